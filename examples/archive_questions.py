@@ -1,9 +1,9 @@
-"""Questions to an archive: vehicles an hour, speeds by kind, one vehicle again, sensors that drift.
+"""SQL queries on an archive: traffic volume, speeds, repeated vehicles, drifting sensors.
 
     mag-tracking archive recordings/ --network site.yaml --out archive
     python examples/archive_questions.py archive
 
-Without a folder it makes an archive of the bundled recordings. DuckDB is asked here; pandas and
+Without a folder, the bundled recordings are archived first. The queries use DuckDB; pandas and
 polars read the same files.
 """
 
@@ -20,14 +20,14 @@ from mag_tracking.recording.archive_folder import schema_of
 ROOT = Path(__file__).resolve().parents[1]
 
 QUESTIONS = {
-    'vehicles an hour': '''
+    'vehicles per hour': '''
         SELECT date_trunc('hour', time) AS hour, kind, count(*) AS vehicles
         FROM tracks GROUP BY ALL ORDER BY ALL''',
-    'speeds by kind [m/s], of tracks that are to be relied on': '''
+    'speeds by kind [m/s], of unambiguous tracks': '''
         SELECT kind, count(*) AS vehicles, round(quantile_cont(speed, 0.15), 1) AS slow,
                round(median(speed), 1) AS median, round(quantile_cont(speed, 0.85), 1) AS fast
         FROM tracks WHERE verdict = 'unique' GROUP BY kind ORDER BY kind''',
-    'the vehicle whose passes are most alike by length and moment': '''
+    'pairs of passes with the most similar length and moment': '''
         WITH one AS (
             SELECT recording, number, length, sqrt(mx * mx + my * my + mz * mz) AS moment
             FROM passes WHERE reason = '')
@@ -37,21 +37,21 @@ QUESTIONS = {
         FROM one a JOIN one b ON (a.recording, a.number) < (b.recording, b.number)
         ORDER BY abs(ln(a.moment / b.moment)) + abs(ln(abs(a.length) / abs(b.length)))
         LIMIT 3''',
-    'sensors that drift most [nT/min], and their noise [nT]': '''
+    'sensors with the largest drift [nT/min], and their noise [nT]': '''
         SELECT sensor, round(60e9 * max(greatest(abs(coalesce(drift_x, 0)),
                abs(coalesce(drift_y, 0)), abs(coalesce(drift_z, 0)))), 2) AS drift,
                round(1e9 * median(noise_x), 1) AS noise, sum(rejected) AS rejected
         FROM health GROUP BY sensor ORDER BY drift DESC''',
 }
-"""{question: SQL over the tables of an archive}."""
+"""{title: SQL query over the tables of an archive}."""
 
 
 def tables_of(folder):
-    """A connection of DuckDB that has the tables of an archive as views."""
+    """Open a DuckDB connection with the tables of an archive as views."""
     connection = duckdb.connect()
     for table in ('tracks', 'poses', 'smoothed', 'passes', 'health'):
         if not any((folder / table).glob('**/*.parquet')):
-            # Nothing was detected in any recording.
+            # No recording had a detection.
             connection.register(table, schema_of(table).empty_table())
             continue
         connection.sql(f"CREATE VIEW {table} AS SELECT * FROM read_parquet("
@@ -60,11 +60,12 @@ def tables_of(folder):
 
 
 def main():
-    """Answer the questions."""
+    """Run the queries and print their results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('folder', nargs='?', type=Path, help='of an archive')
+    parser.add_argument('folder', nargs='?', type=Path,
+                        help='folder of an archive (default: archive the bundled recordings)')
     parser.add_argument('--out', type=Path, default=Path('out/archive'),
-                        help='where the archive of the bundled recordings is made')
+                        help='output folder for the archive of the bundled recordings')
     args = parser.parse_args()
     folder = args.folder
     if folder is None:
@@ -72,7 +73,8 @@ def main():
         run = archive([ROOT / 'test' / 'data' / 'vehicles'],
                       mt.read_network(ROOT / 'config' / 'network.yaml'), settings_for('vehicle'),
                       folder, workers=2, report=print)
-        print(f'{len(run.done)} recordings tracked into {folder}, {len(run.were_done)} were there')
+        print(f'{len(run.done)} recordings archived in {folder}, {len(run.were_done)} already '
+              'complete')
     connection = tables_of(folder)
     for question, sql in QUESTIONS.items():
         print(f'\n{question}\n{connection.sql(sql)}')

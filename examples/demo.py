@@ -1,9 +1,8 @@
-"""The main job on a bundled recording, over real ROS topics.
+"""Track a vehicle of a bundled recording over real ROS topics.
 
-A recorded car turns at a junction between two magnetometers. The replay node
-plays the recording; calibration, detection and tracker nodes work on it; this
-program subscribes to what they publish, prints the track as it grows, and
-draws it.
+A car turns at a junction between two magnetometers. The replay node publishes the recording;
+calibration, detection and tracker nodes process it. This program subscribes to their topics, prints
+the track while it grows, and draws it.
 """
 
 import argparse
@@ -42,7 +41,7 @@ RECORDING = ROOT / 'test' / 'data' / 'vehicles' / 'junction_left_turns_to_rear.m
 
 
 class Spectator(Node):
-    """Subscribes to the published topics, as any other program would."""
+    """Subscribes to the published topics, like any other ROS program."""
 
     def __init__(self, network):
         super().__init__('spectator')
@@ -63,7 +62,7 @@ class Spectator(Node):
         self._hypotheses[stamp_ns(message.header.stamp)] = message
 
     def _whole(self, message):
-        """A track has ended: its path once more, by all that was measured."""
+        """Store the smoothed path of a track that has ended."""
         positions = [p.pose.pose.position for p in message.poses]
         self.smoothed[message.track_id] = np.array([[p.x, p.y, p.z] for p in positions])
 
@@ -72,7 +71,7 @@ class Spectator(Node):
         self.truth.append((stamp_ns(message.header.stamp), p.x, p.y, p.z, q.x, q.y, q.z, q.w))
 
     def truth_arrays(self):
-        """(stamps (n,), positions (n, 3), quaternions (n, 4))."""
+        """Ground truth: timestamps (n,), positions (n, 3), quaternions xyzw (n, 4)."""
         rows = sorted(self.truth)
         return (np.array([r[0] for r in rows], dtype=np.int64), np.array([r[1:4] for r in rows]),
                 np.array([r[4:] for r in rows]))
@@ -88,12 +87,12 @@ class Spectator(Node):
             frame = self._frames.get(track.stamp_ns)
             hypotheses = self._hypotheses.get(track.stamp_ns)
             if frame is None or hypotheses is None:
-                continue  # it came before this node was connected: printed, but not drawn
+                continue  # Published before this node was connected: printed, but not drawn.
             self.logs.setdefault(track.id, TrackLog(track.id)).add(track_of(m, hypotheses), frame)
 
 
 def draw(spectator, out):
-    """Write the pictures and the errors; returns the paths."""
+    """Write the figures and the errors of all tracks; return the paths of the figures."""
     truth = spectator.truth_arrays()
     paths, network = [], spectator.network
     for log in spectator.logs.values():
@@ -109,13 +108,13 @@ def draw(spectator, out):
         (out / f'track_{log.id}.json').write_text(json.dumps(summary, indent=1) + '\n')
         print(f'\ntrack {log.id}: a {summary["kind"]} from {summary["arrival"]}, '
               f'{summary["speed"]:.1f} m/s, {summary["moment_size"]:.0f} A m²; '
-              f'error at the closest point {summary["truth"]["closest"]:.2f} m, '
-              f'within 5 m RMS {summary["truth"]["rms"] or float("nan"):.2f} m')
+              f'error at the closest point of approach {summary["truth"]["closest"]:.2f} m, '
+              f'RMS error within 5 m {summary["truth"]["rms"] or float("nan"):.2f} m')
     return paths
 
 
 def write_page(spectator, out):
-    """Write all of it as one page to look at in a browser; returns its path."""
+    """Write all tracks as one HTML page; return its path."""
     logs = [log for log in spectator.logs.values() if log.stamp_ns]
     begin_ns = min(log.stamp_ns[0] for log in logs)
     tracks = []
@@ -134,10 +133,11 @@ def write_page(spectator, out):
 
 
 def main(argv=None):
-    """Run the demo; returns the exit status."""
+    """Run the demo; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--out', type=Path, default=Path('out/demo'))
-    parser.add_argument('--rate', type=float, default=3.0, help='speed of the replay (default: 3)')
+    parser.add_argument('--rate', type=float, default=3.0,
+                        help='replay speed relative to real time (default: 3)')
     args = parser.parse_args(argv)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
@@ -150,17 +150,17 @@ def main(argv=None):
         spectators.append(Spectator(read_network(network_file)))
         return spectators[-1]
 
-    print(f'Playing {RECORDING.name} at {args.rate:g} times its speed through replay, calibration, '
-          'detection and tracker nodes.\nThe first seconds are target-free: the background is '
-          'learnt from them.\n', flush=True)
+    print(f'Replaying {RECORDING.name} at {args.rate:g} times real time through the calibration, '
+          'detection and tracker nodes.\nThe first seconds are quiet: the background is learnt '
+          'from them.\n', flush=True)
     status = run(network_file, settings_for('vehicle'), RECORDING, args.rate,
                  observers=[spectator])
     paths = draw(spectators[0], args.out)
     if not paths:
-        print('no track was seen', file=sys.stderr)
+        print('no track was received', file=sys.stderr)
         return 1
     print('pictures:', *paths, sep='\n  ')
-    print(f'to look at in a browser: {write_page(spectators[0], args.out)}')
+    print(f'report for the browser: {write_page(spectators[0], args.out)}')
     return status
 
 

@@ -1,18 +1,18 @@
-"""MITRE12, Figures 2 to 6: detection and bounds of a two-axis sensor beside a road.
+"""MITRE12 Figures 2 to 6: detection and bounds of a two-axis sensor beside a road.
 
-MITRE12 is Slater & Jacyna, Evaluating Detection and Estimation Capabilities of
-Magnetometer-Based Vehicle Sensors, 2012. Drawn with the parameters of its tables and
-its equations, corrected where `physics.ellipsoid` and `inference.matched_filter` say so.
-The text leaves the following open. The first two are chosen because the numbers of its
-Figures 2 to 4 are reached with them, and not with the alternatives that are printed:
+MITRE12 is Slater & Jacyna, Evaluating Detection and Estimation Capabilities of Magnetometer-Based
+Vehicle Sensors, 2012. The figures use the parameters of its tables and its equations, corrected as
+described in `physics.ellipsoid` and `inference.matched_filter`. The paper leaves the following
+points open. The first two are chosen because they reproduce the numbers of Figures 2 to 4, which
+the alternatives printed by this program do not:
 
-- The road leads north. x is along the road and y across it, to the left, as (0, 25) is the
-  closest point of approach (CPA) in its Figure 6; M1 is the moment along the road.
-- The transform in (B.11), (B.12) is the DFT divided by the number of samples N. Physical is
-  the DFT divided by the sampling rate, as in `inference.matched_filter`. The sampling rate
-  is 2 N per second here, so that the figures have twice the deflection of the library.
+- The road leads north. x is along the road and y across it, to the left, as (0, 25) is the closest
+point of approach (CPA) in Figure 6; M1 is the moment along the road.
+- The transform in (B.11), (B.12) is the DFT divided by the number of samples N. The physical
+transform is the DFT divided by the sampling rate, as in `inference.matched_filter`. The sampling
+rate is 2 N per second here, so that the figures have twice the deflection of the library.
 - The sensor takes N = 11 samples in a period of 0.5 s; all positions lie in one plane.
-- Figure 5 is drawn for a CPA of 25 m, that of its Figure 6.
+- Figure 5 uses a CPA of 25 m, as Figure 6 does.
 - Samples have independent noise with the power of S_n + S_s in the pass band.
 
 The angle theta of (7), (8) is -90 degrees for a car that drives along x.
@@ -28,7 +28,7 @@ from scipy.optimize import brentq
 
 from mag_tracking.inference.crlb import bound, information, observability
 from mag_tracking.inference.matched_filter import (
-    any_detects,
+    any_detection_probability,
     deflection,
     detection_probability,
     noise_spectrum,
@@ -37,9 +37,10 @@ from mag_tracking.physics.dipole import dipole_field, dipole_jacobians
 from mag_tracking.physics.ellipsoid import ellipsoid_moment
 
 MPH = 0.44704
+"""Mile per hour [m/s]."""
 SPEED = 25.0 * MPH
 BAND = (3.0, 11.0)
-"""[Hz] high-pass and bandwidth."""
+"""High-pass frequency and bandwidth [Hz]."""
 SAMPLING_RATE = 2.0 * BAND[1]
 PERIOD = 0.5
 N_SAMPLES = round(PERIOD * SAMPLING_RATE)
@@ -55,17 +56,17 @@ TABLE_1 = (
     ('sensitivity (step)', f'{RESOLUTION * 1e9:.1f} nT'), ('P_FA', f'{P_FA:.0e}'),
 )
 ONE, FIVE = np.zeros(1), 20.0 * np.arange(-2.0, 3.0)
-"""[m] places of the sensors along the road."""
+"""Positions of the sensors along the road [m]."""
 CPAS = {'car': (10, 15, 20, 25, 30, 35), 'ATV': (5, 8, 10, 12, 15, 20)}
-# Name, the unit that it is drawn in, and that many of them in one SI unit.
+# Name, unit in the figures, and factor from the SI unit to it.
 STATES = (('x0', 'm', 1.0), ('y0', 'm', 1.0), ('v', 'mph', 1.0 / MPH),
           ('theta', 'deg', np.degrees(1.0)), ('M1', 'A m²', 1.0), ('M2', 'A m²', 1.0))
 PRIOR_STD = np.array([30.0, 5.0, 10.0 * MPH, np.radians(15.0), 100.0, 100.0])
-"""Table 2."""
+"""Prior standard deviations of the states, Table 2."""
 PRIOR = np.diag(PRIOR_STD**-2)
 Y0_KNOWN = np.diag([0.0, np.inf, 0.0, 0.0, 0.0, 0.0])
 FIRST_FOUR = np.diag(np.where(np.arange(6) < 4, PRIOR_STD**-2, 0.0))
-"""The prior where the product in (26) ends at four, as printed: none on M1 and M2."""
+"""Prior for the product in (26) up to four, as printed: without M1 and M2."""
 BOUND_CPA = 25.0
 ALONG = -np.pi / 2
 AS_PUBLISHED = SAMPLING_RATE / N_SAMPLES
@@ -75,7 +76,7 @@ CHOSEN = 'road to the north, DFT divided by N'
 
 
 def moment(vehicle, azimuth=0.0):
-    """Induced moment [A m^2] along the road, to its left, up; `azimuth` [rad] from north."""
+    """Induced moment (3,) [A m²] along the road, to its left, up; `azimuth` [rad] from north."""
     dip, declination = np.radians(59.0), np.radians(-11.0)
     field = 57e-6 * np.array([np.cos(declination - azimuth) * np.cos(dip),
                               -np.sin(declination - azimuth) * np.cos(dip), -np.sin(dip)])
@@ -83,7 +84,9 @@ def moment(vehicle, azimuth=0.0):
 
 
 def places(x0, y0, v, theta):
-    """Of the source at the samples of a period (..., 11, 3) [m], seen from the sensor; (7), (8)."""
+    """Position of the source relative to the sensor at the samples of a period, (..., 11, 3) m;
+    (7), (8).
+    """
     t = np.arange(N_SAMPLES) / SAMPLING_RATE
     x, y = (np.asarray(start)[..., None] + v * t * way for start, way in
             ((x0, -np.sin(theta)), (y0, np.cos(theta))))
@@ -92,7 +95,8 @@ def places(x0, y0, v, theta):
 
 
 def detection(m, cpa, starts, sensors, scale=AS_PUBLISHED):
-    """P_D of each period that begins at `starts` [m] along the road, (n_starts, n_sensors).
+    """Detection probability (n_starts, n_sensors) of periods that start at `starts` [m] along the
+    road.
 
     `scale` multiplies the physical deflection.
     """
@@ -103,30 +107,32 @@ def detection(m, cpa, starts, sensors, scale=AS_PUBLISHED):
 
 
 def at_least_once(m, cpa, sensors=ONE, phase=0.0, scale=AS_PUBLISHED):
-    """Probability (6) over a whole drive; `phase` shifts where the periods begin, in periods."""
+    """Probability (6) of a detection in a whole drive; `phase` shifts the periods, in periods."""
     starts = SPEED * PERIOD * (np.arange(-20, 20) + phase)
-    return any_detects(detection(m, cpa, starts, sensors, scale))
+    return any_detection_probability(detection(m, cpa, starts, sensors, scale))
 
 
 def most_in_a_period(m, cpa, sensors=ONE, scale=AS_PUBLISHED):
-    """The largest P_D of one period (5), wherever it begins."""
+    """Maximum detection probability (5) of one period over its start position."""
     starts = np.linspace(-60.0, 60.0, 961)
-    return any_detects(detection(m, cpa, starts, sensors, scale), axis=-1).max()
+    return any_detection_probability(detection(m, cpa, starts, sensors, scale), axis=-1).max()
 
 
 def cpa_where(probability, wanted):
-    """The CPA [m] where a falling `probability(cpa)` is `wanted`."""
+    """CPA [m] at which a decreasing function `probability(cpa)` equals `wanted`."""
     return brentq(lambda cpa: probability(cpa) - wanted, 2.0, 90.0, xtol=1e-6)
 
 
 def noise_std():
-    """Standard deviation [T] of a sample: S_n + S_s over the band, both signs of frequency."""
+    """Noise standard deviation of a sample [T]: S_n + S_s over the band, both signs of frequency.
+    """
     return np.sqrt(2.0 * quad(lambda f: noise_spectrum(f, BACKGROUND, RESOLUTION, BAND[1]),
                               *BAND, epsabs=0.0)[0])
 
 
 def jacobian(z):
-    """Of both axes by z = (x0, y0, v, theta, M1, M2), (11, 2, 6); the chain rule on (7), (8)."""
+    """Jacobian (11, 2, 6) of both axes by z = (x0, y0, v, theta, M1, M2); chain rule on (7), (8).
+    """
     x0, y0, v, theta, m1, m2 = z
     dB_dr, dB_dm = dipole_jacobians(-places(x0, y0, v, theta), np.array([m1, m2, 0.0]))
     t = np.arange(N_SAMPLES) / SAMPLING_RATE
@@ -138,7 +144,7 @@ def jacobian(z):
 
 
 def measured(x0, v=SPEED, vehicle='car'):
-    """Information of one period about z, (6, 6); (18)."""
+    """Information (6, 6) of one period about z; (18)."""
     z = [x0, BOUND_CPA, v, ALONG, *moment(vehicle)[:2]]
     return information(jacobian(z), noise_std()**2 * np.eye(2))
 
@@ -149,13 +155,13 @@ def deviations(information_matrix, prior=None):
 
 
 def pass_figure(sensors, title):
-    """P_D of a period against where it begins: MITRE12 Figures 2 and 3."""
+    """Detection probability of a period against its start position: Figures 2 and 3."""
     figure = Figure(figsize=(10.0, 4.6), layout='constrained')
     starts = np.linspace(-80.0, 80.0, 641)
     for axes, (vehicle, cpas) in zip(figure.subplots(1, 2, sharey=True), CPAS.items(),
                                      strict=True):
         for cpa in cpas:
-            p = any_detects(detection(moment(vehicle), cpa, starts, sensors), axis=-1)
+            p = any_detection_probability(detection(moment(vehicle), cpa, starts, sensors), axis=-1)
             axes.plot(starts, p, label=f'{cpa} m')
         axes.plot(sensors, np.full(len(sensors), -0.045), 'k^', ms=7, label='sensor')
         axes.set(title=vehicle, xlabel=FROM_WHERE, ylim=(-0.08, 1.03), xlim=(-80.0, 80.0))
@@ -167,17 +173,17 @@ def pass_figure(sensors, title):
 
 
 def figure_2():
-    """One sensor."""
+    """Figure 2: one sensor."""
     return pass_figure(ONE, 'MITRE12 Figure 2: one sensor, 25 mph, periods of 0.5 s')
 
 
 def figure_3():
-    """Five sensors."""
+    """Figure 3: five sensors."""
     return pass_figure(FIVE, 'MITRE12 Figure 3: at least one of five sensors, 20 m apart, 25 mph')
 
 
 def figure_4():
-    """Probability of at least one detection in a whole drive against the CPA."""
+    """Figure 4: probability of at least one detection in a whole drive against the CPA."""
     figure = Figure(figsize=(7.5, 4.8), layout='constrained')
     axes = figure.add_subplot()
     cpas = np.linspace(2.0, 45.0, 173)
@@ -196,13 +202,13 @@ def figure_4():
 
 
 def phi_deviation(C, x0, sign):
-    """Bound on phi [deg] by (19) from that on z; x/r^2 in (20) is printed with the `sign` -1."""
+    """Bound on phi [deg] by (19) from that on z; (20) prints x/r^2 with `sign` -1."""
     row = np.array([-BOUND_CPA, sign * x0]) / (x0**2 + BOUND_CPA**2)
     return np.degrees(np.sqrt(row @ C[:2, :2] @ row))
 
 
 def draw_bounds(axes, at, matrices, prior):
-    """The six bounds against `at`; those that are infinite without a prior are dashed, y0 known."""
+    """Draw the six bounds against `at`; those infinite without a prior are dashed, for known y0."""
     given = np.array([deviations(J, prior) for J in matrices])
     helped = np.array([deviations(J, Y0_KNOWN) for J in matrices])
     for i, (name, unit, scale) in enumerate(STATES):
@@ -214,12 +220,12 @@ def draw_bounds(axes, at, matrices, prior):
             axes.axhline(PRIOR_STD[i] * scale, color=f'C{i}', lw=0.8, ls=':')
     axes.grid(alpha=0.3)
     axes.set_ylabel('bound on the standard deviation')
-    axes.set_title('with prior (dotted: the prior alone)' if prior is not None else
-                   'no prior; dashed: infinite, drawn for y0 known')
+    axes.set_title('with prior (dotted: prior only)' if prior is not None else
+                   'no prior (dashed: infinite, drawn for known y0)')
 
 
 def bounds_figure(rows, xlabel, title):
-    """A row of panels without and with prior for each (name, at, matrices)."""
+    """Panels without and with prior, one row for each (name, at, matrices)."""
     figure = Figure(figsize=(10.5, 0.8 + 4.2 * len(rows)), layout='constrained')
     grid = figure.subplots(len(rows), 2, squeeze=False)
     for (left, right), (name, at, matrices) in zip(grid, rows, strict=True):
@@ -233,22 +239,22 @@ def bounds_figure(rows, xlabel, title):
 
 
 def figure_5():
-    """Bounds against the position at the start of the period."""
+    """Figure 5: bounds against the position at the start of the period."""
     starts = np.linspace(-80.0, 80.0, 321)
     return bounds_figure([('car', starts, [measured(x) for x in starts])], FROM_WHERE,
                          'MITRE12 Figure 5: bounds of one period, one sensor, CPA 25 m, 25 mph')
 
 
 def figure_6():
-    """Bounds against the speed, from the closest point on."""
-    mph = np.linspace(-80.0, 80.0, 160)  # even: theta has no meaning at zero
+    """Figure 6: bounds against the speed, for a period that starts at the CPA."""
+    mph = np.linspace(-80.0, 80.0, 160)  # Even number: theta is undefined at zero speed.
     return bounds_figure([(name, mph, [measured(0.0, v * MPH, name) for v in mph])
                           for name in SEMI_AXES], 'speed [mph], negative = backwards',
-                         'MITRE12 Figure 6: bounds of one period from (x0, y0) = (0, 25 m) on')
+                         'MITRE12 Figure 6: bounds of one period starting at (x0, y0) = (0, 25 m)')
 
 
 def compare_detection():
-    """The numbers of Figures 2 to 4, by name."""
+    """Numbers of Figures 2 to 4, by name."""
     n = {}
     car, east = moment('car'), moment('car', np.pi / 2)
     for name, m, scale in (('', car, AS_PUBLISHED), (' physical', car, 1.0),
@@ -264,7 +270,7 @@ def compare_detection():
 
 
 def compare_bounds():
-    """The numbers of Figures 5 and 6, by name."""
+    """Numbers of Figures 5 and 6, by name."""
     starts = np.linspace(-80.0, 80.0, 161)
     alone, prior, four = (np.array([deviations(measured(x), p) for x in starts])
                           for p in (None, PRIOR, FIRST_FOUR))
@@ -279,27 +285,29 @@ def compare_bounds():
 
 
 def detection_report(n):
-    """Figures 2 to 4 against the published ones, as text."""
+    """Comparison of Figures 2 to 4 with the published ones, as text."""
     return f"""\
 Figures 2 and 4, one sensor; road to the north, DFT divided by N
-  agrees   A car at CPA 30 m: most in one period {n['most']:.1%}, published 59.3 %; at least
+  agrees   Car at CPA 30 m: maximum of one period {n['most']:.1%}, published 59.3 %; at least
            once {n['once']:.1%}, published 90 %. At least once at 25 m: {n['at 25']:.1%} (almost \
 always);
-           at 35 m: {n['at 35']:.1%} (almost never); the ATV at 10 m: {n['ATV at 10']:.1%} (high \
+           at 35 m: {n['at 35']:.1%} (almost never); ATV at 10 m: {n['ATV at 10']:.1%} (high \
 probability).
-  differs  By {100 * n['most'] - 59.3:.1f} and {100 * n['once'] - 90.0:.1f} points; why is unknown.
-  instead  DFT divided by the sampling rate, physical, as in the library: {n['most physical']:.1%}
+  differs  By {100 * n['most'] - 59.3:.1f} and {100 * n['once'] - 90.0:.1f} percentage points; \
+the cause is unknown.
+  instead  DFT divided by the sampling rate (physical, as in the library): \
+{n['most physical']:.1%}
            and {n['once physical']:.1%}; half of the cars are detected at \
 {n['range physical']:.1f} m, not {n['range']:.1f} m.
-           Road to the east: {n['most east']:.1%} and {n['once east']:.1%}; half at \
+           Road to the east: {n['most east']:.1%} and {n['once east']:.1%}; half of the cars at \
 {n['range east']:.1f} m.
 Figures 3 and 4, five sensors
-  agrees   At 30 m they reach {n['five']:.4%} for the car (nearly one). For the ATV at 20 m a
-           period has {n['ATV five most']:.1%} at most (not trivial)."""
+  agrees   At 30 m they reach {n['five']:.4%} for the car (nearly one). For the ATV at 20 m, the
+           maximum of one period is {n['ATV five most']:.1%} (nontrivial)."""
 
 
 def bounds_report(n):
-    """Figures 5 and 6 against the published ones, as text."""
+    """Comparison of Figures 5 and 6 with the published ones, as text."""
     starts, alone = n['starts'], n['theta alone']
     best = alone.argmin()
     before, after = n['with prior'][starts == -20.0][0], n['with prior'][starts == 20.0][0]
@@ -309,32 +317,33 @@ def bounds_report(n):
     phi, right = n['phi at -20 m']
     return f"""\
 Figure 5, bounds along the road
-  differs  Without a prior only theta has a bound, of {alone[best]:.0f} deg at best, where the
-           period begins at {starts[best]:.0f} m. {', '.join(n['lost'])} have none: one sensor
-           does not see the scale (T10 (5.5)). At -20 m the lost direction is
+  differs  Without a prior, only theta has a finite bound: at best {alone[best]:.0f} deg, for the
+           period that starts at {starts[best]:.0f} m. {', '.join(n['lost'])} have none: the scale
+           is not observable with one sensor (T10 (5.5)). At -20 m the unobservable direction is
            ({kernel}) = (x0, y0, v, 0, 3 M1, 3 M2)/y0.
-           Published are finite curves, which a singular matrix does not give.
-  agrees   With the prior no bound exceeds it, and theta goes to 15 deg far away.
-  differs  Left and right are not far apart: 20 m before the sensor x0 {before[0]:.1f} m and \
-theta
-           {before[3]:.1f} deg, 20 m after it {after[0]:.1f} m and {after[3]:.1f} deg. Published: \
-low to the left.
+           The published curves are finite, which a singular matrix does not allow.
+  agrees   With the prior, no bound exceeds it, and that of theta approaches 15 deg far away.
+  differs  The bounds on the left and on the right are similar: 20 m before the sensor
+           x0 {before[0]:.1f} m and theta {before[3]:.1f} deg, 20 m after it {after[0]:.1f} m and \
+{after[3]:.1f} deg.
+           Published: low on the left.
 Figure 6, bounds against speed
-  agrees   Without a prior theta has no bound at speed zero. With it the bound on v grows with
-           speed, from {still[1][2]:.1f} to {n['at 80 mph'][1][2]:.1f} mph at 80 mph.
-  differs  With the prior it is the prior's {still[1][3]:.0f} deg; published is a \
-singularity there, too.
-           Without a prior the bound on theta falls with speed, as more of the field is seen:
+  agrees   Without a prior, theta has no bound at speed zero. With the prior, the bound on v grows
+           with speed, from {still[1][2]:.1f} to {n['at 80 mph'][1][2]:.1f} mph at 80 mph.
+  differs  With the prior, the bound on theta at speed zero is that of the prior, \
+{still[1][3]:.0f} deg;
+           published is a singularity. Without a prior, the bound on theta decreases with speed,
+           because the sensor measures more of the signature:
            {thetas}. Published: it grows.
-Printed forms tried as the cause of these differences; neither is one
-  (20)     The sign of x/r^2 changes the bound on phi alone: {phi:.1f} instead of {right:.1f} deg at
-           -20 m, with the prior. The six parameters drawn do not depend on (20).
+Errors in print that were tested as the cause of these differences and excluded
+  (20)     The sign of x/r^2 only changes the bound on phi: {phi:.1f} instead of {right:.1f} deg at
+           -20 m, with the prior. The six parameters in the figures do not depend on (20).
   (26)     A product up to four leaves M1 and M2 without a prior: bounds up to {most[0]:.0f} and
-           {most[1]:.0f} A m^2. At speed zero all stay finite, theta {still[2][3]:.0f} deg."""
+           {most[1]:.0f} A m^2. At speed zero all bounds are finite, theta {still[2][3]:.0f} deg."""
 
 
 def main(argv=None):
-    """Write the figures, print Table 1 and the comparison."""
+    """Write the figures; print Table 1 and the comparison."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--out', type=Path, default=Path('out/mitre12'))
     out = parser.parse_args(argv).out

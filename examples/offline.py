@@ -1,4 +1,4 @@
-"""Track a recording from Python, without ROS: poses as arrays, errors against the truth."""
+"""Track a recording from Python without ROS: poses as arrays, errors against the ground truth."""
 
 from pathlib import Path
 
@@ -15,6 +15,6 @@ if __name__ == '__main__':
         print(pose['stamp_ns'], pose['track_id'], pose['position'].round(2), pose['arrival'],
               pose['ambiguous'])
     for track_id in result.tracks:
-        print(f'track {track_id}, error at the closest point [m]:',
+        print(f'track {track_id}, error at the closest point of approach [m]:',
               result.errors(track_id)['closest'])
     print(result)

@@ -1,17 +1,17 @@
-"""A sensor that speaks a protocol of its own: all that a driver of yours has to say.
+"""A driver for a sensor with its own protocol: the complete code of a custom framing.
 
-This one sends packets between bytes C0 (SLIP, RFC 1055): a count, microseconds and three numbers
-of 24 bits in units of 10 nT, with the sum of all bytes behind them. In a drivers file:
+The sensor sends packets delimited by bytes C0 (SLIP, RFC 1055): a counter, a time in microseconds,
+three 24-bit values in units of 10 nT, and the sum of all bytes as checksum. In a drivers file:
 
     mine:
       transport: serial
       serial: {port: /dev/ttyUSB0}
-      framing: own_sensor:SlipFraming     # module:Class; the module has to be importable
+      framing: own_sensor:SlipFraming     # module:Class; the module must be importable
       framing_settings: {sensor: north}
       unit: '1e-8'
       sensors: {north: mag_1}
 
-Run as a program it writes some packets with garbage between them, and reads them.
+Run as a program, it parses a demonstration stream of packets with garbage between them.
 """
 
 import struct
@@ -23,21 +23,21 @@ from mag_tracking.settings import param
 
 END, ESCAPE = b'\xc0', b'\xdb'
 LONGEST = 2 * 16
-"""A packet in which every byte is escaped."""
+"""Length of a packet in which every byte is escaped."""
 
 
 @dataclass(frozen=True)
 class SlipSettings:
-    """Settings, as they stand under `framing_settings`."""
+    """Settings, listed under `framing_settings` in the drivers file."""
 
-    sensor: str = param('', 'Its name, for the list of sensors.')
+    sensor: str = param('', 'Name of the sensor, as used in `sensors` of the drivers file.')
 
 
 class SlipFraming:
-    """Finds packets in bytes. It holds settings and nothing that it has seen: see `Framing`."""
+    """Finds packets in a byte stream. It holds settings but no state: see `Framing`."""
 
     SETTINGS = SlipSettings
-    # What every device of this kind has in common; a drivers file may say otherwise.
+    # Defaults for every device of this kind; a drivers file may override them.
     CLOCK = {'tick_s': 1e-6, 'wrap': 2**32}
     DRIVER = {'sequence_wrap': 2**16}
 
@@ -45,19 +45,20 @@ class SlipFraming:
         self._sensor = settings.sensor
 
     def parse(self, data, final=False):
-        """All readings in `data`; what may be the beginning of a packet stays for the next time."""
+        """Parse all readings in `data`; an incomplete packet at the end is kept for the next call.
+        """
         *packets, rest = data.split(END)
         rejected, readings = Counter(), []
         for packet in packets:
             self._read(packet, readings, rejected)
-        # Longer than any packet, or nothing follows: it will never be one.
+        # Longer than any packet, or nothing follows: it cannot become a packet.
         if rest and (final or len(rest) > LONGEST):
             rejected['bytes between frames'] += len(rest)
             rest = b''
         return Parsed(tuple(readings), len(data) - len(rest), rejected)
 
     def _read(self, packet, readings, rejected):
-        """One packet: a reading, or why it is none."""
+        """Add the reading of one packet, or count the reason of its rejection."""
         plain = packet.replace(ESCAPE + b'\xdc', END).replace(ESCAPE + b'\xdd', ESCAPE)
         if not plain:
             return
@@ -73,7 +74,7 @@ class SlipFraming:
 
 
 def packet_of(count, microseconds, field):
-    """What the sensor sends; for the demonstration."""
+    """Packet as sent by the sensor, for the demonstration."""
     plain = struct.pack('<HI', count, microseconds) + b''.join(
         v.to_bytes(3, 'little', signed=True) for v in field)
     plain += bytes([sum(plain) % 256])
@@ -81,7 +82,7 @@ def packet_of(count, microseconds, field):
 
 
 def main():
-    """Three packets between garbage."""
+    """Parse three packets separated by garbage."""
     framing = SlipFraming(SlipSettings(sensor='north'))
     stream = b'half a pack' + END + b''.join(
         packet_of(k, 10_000 * k, (200 + k, 1550, -4900)) + b'garbage' + END for k in range(3))

@@ -1,9 +1,8 @@
-"""TSP14 Figure 7 with simulated passes: normalised cost over the number of dipoles.
+"""TSP14 Figure 7 with simulated passes: normalised cost against the number of dipoles.
 
 The bundled recordings of single vehicles on a straight road are simulated (sixty magnetised
-parts, see test/data/README.md). They are fitted at the 100 Hz that they were made with, and
-at the 12.5 Hz to which T10 section 6.3 decimates before its fits; the published costs are of
-the latter rate.
+parts, see test/data/README.md). They are fitted at their original rate of 100 Hz and at 12.5 Hz,
+to which T10 section 6.3 decimates before its fits. The published costs refer to 12.5 Hz.
 
     python examples/tsp14_model_order.py --out out/tsp14
 """
@@ -23,13 +22,13 @@ ROOT = Path(__file__).resolve().parents[1]
 VEHICLES = ('straight_small_left', 'straight_car_right', 'straight_car_fast_left',
             'straight_truck_right')
 RATES = {'12.5 Hz': 12.5, '100 Hz': 0.0}
-"""`calibrate.decimate_to_hz` of each rate; 0 = as recorded."""
+"""`calibrate.decimate_to_hz` for each rate; 0 = as recorded."""
 PUBLISHED = {'cars': ((10.0, 51.0), (1.3, 1.6)), 'large': ((142.0, 360.0), (76.7, 302.6))}
 """TSP14 Tables I and II: lowest and highest normalised cost with one and with three dipoles."""
 
 
 def passes(rate, orders=(1, 2, 3, 4, 5)):
-    """The one `FittedPass` of each recording at one of `RATES`."""
+    """Fit the pass of each recording at one of `RATES`; return one `FittedPass` per recording."""
     network, settings = read_network(ROOT / 'config/network.yaml'), settings_for('vehicle')
     settings = dataclasses.replace(settings, calibrate=replace(
         settings.calibrate, {'decimate_to_hz': RATES[rate]}))
@@ -43,13 +42,13 @@ def passes(rate, orders=(1, 2, 3, 4, 5)):
 
 
 def costs_of(found, n_dipoles):
-    """Normalised cost of each pass with one number of dipoles: cars in a list, the truck."""
+    """Normalised costs with a given number of dipoles: list of the cars, and the truck."""
     costs = [f.normalised_cost for one in found for f in one.fits if f.n_dipoles == n_dipoles]
     return costs[:-1], costs[-1]
 
 
 def report(found):
-    """The costs beside the published ones, as text; `found` has the passes of each rate."""
+    """Costs next to the published ones, as text; `found` holds the passes of each rate."""
     lines = []
     for n_dipoles, (cars, large) in zip((1, 3), zip(*PUBLISHED.values(), strict=True),
                                         strict=True):
@@ -59,15 +58,16 @@ def report(found):
             ours, truck = costs_of(those, n_dipoles)
             lines.append(f'  {rate:8} cars {min(ours):.2f} to {max(ours):.2f}, truck {truck:.1f}')
     return '\n'.join([*lines, """\
-agrees   Every dipole lowers the cost. With three, cars come near one, and the truck does not.
-differs  At 12.5 Hz, as points, the cars are below the published range and the truck is above it:
-         these are other vehicles, simulated, with other noise. The published fits are of data at
-         12.5 Hz (T10 section 6.3). At 100 Hz each sample has more noise, against which the same
-         error of the model weighs less, so that the costs are lower."""])
+agrees   Every dipole lowers the cost. With three dipoles, the cars come close to one; the truck
+         does not.
+differs  With one dipole at 12.5 Hz, the cars are below the published range and the truck is above
+         it: these are other vehicles, simulated, with other noise. The published fits use data at
+         12.5 Hz (T10 section 6.3). At 100 Hz each sample has more noise relative to the model
+         error, so that the costs are lower."""])
 
 
 def main(argv=None):
-    """Draw the figure for both rates and say what differs."""
+    """Draw the figure for both rates and print the comparison."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--out', type=Path, default=Path('out/tsp14'))
     args = parser.parse_args(argv)
@@ -76,7 +76,7 @@ def main(argv=None):
     for rate, those in found.items():
         figure, path = order_figure(those), args.out / f'figure_7_{rate.replace(" ", "_")}.png'
         figure.axes[0].set_title(f'TSP14 Figure 7 with simulated passes at {rate} '
-                                 '(filled: the order chosen)')
+                                 '(filled: selected order)')
         figure.savefig(path, dpi=110)
         print(path)
     print(report(found))

@@ -1,4 +1,4 @@
-// What all compiled code shares: vectors of numbers, and the form of a motion's Jacobian.
+// Types shared by all compiled code: SIMD vectors, aligned arrays and sparse motion Jacobians.
 
 #pragma once
 
@@ -6,16 +6,16 @@
 #include <memory>
 #include <new>
 
-// What is called from a function for several processors has to become part of it.
+// Functions called from a FOR_PROCESSORS function must be inlined to be compiled for its targets.
 #define INLINE inline __attribute__((always_inline))
 
 namespace mag_tracking {
 
-// Eight numbers that are computed with at once, on any processor.
+// SIMD vector of eight doubles; the compiler emulates it on processors without such registers.
 using Eight = double __attribute__((vector_size(64), may_alias));
 constexpr int EIGHT = 8;
 
-// Numbers that begin where vectors of eight may; zero at first.
+// Array of doubles, aligned for vectors of eight and initialised to zero.
 class Numbers {
   public:
     explicit Numbers(std::size_t n = 0)
@@ -33,17 +33,17 @@ class Numbers {
 INLINE Eight* eights(double* p) { return reinterpret_cast<Eight*>(p); }
 INLINE const Eight* eights(const double* p) { return reinterpret_cast<const Eight*>(p); }
 
-// Of one target as many states move at most, and so many targets share a state at most.
+// Maximum number of moving states per target, and of targets in a joint state.
 constexpr int MAX_MOVING = 6, MAX_TARGETS = 4, MAX_ROWS = MAX_MOVING * MAX_TARGETS;
 
-// A move of the targets, and its Jacobian where that is not the one of identity: in `n` rows, each
-// of which has `width` columns that may differ from zero.
+// Motion of the targets and the rows of its Jacobian that differ from identity: `n` rows, each with
+// `width` columns that may be non-zero.
 struct Motion {
     int n, width;
     int rows[MAX_ROWS];
     int columns[MAX_ROWS][MAX_MOVING];
     double f[MAX_ROWS][MAX_MOVING];
-    double moved[MAX_ROWS];  // The states of the rows.
+    double moved[MAX_ROWS];  // Predicted states of the rows.
 };
 
 }  // namespace mag_tracking

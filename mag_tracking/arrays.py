@@ -1,4 +1,4 @@
-"""Types of arrays; shapes and units stand in docstrings."""
+"""Type aliases for arrays; docstrings state the shapes and units."""
 
 from typing import Any, TypeAlias
 
@@ -6,9 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray: TypeAlias = NDArray[np.float64]
+"""Array of float64."""
 IntArray: TypeAlias = NDArray[np.int64]
+"""Array of int64."""
 BoolArray: TypeAlias = NDArray[np.bool_]
+"""Array of bool."""
 StructArray: TypeAlias = NDArray[np.void]
-"""A structured array: one record an element."""
+"""Structured array: one record per element."""
 Record: TypeAlias = Any
 """One element of a structured array."""

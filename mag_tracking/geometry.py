@@ -1,4 +1,4 @@
-"""Rotations, quaternions (x, y, z, w; unit), speed and heading."""
+"""Rotations, unit quaternions in the order (x, y, z, w), speed, heading and overlap of bodies."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -7,14 +7,26 @@ from mag_tracking.arrays import FloatArray
 
 
 def rotation_from_quaternion(q: ArrayLike) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of unit quaternions xyzw (..., 4).
+    """Rotation matrices of unit quaternions.
 
-    Raises ValueError where a norm is further than 1e-3 from one.
+    Parameters
+    ----------
+    q : (..., 4) array
+        Unit quaternions xyzw; normalised before use.
+
+    Returns
+    -------
+    (..., 3, 3) array
+
+    Raises
+    ------
+    ValueError
+        If a norm differs from one by more than 1e-3.
     """
     q = np.asarray(q, dtype=float)
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
     if not np.all(np.abs(norm - 1.0) <= 1e-3):
-        raise ValueError(f'a quaternion needs norm 1, got {np.ravel(norm).tolist()}')
+        raise ValueError(f'quaternions must have norm 1, got norms {np.ravel(norm).tolist()}')
     x, y, z, w = np.moveaxis(q / norm, -1, 0)
     return np.stack([
         np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
@@ -24,25 +36,38 @@ def rotation_from_quaternion(q: ArrayLike) -> FloatArray:
 
 
 def quaternion_from_rotation_vector(v: ArrayLike) -> FloatArray:
-    """Unit quaternions xyzw (..., 4) of rotation vectors (..., 3) [rad]."""
+    """Unit quaternions of rotation vectors.
+
+    Parameters
+    ----------
+    v : (..., 3) array, rad
+        Rotation vectors.
+
+    Returns
+    -------
+    (..., 4) array
+        Unit quaternions xyzw; the identity at v = 0.
+    """
     v = np.asarray(v, dtype=float)
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
-    # sinc keeps the limit at zero: sin(a)/a with a in units of pi.
+    # np.sinc is sin(a)/a with a in units of pi, and has the right limit at zero.
     return np.concatenate([0.5 * v * np.sinc(half / np.pi), np.cos(half)], axis=-1)
 
 
 def rotation_vectors_between(q: ArrayLike, other: ArrayLike) -> FloatArray:
-    """The shortest rotations about world axes from orientation `q` to others.
+    """Shortest rotations about world axes from one orientation to others.
 
     Parameters
     ----------
-    q : (4,) unit quaternion xyzw
-    other : (..., 4) unit quaternions xyzw
+    q : (4,) array
+        Unit quaternion xyzw.
+    other : (..., 4) array
+        Unit quaternions xyzw.
 
     Returns
     -------
     (..., 3) array, rad
-        Of length pi at most.
+        Rotation vectors with a norm of at most pi.
     """
     q, other = np.asarray(q, dtype=float), np.asarray(other, dtype=float)
     v, w = -q[:3], q[3]
@@ -57,7 +82,17 @@ def rotation_vectors_between(q: ArrayLike, other: ArrayLike) -> FloatArray:
 
 
 def cross_matrix(a: ArrayLike) -> FloatArray:
-    """Matrices [a]x with [a]x b = a x b; `a` (..., 3) gives (..., 3, 3)."""
+    """Cross-product matrices [a]x, with [a]x b = a x b.
+
+    Parameters
+    ----------
+    a : (..., 3) array
+        Vectors.
+
+    Returns
+    -------
+    (..., 3, 3) array
+    """
     a = np.asarray(a, dtype=float)
     out = np.zeros(a.shape + (3,))
     out[..., 0, 1], out[..., 0, 2] = -a[..., 2], a[..., 1]
@@ -67,18 +102,30 @@ def cross_matrix(a: ArrayLike) -> FloatArray:
 
 
 def left_jacobian(v: ArrayLike) -> FloatArray:
-    """How a rotation changes with its rotation vector; `v` (..., 3) [rad] gives (..., 3, 3).
+    """Left Jacobian of SO(3): change of a rotation by a change of its rotation vector.
 
-    To first order R(v + d) = R(J d) R(v): a change d of the vector turns what is
-    turned already by J d more. Source: Solà, Deray and Atchuthan, A micro Lie
-    theory for state estimation in robotics (2018), appendix on SO(3).
+    To first order R(v + d) = R(J d) R(v).
+
+    Parameters
+    ----------
+    v : (..., 3) array, rad
+        Rotation vectors.
+
+    Returns
+    -------
+    (..., 3, 3) array
+        J; the identity at v = 0.
+
+    References
+    ----------
+    [Sola18]_ appendix on SO(3).
     """
     v = np.asarray(v, dtype=float)
     square = np.einsum('...i,...i->...', v, v)[..., None, None]
     angle = np.sqrt(square)
     K = cross_matrix(v)
     half = np.sinc(0.5 * angle / np.pi)
-    # (angle - sin(angle)) / angle^3, by its series where the difference would be lost.
+    # (angle - sin(angle)) / angle^3, by its series where the difference would cancel.
     small = angle < 1e-2
     third = np.where(small, (1.0 - square / 20.0) / 6.0,
                      (1.0 - np.sinc(angle / np.pi)) / np.where(small, 1.0, square))
@@ -87,25 +134,69 @@ def left_jacobian(v: ArrayLike) -> FloatArray:
 
 
 def quaternions_from_yaw(yaw: FloatArray) -> FloatArray:
-    """Quaternions xyzw (n, 4) of rotations about z by `yaw` (n,) [rad]."""
+    """Unit quaternions of rotations about z.
+
+    Parameters
+    ----------
+    yaw : (n,) array, rad
+        Rotation angles.
+
+    Returns
+    -------
+    (n, 4) array
+        Unit quaternions xyzw.
+    """
     zero = np.zeros(len(yaw))
     return np.stack([zero, zero, np.sin(0.5 * yaw), np.cos(0.5 * yaw)], axis=1)
 
 
 def rotation_about_z(angle: float) -> FloatArray:
-    """Matrix (3, 3) of a rotation about z by `angle` [rad]."""
+    """Matrix of a rotation about z.
+
+    Parameters
+    ----------
+    angle : float, rad
+
+    Returns
+    -------
+    (3, 3) array
+    """
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def yaw_between(R: FloatArray, other: FloatArray) -> float:
-    """[rad] Rotation about the world's z that takes orientation `R` (3, 3) nearest to `other`."""
+    """Rotation about the world z axis that brings one orientation closest to another.
+
+    Parameters
+    ----------
+    R : (3, 3) array
+        Initial orientation.
+    other : (3, 3) array
+        Target orientation.
+
+    Returns
+    -------
+    float, rad
+        From -pi to pi.
+    """
     M = other @ R.T
     return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
 
 
 def quaternion_from_rotation(R: FloatArray) -> FloatArray:
-    """Unit quaternion xyzw (4,) of a rotation matrix (3, 3), by its largest component."""
+    """Unit quaternion of a rotation matrix, computed from its largest component.
+
+    Parameters
+    ----------
+    R : (3, 3) array
+        Rotation matrix.
+
+    Returns
+    -------
+    (4,) array
+        Unit quaternion xyzw; the sign is that of a positive largest component.
+    """
     w2 = np.array([1 + R[0, 0] - R[1, 1] - R[2, 2], 1 - R[0, 0] + R[1, 1] - R[2, 2],
                    1 - R[0, 0] - R[1, 1] + R[2, 2], 1 + R[0, 0] + R[1, 1] + R[2, 2]])
     k = int(np.argmax(w2))
@@ -119,10 +210,20 @@ def quaternion_from_rotation(R: FloatArray) -> FloatArray:
 
 
 def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
-    """The shortest rotation, as quaternion xyzw (4,), that takes direction `a` to `b`.
+    """Shortest rotation that takes one direction to another.
 
-    `a`, `b` : (3,), any length but zero. Where they are opposite, the turn is
-    about any axis across them.
+    Parameters
+    ----------
+    a : (3,) array
+        Initial direction, of any norm but zero.
+    b : (3,) array
+        Final direction, of any norm but zero.
+
+    Returns
+    -------
+    (4,) array
+        Unit quaternion xyzw. For opposite directions the axis is an arbitrary one perpendicular to
+        `a`.
     """
     u: FloatArray = np.asarray(a, dtype=float) / np.linalg.norm(a)
     v: FloatArray = np.asarray(b, dtype=float) / np.linalg.norm(b)
@@ -136,9 +237,19 @@ def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
 
 
 def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """[m/s] The speed and its deviation, from a velocity (d,) and its covariance (d, d).
+    """Speed and its standard deviation.
 
-    At rest the deviation is the largest of any direction.
+    Parameters
+    ----------
+    velocity : (d,) array, m/s
+    covariance : (d, d) array, m²/s²
+        Covariance of `velocity`.
+
+    Returns
+    -------
+    speed : float, m/s
+    std : float, m/s
+        At zero speed the largest standard deviation of any direction.
     """
     speed = float(np.linalg.norm(velocity))
     if speed == 0.0:
@@ -148,10 +259,20 @@ def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float
 
 
 def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """[rad] The heading, anticlockwise from x, and its deviation.
+    """Heading and its standard deviation.
 
-    From a velocity (2 or 3,) and its covariance, seen from above. At rest the deviation is
-    infinite.
+    Parameters
+    ----------
+    velocity : (2,) or (3,) array, m/s, world frame
+    covariance : (2, 2) or (3, 3) array, m²/s²
+        Covariance of `velocity`.
+
+    Returns
+    -------
+    heading : float, rad
+        From x, anticlockwise seen from above; zero at zero speed.
+    std : float, rad
+        Infinite at zero speed.
     """
     vx, vy = velocity[:2]
     if vx == vy == 0.0:
@@ -160,8 +281,21 @@ def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, flo
     return float(np.arctan2(vy, vx)), float(np.sqrt(g @ covariance[:2, :2] @ g))
 
 
-def moved_along(path: FloatArray, seconds: float) -> FloatArray:
-    """Paths (..., 6 or more) of position, velocity and constants, starting `seconds` later."""
+def propagated_path(path: FloatArray, seconds: float) -> FloatArray:
+    """Straight paths with the time origin moved forwards.
+
+    Parameters
+    ----------
+    path : (..., n) array
+        Position [m] and velocity [m/s], then constants; n >= 6.
+    seconds : float, s
+        Shift of the time origin.
+
+    Returns
+    -------
+    (..., n) array
+        The same paths, starting `seconds` later.
+    """
     moved: FloatArray = path.copy()
     moved[..., :3] += seconds * path[..., 3:6]
     return moved
@@ -169,20 +303,23 @@ def moved_along(path: FloatArray, seconds: float) -> FloatArray:
 
 def overlap(position: FloatArray, velocity: FloatArray, need: ArrayLike,
             width: float) -> FloatArray:
-    """[m] By how much two bodies overlap along the heading of the second; 0 = not at all.
+    """Length by which two bodies overlap along the heading of the second.
 
     Parameters
     ----------
-    position, velocity : (2, n, 2 or 3) [m], [m/s]
-        Of the middles of both.
-    need : float or (n,) [m]
-        Distance along that heading at which they do not overlap.
-    width : float [m]
-        Distance across it at which they do not overlap.
+    position : (2, n, 2 or 3) array, m
+        Centres of the two bodies.
+    velocity : (2, n, 2 or 3) array, m/s
+        Velocities of the two bodies.
+    need : float or (n,) array, m
+        Minimum distance along the heading at which they do not overlap.
+    width : float, m
+        Minimum distance across the heading at which they do not overlap.
 
     Returns
     -------
-    (n,)
+    (n,) array, m
+        Zero if they do not overlap.
     """
     away = position[0, :, :2] - position[1, :, :2]
     size = np.maximum(np.linalg.norm(velocity[1, :, :2], axis=1), 1e-6)

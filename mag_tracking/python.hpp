@@ -1,4 +1,4 @@
-// What modules that are compiled for Python have in common.
+// Helpers shared by all pybind11 modules: array types and shape checks.
 
 #pragma once
 
@@ -15,7 +15,7 @@ namespace mag_tracking {
 
 namespace py = pybind11;
 
-// Arrays are taken as they are: what is written into a copy would be lost.
+// Arrays are never converted: writes to a converted copy would be lost.
 #define IN(name) py::arg(#name).noconvert()
 
 template <class T>
@@ -24,8 +24,8 @@ using Array = ArrayOf<double>;
 using Integers = ArrayOf<std::int64_t>;
 using Size = py::ssize_t;
 
-// A structured array, whose elements are structs. Its type is nearly always the very object that the
-// module gave out; to compare fields takes ten microseconds.
+// A structured array whose elements are structs. Its dtype is nearly always the very object that
+// the module created; comparing the fields instead takes ten microseconds.
 template <class T>
 class Structs {
   public:
@@ -33,14 +33,14 @@ class Structs {
         if (!(array_.flags() & py::array::c_style)
             || (array_.dtype().ptr() != py::dtype::of<T>().ptr()
                 && !py::isinstance<ArrayOf<T>>(array_)))
-            throw py::type_error("a structured array of another type, or not contiguous");
+            throw py::type_error("structured array: wrong dtype, or not C-contiguous");
     }
     Size size() const { return array_.ndim() == 1 ? array_.shape(0) : 0; }
     T* data() { return static_cast<T*>(array_.mutable_data()); }
 
-    // The only element; raises ValueError where there is not one.
+    // The only element; raises ValueError if the size is not one.
     T& only() {
-        if (size() != 1) throw py::value_error("a structured array that has not one element");
+        if (size() != 1) throw py::value_error("structured array: must have exactly one element");
         return *data();
     }
 
@@ -51,29 +51,30 @@ class Structs {
 template <class T>
 void check_shape(const ArrayOf<T>& array, const char* name, const std::vector<Size>& shape) {
     if (std::vector<Size>(array.shape(), array.shape() + array.ndim()) != shape)
-        throw py::value_error(std::string(name) + ": not of the shape that the others ask for");
+        throw py::value_error(std::string(name) + ": shape does not match the other arguments");
 }
 
-// The data of an array of the shape `shape`, to be changed; raises ValueError for another shape,
-// and for an array that may not be written to.
+// Writable data of an array of shape `shape`; raises ValueError for another shape or a read-only
+// array.
 template <class T>
 T* data_of(ArrayOf<T>& array, const char* name, const std::vector<Size>& shape) {
     check_shape(array, name, shape);
     return array.size() ? array.mutable_data() : nullptr;
 }
 
-// As `data_of`, to be read only.
+// Read-only data of an array of shape `shape`; raises ValueError for another shape.
 template <class T>
 const T* input_of(const ArrayOf<T>& array, const char* name, const std::vector<Size>& shape) {
     check_shape(array, name, shape);
     return array.size() ? array.data() : nullptr;
 }
 
-// Its first length; raises ValueError where it has not `dimensions` of them.
+// Length of the first axis; raises ValueError if the array does not have `dimensions` axes.
 template <class T>
 Size length_of(const ArrayOf<T>& array, const char* name, int dimensions) {
     if (array.ndim() != dimensions)
-        throw py::value_error(std::string(name) + ": has another number of dimensions");
+        throw py::value_error(std::string(name) + ": must have " + std::to_string(dimensions)
+                              + " dimensions");
     return array.shape(0);
 }
 

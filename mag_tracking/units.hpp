@@ -1,4 +1,4 @@
-// As units.py.
+// Time constants, as in units.py.
 
 #pragma once
 
@@ -9,7 +9,7 @@ namespace mag_tracking {
 
 using std::int64_t;
 
-// [ns] Timestamp of an event that has not happened.
+// Timestamp of an event that has not happened [ns].
 constexpr int64_t NEVER = std::numeric_limits<int64_t>::min();
 
 }  // namespace mag_tracking

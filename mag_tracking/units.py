@@ -1,9 +1,10 @@
-"""Units at the edges: everything inside is SI, and time is integer nanoseconds."""
+"""Units and time constants: internal quantities are in SI units, timestamps in integer nanoseconds.
+"""
 
 NS = 1_000_000_000
-"""Nanoseconds in a second."""
+"""Nanoseconds per second."""
 NEVER = -2**63
-"""[ns] Timestamp of an event that has not happened: the smallest int64."""
+"""Timestamp of an event that has not happened: the smallest int64 [ns]."""
 LATEST_NS = 2**31 * NS
-"""[ns] Later than any timestamp of a ROS header. Of timestamps that are no further from 1970 every
-difference fits into int64, and none is `NEVER`."""
+"""Upper bound of the timestamps in ROS headers [ns]. Differences of timestamps within this bound of
+1970 fit into int64, and none of these timestamps equals `NEVER`."""

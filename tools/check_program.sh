@@ -1,6 +1,6 @@
 #!/bin/sh
-# check_program.sh PROGRAM PACKAGE TESTS: is there a program that some tests use?
-# As root it is installed from apt; otherwise its absence is told, and those tests are skipped.
+# check_program.sh PROGRAM PACKAGE TESTS: check for a program that some tests use.
+# If it is missing, root installs it from apt; other users get a message, and the tests are skipped.
 set -u
 
 program=$1
@@ -22,5 +22,5 @@ if [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then
     there && exit 0
 fi
 
-echo "There is no $program: $tests are skipped. To run them, too:"
+echo "$program is not installed: $tests are skipped. To run them:"
 echo "    sudo apt update && sudo apt install $package"

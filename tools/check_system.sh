@@ -1,6 +1,6 @@
 #!/bin/sh
-# check_system.sh PYTHON: is there what pip cannot install?
-# Missing system packages are installed when this runs as root, and named otherwise.
+# check_system.sh PYTHON: check for the system packages that pip cannot install.
+# Missing packages are installed if this runs as root, and listed otherwise.
 set -u
 
 python=$1
@@ -15,7 +15,7 @@ apt_line() {
     echo "    sudo apt update && sudo apt install $apt_packages"
 }
 
-# Prints what is missing, one word each.
+# Print the missing packages, one per line.
 missing() {
     command -v g++ >/dev/null || echo 'g++'
     "$python" -c 'import ensurepip, venv' 2>/dev/null || echo 'python3-venv'
@@ -32,33 +32,34 @@ if [ "$(uname -s)" != Linux ] || [ "$(uname -m)" != x86_64 ]; then
 fi
 
 if command -v "$python" >/dev/null; then
-    # The pins of constraints.txt have wheels for 3.10 to 3.13; more can be allowed when they have.
+    # The pins of constraints.txt have wheels for 3.10 to 3.13.
     "$python" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' ||
-        fail "$python is $("$python" --version 2>&1); Python 3.10 to 3.13 is needed." \
-             'Name another one like this: make setup PYTHON=python3.12'
+        fail "$python is $("$python" --version 2>&1); Python 3.10 to 3.13 is required." \
+             'Select another interpreter: make setup PYTHON=python3.12'
 elif [ "$python" != python3 ]; then
-    fail "There is no $python here."
+    fail "$python is not installed."
 fi
 
 lacking=$(echo $(missing))
 [ -n "$lacking" ] || exit 0
 
 if [ "$(id -u)" -ne 0 ] || ! command -v apt-get >/dev/null; then
-    fail "Missing here: $lacking" 'On Debian and Ubuntu, type this and try again:' "$(apt_line)"
+    fail "Missing packages: $lacking" 'On Debian or Ubuntu, install them and try again:' \
+         "$(apt_line)"
 fi
 
-echo "Setting up: installing from apt, as $lacking is missing"
+echo "Setting up: installing missing packages from apt: $lacking"
 log=$(mktemp)
 # shellcheck disable=SC2086 # a list of words
 if ! { apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install -y $apt_packages; } \
         >"$log" 2>&1; then
     tail -n 20 "$log" >&2
     rm -f "$log"
-    fail 'apt-get failed; this is what it was to do:' "$(apt_line)"
+    fail 'apt-get failed. The command was:' "$(apt_line)"
 fi
 rm -f "$log"
 
 lacking=$(echo $(missing))
 [ -z "$lacking" ] ||
     fail "Still missing for $python: $lacking" \
-         'It is perhaps not the Python of apt: try make setup PYTHON=/usr/bin/python3'
+         'This may not be the Python from apt. Try: make setup PYTHON=/usr/bin/python3'

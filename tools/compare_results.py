@@ -1,10 +1,10 @@
-"""Compare what two commits compute from the bundled recordings, number by number.
+"""Compare the results of two commits for the bundled recordings, value by value.
 
-    .venv/bin/python tools/compare_results.py BASE          # the working tree against commit BASE
+    .venv/bin/python tools/compare_results.py BASE          # working tree against commit BASE
 
-Every bundled recording is replayed with both through the command line; every number in
-poses.csv, poses_smoothed.csv, detections.csv and hypotheses.csv has to agree to the tolerance,
-every text and every count of rows exactly. Exit status 1 where something differs.
+Every bundled recording is replayed with both versions from the command line. Every number in
+poses.csv, poses_smoothed.csv, detections.csv and hypotheses.csv must agree within the tolerance;
+every text and the number of rows must be identical. The exit status is 1 if any value differs.
 """
 
 import argparse
@@ -34,7 +34,7 @@ def mag_tracking(tree, *arguments):
 
 
 def recordings(tree, out):
-    """[(name, recording, network, target)] of what is bundled; imports the magnet tables."""
+    """Bundled recordings: [(name, recording, network, target)]; imports the magnet tables."""
     road = ROOT / 'config' / 'network.yaml'
     found = [(p.stem, p, road, 'vehicle') for p in sorted((DATA / 'vehicles').glob('*.mcap'))]
     found.append(('two_way_road_start', DATA / 'two_way_road' / 'two_way_road_start.mcap', road,
@@ -52,7 +52,7 @@ def recordings(tree, out):
 
 
 def replay_all(tree, out, workers):
-    """Replay every bundled recording with the source tree `tree` into `out`."""
+    """Replay every bundled recording with the source tree `tree` into `out`; return their names."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     todo = recordings(tree, out / 'imported')
@@ -64,7 +64,7 @@ def replay_all(tree, out, workers):
 
 
 def difference(one, other):
-    """How far two texts are apart: relative where both are numbers, infinite where they differ."""
+    """Relative difference of two numbers; infinite for texts that differ."""
     if one == other:
         return 0.0
     try:
@@ -77,7 +77,7 @@ def difference(one, other):
 
 
 def compare(one, other):
-    """(rows, numbers, largest difference, where) of two CSV files."""
+    """Compare two CSV files: (rows, values, largest difference, its location)."""
     with open(one, newline='') as a, open(other, newline='') as b:
         rows, others = list(csv.reader(a)), list(csv.reader(b))
     if len(rows) != len(others) or rows[0] != others[0]:
@@ -93,11 +93,13 @@ def compare(one, other):
 
 
 def main():
-    """Replay with both, compare, print a line for each table."""
+    """Replay with both versions, compare, and print one line per table."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('base', help='commit to compare with')
-    parser.add_argument('--tolerance', type=float, default=1e-12, help='relative (default: 1e-12)')
-    parser.add_argument('--workers', type=int, default=2, help='replays at once (default: 2)')
+    parser.add_argument('--tolerance', type=float, default=1e-12,
+                        help='relative tolerance (default: 1e-12)')
+    parser.add_argument('--workers', type=int, default=2,
+                        help='number of concurrent replays (default: 2)')
     args = parser.parse_args()
     build = ROOT / 'build' / 'compare'
     commit = subprocess.run(['git', 'rev-parse', '--short', args.base], cwd=ROOT, check=True,
@@ -118,7 +120,7 @@ def main():
             failed |= bad
             print(f'{name} {table}: {n_rows} rows, {n} values, largest difference {worst:.2g}'
                   + (f'  DIFFERS: {where}' if bad else ''))
-    print('different' if failed else f'all equal to {args.tolerance:g} relative')
+    print('different' if failed else f'all values agree within {args.tolerance:g} (relative)')
     return int(failed)
 
 

@@ -1,7 +1,7 @@
-"""Write config/security/policies.xml: what each node may do, as SROS 2 has it.
+"""Generate config/security/policies.xml: the SROS 2 access policies of the nodes.
 
-By what the nodes do: they are created, and asked. `--check` compares; `--namespace /robot1` prints
-the policies of nodes in a namespace.
+The nodes are created and their topics and services are listed. `--check` compares the file with the
+result; `--namespace /robot1` prints the policies of nodes in a namespace.
 """
 
 import os
@@ -13,13 +13,13 @@ from xml.etree import ElementTree
 ROOT = Path(__file__).resolve().parents[1]
 POLICIES = ROOT / 'config' / 'security' / 'policies.xml'
 SENSORS = ('mag_1', 'mag_2')
-"""Of the bundled network file: in the policies any sensor takes their place."""
+"""Sensors of the bundled network file; the policies have a wildcard in their place."""
 COMMENT = ' Written by tools/generate_policies.py; do not edit. How to use it: docs/ros.md. '
 RECORDING = ROOT / 'test' / 'data' / 'vehicles' / 'straight_car_right.mcap'
 
 
 def nodes(folder, namespace):
-    """The nodes, in this process."""
+    """Create the nodes, one after the other, in this process."""
     from rclpy.parameter import Parameter
 
     from mag_tracking.nodes.calibration_node import CalibrationNode
@@ -41,14 +41,14 @@ def nodes(folder, namespace):
 
 
 def expression(name):
-    """A name in a policy: relative to the root, any sensor in place of one."""
+    """Name in a policy: absolute, with a wildcard for the sensor."""
     for sensor in SENSORS:
         name = name.replace(f'/{sensor}/', '/*/')
     return name
 
 
 def add(profile, kind, what, names):
-    """Rules of one kind."""
+    """Add the rules of one kind to a profile."""
     if not names:
         return
     group = ElementTree.SubElement(profile, kind, {what: 'ALLOW'})
@@ -57,7 +57,7 @@ def add(profile, kind, what, names):
 
 
 def policies(namespace='/'):
-    """The text of the file."""
+    """Text of the policy file for nodes in a namespace."""
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
     from mag_tracking.nodes.middleware import begin
     begin()
@@ -83,7 +83,7 @@ def policies(namespace='/'):
 
 
 def main():
-    """Write the file, or compare it; returns the exit status."""
+    """Write the file, or compare it; return the exit status."""
     if '--namespace' in sys.argv:
         print(policies(sys.argv[sys.argv.index('--namespace') + 1]), end='')
         return 0

@@ -1,6 +1,7 @@
-"""Write config/viewers/: layouts of RViz, Foxglove (and Lichtblick) and PlotJuggler.
+"""Generate config/viewers/: layouts for RViz, Foxglove (and Lichtblick) and PlotJuggler.
 
-For the sensors of config/network.yaml; with another network file: generate_viewers.py FILE FOLDER.
+The layouts are for the sensors of config/network.yaml. For another network file:
+generate_viewers.py FILE FOLDER.
 """
 
 import json
@@ -19,7 +20,7 @@ TRACKER = '/tracker_node'
 
 
 def rviz(network):
-    """The text of an RViz configuration."""
+    """Text of an RViz configuration."""
     def topic(name, durability='Volatile'):
         return {'Value': f'{TRACKER}/{name}', 'Depth': 10, 'History Policy': 'Keep Last',
                 'Reliability Policy': 'Reliable', 'Durability Policy': durability}
@@ -51,7 +52,7 @@ def rviz(network):
 
 
 def foxglove(network, fields):
-    """The text of a layout for Foxglove and Lichtblick."""
+    """Text of a layout for Foxglove and Lichtblick."""
     def plot(title, *paths):
         return {'paths': [{'value': value, 'enabled': True, 'timestampMethod': 'headerStamp',
                            'color': colour} for value, colour in paths],
@@ -84,7 +85,7 @@ def foxglove(network, fields):
 
 
 def plotjuggler(fields):
-    """The text of a layout for PlotJuggler."""
+    """Text of a layout for PlotJuggler."""
     plots = [[(f'{topic}/magnetic_field/{axis}', colour)
               for axis, colour in zip('xyz', AXIS_COLOURS, strict=True)] for topic in fields]
     pose = f'{TRACKER}/odometry/pose/pose/position'
@@ -108,14 +109,14 @@ def plotjuggler(fields):
 
 
 def layouts(network):
-    """{file name: text}."""
+    """Text of each layout: {file name: text}."""
     fields = [f'{absolute(topic)}_calibrated' for topic in network.topics]
     return {'mag_tracking.rviz': rviz(network), 'foxglove.json': foxglove(network, fields),
             'plotjuggler.xml': plotjuggler(fields)}
 
 
 def main(arguments):
-    """Write the files; returns the exit status."""
+    """Write the files; return the exit status."""
     network_file = Path(arguments[0]) if arguments else ROOT / 'config' / 'network.yaml'
     folder = Path(arguments[1]) if len(arguments) > 1 else ROOT / 'config' / 'viewers'
     for name, text in layouts(read_network(network_file)).items():

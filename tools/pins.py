@@ -1,4 +1,4 @@
-"""What the Makefile needs to know of requirements: `pins.py build-requires` or `pins.py freeze`."""
+"""Print requirements for the Makefile: `pins.py build-requires` or `pins.py freeze`."""
 
 import sys
 from importlib.metadata import distributions
@@ -6,7 +6,7 @@ from pathlib import Path
 
 try:
     import tomllib
-except ModuleNotFoundError:  # Python 3.10 has none; it can go when 3.11 is the oldest
+except ModuleNotFoundError:  # Python 3.10; remove when 3.11 is the oldest supported version
     from pip._vendor import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -14,16 +14,17 @@ PROJECTS = ROOT / 'msg_defs' / 'pyproject.toml', ROOT / 'pyproject.toml'
 
 
 def build_requires():
-    """The requirements for building both packages, for those who build without isolation."""
+    """Build requirements of both packages, for builds without isolation."""
     systems = [tomllib.loads(project.read_text())['build-system'] for project in PROJECTS]
     return sorted({requirement for system in systems for requirement in system['requires']})
 
 
 def freeze():
-    """Exact pins of what pip has installed from the index in this environment.
+    """Exact versions of the packages that pip has installed from the index in this environment.
 
-    `pip freeze` would list more: the ros-* wheels carry the metadata of the package inside them
-    (`rclpy` in `ros-rclpy`) under names that on the index are other people's or nobody's.
+    `pip freeze` would list more: the ros-* wheels carry the metadata of the packages inside them
+    (`rclpy` in `ros-rclpy`), under names that do not exist on the index or belong to other
+    projects.
     """
     return sorted(
         f'{each.metadata["Name"].lower()}=={each.version}'

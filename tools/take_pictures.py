@@ -1,4 +1,4 @@
-"""Write docs/images/report.png and report_telephone.png: the report of a recording, in Chromium.
+"""Render docs/images/report.png and report_telephone.png: the report of a recording in Chromium.
 
     PYTHONPATH=test .venv/bin/python tools/take_pictures.py
 """
@@ -15,11 +15,11 @@ IMAGES = Path(__file__).resolve().parents[1] / 'docs' / 'images'
 RECORDING = vehicle_path('junction_left_turns_to_rear')
 SIZE = {'width': 1280, 'height': 1130}
 SHOWN_S = 2.4
-"""[s] The time at which the slider stands: the car begins to turn."""
+"""Time of the slider [s]: the car begins to turn."""
 
 
 def main():
-    """The command."""
+    """Replay the recording and render its report; return the exit status."""
     with tempfile.TemporaryDirectory() as folder, browser() as chromium:
         status = command(['replay', str(RECORDING), '--network', str(NETWORK_FILE), '--out', folder,
                           '--no-figures'])

@@ -17,7 +17,7 @@ import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.inference.least_squares import left_out_covariance
+from mag_tracking.inference.least_squares import model_error_covariance
 from mag_tracking.network.sensor_network import MIN_DELAY_BASELINE
 
 MIN_CORRELATION = 0.97
@@ -324,7 +324,7 @@ def _delay_std(t: FloatArray, J: FloatArray, left: FloatArray, prior: FloatArray
     """[s] Deviation of the delay, with what the two fields do not have in common."""
     covariance: FloatArray = np.linalg.inv(J.T @ J + prior).astype(np.float64)
     shape = len(t), len(left) // len(t)
-    covariance += left_out_covariance([t], [J.reshape(*shape, -1)], [left.reshape(shape)],
+    covariance += model_error_covariance([t], [J.reshape(*shape, -1)], [left.reshape(shape)],
                                       covariance)
     return float(np.sqrt(covariance[0, 0]))
 

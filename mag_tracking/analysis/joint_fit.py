@@ -25,7 +25,7 @@ from mag_tracking.analysis.pass_fit import (
 )
 from mag_tracking.analysis.pass_result import NEARLY, PassFit
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.geometry import moved_along, overlap
+from mag_tracking.geometry import overlap, propagated_path
 from mag_tracking.inference.least_squares import refine
 from mag_tracking.inference.separable_fit import coarse_minima, fine_minimum
 from mag_tracking.physics.passes import SuperposedPasses
@@ -114,7 +114,7 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
     if not orders:
         return ()
     data, rough = at_strongest(data)
-    paths = moved_along(paths, (data.stamp_ns - begin_ns) / NS)
+    paths = propagated_path(paths, (data.stamp_ns - begin_ns) / NS)
     placed = np.vstack([paths.ravel(), _placed(rough, n_targets, ground)])
     fits = _JointFits(data, rough, placed, ground, errors)
     known = [min(orders, key=lambda n: (abs(n - 2), n))] * n_targets
@@ -243,7 +243,8 @@ def are_separate(data: PassData, paths: Sequence[FloatArray], clear: float = CLE
 
 def path_from(data: PassData, fit: PassFit) -> FloatArray:
     """The path (6 or 7,) of a fit, from time zero of `data`."""
-    return moved_along(fit.x[:6 + (fit.n_dipoles > 1)], (data.stamp_ns - fit.data.stamp_ns) / NS)
+    return propagated_path(fit.x[:6 + (fit.n_dipoles > 1)],
+                           (data.stamp_ns - fit.data.stamp_ns) / NS)
 
 
 def _of_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[FloatArray]:
@@ -270,7 +271,7 @@ def _is_same(fit: PassFit, path: FloatArray) -> bool:
     if not len(fit.x):
         return False
     seconds = _strongest_at(fit)
-    away = moved_along(fit.x, seconds)[:2] - moved_along(path, seconds)[:2]
+    away = propagated_path(fit.x, seconds)[:2] - propagated_path(path, seconds)[:2]
     return bool(np.linalg.norm(away) <= SAME_M and np.linalg.norm(
         fit.velocity - path[3:6]) <= SAME_SHARE * np.linalg.norm(path[3:6]))
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray
-from mag_tracking.inference.least_squares import left_out_covariance
+from mag_tracking.inference.least_squares import model_error_covariance
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def robust_covariance(data: PassData, whitened: FloatArray, left: FloatArray, ta
     -------
     (n_x, n_x)
     """
-    honest: FloatArray = (covariance + left_out_covariance(*_by_sensor(data, whitened, left),
+    honest: FloatArray = (covariance + model_error_covariance(*_by_sensor(data, whitened, left),
                                                            covariance)
                           + _of_sensors(data, whitened, target, covariance, errors))
     return honest
@@ -91,7 +91,7 @@ def velocity_change(data: PassData, whitened: FloatArray, left: FloatArray, firs
     inverse = np.linalg.pinv(flat / size, rcond=1e-8) / size[:, None]
     step, covariance = inverse @ left.ravel(), inverse @ inverse.T
     rest = (left.ravel() - flat @ step).reshape(left.shape)
-    honest = covariance + left_out_covariance(*_by_sensor(data, wider, rest), covariance)
+    honest = covariance + model_error_covariance(*_by_sensor(data, wider, rest), covariance)
     scale = seen_s / np.linalg.norm(velocity)
     return (float(np.linalg.norm(step[-2:]) * scale),
             float(np.sqrt(np.trace(honest[-2:, -2:])) * scale))

@@ -6,7 +6,7 @@ import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray
-from mag_tracking.geometry import heading_of, moved_along, speed_of
+from mag_tracking.geometry import heading_of, propagated_path, speed_of
 from mag_tracking.physics.anderson import closest_approach
 
 RIVAL = 9.2
@@ -166,8 +166,8 @@ class PassFit:
         # An infinite variance times zero is NaN.
         with np.errstate(invalid='ignore'):
             covariance, honest = (F @ P @ F.T for P in (self.covariance, self.robust_covariance))
-        rivals = tuple((cost, moved_along(path, seconds)) for cost, path in self.rivals)
-        return replace(self, data=self.data.shifted(seconds), x=moved_along(self.x, seconds),
+        rivals = tuple((cost, propagated_path(path, seconds)) for cost, path in self.rivals)
+        return replace(self, data=self.data.shifted(seconds), x=propagated_path(self.x, seconds),
                        covariance=covariance, robust_covariance=honest, rivals=rivals)
 
     @property

@@ -8,7 +8,7 @@ import numpy as np
 from mag_tracking.analysis.joint_fit import GroundPrior, are_separate
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray
-from mag_tracking.geometry import moved_along
+from mag_tracking.geometry import propagated_path
 from mag_tracking.records import Track
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
@@ -64,7 +64,7 @@ class PassTracks:
                        if pose.stamp_ns >= data.stamp_ns), key=lambda pose: pose.spread)
         paths: list[FloatArray] = []
         for pose in mine:
-            path = moved_along(pose.path, (data.stamp_ns - pose.stamp_ns) / NS)
+            path = propagated_path(pose.path, (data.stamp_ns - pose.stamp_ns) / NS)
             if self._of_vehicles and all(are_separate(data, (path, other)) for other in paths):
                 paths.append(path)
         return np.array(paths).reshape(-1, 6)

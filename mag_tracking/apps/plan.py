@@ -18,7 +18,7 @@ from mag_tracking.analysis.placement import (
 )
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.crlb import Observability, observability, path_bound, snr_range
-from mag_tracking.inference.detection_theory import energy_threshold, missed_probability
+from mag_tracking.inference.detection_theory import energy_threshold, missed_detection_probability
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
 from mag_tracking.pipeline import Settings
@@ -281,5 +281,6 @@ def _missed(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, l
         seen = detection_probabilities(
             network.positions, network.R_sw, target, sampling, points,
             detect.false_alarm_probability, detect.background_std)
-        out.append((offset, float(np.mean(missed_probability(seen, detect.onset_frames)))))
+        out.append((offset, float(np.mean(
+            missed_detection_probability(seen, detect.onset_frames)))))
     return np.array(out)

@@ -1,1 +1,1 @@
-"""Filters and tests: mathematics in arrays, without ROS."""
+"""Filters, estimators, bounds and tests: array mathematics without ROS."""

@@ -8,17 +8,17 @@
 
 namespace mag_tracking {
 
-// A symmetric (3, 3): the lower triangle, row by row.
+// Symmetric (3, 3) matrix: the lower triangle, row by row.
 struct Symmetric {
     double s00, s10, s11, s20, s21, s22;
 };
 
-// S = L diag(e) L' with a unit lower L.
+// Factors of S = L diag(e) L' with a unit lower triangular L.
 struct Factors {
     double l10, l20, l21, e0, e1, e2;
 };
 
-// That of `C` (3, 3), with the rows and columns of axes that `y` (3) has not (NaN) as in identity.
+// `C` (3, 3) with the rows and columns of missing axes (NaN in `y` (3)) replaced by identity.
 inline Symmetric of_present_axes(const double* y, const double* C) {
     Symmetric s{C[0], C[3], C[4], C[6], C[7], C[8]};
     if (std::isnan(y[0])) s.s00 = 1.0, s.s10 = s.s20 = 0.0;
@@ -37,7 +37,7 @@ inline Factors factors(const Symmetric& s) {
     return f;
 }
 
-// y' C^-1 y over the axes that are present, and how many those are; false: C is not positive
+// Computes y' C^-1 y over the measured axes, and their number. Returns false if C is not positive
 // definite.
 inline bool whitened_energy(const double* y, const double* C, double& energy, std::int64_t& n_axes) {
     const Factors f = factors(of_present_axes(y, C));
@@ -53,11 +53,12 @@ inline bool whitened_energy(const double* y, const double* C, double& energy, st
     return true;
 }
 
-// Smallest pivot of the covariance in units of its own variances; NaN where it is not finite or
-// where a variance is negative.
+// Smallest pivot of the correlation matrix; NaN if the covariance is not finite or a variance is
+// negative.
 inline double smallest_pivot(const double* y, const double* C) {
     const Symmetric s = of_present_axes(y, C);
-    // Scaled to one: in tesla squared every pivot looks like zero. Of what is negative NaN.
+    // Scaled to unit diagonal, as every pivot is close to zero in squared tesla. A negative
+    // variance becomes NaN.
     const double a = std::sqrt(s.s00), b = std::sqrt(s.s11), c = std::sqrt(s.s22);
     const Factors f = factors({s.s00 / (a * a), s.s10 / (a * b), s.s11 / (b * b), s.s20 / (a * c),
                                s.s21 / (b * c), s.s22 / (c * c)});

@@ -1,4 +1,4 @@
-"""Covariances of the three axes of a sensor, some of which may be missing."""
+"""Covariances of the three axes of a sensor, any of which may be missing."""
 
 import numpy as np
 
@@ -7,28 +7,37 @@ from mag_tracking.inference import core
 from mag_tracking.records import plain
 
 MIN_PIVOT = 1e-12
-"""A covariance with a smaller one of `smallest_pivots` is singular, but for rounding."""
+"""Pivot (see `smallest_pivots`) below which a covariance is singular up to rounding."""
 
 
 def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Energy of a measurement in units of its noise: y' C^-1 y over the axes present.
+    """Energy of a measurement relative to its noise: y' C^-1 y over the measured axes.
 
     Parameters
     ----------
-    y : (n, 3)
-        Per sensor; NaN = missing axis.
-    C : (n, 3, 3)
-        Covariance, same unit squared, symmetric; not read where `y` is missing.
+    y : (n, 3) array
+        Measurement of each sensor; NaN = missing axis.
+    C : (n, 3, 3) array
+        Noise covariance, in the squared unit of `y`, symmetric. Entries of missing axes are not
+        read.
 
     Returns
     -------
-    energy : (n,)
-        0 where no axis is present.
-    axes : (n,) int
-        How many are.
+    energy : (n,) array
+        Chi-square distributed for noise alone; 0 if no axis is measured.
+    axes : (n,) int array
+        Number of measured axes.
 
-    Raises numpy.linalg.LinAlgError where a covariance is not positive definite.
-    Source: T10 eq. (5.16).
+    Raises
+    ------
+    ValueError
+        If the shapes do not match.
+    numpy.linalg.LinAlgError
+        If a covariance is not positive definite.
+
+    References
+    ----------
+    [T10]_ eq. (5.16).
     """
     y, C = _checked(y, C)
     energy, axes = np.empty(len(y)), np.empty(len(y), dtype=np.int64)
@@ -38,11 +47,26 @@ def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]
 
 
 def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
-    """How far the covariance of each sensor is from singular, over the axes that are present.
+    """Distance of covariances from singularity, over the measured axes.
 
-    The arrays are as for `whitened_energy`. Returns (n,): of the covariance in units of its own
-    variances, the least share of one axis that those before it do not tell. 1 = no axes go
-    together; NaN or not positive: not positive definite.
+    Parameters
+    ----------
+    y : (n, 3) array
+        Measurement of each sensor; NaN = missing axis.
+    C : (n, 3, 3) array
+        Noise covariance, in the squared unit of `y`, symmetric.
+
+    Returns
+    -------
+    (n,) array
+        Smallest pivot of the correlation matrix: the smallest fraction of the variance of one axis
+        that the axes before it do not explain. 1 = uncorrelated axes; NaN or not positive = not
+        positive definite.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not match.
     """
     y, C = _checked(y, C)
     out = np.empty(len(y))
@@ -50,10 +74,24 @@ def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     return out
 
 
-def are_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
-    """Whether covariances are finite, symmetric and positive definite, over the axes present.
+def are_valid_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
+    """Whether covariances are finite, symmetric and positive definite over the measured axes.
 
-    The arrays are as for `whitened_energy`. Returns (n,).
+    Parameters
+    ----------
+    y : (n, 3) array
+        Measurement of each sensor; NaN = missing axis.
+    C : (n, 3, 3) array
+        Noise covariance, in the squared unit of `y`.
+
+    Returns
+    -------
+    (n,) bool array
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not match.
     """
     y, C = _checked(y, C)
     there = ~np.isnan(y)
@@ -68,7 +106,8 @@ def are_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
 
 
 def _checked(y: FloatArray, C: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Both as compiled code takes them. Raises ValueError where the shapes do not fit."""
+    """Both as contiguous arrays for compiled code; ValueError if the shapes do not match."""
     if y.shape != (len(y), 3) or C.shape != (len(y), 3, 3):
-        raise ValueError(f'covariances of shape {C.shape} for axes of shape {y.shape}')
+        raise ValueError('expected measurements (n, 3) and covariances (n, 3, 3), got '
+                         f'{y.shape} and {C.shape}')
     return plain(y), plain(C)

@@ -1,73 +1,120 @@
-"""How much better a target explains the frames of a track than something else does."""
+"""Bayes factor of a target against an alternative explanation, over the frames of a track."""
 
 import numpy as np
 
-from mag_tracking.inference.latest_frames import LatestFrames
+from mag_tracking.inference.sliding_sum import SlidingSum
 from mag_tracking.units import NS
 
 WINDOW_S = 1.0
-"""[s] Length of the latest frames, over which a target must not fall behind."""
+"""Length of the sliding window in which a target must not be disfavoured [s]."""
 
-FAR_BEHIND = -30.0
-"""[nats] Where something else explains a track so much better, it is no target at all."""
+MIN_LOG_RATIO = -30.0
+"""Log Bayes factor [nats] at or below which a track cannot become a target again, whatever its fit.
+"""
 
 
 class TargetBayesFactor:
-    """Log of the Bayes factor of a target against something else.
+    """Log Bayes factor of a target against an alternative explanation.
 
     Attributes
     ----------
-    log_ratio : float
+    log_ratio : float, nats
         Over the whole track.
     """
 
     def __init__(self) -> None:
         self.log_ratio = 0.0
-        self._is_known, self._has_led = True, False
-        self._behind_since_ns: int | None = None
-        self._latest = LatestFrames(WINDOW_S)
+        self._is_known, self._was_favoured = True, False
+        self._disfavoured_since_ns: int | None = None
+        self._latest = SlidingSum(WINDOW_S)
 
     def add(self, log_ratio: float, stamp_ns: int, ratio: float) -> None:
-        """Count a frame.
+        """Add a frame.
 
         Parameters
         ----------
-        log_ratio : float [nats]
-            Log-density of the frame with a target, minus that with something else.
-        stamp_ns : int
+        log_ratio : float, nats
+            Log-density of the frame with a target, minus that with the alternative.
+        stamp_ns : int, ns
+            Timestamp of the frame.
         ratio : float
-            By which one of them has to lead.
+            Bayes factor at which an explanation is favoured.
+
+        Notes
+        -----
+        After a value that is not finite the Bayes factor stays unknown: no target is favoured.
         """
         if not np.isfinite(log_ratio):
             self._is_known = False
             return
         self.log_ratio += log_ratio
-        self._has_led = self._has_led or self.leads(ratio)
+        self._was_favoured = self._was_favoured or self.is_favoured(ratio)
         if self.log_ratio > -np.log(ratio):
-            self._behind_since_ns = None
-        elif self._behind_since_ns is None:
-            self._behind_since_ns = stamp_ns
+            self._disfavoured_since_ns = None
+        elif self._disfavoured_since_ns is None:
+            self._disfavoured_since_ns = stamp_ns
         self._latest.add(stamp_ns, log_ratio)
 
-    def would_lead(self, log_ratio: float, ratio: float) -> bool:
-        """Whether a target would lead if it explained the track better by `log_ratio` [nats]; not
-        where something else is far ahead."""
-        return self._is_known and self.log_ratio > FAR_BEHIND \
+    def would_be_favoured(self, log_ratio: float, ratio: float) -> bool:
+        """Whether a target with a better fit would be favoured.
+
+        Parameters
+        ----------
+        log_ratio : float, nats
+            Improvement of the log-likelihood of the whole track.
+        ratio : float
+            Bayes factor required.
+
+        Returns
+        -------
+        bool
+            False if the Bayes factor is at or below `MIN_LOG_RATIO`, or not known.
+        """
+        return self._is_known and self.log_ratio > MIN_LOG_RATIO \
             and self.log_ratio + log_ratio >= float(np.log(ratio))
 
-    def leads(self, ratio: float) -> bool:
-        """Whether a target explains the whole track `ratio` times better than something else."""
+    def is_favoured(self, ratio: float) -> bool:
+        """Whether the Bayes factor of the whole track favours a target.
+
+        Parameters
+        ----------
+        ratio : float
+            Bayes factor required.
+
+        Returns
+        -------
+        bool
+        """
         return self._is_known and self.log_ratio >= float(np.log(ratio))
 
-    def fell_behind(self, ratio: float) -> bool:
-        """Whether something else explains the latest frames `ratio` times better."""
+    def is_recently_disfavoured(self, ratio: float) -> bool:
+        """Whether the Bayes factor of the latest `WINDOW_S` favours the alternative.
+
+        Parameters
+        ----------
+        ratio : float
+            Bayes factor required.
+
+        Returns
+        -------
+        bool
+        """
         return bool(self._latest.total < -np.log(ratio))
 
-    def unexplained_s(self, stamp_ns: int) -> float:
-        """[s] for which something else has led.
+    def disfavoured_s(self, stamp_ns: int) -> float:
+        """Time for which the alternative has been favoured over the whole track.
 
-        0 where a target has led before: it may have stopped, and is then as smooth as anything.
+        Parameters
+        ----------
+        stamp_ns : int, ns
+            Present time.
+
+        Returns
+        -------
+        float, s
+            0 if a target has been favoured before: the vehicle may have stopped, and its field is
+            then as smooth as any other.
         """
-        if self._has_led or self._behind_since_ns is None or not self._is_known:
+        if self._was_favoured or self._disfavoured_since_ns is None or not self._is_known:
             return 0.0
-        return (stamp_ns - self._behind_since_ns) / NS
+        return (stamp_ns - self._disfavoured_since_ns) / NS

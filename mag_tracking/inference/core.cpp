@@ -1,4 +1,4 @@
-// What of inference is computed for every frame, as a Python module.
+// Python module of the functions of inference that run for every frame.
 
 #include "../python.hpp"
 #include "axes.hpp"
@@ -33,7 +33,8 @@ double step_vectors(Array x, Array P, Array log_w, Array densities, Integers vec
                                                    ? densities.shape(1) : 0;
     length_of(x, "x", 3);
     const Size n_x = x.shape(2);
-    if (n_x < m || n_x > 2 * m) throw py::value_error("x: more rates than levels, or no levels");
+    if (n_x < m || n_x > 2 * m)
+        throw py::value_error("x: must hold all levels and no more rates than levels");
     const VectorBank bank{int(n), int(n_strengths), int(m), int(n_x - m),
                           data_of(x, "x", {n, n_strengths, n_x}),
                           data_of(P, "P", {n, n_strengths, n_x, n_x}), log_w.mutable_data(),
@@ -54,7 +55,8 @@ bool inverses(Array A, double least, Array out) {
 
 Size best(Array x, Array P, Array log_w, Integers label, Integers kind, double negligible) {
     const Size n = length_of(log_w, "log_w", 1), n_x = length_of(x, "x", 2) ? x.shape(1) : 0;
-    if (n < 1 || n_x < 3) throw py::value_error("no hypothesis, or one without a position");
+    if (n < 1 || n_x < 3)
+        throw py::value_error("x: must hold at least one hypothesis with a position");
     return best_of({std::size_t(n), std::size_t(n_x), input_of(x, "x", {n, n_x}),
                     input_of(P, "P", {n, n_x, n_x}), input_of(log_w, "log_w", {n}),
                     input_of(label, "label", {n}), input_of(kind, "kind", {n})}, negligible);
@@ -65,7 +67,7 @@ Size best(Array x, Array P, Array log_w, Integers label, Integers kind, double n
 
 PYBIND11_MODULE(core, m) {
     using namespace mag_tracking;
-    m.doc() = "What of inference is computed for every frame, compiled.";
+    m.doc() = "Compiled functions of inference that run for every frame.";
     m.def("energies", &energies, IN(y), IN(C), IN(energy), IN(axes));
     m.def("smallest_pivots", &smallest_pivots, IN(y), IN(C), IN(out));
     m.def("step_vectors", &step_vectors, IN(x), IN(P), IN(log_w), IN(densities), IN(vector), IN(H),

@@ -1,10 +1,7 @@
-"""A covariance that covers another estimate, too.
+"""Covariance union: a covariance inflated to cover a second estimate.
 
-Where two estimates of one state contradict each other, and it is not known which is wrong, the
-covariance of the one that is kept grows until it covers the other.
-
-Source: Uhlmann 2003, Covariance consistency methods for fault-tolerant distributed data fusion
-(covariance union); here the position alone decides, and the other estimate has no covariance.
+Used if two estimates of one state contradict each other and it is not known which one is wrong: the
+covariance of the estimate that is kept grows until it covers the other.
 """
 
 import numpy as np
@@ -12,12 +9,31 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 
 
-def widened_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
-    """Covariance `P` (n, n) of a state, widened until its horizontal position covers another.
+def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
+    """Covariance of a state, inflated until its horizontal position covers another estimate.
 
-    The state begins with x and y [m]. Along their `difference` (k,), k <= n, from the other
-    estimate the deviation is then no smaller than it. The rest of the state is widened along with
-    them, and only with them.
+    The standard deviation along the horizontal difference becomes no smaller than the difference.
+    Other components are inflated in proportion to their own difference, fully correlated with it.
+
+    Parameters
+    ----------
+    P : (n, n) array
+        Covariance of a state that begins with x and y [m].
+    difference : (k,) array
+        The other estimate minus this one, of the first k <= n components.
+
+    Returns
+    -------
+    (n, n) array
+        `P` itself if it covers the other estimate already.
+
+    Notes
+    -----
+    Only the horizontal position decides, and the other estimate has no covariance.
+
+    References
+    ----------
+    [Uhlmann03]_, covariance union.
     """
     d = difference[:2]
     square, variance = float(d @ d), float(d @ P[:2, :2] @ d)

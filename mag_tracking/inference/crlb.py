@@ -1,10 +1,9 @@
-"""Fisher information, observability and the Cramer-Rao bound.
+"""Fisher information, observability and the Cramér-Rao bound.
 
-The model comes in as its Jacobians H = dh/dx, so that this file is mathematics
-only. Ranks are judged on matrices brought to unit diagonal, as the units of the
-states differ by decades; only `observability` leaves that to the caller. A row of
-H that is wholly NaN is an axis that was not measured (a dipole's Jacobian on the
-very sensor looks alike). Matrices that do not fit, are not finite, not symmetric
+The model is given by its Jacobians H = dh/dx. A row of H that is all NaN is an axis that was not
+measured; a dipole located at the sensor gives such rows as well. Ranks are determined on matrices
+scaled to unit diagonal, because the units of the states differ by decades; only `observability`
+leaves the scale to the caller. Matrices that do not match in shape, are not finite, not symmetric
 or not positive (semi)definite raise ValueError.
 """
 
@@ -24,13 +23,13 @@ from mag_tracking.inference.matrices import (
 )
 
 RANK_TOLERANCE = 1e-12
-"""An eigenvalue below this share of the largest one counts as zero."""
+"""Eigenvalues below this fraction of the largest one count as zero."""
 
-_SHARE = 1e-6
-"""A state takes part in a kernel that reaches further than this along its axis."""
+_KERNEL_TOLERANCE = 1e-6
+"""Minimum component, along its axis, at which a state belongs to a kernel."""
 
 _K_DIPOLE = 1e-7
-"""mu0 / 4 pi [T m / A]; the one in `physics` is not for this room to import."""
+"""mu0 / (4 pi) [T m/A]; the constant in `physics` must not be imported here."""
 
 
 def information(H: ArrayLike, C: ArrayLike | None = None) -> FloatArray:
@@ -38,14 +37,21 @@ def information(H: ArrayLike, C: ArrayLike | None = None) -> FloatArray:
 
     Parameters
     ----------
-    H : (..., n_y, n_x)
-        Jacobians, n_y = 3 axes for a magnetometer; any leading axes (times, sensors).
-    C : (..., n_y, n_y), optional
-        Noise covariance of each measurement, broadcast against `H`, not read
-        where the axis is missing; None if `H` is whitened.
+    H : (..., n_y, n_x) array
+        Jacobians; n_y = 3 axes for a magnetometer, any leading axes (times, sensors). A row of NaN
+        is not measured.
+    C : (..., n_y, n_y) array, optional
+        Noise covariance of each measurement; leading axes broadcast against `H`. Entries of missing
+        axes are not read. Omit if `H` is whitened.
 
-    Returns (n_x, n_x); the unit of entry (i, j) is one over those of x_i and x_j.
-    Source: TSP14 eq. (28), (40); T10 eq. (2.16), (5.7).
+    Returns
+    -------
+    (n_x, n_x) array
+        Entry (i, j) has the reciprocal unit of x_i x_j.
+
+    References
+    ----------
+    [TSP14]_ eq. (28), (40); [T10]_ eq. (2.16), (5.7).
     """
     A = whitened(H, C)
     A = A.reshape(-1, A.shape[-1])
@@ -54,20 +60,22 @@ def information(H: ArrayLike, C: ArrayLike | None = None) -> FloatArray:
 
 @dataclass(frozen=True)
 class Observability:
-    """What measurements do and do not say of the states near one point."""
+    """Observability of the states near one point."""
 
     eigenvalues: FloatArray
-    """(n_x,), ascending, of the scaled information; zeros are rounding of either sign."""
+    """Eigenvalues of the scaled information, (n_x,), ascending; zeros are subject to rounding of
+    either sign."""
     condition_number: float
-    """Largest eigenvalue over smallest, T10 eq. (5.8); infinite where there is a kernel."""
+    """Largest over smallest eigenvalue, T10 eq. (5.8); infinite if there is a kernel."""
     kernel: FloatArray
-    """(n_x, k), in the states' own units; divided by the scale its columns are orthonormal."""
+    """Basis of the unobservable subspace, (n_x, k), in the units of the states; its columns are
+    orthonormal after division by the scale."""
     unobservable: tuple[str, ...]
-    """Names of the states that take part in the kernel."""
+    """Names of the states that belong to the kernel."""
 
     @property
     def kernel_dimension(self) -> int:
-        """How many directions of the state nothing is known about; 0 = observable."""
+        """Number of unobservable directions of the state; 0 = observable."""
         return self.kernel.shape[1]
 
 
@@ -77,50 +85,64 @@ def observability(information: ArrayLike, names: Sequence[str],
 
     Parameters
     ----------
-    information : (n_x, n_x)
-    names : sequence of n_x str
-        Of the states, for `unobservable`.
-    scale : (n_x,), optional
-        Typical size of each state in its unit. Eigenvalues, condition number
-        and rank are then those of diag(scale) information diag(scale), the
-        information about x / scale (T10 eq. (5.11)); else those of the matrix
-        as it stands, which mean little where units differ by decades (metres
-        beside backgrounds in tesla).
+    information : (n_x, n_x) array
+        Fisher information.
+    names : sequence of str
+        Names of the n_x states.
+    scale : (n_x,) array, optional
+        Typical magnitude of each state, in its unit. Eigenvalues, condition number and rank are
+        those of diag(scale) information diag(scale), the information about x / scale. Omitted, they
+        are those of the matrix as it is, which are of little use if units differ by decades (metres
+        next to backgrounds in tesla).
 
-    Source: T10 sections 5.1-5.3; TSP14 section IV.
+    Returns
+    -------
+    Observability
+
+    Raises
+    ------
+    ValueError
+        If the number of names or scales is not n_x, a scale is not positive, or the matrix is
+        invalid.
+
+    References
+    ----------
+    [T10]_ sections 5.1-5.3 and eq. (5.11); [TSP14]_ section IV.
     """
     J = np.asarray(information, dtype=float)
     unit_diagonal('information', J)
     scale = np.ones(len(J)) if scale is None else np.asarray(scale, dtype=float)
     if len(names) != len(J) or scale.shape != (len(J),) or not np.all(scale > 0.0):
-        raise ValueError(f'{len(J)} states need as many names and positive scales, '
+        raise ValueError(f'expected names and positive scales of {len(J)} states, '
                          f'got {list(names)} and {scale.tolist()}')
     w, V = np.linalg.eigh(scale[:, None] * J * scale)
     zero = w <= RANK_TOLERANCE * w[-1]
     return Observability(w, np.inf if zero.any() else w[-1] / w[0], scale[:, None] * V[:, zero],
-                         tuple(names[i] for i in np.flatnonzero(_takes_part(V[:, zero]))))
+                         tuple(names[i] for i in np.flatnonzero(_is_in_kernel(V[:, zero]))))
 
 
 def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
-    """Cramer-Rao bound on the covariance of an estimate.
+    """Cramér-Rao bound on the covariance of an estimate.
 
     Parameters
     ----------
-    information : (n_x, n_x)
-        Of the measurements.
-    prior : (n_x, n_x), optional
-        Information known before: diag(1 / std^2) for independent Gaussian
-        states, `cpa_information`. On the diagonal 0 = nothing is known, inf =
-        known exactly (its row and column are then not read).
+    information : (n_x, n_x) array
+        Fisher information of the measurements.
+    prior : (n_x, n_x) array, optional
+        Prior information: diag(1 / std^2) for independent Gaussian states, or `cpa_information`. On
+        the diagonal, 0 = no prior and inf = exactly known; row and column of an exactly known state
+        are not read.
 
     Returns
     -------
-    (n_x, n_x)
-        Inverse of the sum. Where that is singular, an unobservable state has
-        variance inf and covariances NaN; the others have the values that any
-        vanishing prior leads to. A state known exactly has zeros.
+    (n_x, n_x) array
+        Inverse of the sum. If the sum is singular, an unobservable state has variance inf and
+        covariances NaN; the other states have the limit for a vanishing prior. An exactly known
+        state has zeros.
 
-    Source: TSP14 eq. (42); MITRE12 eq. (18), (28), (32).
+    References
+    ----------
+    [TSP14]_ eq. (42); [MITRE12]_ eq. (18), (28), (32).
     """
     J = np.asarray(information, dtype=float)
     unit_diagonal('information', J)
@@ -130,7 +152,7 @@ def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
     unit_diagonal('prior', prior[free])
     scale, root, kernel = _inverse_root(J[free] + prior[free])
     P = root @ root.T / (scale[:, None] * scale)
-    lost = _takes_part(kernel)
+    lost = _is_in_kernel(kernel)
     P[lost] = P[:, lost] = np.nan
     P[lost, lost] = np.inf
     covariance = np.zeros(J.shape)
@@ -139,38 +161,46 @@ def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
 
 
 def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
-    """Information about some states when all the others are unknown as well.
+    """Information about some states if all others are unknown as well.
 
     Parameters
     ----------
-    information : (n_x, n_x)
-    keep : (k,) int or (n_x,) bool
-        The states of interest; the others (backgrounds, moments) are eliminated
-        and need not be observable themselves.
+    information : (n_x, n_x) array
+        Fisher information.
+    keep : (k,) int array or (n_x,) bool array
+        States of interest. The others (backgrounds, moments) are eliminated and need not be
+        observable.
 
     Returns
     -------
-    (k, k)
-        The Schur complement J_kk - J_ko J_oo^-1 J_ok, in the order of `keep`;
-        zero about what `bound` finds unobservable.
+    (k, k) array
+        Schur complement J_kk - J_ko J_oo^-1 J_ok, in the order of `keep`; its inverse is that block
+        of the bound. Zero in directions that `bound` finds unobservable.
 
-    Raises ValueError also where a state is out of range or there twice.
-    Source: TSP14 eq. (44): its inverse is that block of the bound.
+    Raises
+    ------
+    ValueError
+        If an index in `keep` is out of range or occurs twice, or if the matrix is invalid.
+
+    References
+    ----------
+    [TSP14]_ eq. (44).
     """
     J = np.asarray(information, dtype=float)
     try:
         kept = np.arange(len(J))[np.asarray(keep)]
     except IndexError as error:
-        raise ValueError(f'keep does not fit {len(J)} states: {error}') from error
+        raise ValueError(f'keep is not valid for {len(J)} states: {error}') from error
     if len(set(kept.tolist())) != kept.size:
-        raise ValueError(f'keep names a state twice: {kept.tolist()}')
+        raise ValueError(f'keep contains a state twice: {kept.tolist()}')
     scale, root, kernel = _inverse_root(J)
-    # Not by subtraction: others that are hardly observable would leave rounding that looks
-    # like information. First the directions (columns of U) that the kernel does not reach ...
+    # The complement is not computed by subtraction: eliminated states that are barely observable
+    # would leave rounding errors that look like information. First find the directions (columns
+    # of U) outside the kernel ...
     U, reach, _ = np.linalg.svd(kernel[kept])
-    U = U[:, np.count_nonzero(reach > _SHARE):]
-    U = np.where(np.linalg.norm(U, axis=1, keepdims=True) > _SHARE, U, 0.0)
-    # ... then the inverse of the bound in them, U (U'PU)^-1 U'.
+    U = U[:, np.count_nonzero(reach > _KERNEL_TOLERANCE):]
+    U = np.where(np.linalg.norm(U, axis=1, keepdims=True) > _KERNEL_TOLERANCE, U, 0.0)
+    # ... then invert the bound in them, U (U'PU)^-1 U'.
     R = triangular_factor((U.T @ root[kept]).T)
     W = scale[kept, None] * np.linalg.solve(R.T, U.T).T
     return W @ W.T
@@ -181,57 +211,83 @@ def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
 
     Parameters
     ----------
-    r0 : (3,) [m]
-        Position at time zero, relative to the sensor that the range is counted from.
-    v0 : (3,) [m/s]
-    std : float [m]
-        Standard deviation of the range; the source lets it vanish.
+    r0 : (3,) array, m
+        Position of the target at time zero, relative to the sensor from which the range is
+        measured.
+    v0 : (3,) array, m/s
+        Velocity of the target.
+    std : float, m
+        Standard deviation of the range; TSP14 takes the limit of zero.
 
     Returns
     -------
-    (9, 9)
+    (9, 9) array
         For the states [r0, v0, m]; of rank one.
 
-    Raises ValueError also where the target stands still, and where `r0` is
-    parallel to `v0`: the path then meets the sensor (TSP14 Proposition 2).
-    Source: TSP14 eq. (35)-(37); the gradient by v0 printed in the proof of
-    Proposition 2 lacks a minus sign.
+    Raises
+    ------
+    ValueError
+        If `std` is not positive, `v0` is zero, or `r0` is parallel to `v0`. In the last case the
+        path goes through the sensor (TSP14 Proposition 2).
+
+    Notes
+    -----
+    The gradient by v0 printed in the proof of TSP14 Proposition 2 lacks a minus sign.
+
+    References
+    ----------
+    [TSP14]_ eq. (35)-(37).
     """
     r0, v0 = np.asarray(r0, dtype=float), np.asarray(v0, dtype=float)
     if r0.shape != (3,) or v0.shape != (3,):
-        raise ValueError(f'r0 and v0 need shape (3,), got {r0.shape} and {v0.shape}')
+        raise ValueError(f'r0 and v0 must have shape (3,), got {r0.shape} and {v0.shape}')
     if not (np.isfinite(std) and std > 0.0 and v0 @ v0 > 0.0):
-        raise ValueError(f'std has to be positive and v0 not zero, got {std}, {v0.tolist()}')
+        raise ValueError('std must be positive and finite and v0 non-zero, got '
+                         f'{std} and {v0.tolist()}')
     t_cpa = -(r0 @ v0) / (v0 @ v0)
     r_cpa = r0 + t_cpa * v0
     size = np.linalg.norm(r_cpa)
     if not size > 1e-9 * np.linalg.norm(r0):
         raise ValueError(f'r0 = {r0.tolist()} is parallel to v0 = {v0.tolist()}: a CPA range of '
-                         'zero says nothing of the scale (TSP14 Proposition 2)')
+                         'zero does not make the scale observable (TSP14 Proposition 2)')
     gradient = np.concatenate([r_cpa, t_cpa * r_cpa, np.zeros(3)]) / (size * std)
     return np.outer(gradient, gradient)
 
 
 def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
                P0: ArrayLike) -> FloatArray:
-    """Bound for filters along a given path: the covariance of the EKF linearised at the truth.
+    """Posterior bound of a filter along a given path.
 
-    Step k predicts with F[k], Q[k], then updates with H[k], C[k].
+    It is the covariance of an extended Kalman filter linearised at the truth. Step k predicts with
+    F[k] and Q[k], then updates with H[k] and C[k].
 
     Parameters
     ----------
-    F, Q : (n_steps, n_x, n_x), or (n_x, n_x) for all steps
-        Jacobian of the motion and covariance of its noise; Q may be singular.
-    H : (n_steps, ..., n_y, n_x)
-        Jacobians at the truth.
-    C : (..., n_y, n_y) or None
+    F : (n_steps, n_x, n_x) or (n_x, n_x) array
+        Jacobian of the motion, per step or common to all steps.
+    Q : (n_steps, n_x, n_x) or (n_x, n_x) array
+        Covariance of the process noise; may be singular.
+    H : (n_steps, ..., n_y, n_x) array
+        Measurement Jacobians at the truth.
+    C : (..., n_y, n_y) array or None
         Noise covariances, broadcast against `H`; None if `H` is whitened.
-    P0 : (n_x, n_x)
-        Covariance before the first prediction; may be singular. Where it is
-        that of the first measurement's time, give F[0] = I and Q[0] = 0.
+    P0 : (n_x, n_x) array
+        Covariance before the first prediction; may be singular. If it refers to the time of the
+        first measurement, pass F[0] = I and Q[0] = 0.
 
-    Returns the covariances (n_steps, n_x, n_x) after each update.
-    Source: Tichavsky et al. 1998, without the mean over paths; T10 Alg. 2.
+    Returns
+    -------
+    (n_steps, n_x, n_x) array
+        Covariance after each update.
+
+    Raises
+    ------
+    ValueError
+        If `H` has no axis of steps, or a matrix is invalid.
+
+    References
+    ----------
+    [Tichavsky98]_, without the mean over paths; [T10]_ Alg. 2.
     """
     A = whitened(H, C)
     if A.ndim < 3:
@@ -246,9 +302,9 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
     for k in range(n_steps):
         P = F[k] @ P @ F[k].T + Q[k]
         _, w, V = unit_diagonal(f'covariance of step {k}', P)
-        # Not the scale, which is 1 where the variance is zero: what is known has to stay so.
+        # The scale of `unit_diagonal` is 1 at zero variance; an exactly known state must stay so.
         L = np.sqrt(np.diagonal(P))[:, None] * V * np.sqrt(np.maximum(w, 0.0))
-        # P = L L' becomes L (I + L'A'A L)^-1 L'; by QR nothing is squared or subtracted.
+        # P = L L' becomes L (I + L'A'A L)^-1 L'; QR avoids squares and subtractions.
         R = triangular_factor(np.vstack([A[k].reshape(-1, n_x) @ L, np.eye(n_x)]))
         G = np.linalg.solve(R.T, L.T)
         P = covariances[k] = G.T @ G
@@ -258,15 +314,23 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
 def snr(h: ArrayLike, C: ArrayLike) -> FloatArray:
     """Signal-to-noise ratio (of energies) h' C^-1 h of a field.
 
+    It is the non-centrality parameter of `detection_theory.detection_probability`.
+
     Parameters
     ----------
-    h : (..., n_y)
+    h : (..., n_y) array
         Field without noise and background; NaN = axis not measured.
-    C : (..., n_y, n_y)
-        Noise covariance, same unit squared.
+    C : (..., n_y, n_y) array
+        Noise covariance, in the squared unit of `h`.
 
-    Returns (...), the non-centrality in `detection_probability`; 0 without axes.
-    Source: T10 eq. (5.14).
+    Returns
+    -------
+    (...) array
+        0 if no axis is measured.
+
+    References
+    ----------
+    [T10]_ eq. (5.14).
     """
     A = whitened(np.asarray(h, dtype=float)[..., None], C)
     energy: FloatArray = np.einsum('...ij,...ij->...', A, A)
@@ -275,40 +339,69 @@ def snr(h: ArrayLike, C: ArrayLike) -> FloatArray:
 
 def snr_at_distance(moment: float | FloatArray, noise_std: float | FloatArray,
                     distance: float | FloatArray) -> FloatArray:
-    """Signal-to-noise ratio of one sample of a dipole abeam; four times as much along its axis.
+    """Signal-to-noise ratio of one sample of a dipole, perpendicular to its axis.
+
+    Along the axis of the dipole the ratio is four times larger.
 
     Parameters
     ----------
-    moment : float or array [A m^2]
-        Its size: 300-600 for a car, 1800 for a truck (TSP14).
-    noise_std : float or array [T]
-        Of one axis, all alike; 1.1e-8 in TSP14.
-    distance : float or array [m]
+    moment : float or array, A m²
+        Magnitude: 300-600 for a car, 1800 for a truck (TSP14).
+    noise_std : float or array, T
+        Noise standard deviation of one axis, equal on all axes; 1.1e-8 in TSP14.
+    distance : float or array, m
 
-    Source: T10 eq. (5.20), (5.21). Its (5.23) prints |R|^2 where |R| is meant;
-    moment and noise of its (5.22) are both too small by about 450.
+    Returns
+    -------
+    (...) array
+
+    Notes
+    -----
+    T10 eq. (5.23) prints the squared norm of R instead of the norm. Moment and noise in T10 eq.
+    (5.22) are both too small by a factor of about 450.
+
+    References
+    ----------
+    [T10]_ eq. (5.20), (5.21).
     """
     return cast(FloatArray, (_K_DIPOLE * moment / (noise_std * distance**3))**2)
 
 
 def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
               ratio: float | FloatArray) -> FloatArray:
-    """Distance [m] where `snr_at_distance` is `ratio`; 9.2 gives T10 eq. (5.24).
+    """Distance at which `snr_at_distance` reaches a given ratio.
 
-    Along the dipole's axis it is larger by 2^(1/3).
+    Along the axis of the dipole the distance is larger by 2^(1/3).
+
+    Parameters
+    ----------
+    moment : float or array, A m²
+        Magnitude of the dipole moment.
+    noise_std : float or array, T
+        Noise standard deviation of one axis.
+    ratio : float or array
+        Signal-to-noise ratio; 9.2 in T10.
+
+    Returns
+    -------
+    (...) array, m
+
+    References
+    ----------
+    [T10]_ eq. (5.24).
     """
     distance: FloatArray = np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
     return distance
 
 
 def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scale, G with pseudo-inverse G G' and kernel basis, both of J at unit diagonal."""
+    """Scale, root G of the pseudo-inverse G G', and kernel basis, both of J at unit diagonal."""
     scale, w, V = unit_diagonal('information', J)
     zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
     return scale, V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]
 
 
-def _takes_part(kernel: FloatArray) -> BoolArray:
-    """Which states (n,) an orthonormal kernel basis (n, k) reaches."""
-    reached: BoolArray = np.linalg.norm(kernel, axis=1) > _SHARE
+def _is_in_kernel(kernel: FloatArray) -> BoolArray:
+    """Which states (n,) belong to an orthonormal kernel basis (n, k)."""
+    reached: BoolArray = np.linalg.norm(kernel, axis=1) > _KERNEL_TOLERANCE
     return reached

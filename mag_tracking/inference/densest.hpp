@@ -1,4 +1,4 @@
-// The hypothesis of a bank to publish (filter_bank.py), where their mixture in space is densest.
+// The hypothesis of a bank to publish: where the spatial mixture is densest (filter_bank.py).
 
 #pragma once
 
@@ -12,15 +12,15 @@
 
 namespace mag_tracking {
 
-// exp(-40) changes no sum of which one is a part.
+// Terms below exp(-40) are negligible in a sum that contains 1.
 constexpr double NOTHING = 40.0;
 
-// The inverse of the lower root of a covariance, and the logarithm of its density at the mean, but
-// for what is the same of all.
+// Inverse of the Cholesky factor of a covariance, and the weighted log-density at the mean, up to a
+// common constant.
 struct Whitener {
     double w00, w10, w11, w20, w21, w22, log_top;
 
-    // False: `C` (3, 3) is not positive definite.
+    // Returns false if `C` (3, 3) is not positive definite.
     bool set(const double* C, double log_w) {
         const double l00 = std::sqrt(C[0]), l10 = C[3] / l00, l20 = C[6] / l00;
         const double l11 = std::sqrt(C[4] - l10 * l10), l21 = (C[7] - l20 * l10) / l11;
@@ -32,15 +32,15 @@ struct Whitener {
         return l00 > 0.0 && l11 > 0.0 && l22 > 0.0 && std::isfinite(log_top);
     }
 
-    // Squared distance of a mean that is away by d.
+    // Squared Mahalanobis distance of a difference d.
     double square(double d0, double d1, double d2) const {
         const double a = w00 * d0, b = w10 * d0 + w11 * d1, c = w20 * d0 + w21 * d1 + w22 * d2;
         return a * a + b * b + c * c;
     }
 };
 
-// Of n means (n, 3) with covariances (n, 3, 3) and logarithms of weights (n), the one at which the
-// mixture is densest; -1 where a covariance is not positive definite.
+// Index of the mean at which a mixture is densest; -1 if a covariance is not positive definite. The
+// mixture has means (n, 3), covariances (n, 3, 3) and log-weights (n).
 inline std::ptrdiff_t densest(std::size_t n, const double* mean, const double* covariance,
                               const double* log_w) {
     std::vector<Whitener> each(n);
@@ -49,7 +49,7 @@ inline std::ptrdiff_t densest(std::size_t n, const double* mean, const double* c
     std::ptrdiff_t best = -1;
     double most = -std::numeric_limits<double>::infinity();
     for (std::size_t k = 0; k < n; ++k) {
-        // Relative to what the component itself has there: no sum is without it.
+        // Relative to the density of the component itself, which is part of every sum.
         const double* at = mean + 3 * k;
         double sum = 0.0;
         for (std::size_t i = 0; i < n; ++i) {
@@ -64,14 +64,14 @@ inline std::ptrdiff_t densest(std::size_t n, const double* mean, const double* c
     return best;
 }
 
-// n hypotheses with states (n, n_x), of which the first three are a position.
+// n hypotheses with states (n, n_x); the first three states are the position.
 struct Mixture {
     std::size_t n, n_x;
     const double *x, *P, *log_w;
     const std::int64_t *label, *kind;
 };
 
-// Those of the `rows` that are of the class which weighs most; `of` (n) are their classes.
+// Keeps the `rows` of the heaviest class; `of` (n) holds the class of each hypothesis.
 inline void keep_heaviest(std::vector<std::size_t>& rows, const std::int64_t* of,
                           const double* log_w) {
     double top = -std::numeric_limits<double>::infinity();
@@ -86,8 +86,8 @@ inline void keep_heaviest(std::vector<std::size_t>& rows, const std::int64_t* of
     }), rows.end());
 }
 
-// Of at least one hypothesis. Those that are lighter than the heaviest by more than `negligible`
-// have no say.
+// Row to publish, of at least one hypothesis. Hypotheses lighter than the heaviest by more than
+// `negligible` are ignored.
 inline std::size_t best_of(const Mixture& bank, double negligible) {
     std::vector<std::size_t> rows(bank.n);
     for (std::size_t i = 0; i < bank.n; ++i) rows[i] = i;

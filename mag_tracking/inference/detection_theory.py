@@ -1,7 +1,4 @@
-"""Thresholds and probabilities of the chi-square energy test.
-
-Source: T10 section 5.4, eq. (5.14)-(5.19).
-"""
+"""Thresholds and probabilities of the chi-square energy test."""
 
 from typing import cast
 
@@ -14,38 +11,88 @@ from mag_tracking.arrays import FloatArray, IntArray
 
 def energy_threshold(false_alarm_probability: float | FloatArray,
                      degrees_of_freedom: float | IntArray) -> FloatArray:
-    """Threshold h with P(chi2_n > h) = `false_alarm_probability`; T10 eq. (5.18)."""
+    """Threshold of the energy test for a false-alarm probability.
+
+    Parameters
+    ----------
+    false_alarm_probability : float or array
+        P(chi2_n > threshold) without a target.
+    degrees_of_freedom : float or array
+        Number n of measured axes.
+
+    Returns
+    -------
+    float or (...) array
+
+    References
+    ----------
+    [T10]_ eq. (5.18).
+    """
     return cast(FloatArray, chdtri(degrees_of_freedom, false_alarm_probability))
 
 
 def false_alarm_probability(threshold: float | FloatArray,
                             degrees_of_freedom: int | IntArray) -> FloatArray:
-    """P(chi2_n > threshold), the inverse of `energy_threshold`."""
+    """False-alarm probability of the energy test, P(chi2_n > threshold).
+
+    Parameters
+    ----------
+    threshold : float or array
+    degrees_of_freedom : int or array
+        Number n of measured axes.
+
+    Returns
+    -------
+    float or (...) array
+        The inverse of `energy_threshold`.
+    """
     return cast(FloatArray, chdtrc(degrees_of_freedom, threshold))
 
 
 def detection_probability(snr: float | FloatArray, threshold: float | FloatArray,
                           degrees_of_freedom: int | IntArray) -> FloatArray:
-    """P(chi2_n(snr) > threshold) with non-centrality `snr`; T10 eq. (5.19)."""
-    return cast(FloatArray, 1.0 - chndtr(threshold, degrees_of_freedom, snr))
-
-
-def missed_probability(probability: ArrayLike, run: int) -> FloatArray:
-    """Probability that no `run` frames in a row detect.
+    """Detection probability of the energy test, P(chi2_n(snr) > threshold).
 
     Parameters
     ----------
-    probability : (n, ...)
-        Of each frame's detection, in order of time; the frames are independent.
-    run : int
+    snr : float or array
+        Signal-to-noise ratio, the non-centrality parameter.
+    threshold : float or array
+    degrees_of_freedom : int or array
+        Number n of measured axes.
 
-    Returns (...): exact, by the distribution of how many frames in a row have detected so far.
+    Returns
+    -------
+    float or (...) array
+
+    References
+    ----------
+    [T10]_ eq. (5.19).
+    """
+    return cast(FloatArray, 1.0 - chndtr(threshold, degrees_of_freedom, snr))
+
+
+def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray:
+    """Probability that a target is missed: no `run` consecutive frames all detect it.
+
+    Parameters
+    ----------
+    probability : (n, ...) array
+        Detection probability of each frame, in order of time; the frames are independent.
+    run : int
+        Number of consecutive frames required for an onset.
+
+    Returns
+    -------
+    (...) array
+        Exact, from the distribution of the number of consecutive detections so far.
     """
     p = np.asarray(probability, dtype=float)
     waiting = np.zeros((run, *p.shape[1:]))
     waiting[0] = 1.0
     for detected in p:
-        # One more in a row, or none; the last one leaves: the target has been detected.
+        # The count of consecutive detections grows by one or restarts at zero. The probability
+        # that leaves the last entry is that of an onset.
         waiting = np.concatenate([((1.0 - detected) * waiting.sum(axis=0))[None],
                                   detected * waiting[:-1]])
     missed: FloatArray = waiting.sum(axis=0)

@@ -1,8 +1,9 @@
-"""Driving direction by the sense in which a target's horizontal field rotates.
+"""Driving direction from the sense of rotation of a target's horizontal field.
 
 Seen from the sensor towards the target, a target that moves from left to right rotates the field
-clockwise, whatever its moment, and a target that moves from right to left the other way. That is
-exact for a target at the height of the sensor. A sensor in the lane observes no direction.
+clockwise and a target that moves from right to left rotates it anticlockwise, whatever its moment.
+This is exact for a target at the height of the sensor. A sensor in the lane does not observe the
+direction.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,27 +15,29 @@ from scipy.special import log_ndtr, ndtr
 from mag_tracking.arrays import FloatArray
 
 LAG = 0.35
-"""Default lag, in widths of the energy at half its height: near the best one for passes at constant
-speed (PHD15 Paper B eq. (19))."""
+"""Default lag in widths of the signal energy at half maximum; near the optimum for passes at
+constant speed (PHD15 Paper B eq. (19))."""
 
 MIN_SAMPLES = 8
-"""Fewest samples of a window."""
+"""Minimum number of samples in a window."""
 
 MAX_CONFIDENCE = 0.98
-"""The sign of the correlation is exact for a target at the height of the sensor only. Half its
-lateral distance above it 0.6 % of random moments turn the other way, the whole distance 2.2 %."""
+"""Upper limit of the probability of a direction. The sign of the correlation is exact only for a
+target at the height of the sensor. For a target above the sensor by half its lateral distance, 0.6
+% of random moments rotate the other way; by the whole distance, 2.2 %."""
 
-UPRIGHT = 0.2
-"""Share of the vertical field that a tilted horizontal axis may miss."""
+MAX_VERTICAL_SHARE = 0.2
+"""Maximum direction cosine between a missing axis and a horizontal axis at which the missing axis
+is treated as vertical."""
 
 
 class FieldRotation(NamedTuple):
-    """Statistic of the rotation sense, taken as normally distributed."""
+    """Statistic of the sense of rotation, treated as normally distributed."""
 
     correlation: float
-    """[T^2] negative for a target that moves from left to right."""
+    """T²; negative for a target that moves from left to right."""
     variance: float
-    """[T^4]"""
+    """Variance of the correlation, T⁴."""
 
     @property
     def error_probability(self) -> float:
@@ -43,12 +46,12 @@ class FieldRotation(NamedTuple):
 
     @property
     def left_to_right(self) -> float:
-        """Probability of a target that moves from left to right, for equal priors."""
+        """Probability that the target moves from left to right, for equal priors."""
         return float(ndtr(-self.correlation / np.sqrt(self.variance)))
 
     @property
     def log_odds(self) -> float:
-        """Log odds of left to right against right to left, for equal priors."""
+        """Log-odds of left to right against right to left, for equal priors."""
         z = self.correlation / np.sqrt(self.variance)
         return float(log_ndtr(-z) - log_ndtr(z))
 
@@ -59,22 +62,22 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
     Parameters
     ----------
     field : (n, 2) array, T
-        x and y of a frame whose z points up, without the background. The first and the last `lag`
-        samples are free of the target.
+        Horizontal field x, y in a frame with z up, without the background. The first and the last
+        `lag` samples are free of the target.
     noise_std : float, T
-        Standard deviation of one sample on each axis.
+        Noise standard deviation of one sample, per axis.
     lag : int
-        In samples; 2 lag < n.
+        Lag in samples; 2 lag < n.
 
     Returns
     -------
     FieldRotation
-        The variance is at least that of noise alone.
+        The variance is not below that of noise alone.
 
     Raises
     ------
     ValueError
-        If the lag does not fit into the window.
+        If the lag is not valid for the length of the window.
 
     References
     ----------
@@ -96,8 +99,9 @@ def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRo
     signal : (n, 2) array, T
         Field without noise in the window; zero outside.
     noise_std : float, T
+        Noise standard deviation of one sample, per axis.
     lag : int
-        In samples, at least 1.
+        Lag in samples; at least 1.
 
     Returns
     -------
@@ -124,15 +128,16 @@ def _spread(field: FloatArray, lag: int) -> float:
 
 
 def lag_of(field: FloatArray, noise_std: float, most: int) -> int:
-    """Lag that suits the width of a pass.
+    """Lag matched to the width of a pass.
 
     Parameters
     ----------
     field : (n, 2) array, T
         As for `field_rotation`.
     noise_std : float, T
+        Noise standard deviation of one sample, per axis.
     most : int
-        Samples at each end that are free of the target.
+        Maximum lag: number of samples at each end that are free of the target.
 
     Returns
     -------
@@ -141,7 +146,7 @@ def lag_of(field: FloatArray, noise_std: float, most: int) -> int:
     """
     around = 1 + len(field) // 20
     energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(around), 'same')
-    # Counted, since another target may be at an end of the window.
+    # The samples are counted because another target may be at an end of the window.
     width = np.count_nonzero(energy > 0.5 * energy.max())
     if not width:
         return 0
@@ -153,9 +158,10 @@ def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int
 
     Parameters
     ----------
-    windows : iterable of (n, 2) arrays, T
+    windows : iterable of (n, 2) array, T
         As for `field_rotation`.
     noise_std : float, T
+        Noise standard deviation of one sample, per axis.
     lags : sequence of int
         Candidates.
 
@@ -174,69 +180,73 @@ def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int
 
 
 def fused_log_odds(log_odds: Iterable[float], same_side: Iterable[bool]) -> float:
-    """Log odds of left to right, seen from the side of the first kind of sensors.
+    """Fuse the log-odds of several sensors.
 
     Parameters
     ----------
     log_odds : iterable of float
-        Log odds of each sensor, as it sees the target.
+        Log-odds of left to right, as seen by each sensor.
     same_side : iterable of bool
-        False for a sensor on the opposite side of the road, to which left is right.
+        False for a sensor on the opposite side of the road, where left and right are exchanged.
 
     Returns
     -------
     float
+        Log-odds of left to right, as seen from the side for which `same_side` is true. The errors
+        of the sensors are treated as independent.
 
     References
     ----------
-    [PHD15]_ Paper B eq. (20)-(23); the sensors' errors are taken as independent.
+    [PHD15]_ Paper B eq. (20)-(23).
     """
     return float(sum(value if same else -value
                      for value, same in zip(log_odds, same_side, strict=True)))
 
 
 def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
-    """Horizontal components in the world.
+    """Horizontal field components in the world frame.
 
     Parameters
     ----------
     field : (n, 3) array, T, sensor frame
-        NaN = missing axis; one that is nearly vertical matters little.
+        NaN = missing axis. A missing axis that is nearly vertical is ignored.
     R_ws : (3, 3) array
-        Rotation from the sensor to the world.
+        Rotation from the sensor frame to the world frame.
 
     Returns
     -------
-    (n, 2) array, T
-        NaN where they are not known.
+    (n, 2) array, T, world frame
+        NaN where a component is unknown.
     """
     out: FloatArray = np.zeros((len(field), 2))
     for a in range(3):
         missing = np.isnan(field[:, a])
         for b in range(2):
             part = R_ws[b, a] * field[:, a]
-            out[:, b] += np.where(missing, 0.0 if abs(R_ws[b, a]) < UPRIGHT else np.nan, part)
+            out[:, b] += np.where(
+                missing, 0.0 if abs(R_ws[b, a]) < MAX_VERTICAL_SHARE else np.nan, part)
     return out
 
 
 def rotation_of_pass(field: FloatArray, noise_std: float, n_quiet: int) -> FieldRotation | None:
-    """`field_rotation` at the lag that suits the width of a pass.
+    """`field_rotation` at the lag matched to the width of a pass.
 
-    Every size of the correlation is taken for equally likely beforehand, so that the probability is
-    too sure where the target is below the noise.
+    The prior of the correlation is uniform, so that the probability of the direction is
+    overconfident for a target below the noise.
 
     Parameters
     ----------
     field : (n, 2) array, T
         As for `field_rotation`.
     noise_std : float, T
+        Noise standard deviation of one sample, per axis.
     n_quiet : int
-        Samples at each end that are free of the target.
+        Number of samples at each end that are free of the target.
 
     Returns
     -------
     FieldRotation or None
-        None for a window that is too short, or does not exceed the noise.
+        None if the window is too short or the field does not exceed the noise.
     """
     lag = lag_of(field, noise_std, n_quiet) if len(field) >= MIN_SAMPLES else 0
     return field_rotation(field, noise_std, lag) if lag else None

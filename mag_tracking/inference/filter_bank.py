@@ -1,7 +1,7 @@
-"""The bank of filters: hypotheses as arrays, their weights in logarithms.
+"""Bank of filters: hypotheses as arrays, with logarithmic weights.
 
-Source: T10 section 2.6 and Alg. 3; weights live in logarithms because two
-hypotheses may be thousands of nats apart.
+The bank follows T10 section 2.6 and Alg. 3. Weights are kept as logarithms because two hypotheses
+may differ by thousands of nats.
 """
 
 from dataclasses import dataclass, fields
@@ -12,14 +12,28 @@ from numpy.typing import ArrayLike
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference import core
 
-_NEGLIGIBLE = np.log(100.0)
-"""Hypotheses lighter than the heaviest by more than this have no say in which is published."""
-_SINGULAR = 1e-15
-"""A variance that is less than this share of the largest is none, as in `numpy.linalg.pinv`."""
+_NEGLIGIBLE_LOG_RATIO = np.log(100.0)
+"""Hypotheses lighter than the heaviest by more than this [nats] do not affect which one is
+published."""
+_SINGULAR_TOLERANCE = 1e-15
+"""A variance below this fraction of the largest counts as zero, as in `numpy.linalg.pinv`."""
 
 
 def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
-    """log(sum(exp(a))) without overflow; -inf where all are -inf."""
+    """Logarithm of a sum of exponentials, log(sum(exp(a))), without overflow.
+
+    Parameters
+    ----------
+    a : (...) array
+        Logarithms.
+    axis : int, optional
+        Axis of the sum. Default: all axes.
+
+    Returns
+    -------
+    (...) array
+        Is -inf if all elements are -inf.
+    """
     a = np.asarray(a, dtype=float)
     top = np.max(a, axis=axis, keepdims=True)
     top = np.where(np.isfinite(top), top, 0.0)
@@ -31,35 +45,55 @@ def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
 
 @dataclass
 class FilterBank:
-    """Hypotheses of one target, or of several that share a state; every array has the hypothesis as
-    first axis."""
+    """Hypotheses of one target, or of several targets with a joint state.
+
+    The hypothesis is the first axis of every array.
+    """
 
     x: FloatArray
-    """(n_hyp, n_x) states."""
+    """States, (n_hyp, n_x)."""
     P: FloatArray
-    """(n_hyp, n_x, n_x) covariances."""
+    """Covariances, (n_hyp, n_x, n_x)."""
     log_w: FloatArray
-    """(n_hyp,) normalised log-weights."""
+    """Normalised log-weights, (n_hyp,)."""
     label: IntArray
-    """(n_hyp,) int: the arrival that each hypothesis assumes; of several (n_hyp, n_targets)."""
+    """Assumed direction of arrival, (n_hyp,); for several targets (n_hyp, n_targets)."""
     kind: IntArray
-    """(n_hyp,) int: the kind of target that each assumes; of several (n_hyp, n_targets)."""
+    """Assumed kind of target, (n_hyp,); for several targets (n_hyp, n_targets)."""
     origin: IntArray
-    """(n_hyp,) int: the row that each hypothesis had when the bank was made."""
+    """Row of each hypothesis at the creation of the bank, (n_hyp,)."""
     nis: FloatArray
-    """(n_hyp, n_sensors) normalised innovation squared of the latest measurement; NaN before it,
-    and of a sensor that is missing."""
+    """Normalised innovation squared of the latest measurement, (n_hyp, n_sensors); NaN before the
+    first measurement and for missing sensors."""
 
     @classmethod
-    def of_targets(cls, x: FloatArray, P: FloatArray, label: IntArray, n_sensors: int,
+    def from_targets(cls, x: FloatArray, P: FloatArray, label: IntArray, n_sensors: int,
                    background_std: float, own_covariance: FloatArray | None = None,
                    kind: IntArray | None = None) -> 'FilterBank':
-        """A bank with equal weights from target states alone.
+        """Create a bank with equal weights from target states.
 
-        `x` (n_hyp, n_t), `P` (n_hyp, n_t, n_t). Behind them are put each sensor's own
-        states with the covariances `own_covariance` (n_sensors, n_own, n_own; none if left
-        out), and three backgrounds a sensor with `background_std` [T]; all are zero. `kind`
-        (n_hyp,) is 0 if left out.
+        Each sensor's own states and then three backgrounds per sensor are appended to the target
+        states; all of them are zero.
+
+        Parameters
+        ----------
+        x : (n_hyp, n_t) array
+            Target states.
+        P : (n_hyp, n_t, n_t) array
+            Covariances of the target states.
+        label : (n_hyp,) int array
+            Assumed direction of arrival.
+        n_sensors : int
+        background_std : float, T
+            Standard deviation of the backgrounds.
+        own_covariance : (n_sensors, n_own, n_own) array, optional
+            Covariance of each sensor's own states. Default: no own states.
+        kind : (n_hyp,) int array, optional
+            Assumed kind of target. Default: 0.
+
+        Returns
+        -------
+        FilterBank
         """
         n, n_t = x.shape
         own = np.zeros((n_sensors, 0, 0)) if own_covariance is None else own_covariance
@@ -77,21 +111,37 @@ class FilterBank:
                    np.full((n, n_sensors), np.nan))
 
     def __len__(self) -> int:
+        """Number of hypotheses."""
         return len(self.log_w)
 
     def best(self) -> int:
         """Row of the hypothesis to publish.
 
-        Of the heaviest label, and in it of the heaviest kind, the one at whose position
-        their mixture is densest: near the mode of the posterior. The heaviest alone
-        would be a lottery where many neighbours share the weight.
+        Returns
+        -------
+        int
+            Among the hypotheses of the heaviest label, and of the heaviest kind within it, the one
+            at whose position their mixture is densest, near the mode of the posterior. The heaviest
+            hypothesis would be a random choice if many neighbours share the weight.
         """
         return core.best(self.x, self.P, self.log_w, _classes(self.label), _classes(self.kind),
-                         _NEGLIGIBLE)
+                         _NEGLIGIBLE_LOG_RATIO)
 
-    def of_target(self, i: int, n_one: int) -> 'FilterBank':
-        """The same hypotheses with the states of target `i` of several alone, each of which has
-        `n_one` states; of a single target it is the bank itself.
+    def extract_target(self, i: int, n_one: int) -> 'FilterBank':
+        """Marginal bank of one target of a joint bank.
+
+        Parameters
+        ----------
+        i : int
+            Number of the target.
+        n_one : int
+            Number of states per target.
+
+        Returns
+        -------
+        FilterBank
+            The same hypotheses with the states of target `i` and of the sensors. The bank itself if
+            it has a single target.
         """
         if self.label.ndim == 1:
             return self
@@ -102,7 +152,20 @@ class FilterBank:
                           self.label[:, i].copy(), self.kind[:, i].copy(), self.origin, self.nis)
 
     def without_target(self, i: int, n_one: int) -> 'FilterBank':
-        """The same hypotheses of the other targets: what is known of them is marginal."""
+        """Marginal bank of all other targets of a joint bank.
+
+        Parameters
+        ----------
+        i : int
+            Number of the target to be marginalised out.
+        n_one : int
+            Number of states per target.
+
+        Returns
+        -------
+        FilterBank
+            The same hypotheses without the states of target `i`.
+        """
         n_targets = self.label.shape[1]
         columns = np.delete(np.arange(self.x.shape[1]), np.arange(i * n_one, (i + 1) * n_one))
         label, kind = np.delete(self.label, i, axis=1), np.delete(self.kind, i, axis=1)
@@ -112,52 +175,118 @@ class FilterBank:
                           self.origin.copy(), self.nis.copy())
 
     def copy(self) -> 'FilterBank':
-        """The same bank with arrays of its own."""
+        """Return a deep copy.
+
+        Returns
+        -------
+        FilterBank
+        """
         return FilterBank(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
     def rows(self, rows: IntArray) -> 'FilterBank':
-        """A bank of the hypotheses `rows` (n,) int, weighted alike; its arrays are its own."""
+        """Select hypotheses and give them equal weights.
+
+        Parameters
+        ----------
+        rows : (n,) int array
+            Rows to select; may repeat.
+
+        Returns
+        -------
+        FilterBank
+            Its arrays are copies.
+        """
         chosen = {f.name: np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(self)}
         return FilterBank(**{**chosen, 'log_w': np.full(len(rows), -np.log(len(rows)))})
 
     def alone(self, i: int) -> 'FilterBank':
-        """A bank of the hypothesis `i` alone; its arrays are its own."""
+        """Bank of a single hypothesis.
+
+        Parameters
+        ----------
+        i : int
+            Row of the hypothesis.
+
+        Returns
+        -------
+        FilterBank
+            Its arrays are copies.
+        """
         return self.rows(np.array([i]))
 
     def weight(self, rows: BoolArray) -> float:
-        """Total weight of the hypotheses of the mask `rows` (n_hyp,)."""
+        """Total weight of some hypotheses.
+
+        Parameters
+        ----------
+        rows : (n_hyp,) bool array
+            Mask of the hypotheses.
+
+        Returns
+        -------
+        float
+        """
         return float(np.exp(log_sum_exp(self.log_w[rows]))) if rows.any() else 0.0
 
-    def outweigh(self, n: int, share: float) -> bool:
-        """Whether the `n` heaviest hypotheses have at least this share of the weight."""
+    def is_concentrated_in(self, n: int, share: float) -> bool:
+        """Whether the heaviest hypotheses hold a given share of the weight.
+
+        Parameters
+        ----------
+        n : int
+            Number of hypotheses.
+        share : float
+            Required share of the total weight.
+
+        Returns
+        -------
+        bool
+        """
         return bool(np.exp(np.sort(self.log_w)[-n:]).sum() >= share)
 
     def apart(self, i: int, distance: float = 3.0) -> BoolArray:
-        """(n_hyp,) whether the position of a hypothesis is another one than that of row `i`.
+        """Whether the positions of hypotheses differ significantly from that of one hypothesis.
 
-        By more than `distance` deviations of the difference in some direction (both
-        covariances), so neither explains the other.
+        Parameters
+        ----------
+        i : int
+            Row of the reference hypothesis.
+        distance : float
+            Minimum Mahalanobis distance, with the sum of both covariances.
+
+        Returns
+        -------
+        (n_hyp,) bool array
+            True where neither hypothesis explains the other.
         """
         difference = self.x[:, :3] - self.x[i, :3]
         C = self.P[:, :3, :3] + self.P[i, :3, :3]
         try:
-            # Nearly always; the eigenvalues would take five times as long.
+            # Nearly always possible; eigenvalues would take five times as long.
             z = np.square(np.linalg.solve(np.linalg.cholesky(C), difference[:, :, None])[:, :, 0]
                           ).sum(axis=1)
         except np.linalg.LinAlgError:
             variance, axes = np.linalg.eigh(C)
             along = np.einsum('ni,nij->nj', difference, axes)
-            # Where nothing varies there is nothing to be apart by.
-            varies = variance > _SINGULAR * variance[:, -1:]
+            # Directions without variance do not count.
+            varies = variance > _SINGULAR_TOLERANCE * variance[:, -1:]
             z = (along**2 / np.where(varies, variance, np.inf)).sum(axis=1)
         apart: BoolArray = z > distance**2
         return apart
 
     def reweight(self, log_likelihood: FloatArray) -> float:
-        """Bayes' rule on the weights; returns the log-evidence of the frame.
+        """Update the weights by Bayes' rule.
 
-        A hypothesis whose likelihood is not finite loses all its weight.
-        If none is left the evidence is -inf and the weights stay as they were.
+        Parameters
+        ----------
+        log_likelihood : (n_hyp,) array
+            Log-likelihood of a frame. A hypothesis whose value is not finite loses all its weight.
+
+        Returns
+        -------
+        float
+            Log-evidence of the frame. If no hypothesis is left, it is -inf and the weights do not
+            change.
         """
         log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, -np.inf)
         joint = self.log_w + log_likelihood
@@ -167,21 +296,46 @@ class FilterBank:
         return evidence
 
     def keep(self, mask: BoolArray) -> int:
-        """Keep the hypotheses of `mask` and normalise; returns how many went.
+        """Keep some hypotheses and normalise their weights.
 
-        The arrays `x` and `P` may be written into.
+        Parameters
+        ----------
+        mask : (n_hyp,) bool array
+            Hypotheses to keep.
+
+        Returns
+        -------
+        int
+            Number of hypotheses removed.
+
+        Notes
+        -----
+        The arrays `x` and `P` may be overwritten in place.
         """
         rows = np.flatnonzero(mask)
         gone = len(mask) - len(rows)
         if gone:
-            self.x, self.P = (_moved_up(a, rows) for a in (self.x, self.P))
+            self.x, self.P = (_compacted(a, rows) for a in (self.x, self.P))
             self.log_w = self.log_w[mask] - log_sum_exp(self.log_w[mask])
             for name in ('label', 'kind', 'origin', 'nis'):
                 setattr(self, name, getattr(self, name)[mask])
         return gone
 
     def prune(self, log_ratio: float, most: int) -> int:
-        """Drop what is below the best by more than `log_ratio`, and beyond the `most` best."""
+        """Remove light hypotheses.
+
+        Parameters
+        ----------
+        log_ratio : float, nats
+            Maximum difference of the log-weight from that of the heaviest hypothesis.
+        most : int
+            Maximum number of hypotheses; the heaviest are kept.
+
+        Returns
+        -------
+        int
+            Number of hypotheses removed.
+        """
         mask = self.log_w >= self.log_w.max() - log_ratio
         if np.count_nonzero(mask) > most:
             order = np.argsort(-self.log_w, kind='stable')
@@ -191,23 +345,24 @@ class FilterBank:
 
 
 def _of_columns(x: FloatArray, P: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Some of the states (n_hyp, n_x), and their covariances, as arrays of their own."""
+    """Copies of some of the states (n_hyp, n_x) and of their covariances."""
     return (np.ascontiguousarray(x[:, columns]),
             np.ascontiguousarray(P[:, columns[:, None], columns]))
 
 
 def _classes(labels: IntArray) -> IntArray:
-    """(n,) int: one number for each set of labels (n,) or (n, n_targets)."""
+    """Class number (n,) of each row of labels, (n,) or (n, n_targets)."""
     if labels.ndim == 1:
         return labels
     classes: IntArray = np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1)
     return classes
 
 
-def _moved_up(a: FloatArray, rows: IntArray) -> FloatArray:
-    """The `rows` (n,), ascending, of an array, at its beginning: what is new takes longer.
+def _compacted(a: FloatArray, rows: IntArray) -> FloatArray:
+    """Move the ascending `rows` (n,) of an array to its beginning, which is faster than a new
+    array.
 
-    A new array, though, where the rest would hold more memory than they do.
+    A new array is returned if the old one would hold more than twice the memory.
     """
     held = a if a.base is None else a.base
     if len(rows) * a[:1].nbytes < held.nbytes // 2:

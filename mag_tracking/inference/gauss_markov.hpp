@@ -1,4 +1,4 @@
-// Vectors that change smoothly, one step of all strengths (gauss_markov.py).
+// Vectors that change smoothly: one filter step for all strengths (gauss_markov.py).
 
 #pragma once
 
@@ -13,10 +13,10 @@
 
 namespace mag_tracking {
 
-// n vectors of m components, of which the first n_moving change. Each has a bank of strengths:
-// states (n, n_strengths, n_x) are levels and the rates of those that change, n_x = m + n_moving,
-// with their covariances (n, n_strengths, n_x, n_x); log weights (n, n_strengths); squared
-// densities (n_strengths, m).
+// n vectors of m components, the first n_moving of which change. Each vector has a bank of
+// strengths: states (n, n_strengths, n_x), which are the levels and then the rates of the changing
+// components, n_x = m + n_moving; covariances (n, n_strengths, n_x, n_x); log-weights
+// (n, n_strengths). `densities` (n_strengths, m) are spectral densities.
 struct VectorBank {
     int n, n_strengths, m, n_moving;
     double *x, *P, *log_w;
@@ -25,14 +25,15 @@ struct VectorBank {
     INLINE int n_x() const { return m + n_moving; }
 };
 
-// Scalar measurements: `vector` says of which each is, ascending; (n_y, m) `H`, values, variances.
+// Scalar measurements: number of the `vector` of each, ascending; rows `H` (n_y, m), values and
+// variances.
 struct ScalarMeasurements {
     int n;
     const std::int64_t* vector;
     const double *H, *y, *variance;
 };
 
-// Move levels and rates (n_x) and their covariance on by `dt`, with densities q (m).
+// Predicts levels and rates (n_x) and their covariance by `dt`, with spectral densities q (m).
 INLINE void predict(double* x, double* P, const double* q, const VectorBank& bank, double dt) {
     const int m = bank.m, n = bank.n_x();
     for (int i = 0; i < bank.n_moving; ++i) {
@@ -49,7 +50,7 @@ INLINE void predict(double* x, double* P, const double* q, const VectorBank& ban
     }
 }
 
-// Sum of the rows of P (n, n) by the components of h (m), most of which are zero; into `out` (n).
+// out (n) = h' P: sum of the rows of P (n, n) weighted by h (m), most of which is zero.
 INLINE void rows_by(const double* __restrict P, const double* h, int m, int n,
                     double* __restrict out) {
     for (int j = 0; j < n; ++j) out[j] = 0.0;
@@ -59,22 +60,22 @@ INLINE void rows_by(const double* __restrict P, const double* h, int m, int n,
     }
 }
 
-// Update with a scalar measurement h (m) of the levels; its log-density. `scratch` (3 n) is
-// overwritten.
+// Updates by a scalar measurement of the levels with row h (m). Returns its log-density. `scratch`
+// (3 n) is overwritten.
 INLINE double update(double* x, double* __restrict P, const double* h, int m, int n, double y,
                      double variance, double* __restrict scratch) {
     double *PH = scratch, *K = PH + n, *c = K + n;
     rows_by(P, h, m, n, PH);
     double S = 0.0, nu = y;
     for (int j = 0; j < m; ++j) S += h[j] * PH[j], nu -= h[j] * x[j];
-    // After a long gap the prediction is so wide that rounding errors exceed the noise.
+    // After a long gap the prediction variance is so large that its rounding exceeds the noise.
     S = std::max(S, 0.0) + variance;
     for (int i = 0; i < n; ++i) {
         K[i] = PH[i] / S;
         x[i] += K[i] * nu;
     }
-    // Joseph's form, (I - K h') P (I - K h')' + K R K': what it adds to P - K (P h)' is c K', which
-    // would be zero without rounding errors.
+    // Joseph form, (I - K h') P (I - K h')' + K R K': it adds c K' to P - K (P h)', which would be
+    // zero without rounding errors.
     for (int i = 0; i < n; ++i)
         for (int j = 0; j < n; ++j) P[i * n + j] -= K[i] * PH[j];
     rows_by(P, h, m, n, c);
@@ -83,7 +84,7 @@ INLINE double update(double* x, double* __restrict P, const double* h, int m, in
         for (int j = 0; j < n; ++j) P[i * n + j] += c_i * K[j];
         P[i * n + i] = std::max(P[i * n + i], 0.0);
     }
-    // Rounding errors differ between the halves, and after long gaps would make P indefinite.
+    // Rounding errors differ between the two triangles and could make P indefinite after long gaps.
     for (int i = 1; i < n; ++i)
         for (int j = 0; j < i; ++j)
             P[i * n + j] = P[j * n + i] = 0.5 * (P[i * n + j] + P[j * n + i]);
@@ -91,8 +92,8 @@ INLINE double update(double* x, double* __restrict P, const double* h, int m, in
     return -0.5 * (nu * nu / S + std::log(two_pi * S));
 }
 
-// Log-density of the measurements given those before, `dt` [s] ago; a strength holds for `switch_s`
-// in the mean.
+// Predicts by `dt` [s] and updates. Returns the log-density of the measurements given the previous
+// ones. `switch_s` is the mean time between switches of the strength.
 FOR_PROCESSORS static double step(const VectorBank& bank, const ScalarMeasurements& in, double dt,
                           double switch_s) {
     const int n = bank.n_strengths, m = bank.m, n_x = bank.n_x();

@@ -1,12 +1,9 @@
-"""Vectors that change smoothly, without a model of what moves them.
+"""Filters of vectors that change smoothly, without a model of their cause.
 
-Each component is an integrated random walk: its rate of change is a Wiener process. How strong
-that is, is unknown and may change: a bank of strengths is weighed by the data, and each gives way
-to another one at a constant rate.
-
-Source: Bar-Shalom, Li and Kirubarajan 2001, Estimation with Applications to Tracking and
-Navigation, sections 6.2.2 (the process) and 11.6 (the weights; the states are not mixed here, as
-all of them follow the same data).
+Each component is an integrated random walk: its rate of change is a Wiener process. The strength of
+the process is unknown and may change: a bank of strengths is weighted by the data, and each
+strength switches to another one at a constant rate. The states of different strengths are not
+mixed, because all of them follow the same data.
 """
 
 import numpy as np
@@ -16,33 +13,41 @@ from mag_tracking.inference import core
 from mag_tracking.records import plain
 
 STRENGTHS = np.logspace(-1.5, 4.5, 13)
-"""[1/s^1.5] Root spectral densities of the bank, in units of a vector's scale."""
+"""Root spectral densities of the bank, in units of the scale of a vector [1/s^1.5]."""
 
 SWITCH_S = 0.75
-"""[s] Mean time for which a strength holds."""
+"""Mean time between switches of the strength [s]."""
 
 
 class GaussMarkovVectors:
-    """Filters of vectors that change independently of each other, and begin at zero."""
+    """Filters of vectors that change independently of each other and start at zero.
+
+    Parameters
+    ----------
+    n : int
+        Number of vectors.
+    scale : (m,) array
+        Unit of `STRENGTHS` for each component; zero for constant components, which must come last.
+    std : float
+        Initial standard deviation of each component.
+
+    Raises
+    ------
+    ValueError
+        If a constant component precedes one that changes.
+
+    References
+    ----------
+    [BarShalom01]_ sections 6.2.2 and 11.6.
+    """
 
     def __init__(self, n: int, scale: FloatArray, std: float) -> None:
-        """
-        Parameters
-        ----------
-        n : int
-            Number of vectors.
-        scale : (m,) array
-            Unit of the `STRENGTHS`, of each component; those that do not change, with zero, come
-            last.
-        std : float
-            Standard deviation of each component at the beginning.
-        """
         m, n_moving, n_strengths = len(scale), np.count_nonzero(scale), len(STRENGTHS)
         if not scale[:n_moving].all():
-            raise ValueError('a component that does not change stands before one that does')
-        # [k, i]: of strength k and component i.
+            raise ValueError('scale: constant components, which have zero, must come last')
+        # [k, i]: strength k, component i.
         self._densities = np.square(STRENGTHS[:, None] * scale)
-        # Rates of those that do not change would be states that are known to be zero.
+        # Constant components have no rate state: it would be exactly zero.
         self._x = np.zeros((n, n_strengths, m + n_moving))
         self._P = np.zeros((n, n_strengths, m + n_moving, m + n_moving))
         level, rate = np.arange(m), m + np.arange(n_moving)
@@ -52,18 +57,24 @@ class GaussMarkovVectors:
 
     def log_density(self, vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray,
                     dt: float) -> float:
-        """Log-density of scalar measurements given those before.
+        """Update by scalar measurements and return their log-density given the previous ones.
 
         Parameters
         ----------
-        vector : (n_y,) int array, ascending
-            Which vector each measurement is of.
+        vector : (n_y,) int array
+            Number of the vector of each measurement, ascending.
         H : (n_y, m) array
-            The measurement is H times the vector.
-        y, variance : (n_y,) arrays
-            Measurements without NaN, and the variance of their noise, which is positive.
-        dt : float [s]
-            Since the measurements before.
+            Measurement rows: the measurement is H times the vector.
+        y : (n_y,) array
+            Measurements, without NaN.
+        variance : (n_y,) array
+            Noise variances, positive.
+        dt : float, s
+            Time since the previous measurements.
+
+        Returns
+        -------
+        float
         """
         return core.step_vectors(self._x, self._P, self._log_w, self._densities,
                                  plain(vector, np.int64), plain(H), plain(y), plain(variance), dt,

@@ -1,9 +1,9 @@
-// The steps of a Kalman filter and of its smoother, for one hypothesis at a time.
+// Steps of a Kalman filter and of its smoother, for one hypothesis at a time.
 //
-// A state is that of the target (n_t), of which every sensor sees something, then n_own states of
-// each sensor that only it sees, then three backgrounds of each sensor. The update takes the
-// sensors one after the other, linearised at one common point, which gives the numbers of the
-// stacked update at a fraction of its cost.
+// The state consists of the target state (n_t), which affects all sensors, n_own states of each
+// sensor, which affect only that sensor, and three backgrounds of each sensor. The update processes
+// the sensors one after the other, linearised at one common point. The result is that of the
+// stacked update, at a fraction of its cost.
 
 #pragma once
 
@@ -15,8 +15,8 @@
 
 namespace mag_tracking {
 
-// What an update did, sensor after sensor. Of each given those before it: z = W u whitens its
-// innovation u, and x += G' z, P -= G' G, with G = W [H | I] P.
+// Gains of an update, per sensor, given the sensors before it: z = W u is the whitened innovation,
+// x += G' z and P -= G' G, with G = W [H | I] P.
 struct Gains {
     double* H;  // (n_sensors, 3, n_seen)
     double* G;  // (n_sensors, 3, wide); rows of missing axes are zero.
@@ -51,7 +51,7 @@ INLINE void move_covariance(double* __restrict P, const Sizes& n, const Motion& 
         }
 }
 
-// Multiply the states behind the target's by `decay`, then add `variance`; both (n_x - n_t).
+// Multiplies the states after the target's by `decay`, then adds `variance`; both (n_x - n_t).
 INLINE void drift(double* x, double* __restrict P, const Sizes& n, const double* decay,
                   const double* variance) {
     for (int i = n.n_t; i < n.n_x; ++i) {
@@ -66,7 +66,7 @@ INLINE void drift(double* x, double* __restrict P, const Sizes& n, const double*
     }
 }
 
-// G = [H | I] P of sensor j, four rows of P at a time, so that G is touched less often.
+// G = [H | I] P of sensor j, four rows of P at a time to reduce accesses to G.
 INLINE void gain_rows(const double* __restrict P, const double* H, const Sizes& n, int j,
                       double* __restrict G) {
     Eight *g0 = eights(G), *g1 = g0 + n.n_eights, *g2 = g1 + n.n_eights;
@@ -95,8 +95,8 @@ INLINE void gain_rows(const double* __restrict P, const double* H, const Sizes& 
     }
 }
 
-// P -= G' G, from `first_eight` of each row on. Both halves get the same products, so that P stays
-// symmetric; four rows of P at a time, so that G is read less often.
+// P -= G' G, from `first_eight` of each row on. Both triangles get the same products, so that P
+// stays symmetric. Four rows of P at a time, to read G less often.
 INLINE void subtract_products(double* __restrict P, const double* __restrict G, const Sizes& n) {
     const int m = n.n_eights;
     const Eight *g0 = eights(G), *g1 = g0 + m, *g2 = g1 + m;
@@ -117,13 +117,13 @@ INLINE void subtract_products(double* __restrict P, const double* __restrict G, 
     }
 }
 
-// Update of a hypothesis by sensor j, in place, linearised at `x_lin` (n_x). If the sizes are
-// `is_halved`, P needs `complete` after the last sensor.
+// Updates a hypothesis by sensor j, in place, linearised at `x_lin` (n_x). If the sizes are
+// `is_halved`, P must be completed by `complete` after the last sensor.
 //
-// y (3), C (3, 3): what the sensor measured, NaN where an axis is missing, and its noise, without
-// NaN. h (3), H (3, n_seen): its field without the background, and the derivative. `inflation` is
-// added to the variance of each axis. G (3, wide), z (3), W (6) are written.
-// Returns the normalised innovation squared; its log-likelihood is added to `log_likelihood`.
+// y (3), C (3, 3): measurement, NaN = missing axis, and noise covariance, without NaN. h (3),
+// H (3, n_seen): predicted field without the background, and its derivative. `inflation` is added
+// to the variance of each axis. G (3, wide), z (3) and W (6) are written.
+// Returns the normalised innovation squared; adds the log-likelihood to `log_likelihood`.
 INLINE double update_by_sensor(double* x, double* __restrict P, const double* x_lin,
                                const double* y, const double* C, const double* h, const double* H,
                                double inflation, const Sizes& n, int j, double* __restrict G,
@@ -166,7 +166,7 @@ INLINE double update_by_sensor(double* x, double* __restrict P, const double* x_
             u[a] = 0.0;
             for (int b = 0; b < 3; ++b) S[std::max(a, b)][std::min(a, b)] = a == b ? 1.0 : 0.0;
         }
-    // S = L diag(e) L' with a unit lower L.
+    // S = L diag(e) L' with a unit lower triangular L.
     const double l10 = S[1][0] / S[0][0], l20 = S[2][0] / S[0][0];
     const double e0 = S[0][0], e1 = S[1][1] - l10 * S[1][0], e21 = S[2][1] - l20 * S[1][0];
     const double l21 = e21 / e1, e2 = S[2][2] - l20 * S[2][0] - l21 * e21;
@@ -190,10 +190,10 @@ INLINE double update_by_sensor(double* x, double* __restrict P, const double* x_
     return present ? nis : std::numeric_limits<double>::quiet_NaN();
 }
 
-// What comes later, `after` (wide), carried back over an update, in place: P times it is what a
-// state is moved by. Source: Bierman 1973, Fixed interval smoothing with discrete measurements
-// (modified Bryson-Frazier), here sensor by sensor. No covariance is inverted, so states that are
-// known exactly, or that are one, need no care.
+// Propagates the adjoint state `after` (wide) backwards over an update, in place; P times it is the
+// correction of a smoothed state. Modified Bryson-Frazier smoother, sensor by sensor (Bierman 1973,
+// Fixed interval smoothing with discrete measurements). No covariance is inverted, so that exactly
+// known and fully correlated states need no special treatment.
 INLINE void before_update(double* __restrict after, const Sizes& n, const Gains& gains) {
     for (int j = n.n_sensors - 1; j >= 0; --j) {
         const double *H = gains.H + j * 3 * n.n_seen(), *G = gains.G + j * 3 * n.wide;
@@ -216,7 +216,7 @@ INLINE void before_update(double* __restrict after, const Sizes& n, const Gains&
     }
 }
 
-// The same over a time update.
+// The same over a prediction.
 INLINE void before_move(double* after, const Sizes& n, const Motion& motion, const double* decay) {
     double moved[MAX_ROWS];
     for (int r = 0; r < motion.n; ++r) {
@@ -229,9 +229,9 @@ INLINE void before_move(double* after, const Sizes& n, const Motion& motion, con
     for (int i = n.n_t; i < n.n_x; ++i) after[i] *= decay[i - n.n_t];
 }
 
-// The information of what comes later, `after` (n_x, wide), carried back over an update, in place:
-// P - P `after` P is the covariance of a smoothed state. `y` (n_sensors, 3) tells which axes are
-// missing; `T` and `B` (3, wide) are overwritten.
+// Propagates the adjoint information `after` (n_x, wide) backwards over an update, in place;
+// P - P `after` P is the covariance of a smoothed state. `y` (n_sensors, 3) is NaN for missing
+// axes; `T` and `B` (3, wide) are overwritten.
 INLINE void information_before_update(double* __restrict after, const Sizes& n,
                                       const Gains& gains, const double* y,
                                       double* __restrict T, double* __restrict B) {
@@ -240,7 +240,7 @@ INLINE void information_before_update(double* __restrict after, const Sizes& n,
         const double *H = gains.H + j * 3 * n.n_seen(), *G = gains.G + j * 3 * wide;
         const double* W = gains.W + 6 * j;
         const double L[3][3] = {{W[0], 0.0, 0.0}, {W[1], W[2], 0.0}, {W[3], W[4], W[5]}};
-        // B = W [H | I], without missing axes: they have no gain, and tell nothing.
+        // B = W [H | I], without missing axes, which have no gain and no information.
         std::memset(B, 0, 3 * wide * sizeof(double));
         for (int b = 0; b < 3; ++b) {
             if (std::isnan(y[3 * j + b])) continue;
@@ -279,7 +279,7 @@ INLINE void information_before_update(double* __restrict after, const Sizes& n,
     }
 }
 
-// The same over a time update: F' after F. `T` (motion.n, wide) is overwritten.
+// The same over a prediction: F' after F. `T` (motion.n, wide) is overwritten.
 INLINE void information_before_move(double* __restrict after, const Sizes& n,
                                     const Motion& motion, const double* decay,
                                     double* __restrict T) {

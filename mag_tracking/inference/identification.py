@@ -10,57 +10,61 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.iron import Iron, hard_and_soft_iron
 from mag_tracking.inference.log_normal_classes import UNKNOWN
 
-BETWEEN_STD = 20.0
-"""[A m^2] Moments of one vehicle differ by this between passes, on top of what their fits state
-(T10 Table 6.9: 14, 18 and 21 on the three axes)."""
+PASS_TO_PASS_STD = 20.0
+"""Standard deviation of the moment of one vehicle between passes [A m²], in addition to the
+covariance of the fits (T10 Table 6.9: 14, 18 and 21 on the three axes)."""
 
-MIN_SEPARATION = np.deg2rad(45.0)
-"""[rad] Headings that are this far apart tell hard iron from soft iron."""
+MIN_HEADING_SEPARATION = np.deg2rad(45.0)
+"""Minimum difference of headings that separates hard from soft iron [rad]."""
 
-SAME_HEADING = np.deg2rad(10.0)
-"""[rad] A vehicle that is enrolled at one heading is compared at that heading only."""
+HEADING_TOLERANCE = np.deg2rad(10.0)
+"""Maximum difference of headings at which a vehicle enrolled at a single heading is compared [rad].
+"""
 
-LEVEL = 0.01
-"""A moment that is less probable than this for every vehicle is of an unknown one."""
+SIGNIFICANCE_LEVEL = 0.01
+"""A moment that is less probable than this for every vehicle belongs to an unknown vehicle."""
 
 
 @dataclass(frozen=True)
 class EnrolledVehicle:
-    """A vehicle with its hard and soft iron, or with its moment at one heading."""
+    """A vehicle with its hard and soft iron, or with its moment at a single heading."""
 
     name: str
+    """Name of the vehicle."""
     iron: Iron | None
-    """None: its passes have one heading."""
+    """Hard and soft iron; None if the passes have a single heading."""
     heading: float
-    """[rad] of its passes, where they have one heading; else NaN."""
+    """Single heading of the passes, rad, world frame; else NaN."""
     moment: FloatArray
-    """(3,) [A m^2], world, at that heading."""
+    """Moment at that heading, (3,) A m², world frame; else NaN."""
     covariance: FloatArray
-    """(3, 3) of `moment`."""
+    """Covariance of `moment`, (3, 3) A² m⁴; else NaN."""
 
     def moment_at(self, heading: float, heading_std: float, induction: FloatArray
                   ) -> tuple[FloatArray, FloatArray] | None:
-        """Moment of its next pass, and the covariance of what is predicted.
+        """Predict the moment of the next pass.
 
         Parameters
         ----------
-        heading, heading_std : float, rad
-        induction : (3,) array, A/m
+        heading : float, rad, world frame
+        heading_std : float, rad
+            Standard deviation of the heading.
+        induction : (3,) array, A/m, world frame
             B0/mu0.
 
         Returns
         -------
-        moment : (3,) array, A m^2, world
-        covariance : (3, 3) array
-            Without that of the measurement. None where it cannot be compared at this heading.
+        (moment, covariance) or None
+            Moment (3,) [A m², world frame] and covariance of the prediction (3, 3), without that of
+            the measurement. None if the vehicle was enrolled at another heading only.
 
         References
         ----------
         [T10]_ eq. (6.16); [TSP14]_ eq. (15), (16).
         """
-        between = BETWEEN_STD**2 * np.eye(3)
+        between = PASS_TO_PASS_STD**2 * np.eye(3)
         if self.iron is None:
-            if abs(_turn(heading - self.heading)) > SAME_HEADING:
+            if abs(_wrapped(heading - self.heading)) > HEADING_TOLERANCE:
                 return None
             return self.moment, self.covariance + between
         c, s = np.cos(heading), np.sin(heading)
@@ -73,12 +77,12 @@ class EnrolledVehicle:
 
 @dataclass(frozen=True)
 class Identification:
-    """Which enrolled vehicle a pass is of."""
+    """The enrolled vehicle that a pass belongs to."""
 
     name: str
-    """The most probable vehicle; `UNKNOWN` where the moment fits none."""
+    """The most probable vehicle; `UNKNOWN` if the moment fits no vehicle."""
     probabilities: dict[str, float]
-    """{vehicle: probability}, for equal priors, of those that can be compared."""
+    """{vehicle: probability} of the compared vehicles, for equal priors."""
     distances: dict[str, float]
     """{vehicle: squared Mahalanobis distance}, chi-square with three degrees of freedom."""
     not_compared: tuple[str, ...]
@@ -92,11 +96,13 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
     Parameters
     ----------
     name : str
-    moments : (n, 3) array, A m^2, world
-    covariances : (n, 3, 3) array
-        As the fits state them; the spread between passes is added.
-    headings : (n,) array, rad
-    induction : (3,) array, A/m
+        Name of the vehicle.
+    moments : (n, 3) array, A m², world frame
+        Fitted moments of the passes.
+    covariances : (n, 3, 3) array, A² m⁴
+        Covariances of the fits; the spread between passes is added.
+    headings : (n,) array, rad, world frame
+    induction : (3,) array, A/m, world frame
         B0/mu0.
 
     Returns
@@ -106,19 +112,19 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
     Raises
     ------
     ValueError
-        If there is no pass, or a number is not finite.
+        If there is no pass, a value is not finite, or the headings neither agree nor differ enough.
     """
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
     if not len(moments):
-        raise ValueError(f'{name}: a vehicle is enrolled by at least one pass')
-    spread = np.asarray(covariances, dtype=float) + BETWEEN_STD**2 * np.eye(3)
-    apart = np.abs(_turn(headings[:, None] - headings)).max()
-    if apart >= MIN_SEPARATION:
+        raise ValueError(f'{name}: enrolment requires at least one pass')
+    spread = np.asarray(covariances, dtype=float) + PASS_TO_PASS_STD**2 * np.eye(3)
+    apart = np.abs(_wrapped(headings[:, None] - headings)).max()
+    if apart >= MIN_HEADING_SEPARATION:
         iron = hard_and_soft_iron(moments, headings, induction, spread)
         return EnrolledVehicle(name, iron, np.nan, np.full(3, np.nan), np.full((3, 3), np.nan))
-    if not np.isfinite(moments).all() or apart > SAME_HEADING:
-        raise ValueError(f'{name}: expected finite moments at one heading, or at headings that '
-                         f'are {np.rad2deg(MIN_SEPARATION):.0f} degrees apart; these are '
+    if not np.isfinite(moments).all() or apart > HEADING_TOLERANCE:
+        raise ValueError(f'{name}: expected finite moments at one heading, or at headings at least '
+                         f'{np.rad2deg(MIN_HEADING_SEPARATION):.0f} degrees apart; got headings '
                          f'{np.rad2deg(apart):.0f} degrees apart')
     information = np.linalg.inv(spread)
     covariance = np.linalg.inv(information.sum(axis=0))
@@ -129,15 +135,20 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
 
 def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance: FloatArray,
              heading: float, heading_std: float, induction: FloatArray) -> Identification:
-    """Which of the enrolled vehicles made a pass.
+    """Identify the enrolled vehicle that made a pass.
 
     Parameters
     ----------
     vehicles : sequence of EnrolledVehicle
-    moment : (3,) array, A m^2, world
-    covariance : (3, 3) array
-    heading, heading_std : float, rad
-    induction : (3,) array, A/m
+        Candidates.
+    moment : (3,) array, A m², world frame
+        Fitted moment of the pass.
+    covariance : (3, 3) array, A² m⁴
+        Covariance of `moment`.
+    heading : float, rad, world frame
+    heading_std : float, rad
+        Standard deviation of the heading.
+    induction : (3,) array, A/m, world frame
         B0/mu0.
 
     Returns
@@ -158,11 +169,11 @@ def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance
     p = np.exp(np.array(list(log_p.values())) - max(log_p.values()))
     best = max(log_p, key=lambda name: log_p[name])
     return Identification(
-        best if min(distances.values()) <= chdtri(3, LEVEL) else UNKNOWN,
+        best if min(distances.values()) <= chdtri(3, SIGNIFICANCE_LEVEL) else UNKNOWN,
         dict(zip(log_p, (p / p.sum()).tolist(), strict=True)), distances, tuple(others))
 
 
-def _turn(angle: FloatArray | float) -> FloatArray:
-    """The same angle, between -pi and pi."""
+def _wrapped(angle: FloatArray | float) -> FloatArray:
+    """Angle wrapped to the interval from -pi to pi."""
     turned: FloatArray = np.angle(np.exp(1j * np.asarray(angle)))
     return turned

@@ -1,46 +1,53 @@
-"""Whether the innovations of a track are as large as its filter states, over time.
+"""Innovation consistency: whether the innovations of a track match their covariance, over time.
 
-The normalised innovations squared of a consistent filter are chi-square; those of a filter that
-allows for model errors are smaller. A single frame says little. Tested are the frames of a short
-window, and all of the track; the whole network, and each sensor.
-
-Source: Bar-Shalom, Li and Kirubarajan 2001, Estimation with Applications to Tracking and
-Navigation, section 5.4.2.
+The normalised innovations squared (NIS) of a consistent filter are chi-square distributed; those of
+a filter that allows for model errors are smaller. A single frame is not conclusive. The test covers
+the frames of a short window and the whole track, for the network as a whole and for each sensor.
 """
 
 import numpy as np
 from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.inference.latest_frames import LatestFrames
+from mag_tracking.inference.sliding_sum import SlidingSum
 
 WINDOW_S = 0.5
-"""[s] Latest frames that are tested together."""
+"""Length of the window of latest frames that are tested together [s]."""
 
 FALSE_ALARM = 1e-3
 """Probability that the innovations of a consistent filter fail one test."""
 
 
 class InnovationConsistency:
-    """Innovations of a track against their chi-square law."""
+    """Chi-square test of the innovations of a track.
+
+    Parameters
+    ----------
+    n_sensors : int
+        Number of sensors of the track.
+
+    References
+    ----------
+    [BarShalom01]_ section 5.4.2.
+    """
 
     def __init__(self, n_sensors: int) -> None:
         self._n_sensors = n_sensors
-        # (2, n_sensors + 1): normalised innovations squared and degrees of freedom, of each sensor
-        # and of all.
+        # (2, n_sensors + 1): NIS and degrees of freedom, of each sensor and of the network.
         self._total = np.zeros((2, n_sensors + 1))
-        self._latest = LatestFrames(WINDOW_S)
+        self._latest = SlidingSum(WINDOW_S)
 
     def add(self, nis: FloatArray, n_axes: FloatArray, stamp_ns: int) -> None:
-        """Count a frame.
+        """Add a frame.
 
         Parameters
         ----------
         nis : (n_sensors,) array
             Normalised innovation squared of each sensor; NaN = missing.
         n_axes : (n_sensors,) array
-            Axes that each of them measured.
-        stamp_ns : int
+            Number of axes measured by each sensor.
+        stamp_ns : int, ns
+            Timestamp of the frame.
         """
         values = np.stack([np.nan_to_num(nis), np.where(np.isnan(nis), 0, n_axes)])
         values = np.column_stack([values, values.sum(axis=1)])
@@ -49,7 +56,8 @@ class InnovationConsistency:
 
     @property
     def excess(self) -> float:
-        """How many times too large the variances of the latest innovations are; 1 = as stated."""
+        """Factor by which the latest innovation variances exceed their covariance; 1 = consistent.
+        """
         latest = self._latest.total
         fails = self._fails(latest)
         with np.errstate(invalid='ignore', divide='ignore'):
@@ -58,11 +66,11 @@ class InnovationConsistency:
 
     @property
     def fails(self) -> bool:
-        """Whether the innovations of the track as a whole are too large."""
+        """Whether the innovations of the whole track are too large."""
         return bool(self._fails(self._total).any())
 
     def _fails(self, values: FloatArray) -> FloatArray:
-        """(n_sensors + 1,) whether sums (2, n_sensors + 1) exceed their law."""
+        """Whether sums (2, n_sensors + 1) exceed their thresholds, (n_sensors + 1,)."""
         probability = np.append(np.full(self._n_sensors, FALSE_ALARM / self._n_sensors),
                                 FALSE_ALARM)
         nis, freedom = values

@@ -10,34 +10,36 @@ from mag_tracking.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Iron:
-    """What a vehicle's moment is made of, and how well that is known."""
+    """Hard and soft iron of a vehicle, with covariance."""
 
     hard: FloatArray
-    """(3,) [A m^2], m0 in the vehicle's frame, x forward and z up."""
+    """Hard iron moment m0, (3,) A m², vehicle frame (x forward, z up)."""
     soft: float
-    """[m^3], D."""
+    """Soft iron D, m³."""
     covariance: FloatArray
-    """(4, 4) of [m0, D]."""
+    """Covariance of [m0, D], (4, 4)."""
     residuals: FloatArray
-    """(n, 3) [A m^2], world: moment minus what the two make of it."""
+    """Moments minus their prediction, (n, 3) A m², world frame."""
     normalised_cost: float
-    """Weighted sum of squared residuals over the degrees of freedom; about one where the model and
-    the covariances are right. NaN without covariances."""
+    """Weighted sum of squared residuals over the degrees of freedom; about one if the model and the
+    covariances are right. NaN without covariances."""
 
 
 def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: ArrayLike,
                        covariances: ArrayLike | None = None) -> Iron:
-    """Least squares for m0 and D in m = Rz(heading) m0 + D induction.
+    """Estimate m0 and D in m = Rz(heading) m0 + D induction by least squares.
 
     Parameters
     ----------
-    moments : (n, 3) [A m^2], world
-    headings : (n,) [rad]
-        Anticlockwise from x.
-    induction : (3,) [A/m], world
-        B0/mu0; with 3 B0/mu0 the D that comes out is T10's.
-    covariances : (n, 3, 3) [(A m^2)^2], optional
-        Without them all moments count alike, and the residuals tell how uncertain they are.
+    moments : (n, 3) array, A m², world frame
+        Fitted moments of the passes.
+    headings : (n,) array, rad, world frame
+        From x, anticlockwise seen from above.
+    induction : (3,) array, A/m, world frame
+        B0/mu0. With 3 B0/mu0 the resulting D is that of T10.
+    covariances : (n, 3, 3) array, A² m⁴, optional
+        Covariances of the moments. Omitted, all moments have equal weight and the covariance is
+        estimated from the residuals.
 
     Returns
     -------
@@ -46,11 +48,13 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
     Raises
     ------
     ValueError
-        Shapes that do not fit, numbers that are not finite, a covariance that is not positive
-        definite, or headings from which the two cannot be told apart: one alone, several that
-        are the same, or an earth field that is vertical.
+        If shapes do not match, a value is not finite, a covariance is not positive definite, or
+        hard and soft iron cannot be separated: for a single heading, equal headings, or a vertical
+        earth field.
 
-    Source: TSP14 section VI.E, T10 eq. (6.16).
+    References
+    ----------
+    [TSP14]_ section VI.E; [T10]_ eq. (6.16).
     """
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
     induction = np.asarray(induction, dtype=float)
@@ -60,7 +64,7 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
                          f'{moments.shape}, {headings.shape}, {induction.shape}')
     if not (np.isfinite(moments).all() and np.isfinite(headings).all()
             and np.isfinite(induction).all()):
-        raise ValueError('a moment, a heading or the induction is not finite')
+        raise ValueError('moments, headings and induction must be finite')
     A = np.zeros((n, 3, 4))
     c, s = np.cos(headings), np.sin(headings)
     A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = c, -s, s, c
@@ -68,13 +72,13 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
     A[:, :, 3] = induction
     W = _whitening(covariances, n)
     whitened = (W @ A).reshape(3 * n, 4)
-    # D is in cubic metres of a field of tens of A/m: unit columns first.
+    # The units of m0 and D differ, so the columns are normalised first.
     scale = np.linalg.norm(whitened, axis=0)
-    # Headings a hundredth of a degree apart are taken for the same.
+    # Headings a hundredth of a degree apart are treated as equal.
     if (n < 2 or not (scale > 0.0).all()
             or np.linalg.svd(whitened / scale, compute_uv=False)[-1] < 1e-4):
-        raise ValueError('hard and soft iron cannot be told apart: that takes headings that '
-                         'differ, and an earth field with a horizontal part')
+        raise ValueError('hard and soft iron cannot be separated: headings must differ and the '
+                         'earth field must have a horizontal component')
     y = (W @ moments[:, :, None]).ravel()
     theta = np.linalg.lstsq(whitened / scale, y, rcond=None)[0] / scale
     covariance = np.linalg.inv((whitened / scale).T @ (whitened / scale)) / np.outer(scale, scale)
@@ -86,7 +90,7 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
 
 
 def _whitening(covariances: ArrayLike | None, n: int) -> FloatArray:
-    """(n, 3, 3) inverse Cholesky factors; identities without covariances."""
+    """Inverse Cholesky factors (n, 3, 3); identity matrices without covariances."""
     if covariances is None:
         return np.tile(np.eye(3), (n, 1, 1))
     covariances = np.asarray(covariances, dtype=float)
@@ -95,4 +99,4 @@ def _whitening(covariances: ArrayLike | None, n: int) -> FloatArray:
     try:
         return np.linalg.inv(np.linalg.cholesky(covariances))
     except np.linalg.LinAlgError:
-        raise ValueError('a covariance is not positive definite') from None
+        raise ValueError('covariances: not positive definite') from None

@@ -1,6 +1,6 @@
-"""Non-linear least squares from many starts at once.
+"""Non-linear least squares from many starting points at once.
 
-The model comes in as a function or an object, so that this file is mathematics only.
+The model is passed as a function or an object.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,41 +10,46 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.inference.matrices import pseudo_inverse, running_away
+from mag_tracking.inference.matrices import ignoring_overflow, pseudo_inverse
 
 ResidualAndJacobian: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Takes points (n, n_x), returns residuals (n, n_y) and Jacobians (n, n_y, n_x)."""
+"""Function of points (n, n_x) that returns residuals (n, n_y) and Jacobians (n, n_y, n_x)."""
 
-CORRELATED_S = 0.2
-"""[s] What a model leaves out of a vehicle is alike for so long: a car's length at 20 m/s."""
+CORRELATION_TIME_S = 0.2
+"""Correlation time of the model error of a vehicle [s]: a car length at 20 m/s."""
 
 
 def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iterations: int = 40,
            tolerance: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Levenberg-Marquardt on many starts at once, each with its own damping.
+    """Levenberg-Marquardt from many starting points at once, each with its own damping.
 
     Parameters
     ----------
-    residual_and_jacobian : function
-        Takes (n, n_x), returns whitened residuals (n, n_y) (measured minus
-        predicted) and the Jacobians (n, n_y, n_x) of the prediction.
-    x : (n, n_x)
-        Starts.
+    residual_and_jacobian : callable
+        Takes points (n, n_x). Returns whitened residuals (n, n_y), measured minus predicted, and
+        the Jacobians (n, n_y, n_x) of the prediction.
+    x : (n, n_x) array
+        Starting points.
     n_iterations : int
+        Maximum number of iterations.
     tolerance : float
-        A start is done, too, when a step makes its cost smaller by less than this share of it.
+        Relative decrease of the cost in one step at or below which a start has converged.
 
     Returns
     -------
-    x : (n, n_x)
-    cost : (n,)
-        Sum of squared whitened residuals; infinite where a start is unusable.
-    covariance : (n, n_x, n_x)
-        Pseudo-inverse of the information at x.
-    converged : (n,) bool
-        Done before the iterations were used up, and not because no damping helped.
+    x : (n, n_x) array
+        Final points.
+    cost : (n,) array
+        Sum of squared whitened residuals; infinite for an unusable start.
+    covariance : (n, n_x, n_x) array
+        Pseudo-inverse of the information at `x`.
+    converged : (n,) bool array
+        Whether the steps or the decrease of the cost became negligible within the iterations. False
+        if no damping lowers the cost.
 
-    Source: T10 section 2.3, Alg. 1.
+    References
+    ----------
+    [T10]_ section 2.3, Alg. 1.
     """
     x = np.array(x, dtype=float)
     residual, J, cost = _evaluate(residual_and_jacobian, x)
@@ -71,14 +76,15 @@ def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iteration
 
 
 MAX_DAMPING = 1e12
-"""Steps that are so small and still lead uphill lead nowhere."""
+"""Damping at which a search is abandoned: steps this small that do not lower the cost never will.
+"""
 
 
 def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> FloatArray:
-    """Steps (n, n_x) of Levenberg and Marquardt."""
+    """Levenberg-Marquardt steps (n, n_x)."""
     Jt = np.swapaxes(J, 1, 2)
     information = Jt @ J
-    # Marquardt's scaling: damping is relative to each parameter's own information.
+    # Marquardt's scaling: damping is relative to the information of each parameter.
     diagonal = np.einsum('nii->ni', information)
     A = information + (damping[:, None] * diagonal)[:, :, None] * np.eye(J.shape[2])
     step: FloatArray = np.einsum('nij,nj->ni', pseudo_inverse(A),
@@ -88,8 +94,8 @@ def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> Fl
 
 def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
               ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals, Jacobians and costs; an unusable point costs infinity."""
-    with running_away():
+    """Residuals, Jacobians and costs; an unusable point has infinite cost."""
+    with ignoring_overflow():
         residual, J = residual_and_jacobian(x)
         cost = np.einsum('ni,ni->n', residual, residual)
     bad = ~(np.isfinite(cost) & np.isfinite(J).all(axis=(1, 2)))
@@ -103,44 +109,49 @@ def project_out_linear(A: FloatArray, y: FloatArray
 
     Parameters
     ----------
-    A : (n, n_y, k)
-    y : (n_y,)
+    A : (n, n_y, k) array
+        Design matrices.
+    y : (n_y,) array
+        Whitened measurements.
 
     Returns
     -------
-    p : (n, k)
-        Zero in directions that A hardly has (`LINEAR_RANK`).
-    residual : (n, n_y)
-        y - A p.
-    inverse : (n, k, k)
+    p : (n, k) array
+        Zero in nearly singular directions of `A` (`LINEAR_RANK_TOLERANCE`).
+    residual : (n, n_y) array
+        Residuals y - A p.
+    inverse : (n, k, k) array
         Pseudo-inverse of A'A.
     """
     At = np.swapaxes(A, 1, 2)
-    inverse = pseudo_inverse(At @ A, LINEAR_RANK)
+    inverse = pseudo_inverse(At @ A, LINEAR_RANK_TOLERANCE)
     p = np.einsum('nij,nj->ni', inverse, At @ y)
     return p, y - np.einsum('nyi,ni->ny', A, p), inverse
 
 
-LINEAR_RANK = 1e-11
-"""Dipoles that are almost at one place would cancel each other with moments without bounds."""
+LINEAR_RANK_TOLERANCE = 1e-11
+"""Relative eigenvalue below which a linear direction is left out. Dipoles at nearly the same
+position would otherwise cancel each other with unbounded moments."""
 
 
-def correlated_scores(scores: FloatArray, lag: int) -> FloatArray:
-    """Covariance of the sum of scores that are correlated over some neighbours.
+def score_sum_covariance(scores: FloatArray, lag: int) -> FloatArray:
+    """Covariance of the sum of correlated scores (Newey-West, Bartlett weights).
 
     Parameters
     ----------
-    scores : (n, n_x)
-        Gradient of each sample's cost at the minimum, in order of time.
+    scores : (n, n_x) array
+        Gradient of the cost of each sample at the minimum, in order of time.
     lag : int
-        Samples that are further apart are taken for independent.
+        Samples further apart than this are treated as independent.
 
     Returns
     -------
-    (n_x, n_x)
-        Positive semidefinite. Where model and noise are right it is the information, about.
+    (n_x, n_x) array
+        Positive semidefinite; approximately the information if model and noise are right.
 
-    Source: Newey and West 1987, with Bartlett's weights.
+    References
+    ----------
+    [NeweyWest87]_.
     """
     S = scores.T @ scores
     for k in range(1, min(lag, len(scores) - 1) + 1):
@@ -149,32 +160,37 @@ def correlated_scores(scores: FloatArray, lag: int) -> FloatArray:
     return S
 
 
-def left_out_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatArray],
+def model_error_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatArray],
                         left: Sequence[FloatArray], covariance: FloatArray) -> FloatArray:
-    """What must be added to a covariance for what a model leaves out.
+    """Covariance to be added to that of the noise for the error of the model.
 
-    The residuals then are no noise: they are alike for a while, and count for less than their
-    number. Nothing is taken away where chance made them look less than noise.
+    Residuals caused by model errors are correlated over `CORRELATION_TIME_S`, so that they carry
+    less information than their number suggests. The covariance is never reduced, even if the
+    residuals are by chance smaller than the noise.
 
     Parameters
     ----------
-    t, derivatives, left : of each sensor (n,) [s], (n, k, n_x), (n, k)
-        Times in order; whitened derivatives and residuals.
-    covariance : (n_x, n_x)
-        By noise alone.
+    t : sequence of (n,) array, s
+        Timestamps of each sensor, ascending.
+    derivatives : sequence of (n, k, n_x) array
+        Whitened derivatives of each sensor.
+    left : sequence of (n, k) array
+        Whitened residuals of each sensor.
+    covariance : (n_x, n_x) array
+        Covariance due to noise alone.
 
     Returns
     -------
-    (n_x, n_x)
-        NaN where a variance is infinite.
+    (n_x, n_x) array
+        NaN if a variance is infinite.
     """
     scale = np.sqrt(np.diagonal(covariance))
     excess = np.zeros_like(covariance)
     for times, H, r in zip(t, derivatives, left, strict=True):
         columns = H * scale
-        step = np.median(np.diff(times)) if len(times) > 1 else CORRELATED_S
-        excess += correlated_scores(np.einsum('nai,na->ni', columns, r),
-                                    int(CORRELATED_S / max(step, 1e-9)))
+        step = np.median(np.diff(times)) if len(times) > 1 else CORRELATION_TIME_S
+        excess += score_sum_covariance(np.einsum('nai,na->ni', columns, r),
+                                    int(CORRELATION_TIME_S / max(step, 1e-9)))
         excess -= np.einsum('nai,naj->ij', columns, columns)
     if not np.isfinite(excess).all():
         return np.full_like(covariance, np.nan)

@@ -1,4 +1,4 @@
-"""Posterior probabilities of classes whose features are log-normal."""
+"""Posterior probabilities of classes with log-normal features."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,40 +9,45 @@ from scipy.special import chdtri
 from mag_tracking.arrays import FloatArray
 
 UNKNOWN = 'unknown'
-LEVEL = 0.01
-"""Something that is less probable than this under every class is of an unknown one."""
+"""Name of the class of an object that fits no class."""
+SIGNIFICANCE_LEVEL = 0.01
+"""An object that is less probable than this under every class belongs to an unknown class."""
 
 
 class Feature(NamedTuple):
-    """A positive number that was measured, and its law in each class."""
+    """A measured positive feature and its distribution in each class."""
 
     value: float
+    """Measured value, positive."""
     std: float
+    """Standard deviation of the measurement."""
     medians: Sequence[float]
-    """One per class."""
+    """Median in each class."""
     spreads: Sequence[float]
-    """Standard deviations of the natural logarithm, one per class."""
+    """Standard deviation of the natural logarithm in each class."""
 
 
 class ClassPosterior(NamedTuple):
-    """Classes of one object."""
+    """Class of an object."""
 
     name: str
-    """The most probable class; `UNKNOWN` for an object that fits none."""
+    """The most probable class; `UNKNOWN` for an object that fits no class."""
     probabilities: FloatArray
-    """(n_classes,) in the order of the names."""
+    """Posterior probabilities, (n_classes,), in the order of the names."""
 
 
 def class_posterior(names: Sequence[str], shares: Sequence[float],
                     features: Sequence[Feature]) -> ClassPosterior:
-    """Class of an object by independent features.
+    """Classify an object by independent features.
 
     Parameters
     ----------
     names : sequence of str
+        Names of the classes.
     shares : sequence of float
-        Prior weights, one per class.
+        Prior weight of each class.
     features : sequence of Feature
+        Measured features.
 
     Returns
     -------
@@ -56,5 +61,5 @@ def class_posterior(names: Sequence[str], shares: Sequence[float],
     log_p = np.log(np.array(shares)) - 0.5 * distance - 0.5 * np.log(variance).sum(axis=0)
     p = np.exp(log_p - log_p.max())
     best = int(np.argmax(p))
-    is_known = distance.min() <= chdtri(len(features), LEVEL)
+    is_known = distance.min() <= chdtri(len(features), SIGNIFICANCE_LEVEL)
     return ClassPosterior(names[best] if is_known else UNKNOWN, p / p.sum())

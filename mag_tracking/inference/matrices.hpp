@@ -10,13 +10,13 @@
 
 namespace mag_tracking {
 
-// Inverts symmetric matrices of one size.
+// Inverse of symmetric matrices of one size.
 class Inverter {
   public:
     explicit Inverter(std::size_t n) : n_(n), scale_(n), L_(n * n), inverse_(n * n) {}
 
-    // Inverse of `A` (n, n), scaled to unit diagonal first, into `out`. False where a root of a
-    // pivot is then not larger than `least`.
+    // Writes the inverse of `A` (n, n), scaled to unit diagonal first, to `out`. Returns false if
+    // the root of a pivot is not above `least`.
     bool invert(const double* A, double least, double* out) {
         for (std::size_t i = 0; i < n_; ++i)
             scale_[i] = A[i * n_ + i] > 0.0 ? 1.0 / std::sqrt(A[i * n_ + i]) : 1.0;
@@ -32,7 +32,7 @@ class Inverter {
     }
 
   private:
-    // The scaled matrix is L L'.
+    // Cholesky factor L of the scaled matrix.
     bool factor(const double* A, double least) {
         for (std::size_t i = 0; i < n_; ++i)
             for (std::size_t k = 0; k <= i; ++k) {
@@ -41,7 +41,7 @@ class Inverter {
                 if (k < i) {
                     L_[i * n_ + k] = rest / L_[k * n_ + k];
                 } else {
-                    // Also where it is no number.
+                    // The negation also catches NaN.
                     if (!(rest > least * least) || !std::isfinite(rest)) return false;
                     L_[i * n_ + i] = std::sqrt(rest);
                 }
@@ -64,14 +64,14 @@ class Inverter {
     std::vector<double> scale_, L_, inverse_;
 };
 
-// Eigenvalues and eigenvectors of symmetric matrices of one size.
+// Eigenvalues and eigenvectors of symmetric matrices of one size, by the cyclic Jacobi method.
 //
-// Source: Golub and Van Loan 1996, Matrix Computations, section 8.4: the cyclic Jacobi method.
+// Golub and Van Loan 1996, Matrix Computations, section 8.4.
 class Eigen {
   public:
     explicit Eigen(std::size_t n) : vectors(n * n), n_(n) {}
 
-    // Of `A` (n, n), on whose diagonal the eigenvalues then are.
+    // Decomposes `A` (n, n) in place; the eigenvalues are on its diagonal afterwards.
     void solve(double* A) {
         std::fill(vectors.begin(), vectors.end(), 0.0);
         for (std::size_t i = 0; i < n_; ++i) vectors[i * n_ + i] = 1.0;
@@ -81,10 +81,10 @@ class Eigen {
                     if (A[p * n_ + q] != 0.0) rotate(A, p, q);
     }
 
-    std::vector<double> vectors;  // (n, n), each in a column.
+    std::vector<double> vectors;  // (n, n) eigenvectors in columns.
 
   private:
-    // Far more than it takes: it converges quadratically.
+    // Far more than needed: convergence is quadratic.
     static constexpr int MAX_SWEEPS = 30;
 
     bool is_diagonal(const double* A) const {
@@ -95,7 +95,7 @@ class Eigen {
         return off <= 1e-32 * on;
     }
 
-    // Make the elements (p, q) and (q, p) zero.
+    // Rotates the elements (p, q) and (q, p) to zero.
     void rotate(double* A, std::size_t p, std::size_t q) {
         const double slope = (A[q * n_ + q] - A[p * n_ + p]) / (2.0 * A[p * n_ + q]);
         const double t = (slope >= 0.0 ? 1.0 : -1.0)
@@ -116,15 +116,15 @@ class Eigen {
     std::size_t n_;
 };
 
-// `matrices.pseudo_inverse` of matrices of one size, one after the other.
+// `matrices.pseudo_inverse` for matrices of one size, one at a time.
 class PseudoInverter {
   public:
-    // Of full rank is what `Inverter` inverts with `least`; of the others, directions are left out
-    // whose eigenvalue is below the share `rank` of the largest.
+    // Matrices that `Inverter` inverts with `least` have full rank. For the others, directions with
+    // an eigenvalue below the fraction `rank` of the largest are left out.
     PseudoInverter(std::size_t n, double least, double rank)
         : n_(n), least_(least), rank_(rank), inverter_(n), eigen_(n), unit_(n * n), scale_(n) {}
 
-    // Of `A` (n, n) into `out`; NaN where it is not finite.
+    // Writes the pseudo-inverse of `A` (n, n) to `out`; NaN if `A` is not finite.
     void invert(const double* A, double* out) {
         if (inverter_.invert(A, least_, out)) return;
         if (!std::all_of(A, A + n_ * n_, [](double a) { return std::isfinite(a); })) {
@@ -145,7 +145,7 @@ class PseudoInverter {
     }
 
   private:
-    // Add what the eigenvector `m` gives to the inverse.
+    // Adds the contribution of eigenvector `m` to the inverse.
     void add(std::size_t m, double* out) {
         const double* V = eigen_.vectors.data();
         for (std::size_t i = 0; i < n_; ++i)

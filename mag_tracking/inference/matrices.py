@@ -1,4 +1,4 @@
-"""Matrices that are checked, brought to unit diagonal, whitened, and inverted."""
+"""Matrix validation, scaling to unit diagonal, whitening and pseudo-inverses."""
 
 from contextlib import AbstractContextManager
 from typing import cast
@@ -11,12 +11,32 @@ from mag_tracking.inference import core
 
 
 def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
-    """Rows of H in units of their noise (..., n_y, n_x); missing rows are zero."""
+    """Whiten the rows of measurement matrices.
+
+    Parameters
+    ----------
+    H : (..., n_y, n_x) array
+        Measurement matrices; a row of NaN is not measured.
+    C : (..., n_y, n_y) array or None
+        Noise covariances; leading axes broadcast against `H`. None if `H` is whitened.
+
+    Returns
+    -------
+    (..., n_y, n_x) array
+        Rows of unit noise; zero for missing rows.
+
+    Raises
+    ------
+    ValueError
+        If a shape does not match, or a matrix is not finite, not symmetric or not positive
+        definite.
+    """
     H = np.asarray(H, dtype=float)
     if H.ndim < 2:
-        raise ValueError(f'H needs shape (..., n_y, n_x), got {H.shape}')
+        raise ValueError(f'H must have shape (..., n_y, n_x), got {H.shape}')
     missing = np.isnan(H).all(axis=-1)
-    refuse('row of H ', 'finite or wholly NaN', H, ~np.isfinite(H).all(axis=-1) & ~missing)
+    raise_for_invalid('row of H ', 'finite or wholly NaN', H,
+                      ~np.isfinite(H).all(axis=-1) & ~missing)
     H = np.where(missing[..., None], 0.0, H)
     if C is None:
         return H
@@ -24,71 +44,155 @@ def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
     C = leading_broadcast('C', C, H.shape[:-1] + (n_y,))
     C = np.where(missing[..., :, None] | missing[..., None, :], np.eye(n_y), C)
     scale, w, V = unit_diagonal('C', C)
-    refuse('C', 'positive definite', C, w[..., 0] <= n_y * np.finfo(float).eps)
+    raise_for_invalid('C', 'positive definite', C, w[..., 0] <= n_y * np.finfo(float).eps)
     out: FloatArray = np.swapaxes(V, -1, -2) @ (H / scale[..., None]) / np.sqrt(w)[..., None]
     return out
 
 
 def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """A as a float array of `shape`; only leading axes may be left out."""
+    """Broadcast a matrix over leading axes.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the error message.
+    A : (..., m, n) array
+        Matrix.
+    shape : tuple of int
+        Required shape; its last two lengths must be m and n.
+
+    Returns
+    -------
+    array of shape `shape`
+        Read-only.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not match.
+    """
     A = np.asarray(A, dtype=float)
     try:
         if A.shape[-2:] == shape[-2:]:
             return np.broadcast_to(A, shape)
     except ValueError:
         pass
-    raise ValueError(f'{name} has shape {A.shape}, needed is {shape}')
+    raise ValueError(f'{name} has shape {A.shape}, expected {shape}')
 
 
-def refuse(name: str, fault: str, A: FloatArray, bad: BoolArray | np.bool_) -> None:
-    """Raise ValueError for the first matrix of A (..., n, n) that is `bad` (...)."""
+def raise_for_invalid(name: str, fault: str, A: FloatArray, bad: BoolArray | np.bool_) -> None:
+    """Raise ValueError for the first invalid matrix.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the error message.
+    fault : str
+        Property that is violated, such as 'symmetric'.
+    A : (..., n, n) array
+        Matrices.
+    bad : (...) bool array
+        Flags of the invalid matrices.
+
+    Raises
+    ------
+    ValueError
+        If any flag is set.
+    """
     for at in np.argwhere(bad).tolist():
         raise ValueError(f'{name}{at or ""} is not {fault}: {A[tuple(at)].tolist()}')
 
 
 def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scale, eigenvalues and vectors of A / (scale scale'), once A is fit for it."""
+    """Scale symmetric matrices to unit diagonal and decompose them.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the error message.
+    A : (..., n, n) array
+        Symmetric positive semidefinite matrices.
+
+    Returns
+    -------
+    scale : (..., n) array
+        Roots of the diagonal; 1 where the diagonal is not positive.
+    w : (..., n) array
+        Eigenvalues of A / (scale scale'), ascending.
+    V : (..., n, n) array
+        Eigenvectors in columns.
+
+    Raises
+    ------
+    ValueError
+        If a matrix is not square, finite, symmetric and positive semidefinite.
+    """
     if A.ndim < 2 or A.shape[-1] != A.shape[-2]:
-        raise ValueError(f'{name} has to be square, got {A.shape}')
-    refuse(name, 'finite', A, ~np.isfinite(A).all(axis=(-2, -1)))
+        raise ValueError(f'{name} must be square, got shape {A.shape}')
+    raise_for_invalid(name, 'finite', A, ~np.isfinite(A).all(axis=(-2, -1)))
     diagonal = np.einsum('...ii->...i', A)
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     unit = A / (scale[..., :, None] * scale[..., None, :])
     skew = np.abs(unit - np.swapaxes(unit, -1, -2))
-    refuse(name, 'symmetric', A, (skew > 1e-9).any(axis=(-2, -1)))
+    raise_for_invalid(name, 'symmetric', A, (skew > 1e-9).any(axis=(-2, -1)))
     w, V = np.linalg.eigh(unit)
-    refuse(name, 'positive semidefinite', A, (w < -1e-9).any(-1) | (diagonal < 0.0).any(-1))
+    raise_for_invalid(name, 'positive semidefinite', A,
+                      (w < -1e-9).any(-1) | (diagonal < 0.0).any(-1))
     return scale, w, V
 
 
 def triangular_factor(A: FloatArray) -> FloatArray:
-    """R of A = Q R."""
-    # The stub of numpy knows only of the pair.
+    """R of the QR decomposition A = Q R.
+
+    Parameters
+    ----------
+    A : (m, n) array
+
+    Returns
+    -------
+    (min(m, n), n) array
+        Upper triangular.
+    """
+    # The type stub of NumPy lists only the pair (Q, R).
     return cast(FloatArray, np.linalg.qr(A, mode='r'))
 
 
-def running_away() -> AbstractContextManager[None]:
-    """Start of a block in which numbers may grow beyond all bounds: a search that does so costs
-    infinity.
+def ignoring_overflow() -> AbstractContextManager[None]:
+    """Context in which overflow is not reported: a diverging search has infinite cost.
+
+    Returns
+    -------
+    context manager
     """
     return np.errstate(over='ignore', invalid='ignore')
 
 
-RANK = 1e-15
-"""Directions whose eigenvalue is below this share of the largest are those of rounding errors."""
+PSEUDO_INVERSE_TOLERANCE = 1e-15
+"""Relative eigenvalue below which a direction consists of rounding errors."""
 
 
-def pseudo_inverse(A: FloatArray, rank: float = RANK) -> FloatArray:
-    """Pseudo-inverses (n, k, k), scaled to unit diagonal first: units differ by decades.
+def pseudo_inverse(A: FloatArray, rank: float = PSEUDO_INVERSE_TOLERANCE) -> FloatArray:
+    """Pseudo-inverses of symmetric matrices, scaled to unit diagonal.
 
-    Directions whose eigenvalue is then below the share `rank` of the largest are left out. A
-    matrix that is not finite, of a search that ran away, has an inverse of NaN. Of full rank the
-    lower triangles count.
+    The matrices are scaled because the units of the parameters differ by decades.
+
+    Parameters
+    ----------
+    A : (n, k, k) array
+        Symmetric positive semidefinite matrices.
+    rank : float
+        Directions with an eigenvalue below this fraction of the largest are left out.
+
+    Returns
+    -------
+    (n, k, k) array
+        NaN for a matrix that is not finite, as in a diverging search. For matrices of full rank
+        only the lower triangles are read.
     """
     A = np.ascontiguousarray(A, dtype=float)
     inverse: FloatArray = np.empty_like(A)
-    # It takes a hundredth of the time of the eigenvalues.
-    if core.inverses(A, FULL_RANK, inverse):
+    # Cholesky factors take a hundredth of the time of eigenvalues.
+    if core.inverses(A, MIN_PIVOT_ROOT, inverse):
         return inverse
     finite: BoolArray = np.all(np.isfinite(A), axis=(1, 2))
     if not finite.all():
@@ -98,11 +202,11 @@ def pseudo_inverse(A: FloatArray, rank: float = RANK) -> FloatArray:
     w, V = np.linalg.eigh(A / (scale[:, :, None] * scale[:, None, :]))
     w = np.where(w > rank * w[:, -1:], w, np.inf)
     V = V / scale[:, :, None]
-    with running_away():
+    with ignoring_overflow():
         inverse = (V / w[:, None, :]) @ np.swapaxes(V, 1, 2)
     inverse[~finite] = np.nan
     return inverse
 
 
-FULL_RANK = 1e-3
-"""The least root of a pivot that is left to a matrix whose inverse needs no care."""
+MIN_PIVOT_ROOT = 1e-3
+"""Root of a pivot, at unit diagonal, above which a matrix is inverted by its Cholesky factor."""

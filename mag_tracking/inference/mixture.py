@@ -1,4 +1,4 @@
-"""Moments of a mixture of Gaussians."""
+"""Moments of a Gaussian mixture."""
 
 import numpy as np
 
@@ -7,26 +7,25 @@ from mag_tracking.arrays import FloatArray
 
 def second_moment(weights: FloatArray, differences: FloatArray,
                   covariances: FloatArray) -> FloatArray:
-    """Mean square of the error of one estimate, where each member of a mixture may be right.
+    """Mean square error of an estimate if the truth follows a Gaussian mixture.
 
     Parameters
     ----------
     weights : (n,) array
-        Of the members; they need not sum to one.
+        Weights of the components; they need not sum to one.
     differences : (n, d) array
-        Means of the members minus the estimate.
+        Means of the components minus the estimate.
     covariances : (n, d, d) array
-        Of the members.
+        Covariances of the components.
 
     Returns
     -------
     (d, d) array
-        About the estimate; a covariance where that is the mean of the mixture.
+        Second moment about the estimate; the covariance if the estimate is the mean of the mixture.
 
     References
     ----------
-    Bar-Shalom, Li and Kirubarajan 2001, Estimation with Applications to Tracking and Navigation,
-    section 1.4.16, with the estimate in place of the mean.
+    [BarShalom01]_ section 1.4.16, with the estimate in place of the mean.
     """
     w = weights / weights.sum()
     moment: FloatArray = (np.einsum('n,nij->ij', w, covariances)

@@ -1,4 +1,4 @@
-// Non-linear least squares by variable projection, from one start; least_squares.py says how.
+// Non-linear least squares by variable projection, from one starting point (least_squares.py).
 
 #pragma once
 
@@ -13,13 +13,13 @@
 
 namespace mag_tracking {
 
-// When a search ends, and which directions its inverses leave out; as in least_squares.py.
+// Stopping criteria of a search and tolerances of its pseudo-inverses, as in least_squares.py.
 struct SearchLimits {
     int n_steps;
     double tolerance, most_damping, full_rank, linear_rank, rank;
 };
 
-// A matrix (n, k) whose rows are stored with whole vectors of eight, the last numbers zero.
+// Matrix (n, k) with rows padded by zeros to a multiple of eight.
 struct Rows {
     int n, k, n_eights;
     Numbers numbers;
@@ -57,9 +57,9 @@ INLINE void subtract_product(Rows& A, Rows& B, Rows& X) {
     }
 }
 
-// Fits the measurements y (n_y), from which `nuisance` (n_y, q), whose columns are orthonormal, has
-// been projected out. A `Model` sets its basis (n_y, n_linear) for theta (n_theta), and the
-// derivative (n_y, n_theta) by theta for the linear parameters p (n_linear).
+// Fits measurements y (n_y), from which `nuisance` (n_y, q) with orthonormal columns has been
+// projected out. A `Model` writes its basis (n_y, n_linear) for theta (n_theta), and the derivative
+// (n_y, n_theta) by theta for linear parameters p (n_linear).
 template <class Model>
 class SeparableFit {
   public:
@@ -72,8 +72,8 @@ class SeparableFit {
           linear_(model.n_linear(), limits.full_rank, limits.linear_rank),
           steps_(n_theta_, limits.full_rank, limits.rank), p_(model.n_linear()) {}
 
-    // Levenberg and Marquardt from `theta`, in place. Into `covariance` (n_theta, n_theta): the
-    // pseudo-inverse of the information. Returns the cost, infinite where the start is of no use.
+    // Levenberg-Marquardt from `theta`, in place. Writes the pseudo-inverse of the information to
+    // `covariance` (n_theta, n_theta). Returns the cost, infinite for an unusable start.
     INLINE double refine(double* theta, double* covariance) {
         Point here(n_y_, n_theta_), trial(n_y_, n_theta_);
         std::vector<double> A(n_theta_ * n_theta_), inverse(A), step(n_theta_);
@@ -113,7 +113,7 @@ class SeparableFit {
         Point(int n_y, int n) : theta(n), residual(n_y), gradient(n), J(n_y, n) {}
     };
 
-    // Residuals, their derivative and cost of its theta; one of no use costs infinity.
+    // Evaluates residuals, derivative and cost at a theta; an unusable point has infinite cost.
     INLINE void evaluate(Point& at) {
         model_.set_basis(at.theta.data(), basis_);
         project(basis_, of_basis_);
@@ -141,7 +141,7 @@ class SeparableFit {
     INLINE void set_jacobian(Point& at, const double* inverse) {
         model_.set_derivative(at.theta.data(), p_.data(), at.J);
         project(at.J, of_derivative_);
-        // Kaufman's form: what the linear parameters make up for is left out.
+        // Kaufman's approximation: project out what the linear parameters compensate.
         set_product(basis_, at.J, by_basis_);
         correction_.clear();
         for (int i = 0; i < basis_.k; ++i)
@@ -162,7 +162,7 @@ class SeparableFit {
         at.J.clear();
     }
 
-    // J' J, its diagonal larger by the share `damping`: Marquardt's scaling.
+    // J' J, with its diagonal increased by the fraction `damping` (Marquardt's scaling).
     INLINE void set_information(Point& at, double damping, double* out) {
         set_product(at.J, at.J, information_);
         for (int i = 0; i < n_theta_; ++i) {
@@ -171,7 +171,7 @@ class SeparableFit {
         }
     }
 
-    // A without what the nuisance explains; `scratch` is overwritten.
+    // Projects the nuisance terms out of A; `scratch` is overwritten.
     INLINE void project(Rows& A, Rows& scratch) {
         set_product(nuisance_, A, scratch);
         subtract_product(A, nuisance_, scratch);

@@ -1,6 +1,6 @@
-"""Fits of models that are linear in most of their parameters, from many starts.
+"""Fits of models that are linear in most of their parameters, from many starting points.
 
-The model comes in as an object, so that this file is mathematics only.
+The model is passed as an object.
 """
 
 from collections.abc import Callable
@@ -11,62 +11,118 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import project_out_linear, refine
-from mag_tracking.inference.matrices import running_away
+from mag_tracking.inference.matrices import ignoring_overflow
 
 
 class SeparableModel(Protocol):
-    """Whitened measurements basis(theta) p: linear in p, not in the few theta."""
+    """Model of whitened measurements basis(theta) p: linear in p, non-linear in theta."""
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """(n, n_y, k) for theta (n, n_theta)."""
+        """Design matrices of the linear parameters.
+
+        Parameters
+        ----------
+        theta : (n, n_theta) array
+            Non-linear parameters.
+
+        Returns
+        -------
+        (n, n_y, k) array
+        """
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """d(basis(theta) p)/d(theta), (n, n_y, n_theta)."""
+        """Derivative of basis(theta) p by theta.
+
+        Parameters
+        ----------
+        theta : (n, n_theta) array
+            Non-linear parameters.
+        p : (n, k) array
+            Linear parameters.
+
+        Returns
+        -------
+        (n, n_y, n_theta) array
+        """
 
 
 class SeparableProblem:
-    """A separable model and what it is to fit; p is eliminated for every theta.
+    """A separable model and its measurements; p is eliminated for every theta.
 
     Parameters
     ----------
     model : SeparableModel
-    y : (n_y,)
-        Whitened.
-    nuisance : (n_y, q), optional
-        Further linear terms that do not depend on theta (backgrounds), whitened.
-    prior : (mean, std) of (n_theta,), optional
-        What is known of theta beforehand; an infinite deviation says nothing.
+    y : (n_y,) array
+        Whitened measurements.
+    nuisance : (n_y, q) array, optional
+        Whitened linear terms that do not depend on theta, such as backgrounds.
+    prior : (mean, std) of (n_theta,) arrays, optional
+        Gaussian prior of theta; an infinite standard deviation is no prior.
 
-    Source: variable projection with the Jacobian of Kaufman (1975); TSP14 eq. (46).
+    Attributes
+    ----------
+    energy : float
+        Sum of squares of the measurements after the fit of the nuisance terms alone.
+
+    Notes
+    -----
+    Variable projection with the Jacobian of Kaufman (1975).
+
+    References
+    ----------
+    [Kaufman75]_; [TSP14]_ eq. (46).
     """
 
     def __init__(self, model: SeparableModel, y: FloatArray, nuisance: FloatArray | None = None,
                  prior: tuple[FloatArray, FloatArray] | None = None) -> None:
         self._model = model
         self._prior = None if prior is None else _Prior(*prior)
-        # The nuisance is projected out of everything, once.
+        # The nuisance terms are projected out of model and measurements.
         self._Q = np.zeros((len(y), 0)) if nuisance is None else np.linalg.qr(nuisance)[0]
         self._y = y - self._Q @ (self._Q.T @ y)
         self.energy = float(self._y @ self._y)
-        """Sum of squares of what the nuisance alone does not explain."""
 
     def _without_nuisance(self, A: FloatArray) -> FloatArray:
-        """A (n, n_y, k) without what the nuisance explains."""
+        """Project the nuisance terms out of `A` (n, n_y, k)."""
         return A - self._Q @ (self._Q.T @ A)
 
     def cost(self, theta: FloatArray) -> FloatArray:
-        """(n,) least sum of squares for theta (n, n_theta); infinite where it is no number."""
-        with running_away():
+        """Minimum of the sum of squares over the linear parameters.
+
+        Parameters
+        ----------
+        theta : (n, n_theta) array
+            Non-linear parameters.
+
+        Returns
+        -------
+        (n,) array
+            Infinite where the model is not finite.
+        """
+        with ignoring_overflow():
             A = self._without_nuisance(self._model.basis(theta))
             p, _, _ = project_out_linear(A, self._y)
-            # Not from the residuals: a grid of starts has many, and digits enough.
+            # Cheaper than from the residuals, and accurate enough for a grid of starting points.
             cost = self.energy - np.einsum('ni,ni->n', p, self._y @ A)
             if self._prior is not None:
                 cost = cost + np.square(self._prior.residual(theta)).sum(axis=1)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals (n, n_y) and the Jacobians (n, n_y, n_theta) of what is predicted."""
+        """Residuals and Jacobians of the prediction; see `least_squares.refine`.
+
+        Parameters
+        ----------
+        theta : (n, n_theta) array
+            Non-linear parameters.
+
+        Returns
+        -------
+        residual : (n, n_y) array
+            Whitened; with a prior, its residuals are appended.
+        jacobian : (n, n_y, n_theta) array
+            Derivative of the prediction by theta.
+        """
         A = self._without_nuisance(self._model.basis(theta))
         p, residual, inverse = project_out_linear(A, self._y)
         D = self._without_nuisance(self._model.derivative(theta, p))
@@ -79,57 +135,71 @@ class SeparableProblem:
             axis=1))
 
     def linear(self, theta: FloatArray) -> FloatArray:
-        """p (k,) at theta (n_theta,)."""
+        """Best linear parameters.
+
+        Parameters
+        ----------
+        theta : (n_theta,) array
+            Non-linear parameters.
+
+        Returns
+        -------
+        (k,) array
+        """
         p: FloatArray = project_out_linear(
             self._without_nuisance(self._model.basis(theta[None])), self._y)[0][0]
         return p
 
 
 class _Prior:
-    """A Gaussian prior as whitened measurements of theta."""
+    """Gaussian prior as whitened measurements of theta."""
 
     def __init__(self, mean: FloatArray, std: FloatArray) -> None:
         self._known = np.flatnonzero(np.isfinite(std))
         self._mean, self._std = mean[self._known], std[self._known]
         self.jacobian = (np.eye(len(mean)) / std)[self._known]
-        """(n_known, n_theta)"""
+        """Derivative of the whitened measurements, (n_known, n_theta)."""
 
     def residual(self, theta: FloatArray) -> FloatArray:
-        """(n, n_known) for theta (n, n_theta)."""
+        """Whitened residuals (n, n_known) for theta (n, n_theta)."""
         left: FloatArray = (self._mean - theta[:, self._known]) / self._std
         return left
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """The lowest minimum that a search found."""
+    """Lowest minimum found by a search."""
 
     theta: FloatArray
-    """(n_theta,)."""
+    """Non-linear parameters, (n_theta,)."""
     cost: float
-    """Sum of squared whitened residuals; infinite where no start was usable."""
+    """Sum of squared whitened residuals; infinite if no starting point was usable."""
     converged: bool
+    """Whether the final search converged."""
     rivals: tuple[tuple[FloatArray, float], ...] = ()
-    """(theta, cost) of other minima that it ended in, best first."""
+    """(theta, cost) of other minima found, best first."""
 
 
 def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparableProblem,
            starts: FloatArray, apart: FloatArray,
            companions: Callable[[FloatArray], FloatArray] | None = None) -> Minimum:
-    """The lowest minimum of a separable problem, from many starts.
+    """Search the lowest minimum of a separable problem from many starting points.
 
     Parameters
     ----------
-    smooth, coarse : SeparableProblem
-        Smaller problems with nearly the same minima, the first one smoother; see `coarse_minima`.
+    smooth : SeparableProblem
+        Reduced problem with nearly the same minima, smoother than `coarse`; see `coarse_minima`.
+    coarse : SeparableProblem
+        Reduced problem with nearly the same minima.
     fine : SeparableProblem
-        The one to solve; see `fine_minimum`.
-    starts : (n, n_theta)
-    apart : (n_theta,)
-        Points differ that are farther from each other than this in any of the numbers.
-    companions : function, optional
-        Takes the best point (n_theta,) of the coarse problem, gives others (n, n_theta) whose
-        minima are often mistaken for its own; the search goes on from them, too.
+        Problem to be solved; see `fine_minimum`.
+    starts : (n, n_theta) array
+        Starting points.
+    apart : (n_theta,) array
+        Points are distinct if they differ by more than this in any parameter.
+    companions : callable, (n_theta,) array -> (n, n_theta) array, optional
+        Takes the best point of the coarse problem and returns points whose minima are often
+        mistaken for it. The search continues from them as well.
 
     Returns
     -------
@@ -146,11 +216,35 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
 def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: FloatArray,
                   apart: FloatArray, n_refined: int = 60, n_steps: int = 4,
                   n_distinct: int = 8) -> tuple[FloatArray, FloatArray]:
-    """Minima (n, n_theta) of a separable problem, and their costs (n,).
+    """Minima of a reduced separable problem.
 
-    By the `smooth` problem all `starts` (n, n_theta) are judged, and the best `n_refined` get
-    `n_steps` steps of Levenberg and Marquardt. The best `n_distinct` of those that differ by more
-    than `apart` (n_theta,) go to their minima of the `coarse` one.
+    All starting points are evaluated with the smooth problem, and the best `n_refined` are refined
+    by `n_steps` Levenberg-Marquardt steps. The best `n_distinct` distinct points are then refined
+    to minima of the coarse problem.
+
+    Parameters
+    ----------
+    smooth : SeparableProblem
+        Problem used to select starting points.
+    coarse : SeparableProblem
+        Problem whose minima are returned.
+    starts : (n, n_theta) array
+        Starting points.
+    apart : (n_theta,) array
+        Points are distinct if they differ by more than this in any parameter.
+    n_refined : int
+        Number of starting points to refine.
+    n_steps : int
+        Number of Levenberg-Marquardt steps with the smooth problem.
+    n_distinct : int
+        Maximum number of minima.
+
+    Returns
+    -------
+    theta : (n, n_theta) array
+        Minima.
+    cost : (n,) array
+        Cost of each minimum.
     """
     theta, cost = starts, smooth.cost(starts)
     theta = theta[np.argsort(cost, kind='stable')[:n_refined]]
@@ -162,10 +256,24 @@ def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: Fl
 
 def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray, apart: FloatArray,
                  n_best: int = 4) -> Minimum:
-    """The lowest minimum of a separable problem, from points `theta` (n, n_theta).
+    """Lowest minimum of a separable problem, from points near its minima.
 
-    It starts from the best `n_best` by `cost` (n,) of those that differ by more than `apart`
-    (n_theta,).
+    Parameters
+    ----------
+    fine : SeparableProblem
+        Problem to be solved.
+    theta : (n, n_theta) array
+        Starting points.
+    cost : (n,) array
+        Costs by which the starting points are ranked.
+    apart : (n_theta,) array
+        Points are distinct if they differ by more than this in any parameter.
+    n_best : int
+        Maximum number of distinct starting points.
+
+    Returns
+    -------
+    Minimum
     """
     theta = theta[distinct(theta, cost, apart, n_best)]
     theta, cost, _, converged = refine(fine.residual_and_jacobian, theta, 100, 1e-8)
@@ -180,9 +288,23 @@ def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray, ap
 
 
 def distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> IntArray:
-    """Rows of the best `most` of theta (n, n_theta) of which no two are the same point.
+    """Select the best distinct points.
 
-    Points differ that are farther from each other than `apart` (n_theta,) in any of the numbers.
+    Parameters
+    ----------
+    theta : (n, n_theta) array
+        Points.
+    cost : (n,) array
+        Costs by which the points are ranked.
+    apart : (n_theta,) array
+        Points are distinct if they differ by more than this in any parameter.
+    most : int
+        Maximum number of points.
+
+    Returns
+    -------
+    (k,) int array
+        Rows of the selected points, best first.
     """
     kept: list[int] = []
     for row in np.argsort(cost, kind='stable').tolist():

@@ -1,4 +1,4 @@
-// Covariances in rows of whole vectors of eight, and the part of them that an update changes.
+// Covariances with rows padded to a multiple of eight, and the part that an update changes.
 
 #pragma once
 
@@ -9,15 +9,14 @@
 
 namespace mag_tracking {
 
-// With shorter rows, copying takes longer than updating the whole covariance.
+// Minimum row length, in vectors of eight, at which updating half of the covariance is faster.
 constexpr int HALVED_FROM = 10;
 
-// How many states there are. Rows of a state's length are stored with `wide` numbers, the last of
-// which are zero, so that they are whole vectors of eight.
+// Numbers of states. Rows of n_x states are padded by zeros to `wide` elements, a multiple of
+// eight.
 struct Sizes {
     int n_x, n_t, n_own, n_sensors, wide, n_eights;
-    // Updates skip half of the covariance: of rows that are not the target's, all before the
-    // diagonal block.
+    // Updates skip half of the covariance: in rows of sensor states, all before the diagonal block.
     bool is_halved;
 
     Sizes(int n_t_, int n_own_, int n_sensors_)
@@ -26,9 +25,9 @@ struct Sizes {
           is_halved(n_eights >= HALVED_FROM) {}
 
     INLINE int n_seen() const { return n_t + n_own; }
-    // First of the states of sensor j that only it sees.
+    // First of the own states of sensor j.
     INLINE int own(int j) const { return n_t + n_own * j; }
-    // State that belongs to column c of the derivative of sensor j.
+    // State of column c of the derivative of sensor j.
     INLINE int seen(int j, int c) const { return c < n_t ? c : c + n_own * j; }
     INLINE int background(int j) const { return n_x - 3 * (n_sensors - j); }
     INLINE std::size_t square() const { return std::size_t(n_x) * wide; }
@@ -36,13 +35,12 @@ struct Sizes {
     INLINE int first_eight(int i) const { return is_halved && i >= n_t ? i / EIGHT : 0; }
 };
 
-// A covariance (n_x, n_x) of others into one of rows that are `wide`, and back. Rows are too short
-// for a call of memcpy.
+// Copies n rows of n elements between row lengths. Rows are too short for calls of memcpy.
 INLINE void copy_rows(const double* from, int from_row, double* to, int to_row, int n) {
     for (int i = 0; i < n; ++i, from += from_row, to += to_row) {
         int k = 0;
         for (; k + EIGHT <= n; k += EIGHT) std::memcpy(to + k, from + k, sizeof(Eight));
-        // The rest, once more with what is before it.
+        // Copy the remainder together with elements before it, as one vector of eight.
         if (k < n && n >= EIGHT)
             std::memcpy(to + n - EIGHT, from + n - EIGHT, sizeof(Eight));
         else
@@ -52,7 +50,7 @@ INLINE void copy_rows(const double* from, int from_row, double* to, int to_row, 
 
 INLINE void to_wide(const double* from, const Sizes& n, double* to) {
     copy_rows(from, n.n_x, to, n.wide, n.n_x);
-    // What is beyond the states takes part in sums: NaN that a hypothesis before left is not zero.
+    // The padding takes part in sums and may hold NaN from the previous hypothesis.
     for (int i = 0; i < n.n_x; ++i)
         for (int k = n.n_x; k < n.wide; ++k) to[i * n.wide + k] = 0.0;
 }
@@ -61,7 +59,7 @@ INLINE void from_wide(const double* from, const Sizes& n, double* to) {
     copy_rows(from, n.wide, to, n.n_x, n.n_x);
 }
 
-// Copies the numbers of rows [first, last) that an update has skipped from the columns.
+// Fills the elements of rows [first, last) that an update has skipped from the columns.
 INLINE void complete_rows(double* P, const Sizes& n, int first, int last) {
     for (int k = 0; k < (last - 1) / EIGHT * EIGHT; ++k)
         for (int i = std::max(first, (k / EIGHT + 1) * EIGHT); i < last; ++i)
@@ -74,8 +72,8 @@ INLINE void complete_rows(double* P, const Sizes& n, int first, int last) {
 #define SHUFFLED(a, b, ...) __builtin_shuffle(a, b, Indices{__VA_ARGS__})
 #endif
 
-// Transposes a block (8, 8) of rows that are `row` numbers apart: swaps elements between rows 1, 2
-// and 4 apart.
+// Transposes a block (8, 8) with a row length of `row`, by swapping elements between rows 1, 2 and
+// 4 apart.
 INLINE void transpose_block(const double* from, double* to, int row) {
     using Indices [[maybe_unused]] = long long __attribute__((vector_size(64)));
     Eight block[EIGHT];
@@ -100,7 +98,7 @@ INLINE void transpose_block(const double* from, double* to, int row) {
 
 #undef SHUFFLED
 
-// Copies all that an update has skipped.
+// Fills all elements that an update has skipped.
 INLINE void complete(double* P, const Sizes& n) {
     if (!n.is_halved) return;
     for (int i = n.n_t / EIGHT * EIGHT; i < n.n_x; i += EIGHT) {

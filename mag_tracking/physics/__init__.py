@@ -1,1 +1,1 @@
-"""Fields, sources and motion: mathematics in arrays, without ROS."""
+"""Magnetic fields, source models and motion models: array mathematics without ROS."""

@@ -1,4 +1,4 @@
-// Anderson functions of one pass; anderson.py says what they are.
+// Anderson functions of one pass, as defined in anderson.py.
 
 #pragma once
 
@@ -9,11 +9,12 @@
 
 namespace mag_tracking {
 
-constexpr int N_ANDERSON = 4;  // Three functions, and a constant.
+constexpr int N_ANDERSON = 4;  // Three functions and a constant.
 
-// A constant and the Anderson functions of `n` times t [s], one after the other (4, n).
+// A constant and the three Anderson functions at `n` times t [s]: (4, n). `time` [s] is that of
+// the closest point of approach, `scale` [s] the range there over the speed.
 //
-// Source: TSP14 eq. (23), with the exponent 5/2.
+// TSP14 eq. (23), with the exponent 5/2.
 inline std::vector<double> anderson_functions(const double* t, std::size_t n, double time,
                                               double scale) {
     std::vector<double> f(N_ANDERSON * n);
@@ -29,9 +30,9 @@ inline std::vector<double> anderson_functions(const double* t, std::size_t n, do
     return f;
 }
 
-// Sum of products of `n` numbers; each of `b` is `stride` behind the one before.
+// Dot product of `n` elements; those of `b` are `stride` apart.
 INLINE double dot(const double* a, const double* b, std::size_t n, std::size_t stride = 1) {
-    // Four sums: an addition does not wait for the one before it.
+    // Four independent sums, so that an addition does not wait for the previous one.
     double sums[4] = {};
     std::size_t i = 0;
     for (; i + 4 <= n; i += 4)
@@ -40,8 +41,8 @@ INLINE double dot(const double* a, const double* b, std::size_t n, std::size_t s
     return (sums[0] + sums[1]) + (sums[2] + sums[3]);
 }
 
-// Sum of squares of y (n, k) that a pass leaves over; the functions are made orthonormal one after
-// the other.
+// Residual sum of squares of y (n, k) after a fit of the functions to each column. The functions
+// are orthonormalised one after the other (Gram-Schmidt).
 inline double anderson_residual(const double* t, const double* y, std::size_t n, std::size_t k,
                                 double time, double scale) {
     std::vector<double> f = anderson_functions(t, n, time, scale);
@@ -49,7 +50,7 @@ inline double anderson_residual(const double* t, const double* y, std::size_t n,
     for (int m = 0; m < N_ANDERSON; ++m) {
         double* f_m = f.data() + m * n;
         const double size = dot(f_m, f_m, n);
-        // Twice: once leaves what rounding adds.
+        // Orthogonalise twice to remove rounding errors.
         for (int again = 0; again < 2; ++again)
             for (int earlier = 0; earlier < m; ++earlier) {
                 const double* other = f.data() + earlier * n;
@@ -57,7 +58,7 @@ inline double anderson_residual(const double* t, const double* y, std::size_t n,
                 for (std::size_t i = 0; i < n; ++i) f_m[i] -= along * other[i];
             }
         const double rest = dot(f_m, f_m, n);
-        // A function that the others make up adds nothing.
+        // A function that depends linearly on the previous ones contributes nothing.
         const double factor = rest > 1e-20 * size ? 1.0 / std::sqrt(rest) : 0.0;
         for (std::size_t i = 0; i < n; ++i) f_m[i] *= factor;
         for (std::size_t column = 0; column < k; ++column) {

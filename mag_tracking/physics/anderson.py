@@ -1,7 +1,7 @@
-"""A dipole that passes a sensor on a straight line, in the Anderson functions.
+"""Field of a dipole on a straight pass, expanded in Anderson functions.
 
-Positions are target minus sensor, as in TSP14; the field of a dipole is even in
-them. One pass at a time.
+Positions are target minus sensor, as in TSP14; the field of a dipole is an even function of
+position. Each function evaluates one pass.
 """
 
 import numpy as np
@@ -13,23 +13,30 @@ from mag_tracking.physics.dipole import K_DIPOLE
 
 
 def anderson_functions(tau: ArrayLike) -> FloatArray:
-    """The three Anderson functions tau^n / (tau^2 + 1)^(5/2), n = 0, 1, 2.
+    """Anderson functions tau^n / (tau^2 + 1)^(5/2) for n = 0, 1, 2.
 
     Parameters
     ----------
-    tau : (...)
-        Time from the closest approach, in units of its range over the speed.
+    tau : (...) array
+        Dimensionless time from the closest point of approach (CPA): (t - t_cpa) times speed over
+        CPA range.
 
     Returns
     -------
-    (..., 3)
-        The middle one is odd and orthogonal to the others; those two are not
-        orthogonal to each other, against what TSP14 says.
+    (..., 3) array
+        The function of n = 1 is odd and orthogonal to the other two. The other two are not
+        orthogonal to each other, contrary to TSP14.
 
-    Source: TSP14 eq. (23), corrected: the exponent is 5/2, printed is n/2.
+    Notes
+    -----
+    The exponent is 5/2; TSP14 prints n/2.
+
+    References
+    ----------
+    [TSP14]_ eq. (23).
     """
     tau = np.asarray(tau, dtype=float)
-    # Powers of 1/(tau^2 + 1) and of tau/sqrt(tau^2 + 1), which cannot overflow.
+    # Powers of 1/(tau^2 + 1) and of tau/sqrt(tau^2 + 1) cannot overflow.
     cosine = 1.0 / np.hypot(tau, 1.0)
     sine = tau * cosine
     f: FloatArray = cosine[..., None]**3 * np.stack([cosine**2, sine * cosine, sine**2], axis=-1)
@@ -37,36 +44,41 @@ def anderson_functions(tau: ArrayLike) -> FloatArray:
 
 
 def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatArray]:
-    """Closest point of approach of a straight pass.
+    """Closest point of approach (CPA) of a straight pass at constant velocity.
 
     Parameters
     ----------
-    r0 : (3,) [m]
-        Target minus sensor position at time zero.
-    v0 : (3,) [m/s]
+    r0 : (3,) array, m
+        Position of the target relative to the sensor at time zero.
+    v0 : (3,) array, m/s
         Velocity of the target.
 
     Returns
     -------
-    time : float [s]
-    range : float [m]
-        Zero where the line goes through the sensor, r0 parallel to v0; to
-        rounding, a range below 1e-15 |r0| is taken as zero.
-    r_cpa : (3,) [m]
-        Target minus sensor position at that time, perpendicular to v0.
+    t_cpa : float, s
+        Time of the CPA, from time zero.
+    distance : float, m
+        Range at the CPA. Zero if r0 is parallel to v0; a range below 1e-15 ‖r0‖ is rounded to zero.
+    r_cpa : (3,) array, m
+        Position of the target relative to the sensor at the CPA, perpendicular to v0.
 
-    Raises ValueError where v0 is zero or not finite.
+    Raises
+    ------
+    ValueError
+        If `v0` is zero or not finite, or if a shape is not (3,).
 
-    Source: TSP14 eq. (24).
+    References
+    ----------
+    [TSP14]_ eq. (24).
     """
-    r0, v0 = _vector('r0', r0), _vector('v0', v0)
+    r0, v0 = _checked_vector('r0', r0), _checked_vector('v0', v0)
     speed = np.linalg.norm(v0)
     if not 0.0 < speed < np.inf:
-        raise ValueError(f'v0 has to be finite and not zero, got {v0.tolist()}')
+        raise ValueError(f'v0 must be finite and non-zero, got {v0.tolist()}')
     direction = v0 / speed
     path = -(r0 @ direction)
     r_cpa = r0 + path * direction
-    # Once more, since the difference keeps a share along v0 of the rounding of r0.
+    # Project twice: the difference still has a component along v0 from the rounding of r0.
     r_cpa -= (r_cpa @ direction) * direction
     distance = float(np.linalg.norm(r_cpa))
     if distance <= 1e-15 * np.linalg.norm(r0):
@@ -79,32 +91,43 @@ def anderson_coefficients(r_cpa: ArrayLike, v0: ArrayLike, m: ArrayLike) -> Floa
 
     Parameters
     ----------
-    r_cpa : (3,) [m]
-        Target minus sensor position at the closest approach.
-    v0 : (3,) [m/s]
-        Velocity of the target; only its direction counts.
-    m : (3,) [A m^2]
+    r_cpa : (3,) array, m
+        Position of the target relative to the sensor at the closest point of approach.
+    v0 : (3,) array, m/s
+        Velocity of the target; only its direction matters.
+    m : (3,) array, A m²
         Dipole moment.
 
     Returns
     -------
-    (3, 3) [T]
-        The field is this matrix times the Anderson functions; NaN where r_cpa is
-        zero.
+    (3, 3) array, T
+        Matrix C of the field B = C f(tau), with the functions f of `anderson_functions`. NaN if
+        `r_cpa` is zero.
 
-    Raises ValueError where v0 is zero or r_cpa not perpendicular to it (1e-6).
+    Raises
+    ------
+    ValueError
+        If `v0` is zero or not finite, if the cosine between `r_cpa` and `v0` exceeds 1e-6, or if a
+        shape is not (3,).
 
-    Source: TSP14 eq. (25)-(26), corrected: (25c) has a plus between its terms.
+    Notes
+    -----
+    The two terms of TSP14 eq. (25c) are added; the printed sign is wrong.
+
+    References
+    ----------
+    [TSP14]_ eq. (25), (26).
     """
-    r_cpa, v0, m = _vector('r_cpa', r_cpa), _vector('v0', v0), _vector('m', m)
+    r_cpa, v0, m = (_checked_vector('r_cpa', r_cpa), _checked_vector('v0', v0),
+                    _checked_vector('m', m))
     distance, speed = np.linalg.norm(r_cpa), np.linalg.norm(v0)
     if not 0.0 < speed < np.inf:
-        raise ValueError(f'v0 has to be finite and not zero, got {v0.tolist()}')
+        raise ValueError(f'v0 must be finite and non-zero, got {v0.tolist()}')
     if distance == 0.0:
         return np.full((3, 3), np.nan)
     r, v = r_cpa / distance, v0 / speed
     if abs(r @ v) > 1e-6:
-        raise ValueError('r_cpa has to be perpendicular to v0; the cosine between them is '
+        raise ValueError('r_cpa must be perpendicular to v0; the cosine between them is '
                          f'{r @ v:.3g}')
     c1 = 3 * (r @ m) * r - m
     c2 = 3 * (r @ m) * v + 3 * (v @ m) * r
@@ -113,28 +136,33 @@ def anderson_coefficients(r_cpa: ArrayLike, v0: ArrayLike, m: ArrayLike) -> Floa
 
 
 def anderson_field(t: ArrayLike, r0: ArrayLike, v0: ArrayLike, m: ArrayLike) -> FloatArray:
-    """Flux density at the sensor of a dipole on a straight pass.
+    """Flux density of a dipole on a straight pass, at the sensor.
 
     Parameters
     ----------
-    t : (...) [s]
-        Times, from the one at which the target is at `r0`.
-    r0 : (3,) [m]
-        Target minus sensor position at time zero.
-    v0 : (3,) [m/s]
+    t : (...) array, s
+        Time; the target is at `r0` at t = 0.
+    r0 : (3,) array, m
+        Position of the target relative to the sensor at time zero.
+    v0 : (3,) array, m/s
         Velocity of the target.
-    m : (3,) [A m^2]
+    m : (3,) array, A m²
         Dipole moment, constant.
 
     Returns
     -------
-    (..., 3) [T]
-        The dipole field, written in other terms. NaN at all times where the line
-        goes through the sensor: the expansion has no scale there.
+    (..., 3) array, T
+        Equal to `dipole.dipole_field`. NaN at all times if the path goes through the sensor: the
+        expansion has no scale there.
 
-    Raises ValueError where v0 is zero.
+    Raises
+    ------
+    ValueError
+        If `v0` is zero or not finite, or if a shape is not (3,).
 
-    Source: TSP14 eq. (22), without the background B0.
+    References
+    ----------
+    [TSP14]_ eq. (22), without the background B0.
     """
     t_cpa, distance, r_cpa = closest_approach(r0, v0)
     C = anderson_coefficients(r_cpa, v0, m)
@@ -145,31 +173,34 @@ def anderson_field(t: ArrayLike, r0: ArrayLike, v0: ArrayLike, m: ArrayLike) -> 
 
 
 def anderson_residual(t: FloatArray, y: FloatArray, time: float, scale: float) -> float:
-    """What is left of a measured field without the Anderson functions of a pass and a constant.
+    """Residual sum of squares after a fit of Anderson functions and a constant.
 
     Parameters
     ----------
-    t : (n,) [s]
-    y : (n, k)
-        Fields, whitened; contiguous.
-    time : float [s]
-        Of the closest approach.
-    scale : float [s]
-        Range at the closest approach over the speed.
+    t : (n,) array, s
+        Timestamps.
+    y : (n, k) array
+        Whitened field, contiguous.
+    time : float, s
+        Time of the closest point of approach (CPA).
+    scale : float, s
+        Range at the CPA over the speed.
 
     Returns
     -------
     float
-        Sum of squares of `y`, where the functions are fitted to each of its columns.
+        Each column of `y` is fitted separately.
 
-    Source: TSP14 eq. (22), (23), with the exponent 5/2.
+    References
+    ----------
+    [TSP14]_ eq. (22), (23), with the exponent 5/2.
     """
     return core.anderson_residual(t, y, time, scale)
 
 
-def _vector(name: str, value: ArrayLike) -> FloatArray:
-    """The value as a vector of three."""
+def _checked_vector(name: str, value: ArrayLike) -> FloatArray:
+    """Convert `value` to a (3,) array; raise ValueError for any other shape."""
     value = np.asarray(value, dtype=float)
     if value.shape != (3,):
-        raise ValueError(f'{name} needs the shape (3,), got {value.shape}')
+        raise ValueError(f'{name} must have shape (3,), got {value.shape}')
     return value

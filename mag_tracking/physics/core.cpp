@@ -1,4 +1,4 @@
-// What of the physics is compiled, as a Python module. The modules beside it are its only users.
+// Python module of the compiled physics, for the Python modules in this folder.
 
 #include <algorithm>
 
@@ -18,7 +18,7 @@ namespace {
 
 using Shape = std::vector<Size>;
 
-// The shape of rows of vectors (..., 3).
+// Shape (..., 3) of an array; raises ValueError for another length of the last axis.
 Shape rows_of(const Array& array, const char* name) {
     if (array.ndim() < 1 || array.shape(array.ndim() - 1) != 3)
         throw py::value_error(std::string(name) + ": needs a last axis of length 3");
@@ -119,7 +119,7 @@ py::tuple mounted_fields(const Array& h, const Array& H, const Array& angles) {
 
 py::tuple turned(const Array& x, double dt, double mean, double fading) {
     const Size n = length_of(x, "x", 2), n_x = x.shape(1);
-    if (n_x < 7) throw py::value_error("x: needs position, velocity and turn rate");
+    if (n_x < 7) throw py::value_error("x: must hold position, velocity and turn rate");
     const double* from = input_of(x, "x", {n, n_x});
     Array moved({n, n_x}), F({n, n_x, n_x});
     double *to = moved.mutable_data(), *F_ = F.mutable_data();
@@ -140,11 +140,11 @@ py::tuple turned(const Array& x, double dt, double mean, double fading) {
     return py::make_tuple(moved, F);
 }
 
-// Raises ValueError where states `x` (n, n_x) do not hold those of `n_dipoles`.
+// Raises ValueError if the states `x` (n, n_x) are too few for `n_dipoles` dipoles.
 void check_vehicles(const Array& x, int n_dipoles) {
     length_of(x, "x", 2);
     if (n_dipoles < 1 || x.shape(1) < 9 + 3 * Size(n_dipoles) + (n_dipoles > 1))
-        throw py::value_error("x: not the states of " + std::to_string(n_dipoles) + " dipoles");
+        throw py::value_error("x: too few states for " + std::to_string(n_dipoles) + " dipoles");
 }
 
 py::tuple row_dipoles(const Array& x, int n_dipoles, const Array& induction) {
@@ -167,11 +167,11 @@ py::tuple row_dipoles(const Array& x, int n_dipoles, const Array& induction) {
     return py::make_tuple(r, m, dr_dx, dm_dx);
 }
 
-// Writes the process noise of the hard iron moments into Q (n, n_x, n_x): `walk` (3 d, 3 d) times
-// the squared size of the iron.
+// Writes the process noise of the hard iron moments to Q (n, n_x, n_x): `walk` (3 d, 3 d) times
+// the squared magnitude of the iron.
 void set_moment_noise(const Array& x, const Array& walk, double induction2, Array Q) {
     const Size k = length_of(walk, "walk", 2);
-    if (k % 3) throw py::value_error("walk: not of whole moments");
+    if (k % 3) throw py::value_error("walk: length must be a multiple of 3");
     check_vehicles(x, int(k / 3));
     const Size n = x.shape(0), n_x = x.shape(1);
     const double *x_ = input_of(x, "x", {n, n_x}), *walk_ = input_of(walk, "walk", {k, k});
@@ -225,14 +225,14 @@ Array row_derivatives(const Array& theta, const Array& moments, const Array& pla
     return D;
 }
 
-// The clock of each of `n` samples; raises ValueError for one that is not in `theta`.
+// Clock of each of `n` samples; raises ValueError for a clock that is not in `theta`.
 const std::int64_t* clocks_of(const Integers& clock, Size n, const Array& theta) {
     length_of(theta, "theta", 2);
     const Size n_clocks = theta.shape(1) - N_PATH;
-    if (n_clocks < 0) throw py::value_error("theta: not path and clocks");
+    if (n_clocks < 0) throw py::value_error("theta: must hold path and clock offsets");
     const std::int64_t* clocks = input_of(clock, "clock", {n});
     for (Size s = 0; s < n; ++s)
-        if (clocks[s] >= n_clocks) throw py::value_error("clock: more than theta has");
+        if (clocks[s] >= n_clocks) throw py::value_error("clock: index beyond the clocks in theta");
     return clocks;
 }
 
@@ -283,7 +283,7 @@ double residual(const Array& t, const Array& y, double time, double scale) {
 
 PYBIND11_MODULE(core, module) {
     using namespace mag_tracking;
-    module.doc() = "The physics, compiled; the modules of the package are its users.";
+    module.doc() = "Compiled physics, used by the modules of this package.";
     module.attr("K_DIPOLE") = K_DIPOLE;
     module.attr("PATH") = py::tuple(py::cast(std::vector<std::string>(PATH, PATH + N_PATH)));
     module.def("dipole_field", &dipole_field, IN(d), IN(m));

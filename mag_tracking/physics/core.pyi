@@ -1,6 +1,6 @@
-"""The physics, compiled; the modules that are called like the functions say what they do.
+"""Compiled physics; the Python function of the same name documents each function.
 
-Arrays have to be contiguous. Raises ValueError where their shapes do not fit each other.
+Arrays must be C-contiguous. ValueError is raised if their shapes do not match.
 """
 
 from mag_tracking.arrays import FloatArray, IntArray

@@ -1,4 +1,4 @@
-// The magnetic dipole: field and derivatives.
+// The magnetic dipole: flux density and derivatives.
 
 #pragma once
 
@@ -8,14 +8,14 @@
 
 namespace mag_tracking {
 
-constexpr double K_DIPOLE = 1e-7;  // mu0 / 4 pi [T m / A]
+constexpr double K_DIPOLE = 1e-7;  // mu0 / (4 pi) [T m/A]
 
-// Field and derivatives of one dipole, TSP14 eq. (2), (30a), (30b), with the factor mu0 / 4 pi.
-// All are NaN where |d| = 0.
+// Field and derivatives of one dipole, TSP14 eq. (2), (30a), (30b), with the factor mu0 / (4 pi).
+// All are NaN at d = 0.
 struct Dipole {
     double d[3], m[3], inv2, k3, b, e, g;
 
-    // `d_` [m] from the dipole to the sensor, `m_` its moment [A m^2].
+    // `d_` [m] is the position of the sensor relative to the dipole, `m_` the moment [A m^2].
     INLINE Dipole(const double (&d_)[3], const double (&m_)[3]) {
         for (int a = 0; a < 3; ++a) d[a] = d_[a], m[a] = m_[a];
         inv2 = 1.0 / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
@@ -40,7 +40,7 @@ struct Dipole {
             }
     }
 
-    // Row `R` (3) times dB/dd, and times dB/dm.
+    // Row `R` (3) times dB/dd and dB/dm.
     INLINE void rows(const double* R, double (&by_place)[3], double (&by_moment)[3]) const {
         const double ud = R[0] * d[0] + R[1] * d[1] + R[2] * d[2];
         const double um = R[0] * m[0] + R[1] * m[1] + R[2] * m[2];
@@ -51,13 +51,13 @@ struct Dipole {
         }
     }
 
-    // [T/m] mu0/4pi |m| / |d|^4.
+    // Field gradient scale mu0/(4 pi) |m| / |d|^4 [T/m].
     INLINE double gradient() const {
         return K_DIPOLE * std::sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2]) * inv2 * inv2;
     }
 };
 
-// Field of unit moments at `d`, turned by M (3, 3), into 3 columns of A (3, stride).
+// Writes the field of unit moments at `d`, multiplied by M (3, 3), to 3 columns of A (3, stride).
 INLINE void set_unit_fields(const double (&d)[3], const double* M, double* A, int stride) {
     const Dipole dipole(d, {0.0, 0.0, 0.0});
     for (int a = 0; a < 3; ++a) {

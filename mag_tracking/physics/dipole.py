@@ -1,4 +1,4 @@
-"""The magnetic dipole: field and derivatives."""
+"""The magnetic dipole: flux density and derivatives."""
 
 import math
 
@@ -9,42 +9,53 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.physics import core
 
 MU0 = 4e-7 * math.pi
-"""Vacuum permeability [T m / A], the value of the source documents."""
+"""Vacuum permeability [T m/A]; 4e-7 pi, as in the cited papers."""
 
 K_DIPOLE = core.K_DIPOLE
-"""mu0 / 4 pi [T m / A]."""
+"""mu0 / (4 pi) [T m/A]."""
 
 
 def sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: FloatArray,
                   dr_dx: FloatArray, dm_dx: FloatArray
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Field of moving dipoles at fixed sensors, with its derivative by the state.
+    """Field of moving dipoles at fixed sensors, and its derivative by the target state.
 
     Parameters
     ----------
-    positions : (n_sensors, 3) [m], world
-    R_sw : (n_sensors, 3, 3)
-        Rotations world to sensor.
-    r, m : (n_hyp, n_dipoles, 3) [m], [A m^2], world
-        Positions and moments.
-    dr_dx, dm_dx : (n_hyp, n_dipoles, 3, n_t)
-        Their derivatives by the target state.
+    positions : (n_sensors, 3) array, m, world frame
+        Sensor positions.
+    R_sw : (n_sensors, 3, 3) array
+        Rotation from the world frame to each sensor frame.
+    r : (n_hyp, n_dipoles, 3) array, m, world frame
+        Dipole positions.
+    m : (n_hyp, n_dipoles, 3) array, A m², world frame
+        Dipole moments.
+    dr_dx : (n_hyp, n_dipoles, 3, n_t) array
+        Derivative of `r` by the target state.
+    dm_dx : (n_hyp, n_dipoles, 3, n_t) array
+        Derivative of `m` by the target state.
 
     Returns
     -------
-    h : (n_hyp, n_sensors, 3) [T], sensor frame
-    H : (n_hyp, n_sensors, 3, n_t)
-    gradient : (n_hyp, n_sensors) [T/m]
-        Sum of mu0/4pi |m| / |d|^4: the size of the first neglected multipole term
-        for dipoles that stand for one metre each (ICASSP11 eq. (9)). Neighbours in a
-        body err alike, so sizes are added and not squares.
-        NaN and infinite where a dipole sits on a sensor.
+    h : (n_hyp, n_sensors, 3) array, T, sensor frame
+        Field, summed over the dipoles.
+    H : (n_hyp, n_sensors, 3, n_t) array
+        Derivative of `h` by the target state.
+    gradient : (n_hyp, n_sensors) array, T/m
+        Sum of mu0/(4 pi) ‖m‖ / ‖d‖^4 over the dipoles, d the vector from dipole to sensor. It is
+        the magnitude of the first neglected multipole term per metre of body that a dipole
+        represents. Magnitudes are added, not squares, because the errors of adjacent dipoles of one
+        body are alike. All outputs are NaN or infinite if a dipole is at a sensor.
+
+    References
+    ----------
+    [ICASSP11]_ eq. (9).
     """
     return core.sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx)
 
 
-def _alike(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Both in the shape that they broadcast to."""
+def _broadcast_pair(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Broadcast `r` and `m` to one shape (..., 3), contiguous."""
     r, m = np.broadcast_arrays(np.asarray(r, dtype=float), np.asarray(m, dtype=float))
     if r.shape[-1:] != (3,):
         raise ValueError(f'r and m need a last axis of length 3, got {r.shape}')
@@ -56,38 +67,52 @@ def dipole_field(r: ArrayLike, m: ArrayLike) -> FloatArray:
 
     Parameters
     ----------
-    r : (..., 3) [m], world
-        Sensor minus source position.
-    m : (..., 3) [A m^2], world
+    r : (..., 3) array, m, world frame
+        Position of the sensor relative to the source.
+    m : (..., 3) array, A m², world frame
         Dipole moment; broadcasts against `r`.
 
     Returns
     -------
-    (..., 3) [T], world
-        NaN where |r| = 0.
+    (..., 3) array, T, world frame
+        NaN at r = 0.
 
-    Source: TSP14 eq. (2).
+    Raises
+    ------
+    ValueError
+        If the last axis is not of length 3, or if `r` and `m` do not broadcast.
+
+    References
+    ----------
+    [TSP14]_ eq. (2).
     """
-    return core.dipole_field(*_alike(r, m))
+    return core.dipole_field(*_broadcast_pair(r, m))
 
 
 def dipole_jacobians(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of the dipole field.
+    """Derivatives of the flux density of a point dipole.
 
     Parameters
     ----------
-    r : (..., 3) [m], world
-        Sensor minus source position.
-    m : (..., 3) [A m^2], world
+    r : (..., 3) array, m, world frame
+        Position of the sensor relative to the source.
+    m : (..., 3) array, A m², world frame
         Dipole moment; broadcasts against `r`.
 
     Returns
     -------
-    dB_dr : (..., 3, 3) [T/m]
-        With respect to `r`; the one with respect to the source is its negative.
-    dB_dm : (..., 3, 3) [T/(A m^2)]
-        Both symmetric; NaN where |r| = 0.
+    dB_dr : (..., 3, 3) array, T/m
+        Symmetric. The derivative by the source position is its negative. NaN at r = 0.
+    dB_dm : (..., 3, 3) array, T/(A m²)
+        Symmetric. NaN at r = 0.
 
-    Source: TSP14 eq. (30a), (30b), with the factor mu0/4pi.
+    Raises
+    ------
+    ValueError
+        If the last axis is not of length 3, or if `r` and `m` do not broadcast.
+
+    References
+    ----------
+    [TSP14]_ eq. (30a), (30b), with the factor mu0/(4 pi).
     """
-    return core.dipole_jacobians(*_alike(r, m))
+    return core.dipole_jacobians(*_broadcast_pair(r, m))

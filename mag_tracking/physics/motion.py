@@ -1,8 +1,8 @@
-"""Motion models, exactly discretised; a turn at a rate that stays as it is.
+"""Motion models in exact discretisation: constant velocity and coordinated turn.
 
-Only the exact form of the process noise is supported: white noise drives the
-highest derivative in continuous time. (T10 eq. (4.2) and ICASSP11 eq. (2)
-hold it constant over a sample, and PHD15 Paper A eq. (18) is misprinted.)
+Process noise is exact as well: continuous white noise drives the highest derivative. T10 eq. (4.2)
+and ICASSP11 eq. (2) hold the noise constant over a sample instead, and PHD15 Paper A eq. (18) is
+misprinted.
 """
 
 import numpy as np
@@ -15,20 +15,23 @@ _INTEGRAL, _RATE = np.arange(3), np.arange(3, 6)
 
 
 def integrator_noise(dt: float, density: ArrayLike) -> FloatArray:
-    """Process noise of a double integrator driven by white noise.
+    """Process noise covariance of a double integrator driven by white noise.
 
     Parameters
     ----------
-    dt : float [s]
-    density : (3,) [unit^2/s^3]
-        Spectral density of the second derivative, per axis.
+    dt : float, s
+    density : (3,) array, unit²/s³
+        Power spectral density of the second derivative, per axis.
 
     Returns
     -------
-    (6, 6)
-        density * [[T^3/3, T^2/2], [T^2/2, T]], first three rows the integral.
+    (6, 6) array
+        Per axis, density * [[dt^3/3, dt^2/2], [dt^2/2, dt]]. The first three rows belong to the
+        integral, the last three to its rate.
 
-    Source: PHD15 Paper A eq. (24), the form that (18) should have.
+    References
+    ----------
+    [PHD15]_ Paper A eq. (24), the correct form of eq. (18).
     """
     Q, density = np.zeros((6, 6)), np.asarray(density, dtype=float)
     Q[_INTEGRAL, _INTEGRAL] = density * (dt**3 / 3.0)
@@ -38,38 +41,64 @@ def integrator_noise(dt: float, density: ArrayLike) -> FloatArray:
 
 
 def constant_velocity(dt: float) -> FloatArray:
-    """Transition matrix (6, 6) of position and velocity over `dt` seconds."""
+    """Transition matrix of position and velocity at constant velocity.
+
+    Parameters
+    ----------
+    dt : float, s
+
+    Returns
+    -------
+    (6, 6) array
+    """
     F = np.eye(6)
     F[_INTEGRAL, _RATE] = dt
     return F
 
 
 def coordinated_turn(x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Turn the horizontal velocity at a constant rate, and move along the arc.
+    """Propagate states along an arc: the horizontal velocity rotates at a constant rate.
 
     Parameters
     ----------
-    x : (n, n_x)
-        States that begin with position [m] and velocity [m/s] and end with the rate [rad/s],
-        anticlockwise seen from above.
-    dt : float [s]
+    x : (n, n_x) array
+        States. The first six are position [m] and velocity [m/s], the last is the turn rate
+        [rad/s], anticlockwise seen from above.
+    dt : float, s
 
     Returns
     -------
-    moved : (n, n_x)
-    F : (n, n_x, n_x)
-        Its derivative.
+    moved : (n, n_x) array
+        States after `dt`.
+    F : (n, n_x, n_x) array
+        Derivative of `moved` by `x`.
 
-    Source: Bar-Shalom, Li and Kirubarajan 2001, Estimation with Applications to Tracking and
-    Navigation, section 11.7.
+    References
+    ----------
+    [BarShalom01]_ section 11.7.
     """
     return fading_turn(x, dt, 1.0, 1.0)
 
 
 def fading_turn(x: FloatArray, dt: float, mean: float, fading: float
                 ) -> tuple[FloatArray, FloatArray]:
-    """As `coordinated_turn`, at a rate that changes.
+    """Propagate states along an arc with a turn rate that decays.
 
-    Over `dt` its mean is `mean` times that at the beginning; at the end it is `fading` times that.
+    Parameters
+    ----------
+    x : (n, n_x) array
+        States, as for `coordinated_turn`.
+    dt : float, s
+    mean : float
+        Mean turn rate over `dt`, relative to the initial rate.
+    fading : float
+        Turn rate after `dt`, relative to the initial rate.
+
+    Returns
+    -------
+    moved : (n, n_x) array
+        States after `dt`.
+    F : (n, n_x, n_x) array
+        Derivative of `moved` by `x`.
     """
     return core.turned(np.ascontiguousarray(x, dtype=float), dt, mean, fading)

@@ -1,4 +1,4 @@
-// Sensors that are turned by small angles; mounting.py says of which kind.
+// Sensors with small mounting errors, as defined in mounting.py.
 
 #pragma once
 
@@ -9,9 +9,9 @@
 
 namespace mag_tracking {
 
-// Field `h` (3) and derivative `H` (3, n_t) of a sensor that is turned by `angles` (3), into out_h
-// (3) and out_H (3, n_t + 3), whose last columns are by the angles.
-INLINE void turned_field(const double* h, const double* H, const double* angles, std::size_t n_t,
+// Rotates the field `h` (3) and derivative `H` (3, n_t) of a sensor by its mounting error `angles`
+// (3) into out_h (3) and out_H (3, n_t + 3). The last columns are the derivative by the angles.
+INLINE void rotated_field(const double* h, const double* H, const double* angles, std::size_t n_t,
                          double* out_h, double* out_H) {
     const double a0 = angles[0], a1 = angles[1], a2 = angles[2];
     const std::size_t n = n_t + 3;
@@ -31,12 +31,12 @@ INLINE void turned_field(const double* h, const double* H, const double* angles,
         for (int k = 0; k < 3; ++k) out_H[i * n + n_t + k] = by_angles[i][k];
 }
 
-// The same of `n` sensors.
+// The same for `n` sensors.
 FOR_PROCESSORS static void rotated_fields(const double* h, const double* H, const double* angles,
                                          std::size_t n, std::size_t n_t, double* out_h,
                                          double* out_H) {
     for (std::size_t i = 0; i < n; ++i)
-        turned_field(h + 3 * i, H + 3 * n_t * i, angles + 3 * i, n_t, out_h + 3 * i,
+        rotated_field(h + 3 * i, H + 3 * n_t * i, angles + 3 * i, n_t, out_h + 3 * i,
                      out_H + 3 * (n_t + 3) * i);
 }
 

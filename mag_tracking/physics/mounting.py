@@ -1,4 +1,4 @@
-"""Sensors that are not turned quite as the network says."""
+"""Sensors with small mounting errors: orientations that differ from the network file."""
 
 import numpy as np
 
@@ -8,25 +8,32 @@ from mag_tracking.physics import core
 
 def rotated_fields(h: FloatArray, H: FloatArray, angles: FloatArray
                   ) -> tuple[FloatArray, FloatArray]:
-    """Fields as sensors see them that are turned by small angles.
+    """Fields measured by sensors with small mounting errors, with derivatives.
 
     Parameters
     ----------
-    h : (n_hyp, n_sensors, 3) [T], sensor frame as stated
-    H : (n_hyp, n_sensors, 3, n_t)
-        Its derivative by the target state.
-    angles : (n_hyp, n_sensors, 3) [rad], sensor frame
-        a in B_actual = B_stated + a x B_stated. A sensor that was turned by +b
-        about one of its axes sees the field turned back: a = -b.
+    h : (n_hyp, n_sensors, 3) array, T, nominal sensor frame
+        Field.
+    H : (n_hyp, n_sensors, 3, n_t) array
+        Derivative of `h` by the target state.
+    angles : (n_hyp, n_sensors, 3) array, rad, sensor frame
+        Vector a in B_actual = B_nominal + a x B_nominal. A sensor mounted with a rotation of +b
+        about one of its axes measures a field that is rotated by -b: a = -b.
 
     Returns
     -------
-    h : (n_hyp, n_sensors, 3) [T], sensor frame as it is
-    H : (n_hyp, n_sensors, 3, n_t + 3)
-        Derivative by the target state and by the sensor's own three angles.
+    h : (n_hyp, n_sensors, 3) array, T, actual sensor frame
+        Field.
+    H : (n_hyp, n_sensors, 3, n_t + 3) array
+        Derivative by the target state and by the three angles of the sensor.
 
-    First order in the angle: at ten degrees the field's length is 1.5 % off,
-    at fifteen 3.4 %. Source: the small-angle rotation; T10 section 6.3 for
-    why it is needed.
+    Notes
+    -----
+    First order in the angle: the field magnitude is too large by up to 1.5 % at 10 degrees and
+    3.4 % at 15 degrees.
+
+    References
+    ----------
+    [T10]_ section 6.3, for the need of mounting errors.
     """
     return core.rotated_fields(*(np.ascontiguousarray(a, dtype=float) for a in (h, H, angles)))

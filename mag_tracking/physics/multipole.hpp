@@ -1,7 +1,7 @@
-// Magnetic multipoles of orders 1 to 3; multipole.py says what the moments are.
+// Magnetic multipoles of orders 1 to 3; multipole.py defines the moments.
 //
-// From grad P and grad grad P of the polynomial P of one order follows every derivative; both are
-// contractions of the tensor of moments with d, and P = d.grad(P) / order.
+// Every derivative follows from grad P and grad grad P of the polynomial P of one order. Both are
+// contractions of the moment tensor with d, and P = d.grad(P) / order.
 
 #pragma once
 
@@ -12,14 +12,14 @@
 
 namespace mag_tracking {
 
-// Field and Jacobians of sources at one point, as rows of arrays to which each order adds.
+// Field and Jacobians of a source at one point; each order is added to the arrays.
 struct Multipole {
     int k;                      // 3, 8 or 15 moments.
     double *B, *dB_dd, *dB_dm;  // (3) [T], (3, 3) [T/m], (3, k).
-    double d[3], inv2;          // [m] from the source to the sensor; 1 / |d|^2.
+    double d[3], inv2;          // Sensor relative to the source [m]; 1 / |d|^2.
 
-    // Of one order, from grad P `g`, grad grad P `H` as its upper triangle row by row, and `s`,
-    // which is mu0/4pi / |d|^(2 order + 1).
+    // Adds one order, from grad P `g`, the upper triangle of grad grad P `H`, row by row, and
+    // s = mu0/(4 pi) / |d|^(2 order + 1).
     INLINE void add_order(int order, double s, const double (&g)[3], const double (&H)[6]) const {
         const double a = (2 * order + 1) * s * inv2;
         const double e = a * (g[0] * d[0] + g[1] * d[1] + g[2] * d[2]) / order;
@@ -35,8 +35,8 @@ struct Multipole {
         }
     }
 
-    // Columns of dB_dm from `first` on: the fields of the unit components of one order, whose
-    // grad P are `gradients`.
+    // Writes the columns of dB_dm from `first` on: the fields of unit components of one order, with
+    // grad P in `gradients`.
     template <int n>
     INLINE void set_columns(int order, double s, const double (&gradients)[n][3],
                             int first) const {
@@ -48,7 +48,7 @@ struct Multipole {
         }
     }
 
-    // As add_order, where grad P is `scale` H d.
+    // As above, for grad P = `scale` H d.
     INLINE void add_order(int order, double s, double scale, const double (&H)[6]) const {
         add_order(order, s, {scale * (H[0] * d[0] + H[1] * d[1] + H[2] * d[2]),
                              scale * (H[1] * d[0] + H[3] * d[1] + H[4] * d[2]),
@@ -83,10 +83,10 @@ struct Multipole {
     }
 };
 
-// Field and both Jacobians of one source with `k` moments `m` at one point, `d` (3) [m] from it.
-// Overwrites B, dB_dd and dB_dm; all are NaN where |d| = 0.
+// Field and both Jacobians of one source with `k` moments `m` at one point, at `d` (3) [m] relative
+// to the source. Overwrites B, dB_dd and dB_dm; all are NaN at d = 0.
 //
-// Source: T10 eq. (3.39)-(3.41).
+// T10 eq. (3.39)-(3.41).
 INLINE void multipole(const double* d, const double* m, int k, double* B, double* dB_dd,
                       double* dB_dm) {
     const double inv2 = 1.0 / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
@@ -99,7 +99,7 @@ INLINE void multipole(const double* d, const double* m, int k, double* B, double
     if (k > 8) at.add_octupole(m + 8, s * inv2 * inv2);
 }
 
-// The same of `n` sources.
+// The same for `n` sources.
 FOR_PROCESSORS static void set_multipoles(const double* d, const double* m, std::size_t n, int k,
                                           double* B, double* dB_dd, double* dB_dm) {
     for (std::size_t i = 0; i < n; ++i)

@@ -1,20 +1,19 @@
-"""Magnetic multipoles of orders 1 to 3: dipole, quadrupole and octupole about one point.
+"""Magnetic multipoles of orders 1 to 3 about one point: dipole, quadrupole and octupole.
 
-The moment of order l is a symmetric traceless tensor with 2l + 1 independent
-components. They are kept as Cartesian components in the order of the alphabet,
-without those that hold z twice, which follow from the trace:
+The moment of order l is a symmetric traceless tensor with 2l + 1 independent components. They are
+stored as Cartesian components in alphabetical order, without the components that contain z more
+than once, which follow from the trace::
 
     0..2   x y z                             [A m^2]  dipole
     3..7   xx xy xz yy yz                    [A m^3]  zz = -xx - yy
     8..14  xxx xxy xxz xyy xyz yyy yyz       [A m^4]  izz = -ixx - iyy
 
-A vector of 3, 8 or 15 moments means the orders up to 1, 2 or 3. The scale is
-that of T10 eq. (3.39)-(3.40). With P the polynomial (1/l!) m_ij.. d_i d_j ..,
-the field of one order is
+A vector of 3, 8 or 15 moments holds the orders up to 1, 2 or 3. The scale is that of T10 eq.
+(3.39)-(3.40). With d from the source to the sensor, the field of one order is::
 
-    B = -mu0/4pi grad(P / |d|^(2l+1)),
+    B = -mu0/(4 pi) grad(P / |d|^(2l+1)),  P = (1/l!) m_ij.. d_i d_j ..
 
-whose derivatives `multipole.hpp` has.
+The derivatives are in `multipole.hpp`.
 """
 
 from itertools import combinations_with_replacement
@@ -27,7 +26,7 @@ from mag_tracking.physics import core
 
 
 def _evaluate(r: ArrayLike, moments: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Field and both Jacobians, in the shape that the arguments broadcast to."""
+    """Field and both Jacobians, in the broadcast shape of the arguments."""
     r, moments = np.asarray(r, dtype=float), np.asarray(moments, dtype=float)
     if r.shape[-1:] != (3,):
         raise ValueError(f'r needs a last axis of length 3, got {r.shape}')
@@ -40,77 +39,105 @@ def _evaluate(r: ArrayLike, moments: ArrayLike) -> tuple[FloatArray, FloatArray,
 
 
 def multipole_field(r: ArrayLike, moments: ArrayLike) -> FloatArray:
-    """Flux density of a multipole expansion, the sum of its orders.
+    """Flux density of a multipole expansion, summed over its orders.
 
     Parameters
     ----------
-    r : (..., 3) [m], world
-        Sensor minus source position.
-    moments : (..., 3 | 8 | 15) [A m^2 | A m^3 | A m^4], world
-        Components of the orders up to 1, 2 or 3, as in the module's head;
+    r : (..., 3) array, m, world frame
+        Position of the sensor relative to the source.
+    moments : (..., 3 | 8 | 15) array, A m² | A m³ | A m⁴, world frame
+        Components of the orders up to 1, 2 or 3, in the order given in the module docstring;
         broadcasts against `r`.
 
     Returns
     -------
-    (..., 3) [T], world
-        NaN where |r| = 0.
+    (..., 3) array, T, world frame
+        NaN at r = 0.
 
-    Source: T10 eq. (3.39)-(3.41). T10 eq. (4.17) counts r from the sensor to the
-    source: the moments of even order have the opposite sign there.
+    Raises
+    ------
+    ValueError
+        If the last axis of `r` is not of length 3 or that of `moments` is not of length 3, 8 or 15.
+
+    Notes
+    -----
+    T10 eq. (4.17) defines r from the sensor to the source; moments of even order have the opposite
+    sign there.
+
+    References
+    ----------
+    [T10]_ eq. (3.39)-(3.41).
     """
     return _evaluate(r, moments)[0]
 
 
 def multipole_jacobians(r: ArrayLike, moments: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of the field of a multipole expansion.
+    """Derivatives of the flux density of a multipole expansion.
 
     Parameters
     ----------
-    r : (..., 3) [m], world
-        Sensor minus source position.
-    moments : (..., 3 | 8 | 15), world
-        As in `multipole_field`; called k below.
+    r : (..., 3) array, m, world frame
+        Position of the sensor relative to the source.
+    moments : (..., k) array, A m² | A m³ | A m⁴, world frame
+        As for `multipole_field`; k = 3, 8 or 15.
 
     Returns
     -------
-    dB_dr : (..., 3, 3) [T/m]
-        With respect to `r`, symmetric; the one with respect to the source is its
-        negative.
-    dB_dm : (..., 3, k) [T per unit of the component]
-        The field is dB_dm @ moments. Both are NaN where |r| = 0.
+    dB_dr : (..., 3, 3) array, T/m
+        Symmetric. The derivative by the source position is its negative. NaN at r = 0.
+    dB_dm : (..., 3, k) array, T per unit of the component
+        The field is dB_dm @ moments. NaN at r = 0.
 
-    Source: derivatives of T10 eq. (3.39)-(3.41).
+    Raises
+    ------
+    ValueError
+        If the last axis of `r` is not of length 3 or that of `moments` is not of length 3, 8 or 15.
+
+    References
+    ----------
+    [T10]_ eq. (3.39)-(3.41), differentiated.
     """
     return _evaluate(r, moments)[1:]
 
 
 def multipole_moments(points: ArrayLike, dipoles: ArrayLike, order: int) -> FloatArray:
-    """Moments about the origin of a cloud of dipoles.
+    """Multipole moments of a cloud of dipoles about the origin.
 
-    Those of order 1 are the sum of the dipoles; those above depend on the origin.
+    The dipole moment is the sum of the dipoles; higher moments depend on the origin.
 
     Parameters
     ----------
-    points : (..., n, 3) [m]
-        Positions, relative to the origin of the expansion.
-    dipoles : (..., n, 3) [A m^2]
+    points : (..., n, 3) array, m
+        Dipole positions relative to the origin of the expansion.
+    dipoles : (..., n, 3) array, A m²
         Dipole moments; broadcasts against `points`.
     order : int
         Highest order: 1, 2 or 3.
 
     Returns
     -------
-    (..., 3 | 8 | 15)
-        As `multipole_field` takes them, in the axes of `points`.
+    (..., 3 | 8 | 15) array, A m² | A m³ | A m⁴
+        Moments as for `multipole_field`, in the axes of `points`.
 
-    Source: the Taylor series of the dipoles' potentials, in the scale of T10 eq.
-    (3.40): l (2l-1)!! times the symmetric traceless part of m x x .., l - 1 times x.
+    Raises
+    ------
+    ValueError
+        If `order` is not 1, 2 or 3, or if the arrays do not have the shape (..., n, 3).
+
+    Notes
+    -----
+    Taylor series of the potentials of the dipoles, in the scale of T10: the component of order l is
+    l (2l-1)!! times the symmetric traceless part of m x x .., with l - 1 factors x.
+
+    References
+    ----------
+    [T10]_ eq. (3.40).
     """
     if order not in (1, 2, 3):
-        raise ValueError(f'order has to be 1, 2 or 3, got {order!r}')
+        raise ValueError(f'order must be 1, 2 or 3, got {order!r}')
     x, m = np.broadcast_arrays(np.asarray(points, dtype=float), np.asarray(dipoles, dtype=float))
     if x.ndim < 2 or x.shape[-1] != 3:
-        raise ValueError(f'points and dipoles need the shape (..., n, 3), got {x.shape}')
+        raise ValueError(f'points and dipoles must have shape (..., n, 3), got {x.shape}')
     delta = np.eye(3)
     along = np.sum(x * m, axis=-1)
     moments = [m[..., i] for i in range(3)]
@@ -127,5 +154,5 @@ def multipole_moments(points: ArrayLike, dipoles: ArrayLike, order: int) -> Floa
 
 
 def _independent(order: int) -> list[tuple[int, ...]]:
-    """Indices of the components that are kept: those with at most one z, sorted."""
+    """Sorted indices of the stored components: those that contain z at most once."""
     return [c for c in combinations_with_replacement(range(3), order) if c.count(2) < 2]

@@ -1,6 +1,6 @@
-"""Straight passes as expansions: multipoles about one point, Anderson functions of one sensor.
+"""Field of a straight pass as an expansion: multipoles about one point, or Anderson functions.
 
-The same kind of model as `passes.RowPass`: linear in most of its parameters.
+The interface is that of `passes.RowPass`: linear in most of the parameters.
 """
 
 from dataclasses import dataclass
@@ -12,42 +12,73 @@ from mag_tracking.physics.anderson import anderson_functions
 from mag_tracking.physics.multipole import multipole_jacobians
 
 _N_MOMENTS = {1: 3, 2: 8, 3: 15}
+"""Number of moments up to each order."""
 
 
 @dataclass(frozen=True)
 class MultipolePass:
-    """Multipoles up to `order` 1, 2 or 3 about one point, on a straight line at constant velocity.
+    """Multipoles up to an order about one point, on a straight path at constant velocity.
 
-    Path (6): position r0 at time zero [m], velocity v0 [m/s]. Linear (3, 8 or 15): the moments of
-    `multipole.multipole_field`, world. Where a row needs a length, this needs more moments; it
-    describes any shape, but only from outside the sphere around it.
+    Path parameters (6): position r0 at time zero [m], velocity v0 [m/s]. Linear parameters (3, 8 or
+    15): the moments of `multipole.multipole_field`, world frame. Where a row has a length, this
+    model has more moments. It describes a body of any shape, but is valid only outside the sphere
+    that encloses the body.
 
-    Source: T10 eq. (4.17), (4.18).
+    References
+    ----------
+    [T10]_ eq. (4.17), (4.18).
     """
 
     t: FloatArray
-    """(n,) [s] of the samples."""
+    """Timestamps of the samples, (n,) s."""
     positions: FloatArray
-    """(n, 3) [m], world, of the sensor that each is of."""
+    """Position of the sensor of each sample, (n, 3) m, world frame."""
     M: FloatArray
-    """(n, 3, 3) what the field of each is multiplied by: world to sensor, and whitening."""
+    """Whitening matrix times world-to-sensor rotation of each sample, (n, 3, 3)."""
     order: int = 2
+    """Highest multipole order: 1, 2 or 3."""
 
     names = ('x', 'y', 'z', 'vx', 'vy', 'vz')
+    """Names of the path parameters."""
 
-    def _from_target(self, theta: FloatArray) -> FloatArray:
-        """(n_paths, n, 3) [m] sensor minus target."""
+    def _relative_positions(self, theta: FloatArray) -> FloatArray:
+        """Position of the sensor relative to the target, (n_paths, n, 3) m."""
         return (self.positions - theta[:, None, :3]
                 - self.t[:, None] * theta[:, None, 3:])
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Fields of unit moments, (n_paths, 3 n, 3 | 8 | 15), for paths theta (n_paths, 6)."""
-        _, A = multipole_jacobians(self._from_target(theta), np.zeros(_N_MOMENTS[self.order]))
+        """Whitened fields of unit moments.
+
+        Parameters
+        ----------
+        theta : (n_paths, 6) array
+            Path parameters.
+
+        Returns
+        -------
+        (n_paths, 3 n, 3 | 8 | 15) array
+            NaN where the target is at a sensor.
+        """
+        _, A = multipole_jacobians(self._relative_positions(theta),
+                                   np.zeros(_N_MOMENTS[self.order]))
         return (self.M @ A).reshape(len(theta), 3 * len(self.t), -1)
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """d(basis(theta) p)/d(theta), (n_paths, 3 n, 6); `p` (n_paths, 3 | 8 | 15)."""
-        gradient, _ = multipole_jacobians(self._from_target(theta), p[:, None])
+        """Derivative of the whitened field by the path parameters.
+
+        Parameters
+        ----------
+        theta : (n_paths, 6) array
+            Path parameters.
+        p : (n_paths, 3 | 8 | 15) array
+            Moments.
+
+        Returns
+        -------
+        (n_paths, 3 n, 6) array
+            Derivative of basis(theta) p by theta.
+        """
+        gradient, _ = multipole_jacobians(self._relative_positions(theta), p[:, None])
         D = -(self.M @ gradient)
         return np.concatenate([D, self.t[:, None, None] * D], axis=-1).reshape(
             len(theta), 3 * len(self.t), 6)
@@ -55,34 +86,60 @@ class MultipolePass:
 
 @dataclass(frozen=True)
 class AndersonPass:
-    """A dipole that passes one sensor on a straight line, in Anderson functions.
+    """A dipole that passes one sensor on a straight path, in Anderson functions.
 
-    Path (2): time of the closest approach [s] and speed over its range [1/s]. Linear (9): the
-    coefficients of the three functions on each axis of the sensor [T], axis by axis. Of these nine
-    a dipole has six independent ones; they are fitted as if they were free, which makes the search
-    easier.
+    Path parameters (2): time of the closest point of approach (CPA) [s], speed over range at the
+    CPA [1/s]. Linear parameters (9): coefficients of the three functions on each axis of the sensor
+    [T], axis by axis. A dipole has only six independent coefficients; fitting all nine freely makes
+    the search easier.
 
-    Source: TSP14 eq. (22), (23), corrected as in `anderson`.
+    References
+    ----------
+    [TSP14]_ eq. (22), (23), corrected as in `anderson`.
     """
 
     t: FloatArray
-    """(n,) [s] of the samples."""
+    """Timestamps of the samples, (n,) s."""
     W: FloatArray
-    """(n, 3, 3) whitening."""
+    """Whitening matrix of each sample, (n, 3, 3)."""
 
     names = ('t_cpa', 'rate')
+    """Names of the path parameters."""
 
     def _spread(self, f: FloatArray) -> FloatArray:
-        """(n_paths, 3 n, 9) of functions of time (n_paths, n, 3)."""
+        """Design matrix (n_paths, 3 n, 9) of functions of time (n_paths, n, 3)."""
         columns: FloatArray = np.einsum('nab,pnf->pnabf', self.W, f)
         return columns.reshape(len(f), 3 * len(self.t), 9)
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Fields of unit coefficients, (n_paths, 3 n, 9), for paths theta (n_paths, 2)."""
+        """Whitened fields of unit coefficients.
+
+        Parameters
+        ----------
+        theta : (n_paths, 2) array
+            Path parameters.
+
+        Returns
+        -------
+        (n_paths, 3 n, 9) array
+        """
         return self._spread(anderson_functions(theta[:, 1:] * (self.t - theta[:, :1])))
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """d(basis(theta) p)/d(theta), (n_paths, 3 n, 2); `p` (n_paths, 9)."""
+        """Derivative of the whitened field by the path parameters.
+
+        Parameters
+        ----------
+        theta : (n_paths, 2) array
+            Path parameters.
+        p : (n_paths, 9) array
+            Coefficients.
+
+        Returns
+        -------
+        (n_paths, 3 n, 2) array
+            Derivative of basis(theta) p by theta.
+        """
         tau = theta[:, 1:] * (self.t - theta[:, :1])
         f0, f1, f2 = np.moveaxis(anderson_functions(tau), -1, 0)
         # f_n = tau^n (tau^2 + 1)^(-5/2), so f_n' = n f_{n-1} - 5 tau/(tau^2 + 1) f_n.

@@ -1,4 +1,4 @@
-// Straight passes at constant velocity; passes.py says what the parameters are.
+// Straight passes at constant velocity; passes.py defines the parameters.
 
 #pragma once
 
@@ -9,21 +9,21 @@
 
 namespace mag_tracking {
 
-// The samples of a pass.
+// Samples of a pass.
 struct Samples {
     long n;
     const double *t, *positions, *M;  // As in passes.py.
 };
 
-// The dipoles of a row, from its tail to its head.
+// Dipoles of a row, from tail to head.
 struct Row {
     int n;
-    const double* places;  // (n) in lengths of the row, from its middle.
+    const double* places;  // (n) positions along the row, in row lengths from the centre.
 };
 
-// A row on a straight line: the path is 6 numbers `theta`, with two dipoles or more 7.
+// A row on a straight path with parameters `theta`: 6, or 7 for two or more dipoles.
 //
-// Source: TSP14 eq. (18)-(21).
+// TSP14 eq. (18)-(21).
 class StraightPath {
   public:
     INLINE StraightPath(const double* theta, const Row& row) : row_(row) {
@@ -34,7 +34,7 @@ class StraightPath {
         stretch_ = row.n > 1 ? theta[6] * slowness_ : 0.0;
     }
 
-    // Fields of unit moments at sample s, into A (3, 3 d).
+    // Writes the fields of unit moments at sample s to A (3, 3 d).
     INLINE void basis(const Samples& samples, long s, double* A) const {
         const double *position = samples.positions + 3 * s, *M = samples.M + 9 * s;
         for (int i = 0; i < row_.n; ++i) {
@@ -45,7 +45,8 @@ class StraightPath {
         }
     }
 
-    // Derivative by theta of the field of the `moments` (d, 3) at sample s, into D (3, n_theta).
+    // Writes the derivative by theta of the field of `moments` (d, 3) at sample s to D
+    // (3, n_theta).
     INLINE void derivative(const Samples& samples, long s, const double* moments,
                            double* D) const {
         const double *position = samples.positions + 3 * s, *M = samples.M + 9 * s;
@@ -63,7 +64,7 @@ class StraightPath {
                 dipole.rows(M + 3 * a, g, by_moment);
                 for (int b = 0; b < 3; ++b) by_place[a][b] -= g[b];
                 if (row_.n == 1) continue;
-                // The direction of the row turns with v: d(u)/dv = (I - uu')/|v|.
+                // The row rotates with v: d(u)/dv = (I - uu')/|v|.
                 const double turn = ahead * slowness_;
                 const double along = -(g[0] * u_[0] + g[1] * u_[1] + g[2] * u_[2]);
                 for (int b = 0; b < 3; ++b) by_turn[a][b] -= turn * (g[b] + along * u_[b]);
@@ -82,7 +83,7 @@ class StraightPath {
     double r_[3], v_[3], u_[3], slowness_, length_, stretch_;
 };
 
-// Of `n` paths theta (n, n_theta), into A (n, 3 n_samples, 3 d).
+// Writes the design matrices of `n` paths theta (n, n_theta) to A (n, 3 n_samples, 3 d).
 [[maybe_unused]]
 FOR_PROCESSORS static void set_row_bases(const double* theta, long n, int n_theta, const Row& row,
                                          const Samples& samples, double* A) {
@@ -92,7 +93,7 @@ FOR_PROCESSORS static void set_row_bases(const double* theta, long n, int n_thet
     }
 }
 
-// And of their moments (n, 3 d), into D (n, 3 n_samples, n_theta).
+// Writes the derivatives by theta for the moments (n, 3 d) to D (n, 3 n_samples, n_theta).
 [[maybe_unused]]
 FOR_PROCESSORS static void set_row_derivatives(const double* theta, const double* moments, long n,
                                                int n_theta, const Row& row,

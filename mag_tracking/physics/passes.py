@@ -1,7 +1,7 @@
-"""Straight passes at constant velocity: the field of a whole pass as a function of few numbers.
+"""Field of a whole pass at constant velocity, for rows of dipoles on straight paths.
 
-The moments enter linearly, the path does not: a model gives the matrix of the former and the
-derivatives by the latter (`inference.least_squares` fits such models).
+The moments enter linearly, the path does not: a model returns the design matrix of the moments and
+the derivatives by the path. `inference.least_squares` fits such models.
 """
 
 from collections.abc import Sequence
@@ -16,63 +16,108 @@ from mag_tracking.physics import core
 
 @dataclass(frozen=True)
 class RowPass:
-    """A row of `n_dipoles` dipoles on a straight line at constant velocity.
+    """A row of `n_dipoles` equidistant dipoles on a straight path at constant velocity.
 
-    Path (6, with two dipoles or more 7): position r0 of the row's middle at time zero [m],
-    velocity v0 [m/s], length L from the first to the last dipole [m]. Linear (3 d): moments
-    [A m^2, world], from the tail to the head.
+    Path parameters (6, or 7 for two or more dipoles): position r0 of the centre of the row at time
+    zero [m], velocity v0 [m/s], length L from the first to the last dipole [m]. Linear parameters
+    (3 n_dipoles): coefficients of orthogonal combinations of the moments [A m², world frame]. The
+    dipoles are ordered from tail to head.
 
-    The row lies along v0, as in the source; that of `vehicles.RowVehicle` stays horizontal. Where
-    v0 is zero a row of several has no direction, and the field is NaN.
+    The row is parallel to v0, as in TSP14; that of `vehicles.RowVehicle` stays horizontal. If v0 is
+    zero, a row of two or more dipoles has no direction and the field is NaN.
 
-    Source: TSP14 eq. (18)-(21).
+    References
+    ----------
+    [TSP14]_ eq. (18)-(21).
     """
 
     t: FloatArray
-    """(n,) [s] of the samples."""
+    """Timestamps of the samples, (n,) s."""
     positions: FloatArray
-    """(n, 3) [m], world, of the sensor that each is of."""
+    """Position of the sensor of each sample, (n, 3) m, world frame."""
     M: FloatArray
-    """(n, 3, 3) what the field of each is multiplied by: world to sensor, and whitening."""
+    """Whitening matrix times world-to-sensor rotation of each sample, (n, 3, 3)."""
     n_dipoles: int = 1
+    """Number of dipoles of the row."""
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the path's numbers."""
+        """Names of the path parameters."""
         return ('x', 'y', 'z', 'vx', 'vy', 'vz', *(('L',) if self.n_dipoles > 1 else ()))
 
     @cached_property
     def moment_names(self) -> tuple[str, ...]:
-        """Names of the moments, from the tail to the head."""
+        """Names of the moment components, from tail to head."""
         return tuple(f'm{i + 1}{axis}' for i in range(self.n_dipoles) for axis in 'xyz')
 
     @cached_property
     def combinations(self) -> FloatArray:
-        """(3 d, 3 d) orthogonal: moments of the row = combinations @ linear parameters."""
+        """Orthogonal matrix, (3 d, 3 d): moments of the row = combinations @ linear parameters."""
         powers = np.vander(self._places, increasing=True)
         return np.kron(np.linalg.qr(powers)[0], np.eye(3))
 
     @cached_property
     def _places(self) -> FloatArray:
-        """(d,) of the dipoles, in lengths of the row."""
+        """Positions of the dipoles along the row, (d,), in row lengths from the centre."""
         d = self.n_dipoles
         return np.linspace(-0.5, 0.5, d, dtype=np.float64) if d > 1 else np.zeros(1)
 
     def forward(self, theta: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Path (6 or 7,) and parameters (3 d,) of the same row with a length above zero."""
+        """Return the same row with a positive length.
+
+        A row of negative length is the same row listed from its other end.
+
+        Parameters
+        ----------
+        theta : (6 or 7,) array
+            Path parameters.
+        p : (3 n_dipoles,) array
+            Linear parameters.
+
+        Returns
+        -------
+        theta : (6 or 7,) array
+            Path parameters; the length is not negative.
+        p : (3 n_dipoles,) array
+            Linear parameters with the dipoles in reversed order if the length was negative.
+        """
         if self.n_dipoles == 1 or theta[6] >= 0.0:
             return theta, p
         moments = (self.combinations @ p).reshape(-1, 3)[::-1]
         return np.append(theta[:6], -theta[6]), self.combinations.T @ moments.ravel()
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Fields of unit combinations, (n_paths, 3 n, 3 d), for paths theta (n_paths, 6 or 7)."""
+        """Whitened fields of unit linear parameters.
+
+        Parameters
+        ----------
+        theta : (n_paths, 6 or 7) array
+            Path parameters.
+
+        Returns
+        -------
+        (n_paths, 3 n, 3 n_dipoles) array
+            NaN where a dipole is at a sensor.
+        """
         A = core.row_bases(np.ascontiguousarray(theta), self._places, self.t, self.positions,
                            self.M)
         return A @ self.combinations if self.n_dipoles > 1 else A
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """d(basis(theta) p)/d(theta), (n_paths, 3 n, 6 or 7); `p` (n_paths, 3 d)."""
+        """Derivative of the whitened field by the path parameters.
+
+        Parameters
+        ----------
+        theta : (n_paths, 6 or 7) array
+            Path parameters.
+        p : (n_paths, 3 n_dipoles) array
+            Linear parameters.
+
+        Returns
+        -------
+        (n_paths, 3 n, 6 or 7) array
+            Derivative of basis(theta) p by theta.
+        """
         return core.row_derivatives(
             np.ascontiguousarray(theta), np.ascontiguousarray(p @ self.combinations.T),
             self._places, self.t, self.positions, self.M)
@@ -80,35 +125,78 @@ class RowPass:
 
 @dataclass(frozen=True)
 class SuperposedPasses:
-    """Several rows at once: their fields add up.
+    """Several rows at the same time; their fields add up.
 
-    Path and linear parameters are those of the rows, one row after the other.
+    Path and linear parameters are those of the rows, concatenated.
     """
 
     rows: tuple[RowPass, ...]
+    """Passes with common samples."""
 
     @classmethod
     def of(cls, orders: Sequence[int], t: FloatArray, positions: FloatArray,
            M: FloatArray) -> 'SuperposedPasses':
-        """Rows of `orders` dipoles; the rest is as for `RowPass`."""
+        """Create rows with common samples.
+
+        Parameters
+        ----------
+        orders : sequence of int
+            Number of dipoles of each row.
+        t : (n,) array, s
+            As for `RowPass`.
+        positions : (n, 3) array, m, world frame
+            As for `RowPass`.
+        M : (n, 3, 3) array
+            As for `RowPass`.
+
+        Returns
+        -------
+        SuperposedPasses
+        """
         return cls(tuple(RowPass(t, positions, M, n_dipoles) for n_dipoles in orders))
 
     @cached_property
     def paths(self) -> tuple[slice, ...]:
-        """Where the path of each row is."""
+        """Slice of the path parameters of each row."""
         return _consecutive([len(row.names) for row in self.rows])
 
     @cached_property
     def moments(self) -> tuple[slice, ...]:
-        """Where the linear parameters of each row are."""
+        """Slice of the linear parameters of each row."""
         return _consecutive([3 * row.n_dipoles for row in self.rows])
 
     def split(self, theta: FloatArray) -> list[FloatArray]:
-        """The path (6 or 7,) of each row."""
+        """Split path parameters by row.
+
+        Parameters
+        ----------
+        theta : (n_theta,) array
+            Path parameters of all rows.
+
+        Returns
+        -------
+        list of (6 or 7,) array
+            Path parameters of each row.
+        """
         return [theta[own] for own in self.paths]
 
     def forward(self, theta: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Paths (n_theta,) and parameters (k,) of the same rows with lengths above zero."""
+        """Return the same rows with positive lengths.
+
+        Parameters
+        ----------
+        theta : (n_theta,) array
+            Path parameters of all rows.
+        p : (k,) array
+            Linear parameters of all rows.
+
+        Returns
+        -------
+        theta : (n_theta,) array
+            Path parameters; no length is negative.
+        p : (k,) array
+            Linear parameters.
+        """
         turned = [row.forward(path, p[linear])
                   for row, path, linear in zip(self.rows, self.split(theta), self.moments,
                                                strict=True)]
@@ -116,18 +204,42 @@ class SuperposedPasses:
                 np.concatenate([moments for _, moments in turned]))
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Fields of unit parameters, (n_paths, 3 n, k), for paths theta (n_paths, n_theta)."""
+        """Whitened fields of unit linear parameters.
+
+        Parameters
+        ----------
+        theta : (n_paths, n_theta) array
+            Path parameters of all rows.
+
+        Returns
+        -------
+        (n_paths, 3 n, k) array
+            NaN where a dipole is at a sensor.
+        """
         return np.concatenate([row.basis(theta[:, own])
                                for row, own in zip(self.rows, self.paths, strict=True)], axis=2)
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """d(basis(theta) p)/d(theta), (n_paths, 3 n, n_theta); `p` (n_paths, k)."""
+        """Derivative of the whitened field by the path parameters.
+
+        Parameters
+        ----------
+        theta : (n_paths, n_theta) array
+            Path parameters of all rows.
+        p : (n_paths, k) array
+            Linear parameters of all rows.
+
+        Returns
+        -------
+        (n_paths, 3 n, n_theta) array
+            Derivative of basis(theta) p by theta.
+        """
         return np.concatenate([
             row.derivative(theta[:, own], p[:, linear])
             for row, own, linear in zip(self.rows, self.paths, self.moments, strict=True)], axis=2)
 
 
 def _consecutive(sizes: Sequence[int]) -> tuple[slice, ...]:
-    """Slices of such sizes, one after the other."""
+    """Adjacent slices of the given sizes."""
     ends = np.cumsum(sizes).tolist()
     return tuple(slice(end - size, end) for end, size in zip(ends, sizes, strict=True))

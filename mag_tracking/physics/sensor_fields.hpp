@@ -1,4 +1,4 @@
-// Field of moving dipoles at a fixed sensor, with its derivative by the state of what moves.
+// Field of moving dipoles at fixed sensors, and its derivative by the target state.
 
 #pragma once
 
@@ -12,12 +12,12 @@ namespace mag_tracking {
 // Dipoles of one hypothesis.
 struct Cloud {
     std::size_t n, n_t;      // Dipoles; states.
-    const double *r, *m;     // (n, 3) [m], [A m^2], world.
+    const double *r, *m;     // (n, 3) positions [m] and moments [A m^2], world frame.
     const double *dr, *dm;   // (n, 3, n_t) their derivatives by the state.
 };
 
-// At a sensor at `position` (3), whose frame `R` (3, 3) turns to from the world's: h (3) [T] and H
-// (3, n_t), in that frame. Returns the size of the gradient [T/m].
+// Writes the field h (3) [T] and its derivative H (3, n_t) in the frame of a sensor at `position`
+// (3); `R` (3, 3) rotates from the world to the sensor frame. Returns the gradient scale [T/m].
 INLINE double sensor_field(const Cloud& cloud, const double* position, const double* R, double* h,
                            double* H) {
     const std::size_t n_t = cloud.n_t;
@@ -30,7 +30,7 @@ INLINE double sensor_field(const Cloud& cloud, const double* position, const dou
                             {m[0], m[1], m[2]});
         dipole.add_field(field);
         gradient += dipole.gradient();
-        // Turned into the sensor's frame first: 3 x 3 products are cheaper than 3 x n_t.
+        // Rotate to the sensor frame first: 3 x 3 products are cheaper than 3 x n_t.
         for (int i = 0; i < 3; ++i) {
             double g[3], q[3];
             dipole.rows(R + 3 * i, g, q);
@@ -45,8 +45,8 @@ INLINE double sensor_field(const Cloud& cloud, const double* position, const dou
     return gradient;
 }
 
-// Of `n` hypotheses, one behind the other from `cloud` on, at `n_sensors` sensors: h (n,
-// n_sensors, 3), H (n, n_sensors, 3, n_t), gradient (n, n_sensors).
+// The same for `n` hypotheses, stored consecutively from `cloud` on, and `n_sensors` sensors:
+// h (n, n_sensors, 3), H (n, n_sensors, 3, n_t), gradient (n, n_sensors).
 FOR_PROCESSORS static void set_sensor_fields(Cloud cloud, std::size_t n, const double* positions,
                                              const double* R_sw, std::size_t n_sensors, double* h,
                                              double* H, double* gradient) {

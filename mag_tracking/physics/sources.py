@@ -1,8 +1,8 @@
-"""The targets: what a state means, how it moves, and which dipoles it is.
+"""Source models: meaning of a target state, its motion and its dipoles.
 
-A source model turns a batch of target states into dipoles with derivatives;
-the field at the sensors follows from `dipole.sensor_fields` alone, so that a
-new target is one new class (here; vehicles in `vehicles.py`) and nothing elsewhere.
+A source model maps a batch of target states to dipoles with derivatives; `dipole.sensor_fields`
+computes the field at the sensors from the dipoles alone. A new target therefore needs one new
+class, here or (for vehicles) in `vehicles.py`.
 """
 
 from dataclasses import dataclass
@@ -21,56 +21,95 @@ from mag_tracking.physics.motion import constant_velocity, integrator_noise
 
 
 class Dipoles(NamedTuple):
-    """Dipoles of every hypothesis, in the world, with derivatives by the target state."""
+    """Dipoles of every hypothesis, with derivatives by the target state."""
 
     r: FloatArray
-    """(n_hyp, n_dipoles, 3) [m] positions."""
+    """Positions, (n_hyp, n_dipoles, 3) m, world frame."""
     m: FloatArray
-    """(n_hyp, n_dipoles, 3) [A m^2] moments."""
+    """Moments, (n_hyp, n_dipoles, 3) A m², world frame."""
     dr_dx: FloatArray
-    """(n_hyp, n_dipoles, 3, n_t)."""
+    """Derivative of the positions by the state, (n_hyp, n_dipoles, 3, n_t)."""
     dm_dx: FloatArray
-    """(n_hyp, n_dipoles, 3, n_t)."""
+    """Derivative of the moments by the state, (n_hyp, n_dipoles, 3, n_t)."""
 
 
 class SourceModel(Protocol):
-    """What the tracker asks of a target. States begin with position and velocity."""
+    """Interface of a target model. Every state begins with position and velocity."""
 
     @property
     def state_names(self) -> tuple[str, ...]:
         """Names of the states, in order."""
 
     def dipoles(self, x: FloatArray) -> Dipoles:
-        """Dipoles of the target states `x` (n_hyp, n_t)."""
+        """Dipoles of target states.
+
+        Parameters
+        ----------
+        x : (n_hyp, n_t) array
+            Target states.
+
+        Returns
+        -------
+        Dipoles
+        """
 
     def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """States after `dt` seconds, Jacobian (..., n_t, n_t), process noise (..., n_t, n_t).
+        """Predict target states.
 
-        With the states' covariances `P` (n_hyp, n_t, n_t) the noise holds what the
-        Jacobian leaves out, too, and a state of zero variance may be taken for fixed.
+        Parameters
+        ----------
+        x : (n_hyp, n_t) array
+            Target states.
+        dt : float, s
+            Prediction interval; negative to propagate backwards.
+        P : (n_hyp, n_t, n_t) array, optional
+            Covariances of `x`. If given, `Q` includes the second-order terms that the Jacobian
+            omits, and a state of zero variance may be treated as constant.
+
+        Returns
+        -------
+        x : (n_hyp, n_t) array
+            States after `dt`.
+        F : (..., n_t, n_t) array
+            Jacobian of the prediction.
+        Q : (..., n_t, n_t) array
+            Covariance of the process noise.
         """
 
 
 @dataclass(frozen=True)
 class Magnet:
-    """A small magnet: one dipole that moves and turns, five degrees of freedom.
+    """A small magnet: one dipole that moves and rotates, with five degrees of freedom.
 
-    State (12): position r, velocity v, moment m (world), angular velocity w
-    (world). The moment turns with w; the roll about m cannot be observed.
+    State (12): position r [m], velocity v [m/s], moment m [A m²], angular velocity w [rad/s], all
+    in the world frame. The moment rotates with w; the roll about m is not observable.
 
-    Source: PHD15 Paper A section 3.1 and eq. (19)-(24).
+    References
+    ----------
+    [PHD15]_ Paper A section 3.1 and eq. (19)-(24).
     """
 
     acceleration_density: FloatArray
-    """(3,) [m^2/s^3], spectral density of the acceleration."""
+    """Power spectral density of the acceleration, (3,) m²/s³."""
     angular_density: float
-    """[rad^2/s^3], spectral density of the angular acceleration."""
+    """Power spectral density of the angular acceleration, rad²/s³."""
 
     state_names = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz', 'wx', 'wy', 'wz')
+    """Names of the states, in order."""
 
     def dipoles(self, x: FloatArray) -> Dipoles:
-        """One dipole a hypothesis; see `SourceModel.dipoles`."""
+        """Dipoles of target states: one dipole per hypothesis.
+
+        Parameters
+        ----------
+        x : (n_hyp, 12) array
+            Target states.
+
+        Returns
+        -------
+        Dipoles
+        """
         dr_dx = np.zeros((len(x), 1, 3, 12))
         dr_dx[:, 0, [0, 1, 2], [0, 1, 2]] = 1.0
         dm_dx = np.zeros((len(x), 1, 3, 12))
@@ -79,14 +118,32 @@ class Magnet:
 
     def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Constant velocity and angular velocity; see `SourceModel.propagate`.
+        """Predict target states at constant velocity and constant angular velocity.
 
-        The moment is turned by the whole angle w dt. Eq. (24) holds it constant
-        over the interval, m + dt (w x m): each step makes it longer by half the
-        square of the angle, and a filter that knows the size of its magnet
-        then moves the magnet away to make up for it.
-        Its noise is that of the double integrator, mapped by w -> w x m, and with
-        `P` that of the second order (`_shortening`).
+        Parameters
+        ----------
+        x : (n_hyp, 12) array
+            Target states.
+        dt : float, s
+            Prediction interval.
+        P : (n_hyp, 12, 12) array, optional
+            Covariances of `x`; see `SourceModel.propagate`.
+
+        Returns
+        -------
+        x : (n_hyp, 12) array
+            States after `dt`.
+        F : (n_hyp, 12, 12) array
+            Jacobian of the prediction.
+        Q : (n_hyp, 12, 12) array
+            Noise of the double integrator, mapped to the moment by w -> w x m. With `P`, plus the
+            second-order noise of the rotation.
+
+        Notes
+        -----
+        The moment is rotated by the full angle w dt. PHD15 Paper A eq. (24) uses the first order, m
+        + dt (w x m), which lengthens the moment by half the squared angle in every step. A filter
+        with a known moment magnitude would compensate by moving the magnet away.
         """
         n, angle = len(x), dt * x[:, 9:12]
         R = rotation_from_quaternion(quaternion_from_rotation_vector(angle))
@@ -106,31 +163,32 @@ class Magnet:
         Q[:, 6:, 6:] = (G @ integrator_noise(dt, np.full(3, self.angular_density))
                         @ np.swapaxes(G, 1, 2))
         if P is not None:
-            # What is not known of the moment itself is turned exactly: the turn's share counts.
+            # The uncertainty of the moment itself is rotated exactly; only the increase by the
+            # uncertain rotation counts.
             before = R @ P[:, 6:9, 6:9] @ np.swapaxes(R, 1, 2)
             after = F[:, 6:9] @ P @ np.swapaxes(F[:, 6:9], 1, 2) + Q[:, 6:9, 6:9]
-            Q[:, 6:9, 6:9] += _shortening(moved[:, 6:9], before, after)
+            Q[:, 6:9, 6:9] += _second_order_noise(moved[:, 6:9], before, after)
         return moved, F, Q
 
 
-def _shortening(m: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Second moment (n, 3, 3), along m, of what a turn by an uncertain angle takes from m.
+def _second_order_noise(m: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+    """Second moment (n, 3, 3), along m, of the shortening of m by a rotation of uncertain angle.
 
-    A moment `m` (n, 3) that is turned by a small (a, b) across itself ends
-    (a^2 + b^2)/2 |m| short of the plane in which the Jacobian moves it. With the
-    variances p, q of a, b that has the second moment (3 p^2 + 3 q^2 + 2 p q)/4
-    |m|^2. Counted is what the covariance `after` (n, 3, 3) of the turned moment has
-    more of it than the one `before`, and never more than |m|^2.
+    A moment `m` (n, 3) rotated by small angles (a, b) about axes perpendicular to it ends (a^2 +
+    b^2)/2 |m| short of the plane in which the Jacobian moves it. With the variances p, q of a, b,
+    the second moment of that is (3 p^2 + 3 q^2 + 2 p q)/4 |m|^2. Only the increase from the
+    covariance `before` (n, 3, 3) to the covariance `after` (n, 3, 3) of the rotated moment is
+    counted, limited to |m|^2.
     """
     size2 = np.einsum('ni,ni->n', m, m)
     along = np.einsum('ni,nj->nij', m, m)
-    # A moment of zero cannot be turned: `along` is zero, and so is the result.
+    # A zero moment cannot be rotated: `along` is zero, and so is the result.
     size2 = np.where(size2 > 0.0, size2, 1.0)
     across = np.eye(3) - along / size2[:, None, None]
 
     def second_moment(P: FloatArray) -> FloatArray:
         S = across @ P @ across / size2[:, None, None]
-        # Of the two variances only their sum and the sum of their squares are needed.
+        # Only the sum of the two variances and the sum of their squares are needed.
         moment: FloatArray = 0.25 * (2.0 * np.einsum('nij,nji->n', S, S)
                                      + np.trace(S, axis1=1, axis2=2) ** 2)
         return moment

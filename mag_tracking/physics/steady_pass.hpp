@@ -1,4 +1,4 @@
-// Passes along a path that bends steadily; steady_pass.py says what the parameters are.
+// Passes with constant acceleration and turn acceleration; steady_pass.py defines the parameters.
 
 #pragma once
 
@@ -10,14 +10,14 @@
 
 namespace mag_tracking {
 
-// Of the row's middle at time zero; the clocks follow.
+// Parameters of the centre of the row at time zero; the clock offsets follow.
 enum { X, Y, Z, SPEED, HEADING, CLIMB, LENGTH, ACCELERATION, TURN_RATE, TURN_ACCELERATION, N_PATH };
 constexpr const char* PATH[N_PATH] = {
     "x",      "y",      "z",            "speed",     "heading",
     "climb",  "length", "acceleration", "turn_rate", "turn_acceleration"};
 
-// A path that bends is integrated with these of Gauss and Legendre: right to a micrometre for turns
-// of 90 degrees.
+// Gauss-Legendre nodes and weights for curved paths; the error is below a micrometre for turns of
+// 90 degrees.
 constexpr int N_NODES = 6;
 constexpr double NODES[N_NODES] = {
     -0.93246951420315202781, -0.66120938646626451366, -0.23861918608319690863,
@@ -26,12 +26,12 @@ constexpr double WEIGHTS[N_NODES] = {
     0.17132449237917034504, 0.36076157304813860757, 0.46791393457269104739,
     0.46791393457269104739, 0.36076157304813860757, 0.17132449237917034504};
 
-// The middle of the row at one time.
+// Centre of the row at one time.
 struct Middle {
     double position[3], heading;  // [m], [rad]
-    double time;                  // [s]; the timestamps of a clock that is ahead are too late.
+    double time;                  // [s] of the reference clock; stamps of a clock ahead are late.
 
-    // `clock` is that of the sample; -1: the one that the others are compared to.
+    // `clock` is the clock of the sample; -1: reference clock.
     INLINE Middle(const double* theta, double t, long clock) {
         time = clock >= 0 ? t - theta[N_PATH + clock] : t;
         const double v = theta[SPEED], gain = theta[ACCELERATION];
@@ -54,13 +54,13 @@ struct Middle {
         }
     }
 
-    // Derivatives by `n` parameters: `by` (4, n) of position and heading.
+    // Writes the derivatives of position and heading by the `n` parameters to `by` (4, n).
     INLINE void derivative(const double* theta, long clock, int n, double* by) const {
         const double v = theta[SPEED], gain = theta[ACCELERATION];
         const double rate = theta[TURN_RATE], more = theta[TURN_ACCELERATION];
         const bool bends = rate != 0.0 || more != 0.0;
         const double cos_0 = std::cos(theta[HEADING]), sin_0 = std::sin(theta[HEADING]);
-        double *x = by, *y = by + n, *z = by + 2 * n, *turned = by + 3 * n;
+        double *x = by, *y = by + n, *z = by + 2 * n, *heading_by = by + 3 * n;
         for (int k = 0; k < 4 * n; ++k) by[k] = 0.0;
         x[X] = y[Y] = z[Z] = 1.0, z[CLIMB] = time;
         for (int g = 0; g < N_NODES; ++g) {
@@ -76,17 +76,17 @@ struct Middle {
             x[TURN_ACCELERATION] -= 0.5 * at * at * way * s;
             y[TURN_ACCELERATION] += 0.5 * at * at * way * c;
         }
-        turned[HEADING] = 1.0, turned[TURN_RATE] = time;
-        turned[TURN_ACCELERATION] = 0.5 * time * time;
+        heading_by[HEADING] = 1.0, heading_by[TURN_RATE] = time;
+        heading_by[TURN_ACCELERATION] = 0.5 * time * time;
         if (clock < 0) return;
         const double now = v + gain * time;
         const int k = N_PATH + int(clock);
         x[k] = -now * std::cos(heading), y[k] = -now * std::sin(heading), z[k] = -theta[CLIMB];
-        turned[k] = -rate - more * time;
+        heading_by[k] = -rate - more * time;
     }
 };
 
-// Fields of unit moments at sample s, into A (3, 3 d), for path and clocks `theta`.
+// Writes the fields of unit moments at sample s to A (3, 3 d), for path and clock offsets `theta`.
 INLINE void steady_basis(const double* theta, const Row& row, const Samples& samples, long s,
                          long clock, double* A) {
     const Middle at(theta, samples.t[s], clock);
@@ -99,8 +99,8 @@ INLINE void steady_basis(const double* theta, const Row& row, const Samples& sam
     }
 }
 
-// Derivative by the `n` of `theta` of the field of the `moments` (d, 3), into D (3, n).
-// `by` (4, n) is overwritten.
+// Writes the derivative by theta (n) of the field of `moments` (d, 3) to D (3, n). `by` (4, n) is
+// overwritten.
 INLINE void steady_derivative(const double* theta, int n, const double* moments, const Row& row,
                               const Samples& samples, long s, long clock, double* by, double* D) {
     const Middle at(theta, samples.t[s], clock);
@@ -130,7 +130,7 @@ INLINE void steady_derivative(const double* theta, int n, const double* moments,
     }
 }
 
-// Of `n` paths theta (n, n_theta), into A (n, 3 n_samples, 3 d).
+// Writes the design matrices of `n` paths theta (n, n_theta) to A (n, 3 n_samples, 3 d).
 [[maybe_unused]]
 FOR_PROCESSORS static void set_steady_bases(const double* theta, long n, int n_theta,
                                             const Row& row, const Samples& samples,
@@ -140,7 +140,7 @@ FOR_PROCESSORS static void set_steady_bases(const double* theta, long n, int n_t
             steady_basis(theta + p * n_theta, row, samples, s, long(clocks[s]), A);
 }
 
-// And of their moments (n, 3 d), into D (n, 3 n_samples, n_theta).
+// Writes the derivatives by theta for the moments (n, 3 d) to D (n, 3 n_samples, n_theta).
 [[maybe_unused]]
 FOR_PROCESSORS static void set_steady_derivatives(const double* theta, const double* moments,
                                                   long n, int n_theta, const Row& row,

@@ -1,8 +1,8 @@
-"""Passes along a path that bends steadily, seen by sensors whose clocks may be apart.
+"""Field of a pass with constant acceleration and a changing turn rate, with sensor clock offsets.
 
-Unlike `passes.RowPass` the vehicle may accelerate and turn, and the row of dipoles turns with it.
-The moments enter linearly, the path and the clocks do not (`inference.least_squares` fits such
-models).
+Unlike in `passes.RowPass` the vehicle may accelerate and turn, and the row of dipoles rotates with
+it. The moments enter linearly; the path and the clock offsets do not. `inference.least_squares`
+fits such models.
 """
 
 from dataclasses import dataclass, field
@@ -14,45 +14,49 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.physics import core
 
 PATH = core.PATH
-"""Names of position x, y, z [m], speed [m/s], heading [rad], climb [m/s], length [m], acceleration
-[m/s^2], turn_rate [rad/s] and turn_acceleration [rad/s^2]: of the row's middle at time zero."""
+"""Names of the path parameters, of the centre of the row at time zero: position x, y, z [m], speed
+[m/s], heading [rad], climb [m/s], length [m], acceleration [m/s^2], turn_rate [rad/s],
+turn_acceleration [rad/s^2]."""
 
 N_PATH = len(PATH)
+"""Number of path parameters."""
 N_STRAIGHT = PATH.index('acceleration')
-"""Those before it are of a straight path at constant speed."""
+"""Number of leading path parameters that describe a straight path at constant speed."""
 
 
 @dataclass(frozen=True)
 class SteadyPass:
-    """A row of `n_dipoles` dipoles along a path of steady acceleration and turning.
+    """A row of `n_dipoles` dipoles along a path with constant acceleration and turn acceleration.
 
-    theta: those of `PATH` and of the clocks that are in `free`, in that order; the others stay as
-    in `fixed`. Linear (3 d): combinations of the moments. The tracker fits it in compiled code
-    (`stages/track/steady_fit.hpp`); `basis` and `derivative` are for searches that have a prior,
-    and for simulations.
+    Non-linear parameters theta: those of `PATH` and of the clock offsets that are listed in `free`,
+    in that order; the others stay as in `fixed`. Linear parameters (3 n_dipoles): coefficients of
+    orthogonal combinations of the moments. The tracker fits this model in compiled code
+    (`stages/track/steady_fit.hpp`); `basis` and `derivative` serve searches with a prior, and
+    simulations.
     """
 
     t: FloatArray
-    """(n,) [s] of the samples."""
+    """Timestamps of the samples, (n,) s."""
     positions: FloatArray
-    """(n, 3) [m], world, of the sensor that each is of."""
+    """Position of the sensor of each sample, (n, 3) m, world frame."""
     M: FloatArray
-    """(n, 3, 3) what the field of each is multiplied by: world to sensor, and whitening."""
+    """Whitening matrix times world-to-sensor rotation of each sample, (n, 3, 3)."""
     clock: IntArray
-    """(n,) which of the clocks each sample is of; -1 = the one that the others are compared to."""
+    """Index of the clock of each sample, (n,); -1 is the reference clock."""
     free: IntArray
-    """Columns of (path, clocks) that theta holds, ascending."""
+    """Indices into the concatenation of path and clock offsets that theta holds, ascending."""
     fixed: FloatArray
-    """(N_PATH + n_clocks,) path and clocks [s]; only those that are not free count."""
+    """Path and clock offsets [s], (N_PATH + n_clocks,); entries that are free are not used."""
     n_dipoles: int
+    """Number of dipoles of the row."""
     places: FloatArray = field(init=False)
-    """(d,) of the dipoles from the row's middle, in lengths of the row."""
+    """Positions of the dipoles along the row, (d,), in row lengths from the centre."""
     combinations: FloatArray = field(init=False)
-    """(d, d) by which each component of the moments follows from that of the linear parameters:
-    columns that are orthogonal along the row."""
+    """Map from the linear parameters to the moments, per component, (d, d); its columns are
+    orthogonal along the row."""
 
     def __post_init__(self) -> None:
-        """Places of the dipoles, and combinations of their moments."""
+        """Compute the positions of the dipoles and the combinations of their moments."""
         d = self.n_dipoles
         places = np.linspace(-0.5, 0.5, d) if d > 1 else np.zeros(1)
         object.__setattr__(self, 'places', places)
@@ -60,26 +64,61 @@ class SteadyPass:
                            np.linalg.qr(np.vander(places, increasing=True))[0])
 
     @cached_property
-    def _mixing(self) -> FloatArray:
-        """(3 d, 3 d): moments of the row = mixing @ linear parameters."""
+    def _moment_transform(self) -> FloatArray:
+        """Matrix (3 d, 3 d): moments of the row = matrix @ linear parameters."""
         return np.kron(self.combinations, np.eye(3)).astype(np.float64)
 
     def whole(self, theta: FloatArray) -> FloatArray:
-        """(n_paths, N_PATH + n_clocks) path and clocks for theta (n_paths, n_free)."""
+        """Complete free parameters by the fixed ones.
+
+        Parameters
+        ----------
+        theta : (n_paths, n_free) array
+            Free parameters.
+
+        Returns
+        -------
+        (n_paths, N_PATH + n_clocks) array
+            Path and clock offsets.
+        """
         out = np.tile(self.fixed, (len(theta), 1))
         out[:, self.free] = theta
         return out
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Fields of unit combinations, (n_paths, 3 n, 3 d), for theta (n_paths, n_free)."""
+        """Whitened fields of unit linear parameters.
+
+        Parameters
+        ----------
+        theta : (n_paths, n_free) array
+            Free parameters.
+
+        Returns
+        -------
+        (n_paths, 3 n, 3 n_dipoles) array
+            NaN where a dipole is at a sensor.
+        """
         A = core.steady_bases(self.whole(theta), self.places, self.t, self.positions, self.M,
                               self.clock)
-        return A @ self._mixing
+        return A @ self._moment_transform
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """d(basis(theta) p)/d(theta), (n_paths, 3 n, n_free); `p` (n_paths, 3 d)."""
+        """Derivative of the whitened field by the free parameters.
+
+        Parameters
+        ----------
+        theta : (n_paths, n_free) array
+            Free parameters.
+        p : (n_paths, 3 n_dipoles) array
+            Linear parameters.
+
+        Returns
+        -------
+        (n_paths, 3 n, n_free) array
+            Derivative of basis(theta) p by theta.
+        """
         D = core.steady_derivatives(
-            self.whole(theta), p @ self._mixing.T, self.places, self.t,
+            self.whole(theta), p @ self._moment_transform.T, self.places, self.t,
             self.positions, self.M, self.clock)
         free: FloatArray = D[:, :, self.free]
         return free

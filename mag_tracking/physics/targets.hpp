@@ -1,8 +1,8 @@
-// The target models of vehicles.py and sources.py, for one state at a time.
+// Target models of vehicles.py and sources.py, for one state at a time.
 //
-// RowVehicle and Magnet of Python say what the states are and have the sources of the equations;
-// the tests compare both. A model moves a state (`move`), has the process noise of that (`noise`),
-// and the field at one sensor with its derivative (`field`).
+// The Python classes RowVehicle and Magnet define the states and have the references; the tests
+// compare both implementations. A model predicts a state (`move`) and computes the process noise of
+// the prediction (`noise`) and the field at one sensor with its derivative (`field`).
 
 #pragma once
 
@@ -15,13 +15,13 @@
 
 namespace mag_tracking {
 
-// A dipole that moves and turns: Magnet of sources.py. Sources: PHD15 Paper A eq. (19)-(24).
+// A dipole that moves and rotates: Magnet of sources.py, PHD15 Paper A eq. (19)-(24).
 struct Magnet {
     double density[3], angular_density;  // [m^2/s^3], [rad^2/s^3]
 
     INLINE int n() const { return 12; }
 
-    // I + once [a]x + twice [a]x^2, into `out`.
+    // Writes I + once [a]x + twice [a]x^2 to `out`.
     static INLINE void by_cross(const double (&a)[3], double once, double twice,
                                 double (&out)[3][3]) {
         const double a2 = a[0] * a[0] + a[1] * a[1] + a[2] * a[2];
@@ -35,7 +35,7 @@ struct Magnet {
         }
     }
 
-    // The moment is turned by the whole angle.
+    // The moment is rotated by the full angle.
     INLINE void move(const double* x, double dt, Motion& out) const {
         const double angle[3] = {dt * x[9], dt * x[10], dt * x[11]};
         const double t2 = angle[0] * angle[0] + angle[1] * angle[1] + angle[2] * angle[2];
@@ -63,13 +63,13 @@ struct Magnet {
             }
             for (int k = 0; k < 3; ++k) {
                 out.f[3 + a][k] = R[a][k];
-                // (J e_k) x m, by which the angular velocity turns the moment.
+                // Derivative of the moment by the angular velocity: (J e_k) x m.
                 out.f[3 + a][3 + k] = dt * (J[b][k] * m[c] - J[c][k] * m[b]);
             }
         }
     }
 
-    // (2 tr S^2 + (tr S)^2) / 4 of S = A P A / |m|^2, with A across the moment m.
+    // (2 tr S^2 + (tr S)^2) / 4 of S = A P A / |m|^2; A projects onto the plane normal to m.
     static INLINE double second_moment(const double (&P)[3][3], const double* m, double size2) {
         double A[3][3], AP[3][3] = {}, S[3][3] = {}, trace = 0.0, squares = 0.0;
         for (int i = 0; i < 3; ++i)
@@ -87,7 +87,8 @@ struct Magnet {
         return 0.25 * (2.0 * squares + trace * trace);
     }
 
-    // As of RowVehicle. What the Jacobian leaves out of a turn counts as noise, too.
+    // As RowVehicle::noise. The second-order terms of a rotation, which the Jacobian omits, are
+    // added as noise.
     INLINE void noise(const double*, const double* P, int wide, double dt, const Motion& motion,
                       double* Q) const {
         const double* m = motion.moved + 3;
@@ -98,7 +99,7 @@ struct Magnet {
             integrator_noise(Q, wide, i, 3 + i, density[i], dt);
             Q[(9 + i) * wide + 9 + i] = angular_density * dt;
             const double half = 0.5 * angular_density * dt * dt;
-            // -[m]x: what the angular velocity does to the moment.
+            // -[m]x: effect of the angular velocity on the moment.
             Q[(6 + k) * wide + 9 + l] = Q[(9 + l) * wide + 6 + k] = half * m[i];
             Q[(6 + l) * wide + 9 + k] = Q[(9 + k) * wide + 6 + l] = -half * m[i];
         }
@@ -115,7 +116,7 @@ struct Magnet {
                         if (a < 3 && b < 3) before[i][k] += term;
                     }
             }
-        // A moment of zero cannot be turned.
+        // A zero moment cannot be rotated.
         if (!(size2 > 0.0)) return;
         const double more = std::min(1.0, std::max(
             0.0, second_moment(after, m, size2) - second_moment(before, m, size2)));
@@ -139,7 +140,7 @@ struct Magnet {
     }
 };
 
-// Several vehicles whose fields add up: the states of one after those of the other.
+// Several vehicles whose fields add up; their states are concatenated.
 struct Vehicles {
     RowVehicle one;
     int count;
@@ -173,8 +174,8 @@ struct Vehicles {
     }
 };
 
-// Field and derivative as of a target's `field`; returns the size [T] of what its model leaves out,
-// by the `lengths` [m], one a target.
+// Field and derivative, as Target::field. Returns the magnitude of the model error [T]: the
+// gradient times the length scale in `lengths` [m], one per target.
 template <class Target>
 INLINE double field_and_error(const Target& target, const double* x, const double* position,
                               const double* R, const double* lengths, double* field, double* H,
@@ -182,7 +183,7 @@ INLINE double field_and_error(const Target& target, const double* x, const doubl
     return lengths[0] * target.field(x, position, R, field, H, stride);
 }
 
-// What is left out of several fields is independent.
+// The model errors of several vehicles are independent.
 INLINE double field_and_error(const Vehicles& vehicles, const double* x, const double* position,
                               const double* R, const double* lengths, double* field, double* H,
                               int stride) {

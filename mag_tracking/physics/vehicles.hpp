@@ -1,4 +1,4 @@
-// Vehicles: a point, or a row of dipoles along the heading, for one state at a time.
+// Vehicle models: a point target or a row of dipoles along the heading, for one state at a time.
 
 #pragma once
 
@@ -10,8 +10,8 @@
 
 namespace mag_tracking {
 
-// [A^2 m^4] The squared size of the iron of a state: of its hard iron moment, and of the soft iron
-// times |B0/mu0| per axis. `induction2` [A^2/m^2] is |B0/mu0|^2.
+// Squared magnitude of the iron of a state [A^2 m^4]: hard iron moment, plus soft iron times
+// |B0/mu0| per axis. `induction2` is |B0/mu0|^2 [A^2/m^2].
 INLINE double iron_size2(const double* x, int n_dipoles, double induction2) {
     const int soft = 6 + 3 * n_dipoles;
     double size2 = 0.0;
@@ -23,12 +23,12 @@ INLINE double iron_size2(const double* x, int n_dipoles, double induction2) {
     return size2;
 }
 
-// The heading of a state, and what the earth's field induces in each of its dipoles.
+// Heading of a state, and the moment induced by the earth's field in each of its dipoles.
 struct Induced {
-    double slowness;  // [s/m]; 0 where the speed is zero, and the heading does not change with v.
+    double slowness;  // [s/m]; 0 at zero speed, where the derivative of the heading is set to 0.
     double c, s;      // Cosine and sine of the heading.
-    double ahead, left, up;  // [A/m] of a dipole's share of B0/mu0, in the vehicle's frame.
-    double x, y;             // [A m^2] the moment, in the world; that along z is not here.
+    double ahead, left, up;  // [A/m] B0/mu0 over the number of dipoles, vehicle frame.
+    double x, y;             // [A m^2] horizontal induced moment, world frame.
     double by_x, by_y;       // Its derivative by the heading.
 
     INLINE Induced(const double* state, int n_dipoles, const double* induction) {
@@ -40,7 +40,7 @@ struct Induced {
         const double h_x = induction[0] / n_dipoles, h_y = induction[1] / n_dipoles;
         ahead = c * h_x + s * h_y, left = c * h_y - s * h_x, up = induction[2] / n_dipoles;
         const double m_ahead = soft[0] * ahead, m_left = soft[1] * left;
-        // A body that turns anticlockwise sees the field turn clockwise.
+        // In the frame of a body that rotates anticlockwise, the field rotates clockwise.
         const double dm_ahead = soft[0] * left - m_left, dm_left = m_ahead - soft[1] * ahead;
         x = c * m_ahead - s * m_left, y = s * m_ahead + c * m_left;
         by_x = c * dm_ahead - s * dm_left, by_y = s * dm_ahead + c * dm_left;
@@ -50,12 +50,12 @@ struct Induced {
 // A row of dipoles along the heading: RowVehicle of vehicles.py.
 struct RowVehicle {
     int n_states, n_dipoles;
-    double density[3], induction[3];  // Of the acceleration [m^2/s^3]; B0/mu0 [A/m].
-    double moment_drift, difference_drift, turn_acceleration, turn_time, fastest_turn;
+    double density[3], induction[3];  // Acceleration density [m^2/s^3]; B0/mu0 [A/m].
+    double moment_drift, difference_drift, turn_acceleration, turn_time, max_turn_rate;
 
     INLINE int n() const { return n_states; }
 
-    // Of dipole i along the row, in lengths of it from its middle.
+    // Position of dipole i along the row, in row lengths from the centre.
     INLINE double place_of(int i) const {
         return n_dipoles > 1 ? double(i) / (n_dipoles - 1) - 0.5 : 0.0;
     }
@@ -71,14 +71,14 @@ struct RowVehicle {
             return;
         }
         const int w = n_states - 1;
-        // Backwards, without noise, nothing may become surer than it is.
+        // No decay backwards: without process noise it would reduce the variance.
         const double fading = std::exp(-std::max(dt, 0.0) / turn_time);
         const double mean = dt > 0.0 ? (1.0 - fading) * turn_time / dt : 1.0;
         turn(x, w, dt, mean, fading, out);
     }
 
-    // Of dt > 0 seconds from the state `x` with the covariance `P` (n_x, wide) on, into `Q` (n,
-    // wide); only what is not zero.
+    // Writes the process noise of a prediction by dt > 0 seconds, from state `x` with covariance
+    // `P` (n_x, wide), to the non-zero entries of `Q` (n, wide).
     INLINE void noise(const double* x, const double* P, int wide, double dt, const Motion&,
                       double* Q) const {
         const int n = n_states, d = n_dipoles;
@@ -95,17 +95,17 @@ struct RowVehicle {
                     Q[(6 + 3 * i + a) * wide + 6 + 3 * k + a] =
                         between + (i == k ? difference : 0.0);
         if (turn_acceleration == 0.0) return;
-        // A turn rate whose variance is zero gets no noise: such a vehicle goes straight on.
+        // A turn rate of zero variance gets no noise: the vehicle drives straight on.
         const int w = n - 1;
         const double fading = std::exp(-dt / turn_time);
         const double speed = std::max(std::sqrt(x[3] * x[3] + x[4] * x[4]),
-                                      turn_acceleration / fastest_turn);
+                                      turn_acceleration / max_turn_rate);
         const double rate = turn_acceleration / speed;
         Q[w * wide + w] = P[w * wide + w] > 0.0 ? (1.0 - fading * fading) * rate * rate : 0.0;
     }
 
     // Positions and moments (d, 3) of the dipoles, TSP14 eq. (10b) and ICASSP11 eq. (8), and their
-    // derivatives (d, 3, n) by the state, which come as zeros.
+    // derivatives (d, 3, n) by the state, which must be zero on entry.
     INLINE void dipoles(const double* x, double* r, double* m, double* dr, double* dm) const {
         const int n = n_states, d = n_dipoles, soft = 6 + 3 * d, length = 9 + 3 * d;
         const Induced iron(x, d, induction);
@@ -121,9 +121,9 @@ struct RowVehicle {
             dm[n + k] = s, dm[n + k + 1] = c;
             dm[2 * n + k + 2] = 1.0;
             // d(hard)/d(heading) = z x hard
-            const double turned_x = iron.by_x - hard_y, turned_y = iron.by_y + hard_x;
-            dm[3] = turned_x * turn_x, dm[4] = turned_x * turn_y;
-            dm[n + 3] = turned_y * turn_x, dm[n + 4] = turned_y * turn_y;
+            const double slope_x = iron.by_x - hard_y, slope_y = iron.by_y + hard_x;
+            dm[3] = slope_x * turn_x, dm[4] = slope_x * turn_y;
+            dm[n + 3] = slope_y * turn_x, dm[n + 4] = slope_y * turn_y;
             dm[soft] = c * iron.ahead, dm[soft + 1] = -s * iron.left;
             dm[n + soft] = s * iron.ahead, dm[n + soft + 1] = c * iron.left;
             dm[2 * n + soft + 2] = iron.up;
@@ -137,9 +137,9 @@ struct RowVehicle {
         }
     }
 
-    // At `position` (3) [m]; `R` (3, 3) turns from the world to the frame of the derivative `H`
-    // (3, stride), of which the first n columns are written. `field` (3) [T] is in the world.
-    // Returns the size of the gradient [T/m] as dipole.sensor_fields has it.
+    // Field at `position` (3) [m]. `field` (3) [T] is in the world frame; `R` (3, 3) rotates from
+    // the world frame to that of the derivative `H` (3, stride), of which the first n columns are
+    // written. Returns the gradient [T/m] as defined in dipole.sensor_fields.
     INLINE double field(const double* x, const double* position, const double* R, double* field,
                         double* H, int stride) const {
         const int d = n_dipoles, soft = 6 + 3 * d, length = 9 + 3 * d;
@@ -160,8 +160,8 @@ struct RowVehicle {
                                  x[k + 2] + iron.up * x[soft + 2]});
             dipole.add_field(field);
             gradient += dipole.gradient();
-            // d(hard)/d(heading) = z x hard; of the place it is along z x heading.
-            const double turned_x = iron.by_x - hard_y, turned_y = iron.by_y + hard_x;
+            // d(hard)/d(heading) = z x hard; d(position)/d(heading) = along z x heading.
+            const double slope_x = iron.by_x - hard_y, slope_y = iron.by_y + hard_x;
             for (int a = 0; a < 3; ++a) {
                 double g[3], q[3], *row = H + a * stride;
                 dipole.rows(R + 3 * a, g, q);
@@ -171,7 +171,7 @@ struct RowVehicle {
                 row[soft] += iron.ahead * q_ahead;
                 row[soft + 1] += iron.left * q_left;
                 row[soft + 2] += iron.up * q[2];
-                by_heading[a] += q[0] * turned_x + q[1] * turned_y + along * (g[0] * s - g[1] * c);
+                by_heading[a] += q[0] * slope_x + q[1] * slope_y + along * (g[0] * s - g[1] * c);
                 if (d > 1) row[length] -= place * (g[0] * c + g[1] * s);
             }
         }

@@ -1,4 +1,4 @@
-"""Vehicles: a point, or a row of dipoles along the heading."""
+"""Vehicle models: a point target, or a row of dipoles along the heading."""
 
 import math
 from dataclasses import dataclass
@@ -12,48 +12,58 @@ from mag_tracking.physics.dipole import MU0
 from mag_tracking.physics.motion import constant_velocity, fading_turn, integrator_noise
 from mag_tracking.physics.sources import Dipoles
 
-FASTEST_TURN = 1.0
-"""[rad/s] Deviation of the turn rate of a vehicle that is slow; no car turns much faster."""
+MAX_TURN_RATE = 1.0
+"""Standard deviation of the turn rate of a slow vehicle [rad/s]; no car turns much faster."""
 
 
 @dataclass(frozen=True)
 class RowVehicle:
-    """A row of equidistant dipoles along the heading, of unknown length; one dipole is a point.
+    """A point target, or a row of equidistant dipoles along the heading, of unknown length.
 
-    State (6 + 3 d + 4, with one dipole 12, without a length; one more if any vehicle may turn):
-    position r of the row's middle, velocity v, hard iron moment of each dipole in the vehicle's
-    frame (x forward, z up; from the tail to the head), soft iron of the whole, the diagonal
-    [m^3] of a tensor D in that frame, length L [m], turn rate w [rad/s].
+    State: position r of the centre of the row [m], velocity v [m/s], hard iron moment m0 of each
+    dipole [A m²] in the vehicle frame (x forward, z up; from tail to head), diagonal of the soft
+    iron tensor D of the whole vehicle [m³] in that frame, length L [m], turn rate w [rad/s]. It has
+    10 + 3 d components for d dipoles; 12 for one dipole, which has no length; one more with a turn
+    rate. Moment and position of dipole i = 1 .. d are::
 
         m_i = R (m0_i + D R^T B0/(d mu0)) with R = Rz(heading),
         r_i = r + (i - (d+1)/2) L/(d-1) heading
 
     Sheets and axles are magnetised along themselves, so that a body is easier to magnetise along
-    some of its axes; where all three are equal D is the scalar of the source.
+    some of its axes. If all three components of D are equal, D is the scalar of TSP14.
 
-    The heading is that of the horizontal velocity; no roll, pitch or slip. Where the speed is
-    zero the heading is atan2(0, 0) = 0 and its derivative is taken as zero. With one dipole, or
-    L = 0, it is the point target of ICASSP11 eq. (4)-(8). A negative length is the same row from
-    its other end.
+    The heading is the direction of the horizontal velocity; there is no roll, pitch or slip. At
+    zero speed the heading is atan2(0, 0) = 0 and its derivative is set to zero. With one dipole, or
+    L = 0, the model is the point target of ICASSP11 eq. (4)-(8). A negative length is the same row
+    from its other end.
 
-    Source: TSP14 eq. (10), (16); ICASSP11 eq. (8) for the moments, (D/mu0) B0 and not T10's
-    (3D/mu0) B0; MITRE12 eq. (A.5) for a D that depends on the axis.
+    Notes
+    -----
+    The induced moment is (D/mu0) B0 as in ICASSP11 eq. (8), not (3D/mu0) B0 as in T10. A D that
+    depends on the axis follows MITRE12 eq. (A.5).
+
+    References
+    ----------
+    [TSP14]_ eq. (10), (16); [ICASSP11]_ eq. (4)-(8); [MITRE12]_ eq. (A.5).
     """
 
     earth_field: FloatArray
-    """(3,) [T], world. Zeros: no soft iron can be modelled."""
+    """Flux density B0 of the earth's field, (3,) T, world frame. Zeros: no soft iron can be
+    modelled."""
     acceleration_density: FloatArray
-    """(3,) [m^2/s^3], spectral density of the acceleration, per axis."""
+    """Power spectral density of the acceleration, per axis, (3,) m²/s³."""
     moment_drift: float = 0.0
-    """[1/s^0.5] random walk of the whole hard iron moment per axis, relative to the iron's size."""
+    """Random walk of the total hard iron moment per axis, relative to the magnitude of the iron,
+    1/s^0.5."""
     difference_drift: float = 0.0
-    """[1/s^0.5] the same of what each dipole differs from the mean of the row."""
+    """Random walk of the difference of each dipole from the mean of the row, likewise, 1/s^0.5."""
     n_dipoles: int = 3
+    """Number of dipoles of the row."""
     turn_acceleration: float = 0.0
-    """[m/s^2] standard deviation of the lateral acceleration of those that turn; 0: none does, and
-    the state has no turn rate."""
+    """Standard deviation of the lateral acceleration of turning vehicles, m/s². 0: no vehicle
+    turns, and the state has no turn rate."""
     turn_time: float = 1.5
-    """[s] for which a turn goes on (first-order Gauss-Markov)."""
+    """Correlation time of the turn rate (first-order Gauss-Markov), s."""
 
     @cached_property
     def state_names(self) -> tuple[str, ...]:
@@ -66,35 +76,67 @@ class RowVehicle:
 
     @cached_property
     def induction(self) -> FloatArray:
-        """(3,) [A/m] B0/mu0."""
+        """B0/mu0, (3,) A/m, world frame."""
         return np.asarray(self.earth_field, dtype=float) / MU0
 
     @cached_property
     def _walk(self) -> FloatArray:
-        """(3 d, 3 d) [1/s] random walk of the hard iron moments, relative to the iron's size."""
+        """Random walk of the hard iron moments relative to the squared iron magnitude, (3 d, 3 d)
+        1/s.
+        """
         d = self.n_dipoles
         mean = np.full((d, d), 1.0 / d)
         return np.kron(self.moment_drift**2 / d * mean
                        + self.difference_drift**2 * (np.eye(d) - mean), np.eye(3))
 
     def dipoles(self, x: FloatArray) -> Dipoles:
-        """`n_dipoles` dipoles a hypothesis; see `SourceModel.dipoles`.
+        """Dipoles of target states: `n_dipoles` per hypothesis.
 
-        Raises ValueError where the states are not as many as `state_names`.
+        Parameters
+        ----------
+        x : (n_hyp, n_t) array
+            Target states.
+
+        Returns
+        -------
+        Dipoles
+
+        Raises
+        ------
+        ValueError
+            If the number of states differs from that of `state_names`.
         """
         if x.shape[1:] != (len(self.state_names),):
             raise ValueError(f'{self.n_dipoles} dipoles need {len(self.state_names)} states, '
-                             f'got an array {x.shape}')
+                             f'got an array of shape {x.shape}')
         return Dipoles(*core.row_dipoles(np.ascontiguousarray(x, dtype=float), self.n_dipoles,
                                          self.induction))
 
     def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Constant velocity, or a turn; the drifts grow with the size of the iron.
+        """Predict target states at constant velocity, or along an arc if the state has a turn rate.
 
-        A turn rate whose variance in `P` is zero gets no noise: such a vehicle goes straight on.
-        Over `dt` the rate is taken as its mean; what its noise does to place and velocity within
-        that time is left out. See `SourceModel`.
+        Parameters
+        ----------
+        x : (n_hyp, n_t) array
+            Target states.
+        dt : float, s
+            Prediction interval; negative to propagate backwards, without process noise of the turn
+            rate.
+        P : (n_hyp, n_t, n_t) array, optional
+            Covariances of `x`. A turn rate of zero variance gets no process noise: the vehicle
+            drives straight on.
+
+        Returns
+        -------
+        x : (n_hyp, n_t) array
+            States after `dt`.
+        F : (n_t, n_t) or (n_hyp, n_t, n_t) array
+            Jacobian of the prediction; common to all hypotheses without a turn rate.
+        Q : (n_hyp, n_t, n_t) array
+            Covariance of the process noise. The drift of the moments is proportional to the
+            magnitude of the iron. The effect of the turn rate noise on position and velocity within
+            `dt` is neglected.
         """
         n = x.shape[1]
         Q = np.zeros((len(x), n, n))
@@ -105,7 +147,7 @@ class RowVehicle:
             F = np.eye(n)
             F[:6, :6] = constant_velocity(dt)
             return x @ F.T, F, Q
-        # Backwards, without noise, nothing may become surer than it is.
+        # No decay backwards: without process noise it would reduce the variance.
         fading = math.exp(-max(dt, 0.0) / self.turn_time)
         mean = (1.0 - fading) * self.turn_time / dt if dt > 0.0 else 1.0
         moved, turned = fading_turn(x, dt, mean, fading)
@@ -114,7 +156,17 @@ class RowVehicle:
         return moved, turned, Q
 
     def turn_variance(self, speed: FloatArray) -> FloatArray:
-        """(...) [rad^2/s^2] of the turn rate at a horizontal `speed` (...) [m/s]."""
-        slowest = self.turn_acceleration / FASTEST_TURN
+        """Variance of the turn rate, limited at low speed by `MAX_TURN_RATE`.
+
+        Parameters
+        ----------
+        speed : (...) array, m/s
+            Horizontal speed.
+
+        Returns
+        -------
+        (...) array, rad²/s²
+        """
+        slowest = self.turn_acceleration / MAX_TURN_RATE
         variance: FloatArray = np.square(self.turn_acceleration / np.maximum(speed, slowest))
         return variance

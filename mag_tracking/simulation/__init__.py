@@ -1,1 +1,1 @@
-"""Scenarios with truth."""
+"""Simulated scenarios with ground truth."""

@@ -1,8 +1,7 @@
-"""Scenarios with truth: vehicles and magnets that move past a network.
+"""Simulated scenarios with ground truth: bodies that move past a sensor network.
 
-A simulated vehicle is a cloud of magnetised parts, not one dipole, so that a
-point model meets the model error that it will meet on a road; a matched point
-target is a cloud of one part.
+A simulated vehicle is a cloud of magnetised parts rather than one dipole, so that a point target
+model is subject to a realistic model error. A matched point target is a cloud of one part.
 """
 
 from collections.abc import Sequence
@@ -19,37 +18,67 @@ from mag_tracking.records import Readings
 
 
 class Body(Protocol):
-    """Something magnetic that moves upright over the ground."""
+    """A magnetic body that moves upright over the ground."""
 
     def field(self, earth_field: FloatArray, position: FloatArray, heading: FloatArray,
               points: FloatArray) -> FloatArray:
-        """Its field at `points`.
+        """Field of the body at given points.
 
         Parameters
         ----------
-        earth_field : (3,) [T], world
-        position : (n, 2) [m], heading : (n,) [rad]
-        points : (n_sensors, 3) [m], world
+        earth_field : (3,) array, T, world frame
+            Flux density B0.
+        position : (n, 2) array, m, world frame
+            Horizontal position of the body at each time.
+        heading : (n,) array, rad
+            Heading at each time, anticlockwise from x.
+        points : (n_sensors, 3) array, m, world frame
+            Positions at which the field is evaluated.
 
         Returns
         -------
-        (n, n_sensors, 3) [T], world
+        (n, n_sensors, 3) array, T, world frame
         """
         ...
 
 
-class Course(Protocol):
-    """Where a body is at any time."""
+class Trajectory(Protocol):
+    """Pose of a body as a function of time."""
 
     def at(self, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Position (n, 2) [m] and heading (n,) [rad] at times `t` (n,) [s]."""
+        """Evaluate the trajectory.
+
+        Parameters
+        ----------
+        t : (n,) array, s
+            Times.
+
+        Returns
+        -------
+        position : (n, 2) array, m, world frame
+            Horizontal position.
+        heading : (n,) array, rad
+            Anticlockwise from x.
+        """
         ...
 
 
-def body_axes(position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations (n, 3, 3), body to world, and origins (n, 3) [m] of a body on the ground.
+def body_poses(position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Poses of a body that stands on the ground.
 
-    `position` (n, 2) [m] and `heading` (n,) [rad].
+    Parameters
+    ----------
+    position : (n, 2) array, m, world frame
+        Horizontal position.
+    heading : (n,) array, rad
+        Anticlockwise from x.
+
+    Returns
+    -------
+    R : (n, 3, 3) array
+        Rotation from the body frame to the world frame.
+    origin : (n, 3) array, m, world frame
+        Origin of the body frame, at z = 0.
     """
     R = np.zeros((len(heading), 3, 3))
     R[:, 0, 0], R[:, 0, 1] = np.cos(heading), -np.sin(heading)
@@ -60,19 +89,37 @@ def body_axes(position: FloatArray, heading: FloatArray) -> tuple[FloatArray, Fl
 
 @dataclass(frozen=True)
 class MagneticBody:
-    """Parts fixed in a body frame (x forward, z up), origin on the ground."""
+    """Magnetised parts fixed in a body frame (x forward, z up) with its origin on the ground."""
 
     parts: FloatArray
-    """(n, 3) [m]."""
+    """Positions of the parts, (n, 3) m, body frame."""
     permanent: FloatArray
-    """(n, 3) [A m^2], hard iron of each part."""
+    """Hard iron moment of each part, (n, 3) A m², body frame."""
     susceptibility: FloatArray
-    """(n, 3, 3) [m^3]: induced moment = susceptibility @ B0 / mu0, body frame."""
+    """Soft iron of each part, (n, 3, 3) m³, body frame: induced moment = susceptibility @ B0 / mu0.
+    """
 
     def field(self, earth_field: FloatArray, position: FloatArray, heading: FloatArray,
               points: FloatArray) -> FloatArray:
-        """See `Body.field`."""
-        R, origin = body_axes(position, heading)
+        """Field of the body at given points.
+
+        Parameters
+        ----------
+        earth_field : (3,) array, T, world frame
+            Flux density B0.
+        position : (n, 2) array, m, world frame
+            Horizontal position of the body at each time.
+        heading : (n,) array, rad
+            Heading at each time, anticlockwise from x.
+        points : (n_sensors, 3) array, m, world frame
+            Positions at which the field is evaluated.
+
+        Returns
+        -------
+        (n, n_sensors, 3) array, T, world frame
+            NaN where a part is at a point.
+        """
+        R, origin = body_poses(position, heading)
         r = origin[:, None] + np.einsum('nij,pj->npi', R, self.parts)
         B_body = np.einsum('nji,j->ni', R, earth_field)
         induced = np.einsum('pij,nj->npi', self.susceptibility, B_body) / MU0
@@ -83,17 +130,44 @@ class MagneticBody:
 
 def point_body(hard_iron: Sequence[float] | FloatArray, soft_iron: float,
                height: float) -> MagneticBody:
-    """A matched point target: m0 (3,) [A m^2], D [m^3], `height` [m] above the ground."""
+    """Point target that matches the model of the tracker.
+
+    Parameters
+    ----------
+    hard_iron : (3,) array, A m², body frame
+        Hard iron moment m0.
+    soft_iron : float, m³
+        Soft iron D, equal on all axes.
+    height : float, m
+        Height above the ground.
+
+    Returns
+    -------
+    MagneticBody
+    """
     return MagneticBody(np.array([[0.0, 0.0, height]]), np.array([hard_iron], dtype=float),
                         soft_iron * np.eye(3)[None])
 
 
 def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float = 1.7,
                    height: float = 1.3, n_parts: int = 60, moment: float = 400.0) -> MagneticBody:
-    """A vehicle-like cloud: parts in a box, most of the iron low and at the ends.
+    """Random vehicle: magnetised parts in a box, with most of the iron low and at the ends.
 
-    The permanent and the induced moment are each about `moment` / 1.4 in
-    size for an earth field of 50 microtesla.
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    length : float, m
+    width : float, m
+    height : float, m
+    n_parts : int
+        Number of parts.
+    moment : float, A m²
+        Typical total moment. Permanent and induced moment are each about `moment` / 1.4 in an earth
+        field of 50 microtesla.
+
+    Returns
+    -------
+    MagneticBody
     """
     along = np.where(rng.random(n_parts) < 0.6,
                      rng.choice([-0.35, 0.35], n_parts) + 0.1 * rng.standard_normal(n_parts),
@@ -105,7 +179,7 @@ def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float =
     permanent = (share[:, None] * (common / np.linalg.norm(common)
                                    + 0.7 * rng.standard_normal((n_parts, 3)))
                  * moment / 1.4)
-    # Iron sheets are easier to magnetise along the vehicle than across it.
+    # Sheet metal is easier to magnetise along the vehicle than across it.
     easy = np.array([1.3, 1.0, 0.7]) * rng.uniform(0.8, 1.2, (n_parts, 3))
     total = moment / 1.4 * MU0 / 50e-6
     susceptibility = np.einsum('n,ni,ij->nij', share * total, easy, np.eye(3))
@@ -117,27 +191,40 @@ class Path:
     """A planar path at constant speed: straight, or straight - arc - straight."""
 
     start: FloatArray
-    """(2,) [m]."""
+    """Position at t = 0, (2,) m, world frame."""
     heading: float
-    """[rad] at the start."""
+    """Heading at the start, rad, anticlockwise from x."""
     speed: float
-    """[m/s]."""
+    """Speed, m/s."""
     straight: float = float('inf')
-    """[m] before the arc."""
+    """Length of the straight segment before the arc, m."""
     turn: float = 0.0
-    """[rad], anticlockwise positive."""
+    """Angle of the arc, rad, anticlockwise positive; 0 = straight path."""
     radius: float = 1.0
-    """[m]."""
+    """Radius of the arc, m."""
 
     def at(self, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Position (n, 2) and heading (n,) at times `t` (n,) [s]."""
+        """Evaluate the trajectory.
+
+        Parameters
+        ----------
+        t : (n,) array, s
+            Times.
+
+        Returns
+        -------
+        position : (n, 2) array, m, world frame
+            Horizontal position.
+        heading : (n,) array, rad
+            Anticlockwise from x.
+        """
         s = self.speed * np.asarray(t, dtype=float)
         arc = abs(self.turn) * self.radius
         lead = np.minimum(s, self.straight)
         angle = np.clip((s - self.straight) / self.radius if self.turn else 0.0 * s,
                         0.0, abs(self.turn)) * np.sign(self.turn)
         tail = np.maximum(s - self.straight - arc, 0.0) if self.turn else 0.0 * s
-        # In the frame of the start: forward and left.
+        # In the frame of the start pose: x forward, y left.
         side = np.sign(self.turn)
         forward = lead + self.radius * np.sin(np.abs(angle)) + tail * np.cos(angle)
         left = side * self.radius * (1.0 - np.cos(angle)) + tail * np.sin(angle)
@@ -147,52 +234,62 @@ class Path:
 
 
 @dataclass(frozen=True)
-class Imperfections:
-    """What real sensors add; zeros are perfect sensors."""
+class SensorErrorModel:
+    """Standard deviations of random sensor errors; zeros = perfect sensors."""
 
     noise_std: float = 1.2e-8
-    """[T]."""
+    """White noise, T."""
     bias_std: float = 0.0
-    """[T], constant."""
+    """Constant bias, T."""
     drift_std: float = 0.0
-    """[T/s], constant slope."""
+    """Constant drift rate, T/s."""
     tilt_std: float = 0.0
-    """[rad], per axis: the mounting is off from what the network says."""
+    """Mounting error about each axis, relative to the network file, rad."""
     clock_std: float = 0.0
-    """[s], constant offset, not for the first sensor."""
+    """Constant clock offset, s; the first sensor has none."""
     gain_std: float = 0.0
-    """Of each axis, as a share of 1."""
+    """Relative gain error of each axis."""
 
 
-def simulate(network: SensorNetwork, body: Body, path: Course, rate: float, duration: float,
-             rng: np.random.Generator, imperfections: Imperfections | None = None,
+def simulate(network: SensorNetwork, body: Body, path: Trajectory, rate: float, duration: float,
+             rng: np.random.Generator, sensor_errors: SensorErrorModel | None = None,
              start_s: float = 0.0) -> tuple[Readings, FloatArray, FloatArray, FloatArray]:
-    """Raw readings of every sensor and the truth, for one vehicle.
+    """Simulate the raw readings of all sensors for one body, with ground truth.
 
     Parameters
     ----------
     network : SensorNetwork
-        With an earth field.
+        Sensors; must have an earth field.
     body : Body
-    path : Course
-    rate : float [Hz]
-    duration : float [s]
+    path : Trajectory
+    rate : float, Hz
+        Sampling rate of every sensor.
+    duration : float, s
     rng : numpy.random.Generator
-    imperfections : Imperfections, optional
-    start_s : float [s]
-        Stamp of the first sample.
+    sensor_errors : SensorErrorModel, optional
+        Default: white noise only.
+    start_s : float, s
+        Timestamp of the first sample.
 
     Returns
     -------
-    readings : Readings, in order of their timestamps
-    t : (n,) [s], position : (n, 2) [m], heading : (n,) [rad]
-        The truth.
+    readings : Readings
+        In order of their timestamps.
+    t : (n,) array, s
+        Time of each sample, from the start.
+    position : (n, 2) array, m, world frame
+        True position at `t`.
+    heading : (n,) array, rad
+        True heading at `t`.
 
-    Raises ValueError for a network without an earth field.
+    Raises
+    ------
+    ValueError
+        If the network has no earth field.
     """
-    flaws, earth_field = imperfections or Imperfections(), network.earth_field
+    flaws, earth_field = sensor_errors or SensorErrorModel(), network.earth_field
     if earth_field is None:
-        raise ValueError('the network has no earth field to simulate in')
+        raise ValueError('simulate requires a network with an earth field')
     t = np.arange(0.0, duration, 1.0 / rate, dtype=float)
     fields = []
     for j in range(len(network)):

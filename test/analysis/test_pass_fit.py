@@ -14,7 +14,7 @@ from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.apps.fit import RecordingFit
 from mag_tracking.inference.iron import hard_and_soft_iron
-from mag_tracking.inference.least_squares import correlated_scores, refine
+from mag_tracking.inference.least_squares import refine, score_sum_covariance
 from mag_tracking.physics.dipole import MU0, dipole_field
 from mag_tracking.physics.passes import RowPass
 from mag_tracking.pipeline import settings_for
@@ -149,7 +149,7 @@ def test_correlated_residuals_count_for_less():
         e = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(n))
         x = P @ (H.T @ e)
         errors.append(x)
-        found += P @ correlated_scores(H * (e - H @ x)[:, None], 60) @ P / 300.0
+        found += P @ score_sum_covariance(H * (e - H @ x)[:, None], 60) @ P / 300.0
     true = np.cov(np.transpose(errors))
     # White, it would be said to be a twentieth of that.
     assert (np.diagonal(P) < 0.1 * np.diagonal(true)).all()

@@ -18,7 +18,7 @@ from mag_tracking.analysis.placement import (
 from mag_tracking.apps.plan import compute_plan
 from mag_tracking.cli import main
 from mag_tracking.inference.crlb import bound, information
-from mag_tracking.inference.detection_theory import missed_probability
+from mag_tracking.inference.detection_theory import missed_detection_probability
 from mag_tracking.physics.dipole import dipole_field, dipole_jacobians
 from mag_tracking.pipeline import settings_for
 from support.bundled import NETWORK_FILE
@@ -224,12 +224,12 @@ def test_lanes_keep_a_further_sensor_away_from_each_of_them():
 def test_a_pass_is_missed_as_often_as_no_run_of_frames_detects():
     rng = np.random.default_rng(2)
     p = rng.uniform(0.0, 0.6, (12, 2))
-    found = missed_probability(p, 3)
+    found = missed_detection_probability(p, 3)
     hits = rng.random((40000, 12, 2)) < p
     runs = hits[:, :-2] & hits[:, 1:-1] & hits[:, 2:]
     rate = 1.0 - runs.any(axis=1).mean(axis=0)
     assert (np.abs(rate - found) < 4.0 * np.sqrt(found * (1.0 - found) / 40000)).all()
-    np.testing.assert_allclose(missed_probability(p, 1), np.prod(1.0 - p, axis=0))
+    np.testing.assert_allclose(missed_detection_probability(p, 1), np.prod(1.0 - p, axis=0))
 
 
 def test_a_lane_counts_every_frame_once():

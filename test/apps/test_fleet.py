@@ -71,7 +71,7 @@ def test_what_cannot_be_enrolled_is_named(recordings, tmp_path, capsys):
         assert 'is not a valid fleet file' in capsys.readouterr().err
     file.write_text(json.dumps({'mag_tracking.fleet': 1, 'vehicles': {'empty': []}}))
     assert command(recordings['van_east'], '--fleet', str(file)) == 1
-    assert 'empty: a vehicle is enrolled by at least one pass' in capsys.readouterr().err
+    assert 'empty: enrolment requires at least one pass' in capsys.readouterr().err
 
 
 def test_without_an_earth_field_nothing_is_recognised(tmp_path, capsys):

@@ -15,7 +15,7 @@ from mag_tracking.apps.classes import evaluate_classes, examples_of
 from mag_tracking.event_records import VehiclePassage
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.simulation.scenario import Imperfections
+from mag_tracking.simulation.scenario import SensorErrorModel
 from support.box_vehicles import BOUGHT, random_drive
 from support.bundled import NETWORK_FILE
 from support.labelled_passes import signatures
@@ -44,7 +44,7 @@ def classified(simulator, seed):
     rng = np.random.default_rng([seed, SIMULATORS.index(simulator)])
     name = str(rng.choice(list(SHARES), p=list(SHARES.values())))
     path, duration, closest_s = random_course(rng, False)
-    course, flaws = (path, Imperfections()) if simulator == 'clouds' else \
+    course, flaws = (path, SensorErrorModel()) if simulator == 'clouds' else \
         (random_drive(rng, path, closest_s), BOUGHT)
     network = read_network(NETWORK_FILE)
     readings, *_ = scenario.simulate(network, body_of(rng, name, simulator), course, 100.0,

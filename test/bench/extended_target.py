@@ -23,7 +23,7 @@ from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.report.metrics import pass_errors
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
-from mag_tracking.simulation.scenario import Imperfections, Path, random_vehicle
+from mag_tracking.simulation.scenario import Path, SensorErrorModel, random_vehicle
 from support.samples import one, recorded, simulate
 
 ROOT = FilePath(__file__).resolve().parents[2]
@@ -32,14 +32,14 @@ POINT = {f'track.vehicle.{name}': [value] for name, value in {
     'kinds': 'car', 'lengths': 0.0, 'length_stds': 0.0, 'moments': 400.0, 'moment_stds': 150.0,
     'difference_stds': 0.0, 'heights': 0.5, 'height_stds': 0.2,
     'near_field_lengths': 1.0}.items()}
-BOUGHT = Imperfections(1.2e-8, 1e-6, 4e-9, np.deg2rad(5), 0.015)
+BOUGHT = SensorErrorModel(1.2e-8, 1e-6, 4e-9, np.deg2rad(5), 0.015)
 STUDIES = (
-    ('cars, as points, 12.5 Hz, perfect sensors', 'car', POINT, Imperfections()),
-    ('cars, 12.5 Hz, perfect sensors', 'car', {}, Imperfections()),
+    ('cars, as points, 12.5 Hz, perfect sensors', 'car', POINT, SensorErrorModel()),
+    ('cars, 12.5 Hz, perfect sensors', 'car', {}, SensorErrorModel()),
     ('cars, 12.5 Hz, sensors turned 5 degrees, clocks 15 ms apart', 'car', {}, BOUGHT),
-    ('cars, 100 Hz, perfect sensors', 'car', {'align.period_s': 0.01}, Imperfections()),
-    ('trucks, as points, 12.5 Hz, perfect sensors', 'truck', POINT, Imperfections()),
-    ('trucks, 12.5 Hz, perfect sensors', 'truck', {}, Imperfections()))
+    ('cars, 100 Hz, perfect sensors', 'car', {'align.period_s': 0.01}, SensorErrorModel()),
+    ('trucks, as points, 12.5 Hz, perfect sensors', 'truck', POINT, SensorErrorModel()),
+    ('trucks, 12.5 Hz, perfect sensors', 'truck', {}, SensorErrorModel()))
 
 
 def longest_track(samples, network, changes):

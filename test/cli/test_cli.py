@@ -232,7 +232,7 @@ def test_fit_of_one_vehicle_tells_its_iron(tmp_path, capsys):
     name = str(vehicle_path('straight_car_right'))
     assert main(['fit', name, '--network', str(NETWORK_FILE), '--orders', '3', '--same-vehicle',
                  '--no-figures', '--out', str(tmp_path)]) == 0
-    assert 'cannot be told apart' in capsys.readouterr().out
+    assert 'cannot be separated' in capsys.readouterr().out
     assert json.loads((tmp_path / 'fits.json').read_text())['iron'] is None
 
 

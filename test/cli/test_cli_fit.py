@@ -46,4 +46,4 @@ def test_passes_at_several_headings_tell_hard_and_soft_iron(passes, tmp_path, ca
 
 def test_without_another_heading_they_are_not_told_apart(passes, tmp_path, capsys):
     assert iron_of(['east'], passes, tmp_path) is None
-    assert 'cannot be told apart' in capsys.readouterr().out
+    assert 'cannot be separated' in capsys.readouterr().out

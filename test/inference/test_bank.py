@@ -8,7 +8,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
-from mag_tracking.inference.starting_bank import StartingBank
+from mag_tracking.inference.initial_bank import InitialBank
 from mag_tracking.physics.dipole import MU0, sensor_fields
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
@@ -163,7 +163,7 @@ def starts(network, earth, offset_std=0.5):
                           4.0, 4.0, 4.0])
                 P.append(np.diag([0.5, offset_std, 0.1, 1.0, 0.3, 0.02,
                                   120.0, 120.0, 120.0, 1.0, 1.0, 1.0]) ** 2)
-    bank = FilterBank.of_targets(np.array(x), np.array(P), np.zeros(len(x), dtype=int),
+    bank = FilterBank.from_targets(np.array(x), np.array(P), np.zeros(len(x), dtype=int),
                                  len(network), 1e-8)
     return bank
 
@@ -232,11 +232,11 @@ def test_what_is_kept_is_as_it_was(gone):
 
 def test_a_start_gives_the_rows_of_the_bank_that_it_was_made_of():
     """Whatever has become of that bank, and of a start that has the same arrays."""
-    of_targets = random_bank(5, 4)
+    from_targets = random_bank(5, 4)
     own = np.array([np.diag([1.0, 2.0]), np.diag([3.0, 4.0])])
-    bank = FilterBank.of_targets(of_targets.x, of_targets.P, of_targets.label, 2, 1e-8, own,
-                                 of_targets.kind)
-    before, start = bank.copy(), StartingBank.of(bank, 4)
+    bank = FilterBank.from_targets(from_targets.x, from_targets.P, from_targets.label, 2, 1e-8, own,
+                                 from_targets.kind)
+    before, start = bank.copy(), InitialBank.of(bank, 4)
     other = copy(start)
     bank.x[:], bank.P[:] = np.nan, np.nan
     other.keep(np.array([False, False, True, False, True]))

@@ -134,5 +134,5 @@ def test_components_that_do_not_change_are_constants():
 
 
 def test_a_component_that_does_not_change_stands_behind_those_that_do():
-    with pytest.raises(ValueError, match='stands before'):
+    with pytest.raises(ValueError, match='must come last'):
         GaussMarkovVectors(1, np.array([0.0, 1.0]), 1.0)

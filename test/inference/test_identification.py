@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mag_tracking.inference.identification import BETWEEN_STD, enrol, identify
+from mag_tracking.inference.identification import PASS_TO_PASS_STD, enrol, identify
 from mag_tracking.inference.log_normal_classes import UNKNOWN
 from mag_tracking.physics.dipole import MU0
 from support.vehicle_5 import TABLE
@@ -20,7 +20,7 @@ HARD, SOFT = SCALE * np.array([-0.47, 0.29, -0.56]), 1.22
 
 def distances(between_std, monkeypatch):
     """Squared distances of each published pass to what the twelve others predict."""
-    monkeypatch.setattr('mag_tracking.inference.identification.BETWEEN_STD', between_std)
+    monkeypatch.setattr('mag_tracking.inference.identification.PASS_TO_PASS_STD', between_std)
     out = []
     for k in range(len(TABLE)):
         rest = np.arange(len(TABLE)) != k
@@ -33,7 +33,7 @@ def distances(between_std, monkeypatch):
 def test_published_passes_are_consistent_with_the_spread_between_passes(monkeypatch):
     """T10 Table 6.9, each pass left out; the stated deviations alone are too small."""
     low, high = chi2.ppf([0.005, 0.995], 3 * len(TABLE)) / len(TABLE)
-    assert low < distances(BETWEEN_STD, monkeypatch).mean() < high
+    assert low < distances(PASS_TO_PASS_STD, monkeypatch).mean() < high
     assert distances(1e-6, monkeypatch).mean() > high
 
 
@@ -62,7 +62,7 @@ def turned(degrees):
 def test_two_cars_of_equal_size_are_told_apart(degrees):
     """T10 Fig. 7.1 in kind: enrolled heading north and south, identified at any heading."""
     rng, C = np.random.default_rng(degrees), np.diag([8.0, 8.0, 15.0])**2
-    spread = np.linalg.cholesky(C + BETWEEN_STD**2 * np.eye(3))
+    spread = np.linalg.cholesky(C + PASS_TO_PASS_STD**2 * np.eye(3))
     cars = {'vehicle 5': HARD, 'other': turned(degrees)}
     enrolled_at = np.deg2rad([90.0, 90.0, 270.0, 270.0])
 

@@ -64,7 +64,7 @@ def test_the_covariance_is_that_of_the_errors(stated):
     ([0.3, 1.3, 2.3], [0.0, 0.0, -39.0]), ([0.3, 1.3, 2.3], np.zeros(3))])
 def test_what_cannot_be_told_apart_is_refused(headings, induction):
     headings = np.array(headings)
-    with pytest.raises(ValueError, match='cannot be told apart'):
+    with pytest.raises(ValueError, match='cannot be separated'):
         hard_and_soft_iron(moments_at(headings), headings, induction)
 
 
@@ -73,7 +73,7 @@ def test_bad_input_is_named():
     m = moments_at(headings)
     with pytest.raises(ValueError, match=r'expected moments \(n, 3\)'):
         hard_and_soft_iron(m[:2], headings, INDUCTION)
-    with pytest.raises(ValueError, match='not finite'):
+    with pytest.raises(ValueError, match='must be finite'):
         hard_and_soft_iron(m * [np.nan, 1.0, 1.0], headings, INDUCTION)
     with pytest.raises(ValueError, match=r'expected covariances \(3, 3, 3\)'):
         hard_and_soft_iron(m, headings, INDUCTION, np.eye(3))

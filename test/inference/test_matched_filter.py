@@ -6,7 +6,7 @@ from scipy.integrate import quad
 from scipy.stats import binom, norm
 
 from mag_tracking.inference.matched_filter import (
-    any_detects,
+    any_detection_probability,
     deflection,
     detection_probability,
     noise_spectrum,
@@ -134,8 +134,8 @@ def test_axes_add_up_and_missing_ones_do_not_count():
     assert d[0, 0] == pytest.approx(each[0][0, 0], rel=1e-12)
     p = detection_probability(d, 1e-6)
     assert np.argwhere(np.isnan(d)).tolist() == np.argwhere(np.isnan(p)).tolist() == [[1, 1]]
-    assert any_detects(p) == pytest.approx(1.0 - np.nanprod(1.0 - p), rel=1e-9)
-    assert any_detects([np.nan, np.nan]) == 0.0
+    assert any_detection_probability(p) == pytest.approx(1.0 - np.nanprod(1.0 - p), rel=1e-9)
+    assert any_detection_probability([np.nan, np.nan]) == 0.0
 
 
 def test_detection_probability_has_its_fixed_points_and_grows():
@@ -187,32 +187,33 @@ def test_measured_rate_in_the_sources_noise():
 def test_any_detects_is_one_minus_the_product():
     p = np.random.default_rng(3).uniform(0.0, 1.0, (3, 4, 5))
     for axis in (None, 0, -1, (1, 2)):
-        np.testing.assert_allclose(any_detects(p, axis), 1.0 - np.prod(1.0 - p, axis=axis),
-                                   rtol=1e-12)
-    assert any_detects([0.3, 1.0, 0.0]) == 1.0 and any_detects([0.0, 0.0]) == 0.0
-    assert any_detects(0.25) == pytest.approx(0.25, rel=1e-15)
+        np.testing.assert_allclose(any_detection_probability(p, axis),
+                                   1.0 - np.prod(1.0 - p, axis=axis), rtol=1e-12)
+    assert (any_detection_probability([0.3, 1.0, 0.0]) == 1.0
+            and any_detection_probability([0.0, 0.0]) == 0.0)
+    assert any_detection_probability(0.25) == pytest.approx(0.25, rel=1e-15)
     # Nothing is lost: 1 - (1 - 1e-30)^3 is 0 in plain arithmetic.
-    np.testing.assert_allclose(any_detects([1e-30] * 3), 3e-30, rtol=1e-12)
-    np.testing.assert_allclose(any_detects(np.full(1000, 1e-17)), 1e-14, rtol=1e-9)
+    np.testing.assert_allclose(any_detection_probability([1e-30] * 3), 3e-30, rtol=1e-12)
+    np.testing.assert_allclose(any_detection_probability(np.full(1000, 1e-17)), 1e-14, rtol=1e-9)
 
 
 def test_measured_rate_of_a_network():
     rng, n = np.random.default_rng(5), 20_000
     p = np.array([[0.01, 0.2, 0.05], [0.1, 0.02, 0.0]])
     hits = np.sum((rng.uniform(size=(n, 2, 3)) < p).any(axis=(1, 2)))
-    assert within_binomial(hits, n, any_detects(p))
+    assert within_binomial(hits, n, any_detection_probability(p))
 
 
 GOOD = np.ones((11, 2))
 
 
 @pytest.mark.parametrize('call, message', [
-    (lambda: noise_spectrum([1.0, np.nan], 1e-10, 0.0, 11.0), r'frequency\[1\].*numbers, got nan'),
+    (lambda: noise_spectrum([1.0, np.nan], 1e-10, 0.0, 11.0), r'frequency\[1\].*a number, got nan'),
     (lambda: noise_spectrum(1.0, -1e-10, 0.0, 11.0), 'background.*at least 0.*got -1e-10'),
     (lambda: noise_spectrum(1.0, 1e-10, np.inf, 11.0), 'resolution.*got inf'),
     (lambda: noise_spectrum(1.0, 1e-10, 0.0, 0.0), 'bandwidth.*above 0.*got 0.0'),
-    (lambda: deflection(GOOD[:, 0], 22.0, mitre, ALL), r'B needs shape.*got \(11,\)'),
-    (lambda: deflection(GOOD[:0], 22.0, mitre, ALL), r'B needs shape.*got \(0, 2\)'),
+    (lambda: deflection(GOOD[:, 0], 22.0, mitre, ALL), r'B must have shape.*got \(11,\)'),
+    (lambda: deflection(GOOD[:0], 22.0, mitre, ALL), r'B must have shape.*got \(0, 2\)'),
     (lambda: deflection(np.where(np.arange(11)[:, None] == 3, np.nan, GOOD), 22.0, mitre, ALL),
      r'B\[3, 0\].*NaN on a whole axis, got nan'),
     (lambda: deflection(GOOD * np.inf, 22.0, mitre, ALL), r'B\[0, 0\].*got inf'),
@@ -225,8 +226,8 @@ GOOD = np.ones((11, 2))
     (lambda: detection_probability([1.0, -0.5], 0.1), r'deflection\[1\].*at least 0, got -0.5'),
     (lambda: detection_probability(1.0, 0.0), 'false_alarm_probability.*got 0.0'),
     (lambda: detection_probability(1.0, [0.5, np.nan]), r'false_alarm_probability\[1\].*got nan'),
-    (lambda: any_detects([0.5, 1.5]), r'probability\[1\].*from 0 to 1, got 1.5'),
-    (lambda: any_detects(-0.1), 'probability.*got -0.1'),
+    (lambda: any_detection_probability([0.5, 1.5]), r'probability\[1\].*from 0 to 1, got 1.5'),
+    (lambda: any_detection_probability(-0.1), 'probability.*got -0.1'),
 ])
 def test_bad_input_is_named(call, message):
     with pytest.raises(ValueError, match=message):

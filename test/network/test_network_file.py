@@ -192,7 +192,7 @@ def test_faults_of_a_calibration_are_named(tmp_path, old, new, message):
     ('position: [0, -4.5, 0]', 'position: [0, 1.0e+200, 0]', 'too far from the origin'),
     ('position: [0, -4.5, 0]', 'position: [0, 1.0e9, 0]', "'1.0e9' is text"),
     ('position: [0, -4.5, 0]', 'position: [0, 4.5, 0]', 'sensors a and b are both at'),
-    ('0.7071067811865476, 0.7', '0.1, 0.7', 'needs norm 1'),
+    ('0.7071067811865476, 0.7', '0.1, 0.7', 'must have norm 1'),
     ('[2.0e-6, 1.55e-5, -4.9e-5]', '[0.02, 0.155, -0.49]', 'microtesla or gauss'),
     ('frame: map', 'fram: map', 'unknown key'),
     ('frame: map', 'frame: [', 'not valid YAML'),

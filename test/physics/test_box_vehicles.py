@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.physics.dipole import dipole_field
-from mag_tracking.simulation.scenario import Path, body_axes
+from mag_tracking.simulation.scenario import Path, body_poses
 from support.box_vehicles import Drive, box_car, box_truck
 from support.passes import EARTH
 
@@ -13,7 +13,7 @@ from support.passes import EARTH
 @pytest.mark.parametrize('heading', [0.0, 2.1])
 def test_far_away_a_box_vehicle_is_its_moment(made, heading):
     body = made(np.random.default_rng(4), moment=500.0)
-    R, _ = body_axes(np.zeros((1, 2)), np.array([heading]))
+    R, _ = body_poses(np.zeros((1, 2)), np.array([heading]))
     parts = body.moments((EARTH @ R[0])[None])[0]
     m = R[0] @ parts.sum(axis=0)
     if not heading:

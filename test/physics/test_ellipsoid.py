@@ -74,7 +74,7 @@ def test_factors_keep_the_shape():
 
 @pytest.mark.parametrize('aspect', [0.0, -2.0, math.nan, math.inf, [1.0, 0.0]])
 def test_a_bad_aspect_is_named(aspect):
-    with pytest.raises(ValueError, match='aspect has to be between 1e-100 and 1e100, got'):
+    with pytest.raises(ValueError, match='aspect must be between 1e-100 and 1e100, got'):
         demagnetisation_factors(aspect)
 
 
@@ -140,10 +140,10 @@ def test_moment_broadcasts():
 def test_bad_input_is_named():
     B0 = np.array([0.0, 2e-5, -4e-5])
     for semi_axes in ((0.0, 1.0), (1.0, -1.0), (math.nan, 1.0), (1.0, math.inf)):
-        with pytest.raises(ValueError, match=r'semi_axes have to be above 0 and finite, got '):
+        with pytest.raises(ValueError, match=r'semi_axes must be positive and finite, got '):
             ellipsoid_moment(semi_axes, 10.0, 0.0, B0)
     for mu_r in (0.99, math.nan, math.inf):
-        with pytest.raises(ValueError, match=f'mu_r has to be at least 1 and finite, got {mu_r}'):
+        with pytest.raises(ValueError, match=f'mu_r must be at least 1 and finite, got {mu_r}'):
             ellipsoid_moment((2.0, 1.0), mu_r, 0.0, B0)
     with pytest.raises(ValueError, match=r'last axis of length 3, got \(2,\)'):
         ellipsoid_moment((2.0, 1.0), 10.0, 0.0, B0[:2])

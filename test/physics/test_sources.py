@@ -12,7 +12,7 @@ from mag_tracking.physics.dipole import MU0, sensor_fields
 from mag_tracking.physics.ellipsoid import ellipsoid_moment
 from mag_tracking.physics.motion import constant_velocity, coordinated_turn, integrator_noise
 from mag_tracking.physics.sources import Magnet
-from mag_tracking.physics.vehicles import FASTEST_TURN, RowVehicle
+from mag_tracking.physics.vehicles import MAX_TURN_RATE, RowVehicle
 
 EARTH, ACCELERATION = np.array([2e-6, 1.5e-5, -4.9e-5]), np.array([1.0, 1.0, 0.1])
 EXAMPLES = {
@@ -119,7 +119,7 @@ def test_the_turn_rate_is_a_gauss_markov_process_of_its_size():
     assert later.std() == pytest.approx(0.5, rel=0.01)
     assert np.corrcoef(x[:, -1], later)[0, 1] == pytest.approx(np.exp(-dt / 1.5), abs=0.01)
     assert model.turn_variance(np.array([0.0, 1.0, 12.0])).tolist() == [
-        FASTEST_TURN**2, FASTEST_TURN**2, 0.25**2]
+        MAX_TURN_RATE**2, MAX_TURN_RATE**2, 0.25**2]
 
 
 def test_a_turn_is_as_large_in_one_step_as_in_many():
@@ -194,7 +194,8 @@ def test_standing_vehicle_has_a_finite_model(name):
 
 
 def test_states_of_another_model_are_refused():
-    with pytest.raises(ValueError, match=r'3 dipoles need 19 states, got an array \(2, 10\)'):
+    with pytest.raises(ValueError,
+                       match=r'3 dipoles need 19 states, got an array of shape \(2, 10\)'):
         EXAMPLES['RowVehicle'].dipoles(np.zeros((2, 10)))
 
 

@@ -12,10 +12,10 @@ import magpylib
 import numpy as np
 
 from mag_tracking.physics.dipole import MU0
-from mag_tracking.simulation.scenario import Imperfections, Path, body_axes
+from mag_tracking.simulation.scenario import Path, SensorErrorModel, body_poses
 from support.passes import EARTH
 
-BOUGHT = Imperfections(noise_std=1.2e-8, tilt_std=np.deg2rad(1.0), gain_std=0.01)
+BOUGHT = SensorErrorModel(noise_std=1.2e-8, tilt_std=np.deg2rad(1.0), gain_std=0.01)
 """Uncalibrated sensors, mounted with care."""
 
 SHEET = 0.01
@@ -46,7 +46,7 @@ class BoxVehicle:
 
     def field(self, earth_field, position, heading, points):
         """See `mag_tracking.simulation.scenario.Body`."""
-        R, origin = body_axes(position, heading)
+        R, origin = body_poses(position, heading)
         m = self.moments(np.einsum('nji,j->ni', R, earth_field))
         J = MU0 * m / self.sides.prod(axis=1)[:, None]
         seen = np.einsum('nji,nsj->nsi', R, points[None] - origin[:, None])
@@ -153,7 +153,7 @@ class Drive:
         return self.path.speed * (1.0 + self.change / (1.0 + np.exp(-z)))
 
     def at(self, t):
-        """See `mag_tracking.simulation.scenario.Course`."""
+        """See `mag_tracking.simulation.scenario.Trajectory`."""
         t = np.asarray(t, dtype=float)
         position, heading = self.path.at(self._on_path(t))
         z = (t - self.aside_at) / (self.aside_s / 2.0)

@@ -11,7 +11,7 @@ import numpy as np
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
-from mag_tracking.simulation.scenario import Path, body_axes
+from mag_tracking.simulation.scenario import Path, body_poses
 from support.box_vehicles import random_drive
 from support.passes import network_of
 from support.random_passes import are_wrong, errors_of
@@ -42,7 +42,7 @@ class OnWheels:
     def field(self, earth_field, position, heading, points):
         """See `mag_tracking.simulation.scenario.Body`."""
         B = self.body.field(earth_field, position, heading, points)
-        R, origin = body_axes(position, heading)
+        R, origin = body_poses(position, heading)
         way = np.concatenate([[0.0], np.hypot(*np.diff(position[:, :2], axis=0).T).cumsum()])
         for k, (x, y) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
             a = way / self.radius + 1.7 * k

@@ -7,7 +7,7 @@ import numpy as np
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
-from mag_tracking.simulation.scenario import Imperfections, Path, random_vehicle
+from mag_tracking.simulation.scenario import Path, SensorErrorModel, random_vehicle
 from support.box_vehicles import BOUGHT, box_car, box_truck, random_drive
 from support.bundled import NETWORK_FILE
 from support.samples import scenario
@@ -34,14 +34,14 @@ def random_course(rng, turns):
 
 
 def random_pass(simulator, kind, seed):
-    """(body, course, duration [s], `Imperfections`) of one pass of a kind in `KINDS`."""
+    """(body, course, duration [s], `SensorErrorModel`) of one pass of a kind in `KINDS`."""
     rng = np.random.default_rng([seed, KINDS.index(kind), SIMULATORS.index(simulator)])
     path, duration, closest_s = random_course(rng, kind == 'turning')
     if simulator == 'clouds':
         body = (random_vehicle(rng, rng.uniform(7.0, 16.0), 2.4, 2.8,
                                moment=rng.uniform(1200.0, 2200.0)) if kind == 'truck' else
                 random_vehicle(rng, rng.uniform(3.6, 4.8), moment=rng.uniform(300.0, 600.0)))
-        return body, path, duration, Imperfections()
+        return body, path, duration, SensorErrorModel()
     body = (box_truck if kind == 'truck' else box_car)(rng)
     return body, random_drive(rng, path, closest_s), duration + 3.0, BOUGHT
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings
-from mag_tracking.simulation.scenario import Imperfections, Path
+from mag_tracking.simulation.scenario import Path, SensorErrorModel
 from support.box_vehicles import BOUGHT, magnetised
 from support.samples import scenario
 
@@ -25,7 +25,7 @@ class Ride:
     """(k,) [m/s] at those times, linear in between; negative = backwards."""
 
     def at(self, t):
-        """See `mag_tracking.simulation.scenario.Course`."""
+        """See `mag_tracking.simulation.scenario.Trajectory`."""
         t = np.asarray(t, dtype=float)
         grid = np.arange(0.0, max(self.times[-1], t.max()) + 2 * GRID_S, GRID_S)
         speed = np.interp(grid, self.times, self.speeds)
@@ -73,13 +73,13 @@ def box_two_wheeler(rng, length, moment, iron=1.0):
 def world(network, movers, duration, rng, flaws=None, rate=100.0, ambient=None):
     """`World` of movers [(body, course)] for a `duration` [s], with sensors that have `flaws`."""
     # `ambient` is a function from times (n,) [s] to a field (n, n_sensors, 3) [T], world frame.
-    flaws = flaws or Imperfections()
+    flaws = flaws or SensorErrorModel()
     t = np.arange(0.0, duration, 1.0 / rate)
     parts = []
     for body, course in movers:
         # Each body is simulated separately with perfect sensors; the fields are added.
         readings, *_ = scenario.simulate(network, body, course, rate, duration, rng,
-                                         Imperfections(noise_std=0.0))
+                                         SensorErrorModel(noise_std=0.0))
         parts.append(readings.field.reshape(len(t), len(network), 3) - _earth(network))
     B = sum(parts, np.zeros((len(t), len(network), 3))) + _earth(network)
     if ambient is not None:
@@ -98,7 +98,7 @@ def _earth(network):
 
 
 def _flawed(B, flaws, t, rng):
-    """Fields (n, n_sensors, 3) [T] as measured by sensors with `Imperfections`."""
+    """Fields (n, n_sensors, 3) [T] as measured by sensors with `SensorErrorModel`."""
     out = np.empty_like(B)
     for j in range(B.shape[1]):
         a, b, c = flaws.tilt_std * rng.standard_normal(3)
@@ -109,5 +109,5 @@ def _flawed(B, flaws, t, rng):
     return out + flaws.noise_std * rng.standard_normal(out.shape)
 
 
-FLAWS = {'clouds': Imperfections(), 'boxes': BOUGHT}
-"""{simulator: `Imperfections` of its sensors}."""
+FLAWS = {'clouds': SensorErrorModel(), 'boxes': BOUGHT}
+"""{simulator: `SensorErrorModel` of its sensors}."""

@@ -16,7 +16,7 @@ from mag_tracking.calibration.level_change import SharedChanges
 from mag_tracking.calibration.screening import clear_spikes
 from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
-from mag_tracking.inference.axes import are_covariances
+from mag_tracking.inference.axes import are_valid_covariances
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
@@ -341,7 +341,7 @@ def _own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
     if readings.covariance is None:
         return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
     C = plain(readings.covariance)
-    valid = np.where(are_covariances(plain(readings.field), C), core.VALID, core.INVALID)
+    valid = np.where(are_valid_covariances(plain(readings.field), C), core.VALID, core.INVALID)
     return np.where(readings.has_unknown_covariance(), core.NONE, valid), C
 
 

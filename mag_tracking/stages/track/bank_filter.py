@@ -10,7 +10,7 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.sources import Magnet, SourceModel
-from mag_tracking.physics.vehicles import FASTEST_TURN, RowVehicle
+from mag_tracking.physics.vehicles import MAX_TURN_RATE, RowVehicle
 from mag_tracking.records import FieldFrame, plain
 from mag_tracking.stages.track import core
 from mag_tracking.stages.track.observation import SAME_TIME_S, Observation
@@ -61,7 +61,7 @@ def compiled_filter(model: SourceModel, observation: Observation
             else partial(core.VehiclesFilter, *sensors, observation.n_targets)
         return one(len(model.state_names), model.n_dipoles, list(model.acceleration_density),
                    list(model.induction), model.moment_drift, model.difference_drift,
-                   model.turn_acceleration, model.turn_time, FASTEST_TURN)
+                   model.turn_acceleration, model.turn_time, MAX_TURN_RATE)
     assert isinstance(model, Magnet) and observation.n_targets == 1
     return core.MagnetFilter(*sensors, list(model.acceleration_density), model.angular_density)
 

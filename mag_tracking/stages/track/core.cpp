@@ -179,21 +179,21 @@ using Vector = std::array<double, 3>;
 
 RowVehicle row_vehicle(int n_states, int n_dipoles, Vector density, Vector induction,
                        double moment_drift, double difference_drift, double turn_acceleration,
-                       double turn_time, double fastest_turn) {
+                       double turn_time, double max_turn_rate) {
     if (n_dipoles < 1 || n_states != 9 + 3 * n_dipoles + (n_dipoles > 1) + (turn_acceleration != 0.0))
         throw py::value_error("n_states: not those of a row of so many dipoles");
     return {n_states, n_dipoles, {density[0], density[1], density[2]},
             {induction[0], induction[1], induction[2]}, moment_drift, difference_drift,
-            turn_acceleration, turn_time, fastest_turn};
+            turn_acceleration, turn_time, max_turn_rate};
 }
 
 Vehicles vehicles(int count, int n_states, int n_dipoles, Vector density, Vector induction,
                   double moment_drift, double difference_drift, double turn_acceleration,
-                  double turn_time, double fastest_turn) {
+                  double turn_time, double max_turn_rate) {
     if (count < 1 || count > MAX_TARGETS)
         throw py::value_error("count: from 1 to " + std::to_string(MAX_TARGETS));
     return {row_vehicle(n_states, n_dipoles, density, induction, moment_drift, difference_drift,
-                        turn_acceleration, turn_time, fastest_turn), count};
+                        turn_acceleration, turn_time, max_turn_rate), count};
 }
 
 Magnet magnet(Vector density, double angular_density) {

@@ -27,7 +27,7 @@ class RowVehicleFilter(_Filter):
     def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,
                  n_states: int, n_dipoles: int, density: Sequence[float],
                  induction: Sequence[float], moment_drift: float, difference_drift: float,
-                 turn_acceleration: float, turn_time: float, fastest_turn: float) -> None: ...
+                 turn_acceleration: float, turn_time: float, max_turn_rate: float) -> None: ...
 
 class VehiclesFilter(_Filter):
     """Filter of `count` vehicles whose fields add up."""
@@ -35,7 +35,7 @@ class VehiclesFilter(_Filter):
     def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,
                  count: int, n_states: int, n_dipoles: int, density: Sequence[float],
                  induction: Sequence[float], moment_drift: float, difference_drift: float,
-                 turn_acceleration: float, turn_time: float, fastest_turn: float) -> None: ...
+                 turn_acceleration: float, turn_time: float, max_turn_rate: float) -> None: ...
 
 class MagnetFilter(_Filter):
     def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,

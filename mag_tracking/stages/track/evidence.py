@@ -272,7 +272,7 @@ class TrackEvidence:
         set of str
         """
         found = set()
-        if self.bayes_factor.fell_behind(ratio):
+        if self.bayes_factor.is_recently_disfavoured(ratio):
             found.add(doubts.DISTURBANCE_MODEL)
         if self.contradicts(nis, degrees_of_freedom):
             found.add(doubts.CONTRADICTION)
@@ -363,7 +363,7 @@ class TrackEvidence:
         -------
         str or None
         """
-        if self.bayes_factor.unexplained_s(track.stamp_ns) > UNEXPLAINED_S:
+        if self.bayes_factor.disfavoured_s(track.stamp_ns) > UNEXPLAINED_S:
             return UNEXPLAINED
         misfit = track.nis > settings.end_nis * track.degrees_of_freedom
         self._n_misfits = self._n_misfits + 1 if misfit else 0

@@ -107,7 +107,7 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     state, P, cost = _distinct_optima(settings, network, start, y, std, present)
     if not len(cost):
         return None
-    bank = FilterBank.of_targets(state, P, np.zeros(len(cost), dtype=int), len(network),
+    bank = FilterBank.from_targets(state, P, np.zeros(len(cost), dtype=int), len(network),
                                  background_std, own_covariance)
     bank.reweight(-0.5 * cost)
     return bank

@@ -244,7 +244,7 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
             covariances.append(np.tile(by_speed.repeat(len(moments), 0), (len(starts), 1, 1)))
             labels += [label] * len(states[-1])
             kinds += [kind] * len(states[-1])
-    bank = FilterBank.of_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
+    bank = FilterBank.from_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
                                  len(network), background_std, own_covariance, np.array(kinds))
     return _with_turns(bank, vehicle_model(settings, network), settings.turn_share)
 

@@ -220,7 +220,7 @@ class Member:
         bool
         """
         return self.evidence.doubted or self.cross_check.is_doubtful \
-            or not self.evidence.bayes_factor.leads(settings.min_bayes_factor) \
+            or not self.evidence.bayes_factor.is_favoured(settings.min_bayes_factor) \
             or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
 
     def _doubts(self, update: Update, view: View, alone: bool) -> set[str]:
@@ -229,7 +229,7 @@ class Member:
         found = evidence.doubts | ({doubts.ONE_SENSOR} if alone else set())
         if update.bank_filter.is_implausible(bank, best, update.frame):
             found.add(doubts.MISFIT)
-        if not evidence.bayes_factor.leads(settings.min_bayes_factor):
+        if not evidence.bayes_factor.is_favoured(settings.min_bayes_factor):
             found.add(doubts.DISTURBANCE_MODEL)
         # A magnet may rest: its field is then as smooth as a disturbance, and its pose is right.
         if self._target.starts_anywhere:
@@ -284,7 +284,7 @@ class Member:
         UnexplainedField or None
         """
         if self._was_unambiguous or self.last is None \
-                or self.evidence.bayes_factor.unexplained_s(self.last.stamp_ns) <= 0.0:
+                or self.evidence.bayes_factor.disfavoured_s(self.last.stamp_ns) <= 0.0:
             return None
         return UnexplainedField(self.id, self.begin_ns, self.evidence.largest, self.evidence.sensed,
                            uniform)

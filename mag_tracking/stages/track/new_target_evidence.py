@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.special import chdtrc
 
-from mag_tracking.inference.latest_frames import LatestFrames
+from mag_tracking.inference.sliding_sum import SlidingSum
 from mag_tracking.units import NS
 
 FALSE_ALARM = 1e-3
@@ -33,7 +33,7 @@ class NewTargetEvidence:
     """
 
     def __init__(self) -> None:
-        self._latest = LatestFrames(WINDOW_S)
+        self._latest = SlidingSum(WINDOW_S)
         self._last_ns: int | None = None
         self._was_probable = False
         self._was_rejected = self._is_long = False

@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.inference.least_squares import LINEAR_RANK, MAX_DAMPING
-from mag_tracking.inference.matrices import FULL_RANK, RANK
+from mag_tracking.inference.least_squares import LINEAR_RANK_TOLERANCE, MAX_DAMPING
+from mag_tracking.inference.matrices import MIN_PIVOT_ROOT, PSEUDO_INVERSE_TOLERANCE
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, SteadyPass
 from mag_tracking.records import FieldFrame, plain
@@ -115,8 +115,9 @@ class PassSamples:
             theta=theta, cost=cost, covariance=P, free=plain(free, np.int64), fixed=model.fixed,
             places=model.places, combinations=model.combinations, t=self.t,
             positions=self.positions, M=self.M, clock=self.clock, y=y, nuisance=nuisance,
-            n_steps=N_STEPS, tolerance=TOLERANCE, most_damping=MAX_DAMPING, full_rank=FULL_RANK,
-            linear_rank=LINEAR_RANK, rank=RANK)
+            n_steps=N_STEPS, tolerance=TOLERANCE, most_damping=MAX_DAMPING,
+            full_rank=MIN_PIVOT_ROOT, linear_rank=LINEAR_RANK_TOLERANCE,
+            rank=PSEUDO_INVERSE_TOLERANCE)
         k = int(np.argmin(cost))
         return model.whole(theta[k:k + 1])[0], float(cost[k]), P[k]
 

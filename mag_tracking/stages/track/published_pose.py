@@ -13,7 +13,7 @@ from mag_tracking.geometry import (
     quaternions_from_yaw,
     rotation_vectors_between,
 )
-from mag_tracking.inference.covariance_union import widened_to_cover
+from mag_tracking.inference.covariance_union import inflated_to_cover
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.mixture import second_moment
 from mag_tracking.physics.sources import SourceModel
@@ -304,7 +304,7 @@ def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: Flo
         of_middle = unseen.covariance(x, P, length, kind)
         P = P.copy()
         P[:2, :2] += of_middle
-    P = widened_to_cover(P, difference)
+    P = inflated_to_cover(P, difference)
     q, T, unobserved, flags = orientation(x, P)
     return {'position': x[:3].copy(), 'velocity': x[3:6].copy(), 'covariance': P[:6, :6].copy(),
             'orientation': q, 'orientation_covariance': T @ P @ T.T + unobserved,

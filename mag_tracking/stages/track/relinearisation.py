@@ -27,7 +27,7 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.starting_bank import StartingBank
+from mag_tracking.inference.initial_bank import InitialBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter, PathResult
 from mag_tracking.units import NS
@@ -60,7 +60,7 @@ MAX_NUMBERS = 5_000_000
 class Window:
     """The latest frames of a running track, and the path of each hypothesis through them."""
 
-    anchor: FilterBank | StartingBank
+    anchor: FilterBank | InitialBank
     """At the first of the frames."""
     is_updated: bool
     """The anchor has been updated with the first frame."""
@@ -86,11 +86,11 @@ class Relinearisation:
 
     def clear(self) -> None:
         """Nothing is kept: no track is running."""
-        self._anchor: FilterBank | StartingBank | None = None
+        self._anchor: FilterBank | InitialBank | None = None
         # {origin: log-likelihood along the path minus that in the filter}, as of the last time.
         self._gain: dict[int, float] = {}
 
-    def begin(self, anchor: FilterBank | StartingBank) -> None:
+    def begin(self, anchor: FilterBank | InitialBank) -> None:
         """A track begins with a bank like the `anchor`, which is not yet updated with its first
         frame. The passes start from the anchor, and nobody else may write into it. Without a
         window nothing is done.
@@ -139,7 +139,7 @@ class Relinearisation:
         if self._last_ns is None:
             self._last_ns = frame.stamp_ns
 
-    def _keep(self, anchor: FilterBank | StartingBank, mask: BoolArray) -> None:
+    def _keep(self, anchor: FilterBank | InitialBank, mask: BoolArray) -> None:
         """Keep the rows of `mask` of all that is kept for each hypothesis of the `anchor`."""
         anchor.keep(mask)
         self._paths = [path[mask] for path in self._paths]
@@ -226,8 +226,8 @@ class Relinearisation:
         leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - LEADING]
         return leading[:max(1, min(self._most, affordable))]
 
-    def _moved_on(self, bank_filter: BankFilter, anchor: FilterBank | StartingBank,
-                  bank: FilterBank) -> FilterBank | StartingBank:
+    def _moved_on(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
+                  bank: FilterBank) -> FilterBank | InitialBank:
         """The anchor: once the frames are of twice the window, it moves to where the window begins.
         """
         now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
@@ -237,7 +237,7 @@ class Relinearisation:
                  and n_frames - k <= MAX_FRAMES // 2)
         return self._move_to(bank_filter, anchor, bank, n)
 
-    def _move_to(self, bank_filter: BankFilter, anchor: FilterBank | StartingBank,
+    def _move_to(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
                  bank: FilterBank, n: int) -> FilterBank:
         """The anchor, moved to the frame `n`, where the window begins from now on."""
         self._keep(anchor, np.isin(anchor.origin, bank.origin))
@@ -283,6 +283,6 @@ def _widen(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
     bank.P[rows[wider]] = apart[wider]
 
 
-def _rows(anchor: FilterBank | StartingBank, bank: FilterBank) -> IntArray:
+def _rows(anchor: FilterBank | InitialBank, bank: FilterBank) -> IntArray:
     """Rows of the `anchor` that the hypotheses of `bank` started from."""
     return np.searchsorted(anchor.origin, bank.origin)

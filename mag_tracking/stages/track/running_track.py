@@ -173,7 +173,7 @@ class RunningTrack:
 
     def _view(self, i: int, best: int) -> View:
         """The bank of member `i` alone; `best` is the row of all members."""
-        bank = self.bank.of_target(i, self._bank.one.n_target)
+        bank = self.bank.extract_target(i, self._bank.one.n_target)
         row = best if bank is self.bank else bank.best()
         return View(bank, row, self._bank.one, self._bank.gain(row))
 
@@ -306,7 +306,8 @@ class RunningTrack:
                 self._settings.background_std), reason, not self._is_full).find()
         # A field of something else is no vehicle more.
         if self._newcomers.accepts(found.log_odds if found and all(
-                m.evidence.bayes_factor.would_lead(found.log_odds, self._settings.min_bayes_factor)
+                m.evidence.bayes_factor.would_be_favoured(
+                found.log_odds, self._settings.min_bayes_factor)
                 for m in self.members) else -np.inf):
             return found
         if found is not None and found.log_odds > UNDECIDED_NATS:

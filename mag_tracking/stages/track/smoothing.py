@@ -16,7 +16,7 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.starting_bank import StartingBank
+from mag_tracking.inference.initial_bank import InitialBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.relinearisation import Window
@@ -78,7 +78,7 @@ class _Start:
     """Where a track began, and the filter that it was moved with."""
 
     bank_filter: BankFilter
-    bank: FilterBank | StartingBank
+    bank: FilterBank | InitialBank
     paths: tuple[FloatArray, ...] = ()
     """(n_hyp, n_x) states of all hypotheses at the first frames, as far as they are known."""
     origin: IntArray | None = None
@@ -105,7 +105,7 @@ class WholeTrack:
         self._length_s, self.too_long = 0.0, False
         self._updated = False
 
-    def begin(self, bank: FilterBank | StartingBank, bank_filter: BankFilter) -> None:
+    def begin(self, bank: FilterBank | InitialBank, bank_filter: BankFilter) -> None:
         """A track begins with a bank like `bank`, before its first frame, with the settings of now.
 
         Nobody else may write into `bank`.

@@ -15,8 +15,8 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.least_squares import refine
-from mag_tracking.inference.marginalised import Marginalised
-from mag_tracking.inference.matrices import pseudo_inverse, running_away
+from mag_tracking.inference.marginal_whitener import MarginalWhitener
+from mag_tracking.inference.matrices import ignoring_overflow, pseudo_inverse
 from mag_tracking.inference.separable_fit import distinct
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.steady_pass import N_STRAIGHT, PATH, SteadyPass
@@ -179,9 +179,9 @@ class SteadySearch:
         return self.samples.straight_model(N_DIPOLES)
 
     @cached_property
-    def _without(self) -> Marginalised:
+    def _without(self) -> MarginalWhitener:
         """Takes out what is not known."""
-        return Marginalised(self.columns)
+        return MarginalWhitener(self.columns)
 
     @cached_property
     def _y(self) -> FloatArray:
@@ -208,7 +208,7 @@ class SteadySearch:
     def cost(self, grid: StartGrid) -> FloatArray:
         """(n,) minus twice the log-density of the frames with a point on each path of a grid."""
         n, std = len(grid.theta), self.prior.moment_std[0] * np.sqrt(N_DIPOLES)
-        with running_away():
+        with ignoring_overflow():
             factor = self._without.correction_factor(grid.bases).reshape(-1, n, 3).swapaxes(0, 1)
             information = grid.gram - factor.swapaxes(1, 2) @ factor + np.eye(3) / std**2
             b = (self._without(self._y) @ grid.bases).reshape(n, 3)
@@ -282,13 +282,13 @@ class SteadySearch:
     def _log_determinant_of_moments(self, theta: FloatArray) -> FloatArray:
         """(n,) log-determinant of the information of the moments of paths (n, 7 m), relative to
         the prior."""
-        with running_away():
+        with ignoring_overflow():
             return _log_determinant(self._information_of_moments(theta))
 
     def _are_felt(self, theta: FloatArray) -> BoolArray:
         """(n,) whether each vehicle of paths theta (n, 7 m) is expected to be felt in the frames,
         by the prior of its moments and beside what is not known."""
-        with running_away():
+        with ignoring_overflow():
             energy = np.einsum('nii->ni', self._information_of_moments(theta)) - 1.0
         each = energy.reshape(len(theta), -1, 3 * N_DIPOLES).sum(axis=2)
         felt: BoolArray = (each > DETECTABLE_ENERGY).all(axis=1)

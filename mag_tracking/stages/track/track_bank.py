@@ -8,7 +8,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.starting_bank import StartingBank
+from mag_tracking.inference.initial_bank import InitialBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.bank_size import WEIGHT_KEPT, max_hypotheses, max_sensors
@@ -102,7 +102,7 @@ class TrackBank:
         """The bank, which is of the time of the frame `now`, begins with an earlier one."""
         if first is not now:
             self.filter.move(self.bank, (first.stamp_ns - now.stamp_ns) / NS)
-        start = StartingBank.of(self.bank, self.filter.observation.n_target)
+        start = InitialBank.of(self.bank, self.filter.observation.n_target)
         self._whole.begin(copy(start), self.filter)
         self._relinearisation.begin(start)
 
@@ -183,7 +183,7 @@ class TrackBank:
         """
         sensors, self.later = self.later or self.sensors, None
         n, most = len(sensors.rows), max_hypotheses(self.filter.observation, len(sensors.rows))
-        if n == len(self.sensors.rows) or not self.bank.outweigh(most, WEIGHT_KEPT):
+        if n == len(self.sensors.rows) or not self.bank.is_concentrated_in(most, WEIGHT_KEPT):
             return False
         self._counts['hypotheses dropped'] += self.bank.prune(np.inf, most)
         self._hand_on_to(sensors)

@@ -54,7 +54,7 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
     P = np.array([(root := rng.standard_normal((len(names), len(names)))) @ root.T
                   for _ in range(n_hyp)]) * 0.02 + 0.2 * np.eye(len(names))
     P = 0.5 * (P + np.swapaxes(P, 1, 2))
-    bank = FilterBank.of_targets(
+    bank = FilterBank.from_targets(
         size * rng.standard_normal((n_hyp, len(names))) + np.isin(names, 'z') * 2.0,
         P * np.outer(size, size), np.zeros(n_hyp, dtype=int), n_sensors, 1e-8,
         filters[0].observation.own_covariance,
@@ -164,9 +164,9 @@ def test_a_noise_that_is_not_positive_definite_is_refused(bad):
 
 
 @pytest.mark.parametrize('spoil, error', [
-    (lambda b: setattr(b, 'x', b.x[:, :-1].copy()), 'x: not of the shape'),
-    (lambda b: setattr(b, 'P', b.P[:, :-1].copy()), 'P: not of the shape'),
-    (lambda b: setattr(b, 'P', b.P[:-1].copy()), 'P: not of the shape')])
+    (lambda b: setattr(b, 'x', b.x[:, :-1].copy()), 'x: shape does not match'),
+    (lambda b: setattr(b, 'P', b.P[:, :-1].copy()), 'P: shape does not match'),
+    (lambda b: setattr(b, 'P', b.P[:-1].copy()), 'P: shape does not match')])
 def test_arrays_of_other_sizes_are_refused(spoil, error):
     compiled, _, bank, frames, _ = case('point')
     spoil(bank)
@@ -266,7 +266,7 @@ def test_two_vehicles_that_no_sensor_feels_at_once_are_filtered_like_two_alone()
                                  filters, banks, (slice(0, 2), slice(2, 4)), strict=True)]
         assert log_likelihood[0] == pytest.approx(of_each[0][0] + of_each[1][0], rel=1e-9)
         for i, bank in enumerate(banks):
-            view, n_t = together.of_target(i, len(model.state_names)), len(model.state_names)
+            view, n_t = together.extract_target(i, len(model.state_names)), len(model.state_names)
             np.testing.assert_allclose(view.x[0, :n_t], bank.x[0, :n_t], rtol=1e-9, atol=1e-9)
             std = np.sqrt(np.diagonal(bank.P[0])[:n_t])
             assert np.abs((view.P[0, :n_t, :n_t] - bank.P[0, :n_t, :n_t])

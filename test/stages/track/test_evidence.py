@@ -82,7 +82,7 @@ def bank_of(places, weights, std=0.5, lengths=3.0):
     n_t = len(model.state_names)
     x = np.zeros((n, n_t))
     x[:, 0], x[:, 3], x[:, n_t - 1] = places, 8.0, lengths
-    bank = FilterBank.of_targets(x, np.tile(std**2 * np.eye(n_t), (n, 1, 1)), np.zeros(n, int), 2,
+    bank = FilterBank.from_targets(x, np.tile(std**2 * np.eye(n_t), (n, 1, 1)), np.zeros(n, int), 2,
                                  1e-8)
     bank.log_w = np.log(weights)
     return bank, model
@@ -161,16 +161,16 @@ def test_a_comparison_that_failed_once_is_doubted_for_good():
     bayes_factor = TrackEvidence(2).bayes_factor
     for k, value in enumerate([50.0, np.nan, 50.0]):
         bayes_factor.add(value, k, 20.0)
-        assert bayes_factor.leads(20.0) == (k == 0)
+        assert bayes_factor.is_favoured(20.0) == (k == 0)
 
 
 def test_falling_behind_is_forgotten_within_a_second():
     bayes_factor = TrackEvidence(2).bayes_factor
     bayes_factor.add(50.0, 0, 20.0)
     bayes_factor.add(-5.0, 2 * NS, 20.0)
-    assert bayes_factor.leads(20.0) and bayes_factor.fell_behind(20.0)
+    assert bayes_factor.is_favoured(20.0) and bayes_factor.is_recently_disfavoured(20.0)
     bayes_factor.add(0.0, round(3.1 * NS), 20.0)
-    assert bayes_factor.leads(20.0) and not bayes_factor.fell_behind(20.0)
+    assert bayes_factor.is_favoured(20.0) and not bayes_factor.is_recently_disfavoured(20.0)
 
 
 def test_published_doubts_are_listed_in_one_order_and_each_has_a_meaning():

@@ -12,7 +12,7 @@ from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.physics.mounting import rotated_fields
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
-from mag_tracking.simulation.scenario import Imperfections, Path, point_body
+from mag_tracking.simulation.scenario import Path, SensorErrorModel, point_body
 from mag_tracking.stages.track.initiation_vehicle import vehicle_model
 from mag_tracking.stages.track.observation import Observation
 from support.bundled import POINT
@@ -141,7 +141,7 @@ def passes(n):
                 Path(np.array([-70.0, side]), 0.0, 10.0), seed=seed,
                 changes={**POINT, 'track.mounting_std_deg': mounting, 'track.field_error': 0.02,
                          'track.vehicle.near_field_lengths': [0.0]},
-                flaws=Imperfections(bias_std=1e-6, tilt_std=np.deg2rad(5.0)))
+                flaws=SensorErrorModel(bias_std=1e-6, tilt_std=np.deg2rad(5.0)))
             live = [t for t in tracks if not t.ended]
             for t, q in zip(live, truth, strict=True):
                 if np.hypot(*q) < 5.0:

@@ -169,7 +169,7 @@ def test_a_member_alone_is_the_marginal_of_all():
                       np.arange(2), np.zeros((2, 1)))
     for i, others in ((0, 1), (1, 0)):
         columns = [*range(3 * i, 3 * i + 3), 6, 7, 8]
-        view, rest = bank.of_target(i, 3), bank.without_target(others, 3)
+        view, rest = bank.extract_target(i, 3), bank.without_target(others, 3)
         for one in (view, rest):
             np.testing.assert_array_equal(one.x, bank.x[:, columns])
             np.testing.assert_array_equal(one.P, bank.P[:, columns][:, :, columns])

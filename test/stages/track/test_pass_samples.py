@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mag_tracking.inference.least_squares import LINEAR_RANK, refine
-from mag_tracking.inference.matrices import RANK, pseudo_inverse
+from mag_tracking.inference.least_squares import LINEAR_RANK_TOLERANCE, refine
+from mag_tracking.inference.matrices import PSEUDO_INVERSE_TOLERANCE, pseudo_inverse
 from mag_tracking.inference.separable_fit import SeparableProblem
 from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH, SteadyPass
 from mag_tracking.stages.track import core
@@ -99,8 +99,8 @@ def test_dipoles_that_are_almost_at_one_place_are_fitted_as_by_numpy(length):
         theta=theta.copy(), cost=cost, covariance=P, free=free, fixed=fixed, places=model.places,
         combinations=model.combinations, t=data.t, positions=data.positions, M=data.M,
         clock=data.clock, y=data.y - nuisance @ (nuisance.T @ data.y), nuisance=nuisance,
-        n_steps=0, tolerance=0.0, most_damping=1e12, full_rank=1e-3, linear_rank=LINEAR_RANK,
-        rank=RANK)
+        n_steps=0, tolerance=0.0, most_damping=1e12, full_rank=1e-3,
+        linear_rank=LINEAR_RANK_TOLERANCE, rank=PSEUDO_INVERSE_TOLERANCE)
     residual, J = problem.residual_and_jacobian(theta)
     assert cost[0] == pytest.approx(float(residual[0] @ residual[0]), rel=1e-6)
     # Eigenvalues near the limit are known to a few digits only.
@@ -113,11 +113,11 @@ def test_dipoles_that_are_almost_at_one_place_are_fitted_as_by_numpy(length):
     ('fixed', np.zeros(N_PATH - 1), 'fixed: not path and clocks'),
     ('free', np.array([0, 11]), 'free: no such column'),
     ('free', np.array([-1, 3]), 'free: no such column'),
-    ('y', np.zeros(11), 'y: not of the shape'),
-    ('nuisance', np.zeros((11, 2)), 'nuisance: not of the shape'),
-    ('M', np.zeros((3, 3, 3)), 'M: not of the shape'),
-    ('combinations', np.eye(2), 'combinations: not of the shape'),
-    ('covariance', np.zeros((1, 3, 3)), 'covariance: not of the shape')])
+    ('y', np.zeros(11), 'y: shape does not match'),
+    ('nuisance', np.zeros((11, 2)), 'nuisance: shape does not match'),
+    ('M', np.zeros((3, 3, 3)), 'M: shape does not match'),
+    ('combinations', np.eye(2), 'combinations: shape does not match'),
+    ('covariance', np.zeros((1, 3, 3)), 'covariance: shape does not match')])
 def test_arrays_of_other_sizes_are_refused(name, value, error):
     arguments = {
         'theta': np.zeros((1, 2)), 'cost': np.zeros(1), 'covariance': np.zeros((1, 2, 2)),

@@ -70,7 +70,7 @@ class LinearFilter(StepByStep):
 def followed_beside_plain(filter_, anew, n=40, anew_at=(), prune=True):
     """(bank, the same by the filter alone, Counter) after `n` frames, a gap among them."""
     rng, counts, stamp_ns = np.random.default_rng(0), Counter(), 0
-    bank = FilterBank.of_targets(rng.standard_normal((12, N_T)), np.tile(np.eye(N_T), (12, 1, 1)),
+    bank = FilterBank.from_targets(rng.standard_normal((12, N_T)), np.tile(np.eye(N_T), (12, 1, 1)),
                                  np.zeros(12, dtype=int), 1, 1.0)
     plain = bank.copy()
     anew.begin(bank.copy())
@@ -147,7 +147,7 @@ def less_sure(more, linear):
     """(filter, bank, Relinearisation) after one frame."""
     filter_, rng = LessSure(), np.random.default_rng(0)
     filter_.more, filter_.linear = more, linear
-    bank = FilterBank.of_targets(np.zeros((1, N_T)), np.eye(N_T)[None], np.zeros(1, int), 1, 1.0)
+    bank = FilterBank.from_targets(np.zeros((1, N_T)), np.eye(N_T)[None], np.zeros(1, int), 1, 1.0)
     relinearisation = Relinearisation(0.0, 60.0, 1)
     relinearisation.begin(bank.copy())
     frame = FieldFrame(0, rng.standard_normal((1, 3)), np.eye(3)[None], np.full(1, 8), np.zeros(1),
@@ -292,7 +292,7 @@ def still_target(n, turns=False):
     first = mean + root @ fit.x
     last = np.append(model.propagate(first[None, :n_t], (n - 1) * PERIOD)[0][0], first[n_t:])
     return (BankFilter(matched.NETWORK, model, settings),
-            lambda rows: FilterBank.of_targets(
+            lambda rows: FilterBank.from_targets(
                 np.tile(mean[:n_t], (rows, 1)), np.tile(P0[:n_t, :n_t], (rows, 1, 1)),
                 np.zeros(rows, dtype=int), 2, settings.background_std), y, last)
 

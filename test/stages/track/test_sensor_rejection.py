@@ -53,7 +53,7 @@ def situation(n=6, seed=0, spread=0.3, n_hyp=5):
     P = np.tile(np.diag([spread, spread, 0.1, 1.0, 0.3, 0.02, 30.0, 30.0, 30.0, 0.2, 0.2,
                          0.2]) ** 2,
                 (n_hyp, 1, 1))
-    bank = FilterBank.of_targets(x, P, np.arange(n_hyp), n, 1e-8,
+    bank = FilterBank.from_targets(x, P, np.arange(n_hyp), n, 1e-8,
                                  bank_filter.observation.own_covariance)
     B = dipole_field(network.positions - TARGET, MOMENT)
     field = np.einsum('jik,jk->ji', network.R_sw, B) + SIGMA * rng.standard_normal((n, 3))

@@ -22,7 +22,7 @@ def bank_of(rng, n_hyp, n_t, n_own, n_sensors):
     """Hypotheses whose states all hang together."""
     n_x = n_t + (n_own + 3) * n_sensors
     A = rng.standard_normal((n_hyp, n_x, n_x))
-    bank = FilterBank.of_targets(np.zeros((n_hyp, n_t)), np.zeros((n_hyp, n_t, n_t)),
+    bank = FilterBank.from_targets(np.zeros((n_hyp, n_t)), np.zeros((n_hyp, n_t, n_t)),
                                  np.zeros(n_hyp, dtype=int), n_sensors, 1.0,
                                  np.zeros((n_sensors, n_own, n_own)))
     bank.x, bank.P = rng.standard_normal((n_hyp, n_x)), A @ np.swapaxes(A, 1, 2)

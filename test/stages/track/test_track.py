@@ -10,7 +10,7 @@ from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.messages.schema import pose_covariance
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
-from mag_tracking.simulation.scenario import Imperfections, Path, point_body, random_vehicle
+from mag_tracking.simulation.scenario import Path, SensorErrorModel, point_body, random_vehicle
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.stages.track.target import target_of
@@ -82,7 +82,7 @@ def test_an_extended_target_is_followed(heading, arrival):
     tracks, _, truth = drive(
         network, random_vehicle(np.random.default_rng(3)),
         Path(-80.0 * u + 1.2 * np.array([u[1], -u[0]]), heading, 12.0),
-        flaws=Imperfections(bias_std=1e-6, drift_std=4e-9, tilt_std=0.03, clock_std=0.01))
+        flaws=SensorErrorModel(bias_std=1e-6, drift_std=4e-9, tilt_std=0.03, clock_std=0.01))
     live = [t for t in tracks if not t.ended]
     near = np.hypot(*truth.T) < 5.0
     error = np.array([t.position[:2] for t in live]) - truth

@@ -1,4 +1,4 @@
-"""The sum of a quantity over the latest frames of a track."""
+"""Sum of a quantity over the latest frames of a track."""
 
 from collections import deque
 
@@ -9,21 +9,35 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.units import NS
 
 
-class LatestFrames:
-    """Values added within a time before the latest frame."""
+class SlidingSum:
+    """Sum of the values added within a window before the latest frame.
+
+    Parameters
+    ----------
+    window_s : float, s
+        Length of the window.
+    """
 
     def __init__(self, window_s: float) -> None:
         self._window_ns = round(window_s * NS)
         self._frames: deque[tuple[int, FloatArray]] = deque()
 
     def add(self, stamp_ns: int, value: ArrayLike) -> None:
-        """Add the value of a frame; all values have one shape."""
+        """Add the value of a frame.
+
+        Parameters
+        ----------
+        stamp_ns : int, ns
+            Timestamp of the frame.
+        value : (...) array
+            Must have the same shape for all frames.
+        """
         self._frames.append((stamp_ns, np.asarray(value, dtype=float)))
         while self._frames[0][0] < stamp_ns - self._window_ns:
             self._frames.popleft()
 
     @property
     def total(self) -> FloatArray:
-        """Sum of the values, of their shape; a scalar 0 before the first."""
+        """Sum of the values, of their shape; a scalar 0 before the first value."""
         total: FloatArray = np.sum([value for _, value in self._frames], axis=0)
         return total

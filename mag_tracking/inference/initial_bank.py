@@ -1,0 +1,88 @@
+"""Compact copy of a filter bank at its start, before target and sensor states are correlated.
+
+Smoothing and relinearisation restart at the beginning of a track. Storing the full covariances of
+all hypotheses would need as much memory as the bank.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.inference.filter_bank import FilterBank
+
+
+@dataclass
+class InitialBank:
+    """Hypotheses of a `FilterBank` at its start.
+
+    The hypothesis is the first axis of every array.
+    """
+
+    x: FloatArray
+    """States, (n_hyp, n_x): of the target, then of the sensors."""
+    P: FloatArray
+    """Covariances of the target states, (n_hyp, n_t, n_t)."""
+    P_sensors: FloatArray
+    """Covariance of the sensor states, common to all hypotheses, (n_x - n_t, n_x - n_t)."""
+    label: IntArray
+    """As `FilterBank.label`."""
+    kind: IntArray
+    """As `FilterBank.kind`."""
+    origin: IntArray
+    """As `FilterBank.origin`."""
+    n_sensors: int
+    """Number of sensors."""
+
+    @classmethod
+    def of(cls, bank: FilterBank, n_target: int) -> 'InitialBank':
+        """Copy the start of a bank.
+
+        Parameters
+        ----------
+        bank : FilterBank
+            Bank before its first update.
+        n_target : int
+            Number of target states, which come first.
+
+        Returns
+        -------
+        InitialBank
+        """
+        return cls(bank.x.copy(), bank.P[:, :n_target, :n_target].copy(),
+                   bank.P[0, n_target:, n_target:].copy(), bank.label, bank.kind, bank.origin,
+                   bank.nis.shape[1])
+
+    def __len__(self) -> int:
+        """Number of hypotheses."""
+        return len(self.x)
+
+    def rows(self, rows: IntArray) -> FilterBank:
+        """Restore some hypotheses with equal weights.
+
+        Parameters
+        ----------
+        rows : (n,) int array
+            Rows to restore.
+
+        Returns
+        -------
+        FilterBank
+            Its arrays are copies.
+        """
+        n, n_t = len(rows), self.P.shape[1]
+        P = np.zeros((n, self.x.shape[1], self.x.shape[1]))
+        P[:, :n_t, :n_t], P[:, n_t:, n_t:] = self.P[rows], self.P_sensors
+        return FilterBank(self.x[rows], P, np.full(n, -np.log(n)), self.label[rows],
+                          self.kind[rows], self.origin[rows], np.full((n, self.n_sensors), np.nan))
+
+    def keep(self, mask: BoolArray) -> None:
+        """Keep some hypotheses.
+
+        Parameters
+        ----------
+        mask : (n_hyp,) bool array
+            Hypotheses to keep.
+        """
+        for name in ('x', 'P', 'label', 'kind', 'origin'):
+            setattr(self, name, getattr(self, name)[mask])
