@@ -24,7 +24,7 @@ LAGS = (2, 4, 8, 16)
 N_COSINES = 8
 """Coefficients of the discrete cosine transform of the size."""
 
-FEWEST = 8
+MIN_SAMPLES = 8
 """A shorter signature has no shape."""
 
 
@@ -69,8 +69,9 @@ def features(signature: Signature) -> FloatArray:
         If it has too few samples, is not finite, or nowhere differs from its baseline.
     """
     t, field = np.asarray(signature.t, dtype=float), np.asarray(signature.field, dtype=float)
-    if len(t) < FEWEST:
-        raise ValueError(f'{len(t)} samples are too few for a shape; expected at least {FEWEST}')
+    if len(t) < MIN_SAMPLES:
+        raise ValueError(f'{len(t)} samples are too few for a signature; expected at least '
+                         f'{MIN_SAMPLES}')
     if not (np.isfinite(t).all() and np.isfinite(field).all()):
         raise ValueError('a time or a field is not finite')
     if not (np.diff(t) > 0.0).all():

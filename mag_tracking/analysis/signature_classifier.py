@@ -13,7 +13,7 @@ from mag_tracking.errors import LabelsError, MissingDependencyError
 from mag_tracking.inference.log_normal_classes import UNKNOWN
 
 VERSION = 1
-FEWEST = 4
+MIN_SAMPLES = 4
 """A class with fewer examples is refused: it can't be tested on others than it was trained on."""
 
 FOLDS = 5
@@ -178,9 +178,9 @@ def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]'
                           'otherwise')
     if len(counts) < 2:
         raise LabelsError(f'expected at least two classes, got {", ".join(counts) or "none"}')
-    few = {name: n for name, n in counts.items() if n < FEWEST}
+    few = {name: n for name, n in counts.items() if n < MIN_SAMPLES}
     if few:
-        raise LabelsError('expected at least ' + str(FEWEST) + ' examples of each class, got '
+        raise LabelsError('expected at least ' + str(MIN_SAMPLES) + ' examples of each class, got '
                           + ', '.join(f'{n} of {name!r}' for name, n in sorted(few.items())))
     return counts
 
@@ -301,12 +301,12 @@ def _split(y: Any, groups: Any, test_share: float, seed: int) -> tuple[IntArray,
     for name in np.unique(y):
         mine = rng.permutation(np.unique(groups[y == name]))
         # Enough of each is left to train on.
-        n = min(max(1, round(test_share * len(mine))), max(len(mine) - FEWEST, 0))
+        n = min(max(1, round(test_share * len(mine))), max(len(mine) - MIN_SAMPLES, 0))
         tested |= set(mine[:n].tolist())
     outside = np.isin(groups, list(tested))
     if not outside.any():
-        raise LabelsError(f'too few examples to leave some out: expected more than {FEWEST} of a '
-                          'class')
+        raise LabelsError('too few examples for a test set: expected more than '
+                          f'{MIN_SAMPLES} of a class')
     return np.flatnonzero(~outside), np.flatnonzero(outside)
 
 
