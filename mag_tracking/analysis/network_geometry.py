@@ -12,9 +12,9 @@ import numpy as np
 from mag_tracking.analysis.network_fit import (
     GeometryProblem,
     NormalEquations,
-    Numbers,
+    Unknowns,
+    median_ratio,
     solve,
-    typical,
 )
 from mag_tracking.analysis.network_readings import (
     POSE,
@@ -245,11 +245,11 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
         network=replace(network, positions=network.positions + sensor[:, 7:],
                         R_ws=network.R_ws @ turn, background=tuple(
                             b if h.all() else None
-                            for b, h in zip(sensor[:, :3], problem.heard, strict=True))),
+                            for b, h in zip(sensor[:, :3], problem.reported, strict=True))),
         position_std=sensor_std[:, 7:], rotation_std=sensor_std[:, 4:7],
         gain=1.0 + sensor[:, 3], gain_std=sensor_std[:, 3],
-        bias=np.where(problem.heard, sensor[:, :3], np.nan),
-        bias_std=np.where(problem.heard, sensor_std[:, :3], np.inf),
+        bias=np.where(problem.reported, sensor[:, :3], np.nan),
+        bias_std=np.where(problem.reported, sensor_std[:, :3], np.inf),
         magnet=problem.magnet, rows=np.arange(len(pose)), shared=shared,
         shared_std=shared_std, pose=pose,
         pose_covariance=P_pose * np.outer(problem.pose_unit, problem.pose_unit),
@@ -258,8 +258,8 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
         converged=not reason, reason=reason)
 
 
-def _normalised_cost(problem: GeometryProblem, x: Numbers, predicted: Prediction, W: FloatArray,
-                     trust: FloatArray, priors: Numbers) -> float:
+def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
+                     trust: FloatArray, priors: Unknowns) -> float:
     """Weighted sum of squares over the degrees of freedom that the priors leave; NaN if none."""
     P, P_pose = NormalEquations(problem, x, predicted, W, priors).covariance()
     e2, count, _ = problem.misfit(predicted[0], predicted[1])
@@ -274,15 +274,15 @@ def _residuals(problem: GeometryProblem, predicted: Prediction) -> tuple[FloatAr
     """Of sensors (n,) their root mean square, of poses (K,) the middle of the sensors'."""
     e2, count, _ = problem.misfit(predicted[0], predicted[1])
     e2 = e2.sum(axis=2)
-    by_pose = np.sqrt([np.median(typical(d2, c)[c > 0])
+    by_pose = np.sqrt([np.median(median_ratio(d2, c)[c > 0])
                        for d2, c in zip(e2.T, count.T, strict=True)])
     fits = by_pose <= MISFIT * np.median(by_pose)
-    heard = count[:, fits].sum(axis=1)
-    by_sensor = np.sqrt(e2[:, fits].sum(axis=1) / np.where(heard > 0, heard, np.nan))
+    reported = count[:, fits].sum(axis=1)
+    by_sensor = np.sqrt(e2[:, fits].sum(axis=1) / np.where(reported > 0, reported, np.nan))
     return by_sensor, by_pose
 
 
-def _suspects(problem: GeometryProblem, x: Numbers, by_sensor: FloatArray,
+def _suspects(problem: GeometryProblem, x: Unknowns, by_sensor: FloatArray,
               by_pose: FloatArray) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """Names of the sensors and rows of the poses that do not fit."""
     sensors = by_sensor > MISFIT * np.nanmedian(by_sensor)
@@ -293,7 +293,7 @@ def _suspects(problem: GeometryProblem, x: Numbers, by_sensor: FloatArray,
             tuple(int(k) for k in np.flatnonzero(poses)))
 
 
-def _at_one_place(problem: GeometryProblem, x: Numbers) -> bool:
+def _at_one_place(problem: GeometryProblem, x: Unknowns) -> bool:
     """Whether the magnet neither moved, compared with its distance, nor turned."""
     r, u = _places(problem.magnet, *problem.in_si(x)[1:])
     nearest = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
@@ -301,7 +301,7 @@ def _at_one_place(problem: GeometryProblem, x: Numbers) -> bool:
                 and (np.ptp(u, axis=0) < MIN_CHANGE).all())
 
 
-def _doubt(problem: GeometryProblem, x: Numbers, converged: bool, cost: float) -> str:
+def _doubt(problem: GeometryProblem, x: Unknowns, converged: bool, cost: float) -> str:
     """Why it is no answer; empty where it is one."""
     K, most = len(problem.magnet.tool), problem.settings.iterations
     if K < MIN_POSES:

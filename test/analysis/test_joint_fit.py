@@ -247,7 +247,7 @@ def test_what_left_its_track_says_so():
     # As fast as nobody was.
     astray[1, 3] *= 3.0
     found = fit_joint(data, astray, GROUND, (1,))
-    assert sorted(fit.reason for fit, in found) == ['', 'it is not where it was tracked']
+    assert sorted(fit.reason for fit, in found) == ['', 'the fit is not at the tracked position']
     assert fit_joint(data, astray, GROUND, (1,), stopped=lambda: True) == ()
 
 
