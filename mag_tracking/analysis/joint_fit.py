@@ -12,9 +12,9 @@ from itertools import combinations
 import numpy as np
 
 from mag_tracking.analysis.model_order import order_criteria
+from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
-from mag_tracking.analysis.pass_description import APART, assignment, fits_at_minimum
-from mag_tracking.analysis.pass_deviation import SensorErrors
+from mag_tracking.analysis.pass_description import PATH_TOLERANCE, assignment, fits_at_minimum
 from mag_tracking.analysis.pass_fit import (
     AS_BOUGHT,
     COARSE_ERROR,
@@ -159,7 +159,7 @@ def _initial_paths(rough: PassData, n_targets: int, ground: GroundPrior) -> Floa
             starts.append(np.hstack([np.tile(known, (len(own), 1)), own]))
         coarse = separable_problem(rough, model_of, prior=prior)
         paths, _ = coarse_minima(separable_problem(rough, model_of, COARSE_ERROR, prior), coarse,
-                                 np.concatenate(starts), np.tile(APART[:6], n), N_REFINED,
+                                 np.concatenate(starts), np.tile(PATH_TOLERANCE[:6], n), N_REFINED,
                                  N_STEPS, N_PLACEMENTS)
         if n < n_targets:
             model = model_of(rough.t, rough.positions, rough.network.R_sw[rough.sensor])
@@ -222,7 +222,7 @@ class _JointFits:
         cost = _restricted_to(cost, np.array([are_separate(self._rough, split(found))
                                               for found in theta]), NEARLY)
         found = fine_minimum(fine, theta, cost, np.concatenate(
-            [APART[:6 + (n > 1)] for n in orders]), N_FINE)
+            [PATH_TOLERANCE[:6 + (n > 1)] for n in orders]), N_FINE)
         if not np.isfinite(found.cost):
             return tuple(PassFit(n, data, 'no valid start of the search') for n in orders)
         theta, p = model_of(data.t, data.positions, data.whitening).forward(

@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
+from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
-from mag_tracking.analysis.pass_description import APART, fits_at_minimum
-from mag_tracking.analysis.pass_deviation import SensorErrors
+from mag_tracking.analysis.pass_description import PATH_TOLERANCE, fits_at_minimum
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.detection_theory import energy_threshold
@@ -68,7 +68,7 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
     starts = starting_paths(rough, n_dipoles)
     found = search(separable_problem(rough, model_of, COARSE_ERROR),
                    separable_problem(rough, model_of), problem, starts,
-                   APART[:starts.shape[1]], shorter_rows if n_dipoles > 1 else None)
+                   PATH_TOLERANCE[:starts.shape[1]], shorter_rows if n_dipoles > 1 else None)
     if not np.isfinite(found.cost):
         return PassFit(n_dipoles, data, 'no start of the search could be used')
     theta, p = found.theta, problem.linear(found.theta)

@@ -75,7 +75,7 @@ class PassFit:
     """Sum of squared whitened residuals, TSP14 eq. (46b)."""
     explained: float = np.nan
     """Share of the whitened energy beyond the backgrounds and the noise that the fit explains."""
-    seen_s: float = np.nan
+    duration_s: float = np.nan
     """[s] in which nearly all of the target's energy came."""
     velocity_change: float = np.nan
     """Share of itself by which the velocity seems to change while the target is seen."""
@@ -95,14 +95,14 @@ class PassFit:
     """(n, 3) [T], sensor frame, with the background."""
     predicted_std: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) [T], by the honest covariance, without noise."""
-    n_others: int = 0
+    n_other_unknowns: int = 0
     """How many more unknowns the fit had: those of other targets in the same window, the field of
     which `data` are without."""
 
     @property
     def n_unknowns(self) -> int:
         """How many unknowns were fitted together."""
-        return len(self.x) + self.n_others
+        return len(self.x) + self.n_other_unknowns
 
     @property
     def degrees_of_freedom(self) -> float:
@@ -125,13 +125,13 @@ class PassFit:
         if self.n_dipoles == 1:
             return True
         length, length_std = self.length
-        way = np.linalg.norm(self.velocity) * self.seen_s
+        way = np.linalg.norm(self.velocity) * self.duration_s
         return bool(length_std <= max(length, 1.0) and SHORTEST * way <= length <= way)
 
     @property
     def is_poor_mixture(self) -> bool:
         """Whether targets that were fitted together leave over more than noise."""
-        return self.n_others > 0 and bool(self.normalised_cost > POOR)
+        return self.n_other_unknowns > 0 and bool(self.normalised_cost > POOR)
 
     @property
     def ambiguous(self) -> bool:
@@ -165,10 +165,10 @@ class PassFit:
         F[:3, 3:6] = seconds * np.eye(3)
         # An infinite variance times zero is NaN.
         with np.errstate(invalid='ignore'):
-            covariance, honest = (F @ P @ F.T for P in (self.covariance, self.robust_covariance))
+            covariance, robust = (F @ P @ F.T for P in (self.covariance, self.robust_covariance))
         rivals = tuple((cost, moved_along(path, seconds)) for cost, path in self.rivals)
         return replace(self, data=self.data.shifted(seconds), x=moved_along(self.x, seconds),
-                       covariance=covariance, robust_covariance=honest, rivals=rivals)
+                       covariance=covariance, robust_covariance=robust, rivals=rivals)
 
     @property
     def speed(self) -> tuple[float, float]:

@@ -74,7 +74,7 @@ class FittedRow(NamedTuple):
     """(n, 3) [T], sensor frame."""
 
 
-def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], left: FloatArray) -> float:
+def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: FloatArray) -> float:
     """Share of the whitened energy of the targets' field left over where no vehicle leaves it.
 
     A vehicle leaves something over in proportion to its field, and the more the nearer it is; a
@@ -85,7 +85,7 @@ def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], left: FloatArr
     data : PassData
     rows : list of FittedRow
         The targets, `n` samples each.
-    left : (n, 3)
+    residuals : (n, 3)
         Whitened residuals.
 
     Returns
@@ -99,8 +99,8 @@ def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], left: FloatArr
         return size2
 
     known = sum((_residual_share(data, row) * energy(row.field) for row in rows),
-                np.zeros(len(left)))
-    beyond = np.square(left).sum(axis=1) - known - NOISE_ENERGY
+                np.zeros(len(residuals)))
+    beyond = np.square(residuals).sum(axis=1) - known - NOISE_ENERGY
     everything = energy(np.sum([row.field for row in rows], axis=0))
     return float(np.maximum(beyond, 0.0).sum() / everything.sum())
 
@@ -172,7 +172,7 @@ def _no_pass(fit: PassFit) -> str:
     if turns(fit):
         return ('not at constant velocity: while it was seen it changed by '
                 f'{fit.velocity_change:.0%} of itself (a turn, braking)')
-    if np.linalg.norm(fit.velocity) * fit.seen_s < MIN_DISTANCE * _nearest(fit):
+    if np.linalg.norm(fit.velocity) * fit.duration_s < MIN_DISTANCE * _nearest(fit):
         return 'no pass: while it was seen it hardly moved'
     return ''
 

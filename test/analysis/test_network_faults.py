@@ -163,7 +163,7 @@ def test_another_magnet_is_refused():
     ({'positions': np.full((5, 3), np.nan)}, 'pose 0: expected a finite position'),
     ({'field': np.full((5, 9, 3), np.nan)}, 'pose 0: no sensor has a reading'),
     ({'field': np.full((5, 9, 3), np.inf)}, 'infinite'),
-    ({'positions': np.full((5, 3), 0.0)}, r'pose 0: \[0.0, 0.0, 0.0\] m is the place of a sensor'),
+    ({'positions': np.full((5, 3), 0.0)}, r'pose 0: \[0.0, 0.0, 0.0\] m is the position of a sensor'),
     ({'moment': 0.0}, 'moment is 0.0'), ({'moment': np.nan}, 'moment is nan'),
     ({'network': replace(board(), noise_std=(None,) * 9)}, 'sensor mag_0: noise_std is None'),
     ({'field': np.zeros((0, 9, 3)), 'positions': np.zeros((0, 3)), 'axes': np.zeros((0, 3))},
