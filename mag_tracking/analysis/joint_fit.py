@@ -16,14 +16,14 @@ from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
 from mag_tracking.analysis.pass_description import PATH_TOLERANCE, assignment, fits_at_minimum
 from mag_tracking.analysis.pass_fit import (
-    AS_BOUGHT,
     COARSE_ERROR,
-    at_strongest,
+    DEFAULT_ERRORS,
+    centred_on_peak,
     shorter_rows,
     starting_paths,
-    unusable,
+    unusable_reason,
 )
-from mag_tracking.analysis.pass_result import NEARLY, PassFit
+from mag_tracking.analysis.pass_result import MAX_COST_RATIO, PassFit
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.geometry import moved_along, overlap
 from mag_tracking.inference.least_squares import refine
@@ -94,7 +94,7 @@ class GroundPrior:
 
 
 def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
-              orders: Sequence[int] = (1, 2, 3, 4), errors: SensorErrors = AS_BOUGHT,
+              orders: Sequence[int] = (1, 2, 3, 4), errors: SensorErrors = DEFAULT_ERRORS,
               stopped: Callable[[], bool] | None = None) -> tuple[tuple[PassFit, ...], ...]:
     """Fit several rows of dipoles, each at constant velocity, to the sum of their fields.
 
@@ -122,10 +122,10 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
         few measurements for every order, or if the fit was abandoned.
     """
     n_targets, begin_ns = len(paths), data.stamp_ns
-    orders = [n for n in orders if not unusable(data, n_targets * (n,))]
+    orders = [n for n in orders if not unusable_reason(data, n_targets * (n,))]
     if not orders:
         return ()
-    data, rough = at_strongest(data)
+    data, rough = centred_on_peak(data)
     paths = moved_along(paths, (data.stamp_ns - begin_ns) / NS)
     placed = np.vstack([paths.ravel(), _initial_paths(rough, n_targets, ground)])
     fits = _JointFits(data, rough, placed, ground, errors)
@@ -220,7 +220,7 @@ class _JointFits:
             for found in theta]), np.inf)
         # If only much worse minima are separate, the overlap remains; `fit_targets` rejects it.
         cost = _restricted_to(cost, np.array([are_separate(self._rough, split(found))
-                                              for found in theta]), NEARLY)
+                                              for found in theta]), MAX_COST_RATIO)
         found = fine_minimum(fine, theta, cost, np.concatenate(
             [PATH_TOLERANCE[:6 + (n > 1)] for n in orders]), N_FINE)
         if not np.isfinite(found.cost):

@@ -15,7 +15,12 @@ from mag_tracking.analysis.pass_covariance import (
 )
 from mag_tracking.analysis.pass_data import PassData, background_columns
 from mag_tracking.analysis.pass_result import PassFit
-from mag_tracking.analysis.pass_trust import FittedRow, doubt, residual_elsewhere, trusted
+from mag_tracking.analysis.pass_trust import (
+    FittedRow,
+    rejection_reason,
+    residual_elsewhere,
+    trusted,
+)
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.crlb import bound, cpa_information, information
 from mag_tracking.inference.separable_fit import Minimum
@@ -70,7 +75,7 @@ def fits_at_minimum(data: PassData, orders: Sequence[int], found: Minimum, p: Fl
               for paths, cost in ((np.split(theta, ends), cost) for theta, cost in found.rivals)]
     fits = [replace(fit, rivals=_rivals(fit, [(paths[k], cost) for paths, cost in rivals]))
             for k, fit in enumerate(fits)]
-    return tuple(replace(fit, reason=doubt(fit), trusted=trusted(fit)) for fit in fits)
+    return tuple(replace(fit, reason=rejection_reason(fit), trusted=trusted(fit)) for fit in fits)
 
 
 def _of_one_sensor(data: PassData, n_dipoles: int, found: Minimum, p: FloatArray,
@@ -94,7 +99,7 @@ def _of_one_sensor(data: PassData, n_dipoles: int, found: Minimum, p: FloatArray
     fit = replace(fit, rivals=((0.0, mirrored),))
     if cpa_range is None:
         fit = replace(fit, bearing=bearing_of(fit, place))
-    return replace(fit, reason=doubt(fit), trusted=trusted(fit))
+    return replace(fit, reason=rejection_reason(fit), trusted=trusted(fit))
 
 
 @dataclass(frozen=True)

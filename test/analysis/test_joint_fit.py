@@ -170,7 +170,7 @@ def test_what_is_not_believed_says_why():
                  data, t=data.t[::200], sensor=data.sensor[::200], field=data.field[::200],
                  covariance=data.covariance[::200]), two),
              # A third one that nobody tracked.
-             ('leave over', together(data, measured(
+             ('of the field unexplained', together(data, measured(
                  ROAD, *one_path(rng, 1.5, 1, 1), rng, seconds=6.0, noise=1e-15)), two)]
     for reason, of, tracks in cases:
         fits, = fit_targets(of, alone, tracks, GROUND, (1,))

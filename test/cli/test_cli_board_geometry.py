@@ -186,7 +186,8 @@ def test_bad_files_are_named(tmp_path, capsys):
     write_network(tmp_path / 'stated.yaml', stated)
     write_table(few, field, np.tile(stated.positions[0], (5, 1)), axes)
     assert command(few, '--network', tmp_path / 'stated.yaml', out=out) == 1
-    assert 'few.csv: pose 0: [0.0, 0.0, 0.0] m is the place of a sensor' in capsys.readouterr().err
+    assert 'few.csv: pose 0: [0.0, 0.0, 0.0] m is the position of a sensor' \
+        in capsys.readouterr().err
     assert not out.exists()
 
 
