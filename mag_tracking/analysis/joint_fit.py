@@ -178,7 +178,7 @@ class _JointFits:
     def __init__(self, data: PassData, rough: PassData, placed: FloatArray, ground: GroundPrior,
                  errors: SensorErrors) -> None:
         self._data, self._rough, self._ground, self._errors = data, rough, ground, errors
-        # The first row holds the tracks; the targets of all rows are put into its order.
+        # The first row holds the tracks; the targets of all rows are sorted in its order.
         split = [np.split(paths, paths.size // 6) for paths in placed]
         self._initial_paths = [[paths[i] for i in assignment(split[0], paths)] for paths in split]
         self._n_free = data.n_independent - background_columns(data, data.whitening).shape[1]

@@ -61,7 +61,7 @@ class LevelChange:
     has come; None: unknown."""
 
 
-Judge: TypeAlias = Callable[[LevelChange], bool | None]
+ChangeEvaluator: TypeAlias = Callable[[LevelChange], bool | None]
 """Takes the `LevelChange` of a sensor; whether a vehicle has left, as `has_departed` there."""
 
 
@@ -141,7 +141,7 @@ class SharedChanges:
     def __init__(self) -> None:
         self._latest: dict[int, LevelChange] = {}
 
-    def judge(self, sensor: int, change: LevelChange) -> bool | None:
+    def evaluate_change(self, sensor: int, change: LevelChange) -> bool | None:
         """Whether a vehicle has left a `sensor`, by this change and those of the others.
 
         A change that is not clear is judged by the largest one at the same time.

@@ -9,7 +9,7 @@ from mag_tracking.calibration.background_level import BackgroundLevel
 from mag_tracking.calibration.blocks import Block, stacked
 from mag_tracking.calibration.drift import FormerLevel
 from mag_tracking.calibration.frequent_level import MORE
-from mag_tracking.calibration.level_change import NO_CHANGE, Judge, level_change
+from mag_tracking.calibration.level_change import NO_CHANGE, ChangeEvaluator, level_change
 from mag_tracking.units import NS
 
 MIN_RELEARN_S = 10.0
@@ -37,23 +37,23 @@ class LevelDeparture:
         Whether a vehicle has come and stands now.
     was_steady : bool
         Whether the sensor was at another level for long enough.
-    freed_at : float or None, s
+    departed_at : float or None, s
         When a vehicle that had stood there since the beginning was gone.
     """
 
     def __init__(self, learn: float, relearn: float, state: Record, level: BackgroundLevel,
-                 judge: Judge) -> None:
-        """`learn`, `relearn` [s], `judge`: as `RunningBackground` has them."""
+                 evaluate_change: ChangeEvaluator) -> None:
+        """`learn`, `relearn` [s], `evaluate_change`: as `RunningBackground` has them."""
         self._learn, self._relearn = learn, relearn
         self._state, self._level = state, level
-        self._judge = judge
+        self._evaluate_change = evaluate_change
         self.forget()
 
     def forget(self) -> None:
         """Drop all, also the former level."""
-        self.freed_at: float | None = None
+        self.departed_at: float | None = None
         self.former: FormerLevel | None = None
-        self._judge(NO_CHANGE)
+        self._evaluate_change(NO_CHANGE)
         self.end()
 
     def end(self) -> None:
@@ -109,10 +109,10 @@ class LevelDeparture:
         if self.has_come or not self._has_begin or len(self.blocks) > MAX_JUDGED:
             return False if self.has_come else None
         blocks = stacked([*self._before, *self.blocks])
-        has_departed = self._judge(level_change(
+        has_departed = self._evaluate_change(level_change(
             blocks, len(latest), self._level.at_all(blocks.time), self._state['noise_std'],
             int(self._state['first_ns']) / NS))
         self.has_come = has_departed is False
-        if has_departed and self.former is None and self.freed_at is None:
-            self.freed_at = latest[0].time
+        if has_departed and self.former is None and self.departed_at is None:
+            self.departed_at = latest[0].time
         return has_departed

@@ -30,7 +30,7 @@ MAX_BLOCKS = 4000
 class BlockRecorder(RunningBackground):
     """Collects the blocks of a sensor and is never ready: the first pass over a recording."""
 
-    def judge_block(self) -> None:
+    def evaluate_block(self) -> None:
         """Keep the block that is complete."""
         if self._state['is_full']:
             self._blocks.append(block_of(self._sensors))
@@ -49,7 +49,7 @@ class BlockRecorder(RunningBackground):
         every = 1 + len(blocks) // MAX_BLOCKS
         steps = corrected_steps(self._sensors)
         return most_frequent_level(stacked(blocks[::every]),
-                                   np.where(np.isfinite(steps), steps, 0.0), self._most)
+                                   np.where(np.isfinite(steps), steps, 0.0), self._max_blocks)
 
     def is_known_level(self, initial: FloatArray, found: QuietLevel) -> bool:
         """Whether the level of the beginning, (3,) [T], is that of the background.
