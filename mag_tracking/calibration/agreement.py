@@ -78,8 +78,8 @@ def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
     """
     whole = ~np.isnan(fields).any(axis=1)
     if np.count_nonzero(whole) < 3:
-        raise ValueError('a comparison without earth_field requires three sensors with three axes, '
-                         f'there are {np.count_nonzero(whole)}')
+        raise ValueError('without earth_field, three sensors with three axes are required for a '
+                         f'comparison, there are {np.count_nonzero(whole)}')
     field: FloatArray = np.median(np.einsum('jik,jk->ji', R_ws[whole], fields[whole]), axis=0)
     return field
 

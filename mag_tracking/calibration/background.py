@@ -16,7 +16,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration.background_level import BackgroundLevel
 from mag_tracking.calibration.blocks import Block, Blocks, block_of, pooled_covariance, stacked
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubted_since, noted
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubtful_since, updated
 from mag_tracking.calibration.drift import FormerLevel, is_steep
 from mag_tracking.calibration.frequent_level import MORE
 from mag_tracking.calibration.learning_window import LearningWindow
@@ -103,7 +103,7 @@ class RunningBackground:
         self._resumed = self._relearns_soon = self._contested = self._steep = False
         self._provisional.clear()
         # Frames still in the pipeline remain doubtful.
-        self.doubtful_times = noted(self.doubtful_times, int(self._state['last_ns']), False)
+        self.doubtful_times = updated(self.doubtful_times, int(self._state['last_ns']), False)
         # Duration for which the level was observed, its end, and the start of the background.
         self._seen_s = 0.0 if self._given is None else inf
         self._seen_until = self._since = np.nan
@@ -225,7 +225,7 @@ class RunningBackground:
             self.stuck = bool(still[block.n > 1].all())
             self._begin(block)
         last_ns = int(self._state['last_ns'])
-        self.doubtful_times = noted(self.doubtful_times, last_ns, self.doubtful)
+        self.doubtful_times = updated(self.doubtful_times, last_ns, self.doubtful)
 
     def _begin(self, block: Block) -> None:
         """Before the background is ready: collect blocks until a quiet interval is long enough."""
@@ -321,7 +321,7 @@ class RunningBackground:
         since_ns = int(self._state['first_ns']) + round(np.nan_to_num(self._since) * NS)
         self._change_to(latest, self._learn)
         # The earlier background contained the field of the vehicle.
-        self.doubtful_times = doubted_since(self.doubtful_times, since_ns)
+        self.doubtful_times = doubtful_since(self.doubtful_times, since_ns)
         return True
 
     def _change_to(self, latest: deque[Block], seen_s: float) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.blocks import Block, block_of, stacked
-from mag_tracking.calibration.drift import DRIFT
+from mag_tracking.calibration.drift import TYPICAL_DRIFT
 from mag_tracking.calibration.frequent_level import (
     MIN_BLOCKS,
     MORE,
@@ -59,7 +59,7 @@ class BlockRecorder(RunningBackground):
         """
         level, since, n = initial, 0.0, 0
         for block in self._blocks:
-            width = found.width + DRIFT * (block.time - since)
+            width = found.width + TYPICAL_DRIFT * (block.time - since)
             # A comparison with NaN is false: an axis that is not reported differs from nothing.
             if (np.abs(block.mean - level) > width).any():
                 continue

@@ -164,7 +164,7 @@ def test_without_a_knock_clocks_stay():
     network = stated(clock_offset=np.array([0.0, 0.5, -0.5]))
     found, _ = surveyed(network, knocks=())
     assert found.reference == ''
-    assert found.warnings() == ['clocks stay as they were: the reference felt no knock']
+    assert found.warnings() == ['clocks stay as they were: the reference measured no knock']
     np.testing.assert_array_equal(found.network.clock_offset, [0.0, 0.5, -0.5])
     assert np.isnan(found.network.calibrated[1].clock_offset_std)
 
@@ -175,7 +175,7 @@ def test_a_sensor_that_did_not_feel_the_knock_is_named():
     found, _ = surveyed(change=quiet)
     # Another sensor is the reference then.
     assert found.reference == 'mag_2'
-    assert found.sensors[0].lag.reason == 'the sensor felt no knock'
+    assert found.sensors[0].lag.reason == 'the sensor measured no knock'
     assert found.network.clock_offset[2] == pytest.approx(CLOCK[2] - CLOCK[1], abs=1e-3)
     assert np.isnan(found.network.calibrated[0].clock_offset_std)
     assert found.network.calibrated[1].clock_offset_std == 0.0
