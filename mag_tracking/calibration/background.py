@@ -18,11 +18,11 @@ from mag_tracking.calibration.background_level import BackgroundLevel
 from mag_tracking.calibration.blocks import Block, Blocks, block_of, pooled_covariance, stacked
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubtful_since, updated
 from mag_tracking.calibration.drift import FormerLevel, is_steep
-from mag_tracking.calibration.frequent_level import MORE
+from mag_tracking.calibration.frequent_level import MIN_DURATION_RATIO
 from mag_tracking.calibration.learning_window import LearningWindow
 from mag_tracking.calibration.level_change import ChangeEvaluator, SharedChanges
-from mag_tracking.calibration.level_departure import SOONER, LevelDeparture
-from mag_tracking.calibration.provisional import SEEN_S, FrequentLevel, ProvisionalLevel
+from mag_tracking.calibration.level_departure import SHORTENED_SHARE, LevelDeparture
+from mag_tracking.calibration.provisional import MIN_SEEN_S, FrequentLevel, ProvisionalLevel
 from mag_tracking.calibration.quiet_interval import QuietInterval, line_of
 from mag_tracking.calibration.resolution import MIN_STD, corrected_steps
 from mag_tracking.units import NS
@@ -248,7 +248,7 @@ class RunningBackground:
             if not np.isnan(noise).all():
                 self._level.set((0.0, level.level, np.zeros(3), 0.0),
                                 noise if self._given_noise is None else self._given_noise)
-                self._level.set_uncertainty(found.deviation, is_provisional=True)
+                self._level.set_uncertainty(found.std, is_provisional=True)
 
     def _begin_with_frequent(self, found: FrequentLevel) -> None:
         """Start with a frequent level; other levels may still replace it."""
@@ -283,22 +283,22 @@ class RunningBackground:
         self._seen_until = np.nan
         departure = self._departure
         since = block.time - departure.blocks[0].time
-        longest = departure.longest(self._seen_s, self._resumed and self._relearns_soon)
-        if not longest:
+        relearn_time = departure.relearn_time(self._seen_s, self._resumed and self._relearns_soon)
+        if not relearn_time:
             return departure.end()
         other = self._provisional.found(corrected_steps(self._sensors))
         if other is not None and other.level.is_at(self._level.at(block.time)):
             other = None
-        latest = departure.steady_end(SOONER)
+        latest = departure.steady_end(SHORTENED_SHARE)
         if latest is not None and self._relearn and self._adopt_if_background(latest):
             return
         # Two levels of equal duration may both be the background, unless a vehicle was observed
         # to arrive at one of them.
-        self._contested = not departure.has_come and (
+        self._contested = not departure.has_arrived and (
             self._contested
             or since >= min(self._seen_s, self._relearn) and departure.steady_end() is not None
-            or other is not None and other.seen_s >= min(self._seen_s, SEEN_S))
-        if since < longest:
+            or other is not None and other.seen_s >= min(self._seen_s, MIN_SEEN_S))
+        if since < relearn_time:
             return
         if self._adopt_if_steady(departure.blocks):
             self.n_relearnt += 1
@@ -377,7 +377,7 @@ class RunningBackground:
         self._resumed = False
         line = line_of(blocks)
         assert self._level.noise is not None
-        is_young = MORE * self._seen_s < self._relearn
+        is_young = MIN_DURATION_RATIO * self._seen_s < self._relearn
         self._steep = is_young and is_steep(
             blocks, line[2], self._level.noise.diagonal() + self._state['step_variance'])
         self._level.set_uncertainty(np.abs(line[2]) * self._learn if self._steep else 0.0)

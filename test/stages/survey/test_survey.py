@@ -232,7 +232,7 @@ def test_a_field_that_tells_no_heading_is_told_once():
     found, _ = surveyed(stated(earth=np.array([0.0, 0.0, -5e-5])), fields=up)
     for s in found.sensors:
         assert s.by == 'accelerometer, heading as stated'
-        assert len(s.warnings) == 1 and 'does not tell the heading' in s.warnings[0]
+        assert len(s.warnings) == 1 and 'heading is not observable' in s.warnings[0]
 
 
 @pytest.mark.parametrize('stated_yaw', [0.0, 165.0, 180.0, 190.0])
