@@ -16,10 +16,10 @@ from mag_tracking.calibration.frequent_level import (
 from mag_tracking.calibration.resolution import corrected_steps, raw_steps
 
 NEAR_STDS = 8.0
+"""Maximum difference between the initial and the most frequent level, in standard deviations of a
+reading, that an approaching target may cause."""
 NEAR_DURATION_RATIO = 1.5
-"""A level that differs by less than the first number of standard deviations of a reading may be the
-initial level with an approaching target; for it, the second value is the required ratio of
-durations."""
+"""Ratio of durations that replaces `MIN_DURATION_RATIO` for such levels."""
 
 LEVEL_WEIGHT = 0.3
 """Weight of the latest block in the exponential average of a drifting level."""

@@ -80,7 +80,7 @@ def test_knocks_and_what_is_not_finite_are_left_out():
     (np.zeros((0, 3)), '0 accelerations are too few'),
     (at_rest(np.eye(3), 7), '7 accelerations are too few'),
     (np.full((50, 3), np.nan), '0 accelerations are too few'),
-    (at_rest(np.eye(3)) / GRAVITY, r'in g\?'),
+    (at_rest(np.eye(3)) / GRAVITY, r'is its unit g\?'),
     (np.zeros((50, 3)), 'at rest is 0, not 9.81'),
     (1.2 * at_rest(np.eye(3)), 'at rest is 11.8, not 9.81')])
 def test_what_is_no_accelerometer_at_rest_is_refused(a, message):

@@ -154,7 +154,7 @@ def spoiled(name, function):
 def test_another_unit_than_metres_per_second_squared_is_named():
     found, _ = surveyed(change=spoiled('mag_3', lambda a: a / 9.81))
     assert list(warnings(found)) == ['mag_3']
-    assert 'in g?' in found.sensors[2].warnings[0]
+    assert 'is its unit g?' in found.sensors[2].warnings[0]
     assert found.sensors[2].orientation is None
     # How it is shaken still says when.
     assert found.network.clock_offset[2] == pytest.approx(CLOCK[2], abs=1e-3)
