@@ -77,10 +77,12 @@ def bearing_of(fit: PassFit, place: FloatArray) -> Bearing:
     up = 1.0 if r_cpa[2] >= 0.0 else -1.0
     stds = np.array([_direction_std(r_cpa, dr_cpa @ P[:6, :6] @ dr_cpa.T),
                      _direction_std(v, P[3:6, 3:6]), _direction_std(m, P_m)])
-    at, along, turned = (x / np.linalg.norm(x) if std < MAX_DIRECTION_STD else np.full(3, np.nan)
-                         for x, std in zip((up * r_cpa, up * v, m), stds, strict=True))
-    return Bearing(at, along, turned, stds, time, float(np.sqrt(g_time @ P[:6, :6] @ g_time)),
-                   float(np.sqrt(v2) / distance), float(np.sqrt(g_rate @ P[:6, :6] @ g_rate)))
+    at, motion_direction, moment_direction = (
+        x / np.linalg.norm(x) if std < MAX_DIRECTION_STD else np.full(3, np.nan)
+        for x, std in zip((up * r_cpa, up * v, m), stds, strict=True))
+    return Bearing(at, motion_direction, moment_direction, stds, time,
+                   float(np.sqrt(g_time @ P[:6, :6] @ g_time)), float(np.sqrt(v2) / distance),
+                   float(np.sqrt(g_rate @ P[:6, :6] @ g_rate)))
 
 
 def _direction_std(x: FloatArray, P: FloatArray) -> float:

@@ -69,8 +69,7 @@ class NetworkGeometry:
     """A calibrated network; not to be used if `reason` is not empty.
 
     Standard deviations are posterior. If the readings fit worse than their stated noise, the noise
-    is
-    scaled up accordingly.
+    is scaled up accordingly.
     """
 
     network: SensorNetwork

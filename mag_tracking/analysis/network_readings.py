@@ -83,13 +83,12 @@ class TrackedMagnet:
         ----------
         shared : (12,) array
             Shift [m], rotation vector [rad], offset [m, tool frame], tilt [slope, tool frame], log
-            of
-            the moment relative to the stated one. Shift and rotation are from the tracker frame to
-            the board (world) frame.
+            of the moment relative to the stated one. Shift and rotation are from the tracker frame
+            to the board (world) frame.
         pose : (K, 8) array
             Corrections of the position [m, world frame] and of the tilt [slope, tool frame]; change
-            of
-            the ambient field [T, world frame], which is the same at all sensors and not used here.
+            of the ambient field [T, world frame], which is the same at all sensors and not used
+            here.
 
         Returns
         -------

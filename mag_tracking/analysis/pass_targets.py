@@ -101,7 +101,7 @@ def _rejection_reason(data: PassData, fits: Sequence[PassFit]) -> str:
         if fit.reason:
             return f'vehicle {k}: {fit.reason}'
         if fit.length[0] > MAX_LENGTH:
-            return f'vehicle {k}: a length of {fit.length[0]:.0f} m is more than that of a vehicle'
+            return f'vehicle {k}: a length of {fit.length[0]:.0f} m exceeds that of any vehicle'
     return ''
 
 

@@ -23,9 +23,8 @@ class Growth:
     """Time that a change takes to grow from one size to another.
 
     For a ratio q of the two sizes, each quarter takes q**(1/12) times as long as the next one if
-    the
-    size grows with the inverse cube of a distance, and the next one takes q**(1/8) times as long if
-    the size grows with the square of time.
+    the size grows with the inverse cube of a distance, and the next one takes q**(1/8) times as
+    long if the size grows with the square of time.
     """
 
     quarters: tuple[float, ...]

@@ -66,8 +66,7 @@ class BlockRecorder(RunningBackground):
         """Whether the initial level is that of the background.
 
         True if the field drifts from the initial level to the most frequent level, or is at the
-        latter
-        for hardly longer.
+        latter for hardly longer.
 
         Parameters
         ----------
