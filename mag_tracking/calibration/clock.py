@@ -1,8 +1,4 @@
-"""Clock offset between two sensors from knocks that both measure.
-
-The correlation of the accelerometers (T10 section 6.3) is refined below the sampling interval by
-least squares, which also gives the standard deviation.
-"""
+"""Clock offset between two sensors from knocks that both measure."""
 
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -74,6 +70,9 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
               max_lag: float) -> Lag:
     """Clock offset of a sensor relative to a reference, from knocks that both measured.
 
+    The lag with the largest correlation is refined below the sampling interval by least squares,
+    which also gives the standard deviation.
+
     Parameters
     ----------
     t_reference : (n,) array, s
@@ -96,6 +95,10 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
     ------
     ValueError
         If times and values have different shapes, or times do not increase.
+
+    References
+    ----------
+    [T10]_ section 6.3 for the correlation of the accelerometers.
     """
     a, b = _series(t_reference, reference, 'reference'), _series(t, signal, 'sensor')
     a, b = _without_cut_knocks(*a), _without_cut_knocks(*b)

@@ -1,8 +1,4 @@
-"""Decimation of a fast sensor with an anti-aliasing filter.
-
-T10 section 6.3 uses a low-pass filter before reducing 100 Hz to 12.5 Hz. The filter here is that of
-`scipy.signal.firwin`, of linear phase; its delay is subtracted from the timestamps.
-"""
+"""Decimation of a fast sensor with an anti-aliasing filter."""
 
 from collections import deque
 
@@ -47,8 +43,9 @@ def lowpass(factor: int) -> FloatArray:
 class Decimator:
     """Decimates the samples of one sensor; stores one filter length.
 
-    The rate is measured from the first samples. After a gap or a step of the clock the filter
-    restarts, because filtering across it would produce an invalid field.
+    The filter is that of `scipy.signal.firwin`, of linear phase; its delay is subtracted from the
+    timestamps. The rate is measured from the first samples. After a gap or a step of the clock the
+    filter restarts, because filtering across it would produce an invalid field.
 
     Parameters
     ----------
@@ -59,6 +56,10 @@ class Decimator:
     ----------
     factor : int or None
         Ratio of input to output rate; None before the rate is known.
+
+    References
+    ----------
+    [T10]_ section 6.3: a low-pass filter before the reduction of 100 Hz to 12.5 Hz.
     """
 
     def __init__(self, rate: float) -> None:

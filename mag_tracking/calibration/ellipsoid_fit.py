@@ -3,11 +3,6 @@
 In a uniform field, the readings y of a rotating sensor lie on an ellipsoid; B = C (y - o) maps them
 to a sphere. A rotation of B does not change its size, so C is chosen symmetric: the orientation of
 the sensor's axes relative to its case is not observable from field sizes.
-
-The conversion of the quadric into offset and matrix is that of Renaudin, Afzal and Lachapelle,
-Complete triaxis magnetometer calibration in the magnetic domain (2010), and Kok and Schön,
-Magnetometer calibration using inertial sensors (2016), section V.A. The measure of coverage and the
-rejection criteria are additions of this package.
 """
 
 from dataclasses import dataclass
@@ -177,6 +172,11 @@ def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> Elli
     ------
     ValueError
         If `readings` are not (n, 3) or not finite, or `field_size` is not positive.
+
+    References
+    ----------
+    [Renaudin10]_ and [KokSchon16]_ section V.A for the conversion of the quadric into offset and
+    correction. The measure of coverage and the rejection criteria are additions of this package.
     """
     readings = _checked(readings, field_size)
     present: BoolArray = ~np.any(np.isnan(readings), axis=1)

@@ -1,8 +1,4 @@
-"""Robust geometric least-squares fit of an ellipsoid to the readings of a tumbled sensor.
-
-The method is that of Kok and Schön, Magnetometer calibration using inertial sensors (2016),
-section V.A. The weights by direction and the robust loss are additions of this package.
-"""
+"""Robust geometric least-squares fit of an ellipsoid to the readings of a tumbled sensor."""
 
 from typing import TypedDict
 
@@ -66,6 +62,11 @@ def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
     covariance : (9, 9) array
         Of the offset and the six entries of the correction.
     quality : Quality
+
+    References
+    ----------
+    [KokSchon16]_ section V.A. The weights by direction and the robust loss are additions of this
+    package.
     """
     theta: FloatArray = np.concatenate([o, C[_UPPER]])
     for _ in range(2):

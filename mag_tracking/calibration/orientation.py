@@ -1,7 +1,4 @@
-"""Orientation of a sensor: tilt from its accelerometer, heading from the Earth's field.
-
-T10 section 6.3.1, eq. (6.2)-(6.9); the standard deviations are an addition of this package.
-"""
+"""Orientation of a sensor: tilt from its accelerometer, heading from the Earth's field."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -140,6 +137,10 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
     ------
     ValueError
         If the heading is not observable: the field is vertical, or no measured axis is across it.
+
+    References
+    ----------
+    [T10]_ section 6.3.1, eq. (6.2)-(6.9). The standard deviations are an addition of this package.
     """
     y, B0 = np.asarray(field, dtype=float), np.asarray(earth_field, dtype=float)
     reported = ~np.isnan(y)

@@ -1,9 +1,4 @@
-"""Linear least-squares fit of a quadric to the readings of a tumbled sensor.
-
-The method is that of Renaudin, Afzal and Lachapelle, Complete triaxis magnetometer calibration in
-the magnetic domain (2010). The weights by direction and the exclusion of outliers are additions of
-this package.
-"""
+"""Linear least-squares fit of a quadric to the readings of a tumbled sensor."""
 
 import numpy as np
 
@@ -34,6 +29,11 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
     correction : (3, 3) array
     reason : str
         Why there is no ellipsoid; empty if there is one.
+
+    References
+    ----------
+    [Renaudin10]_. The weights by direction and the exclusion of outliers are additions of this
+    package.
     """
     # The midpoint of the extremes is inside the ellipsoid, even if the sensor was mostly at rest.
     w = even_weights(z - 0.5 * (z.min(axis=0) + z.max(axis=0)))
