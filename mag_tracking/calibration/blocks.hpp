@@ -14,8 +14,8 @@ constexpr int MIN_SAMPLES = 8;
 
 // Subtract the background at `time` [s] from `field` (3) [T], into `out` (3).
 //
-// The drift is extrapolated for at most twice the interval that it was fitted to: a drift from three
-// seconds of readings is not valid for twenty.
+// The drift is extrapolated for at most twice the interval that it was fitted to: a drift from
+// three seconds of readings is not valid for twenty.
 inline void subtract_background(const Sensor& s, double time, const double* field, double* out) {
     const double since = (s.horizon < time ? s.horizon : time) - s.centre;
     for (int a = 0; a < 3; ++a) out[a] = field[a] - s.mean[a] - since * s.slope[a];
@@ -71,8 +71,8 @@ inline void collect(Sensor& s, double time, const double* field) {
     }
 }
 
-// Mean (3) [T] and sum of squared deviations (3, 3) [T^2] of block `k`; a missing axis affects its own
-// elements only.
+// Mean (3) [T] and sum of squared deviations (3, 3) [T^2] of block `k`; a missing axis affects its
+// own elements only.
 inline void moments(const Sensor& s, int64_t k, double* mean, double* scatter) {
     const auto &count = s.count[k], &sum = s.sum[k];
     for (int a = 0; a < 3; ++a) mean[a] = count[a][a] > 0.0 ? sum[a][a] / count[a][a] : NAN;
@@ -86,8 +86,8 @@ inline void moments(const Sensor& s, int64_t k, double* mean, double* scatter) {
 }
 
 // Pooled covariance within k blocks, from their sums of squared deviations `scatter` (k, 3, 3) and
-// numbers of samples `n` (k, 3), into `out` (3, 3); NaN if an axis is not reported. Returns false if
-// there are too few samples.
+// numbers of samples `n` (k, 3), into `out` (3, 3); NaN if an axis is not reported. Returns false
+// if there are too few samples.
 inline bool pool(int64_t k, const double* scatter, const double* n, double* out) {
     double freedom[3] = {0.0, 0.0, 0.0}, sum[9] = {};
     for (int64_t i = 0; i < k; ++i) {

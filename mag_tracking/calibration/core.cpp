@@ -36,7 +36,8 @@ int calibrate_readings(Structured sensors, Structured limits, Integers rows, Int
     Batch& batch = Structs<Batch>(batches).only();
     if (batch.next < 0) throw py::index_error("next: must not be negative");
     for (Size i = batch.next; i < n; ++i) {
-        if (in.rows[i] >= all.size()) throw py::index_error("rows: out of range, there is no such sensor");
+        if (in.rows[i] >= all.size())
+            throw py::index_error("rows: out of range, there is no such sensor");
         if (in.rows[i] >= 0) checked(all.data()[in.rows[i]]);
         if (in.own[i]) input_of(covariances, "covariances", {n, 3, 3});
     }

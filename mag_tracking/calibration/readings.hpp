@@ -1,7 +1,7 @@
 // Calibration of readings one by one.
 //
-// This file contains all rules for single readings. A case that requires Python (a rejection that is
-// counted by name, a complete block, a clock that jumped back, ...) is returned as a reason, and
+// This file contains all rules for single readings. A case that requires Python (a rejection that
+// is counted by name, a complete block, a clock that jumped back, ...) is returned as a reason, and
 // `calibrate` continues where it stopped.
 
 #pragma once
@@ -22,7 +22,8 @@ enum Reason {
     DUPLICATE, OUT_OF_ORDER, STUCK,
     // To be handled before the same reading is processed again.
     BLOCK_COMPLETE = 20, JUMPED_BACK, RESTORABLE,
-    // The previous `n_spikes` readings are rejected, or the `n_released` held readings are to be used.
+    // The previous `n_spikes` readings are rejected, or the `n_released` held readings are to be
+    // used.
     SPIKES = 30, PASSED
 };
 
@@ -42,9 +43,9 @@ struct Limits {
     int64_t is_decimated, trust_covariances;
 };
 
-// Progress within a batch: next reading; sensor and timestamp of the reading that a reason refers to;
-// numbers of calibrated readings, of spikes, of readings whose background (or that of one axis) is
-// not known yet, and of readings whose covariance was overruled.
+// Progress within a batch: next reading; sensor and timestamp of the reading that a reason refers
+// to; numbers of calibrated readings, of spikes, of readings whose background (or that of one axis)
+// is not known yet, and of readings whose covariance was overruled.
 struct Batch {
     int64_t next, row, n_out, n_spikes, n_learning, n_partly_learning, n_overruled, stamp_ns;
 };
@@ -150,7 +151,8 @@ inline bool is_credible(const Sensor& s, const double* C) {
     for (int a = 0; a < 3; ++a) {
         const double stated = C[4 * a], known = s.noise[a][a] + s.step_variance[a];
         // A comparison with NaN is false: a missing axis is not inconsistent.
-        if (stated > MAX_VARIANCE_RATIO * known || known > MAX_VARIANCE_RATIO * stated) return false;
+        if (stated > MAX_VARIANCE_RATIO * known || known > MAX_VARIANCE_RATIO * stated)
+            return false;
         for (int b = 0; b < a; ++b) {
             // The correlation in the message must be close to the measured one.
             const double both = std::sqrt(stated * C[4 * b]);
@@ -162,8 +164,8 @@ inline bool is_credible(const Sensor& s, const double* C) {
     return true;
 }
 
-// Covariance of a reading, into `out` (3, 3): its own if credible, otherwise that of the sensor, plus
-// that of a provisional background.
+// Covariance of a reading, into `out` (3, 3): its own if credible, otherwise that of the sensor,
+// plus that of a provisional background.
 inline void attach_covariance(Sensor& s, const Limits& limits, Batch& batch, const Reading& reading,
                               double* out) {
     const double* C = reading.covariance;
@@ -225,7 +227,8 @@ inline void correct_covariance(const Sensor& s, const double* C, double* out) {
         for (int b = 0; b < 3; ++b)
             for (int c = 0; c < 3; ++c)
                 for (int d = 0; d < 3; ++d)
-                    out[3 * a + b] += product(s.correction[a][c] * s.correction[b][d], C[3 * c + d]);
+                    out[3 * a + b] +=
+                        product(s.correction[a][c] * s.correction[b][d], C[3 * c + d]);
 }
 
 // Calibrate readings from `next` on, until the batch is finished or Python is required.

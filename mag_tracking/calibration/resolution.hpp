@@ -23,8 +23,8 @@ constexpr double MIN_REPEATS = 0.2;
 // Maximum duration of a rest that counts as one measurement; a longer one counts as several.
 constexpr int64_t MAX_REST_NS = 300'000'000;
 
-// Update the steps of a sensor, and the time since which each axis is constant. `raw` (3) [T] is the
-// raw reading; NaN = missing axis.
+// Update the steps of a sensor, and the time since which each axis is constant. `raw` (3) [T] is
+// the raw reading; NaN = missing axis.
 inline void note_step(Sensor& s, int64_t stamp, const double* raw) {
     for (int a = 0; a < 3; ++a) {
         const double value = raw[a];
@@ -34,8 +34,8 @@ inline void note_step(Sensor& s, int64_t stamp, const double* raw) {
             if (stamp - s.rest_since_ns[a] <= MAX_REST_NS) ++s.n_rest[a];
             continue;
         }
-        // A comparison with NaN is false: the first reading is no change. Only completed rests count,
-        // since a stuck axis rests indefinitely.
+        // A comparison with NaN is false: the first reading is no change. Only completed rests
+        // count, since a stuck axis rests indefinitely.
         if (change >= 0.0) {
             s.n_same[a] += s.n_rest[a] - 1;
             ++s.n_changed[a];
@@ -45,8 +45,9 @@ inline void note_step(Sensor& s, int64_t stamp, const double* raw) {
     }
 }
 
-// Step [T] of raw axis `a`; 0 if it is too fine to be observed. The smallest change is the step only
-// if the axis repeats values; a field that changes with every reading has a smallest change as well.
+// Step [T] of raw axis `a`; 0 if it is too fine to be observed. The smallest change is the step
+// only if the axis repeats values; a field that changes with every reading has a smallest change as
+// well.
 inline double seen_step(const Sensor& s, int a) {
     return double(s.n_same[a]) >= MIN_REPEATS * double(s.n_changed[a]) ? s.step[a] : 0.0;
 }
@@ -88,9 +89,9 @@ inline double rest_of(const Sensor& s, int a) {
 // Whether an axis with this step [T] and noise variance [T^2], possibly NaN, repeats values.
 inline bool rests(double variance, double step) { return variance <= DITHERED * (step * step); }
 
-// Complete the `steps` (3) [T]: an unknown (infinite) step is taken from the other axes if those are
-// at rest. An axis that has never changed is dead (NaN) if another axis of the same sensor changes
-// with every reading. If no axis has changed, it may be at rest.
+// Complete the `steps` (3) [T]: an unknown (infinite) step is taken from the other axes if those
+// are at rest. An axis that has never changed is dead (NaN) if another axis of the same sensor
+// changes with every reading. If no axis has changed, it may be at rest.
 inline void complete_steps(const double* variance, double* steps) {
     double largest = 0.0;
     bool is_known = false;

@@ -39,8 +39,8 @@ constexpr double MAX_STEP = 1.5e-6;
 // Maximum difference of the field after a spike from that before it, relative to the spike.
 constexpr double MAX_RETURN = 0.3;
 
-// The reading passes; it is held; the held readings are a spike (call again for the reading itself);
-// the held readings and this one pass, in order.
+// The reading passes; it is held; the held readings are a spike (call again for the reading
+// itself); the held readings and this one pass, in order.
 enum Verdict { PASSES, HELD, SPIKE, RELEASED };
 
 // Whether the current run of equal readings is too long to be due to chance.
@@ -93,7 +93,8 @@ inline double usual_noise(const Sensor& s, int a) {
     return std::max(largest_recent(s, a) / MAX_OF_RECENT, step / std::sqrt(12.0));
 }
 
-// Whether the differences `steps` (3) [T] from the previous reading are larger than those of a target.
+// Whether the differences `steps` (3) [T] from the previous reading are larger than those of a
+// target.
 inline bool is_off(const Sensor& s, double threshold, int64_t stamp, const double* steps) {
     // A comparison with NaN is false: a missing axis is no spike.
     bool is_high = false;
@@ -104,7 +105,8 @@ inline bool is_off(const Sensor& s, double threshold, int64_t stamp, const doubl
     for (int a = 0; a < 3; ++a) {
         const double noise = usual_noise(s, a), largest = largest_recent(s, a);
         // A sensor with coarse steps may not have changed recently, hence the comparison with the
-        // noise. A comparison with NaN is false: an axis without recent differences is not evaluated.
+        // noise. A comparison with NaN is false: an axis without recent differences is not
+        // evaluated.
         if (largest >= 0.0 && steps[a] > threshold * noise && steps[a] > ratio * noise
             && steps[a] > ratio * largest)
             return true;
@@ -164,10 +166,11 @@ inline bool has_returned(const Sensor& s, const double* steps) {
 
 // Classify a reading and the held readings before it.
 //
-// A reading is held if it differs from the previous one by more than `threshold` standard deviations
-// of the noise and by more than `MIN_RATIO` times the recent differences, since a vehicle approaches
-// smoothly. If the rate is so low that a target may pass between two readings, the ratio is larger.
-// Before the noise is known (not `is_ready`), it is estimated from the recent differences.
+// A reading is held if it differs from the previous one by more than `threshold` standard
+// deviations of the noise and by more than `MIN_RATIO` times the recent differences, since a
+// vehicle approaches smoothly. If the rate is so low that a target may pass between two readings,
+// the ratio is larger. Before the noise is known (not `is_ready`), it is estimated from the recent
+// differences.
 inline Verdict screen_spike(Sensor& s, double threshold, const Reading& reading) {
     double steps[3] = {NAN, NAN, NAN};
     // There are never more when a reading arrives.

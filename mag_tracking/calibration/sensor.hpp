@@ -1,5 +1,5 @@
-// State of one sensor that changes with every reading, in [T] and [s], or [ns] if the name ends with
-// `_ns`. Compiled code accesses it for each reading, Python for each block, as an element of a
+// State of one sensor that changes with every reading, in [T] and [s], or [ns] if the name ends
+// with `_ns`. Compiled code accesses it for each reading, Python for each block, as an element of a
 // structured array (`SENSOR`) whose fields are listed in core.cpp.
 
 #pragma once
@@ -24,8 +24,8 @@ struct Sensor {
     double centre, mean[3], slope[3], horizon, noise[3][3], noise_std[3];
     // Variance of that line if it is provisional, else 0.
     double level_variance[3];
-    // First and latest timestamp; a timestamp that is too far ahead and not yet confirmed; whether a
-    // stored background may be restored at the next reading.
+    // First and latest timestamp; a timestamp that is too far ahead and not yet confirmed; whether
+    // a stored background may be restored at the next reading.
     int64_t first_ns, last_ns, unconfirmed_ns, is_restorable, accepted;
     // Repetition: the latest reading, the length of the current run of equal readings, and the
     // numbers of readings that were equal to the previous one, or differed.
@@ -33,8 +33,8 @@ struct Sensor {
     int64_t run;
     double repeats, changes;
     // Resolution: the latest value of each raw axis, the time and number of readings since it is
-    // constant, the numbers of repetitions and changes, the smallest change, and the variance due to
-    // the steps; the number of readings of a decimated one.
+    // constant, the numbers of repetitions and changes, the smallest change, and the variance due
+    // to the steps; the number of readings of a decimated one.
     double raw[3];
     int64_t rest_since_ns[3], n_rest[3], n_same[3], n_changed[3];
     double step[3], step_variance[3], n_averaged;
@@ -56,7 +56,8 @@ struct Sensor {
     // being collected, and whether the other one is complete.
     double length, phase, end;
     int64_t now, is_full;
-    // Both sums, relative to their first reading; each pair of axes over the readings that have both.
+    // Both sums, relative to their first reading; each pair of axes over the readings that have
+    // both.
     int64_t n[2];
     double time[2], origin[2][3], count[2][3][3], sum[2][3][3], product[2][3][3];
 };
