@@ -21,7 +21,7 @@ inline void subtract_background(const Sensor& s, double time, const double* fiel
     for (int a = 0; a < 3; ++a) out[a] = field[a] - s.mean[a] - since * s.slope[a];
 }
 
-// Integer part of a / b for `a` >= 0 and `b` > 0, without rounding up of the quotient.
+// Integer part of a / b for `a` >= 0 and `b` > 0, correct even if the quotient is rounded up.
 inline double whole_times(double a, double b) { return std::round((a - std::fmod(a, b)) / b); }
 
 // Begin the next block if a reading at `time` [s] is the first after the current one. An earlier
