@@ -127,7 +127,7 @@ def test_a_magnet_the_wrong_way_round_is_refused(tmp_path, capsys):
     assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
                    tmp_path / 'board.png', out=tmp_path / 'out.yaml') == 1
     out, err = capsys.readouterr()
-    assert 'refused: not what the model describes: the normalised cost is' in err
+    assert 'refused: the readings do not fit the model: the normalised cost is' in err
     assert 'the network is in' not in out
     assert {p.name for p in tmp_path.iterdir()} == {'stated.yaml', 'poses.csv'}
 
