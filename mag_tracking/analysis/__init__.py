@@ -1,1 +1,1 @@
-"""Questions asked of a whole pass or of a network, not of a stream: fits, bounds, placement."""
+"""Analyses of a whole pass or a network: batch fits, bounds, sensor placement."""

@@ -1,4 +1,4 @@
-"""What one sensor tells of a pass: everything but the scale."""
+"""Observable quantities of a pass measured by one sensor: everything but the scale."""
 
 import numpy as np
 
@@ -6,27 +6,47 @@ from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.physics.anderson import closest_approach
 
-THROUGH = 1e-3
-"""A CPA range below this share of the way seen is none: the path goes through the sensor."""
+MIN_CPA_SHARE = 1e-3
+"""Minimum CPA range relative to the distance travelled. Below it, the path is treated as going
+through the sensor."""
 
-VAGUE = 0.5
-"""[rad] A direction that is known no better than this is none."""
+MAX_DIRECTION_STD = 0.5
+"""[rad] Maximum standard deviation of a direction. A less certain direction is returned as NaN."""
 
 
 def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
                     distance: float) -> tuple[FloatArray, FloatArray] | None:
-    """A path and its moments, seen alike by the one sensor at `place`, with that CPA range.
+    """Scale a path and its moments to a given CPA range.
 
-    (r, v, L, m) and (u r, u v, u L, u^3 m) give the same field; TSP14 eq. (34).
-    So do (r, v) and (-r, -v), of which it gives the one that passes above the sensor.
-    Returns None where the path goes through the sensor.
+    One sensor measures the same field for (r, v, m) and (u r, u v, u³ m), and for (r, v) and
+    (-r, -v). Of the latter two, the path that passes above the sensor is returned.
+
+    Parameters
+    ----------
+    theta : (6 or 7,) array, m, m/s, m
+        Path: position, velocity and, for a row of dipoles, length.
+    p : (k,) array, A m²
+        Moments.
+    place : (3,) array, m, world frame
+        Position of the sensor.
+    distance : float, m
+        CPA range of the returned path.
+
+    Returns
+    -------
+    (array, array) or None
+        Path and moments; None if the path goes through the sensor.
+
+    References
+    ----------
+    [TSP14]_ eq. (34).
     """
     r, v = theta[:3] - place, theta[3:6]
     time, at, _ = closest_approach(r, v)
-    if at <= THROUGH * np.linalg.norm(r - time * v):
+    if at <= MIN_CPA_SHARE * np.linalg.norm(r - time * v):
         return None
     u = distance / at
-    # Target and motion may both be reversed: taken is the end that is not below the sensor.
+    # Target and motion may both be reversed. The solution that is not below the sensor is used.
     side = 1.0 if (r + time * v)[2] >= 0.0 else -1.0
     scaled = u * np.concatenate([side * r, side * v, theta[6:]])
     scaled[:3] += place
@@ -34,7 +54,18 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
 
 
 def bearing_of(fit: PassFit, place: FloatArray) -> Bearing:
-    """The `Bearing` of a fit whose CPA range was taken for known; `place` (3,) of the sensor."""
+    """Directions, time and rate of a fit with an assumed CPA range.
+
+    Parameters
+    ----------
+    fit : PassFit
+    place : (3,) array, m, world frame
+        Position of the sensor.
+
+    Returns
+    -------
+    Bearing
+    """
     r, v = fit.position - place, fit.velocity
     P = fit.robust_covariance
     time, distance, r_cpa = closest_approach(r, v)
@@ -46,14 +77,16 @@ def bearing_of(fit: PassFit, place: FloatArray) -> Bearing:
     up = 1.0 if r_cpa[2] >= 0.0 else -1.0
     stds = np.array([_direction_std(r_cpa, dr_cpa @ P[:6, :6] @ dr_cpa.T),
                      _direction_std(v, P[3:6, 3:6]), _direction_std(m, P_m)])
-    at, along, turned = (x / np.linalg.norm(x) if std < VAGUE else np.full(3, np.nan)
-                         for x, std in zip((up * r_cpa, up * v, m), stds, strict=True))
-    return Bearing(at, along, turned, stds, time, float(np.sqrt(g_time @ P[:6, :6] @ g_time)),
-                   float(np.sqrt(v2) / distance), float(np.sqrt(g_rate @ P[:6, :6] @ g_rate)))
+    at, motion_direction, moment_direction = (
+        x / np.linalg.norm(x) if std < MAX_DIRECTION_STD else np.full(3, np.nan)
+        for x, std in zip((up * r_cpa, up * v, m), stds, strict=True))
+    return Bearing(at, motion_direction, moment_direction, stds, time,
+                   float(np.sqrt(g_time @ P[:6, :6] @ g_time)), float(np.sqrt(v2) / distance),
+                   float(np.sqrt(g_rate @ P[:6, :6] @ g_rate)))
 
 
 def _direction_std(x: FloatArray, P: FloatArray) -> float:
-    """[rad] Largest deviation of the direction of x (3,) with covariance P; inf where unknown."""
+    """Largest standard deviation [rad] of the direction of x (3,); inf if P is not finite."""
     if not np.isfinite(P).all():
         return np.inf
     u = x / np.linalg.norm(x)

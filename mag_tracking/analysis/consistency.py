@@ -1,4 +1,4 @@
-"""A track's error against what its sensors allow: the path bound, with truth at hand."""
+"""Error of a track relative to the path bound, for recordings with ground truth."""
 
 import numpy as np
 
@@ -11,42 +11,51 @@ from mag_tracking.report.metrics import interpolate_truth
 from mag_tracking.report.track_log import TrackLog
 
 MIN_MOTION = 1e-9
-"""[m/s] Slower is at rest, for the width of the prior."""
+"""[m/s] Minimum speed for the width of the velocity prior; slower targets are at rest."""
 
 
 def error_over_bound(network: SensorNetwork, log: TrackLog,
                      truth: tuple[IntArray, FloatArray, FloatArray], acceleration: FloatArray,
                      moment_walk: float, field_error: float, background_std: float,
                      rows: IntArray, axes: int) -> float | None:
-    """Ratio of a track's RMS error to the bound for filters along the true path.
+    """Ratio of the RMS error of a track to the posterior Cramér-Rao bound along the true path.
 
-    The bound is that of a point target with the track's own moment (nobody knows the true one),
-    the motion that the tracker assumes, the sensors' noise and the relative field error that the
-    tracker allows for; the backgrounds are states, and nothing else is known at the first pose.
-    What a vehicle is beyond a point is not in it.
+    The bound is that of a point target with the moment of the track, since the true moment is
+    unknown. It uses the motion model of the tracker, the sensor noise and the relative field error
+    that the tracker allows for. The backgrounds are states, and there is no information on the
+    first pose. Effects of the extent of a vehicle are not included.
 
     Parameters
     ----------
     network : SensorNetwork
     log : TrackLog
-    truth : (stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4))
-    acceleration : (3,) [m^2/s^3] spectral density
-    moment_walk : float [1/s^0.5]
+    truth : (timestamps, positions, quaternions)
+        (n,) ns, (n, 3) m, (n, 4).
+    acceleration : (3,) array, m²/s³
+        Spectral density of the acceleration.
+    moment_walk : float, 1/s^0.5
         Random walk of the moment relative to its size.
     field_error : float
-    background_std : float [T]
-    rows : (k,) int
-        Poses of which the errors count.
+        Model error relative to the field.
+    background_std : float, T
+    rows : (k,) int array
+        Poses whose errors are evaluated.
     axes : int
-        2 = in the plane, 3 = in space.
+        2 = horizontal errors, 3 = errors in space.
 
-    Returns a float, None where there are not two poses with truth.
-    Source: T10 Alg. 2 linearised at the truth; Tichavsky et al. 1998.
+    Returns
+    -------
+    float or None
+        None if fewer than two poses have a ground truth.
+
+    References
+    ----------
+    [T10]_ Alg. 2, linearised at the truth; [Tichavsky98]_.
     """
     true = interpolate_truth(truth, log.stamp_ns)
     known = np.flatnonzero(np.isfinite(true).all(axis=1))
     if axes == 2:
-        # The truth of a vehicle is on the road, its iron is not.
+        # The true height is that of the road, not of the magnetic centre of the vehicle.
         true[:, 2] = np.array(log.position)[:, 2]
     rows = np.intersect1d(rows, known)
     if len(known) < 2 or not len(rows):
@@ -63,7 +72,7 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
 
 def _linearised(network: SensorNetwork, log: TrackLog, true: FloatArray, t: FloatArray,
                 known: IntArray, field_error: float) -> tuple[FloatArray, FloatArray]:
-    """Jacobians (k, n_sensors, 3, n_x) by [r, v, m, backgrounds] at the truth, and noise."""
+    """Jacobians (k, n_sensors, 3, n_x) by [r, v, m, backgrounds] at the truth, and covariances."""
     n, n_sensors = len(known), len(network)
     dr_dx, dm_dx = np.zeros((2, n, 1, 3, 9))
     dr_dx[:, 0, range(3), range(3)] = 1.0
@@ -82,7 +91,7 @@ def _linearised(network: SensorNetwork, log: TrackLog, true: FloatArray, t: Floa
 
 def _motion(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: TrackLog,
             known: IntArray, n_x: int) -> tuple[FloatArray, FloatArray]:
-    """F and Q (k, n_x, n_x) from pose to pose; the first is none."""
+    """F and Q (k, n_x, n_x) between consecutive poses; identity and zero for the first pose."""
     F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
     for k, dt in enumerate(np.diff(t), 1):
         F[k, :6, :6] = constant_velocity(dt)
@@ -94,7 +103,7 @@ def _motion(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: Tr
 
 def _prior(network: SensorNetwork, true: FloatArray, t: FloatArray, log: TrackLog,
            known: IntArray, background_std: float) -> FloatArray:
-    """(n_x, n_x) before the first pose: as far as the way is long, as fast as it went."""
+    """Prior covariance (n_x, n_x) of the first pose, from the length and speed of the path."""
     way = max(np.ptp(true, axis=0).max(), np.ptp(network.positions, axis=0).max())
     speed = max(np.linalg.norm(np.diff(true, axis=0), axis=1).max()
                 / np.diff(t).min(), MIN_MOTION)

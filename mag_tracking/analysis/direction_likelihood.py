@@ -7,8 +7,8 @@ from scipy.optimize import fminbound
 
 from mag_tracking.arrays import FloatArray
 
-STEP = 0.05
-"""Largest step of the search for the time of the closest approach, in lateral distance over
+MAX_STEP = 0.05
+"""Maximum step of the search for the time of closest approach, in units of lateral distance over
 speed."""
 
 
@@ -16,25 +16,25 @@ class LaneHypothesis(NamedTuple):
     """A target that passes the sensor at a known speed and distance."""
 
     speed: float
-    """[m/s] along x; positive from left to right as seen from the sensor."""
+    """Speed along x [m/s]; positive from left to right as seen from the sensor."""
     distance: float
-    """[m] to the lane, along y."""
+    """Distance of the lane along y [m]."""
     height: float = 0.0
-    """[m] of the target above the sensor."""
+    """Height of the target above the sensor [m]."""
 
 
 def direction_likelihood_ratio(t: FloatArray, field: FloatArray, noise_std: float,
                                left_to_right: LaneHypothesis,
                                right_to_left: LaneHypothesis) -> float:
-    """Log likelihood ratio of two lanes, with the moment and the time of passing maximised.
+    """Generalised log-likelihood ratio of two lanes, maximised over moment and time of passing.
 
     Parameters
     ----------
     t : (n,) array, s
     field : (n, 2) array, T
-        Horizontal field, x along the road, without the background.
+        Horizontal field without the background, x along the road.
     noise_std : float, T
-        Standard deviation of one sample on each axis.
+        Standard deviation of one sample, per axis.
     left_to_right, right_to_left : LaneHypothesis
 
     Returns
@@ -44,15 +44,15 @@ def direction_likelihood_ratio(t: FloatArray, field: FloatArray, noise_std: floa
 
     References
     ----------
-    [PHD15]_ Paper B eq. (24)-(35). Eq. (27) prints +||r||^2 where the dipole has -||r||^2.
+    [PHD15]_ Paper B eq. (24)-(35). Eq. (27) prints +||r||² where the dipole has -||r||².
     """
     first, second = (_least_residual(t, field, h) for h in (left_to_right, right_to_left))
     return (second - first) / (2.0 * noise_std**2)
 
 
 def _least_residual(t: FloatArray, field: FloatArray, lane: LaneHypothesis) -> float:
-    """[T^2] Smallest sum of squares that a dipole in the lane leaves."""
-    step = float(STEP * abs(lane.distance / lane.speed))
+    """Minimum residual sum of squares [T²] of a dipole in the lane."""
+    step = float(MAX_STEP * abs(lane.distance / lane.speed))
     grid = np.arange(t[0], t[-1] + step, step)
     at_grid = _residuals(t, field, lane, grid)
     k = int(np.argmin(at_grid))
@@ -66,13 +66,12 @@ def _least_residual(t: FloatArray, field: FloatArray, lane: LaneHypothesis) -> f
 
 def _residuals(t: FloatArray, field: FloatArray, lane: LaneHypothesis,
                at: FloatArray) -> FloatArray:
-    """(k,) [T^2] sums of squares that the best moments leave, for closest approaches `at` (k,) [s].
-    """
+    """Residual sums of squares (k,) [T²] of the best moments, for CPA times `at` (k,) [s]."""
     along = lane.speed * (t - at[:, None])
     r = np.stack([along, np.full_like(along, lane.distance),
                   np.full_like(along, lane.height)], axis=-1)
     size = np.linalg.norm(r, axis=-1)[..., None, None]
-    # At the height of the sensor a vertical moment has no horizontal field.
+    # The horizontal field of a vertical moment is zero at the height of the sensor.
     n = 3 if lane.height else 2
     H = (3.0 * r[..., :2, None] * r[..., None, :n] / size**5 - np.eye(3)[:2, :n] / size**3)
     H = H.reshape(len(at), -1, n)

@@ -1,4 +1,4 @@
-"""Where a magnet of known moment is, from one reading of a calibrated network."""
+"""Position and direction of a magnet of known moment from one reading of a calibrated network."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,99 +13,109 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_jacobians, sensor_fields
 from mag_tracking.settings import param
 
-UNKNOWNS = 5
-"""Of a pose: a dipole has no roll."""
+N_UNKNOWNS = 5
+"""Number of unknowns of a pose; the roll of a dipole is not observable."""
 
-NOTHING = 1e-9
-"""A sum of squares below is that of exact readings: no step makes it smaller by a share."""
+EXACT_COST = 1e-9
+"""Sum of squares of exact readings; below it, convergence is assumed, since no step reduces it
+further."""
 
 MAX_COST = 100.0
-"""A normalised cost beyond is none of one dipole of that moment."""
+"""Maximum normalised cost; beyond it, the readings are not those of one dipole of this moment."""
 
 _Problem: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Of points (n, 9) the residuals (n, n_y) and their Jacobians (n, n_y, 9)."""
+"""Maps points (n, 9) to residuals (n, n_y) and their Jacobians (n, n_y, 9)."""
 
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """How a magnet is looked for, and what its readings err by."""
+    """Settings of the search for a magnet and errors of its readings."""
 
     field_error: float = param(
-        0.01, 'What sensors and dipole err by, relative to the field.', '', (0.0, 1.0))
+        0.01, 'Error of sensors and dipole model relative to the field.', '', (0.0, 1.0))
     ambient_std: float = param(
-        1e-7, 'Of the change of the ambient field since the biases were found, per axis, alike '
-        'everywhere.', 'T', (1e-15, 1e-3))
-    grid_points: int = param(343, 'Points of the coarse grid over the box.', '', (8, 1_000_000))
-    starts: int = param(8, 'Best points of the grid that are refined.', '', (1, 1000))
-    iterations: int = param(60, 'No more steps than these.', '', (1, 10000))
+        1e-7, 'Standard deviation of the change of the ambient field since the biases were '
+        'estimated, per axis; the change is the same at all sensors.', 'T', (1e-15, 1e-3))
+    grid_points: int = param(
+        343, 'Number of points of the coarse grid over the box.', '', (8, 1_000_000))
+    starts: int = param(8, 'Number of grid points that are refined.', '', (1, 1000))
+    iterations: int = param(60, 'Maximum number of steps.', '', (1, 10000))
 
 
 @dataclass(frozen=True)
 class MagnetPose:
-    """A magnet's place and direction; where `reason` is not empty they are not to be used."""
+    """Position and direction of a magnet; not to be used if `reason` is not empty."""
 
     position: FloatArray
     """(3,) [m], world."""
     axis: FloatArray
-    """(3,) unit vector, world: the moment's direction."""
+    """(3,) unit vector, world: direction of the moment."""
     covariance: FloatArray
-    """(6, 6) of both, singular along the axis; made larger where the fit is worse than stated."""
+    """(6, 6) of position and axis, singular along the axis; scaled up if the fit is worse than the
+    stated errors."""
     ambient: FloatArray
-    """(3,) [T], world: change of the ambient field."""
+    """(3,) [T], world: change of the ambient field since the biases were estimated."""
     normalised_cost: float
-    """About one where moment, noise and field error are right."""
+    """About one if moment, noise and field error are correct."""
     converged: bool
+    """Whether the pose is valid."""
     reason: str
+    """Why the pose is not valid; empty if it is."""
 
 
 def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low: ArrayLike,
                   high: ArrayLike, settings: PoseSettings) -> MagnetPose:
     """Pose of a dipole of known moment from one reading of all sensors.
 
+    Several starts on a grid are refined by the Levenberg-Marquardt method; the best is returned.
+
     Parameters
     ----------
     network : SensorNetwork
-        With the `noise_std` of every sensor.
-    field : (n, 3) [T], sensor frame
-        Without biases, gains put right (`NetworkGeometry.signal`); NaN = not measured.
-    moment : float [A m^2]
-    low, high : (3,) [m], world
-        Corners of the box in which it is looked for.
+        With `noise_std` of every sensor.
+    field : (n, 3) array, T, sensor frame
+        Readings corrected for bias and gain (`NetworkGeometry.signal`); NaN = not measured.
+    moment : float, A m²
+    low, high : (3,) array, m, world frame
+        Corners of the box in which the magnet is searched.
     settings : PoseSettings
 
     Returns
     -------
     MagnetPose
-        All NaN where too few axes were measured.
+        All NaN if too few axes were measured.
 
     Raises
     ------
     ValueError
-        Shapes that do not fit, a moment or a box of no size, a sensor without noise.
+        If shapes do not match, a reading is infinite, the moment is not positive, the box is
+        empty, or a sensor has no `noise_std`.
 
-    Source: PHD15 Paper A eq. (3); the best of several starts, by Levenberg and Marquardt.
+    References
+    ----------
+    [PHD15]_ Paper A eq. (3).
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
     _check(network, field, moment, low, high)
     present = ~np.isnan(field)
     n_values = int(np.count_nonzero(present))
-    if n_values <= UNKNOWNS:
+    if n_values <= N_UNKNOWNS:
         nothing = np.full(3, np.nan)
         return MagnetPose(nothing, nothing, np.full((6, 6), np.nan), nothing, np.nan, False,
-                          f'{n_values} axes measured, more than {UNKNOWNS} are needed')
+                          f'{n_values} axes measured, more than {N_UNKNOWNS} are required')
     size2 = np.nansum(np.square(field), axis=1)[:, None]
     std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * size2)
     problem = _problem(network, field, std, present, moment, settings.ambient_std)
     starts = _starts(network, field, std, present, low, high, settings)
     x, cost, covariance, converged = refine(problem, starts, settings.iterations, 1e-9)
     best = int(np.argmin(cost))
-    return _pose(x[best], covariance[best], cost[best] / (n_values - UNKNOWNS),
-                 converged[best] or cost[best] < NOTHING, low, high, settings)
+    return _pose(x[best], covariance[best], cost[best] / (n_values - N_UNKNOWNS),
+                 converged[best] or cost[best] < EXACT_COST, low, high, settings)
 
 
 def _problem(network: SensorNetwork, field: FloatArray, std: FloatArray, present: BoolArray,
              moment: float, ambient_std: float) -> _Problem:
-    """Residuals and Jacobians of x = place, direction of any length, ambient field in its std."""
+    """Residuals and Jacobians of x = [position, unnormalised axis, ambient field over its std]."""
     y = (field / std)[present]
     uniform = (network.R_sw * ambient_std / std[:, :, None])[present]
     prior = np.hstack([np.zeros((3, 6)), np.eye(3)])
@@ -130,11 +140,11 @@ def _problem(network: SensorNetwork, field: FloatArray, std: FloatArray, present
 
 def _starts(network: SensorNetwork, field: FloatArray, std: FloatArray, present: BoolArray,
             low: FloatArray, high: FloatArray, settings: PoseSettings) -> FloatArray:
-    """Best points (k, 9) of a grid, each with the direction of the moment that fits it best."""
+    """Best points (k, 9) of a grid, each with the best-fitting direction of the moment."""
     per_axis = max(2, int(round(settings.grid_points ** (1.0 / 3.0))))
     axes = [np.linspace(a, b, per_axis + 2)[1:-1] for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
-    # Only the moment's Jacobian is wanted: it does not depend on the moment.
+    # Only the Jacobian by the moment is used; it does not depend on the moment.
     dB_dm = dipole_jacobians(network.positions - grid[:, None], np.zeros(3))[1]
     A = (network.R_sw @ dB_dm / std[:, :, None])[:, present]
     usable = np.isfinite(A).all(axis=(1, 2))
@@ -146,7 +156,7 @@ def _starts(network: SensorNetwork, field: FloatArray, std: FloatArray, present:
 
 def _pose(x: FloatArray, covariance: FloatArray, cost: float, converged: bool, low: FloatArray,
           high: FloatArray, settings: PoseSettings) -> MagnetPose:
-    """The `MagnetPose` of a minimum."""
+    """`MagnetPose` of a minimum."""
     length = np.linalg.norm(x[3:6])
     u = x[3:6] / length
     T = np.zeros((6, 9))
@@ -155,9 +165,10 @@ def _pose(x: FloatArray, covariance: FloatArray, cost: float, converged: bool, l
     if not (np.isfinite(cost) and converged):
         reason = f'no minimum within {settings.iterations} steps'
     elif not cost <= MAX_COST:
-        reason = f'not one dipole of that moment: the normalised cost is {cost:.0f}'
+        reason = ('the readings do not fit one dipole of this moment: the normalised cost is '
+                  f'{cost:.0f}')
     elif not ((low <= x[:3]) & (x[:3] <= high)).all():
-        reason = f'outside the box: {x[:3].tolist()} m'
+        reason = f'the magnet is outside the box: {x[:3].tolist()} m'
     else:
         reason = ''
     return MagnetPose(x[:3], u, max(1.0, cost) * T @ covariance @ T.T,
@@ -166,16 +177,16 @@ def _pose(x: FloatArray, covariance: FloatArray, cost: float, converged: bool, l
 
 def _check(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
            high: FloatArray) -> None:
-    """Raise ValueError for what cannot be used."""
+    """Raise ValueError if an input is invalid."""
     if field.shape != (len(network), 3) or low.shape != (3,) or high.shape != (3,):
         raise ValueError(f'expected field ({len(network)}, 3) and corners (3,), got '
                          f'{field.shape}, {low.shape}, {high.shape}')
     if not (np.isfinite(moment) and moment > 0.0):
-        raise ValueError(f'moment is {moment}, expected it above 0 A m^2')
+        raise ValueError(f'moment is {moment} A m^2, must be finite and above 0')
     if not (np.isfinite(high - low).all() and (high > low).all()):
-        raise ValueError(f'the box from {low.tolist()} to {high.tolist()} m has no size')
+        raise ValueError(f'the box from {low.tolist()} to {high.tolist()} m has no volume')
     if np.isinf(field).any():
-        raise ValueError('a reading is infinite')
+        raise ValueError('field contains an infinite reading')
     for name, std in zip(network.names, network.noise_std, strict=True):
         if std is None or not (np.asarray(std) > 0.0).all():
-            raise ValueError(f'sensor {name}: noise_std is {std}, expected it above 0 T')
+            raise ValueError(f'sensor {name}: noise_std is {std}, must be above 0 T')

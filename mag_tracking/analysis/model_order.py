@@ -1,4 +1,4 @@
-"""How many dipoles a pass is worth."""
+"""Selection of the number of dipoles of a pass."""
 
 from collections.abc import Sequence
 
@@ -9,21 +9,22 @@ from mag_tracking.arrays import FloatArray
 
 
 def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
-    """The criterion of each fit of one pass; the smallest one wins.
+    """Information criterion of each fit of one pass; the smallest is selected.
 
-    Every unknown has to earn log(n) (Schwarz's criterion, BIC): an order that is too large fits
-    noise. The noise is known, so the cost is -2 log-likelihood but for a constant; it is first
-    divided by the normalised cost of the richest fit (if that is above one): what no order
-    describes is no reason to take the next one. TSP14 section V.C leaves the rule open.
+    The criterion is the Bayesian information criterion (BIC, Schwarz): each unknown is penalised
+    by log(n), so that orders that only fit noise are not selected. The noise is known, hence the
+    cost is -2 times the log-likelihood up to a constant. The cost is first divided by the
+    normalised cost of the fit with the most dipoles if that exceeds one, since a residual that no
+    order explains is no evidence for a higher order. TSP14 section V.C leaves the criterion open.
 
     Parameters
     ----------
     fits : sequence of PassFit
-        Of the same measurements.
+        Fits of the same measurements.
 
     Returns
     -------
-    (n,)
+    (n,) array
         Relative to the smallest; infinite for a fit that the measurements do not determine.
     """
     usable = [f for f in fits if f.determined]
@@ -38,9 +39,19 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
 
 
 def choose_order(fits: Sequence[PassFit]) -> PassFit | None:
-    """The fit with the smallest of `order_criteria`, or None where that one is no answer.
+    """Return the fit with the smallest criterion, or None if that fit is rejected.
 
-    A turn is not seen by a point that fits it badly: what the best fit contradicts holds for all.
+    A point can fit a turn poorly without indicating it, so a rejection of the best fit holds for
+    all orders.
+
+    Parameters
+    ----------
+    fits : sequence of PassFit
+        Fits of the same measurements.
+
+    Returns
+    -------
+    PassFit or None
     """
     criteria = order_criteria(fits)
     if not len(fits) or not np.isfinite(criteria).any():

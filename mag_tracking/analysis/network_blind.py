@@ -1,4 +1,4 @@
-"""A network's geometry from a magnet that nothing tracks."""
+"""Geometry of a network from a magnet whose poses are unknown."""
 
 from dataclasses import replace
 
@@ -17,36 +17,42 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 
 COARSE_ERROR = 0.1
-"""What the field is taken to err by while poses are no better than their starts."""
+"""Assumed error relative to the field while the poses are close to their starts."""
 
-FIRST = PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
-"""How poses are looked for while the biases are hardly known."""
+FIRST_POSE_SETTINGS = PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
+"""Settings of the search for the first poses, while the biases are hardly known."""
 
 
 def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: float,
                              low: ArrayLike, high: ArrayLike,
                              settings: GeometrySettings) -> NetworkGeometry:
-    """As `calibrate_geometry` where nothing tracks the magnet: its poses are unknown, too.
+    """Estimate the geometry of a network from a magnet whose poses are unknown.
+
+    The first poses are found with the median of each sensor as its bias. Biases and poses are then
+    fitted with an assumed field error of 10 %, and finally all unknowns.
 
     Parameters
     ----------
-    network, field, moment, settings : as for `calibrate_geometry`
-    low, high : (3,) [m], world
-        Corners of the box in which the magnet was.
+    network : SensorNetwork
+        As for `calibrate_geometry`.
+    field : (K, n, 3) array, T, sensor frame
+        Readings including their constant background; NaN = not measured.
+    moment : float, A m²
+    low, high : (3,) array, m, world frame
+        Corners of the box that contains the magnet.
+    settings : GeometrySettings
 
     Returns
     -------
     NetworkGeometry
-        World is what the priors of the sensors make of it: compare after a registration. `rows`
-        are the poses that were found in the box.
+        The world frame is defined by the priors of the sensors only: register it before
+        comparing it with another. `rows` are the poses that were found in the box.
 
     Raises
     ------
     ValueError
-        As `calibrate_geometry`, or fewer than `MIN_POSES` poses found in the box.
-
-    The poses begin as if each bias were the sensor's median; then biases and poses are fitted to a
-    field that is believed to a tenth, and only then all the rest.
+        If an input is invalid (see `calibrate_geometry`), or fewer than `MIN_POSES` poses were
+        found in the box.
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
     s = settings
@@ -59,7 +65,7 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
     for how in (coarse, s):
         if len(rows) < MIN_POSES:
             raise ValueError(f'{len(rows)} of {len(field)} poses were found in the box, at least '
-                             f'{MIN_POSES} are needed')
+                             f'{MIN_POSES} are required')
         geometry = fitted_geometry(network, field[rows], r, u, moment, how, shared_unit,
                                    pose_unit)
         used, (r, u) = rows, geometry.poses
@@ -71,13 +77,14 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
 
 def _first_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
                  high: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Rows (k,) of poses that are found, their positions and axes (k, 3)."""
+    """Rows (k,) of the poses that were found, their positions and axes (k, 3)."""
     if field.ndim != 3 or field.shape[1:] != (len(network), 3):
         raise ValueError(f'expected field (K, {len(network)}, 3), got {field.shape}')
     middle = np.zeros(field.shape[1:])
     for j, a in zip(*np.nonzero((~np.isnan(field)).any(axis=0)), strict=True):
         middle[j, a] = np.nanmedian(field[:, j, a])
-    found = [locate_magnet(network, B - middle, moment, low, high, FIRST) for B in field]
+    found = [locate_magnet(network, B - middle, moment, low, high, FIRST_POSE_SETTINGS)
+             for B in field]
     rows = np.flatnonzero([pose.converged for pose in found])
     positions, axes = (np.array([getattr(found[k], name) for k in rows]).reshape(-1, 3)
                        for name in ('position', 'axis'))

@@ -1,6 +1,6 @@
-"""Gauss and Newton for a network's geometry: weights, normal equations, steps.
+"""Gauss-Newton for the geometry of a network: weights, normal equations, steps.
 
-Sensors and poses are tied by their readings only, so that poses are eliminated block by block.
+Sensors and poses are coupled by their readings only, so the poses are eliminated block by block.
 """
 
 from typing import Protocol, TypeAlias
@@ -20,57 +20,79 @@ from mag_tracking.analysis.network_readings import (
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 
-OUTLYING = 1e-3
-"""Readings less probable than this under the noise lose weight, the more the farther out."""
+OUTLIER_PROBABILITY = 1e-3
+"""Probability under the noise below which a reading is down-weighted, the more the larger its
+residual."""
 
-STEADY = 1e-3
-"""A step is the last where its squared length, in posterior deviations, is below this."""
+STEP_TOLERANCE = 1e-3
+"""Squared length of a step, in posterior standard deviations, below which the fit has converged."""
 
 MAX_DAMPING = 1e10
+"""Damping at which the search for a step is abandoned."""
 
-Numbers: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-"""Of the sensors (n, 10), shared (12,) and of the poses (K, 8)."""
+Unknowns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+"""Unknowns of the sensors (n, 10), shared (12,) and of the poses (K, 8)."""
 
-Weights: TypeAlias = tuple[FloatArray, Numbers, float, FloatArray]
-"""As `GeometryProblem.weights` returns them."""
+Weights: TypeAlias = tuple[FloatArray, Unknowns, float, FloatArray]
+"""As returned by `GeometryProblem.weights`."""
 
 
 class Priors(Protocol):
-    """The prior deviations of `GeometrySettings` that the sensors' numbers have."""
+    """Prior standard deviations of the unknowns of a sensor, as in `GeometrySettings`."""
 
     @property
     def gain_std(self) -> float:
-        """Of a gain."""
+        """Standard deviation of a gain."""
 
     @property
     def rotation_std_deg(self) -> float:
-        """[deg] Of an orientation, per axis."""
+        """Standard deviation of an orientation, per axis [deg]."""
 
     @property
     def position_std(self) -> float:
-        """[m] Of a position, per axis."""
+        """Standard deviation of a position, per axis [m]."""
 
     @property
     def field_error(self) -> float:
-        """What the dipole errs by, relative to the field."""
+        """Error of the dipole model relative to the field."""
 
     @property
     def iterations(self) -> int:
-        """No more steps than these."""
+        """Maximum number of steps."""
 
 
 class GeometryProblem:
-    """What is given; the unknowns' units and priors; what is predicted, weighted.
+    """Readings, units and priors of the unknowns, and weighted predictions.
+
+    All x are `Unknowns` in units of their priors.
 
     Parameters
     ----------
-    network, field, positions, axes, moment, settings : as for `calibrate_geometry`, checked
-    shared_unit : (12,)
-        Prior deviations of what is shared; zero = fixed.
-    pose_unit : (8,)
-        The same of a pose.
+    network : SensorNetwork
+    field : (K, n, 3) array, T, sensor frame
+        As for `calibrate_geometry`, checked.
+    positions, axes : (K, 3) array, m and unit vectors, tracker frame
+    moment : float, A m²
+    settings : Priors
+    shared_unit : (12,) array
+        Prior standard deviations of the shared unknowns; zero = fixed.
+    pose_unit : (8,) array
+        Prior standard deviations of the unknowns of a pose; zero = fixed.
 
-    All x are (sensors (n, 10), shared (12,), poses (K, 8)) in these units.
+    Attributes
+    ----------
+    network : SensorNetwork
+    settings : Priors
+    shared_unit : (12,) array
+    pose_unit : (8,) array
+    sensor_unit : (n, 10) array
+        Units of the unknowns of the sensors.
+    field : (n, K, 3) array, T, sensor frame
+    variance : (n, 1, 3) array, T²
+        Noise variances.
+    magnet : TrackedMagnet
+    reported : (n, 3) bool array
+        Whether an axis has any reading.
     """
 
     def __init__(self, network: SensorNetwork, field: FloatArray, positions: FloatArray,
@@ -82,85 +104,196 @@ class GeometryProblem:
         self.variance = np.square(np.array(network.noise_std))[:, None]
         self.magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0),
                                     float(moment))
-        self.heard: BoolArray = np.any(~np.isnan(self.field), axis=1)
+        self.reported: BoolArray = np.any(~np.isnan(self.field), axis=1)
         n = len(network)
         s = settings
         self.sensor_unit = np.hstack([
             np.array(network.noise_std), np.tile(np.repeat(
                 [s.gain_std, np.deg2rad(s.rotation_std_deg), s.position_std], [1, 3, 3]), (n, 1))])
 
-    def predicted(self, x: Numbers) -> Prediction:
-        """As `predicted_readings`, by x in units of the priors."""
+    def predicted(self, x: Unknowns) -> Prediction:
+        """Predicted readings and derivatives by x.
+
+        Parameters
+        ----------
+        x : Unknowns
+
+        Returns
+        -------
+        Prediction
+            As `predicted_readings`, with derivatives in units of the priors.
+        """
         sensor, shared, pose = self.in_si(x)
         f, signal, by_sensor, by_shared, by_pose = predicted_readings(
             self.network, self.magnet, sensor, shared, pose)
         return (f, signal, by_sensor * self.sensor_unit[:, None, None],
                 by_shared * self.shared_unit, by_pose * self.pose_unit)
 
-    def in_si(self, x: Numbers) -> Numbers:
-        """Sensors' (n, 10), shared (12,) and poses' (K, 8) numbers of x."""
+    def in_si(self, x: Unknowns) -> Unknowns:
+        """Convert x to SI units.
+
+        Parameters
+        ----------
+        x : Unknowns
+
+        Returns
+        -------
+        Unknowns
+        """
         sensor, shared, pose = x
         return sensor * self.sensor_unit, shared * self.shared_unit, pose * self.pose_unit
 
-    def start(self) -> Numbers:
-        """x with nothing corrected, and biases that are the middle of what is left over."""
+    def start(self) -> Unknowns:
+        """Starting point: no corrections, and biases from the median residuals.
+
+        Returns
+        -------
+        Unknowns
+        """
         n, K = len(self.network), len(self.magnet.tool)
         x = np.zeros((n, SENSOR)), np.zeros(SHARED), np.zeros((K, POSE))
         left = self.field - self.predicted(x)[0]
-        for j, a in zip(*np.nonzero(self.heard), strict=True):
+        for j, a in zip(*np.nonzero(self.reported), strict=True):
             x[0][j, a] = np.nanmedian(left[j, :, a]) / self.sensor_unit[j, a]
         return x
 
     def misfit(self, f: FloatArray,
                signal: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Squared residuals over their variance (n, K, 3), how many (n, K), and the variance."""
+        """Normalised squared residuals.
+
+        Parameters
+        ----------
+        f : (n, K, 3) array, T
+            Predicted readings.
+        signal : (n, K, 3) array, T
+            Predicted readings without biases.
+
+        Returns
+        -------
+        e2 : (n, K, 3) array
+            Squared residuals over their variance; zero where nothing was measured.
+        count : (n, K) int array
+            Number of measured axes.
+        variance : (n, K, 3) array, T²
+        """
         size2 = np.einsum('nki,nki->nk', signal, signal)[:, :, None]
         variance = self.variance + self.settings.field_error**2 * size2
         e2 = np.square(self.field - f) / variance
         return np.nan_to_num(e2), (~np.isnan(e2)).sum(axis=2), variance
 
-    def weights(self, f: FloatArray, signal: FloatArray, x: Numbers) -> Weights:
-        """Of readings (n, K, 3), of priors, as x is, the scale of the misfit, the trust (n, K)."""
+    def weights(self, f: FloatArray, signal: FloatArray, x: Unknowns) -> Weights:
+        """Weights of readings and priors.
+
+        Parameters
+        ----------
+        f, signal : (n, K, 3) array, T
+            As for `misfit`.
+        x : Unknowns
+
+        Returns
+        -------
+        W : (n, K, 3) array
+            Weights of the readings.
+        priors : Unknowns
+            Weights of the priors.
+        scale : float
+            Scale of the misfit, at least one.
+        trust : (n, K) array
+            Robust weights, 0 to 1.
+        """
         e2, count, variance = self.misfit(f, signal)
         d2 = e2.sum(axis=2)
-        scale = max(1.0, float(np.median(typical(d2, count)[count > 0])))
-        trust = _trust(d2 / scale, count)
+        scale = max(1.0, float(np.median(median_ratio(d2, count)[count > 0])))
+        trust = _robust_weights(d2 / scale, count)
         W = trust[:, :, None] / (variance * scale)
         W[np.isnan(self.field)] = 0.0
         return W, self._priors(x), scale, trust
 
-    def _priors(self, x: Numbers) -> Numbers:
-        """Weights of the priors, as x is."""
-        # Only with the root: out of bounds is a fault, but one of what is asked for.
-        sensor, pose = (np.sqrt(_trust(np.square(v).sum(axis=1), v.shape[1]))[:, None]
+    def _priors(self, x: Unknowns) -> Unknowns:
+        """Weights of the priors."""
+        # The square root limits the down-weighting: a large correction is a fault of the quantity
+        # that is estimated, not an outlier to be ignored.
+        sensor, pose = (np.sqrt(_robust_weights(np.square(v).sum(axis=1), v.shape[1]))[:, None]
                         for v in (x[0][:, 3:], x[2]))
-        # A bias has no prior; where an axis is silent, one that changes nothing.
-        return (np.hstack([1.0 * ~self.heard, np.tile(sensor, SENSOR - 3)]), np.ones(SHARED),
+        # A bias has no prior. The prior of an axis without readings keeps the equations regular.
+        return (np.hstack([1.0 * ~self.reported, np.tile(sensor, SENSOR - 3)]), np.ones(SHARED),
                 np.tile(pose, POSE))
 
-    def cost(self, x: Numbers, f: FloatArray, W: FloatArray, priors: Numbers) -> float:
-        """Sum of squares with given weights; infinite where it is no number."""
+    def cost(self, x: Unknowns, f: FloatArray, W: FloatArray, priors: Unknowns) -> float:
+        """Weighted sum of squares.
+
+        Parameters
+        ----------
+        x : Unknowns
+        f : (n, K, 3) array, T
+            Predicted readings.
+        W : (n, K, 3) array
+        priors : Unknowns
+            Weights of the priors.
+
+        Returns
+        -------
+        float
+            Infinite if a prediction is not finite.
+        """
         e = np.nan_to_num(self.field - f)
         cost = (W * e * e).sum() + sum((w * v**2).sum() for w, v in zip(priors, x, strict=True))
         return cost if np.isfinite(f).all() else np.inf
 
 
-def typical(d2: FloatArray, count: IntArray) -> FloatArray:
-    """Squared residuals over their median under the noise; one where nothing was measured."""
+def median_ratio(d2: FloatArray, count: IntArray) -> FloatArray:
+    """Squared residuals over their median under the noise.
+
+    Parameters
+    ----------
+    d2 : (...) array
+        Sums of squared normalised residuals.
+    count : (...) int array
+        Number of values of each sum.
+
+    Returns
+    -------
+    (...) array
+        One where nothing was measured.
+    """
     return np.where(count > 0, d2 / chi2.median(np.maximum(count, 1)), 1.0)
 
 
-def _trust(d2: FloatArray, count: IntArray | int) -> FloatArray:
-    """Weights of residuals with `count` numbers: one, then falling with the square."""
-    limit = chi2.isf(OUTLYING, np.maximum(count, 1))
+def _robust_weights(d2: FloatArray, count: IntArray | int) -> FloatArray:
+    """Robust weights of residuals with `count` values: one, then falling with their square."""
+    limit = chi2.isf(OUTLIER_PROBABILITY, np.maximum(count, 1))
     return limit / np.maximum(d2, limit)
 
 
 class NormalEquations:
-    """Normal equations with the poses eliminated, block by block."""
+    """Normal equations with the poses eliminated block by block.
 
-    def __init__(self, problem: GeometryProblem, x: Numbers, predicted: Prediction, W: FloatArray,
-                 priors: Numbers) -> None:
+    Parameters
+    ----------
+    problem : GeometryProblem
+    x : Unknowns
+    predicted : Prediction
+    W : (n, K, 3) array
+        Weights of the readings.
+    priors : Unknowns
+        Weights of the priors.
+
+    Attributes
+    ----------
+    A : (N, N) array
+        Information of [sensors, shared].
+    g : (N,) array
+        Negative gradient of [sensors, shared].
+    A_pose : (K, 8, 8) array
+        Information of the poses.
+    g_pose : (K, 8) array
+        Negative gradient of the poses.
+    C : (K, N, 8) array
+        Information between [sensors, shared] and each pose.
+    """
+
+    def __init__(self, problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
+                 priors: Unknowns) -> None:
         f, _, by_sensor, by_shared, by_pose = predicted
         n, K = W.shape[:2]
         root = np.sqrt(W)
@@ -190,7 +323,20 @@ class NormalEquations:
         self.C = np.concatenate([across.reshape(K, m, POSE), shared], axis=1)
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Steps of [sensors, shared] (N,) and of the poses (K, 8)."""
+        """Solve the damped normal equations.
+
+        Parameters
+        ----------
+        damping : float
+            Share added to the diagonals.
+
+        Returns
+        -------
+        dx : (N,) array
+            Step of [sensors, shared].
+        dpose : (K, 8) array
+            Steps of the poses.
+        """
         A, A_pose = self._damped(damping)
         CB = self.C @ np.linalg.inv(A_pose)
         S = A - self._reduced(CB)
@@ -199,7 +345,15 @@ class NormalEquations:
         return dx, np.linalg.solve(A_pose, rest[..., None])[..., 0]
 
     def covariance(self) -> tuple[FloatArray, FloatArray]:
-        """Of [sensors, shared] (N, N) and of every pose (K, 8, 8)."""
+        """Covariances of the solution.
+
+        Returns
+        -------
+        P : (N, N) array
+            Covariance of [sensors, shared].
+        P_pose : (K, 8, 8) array
+            Covariance of each pose.
+        """
         B = np.linalg.inv(self.A_pose)
         CB = self.C @ B
         P = np.linalg.inv(self.A - self._reduced(CB))
@@ -207,27 +361,33 @@ class NormalEquations:
         return P, B + np.swapaxes(CB, 1, 2) @ (P @ CB)
 
     def _reduced(self, CB: FloatArray) -> FloatArray:
-        """What the poses take away (N, N)."""
+        """Information (N, N) that the elimination of the poses removes."""
         N = len(self.g)
         taken: FloatArray = (np.swapaxes(CB, 0, 1).reshape(N, -1)
                              @ np.swapaxes(self.C, 0, 1).reshape(N, -1).T)
         return taken
 
     def _damped(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Both diagonals, a little larger."""
+        """Both information matrices with increased diagonals."""
         return (self.A + damping * np.diag(np.diagonal(self.A)),
                 self.A_pose * (1.0 + damping * np.eye(POSE)))
 
 
 def solve(problem: GeometryProblem,
-          iterations: int) -> tuple[Numbers, Weights, Prediction, bool]:
-    """The minimum, from nothing corrected.
+          iterations: int) -> tuple[Unknowns, Weights, Prediction, bool]:
+    """Minimise a `GeometryProblem` by the Levenberg-Marquardt method.
+
+    Parameters
+    ----------
+    problem : GeometryProblem
+    iterations : int
+        Maximum number of steps.
 
     Returns
     -------
-    x : as for `GeometryProblem`
-    weights : (W, priors, scale, trust) as of `GeometryProblem.weights`
-    predicted : as of `GeometryProblem.predicted`
+    x : Unknowns
+    weights : Weights
+    predicted : Prediction
     converged : bool
     """
     x, damping, converged = problem.start(), 1e-3, False
@@ -247,14 +407,14 @@ def solve(problem: GeometryProblem,
         else:
             break
         x, predicted, damping = trial, there, 0.1 * damping
-        if dx @ normal.g + (dpose * normal.g_pose).sum() < STEADY:
+        if dx @ normal.g + (dpose * normal.g_pose).sum() < STEP_TOLERANCE:
             converged = True
             break
     weights = problem.weights(predicted[0], predicted[1], x)
     return x, weights, predicted, converged
 
 
-def _moved(x: Numbers, dx: FloatArray, dpose: FloatArray) -> Numbers:
+def _moved(x: Unknowns, dx: FloatArray, dpose: FloatArray) -> Unknowns:
     """x after a step."""
     m = len(dx) - SHARED
     return x[0] + dx[:m].reshape(-1, SENSOR), x[1] + dx[m:], x[2] + dpose

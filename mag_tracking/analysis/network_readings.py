@@ -1,7 +1,6 @@
-"""What fixed sensors read of a magnet on a tracked tool, with derivatives by all that is unknown.
+"""Predicted readings of fixed sensors for a magnet on a tracked tool, and their derivatives.
 
-All unknowns are in units of their own prior deviation (`PoseUnknowns` says which), so that a prior
-is the identity and a deviation of zero means fixed.
+The unknowns and their order are described in `TrackedMagnet.poses` and `predicted_readings`.
 """
 
 from dataclasses import dataclass
@@ -21,61 +20,82 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_field, dipole_jacobians
 
 SENSOR, SHARED, POSE = 10, 12, 8
-"""Numbers per sensor (bias, gain, rotation, position), of all (board's shift and rotation, the
-magnet's offset and tilt in the tool, log of the moment), and per pose (place, tilt, ambient
-field)."""
+"""Number of unknowns per sensor (bias, gain, rotation, position), shared (shift and rotation of the
+board, offset and tilt of the magnet in the tool, log of the moment), and per pose (position, tilt,
+ambient field)."""
 
 Prediction: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
-"""As `predicted_readings` returns it."""
+"""As returned by `predicted_readings`."""
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
 def tool_rotations(axes: FloatArray) -> FloatArray:
-    """Rotations tool to tracker (K, 3, 3) that take z to the unit vectors `axes` (K, 3).
+    """Shortest rotations from the tool frame to the tracker frame.
 
-    The shortest ones: a tracked axis has no roll, and a tool that is tilted by an arm keeps its
-    own. What is across the axis in the tool is meaningful as far as that holds.
+    A tracked axis has no roll. The shortest rotation is correct for a tool that an arm tilts
+    without twisting it; otherwise the components across the axis in the tool frame have no meaning.
+
+    Parameters
+    ----------
+    axes : (K, 3) array, unit vectors, tracker frame
+        Directions of the tool's z axis.
+
+    Returns
+    -------
+    (K, 3, 3) array
     """
     return rotation_from_quaternion(np.array([quaternion_between(UP, a) for a in axes]))
 
 
 def rotation(v: FloatArray) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    """Rotation matrices of rotation vectors.
+
+    Parameters
+    ----------
+    v : (..., 3) array, rad
+
+    Returns
+    -------
+    (..., 3, 3) array
+    """
     return rotation_from_quaternion(quaternion_from_rotation_vector(v))
 
 
 @dataclass(frozen=True)
 class TrackedMagnet:
-    """Where the magnet is, by a tracked tool and what is unknown between tool and board."""
+    """A magnet on a tracked tool whose alignment with the tool and the board is uncertain."""
 
     tool: FloatArray
-    """(K, 3) [m], tracker: the tracked points."""
+    """(K, 3) [m], tracker frame: tracked points."""
     R_tool: FloatArray
-    """(K, 3, 3), tool to tracker; its z is the tool's axis."""
+    """(K, 3, 3), tool to tracker; the z axis is the tool's axis."""
     pivot: FloatArray
-    """(3,) [m]: the board turns about it, against the tracker."""
+    """(3,) [m]: centre of the rotation of the board relative to the tracker."""
     moment: float
-    """[A m^2] as stated."""
+    """[A m²], as stated."""
 
     def poses(self, shared: FloatArray, pose: FloatArray) -> tuple[
             FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Magnet centres and moments.
+        """Positions and moments of the magnet, and their derivatives.
 
         Parameters
         ----------
-        shared : (12,)
-            Shift [m], rotation vector [rad], offset [m, tool], tilt [slope, tool], log of the
-            moment over the stated one. Frames: tracker to board (world).
-        pose : (K, 8)
-            Deviation of the place [m, world] and of the tilt [slope, tool]; change of the ambient
-            field [T, world], which is the same at all sensors and not read here.
+        shared : (12,) array
+            Shift [m], rotation vector [rad], offset [m, tool frame], tilt [slope, tool frame], log
+            of the moment relative to the stated one. Shift and rotation are from the tracker frame
+            to the board (world) frame.
+        pose : (K, 8) array
+            Corrections of the position [m, world frame] and of the tilt [slope, tool frame]; change
+            of the ambient field [T, world frame], which is the same at all sensors and not used
+            here.
 
         Returns
         -------
-        r, m : (K, 3) [m], [A m^2], world
-        dr_dshared, dm_dshared : (K, 3, 12)
-        dr_dpose, dm_dpose : (K, 3, 8)
+        r : (K, 3) array, m, world frame
+        m : (K, 3) array, A m², world frame
+        dr_dshared, dm_dshared : (K, 3, 12) array
+        dr_dpose, dm_dpose : (K, 3, 8) array
         """
         K = len(self.tool)
         R_b, J_b = rotation(shared[3:6]), left_jacobian(shared[3:6])
@@ -102,28 +122,34 @@ class TrackedMagnet:
 
 def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: FloatArray,
                        shared: FloatArray, pose: FloatArray) -> Prediction:
-    """What every sensor reads of every pose.
+    """Readings of every sensor at every pose, and their derivatives.
 
     Parameters
     ----------
     network : SensorNetwork
         Positions and orientations as stated.
     magnet : TrackedMagnet
-    sensor : (n, 10)
-        Bias [T, sensor frame], gain less one, rotation vector [rad, stated sensor frame],
-        position less the stated one [m, world].
-    shared, pose : as for `TrackedMagnet.poses`
+    sensor : (n, 10) array
+        Bias [T, sensor frame], gain minus one, rotation vector [rad, stated sensor frame],
+        position relative to the stated one [m, world frame].
+    shared : (12,) array
+    pose : (K, 8) array
+        As for `TrackedMagnet.poses`.
 
     Returns
     -------
-    f : (n, K, 3) [T], sensor frame
-    signal : (n, K, 3) [T], sensor frame
-        The same without the bias.
-    by_sensor, by_shared, by_pose : (n, K, 3, 10 or 12 or 8)
-        NaN where the magnet is on a sensor.
+    f : (n, K, 3) array, T, sensor frame
+    signal : (n, K, 3) array, T, sensor frame
+        Without the bias.
+    by_sensor : (n, K, 3, 10) array
+        NaN where the magnet is at the position of a sensor.
+    by_shared : (n, K, 3, 12) array
+    by_pose : (n, K, 3, 8) array
 
-    Source: TSP14 eq. (2), (30) for the dipole; the small unknowns as in T10 section 6.3, but with
-    whole rotations.
+    References
+    ----------
+    [TSP14]_ eq. (2), (30) for the dipole. The corrections are those of [T10]_ section 6.3, but
+    with finite rotations.
     """
     r, m, *by = magnet.poses(shared, pose)
     d = (network.positions + sensor[:, 7:])[:, None] - r

@@ -1,4 +1,4 @@
-"""What a network measured while something passed, as arrays that can be fitted."""
+"""Readings of a network during a pass, as arrays for a fit."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,16 +13,17 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.units import NS
 
 ModelOf: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], SeparableModel]
-"""Of times (n,) [s], positions (n, 3) [m] and matrices (n, 3, 3) that a field is multiplied by."""
+"""Makes a model from times (n,) [s], positions (n, 3) [m] and matrices (n, 3, 3) that multiply the
+field."""
 
 
 @dataclass(frozen=True)
 class PassData:
-    """Samples of some sensors over one stretch of time; a sensor's samples are neighbours."""
+    """Samples of several sensors over one interval; the samples of one sensor are contiguous."""
 
     network: SensorNetwork
     stamp_ns: int
-    """Where `t` is zero."""
+    """Timestamp at which `t` is zero [ns]."""
     t: FloatArray
     """(n,) [s], ascending for each sensor."""
     sensor: IntArray
@@ -30,25 +31,29 @@ class PassData:
     field: FloatArray
     """(n, 3) [T], sensor frame; NaN = axis not measured."""
     covariance: FloatArray
-    """(n, 3, 3) [T^2] of each sample (of one of those that it is the mean of); not read where the
-    axis is missing."""
+    """(n, 3, 3) [T²] of each sample, or of one of the samples that it is the mean of; ignored for
+    missing axes."""
     count: IntArray | None = None
-    """(n,) of how many samples each is the mean; None = of one."""
+    """(n,) number of samples that each one is the mean of; None = one."""
 
     @classmethod
     def of_frames(cls, network: SensorNetwork, stamps_ns: Sequence[int],
                   fields: Sequence[FloatArray], covariances: Sequence[FloatArray],
                   offsets: Sequence[FloatArray] | None = None) -> 'PassData':
-        """The frames of a network.
+        """Create the data of a pass from frames.
 
         Parameters
         ----------
         network : SensorNetwork
-        stamps_ns : n int
-        fields : n arrays (n_sensors, 3) [T]
-        covariances : n arrays (n_sensors, 3, 3) [T^2]
-        offsets : n arrays (n_sensors,) [s], optional
-            Of the sensors' times from the timestamps.
+        stamps_ns : sequence of n int, ns
+        fields : sequence of n (n_sensors, 3) array, T
+        covariances : sequence of n (n_sensors, 3, 3) array, T²
+        offsets : sequence of n (n_sensors,) array, s, optional
+            Time of each sensor's sample relative to the timestamp of the frame.
+
+        Returns
+        -------
+        PassData
         """
         n, n_sensors = len(stamps_ns), len(network)
         t = np.tile((np.array(stamps_ns, dtype=np.int64) - stamps_ns[0]) / NS, (n_sensors, 1))
@@ -60,15 +65,16 @@ class PassData:
 
     @property
     def n_values(self) -> int:
-        """How many numbers were measured."""
+        """Number of measured values."""
         return int(np.count_nonzero(~np.isnan(self.field)))
 
     @cached_property
     def n_independent(self) -> float:
-        """How many of these numbers are independent.
+        """Number of independent values.
 
-        A coarse sensor at rest says the same again and again, with a variance that says so
-        (`calibration.resolution`): its readings count by the smallest variance of their axis.
+        A coarse sensor at rest repeats its reading, and its variance is increased accordingly
+        (`calibration.resolution`). Each value counts by the smallest variance of its axis over its
+        own variance.
         """
         total = 0.0
         for j in self.sensors:
@@ -77,28 +83,38 @@ class PassData:
                                 np.einsum('nii->ni', self.covariance[mine]))
             variance = variance[:, ~np.isnan(variance).all(axis=0)]
             share = np.nanmin(variance, axis=0) / variance
-            # Noise that is learnt along the way varies a little; a rest is of dozens of readings.
+            # The estimated noise varies slightly over time. At rest, dozens of readings repeat.
             total += float(np.nansum(np.where(share > 0.5, 1.0, share)))
         return total
 
     @property
     def sensors(self) -> IntArray:
-        """(k,) rows of the network of which there are measurements."""
+        """Rows of the network that have measurements, (k,)."""
         return np.unique(self.sensor[~np.isnan(self.field).all(axis=1)])
 
     @property
     def positions(self) -> FloatArray:
-        """(n, 3) [m], world, of each sample's sensor."""
+        """Position of the sensor of each sample, (n, 3) m, world frame."""
         return self.network.positions[self.sensor]
 
     def shifted(self, seconds: float) -> 'PassData':
-        """The same with time zero `seconds` later."""
+        """Return the same data with time zero moved.
+
+        Parameters
+        ----------
+        seconds : float, s
+            Positive moves time zero later.
+
+        Returns
+        -------
+        PassData
+        """
         return replace(self, stamp_ns=self.stamp_ns + int(round(1e9 * seconds)),
                        t=self.t - seconds)
 
     @cached_property
     def whitening(self) -> FloatArray:
-        """(n, 3, 3) W with W C W' = I over the axes measured; the other rows are zero."""
+        """Matrices W, (n, 3, 3), with W C Wᵀ = I over the measured axes and zero rows elsewhere."""
         W = np.zeros((len(self.t), 3, 3))
         present = ~np.isnan(self.field)
         for axes in np.unique(present, axis=0):
@@ -108,18 +124,28 @@ class PassData:
                 W[block] = np.linalg.inv(np.linalg.cholesky(self.covariance[block]))
         return W if self.count is None else W * np.sqrt(self.count)[:, None, None]
 
-    def averaged(self, most: int) -> 'PassData':
-        """The same with at most `most` means of neighbours for each sensor, of fewer where the
-        field is strong."""
+    def averaged(self, max_samples: int) -> 'PassData':
+        """Reduce the data to means of adjacent samples.
+
+        Parameters
+        ----------
+        max_samples : int
+            Maximum number of means for each sensor. Each is over fewer samples where the field is
+            strong.
+
+        Returns
+        -------
+        PassData
+        """
         size = np.sqrt(np.linalg.norm(self.departure, axis=1))
         rows = []
         for j in np.unique(self.sensor):
             mine = np.flatnonzero(self.sensor == j)
             share = 1.0 / len(mine) + size[mine] / max(size[mine].sum(), 1e-300)
-            part = np.floor(np.cumsum(share) / share.sum() * most * (1.0 - 1e-9)).astype(int)
+            part = np.floor(np.cumsum(share) / share.sum() * max_samples * (1.0 - 1e-9)).astype(int)
             first = np.flatnonzero(np.diff(part, prepend=-1))
             n = np.diff(first, append=len(mine))
-            # The mean of an axis that is missing in part would belong to another time: NaN.
+            # If an axis is missing in some samples, its mean would belong to another time: NaN.
             rows.append((np.add.reduceat(self.t[mine], first) / n, np.full(len(n), j),
                          np.add.reduceat(self.field[mine], first) / n[:, None],
                          np.add.reduceat(self.covariance[mine], first) / n[:, None, None], n))
@@ -128,7 +154,7 @@ class PassData:
 
     @cached_property
     def departure(self) -> FloatArray:
-        """(n, 3) [T], what departs from each sensor's median: the target, more or less."""
+        """Field minus the median of each sensor, (n, 3) T: approximately that of the target."""
         out = np.zeros_like(self.field)
         for j in self.sensors:
             mine = self.sensor == j
@@ -141,20 +167,22 @@ class PassData:
 
 def separable_problem(data: PassData, model_of: ModelOf, relative_error: float = 0.0,
                       prior: tuple[FloatArray, FloatArray] | None = None) -> SeparableProblem:
-    """The fit of a pass as a `SeparableProblem`, the sensors' backgrounds being unknown.
+    """Fit of a pass as a separable problem with unknown backgrounds.
 
     Parameters
     ----------
     data : PassData
     model_of : function
-        Takes t (n,), positions (n, 3) and M (n, 3, 3) (world to sensor, and whitening), gives a
+        Takes t (n,), positions (n, 3) and M (n, 3, 3) (world to sensor, whitened) and returns a
         `SeparableModel`.
     relative_error : float
-        Each sample counts as if its field were wrong by this share of itself, too.
+        Model error relative to the field of each sample, added to the noise.
     prior : (mean, std), optional
-        Of the path; see `SeparableProblem`.
+        Prior of the path; see `SeparableProblem`.
 
-    Returns a `SeparableProblem`.
+    Returns
+    -------
+    SeparableProblem
     """
     W = data.whitening
     if relative_error > 0.0:
@@ -167,7 +195,18 @@ def separable_problem(data: PassData, model_of: ModelOf, relative_error: float =
 
 
 def background_columns(data: PassData, W: FloatArray) -> FloatArray:
-    """(3 n, q): the constant field of each axis of each sensor that was measured, whitened."""
+    """Whitened columns of the constant fields of all measured axes.
+
+    Parameters
+    ----------
+    data : PassData
+    W : (n, 3, 3) array
+        Whitening matrices.
+
+    Returns
+    -------
+    (3 n, q) array
+    """
     columns = np.zeros((len(data.t), 3, len(data.network), 3))
     columns[np.arange(len(data.t)), :, data.sensor] = W
     flat = columns.reshape(3 * len(data.t), -1)

@@ -1,4 +1,4 @@
-"""Batch fit of a pass: where something went by, how fast, how long it is, and its moments."""
+"""Batch fit of a pass: path, speed, length and moments of the target."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
+from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
-from mag_tracking.analysis.pass_description import APART, fits_at_minimum
-from mag_tracking.analysis.pass_deviation import SensorErrors
+from mag_tracking.analysis.pass_description import PATH_TOLERANCE, fits_at_minimum
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.detection_theory import energy_threshold
@@ -16,61 +16,69 @@ from mag_tracking.inference.separable_fit import search
 from mag_tracking.physics.passes import RowPass
 
 N_COARSE = 24
-"""Samples of each sensor that the starts are judged by."""
+"""Number of samples per sensor for the evaluation of the starts."""
 
 COARSE_ERROR = 0.1
-"""The starts are judged as if the field were known to this share: that smooths the valleys."""
+"""Assumed error relative to the field for the evaluation of the starts; it smooths the cost
+function."""
 
 FALSE_ALARM = 1e-6
-"""A field that noise exceeds with this probability is none."""
+"""Probability that noise alone exceeds the energy threshold of a pass."""
 
-AS_BOUGHT = SensorErrors()
-"""Errors of sensors that were bought and set up by hand."""
+DEFAULT_ERRORS = SensorErrors()
+"""Errors of uncalibrated sensors that were mounted by hand."""
 
 
 def fit_pass(data: PassData, n_dipoles: int = 3,
              cpa_range: tuple[float, float] | None = None,
-             errors: SensorErrors = AS_BOUGHT) -> PassFit:
-    """Fit a row of dipoles at constant velocity to what a network measured.
+             errors: SensorErrors = DEFAULT_ERRORS) -> PassFit:
+    """Fit a row of dipoles at constant velocity to the readings of a network.
 
     Parameters
     ----------
     data : PassData
     n_dipoles : int
-        The model order; 1 = a point target, without a length.
-    cpa_range : (range, std) [m], optional
-        For one sensor, which cannot tell the scale: the range at the closest point is known
-        beforehand (TSP14 section IV.B).
+        Model order; 1 = a point target, without a length.
+    cpa_range : (float, float), m, optional
+        Known range at the CPA and its standard deviation, for a single sensor, whose scale is not
+        observable (TSP14 section IV.B).
     errors : SensorErrors
-        Of the sensors, for the honest covariance.
+        Sensor errors that the robust covariance includes.
 
     Returns
     -------
     PassFit
-        With time zero at the strongest field. Its `reason` says why there is no answer.
+        Time zero is at the strongest field. `reason` is not empty if the fit is rejected.
 
-    Raises ValueError for a `cpa_range` with several sensors.
-    Source: TSP14 sections III.A and V; T10 Alg. 1.
+    Raises
+    ------
+    ValueError
+        If `cpa_range` is given with several sensors, or `n_dipoles` is less than one.
+
+    References
+    ----------
+    [TSP14]_ sections III.A and V; [T10]_ Alg. 1.
     """
     if cpa_range is not None and len(data.sensors) > 1:
-        raise ValueError(f'a known CPA range is for one sensor, there are {len(data.sensors)}')
-    reason = unusable(data, (n_dipoles,))
+        raise ValueError('cpa_range is for one sensor only, the data are of '
+                         f'{len(data.sensors)} sensors')
+    reason = unusable_reason(data, (n_dipoles,))
     if reason:
         return PassFit(n_dipoles, data, reason)
-    data, rough = at_strongest(data)
+    data, rough = centred_on_peak(data)
     model_of = partial(RowPass, n_dipoles=n_dipoles)
     problem = separable_problem(data, model_of)
     n_free = data.n_independent - background_columns(data, data.whitening).shape[1]
     limit = energy_threshold(FALSE_ALARM, n_free)
     if problem.energy <= limit:
         return PassFit(n_dipoles, data, 'out of range: the field is no stronger than noise '
-                       f'(energy {problem.energy:.0f}, noise stays below {limit:.0f})')
+                       f'(energy {problem.energy:.0f}, threshold {limit:.0f})')
     starts = starting_paths(rough, n_dipoles)
     found = search(separable_problem(rough, model_of, COARSE_ERROR),
                    separable_problem(rough, model_of), problem, starts,
-                   APART[:starts.shape[1]], shorter_rows if n_dipoles > 1 else None)
+                   PATH_TOLERANCE[:starts.shape[1]], shorter_rows if n_dipoles > 1 else None)
     if not np.isfinite(found.cost):
-        return PassFit(n_dipoles, data, 'no start of the search could be used')
+        return PassFit(n_dipoles, data, 'no valid start of the search')
     theta, p = found.theta, problem.linear(found.theta)
     theta, p = model_of(data.t, data.positions, data.whitening).forward(theta, p)
     left = max(found.cost - n_free, 0.0) / (problem.energy - n_free)
@@ -79,32 +87,70 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
     return fit
 
 
-def at_strongest(data: PassData) -> tuple[PassData, PassData]:
-    """A pass with time zero at its strongest field, and a few means of it."""
+def centred_on_peak(data: PassData) -> tuple[PassData, PassData]:
+    """Shift time zero of a pass to its strongest field.
+
+    Parameters
+    ----------
+    data : PassData
+
+    Returns
+    -------
+    data : PassData
+        All samples.
+    rough : PassData
+        At most `N_COARSE` means per sensor.
+    """
     rough = data.averaged(N_COARSE)
     departure = rough.departure
     seconds = rough.t[np.argmax(np.einsum('ni,ni->n', departure, departure))]
     return data.shifted(seconds), rough.shifted(seconds)
 
 
-def unusable(data: PassData, orders: Sequence[int]) -> str:
-    """Why rows of `orders` dipoles cannot be fitted, before trying; or nothing."""
+def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
+    """Check whether there are enough measurements for a fit.
+
+    Parameters
+    ----------
+    data : PassData
+    orders : sequence of int
+        Number of dipoles of each target.
+
+    Returns
+    -------
+    str
+        Reason why the fit is not possible; empty if it is.
+
+    Raises
+    ------
+    ValueError
+        If an order is less than one.
+    """
     if min(orders) < 1:
-        raise ValueError(f'a row needs at least one dipole, got {min(orders)}')
+        raise ValueError(f'number of dipoles is {min(orders)}, must be at least one dipole')
     if not len(data.sensors):
         return 'no sensor has a measurement'
     axes = sum(int((~np.isnan(data.field[data.sensor == j])).any(axis=0).sum())
                for j in data.sensors)
     unknowns = sum(6 + (n > 1) + 3 * n for n in orders) + axes
     if data.n_values <= unknowns:
-        return f'fewer measurements ({data.n_values}) than unknowns ({unknowns}) and one to spare'
+        return f'fewer measurements ({data.n_values}) than unknowns ({unknowns}) plus one'
     return ''
 
 
 def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
-    """Paths (n, 6 or 7) to search from: all headings, past the sensor with the strongest field.
+    """Starting paths of the search: all headings past the sensor with the strongest field.
 
-    How long that sensor sees the target says how fast it is for its distance.
+    The duration of the field at that sensor gives the ratio of speed to distance.
+
+    Parameters
+    ----------
+    data : PassData
+    n_dipoles : int
+
+    Returns
+    -------
+    (n, 6 or 7) array, m, m/s, m
     """
     departure = data.departure
     energy = np.einsum('ni,ni->n', departure, departure)
@@ -127,9 +173,17 @@ def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
 
 
 def shorter_rows(path: FloatArray) -> FloatArray:
-    """Paths (n, 7) of shorter rows that fit nearly as well as `path` (7,) does.
+    """Paths of shorter rows that fit nearly as well.
 
-    A row with an empty end looks like a shorter one whose middle is elsewhere.
+    A row whose end has no moment is similar to a shorter row with another centre.
+
+    Parameters
+    ----------
+    path : (7,) array, m, m/s, m
+
+    Returns
+    -------
+    (n, 7) array, m, m/s, m
     """
     rows = []
     for share, ahead in ((0.7, 0.15), (0.7, 0.0), (0.7, -0.15), (0.4, 0.25), (0.4, 0.0),

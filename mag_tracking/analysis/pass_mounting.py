@@ -1,8 +1,9 @@
-"""What tracks tell of how the sensors are turned: their mounting angles, folded into one answer.
+"""Sensor orientations from the mounting angles that tracks estimate.
 
-Each track estimates the angles from the same prior, that of the network. What it adds to
-the prior is its own; of several tracks these add up. Weaker than a calibration with a known
-target: what the model leaves out of a vehicle is alike in all passes of one lane.
+Each track estimates the mounting errors with the same prior, that of the network. The information
+that each track adds to the prior is independent and is summed. The result is weaker than a
+calibration with a known target, since the model errors of vehicles are similar in all passes of
+one lane.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,44 +17,47 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Track
 
 MIN_SHARE = 0.05
-"""A direction in which a track adds less than this share of what it adds in its best one is not
-compared with what other tracks say."""
+"""Minimum information in a direction relative to the best direction of the track. Weaker directions
+are not compared between tracks."""
 
 
 @dataclass(frozen=True)
 class MountingEvidence:
-    """What the tracks said."""
+    """Sensor orientations fused from tracks."""
 
-    turn: FloatArray
-    """(n_sensors, 3) [rad] small rotations about the world's axes that take the orientations of
-    the network to the better ones."""
+    rotation: FloatArray
+    """(n_sensors, 3) [rad] small rotations about the world axes that correct the orientations of
+    the network."""
     covariance: FloatArray
-    """(n_sensors, 3, 3) [rad^2] of `turn`, world's axes."""
+    """(n_sensors, 3, 3) [rad²] of `rotation`, world axes."""
     scatter: FloatArray
-    """(n_sensors,) how far the tracks differ among each other, against what they claim: mean of
-    the squares, one when they claim what is true; NaN with fewer than two. Where it is above one
-    the covariance has been widened by it."""
+    """(n_sensors,) mean squared normalised difference between the tracks; one if their covariances
+    are consistent, NaN with fewer than two tracks. If it exceeds one, the covariance is scaled by
+    it."""
     n_tracks: int
 
 
-def fold_mounting(network: SensorNetwork, prior_std: Iterable[FloatArray],
+def fuse_mounting(network: SensorNetwork, prior_std: Iterable[FloatArray],
                   tracks: Sequence[Track]) -> MountingEvidence:
-    """Fold the last poses of tracks into one estimate of the sensors' orientations.
+    """Fuse the mounting angles of tracks into one estimate of the sensor orientations.
 
     Parameters
     ----------
     network : SensorNetwork
-        That the tracks were made with.
-    prior_std : (n_sensors, 3) [rad]
-        About the world's axes; what the tracks began with.
-    tracks : list of Track
-        With mounting angles; of each target the last pose that is not ambiguous.
+        The network that the tracks were made with.
+    prior_std : iterable of n_sensors (3,) array, rad
+        Prior standard deviations of the tracks, about the world axes.
+    tracks : sequence of Track
+        The last unambiguous pose of each target, with mounting angles.
 
     Returns
     -------
     MountingEvidence
 
-    Raises ValueError for a track without mounting angles.
+    Raises
+    ------
+    ValueError
+        If a track has no mounting angles, or those of another number of sensors.
     """
     n = len(network)
     prior = np.array([np.diag(1.0 / np.square(std)) for std in prior_std])
@@ -61,54 +65,66 @@ def fold_mounting(network: SensorNetwork, prior_std: Iterable[FloatArray],
     pulls: list[FloatArray] = []
     for track in tracks:
         if len(track.mounting) != n:
-            raise ValueError(f'track {track.id} has the mounting angles of {len(track.mounting)} '
-                             f'sensors, not of {n}')
-        # The angles turn the field, in the sensor's frame: the sensor is turned back.
-        turn = -np.einsum('jik,jk->ji', network.R_ws, track.mounting)
+            raise ValueError(f'track {track.id} has mounting angles of {len(track.mounting)} '
+                             f'sensors, expected {n}')
+        # The angles rotate the field in the sensor frame; the sensor is rotated the other way.
+        rotation = -np.einsum('jik,jk->ji', network.R_ws, track.mounting)
         P = network.R_ws @ track.mounting_covariance @ network.R_sw
         information = np.linalg.inv(P)
         gains.append(_nonnegative(information - prior))
-        # The prior pulls towards zero: what it does is the same in all.
-        pulls.append(np.einsum('jik,jk->ji', information, turn))
+        # The prior mean is zero and adds nothing to the information vector.
+        pulls.append(np.einsum('jik,jk->ji', information, rotation))
     total = prior + np.sum(gains, axis=0) if gains else prior
     covariance = np.linalg.inv(total)
-    turn = np.einsum('jik,jk->ji', covariance, np.sum(pulls, axis=0)) if pulls \
+    rotation = np.einsum('jik,jk->ji', covariance, np.sum(pulls, axis=0)) if pulls \
         else np.zeros((n, 3))
-    scatter = _scatter(gains, pulls, turn, covariance) if len(tracks) > 1 else np.full(n, np.nan)
+    scatter = _scatter(gains, pulls, rotation, covariance) if len(tracks) > 1 \
+        else np.full(n, np.nan)
     widen = np.maximum(1.0, np.nan_to_num(scatter, nan=1.0))
     information = prior + (total - prior) / widen[:, None, None]
     covariance = np.linalg.inv(information)
     if pulls:
-        turn = np.einsum('jik,jk->ji', covariance,
+        rotation = np.einsum('jik,jk->ji', covariance,
                          np.sum(pulls, axis=0) / widen[:, None])
-    return MountingEvidence(turn, covariance, scatter, len(tracks))
+    return MountingEvidence(rotation, covariance, scatter, len(tracks))
 
 
 def _nonnegative(information: FloatArray) -> FloatArray:
-    """(n_sensors, 3, 3) without what rounding and the linearisation of the mean made negative."""
+    """Information (n_sensors, 3, 3) without negative eigenvalues from rounding or linearisation."""
     values, vectors = np.linalg.eigh(information)
     kept: FloatArray = np.einsum('jik,jk,jlk->jil', vectors, np.maximum(values, 0.0), vectors)
     return kept
 
 
-def _scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], turn: FloatArray,
+def _scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], rotation: FloatArray,
              covariance: FloatArray) -> FloatArray:
-    """(n_sensors,) mean square of what each track says against all, by what it claims."""
-    squares, freedom = np.zeros(len(turn)), np.zeros(len(turn))
+    """Mean squared normalised difference (n_sensors,) between each track and the fused estimate."""
+    squares, freedom = np.zeros(len(rotation)), np.zeros(len(rotation))
     for gain, pull in zip(gains, pulls, strict=True):
-        off = pull - np.einsum('jik,jk->ji', gain, turn)
+        off = pull - np.einsum('jik,jk->ji', gain, rotation)
         inverse = np.linalg.pinv(gain, rcond=MIN_SHARE, hermitian=True)
         squares += np.einsum('ji,jik,jk->j', off, inverse, off)
-        # What is compared, less what went into the answer that it is compared with.
+        # Degrees of freedom: the fused estimate contains the track itself.
         projection = inverse @ gain
         freedom += np.einsum('jii->j', projection - projection @ covariance @ gain)
-    scatter: FloatArray = np.divide(squares, freedom, out=np.full(len(turn), np.nan),
+    scatter: FloatArray = np.divide(squares, freedom, out=np.full(len(rotation), np.nan),
                                     where=freedom > 1e-3)
     return scatter
 
 
 def with_evidence(network: SensorNetwork, evidence: MountingEvidence) -> SensorNetwork:
-    """The `SensorNetwork` turned by `MountingEvidence`, with its deviations."""
-    turns = rotation_from_quaternion(quaternion_from_rotation_vector(evidence.turn))
+    """Correct the orientations of a network.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    evidence : MountingEvidence
+
+    Returns
+    -------
+    SensorNetwork
+        With the standard deviations of the evidence.
+    """
+    turns = rotation_from_quaternion(quaternion_from_rotation_vector(evidence.rotation))
     std = np.sqrt(np.einsum('jii->ji', evidence.covariance))
     return replace(network, R_ws=turns @ network.R_ws, orientation_std=tuple(std))

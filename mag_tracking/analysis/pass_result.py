@@ -1,4 +1,4 @@
-"""What a batch fit of a pass has to say."""
+"""Result of a batch fit of a pass."""
 
 from dataclasses import dataclass, field, replace
 
@@ -9,41 +9,44 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import heading_of, propagated_path, speed_of
 from mag_tracking.physics.anderson import closest_approach
 
-RIVAL = 9.2
-"""Chi-square that a rival may be behind: one in a hundred."""
+RIVAL_CHI2 = 9.2
+"""Maximum chi-square distance of a rival from the best fit (probability 0.01)."""
 
-FAR = 22.5
-"""Squared deviations, of six numbers, at which another path is another: one in a thousand."""
+DIFFERENT_PATH_CHI2 = 22.5
+"""Minimum squared normalised distance, in six parameters, of two different paths (probability
+0.001)."""
 
 
-POOR = 2.0
-"""A normalised cost beyond says that the model leaves out more than the noise covers."""
+MAX_NORMALISED_COST = 2.0
+"""Maximum normalised cost; beyond it, model errors exceed the noise."""
 
-NEARLY = 1.25
-"""A fit whose cost is not larger than this times that of the best describes the pass as well."""
+MAX_COST_RATIO = 1.25
+"""Maximum ratio of the cost of a fit to the best cost at which it describes the pass equally
+well."""
 
-SHORTEST = 1e-2
-"""A row that is shorter than this share of the way on which it was seen is a point; one that is
-longer than that way is none."""
+MIN_LENGTH_SHARE = 1e-2
+"""Minimum length of a row relative to the distance travelled during the pass; a shorter row is a
+point. A row longer than the distance travelled is rejected."""
 
 
 @dataclass(frozen=True)
 class Bearing:
-    """What one sensor alone tells: everything but the scale.
+    """Observable quantities of a pass at one sensor: everything but the scale.
 
-    Seen from the sensor; target and motion may both be reversed, which gives the same field.
+    Relative to the sensor. The same field results if target and motion are both reversed.
     """
 
     cpa_direction: FloatArray
-    """(3,) unit vector, world, to the target at its closest; the end that is not below."""
+    """(3,) unit vector, world, to the target at the CPA; of the two solutions the one that is not
+    below."""
     motion_direction: FloatArray
     """(3,) unit vector, world."""
     moment_direction: FloatArray
-    """(3,) unit vector, world, of the whole."""
+    """(3,) unit vector, world, of the total moment."""
     direction_std: FloatArray
-    """(3,) [rad], of the three: the largest deviation across each."""
+    """(3,) [rad] largest standard deviation of each of the three directions."""
     cpa_time: float
-    """[s] after time zero."""
+    """[s] relative to time zero."""
     cpa_time_std: float
     rate: float
     """[1/s] speed over CPA range."""
@@ -52,9 +55,9 @@ class Bearing:
 
 @dataclass(frozen=True)
 class PassFit:
-    """A pass at constant velocity, as weighted least squares has it.
+    """Weighted least-squares fit of a pass at constant velocity.
 
-    Where `reason` is not empty the fit as a whole is no answer; what is `trusted` is one.
+    If `reason` is not empty, the fit as a whole is rejected; the quantities in `trusted` are valid.
     """
 
     n_dipoles: int
@@ -62,61 +65,63 @@ class PassFit:
     reason: str = ''
     converged: bool = False
     names: tuple[str, ...] = ()
-    """Of the unknowns: path, moments, backgrounds."""
+    """Names of the unknowns: path, moments, backgrounds."""
     x: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """(n_x,) their values: [m], [m/s], [A m^2], [T]."""
+    """(n_x,) values of the unknowns: [m], [m/s], [A m²], [T]."""
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    """(n_x, n_x) TSP14 eq. (47), which takes model and noise for right; infinite variance = not
+    """(n_x, n_x) TSP14 eq. (47), for a correct model and noise; infinite variance = not
     observable."""
     robust_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    """(n_x, n_x) the same and what the model leaves out: residuals that are alike for a while
-    instead of noise. All deviations are of this one."""
+    """(n_x, n_x) including model errors, whose residuals are correlated in time, and sensor errors.
+    All standard deviations are from this covariance."""
     cost: float = np.nan
     """Sum of squared whitened residuals, TSP14 eq. (46b)."""
     explained: float = np.nan
-    """Share of the whitened energy beyond the backgrounds and the noise that the fit explains."""
-    seen_s: float = np.nan
-    """[s] in which nearly all of the target's energy came."""
+    """Share of the whitened energy, less backgrounds and noise, that the fit explains."""
+    duration_s: float = np.nan
+    """[s] that contain nearly all of the target's energy."""
     velocity_change: float = np.nan
-    """Share of itself by which the velocity seems to change while the target is seen."""
+    """Apparent relative change of the velocity during the pass."""
     velocity_change_std: float = np.nan
-    """By noise, and by what the model leaves out."""
+    """Due to noise and model errors."""
     residual_elsewhere: float = np.nan
-    """Share of the energy that is left over where no vehicle leaves any; see `pass_trust`."""
+    """Share of the energy that is unexplained where a vehicle leaves no residual; see
+    `pass_trust`."""
     trusted: tuple[str, ...] = ()
-    """The names of those among speed, direction and time (of the closest point) that are
-    determined, also where the whole has a reason not to be believed; see `pass_trust`."""
+    """Those of speed, direction and time (of the CPA) that are determined, even if the fit as a
+    whole is rejected; see `pass_trust`."""
     bearing: Bearing | None = None
-    """With one sensor."""
+    """For one sensor."""
     rivals: tuple[tuple[float, FloatArray], ...] = ()
-    """(d, path) of other minima, a likelihood ratio of exp(-d/2) behind this one: the covariance
-    knows nothing of them. A row with an empty end is one, a shorter one further on."""
+    """(d, path) of other minima with a likelihood ratio of exp(-d/2) to this one; the covariance
+    does not include them. A row whose end has no moment has a rival: a shorter row with another
+    centre."""
     predicted: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(n, 3) [T], sensor frame, with the background."""
+    """(n, 3) [T], sensor frame, including the background."""
     predicted_std: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(n, 3) [T], by the honest covariance, without noise."""
-    n_others: int = 0
-    """How many more unknowns the fit had: those of other targets in the same window, the field of
-    which `data` are without."""
+    """(n, 3) [T], from the robust covariance, without noise."""
+    n_other_unknowns: int = 0
+    """Number of unknowns of other targets in the same joint fit; `data` does not contain their
+    fields."""
 
     @property
     def n_unknowns(self) -> int:
-        """How many unknowns were fitted together."""
-        return len(self.x) + self.n_others
+        """Number of unknowns that were fitted jointly."""
+        return len(self.x) + self.n_other_unknowns
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Independent measurements less unknowns."""
+        """Number of independent measurements minus number of unknowns."""
         return self.data.n_independent - self.n_unknowns
 
     @property
     def normalised_cost(self) -> float:
-        """About one where the model is right; TSP14 eq. (50)."""
+        """Cost per degree of freedom, about one if the model is correct; TSP14 eq. (50)."""
         return self.cost / self.degrees_of_freedom
 
     @property
     def determined(self) -> bool:
-        """Whether the measurements fix all unknowns, right or not."""
+        """Whether the measurements determine all unknowns."""
         if not (len(self.x) and self.converged):
             return False
         variance = np.diagonal(self.robust_covariance)
@@ -125,71 +130,80 @@ class PassFit:
         if self.n_dipoles == 1:
             return True
         length, length_std = self.length
-        way = np.linalg.norm(self.velocity) * self.seen_s
-        return bool(length_std <= max(length, 1.0) and SHORTEST * way <= length <= way)
+        way = np.linalg.norm(self.velocity) * self.duration_s
+        return bool(length_std <= max(length, 1.0) and MIN_LENGTH_SHARE * way <= length <= way)
 
     @property
     def is_poor_mixture(self) -> bool:
-        """Whether targets that were fitted together leave over more than noise."""
-        return self.n_others > 0 and bool(self.normalised_cost > POOR)
+        """Whether the residuals of a joint fit exceed the noise."""
+        return self.n_other_unknowns > 0 and bool(self.normalised_cost > MAX_NORMALISED_COST)
 
     @property
     def ambiguous(self) -> bool:
-        """Whether another path, elsewhere by its deviations, is possible at 1 %.
+        """Whether a different path is possible at the 1 % level.
 
-        Of targets that were fitted together also where much is left over: of which of them it is
-        nobody knows.
+        A poor joint fit is ambiguous as well, since the residual cannot be assigned to a target.
         """
         if self.is_poor_mixture:
             return True
         P = self.robust_covariance[:6, :6]
         for d, path in self.rivals:
             e = path[:6] - self.x[:6]
-            if d < RIVAL and e @ np.linalg.pinv(P, hermitian=True) @ e > FAR:
+            if d < RIVAL_CHI2 and e @ np.linalg.pinv(P, hermitian=True) @ e > DIFFERENT_PATH_CHI2:
                 return True
         return False
 
     @property
     def position(self) -> FloatArray:
-        """(3,) [m], world, of the middle at time zero."""
+        """Position of the centre at time zero, (3,) m, world frame."""
         return self.x[:3]
 
     @property
     def velocity(self) -> FloatArray:
-        """(3,) [m/s], world."""
+        """Velocity, (3,) m/s, world frame."""
         return self.x[3:6]
 
     def shifted(self, seconds: float) -> 'PassFit':
-        """The same fit with time zero `seconds` later."""
+        """Return the same fit with time zero moved.
+
+        Parameters
+        ----------
+        seconds : float, s
+            Positive moves time zero later.
+
+        Returns
+        -------
+        PassFit
+        """
         F = np.eye(len(self.x))
         F[:3, 3:6] = seconds * np.eye(3)
         # An infinite variance times zero is NaN.
         with np.errstate(invalid='ignore'):
-            covariance, honest = (F @ P @ F.T for P in (self.covariance, self.robust_covariance))
+            covariance, robust = (F @ P @ F.T for P in (self.covariance, self.robust_covariance))
         rivals = tuple((cost, propagated_path(path, seconds)) for cost, path in self.rivals)
         return replace(self, data=self.data.shifted(seconds), x=propagated_path(self.x, seconds),
-                       covariance=covariance, robust_covariance=honest, rivals=rivals)
+                       covariance=covariance, robust_covariance=robust, rivals=rivals)
 
     @property
     def speed(self) -> tuple[float, float]:
-        """[m/s] and its deviation."""
+        """Speed and its standard deviation [m/s]."""
         return speed_of(self.velocity, self.robust_covariance[3:6, 3:6])
 
     @property
     def heading(self) -> tuple[float, float]:
-        """[rad] anticlockwise from x, and its deviation."""
+        """Heading, anticlockwise from x, and its standard deviation [rad]."""
         return heading_of(self.velocity, self.robust_covariance[3:6, 3:6])
 
     @property
     def length(self) -> tuple[float, float]:
-        """[m] of the row and its deviation; zeros for a point."""
+        """Length of the row and its standard deviation [m]; zeros for a point."""
         if self.n_dipoles == 1:
             return 0.0, 0.0
         return self.x[6], np.sqrt(self.robust_covariance[6, 6])
 
     @property
     def moment(self) -> tuple[FloatArray, FloatArray]:
-        """(3,) [A m^2], world, of the whole, and its covariance (3, 3); TSP14 (9)."""
+        """Total moment, (3,) A m², world frame, and its covariance (3, 3); TSP14 eq. (9)."""
         S = np.zeros((3, len(self.x)))
         first = 6 + int(self.n_dipoles > 1)
         for i in range(self.n_dipoles):
@@ -197,18 +211,23 @@ class PassFit:
         return S @ self.x, S @ self.robust_covariance @ S.T
 
     def closest_approach(self, point: FloatArray) -> tuple[float, float, float, float]:
-        """CPA of the row's middle to a point.
+        """CPA of the centre of the row to a point.
 
         Parameters
         ----------
-        point : (3,) [m], world
+        point : (3,) array, m, world frame
 
         Returns
         -------
-        time, time_std : float [s], after time zero
-        range, range_std : float [m]
+        time : float, s
+            Relative to time zero.
+        time_std : float, s
+        range : float, m
+        range_std : float, m
 
-        Source: TSP14 eq. (24); deviations by its derivatives.
+        References
+        ----------
+        [TSP14]_ eq. (24), with linearised standard deviations.
         """
         r, v = self.position - point, self.velocity
         time, distance, r_cpa = closest_approach(r, v)

@@ -1,4 +1,4 @@
-"""Fit a pass as one target, or as several where several were tracked."""
+"""Fit of a pass as one target or as several tracked targets."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,98 +14,98 @@ from mag_tracking.analysis.joint_fit import (
 from mag_tracking.analysis.model_order import order_criteria
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_result import PassFit
-from mag_tracking.analysis.pass_trust import describes
+from mag_tracking.analysis.pass_trust import has_plausible_residual
 from mag_tracking.arrays import FloatArray
 
 MAX_TARGETS = 3
-"""More are not fitted together: each has a dozen unknowns."""
+"""Maximum number of targets in a joint fit; each has a dozen unknowns."""
 
-LONGEST = 18.75
-"""[m] The iron of one vehicle is no longer: a road train (directive 96/53/EC)."""
+MAX_LENGTH = 18.75
+"""[m] Maximum length of the iron of one vehicle: a road train (directive 96/53/EC)."""
 
-ALIKE = 0.25
-"""Parts of one vehicle are found with velocities that differ by no more than this share."""
+MAX_VELOCITY_SPREAD = 0.25
+"""Maximum relative difference of the velocities of parts of one vehicle."""
 
 
 def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, ground: GroundPrior,
                 orders: Sequence[int], stopped: Callable[[], bool] | None = None
                 ) -> tuple[tuple[PassFit, ...], ...]:
-    """The fits of a pass for each of its targets.
+    """Fit a pass as one target or as the tracked targets, whichever explains the field.
 
-    The number of targets cannot be told by the fit alone: a long row of dipoles describes two
-    vehicles that follow each other, and two straight targets describe one that turns.
+    The number of targets is not observable from the fit alone: a long row of dipoles can explain
+    two vehicles in line, and two straight targets can explain one that turns.
 
     Parameters
     ----------
     data : PassData
     alone : sequence of PassFit
-        As of one target, with several numbers of dipoles.
-    paths : (K, 6) [m], [m/s]
-        Of the targets that were tracked, where they are when `data.t` is zero.
+        Fits as a single target, with several numbers of dipoles.
+    paths : (K, 6) array, m, m/s
+        Positions of the tracked targets when `data.t` is zero, and their velocities.
     ground : GroundPrior
     orders : sequence of int
-        Numbers of dipoles to try where there are several.
+        Numbers of dipoles to try for several targets.
     stopped : function, optional
-        Whether to give up; what is returned is then of no use.
+        Returns whether to abandon the fit. The result of an abandoned fit is not valid.
 
     Returns
     -------
     tuple of tuples of PassFit
-        Of each target, with each number of dipoles. Those of one target where it describes the
-        field as well, or where several would be parts of it: a long vehicle is now and then
-        tracked as two. With a reason where neither one nor all that were tracked describe it.
+        For each target, one fit per number of dipoles. The fits as a single target if that
+        explains the field as well, or if the targets would be parts of it (long vehicles are
+        sometimes tracked as two). The fits have a reason if neither one target nor the tracked
+        targets explain the field.
     """
     n_targets = len(paths)
     if n_targets < 2 or len(data.sensors) < 2:
         return (tuple(alone),)
     if n_targets > MAX_TARGETS:
-        return (_refused(alone, n_targets, f'at most {MAX_TARGETS} are fitted together'),)
+        return (_rejected(alone, n_targets, f'at most {MAX_TARGETS} can be fitted together'),)
     found = fit_joint(data, paths, ground, orders, stopped=stopped)
     if not found:
-        return (_refused(alone, n_targets,
+        return (_rejected(alone, n_targets,
                          'there are too few measurements to fit them together'),)
     best, one = [_best(fits) for fits in found], _best(alone)
-    if not one.reason and one.length[0] <= LONGEST and all(fit.determined for fit in best) and (
+    if not one.reason and one.length[0] <= MAX_LENGTH and all(fit.determined for fit in best) and (
             _are_parts(data, best) or order_criteria([one, best[0]])[0] == 0.0):
         return (tuple(alone),)
-    why = _why_not(data, best)
-    return (_refused(alone, n_targets, why),) if why else found
+    why = _rejection_reason(data, best)
+    return (_rejected(alone, n_targets, why),) if why else found
 
 
 def _best(fits: Sequence[PassFit]) -> PassFit:
-    """The fit that `choose_order` looks at; the first one where none is determined."""
+    """The fit that `choose_order` considers; the first one if none is determined."""
     return fits[int(np.argmin(order_criteria(fits)))]
 
 
 def _are_parts(data: PassData, fits: Sequence[PassFit]) -> bool:
-    """Whether targets move together, and overlap."""
+    """Whether targets move together and overlap."""
     velocity = np.array([fit.velocity for fit in fits])
     mean = velocity.mean(axis=0)
-    return bool((np.linalg.norm(velocity - mean, axis=1) <= ALIKE * np.linalg.norm(mean)).all()
+    return bool((np.linalg.norm(velocity - mean, axis=1)
+                 <= MAX_VELOCITY_SPREAD * np.linalg.norm(mean)).all()
                 and not are_separate(data, [path_from(data, fit) for fit in fits]))
 
 
-def _why_not(data: PassData, fits: Sequence[PassFit]) -> str:
-    """Why targets that were fitted together are not believed, or nothing.
-
-    An error in one of them affects the answers of all.
-    """
+def _rejection_reason(data: PassData, fits: Sequence[PassFit]) -> str:
+    """Why a joint fit is rejected; empty if it is not. An error in one target affects all."""
     if not all(fit.converged for fit in fits):
-        return 'the fit of them together did not converge'
-    if not all(describes(fit) for fit in fits):
-        return ('which at constant velocities leave over '
-                f'{1.0 - fits[0].explained:.1%} of the field (a turn, braking, a further one)')
+        return 'but the joint fit did not converge'
+    if not all(has_plausible_residual(fit) for fit in fits):
+        return ('but constant velocities leave '
+                f'{1.0 - fits[0].explained:.1%} of the field unexplained (a turn, braking, '
+                'another vehicle)')
     if not are_separate(data, [path_from(data, fit) for fit in fits]):
-        return 'which would overlap (a turn, braking, a further one)'
+        return 'but the fitted vehicles overlap (a turn, braking, another vehicle)'
     for k, fit in enumerate(fits, 1):
         if fit.reason:
-            return f'of vehicle {k}: {fit.reason}'
-        if fit.length[0] > LONGEST:
-            return f'of vehicle {k}: {fit.length[0]:.0f} m are longer than any vehicle'
+            return f'vehicle {k}: {fit.reason}'
+        if fit.length[0] > MAX_LENGTH:
+            return f'vehicle {k}: a length of {fit.length[0]:.0f} m exceeds that of any vehicle'
     return ''
 
 
-def _refused(fits: Sequence[PassFit], n_targets: int, why: str) -> tuple[PassFit, ...]:
-    """The same with a reason, and nothing that is trusted."""
+def _rejected(fits: Sequence[PassFit], n_targets: int, why: str) -> tuple[PassFit, ...]:
+    """The same fits with a reason and without trusted quantities."""
     reason = f'not one target: {n_targets} were tracked, {why}'
     return tuple(replace(fit, reason=reason, trusted=()) for fit in fits)

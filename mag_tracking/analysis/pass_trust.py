@@ -1,9 +1,9 @@
-"""How far a fitted pass is to be trusted.
+"""Plausibility of a fitted pass and of the quantities that it determines.
 
-No row of dipoles is a vehicle: near it some of the field is left over, and what is left over says
-little against the fit as long as it is where, and as much as, real vehicles leave. Speed,
-direction and time of the closest point then have deviations of their own, and each is trusted or
-not by those. The whole fit is refused only where something is not determined.
+A row of dipoles is an approximation of a vehicle: part of the near field remains unexplained. This
+residual is no reason to reject a fit as long as its location and size are those of real vehicles.
+Speed, direction and time of the CPA have their own standard deviations and are accepted
+individually. The fit as a whole is rejected only if a quantity is not determined.
 """
 
 from collections.abc import Sequence
@@ -16,49 +16,60 @@ from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
 
 POINT_REACH = 2.1
-"""[m] How far the iron of a car reaches from a single dipole: at the distance r this over r, as a
-share of its size, is wrong about the field. Four real cars at 4.5 m had normalised costs of 10,
-14, 17 and 51 (T10 Table 6.1, TSP14 Table I), the signal having 1200 times the energy of the noise
-at the closest point (T10 (6.1)): 87 times a value, on average over the pass. So three of them left
-over 10 to 18 % of the energy; the fourth, 57 %, is no pass of a point."""
+"""[m] Reach of the iron of a car from a single dipole: at distance r, the model error relative to
+the field is this over r. Four real cars at 4.5 m had normalised costs of 10, 14, 17 and 51 (T10
+Table 6.1, TSP14 Table I), at a signal energy of 1200 times that of the noise at the CPA (T10 eq.
+(6.1)), which is 87 times per value on average over the pass. Three of them left 10 to 18 % of the
+energy unexplained; the fourth, with 57 %, is not the pass of a point."""
 
 ROW_REACH = 0.45
-"""The same of a row, in distances of its dipoles: costs of 1.3 to 1.6 (cars) and 77 to 303 (trucks,
-of twenty times the energy) with three dipoles (T10 Table 6.5, TSP14 Table II) are 0.15 to 0.45."""
+"""Reach of the iron from a row, relative to the spacing of its dipoles. With three dipoles, costs
+of 1.3 to 1.6 (cars) and 77 to 303 (trucks, of twenty times the energy) (T10 Table 6.5, TSP14 Table
+II) correspond to 0.15 to 0.45."""
 
 MIN_ROW_REACH = 0.4
-"""[m] However close the dipoles of a row: the cars of those tables."""
+"""[m] Minimum reach of the iron from a row, for the cars of those tables."""
 
 NOISE_ENERGY = 16.3
-"""Whitened energy of three axes that noise exceeds once in a thousand samples."""
+"""Whitened energy of three axes that noise exceeds in one of a thousand samples."""
 
 MIN_ELSEWHERE, MAX_ELSEWHERE = 0.003, 0.1
-"""A vehicle leaves over up to this share of its field elsewhere (gains, a swerve), and up to this
-share of all that it leaves over."""
+"""Maximum share of the field energy (gain errors, a swerve), and maximum share of the total
+residual, that a vehicle leaves unexplained outside its reach."""
 
 MIN_DISTANCE = 0.3
-"""Share of the distance of the nearest sensor that a target has to move while it is seen."""
+"""Minimum distance travelled during the pass, relative to the distance of the nearest sensor."""
 
 MAX_CHANGE = 0.3
-"""Share of itself by which the velocity may seem to change while the target is seen: 17 degrees of
-a turn. Vehicles that are no rows of dipoles seem to change it by up to 0.2."""
+"""Maximum apparent relative change of the velocity during the pass, equivalent to a turn of 17
+degrees. The model errors of vehicles cause up to 0.2."""
 
-SIGNIFICANT = 2.5
-"""A change of the velocity that is larger than so many deviations is one."""
+MIN_CHANGE_STDS = 2.5
+"""Minimum change of the velocity in standard deviations."""
 
 MAX_SPEED_STD = 0.25
-"""A speed is trusted whose deviation is no larger than this share of it: it is not zero."""
+"""Maximum standard deviation of a trusted speed relative to the speed."""
 
 MAX_HEADING_STD = np.pi / 6.0
-"""[rad] A direction is trusted that three deviations do not turn to the side."""
+"""[rad] Maximum standard deviation of a trusted direction; three of them are a right angle."""
 
 MAX_TIME_STD = 0.25
-"""A time of the closest point is trusted that is known to this share of the time in which the
-target moves by its distance."""
+"""Maximum standard deviation of a trusted CPA time, relative to the time in which the target
+travels the distance of the nearest sensor."""
 
 
 def reach(n_dipoles: int, length: float) -> float:
-    """[m] How far iron reaches beyond a row of `n_dipoles` over `length` [m]."""
+    """Reach of the iron beyond the dipoles of a row.
+
+    Parameters
+    ----------
+    n_dipoles : int
+    length : float, m
+
+    Returns
+    -------
+    float, m
+    """
     if n_dipoles == 1:
         return POINT_REACH
     return max(MIN_ROW_REACH, ROW_REACH * abs(length) / (n_dipoles - 1))
@@ -69,29 +80,33 @@ class FittedRow(NamedTuple):
 
     n_dipoles: int
     theta: FloatArray
-    """(6 or 7,) the path: position at time zero, velocity, length."""
+    """(6 or 7,) path: position at time zero, velocity, length."""
     field: FloatArray
     """(n, 3) [T], sensor frame."""
 
 
-def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], left: FloatArray) -> float:
-    """Share of the whitened energy of the targets' field left over where no vehicle leaves it.
+def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: FloatArray) -> float:
+    """Share of the whitened energy of all targets that is unexplained where no vehicle leaves it.
 
-    A vehicle leaves something over in proportion to its field, and the more the nearer it is; a
-    further vehicle does so at another time.
+    The residual of a vehicle is proportional to its field and decreases with distance. An
+    additional vehicle leaves a residual at other times.
 
     Parameters
     ----------
     data : PassData
-    rows : list of FittedRow
-        The targets, `n` samples each.
-    left : (n, 3)
+    rows : sequence of FittedRow
+        The targets, each with n samples.
+    residuals : (n, 3) array
         Whitened residuals.
 
     Returns
     -------
     float
-        What is beyond ICASSP11 eq. (9), with `reach` for lambda, and beyond noise.
+        Residual beyond ICASSP11 eq. (9), with `reach` in place of lambda, and beyond noise.
+
+    References
+    ----------
+    [ICASSP11]_ eq. (9).
     """
     def energy(field: FloatArray) -> FloatArray:
         whitened = np.einsum('nij,nj->ni', data.whitening, field)
@@ -99,14 +114,14 @@ def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], left: FloatArr
         return size2
 
     known = sum((_residual_share(data, row) * energy(row.field) for row in rows),
-                np.zeros(len(left)))
-    beyond = np.square(left).sum(axis=1) - known - NOISE_ENERGY
+                np.zeros(len(residuals)))
+    beyond = np.square(residuals).sum(axis=1) - known - NOISE_ENERGY
     everything = energy(np.sum([row.field for row in rows], axis=0))
     return float(np.maximum(beyond, 0.0).sum() / everything.sum())
 
 
 def _residual_share(data: PassData, row: FittedRow) -> FloatArray:
-    """(n,) share of a target's energy that it may leave over in each sample."""
+    """Maximum unexplained share (n,) of a target's energy in each sample."""
     n_dipoles, theta, _ = row
     v = theta[3:6]
     ahead = np.linspace(-0.5, 0.5, n_dipoles) * theta[6] if n_dipoles > 1 else np.zeros(1)
@@ -119,9 +134,19 @@ def _residual_share(data: PassData, row: FittedRow) -> FloatArray:
     return share
 
 
-def doubt(fit: PassFit) -> str:
-    """Why a minimum is no answer as a whole, or nothing."""
-    if reason := _no_pass(fit):
+def rejection_reason(fit: PassFit) -> str:
+    """Why a fit as a whole is rejected.
+
+    Parameters
+    ----------
+    fit : PassFit
+
+    Returns
+    -------
+    str
+        Empty if the fit is accepted.
+    """
+    if reason := _no_pass_reason(fit):
         return reason
     if fit.bearing is not None:
         return ('one sensor: the scale is not observable, only directions and the time of the '
@@ -132,68 +157,102 @@ def doubt(fit: PassFit) -> str:
         return f'not observable: {", ".join(lost)}'
     if not fit.determined:
         length, length_std = fit.length
-        return (f'not determined: a length of {length:.1f} m, known to {length_std:.1f} m; '
-                'take fewer dipoles')
+        return (f'not determined: a length of {length:.1f} m with a standard deviation of '
+                f'{length_std:.1f} m; use fewer dipoles')
     std, nearest = np.sqrt(np.trace(fit.robust_covariance[:3, :3])), _nearest(fit)
     if std > nearest:
-        return (f'out of range: the position is known to {std:.1f} m only, and no sensor is nearer '
-                f'than {nearest:.1f} m')
+        return (f'out of range: the position has a standard deviation of {std:.1f} m, and the '
+                f'nearest sensor is {nearest:.1f} m away')
     return ''
 
 
 def trusted(fit: PassFit) -> tuple[str, ...]:
-    """Speed, direction and time: those that a minimum determines, whatever else it does not.
+    """Those of speed, direction and time that a fit determines.
 
-    None of a target that the model does not describe, or that turned or did not pass.
+    Parameters
+    ----------
+    fit : PassFit
+
+    Returns
+    -------
+    tuple of str
+        Subset of speed, direction, time. Empty if the model does not explain the target, or if
+        the target turned or did not pass.
     """
-    if _no_pass(fit) or fit.bearing is not None:
+    if _no_pass_reason(fit) or fit.bearing is not None:
         return ()
     speed, speed_std = fit.speed
     _, heading_std = fit.heading
     nearest = _nearest(fit)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     _, time_std, _, _ = fit.closest_approach(centre)
-    # A comparison with NaN, where a variance is not known, is false.
+    # A comparison with NaN (an unknown variance) is false.
     known = {'speed': speed_std <= MAX_SPEED_STD * speed,
              'direction': heading_std <= MAX_HEADING_STD and speed_std <= 0.5 * speed,
              'time': time_std * speed <= MAX_TIME_STD * nearest}
     return tuple(name for name, is_known in known.items() if is_known)
 
 
-def _no_pass(fit: PassFit) -> str:
-    """Why a minimum is no pass of one target at constant velocity, or nothing."""
+def _no_pass_reason(fit: PassFit) -> str:
+    """Why a fit is not the pass of one target at constant velocity; empty if it is."""
     if not fit.converged:
         return 'the fit did not converge'
-    if not describes(fit):
+    if not has_plausible_residual(fit):
         return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
-                f'left over, {fit.residual_elsewhere:.1%} where a vehicle at that distance '
-                'leaves none '
-                '(another vehicle, a turn, a wrong network file)')
-    if turns(fit):
-        return ('not at constant velocity: while it was seen it changed by '
-                f'{fit.velocity_change:.0%} of itself (a turn, braking)')
-    if np.linalg.norm(fit.velocity) * fit.seen_s < MIN_DISTANCE * _nearest(fit):
-        return 'no pass: while it was seen it hardly moved'
+                f'unexplained, {fit.residual_elsewhere:.1%} where a vehicle at that distance '
+                'leaves no residual (another vehicle, a turn, a wrong network file)')
+    if has_velocity_change(fit):
+        return ('not at constant velocity: it changed by '
+                f'{fit.velocity_change:.0%} during the pass (a turn, braking)')
+    if np.linalg.norm(fit.velocity) * fit.duration_s < MIN_DISTANCE * _nearest(fit):
+        return 'no pass: the target hardly moved'
     return ''
 
 
-def describes(fit: PassFit) -> bool:
-    """Whether what is left over is where real vehicles leave it."""
+def has_plausible_residual(fit: PassFit) -> bool:
+    """Whether the residual is plausible for a vehicle.
+
+    Parameters
+    ----------
+    fit : PassFit
+
+    Returns
+    -------
+    bool
+    """
     limit = max(MIN_ELSEWHERE, MAX_ELSEWHERE * (1.0 - fit.explained))
     return fit.residual_elsewhere <= limit
 
 
-def turns(fit: PassFit) -> bool:
-    """Whether the velocity changes by much, and by more than errors of the model make it seem."""
-    return bool(fit.velocity_change > max(MAX_CHANGE, SIGNIFICANT * fit.velocity_change_std))
+def has_velocity_change(fit: PassFit) -> bool:
+    """Whether the velocity changes by more than model errors can cause.
+
+    Parameters
+    ----------
+    fit : PassFit
+
+    Returns
+    -------
+    bool
+    """
+    return bool(fit.velocity_change > max(MAX_CHANGE, MIN_CHANGE_STDS * fit.velocity_change_std))
 
 
-def contradicted(fit: PassFit) -> bool:
-    """Whether a fit says that there was not one target on a straight line, whatever the order."""
-    return fit.n_dipoles > 1 and (turns(fit) or not describes(fit))
+def contradicts_straight_pass(fit: PassFit) -> bool:
+    """Whether a fit excludes one target on a straight line for every number of dipoles.
+
+    Parameters
+    ----------
+    fit : PassFit
+
+    Returns
+    -------
+    bool
+    """
+    return fit.n_dipoles > 1 and (has_velocity_change(fit) or not has_plausible_residual(fit))
 
 
 def _nearest(fit: PassFit) -> float:
-    """[m] How near the middle of the target comes to a sensor."""
+    """Distance [m] of the nearest sensor at its CPA."""
     return min(fit.closest_approach(place)[2]
                for place in fit.data.network.positions[fit.data.sensors])

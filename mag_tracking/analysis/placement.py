@@ -1,8 +1,8 @@
-"""What a network of sensors can know of a target that passes: bounds and detection, for planning.
+"""Bounds and detection probabilities of a passing target for the planning of sensor positions.
 
-A point target on a straight line at constant speed, with the states [r, v, m]; the moment's
-direction is not known beforehand, so everything is taken over `DIRECTIONS`. The bounds are those of
-TSP14 section IV and MITRE12 section 4, with the backgrounds unknown as well.
+A point target moves on a straight line at constant speed, with the states [r, v, m]. The direction
+of its moment is unknown in advance, so all results are computed for each of `DIRECTIONS`. The
+bounds are those of TSP14 section IV and MITRE12 section 4, with unknown backgrounds.
 """
 
 from collections.abc import Iterator
@@ -16,33 +16,43 @@ from mag_tracking.physics.dipole import sensor_fields
 
 DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], *(
     np.array(d) / np.sqrt(3.0) for d in ((1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)))])
-"""(7, 3) of the moment; the opposite ones give the same information."""
+"""(7, 3) directions of the moment; opposite directions give the same information."""
 
 STATES = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz')
 
-MAX_AT_ONCE = 200_000
-"""Fields computed at once; more are done in turn, so that memory stays small."""
+MAX_FIELDS = 200_000
+"""Maximum number of fields computed at once, to limit memory."""
 
 
 @dataclass(frozen=True)
 class PlannedTarget:
-    """What is expected to pass."""
+    """Expected target."""
 
     moment: float
-    """[A m^2] its size."""
+    """Size of the moment [A m²]."""
     height: float
-    """[m] of its magnetic centre."""
+    """Height of the magnetic centre [m]."""
     speed: float
-    """[m/s]."""
+    """[m/s]"""
     height_std: float = np.inf
-    """[m] how well the height is known beforehand; inf = not at all."""
+    """Prior standard deviation of the height [m]; inf = unknown."""
     climb_std: float = np.inf
-    """[m/s] the same of the vertical speed."""
+    """Prior standard deviation of the vertical speed [m/s]; inf = unknown."""
     moment_known: bool = True
-    """Whether the moment's size is known beforehand, to the size itself; never its direction."""
+    """Whether the size of the moment is known in advance, with a standard deviation of that size.
+    Its direction is always unknown."""
 
     def prior(self) -> FloatArray:
-        """(9, 9) information of what is known beforehand; MITRE12 eq. (28)."""
+        """Prior information about [r, v, m].
+
+        Returns
+        -------
+        (9, 9) array
+
+        References
+        ----------
+        [MITRE12]_ eq. (28).
+        """
         std = np.full(9, np.inf)
         std[2], std[5] = self.height_std, self.climb_std
         if self.moment_known:
@@ -52,23 +62,32 @@ class PlannedTarget:
 
 @dataclass(frozen=True)
 class Sampling:
-    """How the sensors look at it."""
+    """Sampling and errors of the sensors."""
 
     period: float
-    """[s] between frames."""
+    """Interval between frames [s]."""
     noise_std: FloatArray | float
-    """(n_sensors,) [T] of one axis of one frame, or one for all."""
+    """(n_sensors,) [T] standard deviation per axis and frame, or one value for all sensors."""
     field_error: float = 0.0
-    """Relative error of the field, by clocks, mountings and the model, as noise frame by frame; of
-    an error that lasts, the root of the number of frames that it lasts times as much."""
+    """Error relative to the field due to clocks, mounting and model, treated as noise that is
+    independent between frames. For an error that lasts n frames, multiply by the square root of
+    n."""
     background_std: float = np.inf
-    """[T] how well the backgrounds are known; inf = not at all."""
+    """Prior standard deviation of the backgrounds [T]; inf = unknown."""
     half_window: float = 3.0
-    """[s] the target is followed so long before and after the point that is asked about."""
+    """[s] Duration of the track before and after the evaluated point."""
     max_frames: int = 60
+    """Maximum number of frames that are computed."""
 
     def times(self) -> tuple[FloatArray, float]:
-        """(k,) [s] of the frames, and how many real ones each stands for."""
+        """Times of the computed frames.
+
+        Returns
+        -------
+        t : (k,) array, s
+        weight : float
+            Number of real frames that each computed frame represents.
+        """
         n = 2 * int(self.half_window / self.period) + 1
         k = min(n, self.max_frames // 2 * 2 + 1)
         t = np.linspace(-self.half_window, self.half_window, k, dtype=np.float64)
@@ -82,14 +101,20 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
 
     Parameters
     ----------
-    positions, R_sw : (n_sensors, 3), (n_sensors, 3, 3)
+    positions : (n_sensors, 3) array, m, world frame
+    R_sw : (n_sensors, 3, 3) array
+        World to sensor.
     target : PlannedTarget
     sampling : Sampling
-    points : (n, 2) [m], world
-    heading : float [rad]
+    points : (n, 2) array, m, world frame
+    heading : float, rad
 
-    Yields (slice of points, h (n_p, 7, k, n_sensors, 3) [T], H (n_p, 7, k, n_sensors, 3, 9)), a
-    part of the points at a time.
+    Yields
+    ------
+    part : slice
+        Points of this part.
+    h : (n_p, 7, k, n_sensors, 3) array, T
+    H : (n_p, 7, k, n_sensors, 3, 9) array
     """
     t, _ = sampling.times()
     v = target.speed * np.array([np.cos(heading), np.sin(heading), 0.0])
@@ -101,7 +126,7 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
     dr_dx[..., range(3), range(3, 6)] = t[:, None]
     dm_dx[..., range(3), range(6, 9)] = 1.0
     m = np.broadcast_to(target.moment * DIRECTIONS[:, None], (*shape, 3))
-    step = max(1, MAX_AT_ONCE // (size * len(positions)))
+    step = max(1, MAX_FIELDS // (size * len(positions)))
     for first in range(0, len(points), step):
         some = points[first:first + step]
         n = len(some)
@@ -109,12 +134,12 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
         r = np.broadcast_to(r0[:, None, None] + t[:, None] * v, (n, *shape, 3))
 
         def repeated(a: FloatArray, n: int = n) -> FloatArray:
-            """The same for each of the points."""
+            """Repeat an array for each of the points."""
             return np.tile(a.reshape(size, 1, *a.shape[2:]), (n, *[1] * (a.ndim - 1)))
 
         h, H, _ = sensor_fields(positions, R_sw, r.reshape(n * size, 1, 3).copy(), repeated(m),
                                 repeated(dr_dx), repeated(dm_dx))
-        # On the very sensor there is no field; that look tells nothing.
+        # At the position of a sensor the field is singular; the frame gives no information.
         on_it = ~(np.isfinite(h).all(axis=-1) & np.isfinite(H).all(axis=(-2, -1)))
         h[on_it], H[on_it] = 0.0, 0.0
         yield (slice(first, first + n), h.reshape(n, *shape, -1, 3),
@@ -123,12 +148,27 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
 
 def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                      sampling: Sampling, points: FloatArray, heading: float) -> FloatArray:
-    """Fisher information of each sensor about [r, v, m] at the moment the target is at a point.
+    """Fisher information of each sensor about [r, v, m] when the target is at a point.
 
-    The backgrounds are eliminated: what is constant over the pass says nothing beyond their prior.
+    The backgrounds are eliminated: a constant field adds no information beyond their prior.
 
-    Returns (n, 7, n_sensors, 9, 9). Parameters as for `pass_fields`.
-    Source: TSP14 eq. (28), (40); MITRE12 eq. (17), (30).
+    Parameters
+    ----------
+    positions : (n_sensors, 3) array, m, world frame
+    R_sw : (n_sensors, 3, 3) array
+        World to sensor.
+    target : PlannedTarget
+    sampling : Sampling
+    points : (n, 2) array, m, world frame
+    heading : float, rad
+
+    Returns
+    -------
+    (n, 7, n_sensors, 9, 9) array
+
+    References
+    ----------
+    [TSP14]_ eq. (28), (40); [MITRE12]_ eq. (17), (30).
     """
     _, each = sampling.times()
     out = np.empty((len(points), len(DIRECTIONS), len(positions), 9, 9))
@@ -144,17 +184,23 @@ def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTar
 
 
 def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
-    """Standard deviations that no unbiased estimate beats, per block.
+    """Cramér-Rao bounds of the standard deviations of position, velocity and moment.
 
     Parameters
     ----------
-    information : (..., 9, 9)
+    information : (..., 9, 9) array
         About [r, v, m].
-    prior : (9, 9)
+    prior : (9, 9) array
 
-    Returns (..., 3): of position and velocity in the plane, root of the summed variances [m],
-    [m/s]; of the moment [A m^2]. What hardly is observable is large, and at most 1e6 of its unit.
-    Source: TSP14 eq. (42)-(45), the trace in place of the norm; MITRE12 eq. (32).
+    Returns
+    -------
+    (..., 3) array, m, m/s, A m²
+        Square roots of the summed variances of horizontal position, horizontal velocity and
+        moment. Hardly observable quantities are large, at most 1e6 of their unit.
+
+    References
+    ----------
+    [TSP14]_ eq. (42)-(45), with the trace in place of the norm; [MITRE12]_ eq. (32).
     """
     J = information + prior + 1e-12 * np.eye(9)
     scale = np.sqrt(np.einsum('...ii->...i', J))
@@ -169,19 +215,29 @@ def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
 def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                             sampling: Sampling, points: FloatArray, false_alarm: float,
                             allowance: float = 0.0) -> FloatArray:
-    """Probability that one frame exceeds the detection's threshold with the target at a point.
+    """Probability that one frame exceeds the detection threshold with the target at a point.
 
     Parameters
     ----------
-    positions, R_sw, target, sampling, points
-        As for `pass_fields`.
+    positions : (n_sensors, 3) array, m, world frame
+    R_sw : (n_sensors, 3, 3) array
+        World to sensor.
+    target : PlannedTarget
+    sampling : Sampling
+    points : (n, 2) array, m, world frame
     false_alarm : float
-        Probability of a frame of noise alone.
-    allowance : float [T]
-        What the backgrounds may be off by, added to the noise.
+        Probability that noise alone exceeds the threshold in one frame.
+    allowance : float, T
+        Allowed error of the backgrounds, added to the noise.
 
-    Returns (n, 7), for every direction of the moment. Source: T10 eq. (5.14)-(5.19), over all
-    sensors at once.
+    Returns
+    -------
+    (n, 7) array
+        For every direction of the moment.
+
+    References
+    ----------
+    [T10]_ eq. (5.14)-(5.19), applied to all sensors at once.
     """
     still = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
     ratio = np.empty((len(points), len(DIRECTIONS)))

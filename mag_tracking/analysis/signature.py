@@ -7,49 +7,49 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 
 N_SAMPLES = 64
-"""A signature is resampled to this number of samples, so that its duration does not matter."""
+"""Number of samples of a resampled signature, which makes it independent of its duration."""
 
-QUIET = 0.1
-"""Share of a signature at each end that gives the baseline."""
+BASELINE_SHARE = 0.1
+"""Share of a signature at each end that defines the baseline."""
 
 ENERGY_TAIL = 0.005
-"""Share of the energy before the begin, and after the end, of what is felt of a target."""
+"""Share of the energy before the beginning, and after the end, of the evaluated part."""
 
-PROMINENT = 0.1
-"""An extremum counts that stands out by this share of the range of its axis."""
+MIN_PROMINENCE = 0.1
+"""Minimum prominence of an extremum relative to the range of its axis."""
 
 LAGS = (2, 4, 8, 16)
-"""Lags of the autocorrelation of the size, in samples."""
+"""Lags of the autocorrelation of the field size, in samples."""
 
 N_COSINES = 8
-"""Coefficients of the discrete cosine transform of the size."""
+"""Number of coefficients of the discrete cosine transform of the field size."""
 
-FEWEST = 8
-"""A shorter signature has no shape."""
+MIN_SAMPLES = 8
+"""Minimum number of samples of a signature."""
 
 
 @dataclass(frozen=True)
 class Signature:
-    """The field of one pass at one sensor."""
+    """Field of one pass at one sensor."""
 
     t: FloatArray
-    """(n,) [s], in order."""
+    """(n,) [s], increasing."""
     field: FloatArray
     """(n, n_axes) [T], or in an unknown unit."""
     label: str
-    """Class; empty if it is unknown."""
+    """Class; empty if unknown."""
     source: str
-    """Where it came from, for messages."""
+    """Origin of the signature, for messages."""
     axes: tuple[str, ...]
     """Names of the axes."""
     unit: str
-    """T, or empty if it is unknown."""
+    """T, or empty if unknown."""
     group: str
-    """Name shared by the signatures of one target, which are trained on or tested on together."""
+    """Name shared by the signatures of one target, which are kept together in training or test."""
 
 
 def features(signature: Signature) -> FloatArray:
-    """Features of the shape and the size of a signature.
+    """Features of the shape and size of a signature.
 
     Parameters
     ----------
@@ -58,26 +58,28 @@ def features(signature: Signature) -> FloatArray:
     Returns
     -------
     (n_features,) array
-        For each axis the logarithm of the range, the share of the energy, the number of extrema,
-        the places of the largest and the smallest value and the share of the upper third of the
-        spectrum; for the size of the field its logarithm, the number of maxima, autocorrelation
-        and cosine transform. The duration is left out, as the speed is not known.
+        For each axis: logarithm of the range, share of the energy, numbers of maxima and minima,
+        positions of the largest and the smallest value, share of the upper third of the spectrum.
+        For the size of the field: its logarithm, number of maxima, autocorrelation, cosine
+        transform. The duration is not a feature, since the speed is unknown.
 
     Raises
     ------
     ValueError
-        If it has too few samples, is not finite, or nowhere differs from its baseline.
+        If the signature has too few samples, is not finite, its times do not increase, or its
+        field is constant.
     """
     t, field = np.asarray(signature.t, dtype=float), np.asarray(signature.field, dtype=float)
-    if len(t) < FEWEST:
-        raise ValueError(f'{len(t)} samples are too few for a shape; expected at least {FEWEST}')
+    if len(t) < MIN_SAMPLES:
+        raise ValueError(f'{len(t)} samples are too few for a signature; expected at least '
+                         f'{MIN_SAMPLES}')
     if not (np.isfinite(t).all() and np.isfinite(field).all()):
-        raise ValueError('a time or a field is not finite')
+        raise ValueError('a time or a field value is not finite')
     if not (np.diff(t) > 0.0).all():
-        raise ValueError('its times do not increase')
+        raise ValueError('the times do not increase')
     largest = np.abs(field).max()
     if not largest > 0.0 or not np.ptp(field / largest, axis=0).max() > 1e-12:
-        raise ValueError('the field does not vary')
+        raise ValueError('the field is constant')
     shape = _resampled(t, _without_baseline(t, field / largest))
     size = np.linalg.norm(shape, axis=1)
     energy = np.square(shape).sum(axis=0)
@@ -88,8 +90,8 @@ def features(signature: Signature) -> FloatArray:
 
 
 def _without_baseline(t: FloatArray, field: FloatArray) -> FloatArray:
-    """The field less the line through its ends, by least squares."""
-    n = max(2, round(QUIET * len(t)))
+    """Field minus the least-squares line through both ends of the signature."""
+    n = max(2, round(BASELINE_SHARE * len(t)))
     ends = np.r_[:n, len(t) - n:len(t)]
     A = np.stack([np.ones_like(t), (t - t[0]) / (t[-1] - t[0])], axis=1)
     line = np.linalg.lstsq(A[ends], field[ends], rcond=None)[0]
@@ -98,7 +100,7 @@ def _without_baseline(t: FloatArray, field: FloatArray) -> FloatArray:
 
 
 def _resampled(t: FloatArray, field: FloatArray) -> FloatArray:
-    """(N_SAMPLES, n_axes) of the part in which nearly all of the energy comes."""
+    """Part (N_SAMPLES, n_axes) that contains nearly all of the energy."""
     even = np.linspace(t[0], t[-1], max(4 * N_SAMPLES, len(t)))
     fine = np.stack([np.interp(even, t, axis) for axis in field.T], axis=1)
     energy = np.square(fine).sum(axis=1)
@@ -106,7 +108,7 @@ def _resampled(t: FloatArray, field: FloatArray) -> FloatArray:
     begin = int(np.searchsorted(part, ENERGY_TAIL))
     end = int(np.searchsorted(part, 1.0 - ENERGY_TAIL)) + 1
     at = np.linspace(begin, min(end, len(even) - 1), N_SAMPLES)
-    # Means around the new samples: what changes faster than they do would be chance.
+    # Averaging over the new interval removes changes that the new samples cannot represent.
     width = max(1, round((at[-1] - at[0]) / N_SAMPLES))
     smooth = np.stack([np.convolve(axis, np.ones(width) / width, 'same') for axis in fine.T],
                       axis=1)
@@ -128,14 +130,15 @@ def _axis_features(axis: FloatArray, share: float, size: float) -> list[float]:
 
 def _n_maxima(values: FloatArray) -> int:
     """Number of prominent maxima."""
-    # It takes a quarter of a second to import.
+    # The import takes 0.25 s.
     from scipy.signal import find_peaks
 
-    return len(find_peaks(values, prominence=PROMINENT * max(float(np.ptp(values)), 1e-300))[0])
+    return len(find_peaks(
+        values, prominence=MIN_PROMINENCE * max(float(np.ptp(values)), 1e-300))[0])
 
 
 def _size_features(size: FloatArray) -> list[float]:
-    """Features of the size of the field, whose largest value is one."""
+    """Features of the field size, normalised to a maximum of one."""
     from scipy.fft import dct
 
     centred = size - size.mean()

@@ -1,4 +1,4 @@
-"""Classes of passes by their signature at one sensor: training, posteriors, evaluation."""
+"""Classifier of passes by their signature at one sensor: training, posteriors, evaluation."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -13,39 +13,41 @@ from mag_tracking.errors import LabelsError, MissingDependencyError
 from mag_tracking.inference.log_normal_classes import UNKNOWN
 
 VERSION = 1
-FEWEST = 4
-"""A class with fewer examples is refused: it can't be tested on others than it was trained on."""
+MIN_SAMPLES = 4
+"""Minimum number of examples of a class; with fewer, there are none left for a test."""
 
 FOLDS = 5
+"""Number of folds of the cross-validation."""
 PENALTIES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
-"""Inverse penalties of the logistic regression that are tried."""
+"""Candidate inverse penalties of the logistic regression."""
 
-KNOWN = 0.99
-"""A signature further from all classes than this share of the training set was from its own, each
-when it was left out, is of an unknown class."""
+KNOWN_QUANTILE = 0.99
+"""A signature is of an unknown class if its distance to every class exceeds this quantile of the
+distances of left-out training examples to their own class."""
 
 TEMPERATURES = np.geomspace(0.3, 10.0, 40)
+"""Candidate temperatures."""
 
 
 @dataclass(frozen=True)
 class SignatureModel:
-    """A linear classifier, and how far a class reaches."""
+    """Linear classifier with a limit on the distance to its classes."""
 
     classes: tuple[str, ...]
     axes: tuple[str, ...]
     unit: str
-    """Unit of the fields: T, or empty if it is unknown."""
+    """Unit of the fields: T, or empty if unknown."""
     method: str
     mean: FloatArray
-    """(n_features,) of the training set."""
+    """(n_features,) mean of the training set."""
     scale: FloatArray
-    """(n_features,) standard deviations."""
+    """(n_features,) standard deviations of the training set."""
     weights: FloatArray
     """(n_classes, n_features) of the scaled features."""
     offsets: FloatArray
     """(n_classes,)"""
     temperature: float
-    """The logits are divided by it: what was learnt from few examples is too sure."""
+    """Divisor of the logits, which corrects the overconfidence due to few examples."""
     centres: FloatArray
     """(n_classes, n_features) of the scaled features."""
     precision: FloatArray
@@ -56,17 +58,44 @@ class SignatureModel:
     """{class: number of examples}."""
 
     def posterior(self, x: FloatArray) -> FloatArray:
-        """(n, n_classes) probabilities of features (n, n_features)."""
+        """Class probabilities.
+
+        Parameters
+        ----------
+        x : (n, n_features) array
+
+        Returns
+        -------
+        (n, n_classes) array
+        """
         return _softmax((self._scaled(x) @ self.weights.T + self.offsets) / self.temperature)
 
     def is_known(self, x: FloatArray) -> FloatArray:
-        """(n,) whether features (n, n_features) are as near to a class as its examples."""
+        """Whether signatures are as close to a class as its own examples.
+
+        Parameters
+        ----------
+        x : (n, n_features) array
+
+        Returns
+        -------
+        (n,) bool array
+        """
         known: FloatArray = _distances(self._scaled(x), self.centres,
                                        self.precision).min(axis=1) <= self.limit
         return known
 
     def names(self, x: FloatArray) -> list[str]:
-        """The most probable class of each, or `unknown`."""
+        """Most probable class of each signature, or `unknown`.
+
+        Parameters
+        ----------
+        x : (n, n_features) array
+
+        Returns
+        -------
+        list of n str
+        """
         best = self.posterior(x).argmax(axis=1)
         return [self.classes[k] if known else UNKNOWN
                 for k, known in zip(best.tolist(), self.is_known(x).tolist(), strict=True)]
@@ -79,34 +108,49 @@ class SignatureModel:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Accuracy over one or several sets of signatures that were not trained on."""
+    """Accuracy on one or several test sets."""
 
     classes: tuple[str, ...]
     n: int
-    """Signatures in a set."""
+    """Number of signatures in a set."""
     majority: float
-    """Share of the largest class: the accuracy of a constant answer."""
+    """Share of the largest class: the accuracy of a constant prediction."""
     accuracy: FloatArray
-    """(n_sets,) share of right answers; `unknown` counts as wrong."""
+    """(n_sets,) share of correct predictions; `unknown` counts as incorrect."""
     balanced_accuracy: FloatArray
     """(n_sets,) mean of the recalls."""
     recall: FloatArray
     """(n_sets, n_classes)"""
     unknown: FloatArray
-    """(n_sets,) share of answers `unknown`."""
+    """(n_sets,) share of `unknown` predictions."""
     reliability: float
-    """Mean difference between stated and measured share of right classes, weighted by numbers, over
-    bins of the stated probability."""
+    """Expected calibration error: mean absolute difference between the stated probability and the
+    accuracy, over bins of the probability, weighted by their counts."""
 
 
 def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray, list[str]]:
-    """Features (n, n_features) of signatures, the rows (n,) that have them, and reasons.
+    """Features of several signatures.
 
-    Raises LabelsError where axes or units differ.
+    Parameters
+    ----------
+    signatures : sequence of Signature
+
+    Returns
+    -------
+    x : (n, n_features) array
+    rows : (n,) int array
+        Signatures that have features.
+    reasons : list of str
+        Why the others have none.
+
+    Raises
+    ------
+    LabelsError
+        If the signatures have different axes or units.
     """
     axes = Counter((' '.join(s.axes), s.unit) for s in signatures)
     if len(axes) > 1:
-        raise LabelsError('signatures have different axes or units: ' + ', '.join(
+        raise LabelsError('the signatures have different axes or units: ' + ', '.join(
             f'{n} with {name or "none"} [{unit or "unit unknown"}]'
             for (name, unit), n in sorted(axes.items())))
     rows, found, reasons = [], [], []
@@ -121,18 +165,18 @@ def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray
 
 def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tuple[str, ...],
           unit: str, seed: int = 0) -> SignatureModel:
-    """Train a classifier; method and penalty are chosen by cross-validation.
+    """Train a classifier; method and penalty are selected by cross-validation.
 
     Parameters
     ----------
     x : (n, n_features) array
     labels : sequence of n str
     groups : sequence of n str
-        Signatures of one target, which are left out together.
+        Signatures of one target have the same group and are left out together.
     axes : tuple of str
     unit : str
     seed : int
-        Of the folds.
+        Seed of the folds.
 
     Returns
     -------
@@ -143,6 +187,7 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
     LabelsError
         If there are fewer than two classes, or too few examples of one.
     MissingDependencyError
+        If scikit-learn is not installed.
     """
     counts = check_labels(labels, groups)
     classes = tuple(sorted(counts))
@@ -164,23 +209,39 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
     centres, precision = _spread(z, y)
     left_out = np.concatenate([_own_distances(z, y, inside, outside) for inside, outside in folds])
     return SignatureModel(classes, axes, unit, name, mean, scale, *_linear(fitted, len(classes)),
-                          temperature, centres, precision, float(np.quantile(left_out, KNOWN)),
-                          dict(counts))
+                          temperature, centres, precision,
+                          float(np.quantile(left_out, KNOWN_QUANTILE)), dict(counts))
 
 
 def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]':
-    """{class: targets}; raises LabelsError where nothing can be learnt from them."""
+    """Count the targets of each class and check that a classifier can be trained.
+
+    Parameters
+    ----------
+    labels : sequence of n str
+    groups : sequence of n str
+
+    Returns
+    -------
+    Counter of str
+        Number of targets of each class.
+
+    Raises
+    ------
+    LabelsError
+        If a label is empty or reserved, or there are too few classes or examples.
+    """
     counts = Counter(label for label, _ in set(zip(labels, groups, strict=True)))
     if '' in counts:
         raise LabelsError(f'{counts[""]} signatures have no label')
     if UNKNOWN in counts:
-        raise LabelsError(f'{UNKNOWN!r} is the answer for what fits no class; name the class '
-                          'otherwise')
+        raise LabelsError(f'the label {UNKNOWN!r} is reserved for signatures of no class; rename '
+                          'the class')
     if len(counts) < 2:
         raise LabelsError(f'expected at least two classes, got {", ".join(counts) or "none"}')
-    few = {name: n for name, n in counts.items() if n < FEWEST}
+    few = {name: n for name, n in counts.items() if n < MIN_SAMPLES}
     if few:
-        raise LabelsError('expected at least ' + str(FEWEST) + ' examples of each class, got '
+        raise LabelsError('expected at least ' + str(MIN_SAMPLES) + ' examples of each class, got '
                           + ', '.join(f'{n} of {name!r}' for name, n in sorted(few.items())))
     return counts
 
@@ -188,16 +249,22 @@ def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]'
 def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
                     axes: tuple[str, ...], unit: str, n_splits: int = 20,
                     test_share: float = 0.3, progress: Any = iter) -> Evaluation:
-    """Train and test on stratified splits; everything is chosen inside the training part.
+    """Train and test on stratified random splits.
+
+    All choices are made within the training part of a split.
 
     Parameters
     ----------
-    x, labels, groups, axes, unit
+    x : (n, n_features) array
+    labels, groups : sequence of n str
+    axes : tuple of str
+    unit : str
         As for `train`.
     n_splits : int
     test_share : float
+        Share of each class in the test part.
     progress : function
-        Wraps the iterator of the splits.
+        Wraps the iterator over the splits.
 
     Returns
     -------
@@ -205,7 +272,10 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
 
     Raises
     ------
-    LabelsError, MissingDependencyError
+    LabelsError
+        As `train`, or if no class has enough examples for a test part.
+    MissingDependencyError
+        If scikit-learn is not installed.
     """
     check_labels(labels, groups)
     y, g = np.array(labels), np.array(groups)
@@ -218,47 +288,76 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
 
 
 def evaluate(model: SignatureModel, x: FloatArray, labels: Sequence[str]) -> Evaluation:
-    """A trained model on other signatures; raises LabelsError for a class that it has not."""
+    """Evaluate a trained model on other signatures.
+
+    Parameters
+    ----------
+    model : SignatureModel
+    x : (n, n_features) array
+    labels : sequence of n str
+
+    Returns
+    -------
+    Evaluation
+
+    Raises
+    ------
+    LabelsError
+        If a label is not a class of the model.
+    """
     others = sorted(set(labels) - set(model.classes))
     if others:
-        raise LabelsError(f'the model does not have {", ".join(map(repr, others))}; it has '
-                          f'{", ".join(model.classes)}')
+        raise LabelsError(f'the model does not have the classes {", ".join(map(repr, others))}; '
+                          f'it has {", ".join(model.classes)}')
     return _evaluation([(model, x, np.array(labels))])
 
 
 def _evaluation(parts: Sequence[tuple[SignatureModel, FloatArray, Any]]) -> Evaluation:
-    """The `Evaluation` of models on their test sets."""
+    """`Evaluation` of models on their test sets."""
     classes = parts[0][0].classes
-    accuracy, recall, unknown, stated, right = [], [], [], [], []
+    accuracy, recall, unknown, probability, correct = [], [], [], [], []
     for model, x, y in parts:
         p, names = model.posterior(x), np.array(model.names(x))
         accuracy.append(float(np.mean(names == y)))
         recall.append([float(np.mean(names[y == c] == c)) if (y == c).any() else np.nan
                        for c in classes])
         unknown.append(float(np.mean(names == UNKNOWN)))
-        stated += p.max(axis=1).tolist()
-        right += (np.array(classes)[p.argmax(axis=1)] == y).tolist()
+        probability += p.max(axis=1).tolist()
+        correct += (np.array(classes)[p.argmax(axis=1)] == y).tolist()
     y = np.concatenate([part[2] for part in parts])
     recalls = np.array(recall)
     return Evaluation(classes, len(parts[0][2]), max(Counter(y.tolist()).values()) / len(y),
                       np.array(accuracy), np.nanmean(recalls, axis=1), recalls, np.array(unknown),
-                      reliability_error(np.array(stated), np.array(right)))
+                      reliability_error(np.array(probability), np.array(correct)))
 
 
-def reliability_error(stated: FloatArray, right: FloatArray, n_bins: int = 10) -> float:
-    """Expected calibration error of probabilities (n,) of answers that are `right` (n,)."""
-    bins = np.minimum((stated * n_bins).astype(int), n_bins - 1)
-    return float(sum(abs(stated[bins == b].mean() - right[bins == b].mean()) * np.mean(bins == b)
-                     for b in np.unique(bins)))
+def reliability_error(probability: FloatArray, correct: FloatArray, n_bins: int = 10) -> float:
+    """Expected calibration error of predictions.
+
+    Parameters
+    ----------
+    probability : (n,) array
+        Probabilities of the predicted classes.
+    correct : (n,) bool array
+        Whether the predictions are correct.
+    n_bins : int
+
+    Returns
+    -------
+    float
+    """
+    bins = np.minimum((probability * n_bins).astype(int), n_bins - 1)
+    return float(sum(abs(probability[bins == b].mean() - correct[bins == b].mean())
+                     * np.mean(bins == b) for b in np.unique(bins)))
 
 
 def _candidates() -> list[tuple[str, Any]]:
-    """[(name, function that makes an estimator)]; raises MissingDependencyError."""
+    """(name, function that creates an estimator) of each candidate."""
     try:
         from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
         from sklearn.linear_model import LogisticRegression
     except ImportError as error:
-        raise MissingDependencyError('classes of signatures need scikit-learn: pip install '
+        raise MissingDependencyError('the classifier requires scikit-learn: pip install '
                                      '"mag_tracking[classes]"') from error
     out: list[tuple[str, Any]] = [('linear discriminant analysis', lambda: (
         LinearDiscriminantAnalysis(solver='lsqr', shrinkage='auto')))]
@@ -285,33 +384,33 @@ def _logits(fitted: Any, z: FloatArray) -> FloatArray:
 
 
 def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
-    """Stratified folds of whole groups: (rows inside, rows outside)."""
+    """Stratified folds of whole groups: (training rows, test rows)."""
     try:
         from sklearn.model_selection import StratifiedGroupKFold
     except ImportError as error:
-        raise MissingDependencyError('classes of signatures need scikit-learn: pip install '
+        raise MissingDependencyError('the classifier requires scikit-learn: pip install '
                                      '"mag_tracking[classes]"') from error
     folds = StratifiedGroupKFold(n, shuffle=True, random_state=seed)
     return folds.split(np.zeros(len(y)), y, np.array(groups))
 
 
 def _split(y: Any, groups: Any, test_share: float, seed: int) -> tuple[IntArray, IntArray]:
-    """Rows to train on, and rows to test on: of every class its share of the groups."""
+    """Training and test rows, stratified by class, with whole groups."""
     rng, tested = np.random.default_rng(seed), set[str]()
     for name in np.unique(y):
         mine = rng.permutation(np.unique(groups[y == name]))
-        # Enough of each is left to train on.
-        n = min(max(1, round(test_share * len(mine))), max(len(mine) - FEWEST, 0))
+        # The training part keeps the minimum number of examples.
+        n = min(max(1, round(test_share * len(mine))), max(len(mine) - MIN_SAMPLES, 0))
         tested |= set(mine[:n].tolist())
     outside = np.isin(groups, list(tested))
     if not outside.any():
-        raise LabelsError(f'too few examples to leave some out: expected more than {FEWEST} of a '
-                          'class')
+        raise LabelsError('too few examples for a test set: expected more than '
+                          f'{MIN_SAMPLES} of a class')
     return np.flatnonzero(~outside), np.flatnonzero(outside)
 
 
 def _spread(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Centres (n_classes, n_features), and the inverse of the covariance within the classes."""
+    """Class centres (n_classes, n_features) and the inverse covariance within the classes."""
     from sklearn.covariance import ledoit_wolf
 
     centres = np.array([z[y == k].mean(axis=0) for k in range(int(y.max()) + 1)])
@@ -320,7 +419,7 @@ def _spread(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _own_distances(z: FloatArray, y: IntArray, inside: IntArray, outside: IntArray) -> FloatArray:
-    """Squared distances of those that were left out, to their own class."""
+    """Squared distances of left-out examples to their own class."""
     centres, precision = _spread(z[inside], y[inside])
     own: FloatArray = _distances(z[outside], centres, precision)[np.arange(len(outside)),
                                                                  y[outside]]
@@ -342,5 +441,5 @@ def _softmax(logits: FloatArray) -> FloatArray:
 
 
 def _log_loss(logits: FloatArray, y: IntArray) -> float:
-    """Mean negative logarithm of the probability of the right class."""
+    """Mean negative log-probability of the correct class."""
     return float(-np.mean(np.log(np.maximum(_softmax(logits)[np.arange(len(y)), y], 1e-300))))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mag_tracking.analysis.pass_mounting import MountingEvidence, fold_mounting, with_evidence
+from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting, with_evidence
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.network import SensorNetwork
@@ -83,7 +83,7 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
             prior = np.array([
                 np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
                 for s in found.orientation_std])
-            evidence = fold_mounting(found, prior, tracks)
+            evidence = fuse_mounting(found, prior, tracks)
             found = _marked(with_evidence(found, evidence), found, date, evidence.n_tracks)
     waiting = tuple(name for name in network.names if name not in levels)
     return Calibration(found, survey, evidence, levels, rejected(calibrated.counts), waiting,

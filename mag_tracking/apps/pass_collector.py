@@ -8,7 +8,7 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.saturation import cut_off
+from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Detection, FieldFrame, Readings
@@ -132,7 +132,7 @@ class PassCollector:
             if found.covariance is not None:
                 covariance[mine] = _settled(found.covariance[mine])
             for a, axis in enumerate('xyz'):
-                bad = mine[cut_off(raw[mine, a])]
+                bad = mine[saturated_readings(raw[mine, a])]
                 if len(bad):
                     field[bad, a] = np.nan
                     notes.append(f'{self._network.names[j]}: {axis} was saturated in {len(bad)} '

@@ -10,9 +10,9 @@ from mag_tracking.analysis.joint_fit import GroundPrior, are_separate, path_from
 from mag_tracking.analysis.model_order import choose_order
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
-from mag_tracking.analysis.pass_result import NEARLY, PassFit
+from mag_tracking.analysis.pass_result import MAX_COST_RATIO, PassFit
 from mag_tracking.analysis.pass_targets import fit_targets
-from mag_tracking.analysis.pass_trust import contradicted
+from mag_tracking.analysis.pass_trust import contradicts_straight_pass
 from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.arrays import FloatArray
@@ -62,7 +62,7 @@ class FittedPass:
         if self.chosen is not None:
             return self.chosen
         usable = [f for f in self.fits if f.converged and f.trusted]
-        if not usable or any(contradicted(f) for f in self.fits if f.converged):
+        if not usable or any(contradicts_straight_pass(f) for f in self.fits if f.converged):
             return None
         return min(usable, key=lambda f: f.normalised_cost)
 
@@ -77,7 +77,7 @@ class FittedPass:
         if best is None or not best.cost > energy_threshold(1e-3, best.degrees_of_freedom):
             return np.nan, np.nan
         others = [f for f in self.fits if f is not best and not f.reason
-                  and f.normalised_cost <= NEARLY * best.normalised_cost]
+                  and f.normalised_cost <= MAX_COST_RATIO * best.normalised_cost]
         if not others:
             return np.nan, np.nan
         return (max(float(np.linalg.norm(f.position - best.position)) for f in others),

@@ -44,7 +44,7 @@ class Prescan:
 
     def apply(self, calibrate: Calibrate) -> None:
         """Begin a calibration with what was found."""
-        calibrate.begin_with(self.levels, self.steps)
+        calibrate.start_from(self.levels, self.steps)
 
 
 def prescan(batches: Iterable[Readings], network: SensorNetwork,
@@ -80,7 +80,7 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
     for name, background in recorder.backgrounds().items():
         assert isinstance(background, BlockRecorder)
         steps[name] = background.steps
-        level, was_freed = _level_of(background, learner.backgrounds()[name].freed_at,
+        level, was_freed = _level_of(background, learner.backgrounds()[name].departed_at,
                                      learnt.get(name)) if name in wanted else (None, False)
         if level is not None and level.n_blocks * level.block_s >= LEAST * settings.learn_s:
             found[name] = level
@@ -90,17 +90,17 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
     return Prescan({} if is_quiet else found, steps)
 
 
-def _level_of(recorder: BlockRecorder, freed_at: float | None,
+def _level_of(recorder: BlockRecorder, departed_at: float | None,
               learnt: tuple[float, FloatArray] | None) -> tuple[QuietLevel | None, bool]:
-    """Most frequent level of a sensor, and whether something had stood there until `freed_at` [s].
+    """Most frequent level of a sensor, and whether something stood there until `departed_at` [s].
 
     It had not where the level of the beginning, as it was `learnt`, comes back.
     """
     level = recorder.quiet_level()
-    if level is None or freed_at is None or learnt is None \
-            or recorder.has_returned(learnt[1], level, freed_at):
+    if level is None or departed_at is None or learnt is None \
+            or recorder.has_returned(learnt[1], level, departed_at):
         return level, False
-    return recorder.quiet_level(freed_at), True
+    return recorder.quiet_level(departed_at), True
 
 
 def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mag_tracking.analysis.consistency import error_over_bound
-from mag_tracking.analysis.correlated_motion import correlated_motion, disagree
+from mag_tracking.analysis.correlated_motion import contradicts_delays, correlated_motion
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.apps.prescan import Prescan, prescan_of
@@ -245,7 +245,7 @@ def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
             'heading_deg': float(np.degrees(found.heading)),
             'heading_sd_deg': None if np.isnan(found.heading_std)
             else float(np.degrees(found.heading_std)),
-            'contradicts': disagree(speed_of(*moving), heading_of(*moving), found)}
+            'contradicts': contradicts_delays(speed_of(*moving), heading_of(*moving), found)}
 
 
 def _mounting(log: TrackLog, pipeline: Pipeline) -> dict[str, dict[str, Any]]:

@@ -8,7 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated_motion, disagree
+from mag_tracking.analysis.correlated_motion import (
+    CorrelatedMotion,
+    contradicts_delays,
+    correlated_motion,
+)
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.apps.prescan import prescan_of
@@ -41,7 +45,7 @@ class CountedVehicle:
         """Whether speed or direction contradict the delays."""
         p = self.passage
         heading = float(np.arctan2(p.velocity[1], p.velocity[0]))
-        return disagree((p.speed, p.speed_std), (heading, p.heading_std), self.delay)
+        return contradicts_delays((p.speed, p.speed_std), (heading, p.heading_std), self.delay)
 
 
 @dataclass(frozen=True)

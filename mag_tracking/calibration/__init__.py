@@ -1,1 +1,1 @@
-"""What a sensor must be corrected for, learnt from its own samples."""
+"""Calibration of sensors from their own readings: background, noise, iron, orientation, clocks."""

@@ -1,10 +1,10 @@
-"""Background field and noise of one sensor, learnt from target-free stretches.
+"""Running estimate of the background and noise of one sensor from intervals without a target.
 
-The background is a straight line in time (level and drift) through the means of short quiet blocks;
-the noise is their pooled scatter. A block that departs from the line freezes the learning, and
-takes with it what was learnt shortly before: a target comes near gradually. Without a quiet stretch
-the most frequent level is a provisional background. Source: TSP14 section VI, T10 section 6.3 (mean
-and covariance of a target-free stretch); the line and the freezing are this package's own.
+The background is a line in time (level and drift) through the means of short quiet blocks; the
+noise is their pooled scatter. A block that departs from the line freezes the estimate and discards
+the blocks shortly before, because a target approaches gradually. Without a quiet interval, the most
+frequent level is a provisional background. TSP14 section VI and T10 section 6.3 use the mean and
+covariance of a target-free interval; the line and the freezing are additions of this package.
 """
 
 from collections import deque
@@ -16,62 +16,72 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration.background_level import BackgroundLevel
 from mag_tracking.calibration.blocks import Block, Blocks, block_of, pooled_covariance, stacked
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubted_since, noted
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubtful_since, updated
 from mag_tracking.calibration.drift import FormerLevel, is_steep
-from mag_tracking.calibration.frequent_level import MORE
+from mag_tracking.calibration.frequent_level import MIN_DURATION_RATIO
 from mag_tracking.calibration.learning_window import LearningWindow
-from mag_tracking.calibration.level_change import Judge, SharedChanges
-from mag_tracking.calibration.level_departure import SOONER, LevelDeparture
-from mag_tracking.calibration.provisional import SEEN_S, FrequentLevel, ProvisionalLevel
+from mag_tracking.calibration.level_change import ChangeEvaluator, SharedChanges
+from mag_tracking.calibration.level_departure import SHORTENED_SHARE, LevelDeparture
+from mag_tracking.calibration.provisional import MIN_SEEN_S, FrequentLevel, ProvisionalLevel
 from mag_tracking.calibration.quiet_interval import QuietInterval, line_of
 from mag_tracking.calibration.resolution import MIN_STD, corrected_steps
 from mag_tracking.units import NS
 
 
 class RunningBackground:
-    """Running estimate of one sensor's background; times in seconds of the records.
+    """Running estimate of one sensor's background; times in seconds since its first reading.
 
     Parameters
     ----------
-    learn, memory, guard, block : float [s]
-        Quiet time needed before it is ready; length of the stretch that the line is fitted to, and
-        how far that stays behind the present; length of a block.
+    learn : float, s
+        Quiet time required before the background is ready.
+    memory : float, s
+        Length of the interval that the line is fitted to.
+    guard : float, s
+        Time by which that interval lags the latest reading.
+    block : float, s
+        Length of a block.
     freeze_std : float
-        A block departs if its mean is this many noise deviations off.
-    relearn : float [s]
-        After so long frozen on a steady level that level is the new background, or earlier if the
-        old one was seen only briefly, or was that of something that has left; 0 = never.
-    background, noise_std : (3,) [T], optional
-        Known beforehand: with both it is ready at once.
+        A block departs from the background if its mean differs by this number of standard
+        deviations of the noise.
+    relearn : float, s
+        Time on another steady level after which that level becomes the background. Shorter if the
+        background was observed only briefly, or contains a target that has left. 0 = never.
+    background : (3,) array, T, optional
+        Known background.
+    noise_std : (3,) array, T, optional
+        Known noise. If both are known, the background is ready at once.
     phase : float, optional
-        Staggers the blocks of many sensors that began together: the first block is longer by
-        this share, and the others follow at even times. A complete block is judged by
-        `judge_block`, or before the next reading. Without a phase it is judged at once.
-    sensors : (1,) SENSOR
-        State of the sensor: holds the present block, and line and noise for compiled code.
-    judge : Judge, optional
-        Judges the sensor's changes of level together with those of other sensors.
+        Staggers the blocks of sensors that started together: the first block is longer by this
+        share, the others follow at even times. A complete block is evaluated by `evaluate_block`,
+        or before the next reading. Without a phase it is evaluated at once.
+    sensors : (1,) SENSOR array
+        State of the sensor: contains the current block, and line and noise for compiled code.
+    evaluate_change : ChangeEvaluator, optional
+        Evaluates level changes of the sensor together with those of other sensors.
 
     Attributes
     ----------
-    frozen, stuck : bool
-        Whether a target is near; whether the readings do not change.
+    frozen : bool
+        Whether the field departs from the background, e.g. because of a target.
+    stuck : bool
+        Whether the readings do not change.
     n_relearnt : int
-        How often another steady level was taken for the background.
+        Number of times another steady level became the background.
     doubtful_times : DoubtfulTimes
-        When it was `doubtful`.
+        Intervals in which the background was doubtful.
     """
 
     def __init__(self, learn: float, memory: float, guard: float, block: float,
                  freeze_std: float, relearn: float, background: FloatArray | None = None,
                  noise_std: FloatArray | None = None, phase: float | None = None, *,
-                 sensors: StructArray, judge: Judge | None = None) -> None:
+                 sensors: StructArray, evaluate_change: ChangeEvaluator | None = None) -> None:
         self._learn, self._length, self._relearn = learn, block, relearn
         self._sensors, self._state = sensors, sensors[0]
         self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
-        self._most = max(3, int(round(memory / block)))
-        self._quiet = QuietInterval(guard, self._most)
-        self._learning_window = LearningWindow(learn, block, self._most)
+        self._max_blocks = max(3, int(round(memory / block)))
+        self._quiet = QuietInterval(guard, self._max_blocks)
+        self._learning_window = LearningWindow(learn, block, self._max_blocks)
         self._given = None if background is None else np.asarray(background, dtype=float)
         self._given_noise: FloatArray | None = \
             None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
@@ -80,11 +90,11 @@ class RunningBackground:
         self.doubtful_times: DoubtfulTimes = ()
         self._provisional = ProvisionalLevel(learn)
         self._departure = LevelDeparture(learn, relearn, self._state, self._level,
-                                    judge or partial(SharedChanges().judge, 0))
+                                    evaluate_change or partial(SharedChanges().evaluate_change, 0))
         self.forget()
 
     def forget(self) -> None:
-        """Drop what was learnt; what was given beforehand stays."""
+        """Discard everything learnt; the known background and noise remain."""
         self._state['n'], self._state['end'], self._state['is_full'] = 0, np.nan, False
         self._quiet.clear()
         self._learning_window.clear()
@@ -92,32 +102,46 @@ class RunningBackground:
         self.frozen = self.stuck = False
         self._resumed = self._relearns_soon = self._contested = self._steep = False
         self._provisional.clear()
-        # What is doubtful in the frames that are still on their way stays so.
-        self.doubtful_times = noted(self.doubtful_times, int(self._state['last_ns']), False)
-        # For how long the level was seen, until when, and since when it is the background.
+        # Frames still in the pipeline remain doubtful.
+        self.doubtful_times = updated(self.doubtful_times, int(self._state['last_ns']), False)
+        # Duration for which the level was observed, its end, and the start of the background.
         self._seen_s = 0.0 if self._given is None else inf
         self._seen_until = self._since = np.nan
-        self._level.rely()
+        self._level.set_uncertainty()
         self._level.set(None if self._given is None else (0.0, self._given, np.zeros(3), 0.0),
                         self._given_noise)
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
-        """Go on from what was known a moment ago: (3,) [T] and (3, 3) [T^2], NaN as elsewhere.
+        """Continue from a background that was recently known.
 
-        It is a line again when a stretch as long as at first has been quiet.
+        The level is constant until the quiet interval is as long as for a new background.
+
+        Parameters
+        ----------
+        background : (3,) array, T
+            NaN = axis not reported.
+        covariance : (3, 3) array, T²
+            Noise of one reading.
         """
         noise = np.asarray(covariance, dtype=float)
         self._level.set((0.0, np.asarray(background, dtype=float), np.zeros(3), 0.0),
                         noise if self._given_noise is None else self._given_noise)
         self._resumed = self._relearns_soon = True
         self._seen_s, self._steep = inf, False
-        self._level.rely()
+        self._level.set_uncertainty()
 
-    def begin_with(self, level: FloatArray, covariance: FloatArray) -> None:
-        """Begin with a level that later readings have: (3,) [T] and (3, 3) [T^2].
+    def start_from(self, level: FloatArray, covariance: FloatArray) -> None:
+        """Start with a level that is taken from other readings.
 
-        As after `resume`, but another level has to last as long as it always has to. Nothing is
-        begun where no axis changes.
+        As `resume`, but another level has to last for the full time to replace it. No effect if no
+        axis changes.
+
+        Parameters
+        ----------
+        level : (3,) array, T
+            NaN = axis not reported.
+        covariance : (3, 3) array, T²
+            Noise of one reading.
         """
         covariance = self._level.without_unknown_noise(covariance)
         if not np.isnan(covariance).all():
@@ -126,51 +150,65 @@ class RunningBackground:
 
     @property
     def ready(self) -> bool:
-        """Whether both background and noise are known, if only provisionally."""
+        """Whether background and noise are known, possibly provisionally."""
         return self._level.is_ready
 
     @property
     def doubtful(self) -> bool:
-        """Whether it is provisional, or that of a target that has left since, or comes near."""
+        """Whether the background is provisional or may contain the field of a target."""
         return self._level.is_provisional or self._contested or self._steep
 
     @property
-    def freed_at(self) -> float | None:
-        """[s] When a vehicle that stood there at first was gone; None where there was none."""
-        return self._departure.freed_at
+    def departed_at(self) -> float | None:
+        """Time [s] at which a vehicle present from the start had left; None if there was none."""
+        return self._departure.departed_at
 
     @property
     def certain(self) -> bool:
-        """Whether it is ready and not doubtful."""
+        """Whether the background is ready and not doubtful."""
         return self.ready and not self.doubtful
 
     @property
     def covariance(self) -> FloatArray | None:
-        """(3, 3) [T^2] noise of one sample and its steps, or None; NaN for an axis not reported."""
+        """Noise of one sample including steps, (3, 3) T², or None; NaN = axis not reported."""
         return self._level.covariance
 
     @property
     def drift(self) -> FloatArray:
-        """(3,) [T/s] of the background; NaN before it is ready, and of an axis not reported."""
+        """Drift, (3,) T/s; NaN before the background is ready and for an axis not reported."""
         return self._level.drift
 
     def level(self, time: float) -> FloatArray:
-        """(3,) [T] background at `time` [s]; raises ValueError before it is ready."""
+        """Background at a time.
+
+        Parameters
+        ----------
+        time : float, s
+
+        Returns
+        -------
+        (3,) array, T
+
+        Raises
+        ------
+        ValueError
+            If the background is not ready.
+        """
         return self._level.at(time)
 
     @property
     def scatter_std(self) -> FloatArray:
-        """(3,) [T] scatter of the quiet readings and their steps; NaN = unknown."""
+        """Scatter of the quiet readings including their steps, (3,) T; NaN = unknown."""
         variance = self._quiet.scatter() + self._state['step_variance']
         return np.where(variance > 0.0, np.sqrt(variance), np.nan)
 
     @property
     def measured(self) -> bool:
-        """Whether the background is from readings, not from what was given beforehand."""
+        """Whether the background is from readings, not the known one."""
         return bool(self._quiet) and self.ready
 
-    def judge_block(self) -> None:
-        """Judge the block that the latest sample has shown to be complete."""
+    def evaluate_block(self) -> None:
+        """Evaluate the current block if the latest sample has completed it."""
         if not self._state['is_full']:
             return
         block = block_of(self._sensors)
@@ -178,7 +216,7 @@ class RunningBackground:
         still = (block.n > 1) & (block.scatter.diagonal() < MIN_STD**2 * (block.n - 1))
         if self.ready and not self._level.is_provisional:
             self._level.apply_steps()
-            # An axis with coarse steps rests; one with fine steps is stuck.
+            # A constant axis is at rest if its steps are coarse, and stuck if they are fine.
             self.stuck = bool((still & (self._state['step_variance'] == 0.0)
                                & ~np.isnan(self._state['noise_std'])).any())
             if not self.stuck:
@@ -187,21 +225,21 @@ class RunningBackground:
             self.stuck = bool(still[block.n > 1].all())
             self._begin(block)
         last_ns = int(self._state['last_ns'])
-        self.doubtful_times = noted(self.doubtful_times, last_ns, self.doubtful)
+        self.doubtful_times = updated(self.doubtful_times, last_ns, self.doubtful)
 
     def _begin(self, block: Block) -> None:
-        """Before it is ready: collect until a quiet stretch is long enough."""
+        """Before the background is ready: collect blocks until a quiet interval is long enough."""
         self._since = block.time if np.isnan(self._since) else self._since
         segments = self._learning_window.segments(block, self.stuck)
         if not any(self._adopt_if_steady(s) for s in segments) and not self.stuck:
             self._provide(block)
 
     def _provide(self, block: Block) -> None:
-        """Without a quiet stretch: begin with the most frequent level."""
+        """Without a quiet interval: start with the most frequent level."""
         self._provisional.collect(block)
         found = self._provisional.found(corrected_steps(self._sensors))
         if found is not None and self._given is not None:
-            self.begin_with(self._given, found.level.covariance)
+            self.start_from(self._given, found.level.covariance)
             self._learning_window.clear()
         elif found is not None and found.is_certain:
             self._begin_with_frequent(found)
@@ -210,19 +248,19 @@ class RunningBackground:
             if not np.isnan(noise).all():
                 self._level.set((0.0, level.level, np.zeros(3), 0.0),
                                 noise if self._given_noise is None else self._given_noise)
-                self._level.rely(found.deviation, is_provisional=True)
+                self._level.set_uncertainty(found.std, is_provisional=True)
 
     def _begin_with_frequent(self, found: FrequentLevel) -> None:
-        """Begin with a level that is frequent enough; others may still take its place."""
-        self.begin_with(found.level.level, found.level.covariance)
+        """Start with a frequent level; other levels may still replace it."""
+        self.start_from(found.level.level, found.level.covariance)
         self._seen_s, self.frozen, self._contested = found.seen_s, False, False
         self._learning_window.clear()
         self._departure.end()
 
     def _follow(self, block: Block) -> None:
-        """Once ready: extend the quiet stretch, or freeze."""
+        """Once the background is ready: extend the quiet interval, or freeze."""
         off = np.abs(self._level.departure(block.time, block.mean))
-        # A comparison with NaN is false: an axis that is not reported freezes nothing.
+        # A comparison with NaN is false: an axis that is not reported does not freeze.
         self.frozen = bool((off > self._level.limits).any())
         self._provisional.collect(block)
         if self.frozen:
@@ -232,7 +270,7 @@ class RunningBackground:
             return
         self._contested = False
         if self._departure.was_steady:
-            self._provisional.clear()  # The vehicle is gone, and its level.
+            self._provisional.clear()  # The vehicle has left; its level is obsolete.
         if not np.isnan(self._seen_until):
             self._seen_s += block.time - self._seen_until
         self._seen_until = block.time
@@ -241,26 +279,26 @@ class RunningBackground:
             self._fit(blocks)
 
     def _change_if_steady(self, block: Block) -> None:
-        """While frozen: take another level that lasts, or that was the background before."""
+        """While frozen: adopt another level that lasts, or that was the background before."""
         self._seen_until = np.nan
         departure = self._departure
         since = block.time - departure.blocks[0].time
-        longest = departure.longest(self._seen_s, self._resumed and self._relearns_soon)
-        if not longest:
+        relearn_time = departure.relearn_time(self._seen_s, self._resumed and self._relearns_soon)
+        if not relearn_time:
             return departure.end()
         other = self._provisional.found(corrected_steps(self._sensors))
         if other is not None and other.level.is_at(self._level.at(block.time)):
             other = None
-        latest = departure.steady_end(SOONER)
-        if latest is not None and self._relearn and self._judge_change(latest):
+        latest = departure.steady_end(SHORTENED_SHARE)
+        if latest is not None and self._relearn and self._adopt_if_background(latest):
             return
-        # Two levels that were seen for equally long may both be the background, unless a vehicle
-        # was seen to come to one of them.
-        self._contested = not departure.has_come and (
+        # Two levels of equal duration may both be the background, unless a vehicle was observed
+        # to arrive at one of them.
+        self._contested = not departure.has_arrived and (
             self._contested
             or since >= min(self._seen_s, self._relearn) and departure.steady_end() is not None
-            or other is not None and other.seen_s >= min(self._seen_s, SEEN_S))
-        if since < longest:
+            or other is not None and other.seen_s >= min(self._seen_s, MIN_SEEN_S))
+        if since < relearn_time:
             return
         if self._adopt_if_steady(departure.blocks):
             self.n_relearnt += 1
@@ -271,8 +309,8 @@ class RunningBackground:
         else:
             departure.shorten()
 
-    def _judge_change(self, latest: deque[Block]) -> bool:
-        """Whether the level of the `latest` blocks is the background from now on."""
+    def _adopt_if_background(self, latest: deque[Block]) -> bool:
+        """Adopt the level of the `latest` blocks if it is the background; return whether it is."""
         former_seen_s = self._departure.former_seen_s()
         if former_seen_s:
             self._change_to(latest, former_seen_s)
@@ -282,29 +320,29 @@ class RunningBackground:
             return False
         since_ns = int(self._state['first_ns']) + round(np.nan_to_num(self._since) * NS)
         self._change_to(latest, self._learn)
-        # All before was measured against the vehicle that stood there.
-        self.doubtful_times = doubted_since(self.doubtful_times, since_ns)
+        # The earlier background contained the field of the vehicle.
+        self.doubtful_times = doubtful_since(self.doubtful_times, since_ns)
         return True
 
     def _change_to(self, latest: deque[Block], seen_s: float) -> None:
-        """Go on with the level of the `latest` blocks, which was seen for `seen_s` [s] in all."""
-        # The first half may have the tail of the vehicle that has left.
+        """Continue with the level of the `latest` blocks, observed for `seen_s` [s] in total."""
+        # The first half may contain the tail of the departing vehicle's field.
         half = list(latest)[len(latest) // 2:]
         self._depart_from(half[0].time)
-        self._level.rest_at(stacked(half))
+        self._level.set_constant(stacked(half))
         self._resumed, self._relearns_soon, self._seen_s = True, False, seen_s
         self._quiet.begin(half)
         self.n_relearnt += 1
         self.frozen = self._contested = self._steep = False
 
     def _depart_from(self, begin: float) -> None:
-        """The present level is the former one, as another is the background since `begin` [s]."""
+        """Keep the present level as the former one; another is the background since `begin` [s]."""
         self._since = begin
         self._departure.former = FormerLevel(begin, self._level.at(begin), self._seen_s)
         self._departure.end()
 
     def _adopt_if_steady(self, collected: deque[Block]) -> bool:
-        """Take the collected blocks as the background if they lie on one line."""
+        """Adopt the collected blocks as the background if they lie on one line."""
         blocks = stacked(collected)
         noise = pooled_covariance(blocks) if self._given_noise is None else self._given_noise
         noise = None if noise is None else self._level.without_dead_axes(noise)
@@ -312,7 +350,7 @@ class RunningBackground:
             return False
         before = self._level.noise
         self._level.set(self._level.line, noise)
-        if not self._level.holds(blocks):
+        if not self._level.are_steady(blocks):
             self._level.set(self._level.line, before)
             return False
         if self._given is not None and self._level.line is not None and not self.n_relearnt \
@@ -322,27 +360,27 @@ class RunningBackground:
             return True
         if self.frozen and self._level.line is not None:
             self._depart_from(float(blocks.time[0]))
-        # A steady stretch was asked for its own length; it need not be as long as at first.
+        # The required length was checked by the caller; the initial length does not apply.
         self._resumed = False
         self._seen_s = float(blocks.time[-1] - blocks.time[0]) + self._length
         self._seen_until = float(blocks.time[-1])
-        self._level.rely()
+        self._level.set_uncertainty()
         self._quiet.begin(collected)
         self._learning_window.clear()
         self._fit(self._quiet.blocks())
         return True
 
     def _fit(self, blocks: Blocks) -> None:
-        """Line and noise from the quiet `blocks`."""
+        """Fit line and noise to the quiet `blocks`."""
         if (self._given is not None or self._resumed) and np.ptp(blocks.time) < self._learn:
             return
         self._resumed = False
         line = line_of(blocks)
         assert self._level.noise is not None
-        is_young = MORE * self._seen_s < self._relearn
+        is_young = MIN_DURATION_RATIO * self._seen_s < self._relearn
         self._steep = is_young and is_steep(
             blocks, line[2], self._level.noise.diagonal() + self._state['step_variance'])
-        self._level.rely(np.abs(line[2]) * self._learn if self._steep else 0.0)
+        self._level.set_uncertainty(np.abs(line[2]) * self._learn if self._steep else 0.0)
         noise = pooled_covariance(blocks) if self._given_noise is None else None
         self._level.set(line, self._level.noise if noise is None
                         else self._level.without_dead_axes(noise))

@@ -1,4 +1,4 @@
-"""Background line and noise of one sensor, as compiled code reads them."""
+"""Background line and noise of one sensor, stored where compiled code reads them."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -8,35 +8,42 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration import core
-from mag_tracking.calibration.blocks import Block, Blocks, line_through, one_is_loud, stacked
+from mag_tracking.calibration.blocks import Block, Blocks, has_noisy_block, line_through, stacked
 from mag_tracking.calibration.resolution import MIN_STD, completed_steps, corrected_steps
 from mag_tracking.records import plain
 
 _Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
-"""Centre [s], mean (3,) [T], slope (3,) [T/s] and horizon [s]."""
+"""Centre [s], mean (3,) [T], slope (3,) [T/s], and horizon [s], after which the line is
+constant."""
 
 
 class BackgroundLevel:
-    """Line and noise of the background, kept in the state of its sensor.
+    """Line and noise of the background, stored in the state of its sensor.
+
+    Parameters
+    ----------
+    sensors : (1,) SENSOR array
+        State of the sensor.
+    freeze_std : float
+        Number of standard deviations by which the mean of a block departs from the background.
 
     Attributes
     ----------
     line : (float, (3,), (3,), float) or None
         Centre [s], mean [T], slope [T/s] and horizon [s].
-    noise : (3, 3) array or None, T^2
-        Of one reading, without its steps.
+    noise : (3, 3) array or None, T²
+        Noise of one reading, without its steps.
     limits : (3,) array, T
-        A block whose mean is further off is not background.
+        Maximum deviation of the mean of a block from the background.
     is_provisional : bool
         Whether the line may be that of something else.
     """
 
     def __init__(self, sensors: StructArray, freeze_std: float) -> None:
-        """`sensors` is (1,) SENSOR; a block is off by more than `freeze_std` deviations."""
         self._sensors, self._freeze_std = sensors, freeze_std
         self._state = sensors[0]
         self.limits = np.full(3, np.nan)
-        self.rely()
+        self.set_uncertainty()
         self.set(None, None)
 
     @property
@@ -45,7 +52,15 @@ class BackgroundLevel:
         return self.line is not None and self.noise is not None
 
     def set(self, line: _Line | None, noise: FloatArray | None) -> None:
-        """Line and noise from now on, also those that compiled code reads."""
+        """Set line and noise, also for compiled code.
+
+        Parameters
+        ----------
+        line : (float, (3,), (3,), float) or None
+            Centre [s], mean [T], slope [T/s] and horizon [s].
+        noise : (3, 3) array or None, T²
+            Noise of one reading, without its steps.
+        """
         s = self._state
         self.line, self.noise = line, noise
         s['is_ready'] = self.is_ready
@@ -55,11 +70,21 @@ class BackgroundLevel:
         self.apply_steps()
 
     def apply_steps(self) -> None:
-        """Add what the sensor's steps do to the noise; its steps may have been found meanwhile."""
+        """Update the noise for the sensor's steps, which may have been found since `set`."""
         core.apply_steps(self._sensors, self._freeze_std, self.limits)
 
     def without_dead_axes(self, noise: FloatArray) -> FloatArray:
-        """(3, 3) [T^2] `noise` with NaN for an axis that has not changed and does not rest."""
+        """Set the noise of dead axes to NaN.
+
+        Parameters
+        ----------
+        noise : (3, 3) array, T²
+
+        Returns
+        -------
+        (3, 3) array, T²
+            NaN for an axis that is constant and does not rest.
+        """
         steps, variance = corrected_steps(self._sensors), noise.diagonal()
         if np.isfinite(steps).all() and (variance > MIN_STD**2).all():
             return noise
@@ -68,19 +93,36 @@ class BackgroundLevel:
         return np.where(dead[:, None] | dead, np.nan, noise)
 
     def without_unknown_noise(self, covariance: FloatArray) -> FloatArray:
-        """(3, 3) [T^2] `covariance` with NaN for an axis that neither changes nor has steps."""
+        """Set the covariance of axes without noise and steps to NaN.
+
+        Parameters
+        ----------
+        covariance : (3, 3) array, T²
+
+        Returns
+        -------
+        (3, 3) array, T²
+            NaN for an axis that neither changes nor has steps.
+        """
         steps = corrected_steps(self._sensors)
         dead = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
         return np.where(dead[:, None] | dead, np.nan, covariance)
 
-    def rely(self, deviation: FloatArray | float = 0.0, is_provisional: bool = False) -> None:
-        """The line is the background, with a `deviation` (3,) [T]; NaN = axis not reported."""
+    def set_uncertainty(self, std: FloatArray | float = 0.0, is_provisional: bool = False) -> None:
+        """Set the uncertainty of the line.
+
+        Parameters
+        ----------
+        std : (3,) array or float, T
+            Standard deviation; NaN = axis not reported.
+        is_provisional : bool
+        """
         self.is_provisional = is_provisional
-        self._state['level_variance'] = np.where(np.isnan(deviation), 0.0, np.square(deviation))
+        self._state['level_variance'] = np.where(np.isnan(std), 0.0, np.square(std))
 
     @property
     def covariance(self) -> FloatArray | None:
-        """(3, 3) [T^2] noise of one sample and its steps, or None; NaN for an axis not reported."""
+        """Noise of one sample including steps, (3, 3) T², or None; NaN = axis not reported."""
         if self.noise is None:
             return None
         covariance: FloatArray = self.noise + np.diag(self._state['step_variance'])
@@ -88,19 +130,52 @@ class BackgroundLevel:
 
     @property
     def drift(self) -> FloatArray:
-        """(3,) [T/s] of the background; NaN before it is ready, and of an axis not reported."""
+        """Drift, (3,) T/s; NaN before the background is ready and for an axis not reported."""
         return np.full(3, np.nan) if self.line is None else self.line[2]
 
     def at(self, time: float) -> FloatArray:
-        """(3,) [T] background at `time` [s]; raises ValueError before it is ready."""
+        """Background at a time.
+
+        Parameters
+        ----------
+        time : float, s
+
+        Returns
+        -------
+        (3,) array, T
+
+        Raises
+        ------
+        ValueError
+            If the background is not ready.
+        """
         return -self.departure(time, np.zeros(3))
 
-    def rest_at(self, blocks: Blocks) -> None:
-        """From now on the level is that of `blocks`, without a drift."""
+    def set_constant(self, blocks: Blocks) -> None:
+        """Set a constant level, the mean of some blocks.
+
+        Parameters
+        ----------
+        blocks : Blocks
+        """
         self.set((0.0, line_through(blocks)[1], np.zeros(3), 0.0), self.noise)
 
     def at_all(self, times: FloatArray) -> FloatArray:
-        """(k, 3) [T] background at `times` (k,) [s]; raises ValueError before it is ready."""
+        """Background at several times.
+
+        Parameters
+        ----------
+        times : (k,) array, s
+
+        Returns
+        -------
+        (k, 3) array, T
+
+        Raises
+        ------
+        ValueError
+            If the background is not ready.
+        """
         if self.line is None:
             raise ValueError('the background has not been learnt yet')
         centre, mean, slope, horizon = self.line
@@ -108,7 +183,22 @@ class BackgroundLevel:
         return out
 
     def departure(self, time: float, field: FloatArray) -> FloatArray:
-        """(3,) [T] `field` without the background at `time` [s]."""
+        """Field minus the background.
+
+        Parameters
+        ----------
+        time : float, s
+        field : (3,) array, T
+
+        Returns
+        -------
+        (3,) array, T
+
+        Raises
+        ------
+        ValueError
+            If the background is not ready.
+        """
         if self.line is None:
             raise ValueError('the background has not been learnt yet')
         out = np.empty(3)
@@ -116,7 +206,19 @@ class BackgroundLevel:
         return out
 
     def steady_end(self, blocks: Sequence[Block], length: float) -> deque[Block] | None:
-        """The latest of the blocks, over a `length` [s], if they are of a steady level."""
+        """Latest blocks if they are of a steady level.
+
+        Parameters
+        ----------
+        blocks : sequence of Block
+        length : float, s
+            Required duration.
+
+        Returns
+        -------
+        deque of Block or None
+            None if the blocks are not steady or too few.
+        """
         since = blocks[-1].time - length
         latest: deque[Block] = deque()
         for block in reversed(blocks):
@@ -124,11 +226,20 @@ class BackgroundLevel:
                 break
             latest.appendleft(block)
         is_long = len(blocks) >= 3 and blocks[0].time <= since
-        return latest if is_long and self.holds(stacked(latest)) else None
+        return latest if is_long and self.are_steady(stacked(latest)) else None
 
-    def holds(self, blocks: Blocks) -> bool:
-        """Whether blocks are those of a steady level, by the present noise."""
+    def are_steady(self, blocks: Blocks) -> bool:
+        """Whether blocks are of one steady level, given the present noise.
+
+        Parameters
+        ----------
+        blocks : Blocks
+
+        Returns
+        -------
+        bool
+        """
         centre, mean, slope = line_through(blocks)
         off = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
-        return not one_is_loud(blocks, self._state['step_variance']) \
+        return not has_noisy_block(blocks, self._state['step_variance']) \
             and bool(np.nanmax(off / self.limits) <= 1.0)

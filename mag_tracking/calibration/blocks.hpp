@@ -1,4 +1,4 @@
-// Readings in short stretches, and the background line that is fitted to them (blocks.py,
+// Blocks of readings, and the background line that is fitted to them (blocks.py,
 // background_level.py).
 
 #pragma once
@@ -9,23 +9,23 @@
 
 namespace mag_tracking {
 
-// A block has at least so many readings, however slow the sensor: fewer tell nothing of noise.
+// Minimum number of readings of a block, even of a slow sensor; fewer do not determine the noise.
 constexpr int MIN_SAMPLES = 8;
 
-// Field without the background at `time` [s]: from `field` (3) [T] into `out` (3).
+// Subtract the background at `time` [s] from `field` (3) [T], into `out` (3).
 //
-// The drift is extrapolated over at most twice the stretch that it was fitted to: a drift learnt
-// from three seconds does not hold for twenty.
+// The drift is extrapolated for at most twice the interval that it was fitted to: a drift from
+// three seconds of readings is not valid for twenty.
 inline void subtract_background(const Sensor& s, double time, const double* field, double* out) {
     const double since = (s.horizon < time ? s.horizon : time) - s.centre;
     for (int a = 0; a < 3; ++a) out[a] = field[a] - s.mean[a] - since * s.slope[a];
 }
 
-// How often `b` > 0 fits into `a` >= 0; the quotient may be rounded up to the next whole number.
+// Integer part of a / b for `a` >= 0 and `b` > 0, correct even if the quotient is rounded up.
 inline double whole_times(double a, double b) { return std::round((a - std::fmod(a, b)) / b); }
 
-// Begin the next block where a reading at `time` [s] is the first after the present one. What was
-// complete before (`is_full`) must have been used by now.
+// Begin the next block if a reading at `time` [s] is the first after the current one. An earlier
+// complete block (`is_full`) must have been evaluated before.
 inline void begin_block_if_due(Sensor& s, double time) {
     if (std::isnan(s.end)) {
         s.end = time + s.length * (std::isnan(s.phase) ? 1.0 : 1.0 + s.phase);
@@ -37,12 +37,12 @@ inline void begin_block_if_due(Sensor& s, double time) {
     if (std::isnan(s.phase))
         s.end = time + s.length;
     else
-        // With jittering timestamps the blocks of all sensors would sooner or later end with the
-        // same reading, and from then on always.
+        // Otherwise, with timestamp jitter, the blocks of all sensors would eventually end at the
+        // same reading and remain synchronised.
         s.end += (whole_times(time - s.end, s.length) + 1.0) * s.length;
 }
 
-// Add a reading, `field` (3) [T] at `time` [s], to the present block.
+// Add a reading, `field` (3) [T] at `time` [s], to the current block.
 inline void collect(Sensor& s, double time, const double* field) {
     const auto k = s.now;
     double* origin = s.origin[k];
@@ -62,7 +62,7 @@ inline void collect(Sensor& s, double time, const double* field) {
         const double d = field[a] - origin[a];
         for (int b = 0; b < 3; ++b) {
             if (std::isnan(field[b])) continue;
-            // Where it has not been heard before, this reading is the origin of that axis.
+            // If the axis has not been reported before, this reading is its origin.
             const double e = std::isnan(origin[b]) ? 0.0 : field[b] - origin[b];
             s.count[k][a][b] += 1.0;
             s.sum[k][a][b] += d;
@@ -71,8 +71,8 @@ inline void collect(Sensor& s, double time, const double* field) {
     }
 }
 
-// Mean (3) [T] and sum of squared deviations (3, 3) [T^2] of block `k`; an axis that is missing is so
-// in its products only.
+// Mean (3) [T] and sum of squared deviations (3, 3) [T^2] of block `k`; a missing axis affects its
+// own elements only.
 inline void moments(const Sensor& s, int64_t k, double* mean, double* scatter) {
     const auto &count = s.count[k], &sum = s.sum[k];
     for (int a = 0; a < 3; ++a) mean[a] = count[a][a] > 0.0 ? sum[a][a] / count[a][a] : NAN;
@@ -85,9 +85,9 @@ inline void moments(const Sensor& s, int64_t k, double* mean, double* scatter) {
     for (int a = 0; a < 3; ++a) mean[a] += s.origin[k][a];
 }
 
-// Scatter within k blocks, pooled: of their sums of squared deviations `scatter` (k, 3, 3) and
-// numbers of samples `n` (k, 3), into `out` (3, 3); NaN where an axis is not reported. False: too few
-// samples.
+// Pooled covariance within k blocks, from their sums of squared deviations `scatter` (k, 3, 3) and
+// numbers of samples `n` (k, 3), into `out` (3, 3); NaN if an axis is not reported. Returns false
+// if there are too few samples.
 inline bool pool(int64_t k, const double* scatter, const double* n, double* out) {
     double freedom[3] = {0.0, 0.0, 0.0}, sum[9] = {};
     for (int64_t i = 0; i < k; ++i) {
@@ -104,8 +104,8 @@ inline bool pool(int64_t k, const double* scatter, const double* n, double* out)
 }
 
 // Weighted least-squares line of one axis through the means `y` [T] of k blocks of `n` readings at
-// `time` [s], all strided by three but for the time: its value and slope at `centre`. NaN where no
-// block has the axis.
+// `time` [s]; its value and slope at `centre`. `y` and `n` have a stride of three. NaN if no block
+// has the axis.
 inline void line(int64_t k, const double* time, const double* n, const double* y, double centre,
                  double& mean, double& slope) {
     double total = 0.0, mean_t = 0.0, mean_y = 0.0, spread = 0.0, along = 0.0;

@@ -1,4 +1,4 @@
-"""Summaries of short stretches of readings, which a background is fitted to."""
+"""Blocks: summaries of short intervals of readings, to which a background is fitted."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,32 +10,42 @@ from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration import core
 from mag_tracking.records import plain
 
-LOUDEST = 100.0
-"""A block whose variance is so many times that of the quietest is no noise: a target passed within
-it, as it can within the long blocks of a slow sensor. Noise and coarse steps stay well below."""
+MAX_VARIANCE_RATIO = 100.0
+"""Maximum ratio of the variance of a block to that of the quietest block. A higher ratio is not
+noise: a target passed within the block, which is possible in the long blocks of a slow sensor.
+Noise and coarse steps remain well below."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Summary of one short stretch."""
+    """Summary of the readings of a short interval."""
 
     time: float
-    """[s], centre."""
+    """[s] Mean time of the readings."""
     mean: FloatArray
     """(3,) [T]; NaN = axis not reported."""
     scatter: FloatArray
-    """(3, 3) [T^2], sum of squared deviations."""
+    """(3, 3) [T²] Sum of squared deviations from the mean."""
     n: FloatArray
-    """(3,) samples per axis."""
+    """(3,) number of samples per axis."""
 
 
 def block_of(sensors: StructArray) -> Block:
-    """`Block` of the complete block of a sensor, (1,) SENSOR."""
+    """Summarise the complete block of a sensor.
+
+    Parameters
+    ----------
+    sensors : (1,) SENSOR array
+
+    Returns
+    -------
+    Block
+    """
     return Block(*core.block_moments(sensors))
 
 
 class Blocks(NamedTuple):
-    """Many, as arrays: time (k,), mean (k, 3), scatter (k, 3, 3), n (k, 3); as in `Block`."""
+    """Several `Block` as arrays: time (k,), mean (k, 3), scatter (k, 3, 3), n (k, 3)."""
 
     time: FloatArray
     mean: FloatArray
@@ -44,38 +54,62 @@ class Blocks(NamedTuple):
 
 
 class BlockWindow:
-    """The latest blocks, as arrays: a line is put through them as often as one comes."""
+    """Ring buffer of the latest blocks, stored as arrays for the frequent line fits.
 
-    def __init__(self, most: int) -> None:
-        """`most` are kept."""
-        self._time, self._n = np.zeros(most), np.zeros((most, 3))
-        self._mean, self._scatter = np.zeros((most, 3)), np.zeros((most, 3, 3))
+    Parameters
+    ----------
+    max_blocks : int
+        Maximum number of blocks.
+    """
+
+    def __init__(self, max_blocks: int) -> None:
+        self._time, self._n = np.zeros(max_blocks), np.zeros((max_blocks, 3))
+        self._mean, self._scatter = np.zeros((max_blocks, 3)), np.zeros((max_blocks, 3, 3))
         self.clear()
 
     def __len__(self) -> int:
         return min(self._count, len(self._time))
 
     def clear(self) -> None:
-        """Without any block."""
+        """Remove all blocks."""
         self._count = 0
 
     def append(self, block: Block) -> None:
-        """The latest; it takes the place of the oldest."""
+        """Append a block; if the window is full, it replaces the oldest one.
+
+        Parameters
+        ----------
+        block : Block
+        """
         i = self._count % len(self._time)
         self._time[i], self._mean[i], self._scatter[i] = block.time, block.mean, block.scatter
         self._n[i] = block.n
         self._count += 1
 
     def blocks(self) -> Blocks:
-        """The `Blocks`, in no order."""
+        """Stored blocks, in no particular order.
+
+        Returns
+        -------
+        Blocks
+        """
         k = len(self)
         return Blocks(self._time[:k], self._mean[:k], self._scatter[:k], self._n[:k])
 
 
 def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
-    """Weighted least-squares line per axis: centre [s], mean (3,) and slope (3,) there.
+    """Weighted least-squares line of each axis.
 
-    NaN for an axis that no block reports.
+    Parameters
+    ----------
+    blocks : Blocks
+
+    Returns
+    -------
+    centre : float, s
+    mean : (3,) array, T
+        Value at the centre; NaN for an axis that no block reports.
+    slope : (3,) array, T/s
     """
     centre = float(blocks.time.mean())
     return centre, *core.line_through(
@@ -83,23 +117,50 @@ def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
 
 
 def stacked(blocks: Iterable[Block]) -> Blocks:
-    """`Blocks` of `Block`s."""
+    """Convert blocks to arrays.
+
+    Parameters
+    ----------
+    blocks : iterable of Block
+
+    Returns
+    -------
+    Blocks
+    """
     return Blocks(*(np.array(values, dtype=float) for values in zip(*(
         (b.time, b.mean, b.scatter, b.n) for b in blocks), strict=True)))
 
 
-def one_is_loud(blocks: Blocks, step_variance: FloatArray) -> bool:
+def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
     """Whether a block scatters far more than the others, on any axis.
 
-    `step_variance` (3,) [T^2] is what the sensor's steps add.
+    Parameters
+    ----------
+    blocks : Blocks
+    step_variance : (3,) array, T²
+        Variance due to the sensor's steps.
+
+    Returns
+    -------
+    bool
     """
     n = blocks.n
     variance = np.where(n > 1, np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1, 1), np.nan)
     variance = np.maximum(variance, step_variance)
     known = variance[:, ~np.isnan(variance).all(axis=0)]
-    return bool((np.nanmax(known, axis=0) > LOUDEST * np.nanmin(known, axis=0)).any())
+    return bool((np.nanmax(known, axis=0) > MAX_VARIANCE_RATIO * np.nanmin(known, axis=0)).any())
 
 
 def pooled_covariance(blocks: Blocks) -> FloatArray | None:
-    """(3, 3) scatter within blocks, pooled; None = too few samples, NaN = axis not reported."""
+    """Pooled scatter within blocks.
+
+    Parameters
+    ----------
+    blocks : Blocks
+
+    Returns
+    -------
+    (3, 3) array or None, T²
+        None = too few samples; NaN = axis not reported.
+    """
     return core.pooled_covariance(plain(blocks.scatter), plain(blocks.n))

@@ -1,8 +1,4 @@
-"""By how much the clocks of two sensors differ, from a knock that both feel.
-
-Source: T10 section 6.3 (correlation of the accelerometers); refined below a sample by
-least squares, which also says how well it is known.
-"""
+"""Clock offset between two sensors from knocks that both measure."""
 
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -14,20 +10,21 @@ from scipy.signal import correlate, find_peaks
 
 from mag_tracking.arrays import BoolArray, FloatArray
 
-LOUD = 10.0
-"""A knock is above so many deviations of the rest."""
+KNOCK_THRESHOLD = 10.0
+"""Minimum size of a knock in standard deviations of the signal at rest."""
 
-ALIKE = 0.7
-"""Two sensors felt the same knocks where they correlate at least so well."""
+MIN_CORRELATION = 0.7
+"""Minimum correlation of two sensors that measured the same knocks."""
 
-RIVAL = 0.9
-"""Another lag that correlates so well compared with the best is as likely."""
+MIN_RIVAL_RATIO = 0.9
+"""A second lag whose correlation exceeds this share of the best one makes the lag ambiguous."""
 
-AROUND_S = 5.0
-"""[s] Of a long recording only what is so near to knocks is compared; it tells what rest is."""
+CONTEXT_S = 5.0
+"""[s] Interval before the first and after the last knock that is compared in a long recording; it
+contains the signal at rest."""
 
 MARGIN_S = 0.1
-"""[s] What is compared before and after a knock."""
+"""[s] Interval before and after a knock that is compared."""
 
 _Series: TypeAlias = tuple[FloatArray, FloatArray]
 """Times (n,) [s] and values (n,)."""
@@ -35,27 +32,33 @@ _Series: TypeAlias = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class Lag:
-    """How far one clock is ahead of another."""
+    """Clock offset of one sensor relative to another."""
 
     offset: float
-    """[s]; NaN where there is a reason."""
+    """[s]; NaN if there is a reason."""
     std: float
     """[s]"""
     correlation: float
-    """Of the two, at that lag, 0..1; NaN where neither was loud."""
+    """Correlation at that lag, 0 to 1; NaN if a sensor measured no knock."""
     reason: str
-    """Why there is none; empty where there is one."""
+    """Why there is no lag; empty if there is one."""
 
 
-def _none(reason: str, correlation: float = float('nan')) -> Lag:
-    """No lag."""
+def _no_lag(reason: str, correlation: float = float('nan')) -> Lag:
+    """A `Lag` without a value."""
     return Lag(float('nan'), float('nan'), correlation, reason)
 
 
 def shock(acceleration: FloatArray) -> FloatArray:
-    """(n,) [m/s^2] how far each of the accelerations (n, 3) is from rest, in any direction.
+    """Deviation of an acceleration from rest, independent of the orientation of the sensor.
 
-    In any: how a sensor is turned need not be known.
+    Parameters
+    ----------
+    acceleration : (n, 3) array, m/s²
+
+    Returns
+    -------
+    (n,) array, m/s²
     """
     a = np.asarray(acceleration, dtype=float)
     size = np.linalg.norm(a - np.nanmedian(a, axis=0), axis=1)
@@ -64,53 +67,67 @@ def shock(acceleration: FloatArray) -> FloatArray:
 
 
 def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, signal: FloatArray,
-              longest: float) -> Lag:
-    """How far the clock of one sensor is ahead of a reference's, by knocks that both felt.
+              max_lag: float) -> Lag:
+    """Clock offset of a sensor relative to a reference, from knocks that both measured.
+
+    The lag with the largest correlation is refined below the sampling interval by least squares,
+    which also gives the standard deviation.
 
     Parameters
     ----------
-    t_reference, t : (n,) and (m,) [s]
-        Increasing; each by its own sensor's clock, from the same zero.
-    reference, signal : (n,) and (m,)
-        How much each is shaken (`shock`).
-    longest : float [s]
-        No lag is longer.
+    t_reference : (n,) array, s
+        Increasing times by the clock of the reference.
+    reference : (n,) array
+        Shock of the reference, see `shock`.
+    t : (m,) array, s
+        Increasing times by the clock of the sensor, relative to the same zero.
+    signal : (m,) array
+        Shock of the sensor.
+    max_lag : float, s
+        Maximum size of the offset.
 
     Returns
     -------
     Lag
-        Positive where the sensor stamps the same knock later.
+        Positive if the sensor's timestamps are later.
 
-    Raises ValueError where times and signals do not fit, or do not increase.
+    Raises
+    ------
+    ValueError
+        If times and values have different shapes, or times do not increase.
+
+    References
+    ----------
+    [T10]_ section 6.3 for the correlation of the accelerometers.
     """
     a, b = _series(t_reference, reference, 'reference'), _series(t, signal, 'sensor')
-    a, b = _whole(*a), _whole(*b)
-    apart = _apart(a, b, longest)
+    a, b = _without_cut_knocks(*a), _without_cut_knocks(*b)
+    apart = _separation(a, b, max_lag)
     if apart is not None:
-        return _none(f'the knocks are {apart:.3g} s apart, more than {longest:g} s')
-    a, b = _near(a, b, longest), _near(b, a, longest)
+        return _no_lag(f'the knocks are {apart:.3g} s apart, maximum {max_lag:g} s')
+    a, b = _around_knocks(a, b, max_lag), _around_knocks(b, a, max_lag)
     for name, (_, s) in (('reference', a), ('sensor', b)):
-        if len(s) < 8 or not _loud(s).any():
-            return _none(f'the {name} felt no knock')
-    lag, correlation, reason = _coarse(a, b, longest)
+        if len(s) < 8 or not _is_knock(s).any():
+            return _no_lag(f'the {name} measured no knock')
+    lag, correlation, reason = _coarse(a, b, max_lag)
     if reason:
-        return _none(reason, correlation)
-    # The one with more readings is interpolated.
+        return _no_lag(reason, correlation)
+    # The series with the higher rate is interpolated.
     if _step(*a) <= _step(*b):
         offset, std = _fine(a, b, lag)
     else:
         offset, std = _fine(b, a, -lag)
         offset = -offset
-    if not abs(offset) <= longest:
-        return _none(f'the knocks are {offset:.3f} s apart, more than {longest:g} s', correlation)
+    if not abs(offset) <= max_lag:
+        return _no_lag(f'the knocks are {offset:.3f} s apart, maximum {max_lag:g} s', correlation)
     return Lag(offset, std, correlation, '')
 
 
 def _series(t: FloatArray, s: FloatArray, name: str) -> _Series:
-    """(t, s) as arrays without NaN."""
+    """Arrays (t, s) without NaN."""
     t, s = np.asarray(t, dtype=float), np.asarray(s, dtype=float)
     if t.shape != s.shape or t.ndim != 1:
-        raise ValueError(f'the {name} has times {t.shape} for values {s.shape}')
+        raise ValueError(f'the {name} has times of shape {t.shape} for values of shape {s.shape}')
     good = ~np.isnan(s)
     t, s = t[good], s[good]
     if (np.diff(t) <= 0.0).any():
@@ -118,14 +135,14 @@ def _series(t: FloatArray, s: FloatArray, name: str) -> _Series:
     return t, s
 
 
-def _whole(t: FloatArray, s: FloatArray) -> _Series:
-    """The series without a knock that it begins or ends in."""
+def _without_cut_knocks(t: FloatArray, s: FloatArray) -> _Series:
+    """The series without a knock that is cut off at its beginning or end."""
     if len(s) < 8:
         return t, s
-    loud = _loud(s)
+    loud = _is_knock(s)
     for _ in range(2):
         if loud[t <= t[0] + MARGIN_S].any():
-            # Up to where it has been quiet for as long.
+            # The knock ends where the signal has been quiet for MARGIN_S.
             ends = np.flatnonzero(np.diff(np.append(t[loud], np.inf)) > MARGIN_S)
             keep = t > t[loud][ends[0]]
             t, s, loud = t[keep], s[keep], loud[keep]
@@ -135,87 +152,86 @@ def _whole(t: FloatArray, s: FloatArray) -> _Series:
     return t, s
 
 
-def _apart(a: _Series, b: _Series, longest: float) -> float | None:
-    """[s] between the knocks of two series where all are farther apart than `longest`, or None."""
-    if not (len(a[1]) > 7 and len(b[1]) > 7 and _loud(a[1]).any() and _loud(b[1]).any()):
+def _separation(a: _Series, b: _Series, max_lag: float) -> float | None:
+    """Smallest distance [s] of knocks of two series if it exceeds `max_lag`, else None."""
+    if not (len(a[1]) > 7 and len(b[1]) > 7 and _is_knock(a[1]).any() and _is_knock(b[1]).any()):
         return None
-    s, t = a[0][_loud(a[1])], b[0][_loud(b[1])]
+    s, t = a[0][_is_knock(a[1])], b[0][_is_knock(b[1])]
     after = np.clip(np.searchsorted(t, s), 0, len(t) - 1)
     distance = np.minimum(np.abs(t[after] - s), np.abs(t[np.maximum(after - 1, 0)] - s)).min()
-    return float(distance) if distance > longest + MARGIN_S else None
+    return float(distance) if distance > max_lag + MARGIN_S else None
 
 
-def _near(a: _Series, b: _Series, longest: float) -> _Series:
-    """Series `a` from a while before the other's first knock to a while after its last."""
-    if len(b[1]) < 8 or not _loud(b[1]).any():
+def _around_knocks(a: _Series, b: _Series, max_lag: float) -> _Series:
+    """Part of series `a` around the knocks of `b`."""
+    if len(b[1]) < 8 or not _is_knock(b[1]).any():
         return a
     first, last = _event_times(*b)
-    near = (a[0] >= first - longest - AROUND_S) & (a[0] <= last + longest + AROUND_S)
+    near = (a[0] >= first - max_lag - CONTEXT_S) & (a[0] <= last + max_lag + CONTEXT_S)
     return a[0][near], a[1][near]
 
 
-def _loud(s: FloatArray) -> BoolArray:
-    """(n,) where a signal is above its rest."""
+def _is_knock(s: FloatArray) -> BoolArray:
+    """Whether a signal exceeds its level at rest, (n,)."""
     rest = 1.4826 * np.median(np.abs(s - np.median(s)))
-    loud: BoolArray = s > LOUD * max(rest, 1e-3)
+    loud: BoolArray = s > KNOCK_THRESHOLD * max(rest, 1e-3)
     return loud
 
 
 def _event_times(t: FloatArray, s: FloatArray) -> tuple[float, float]:
-    """(first, last) time of what is loud."""
-    loud = t[_loud(s)]
+    """Times (first, last) of knocks."""
+    loud = t[_is_knock(s)]
     return loud[0], loud[-1]
 
 
 def _step(t: FloatArray, s: FloatArray) -> float:
-    """[s] Sampling interval where it is loud."""
+    """Sampling interval [s] around the knocks."""
     first, last = _event_times(t, s)
     near = (t >= first - MARGIN_S) & (t <= last + MARGIN_S)
     return float(np.median(np.diff(t[near]))) if np.count_nonzero(near) > 2 else float('inf')
 
 
-def _coarse(a: _Series, b: _Series, longest: float) -> tuple[float, float, str]:
-    """(lag, correlation, reason) to a fraction of a sample."""
+def _coarse(a: _Series, b: _Series, max_lag: float) -> tuple[float, float, str]:
+    """Lag to a fraction of a sample, correlation and reason."""
     step = 0.5 * min(_step(*a), _step(*b))
     if not np.isfinite(step):
-        return float('nan'), float('nan'), 'the knock is shorter than a sample'
+        return float('nan'), float('nan'), 'the knock is shorter than the sampling interval'
     firsts, lasts = zip(_event_times(*a), _event_times(*b), strict=True)
-    grid = np.arange(min(firsts) - longest, max(lasts) + longest + step, step)
+    grid = np.arange(min(firsts) - max_lag, max(lasts) + max_lag + step, step)
     u, v = (np.interp(grid, t, s, left=0.0, right=0.0) for t, s in (a, b))
     c = correlate(v, u, method='auto') / np.sqrt((u @ u) * (v @ v))
     lags = step * np.arange(1 - len(u), len(v))
-    # A little more than is allowed: a maximum on the border is none.
-    within = np.abs(lags) <= longest + 4.0 * step
+    # The margin excludes maxima on the border.
+    within = np.abs(lags) <= max_lag + 4.0 * step
     c, lags = c[within], lags[within]
     best = int(c.argmax())
-    if c[best] < ALIKE:
+    if c[best] < MIN_CORRELATION:
         return lags[best], float(c[best]), (
-            f'the two do not feel the same knocks within {longest:g} s '
+            f'the two sensors did not measure the same knocks within {max_lag:g} s '
             f'(correlation {c[best]:.2f})')
-    others = [k for k in find_peaks(c)[0] if abs(k - best) > 2 and c[k] > RIVAL * c[best]]
+    others = [k for k in find_peaks(c)[0] if abs(k - best) > 2 and c[k] > MIN_RIVAL_RATIO * c[best]]
     if others:
         return lags[best], float(c[best]), (
-            f'lags of {lags[best]:.3f} and {lags[others[0]]:.3f} s fit alike: knock once more, '
-            'unevenly')
+            f'lags of {lags[best]:.3f} and {lags[others[0]]:.3f} s fit equally well: knock again, '
+            'unevenly spaced')
     return float(lags[best]), float(c[best]), ''
 
 
 def _fine(a: _Series, b: _Series, lag: float) -> tuple[float, float]:
-    """(offset, std) [s] where series `a`, interpolated, moved and scaled, fits `b` best."""
+    """Offset and standard deviation [s] of the best fit of `a`, interpolated and scaled, to `b`."""
     offset, std = _fitted(a, b, lag, PchipInterpolator(*a, extrapolate=False))
-    # What lies between two readings nobody knows: another curve through them says how much
-    # that matters.
+    # The signal between two readings is unknown; a second interpolation estimates its effect.
     other, _ = _fitted(a, b, lag, CubicSpline(*a, extrapolate=False))
     return offset, float(np.hypot(std, other - offset))
 
 
 def _fitted(a: _Series, b: _Series, lag: float,
             curve: PchipInterpolator | CubicSpline) -> tuple[float, float]:
-    """(offset, std) [s] with `curve` as the interpolated series."""
+    """Offset and standard deviation [s] with `curve` as the interpolated series."""
     t, s = b
     step = max(_step(*a), _step(*b))
     first, last = _event_times(*a)
-    # The same readings throughout: a sum over others with every lag would have steps.
+    # A fixed set of readings, since a set that depends on the lag would make the sum discontinuous.
     near = (t >= first + lag - MARGIN_S) & (t <= last + lag + MARGIN_S)
     near &= (t >= a[0][0] + lag + 2.0 * step) & (t <= a[0][-1] + lag - 2.0 * step)
     t, s = t[near], s[near]
@@ -229,7 +245,7 @@ def _fitted(a: _Series, b: _Series, lag: float,
                             options={'xatol': 1e-6})
     u, slope = curve(t - found.x), curve.derivative()(t - found.x)
     gain, square = (u @ s) / (u @ u), slope @ slope
-    # What is left over is largest on the flanks, where it counts: noise of a size is, and so is
-    # what interpolation leaves out (MacKinnon and White 1985, HC3).
-    left = residual(found.x) / np.maximum(1.0 - slope**2 / square - u**2 / (u @ u), 0.1)
-    return float(found.x), float(np.sqrt(np.sum((slope * left)**2)) / (abs(gain) * square))
+    # The residuals are heteroscedastic: multiplicative noise and interpolation errors are largest
+    # on the flanks, which determine the lag (MacKinnon and White 1985, HC3).
+    residuals = residual(found.x) / np.maximum(1.0 - slope**2 / square - u**2 / (u @ u), 0.1)
+    return float(found.x), float(np.sqrt(np.sum((slope * residuals)**2)) / (abs(gain) * square))

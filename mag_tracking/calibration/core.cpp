@@ -1,4 +1,4 @@
-// What is done for every reading, as a Python module; core.pyi says what the arguments are.
+// Python module of the operations on every reading; the arguments are described in core.pyi.
 
 #include "../python.hpp"
 #include "readings.hpp"
@@ -9,7 +9,7 @@ namespace {
 // Arrays of `Sensor`, `Limits`, `Batch`.
 using Structured = py::array;
 
-// Python may have changed what is used as an index.
+// Python may have changed the values that are used as indices.
 Sensor& checked(Sensor& s) {
     if (s.now < 0 || s.now > 1 || s.n_held < 0 || s.n_held > MAX_HELD + 1 || s.n_steps < 0)
         throw py::value_error("now, n_held or n_steps of a sensor: out of range");
@@ -34,9 +34,10 @@ int calibrate_readings(Structured sensors, Structured limits, Integers rows, Int
                          input_of(fields, "fields", {n, 3}), input_of(own, "own", {n}),
                          covariances.data()};
     Batch& batch = Structs<Batch>(batches).only();
-    if (batch.next < 0) throw py::index_error("next: negative");
+    if (batch.next < 0) throw py::index_error("next: must not be negative");
     for (Size i = batch.next; i < n; ++i) {
-        if (in.rows[i] >= all.size()) throw py::index_error("rows: there is no such sensor");
+        if (in.rows[i] >= all.size())
+            throw py::index_error("rows: out of range, there is no such sensor");
         if (in.rows[i] >= 0) checked(all.data()[in.rows[i]]);
         if (in.own[i]) input_of(covariances, "covariances", {n, 3, 3});
     }
@@ -49,7 +50,7 @@ bool use_reading(Structured sensors, Structured limits, Structured batches, int6
                  Integers out_stamps, Array out_fields, Array out_covariances) {
     Structs<Sensor> all(sensors);
     if (row < 0 || row >= all.size())
-        throw py::index_error("row: there is no such sensor");
+        throw py::index_error("row: out of range, there is no such sensor");
     const Reading reading{stamp, input_of(field, "field", {3}), own,
                           input_of(covariance, "covariance", {3, 3})};
     return use(checked(all.data()[row]), Structs<Limits>(limits).only(), Structs<Batch>(batches).only(), row,
@@ -118,7 +119,7 @@ void add_constants(py::module_& m) {
 #undef CODE
 }
 
-// Structured arrays of Python whose elements are these.
+// Register the element types of the structured arrays.
 void add_types(py::module_& m) {
     PYBIND11_NUMPY_DTYPE(
         Sensor, clock_offset_ns, offset, has_correction, correction, is_ready, centre, mean, slope,
@@ -141,7 +142,7 @@ void add_types(py::module_& m) {
 
 PYBIND11_MODULE(core, m) {
     using namespace mag_tracking;
-    m.doc() = "The calibration of one reading after the other, compiled.";
+    m.doc() = "Calibration of readings one by one, compiled.";
     add_constants(m);
     add_types(m);
     m.def("calibrate_readings", &calibrate_readings, IN(sensors), IN(limits), IN(rows), IN(stamps),
@@ -161,7 +162,7 @@ PYBIND11_MODULE(core, m) {
     m.def("apply_steps", [](Structured sensors, double freeze_std, Array limits) {
         apply_steps(sensor_of(sensors), freeze_std, data_of(limits, "limits", {3}));
     }, IN(sensors), py::arg("freeze_std"), IN(limits));
-    // For one sensor and reading, as the tests have them.
+    // For one sensor and reading; used by tests.
     m.def("note_step", [](Structured sensors, int64_t stamp, Array raw) {
         note_step(sensor_of(sensors), stamp, input_of(raw, "raw", {3}));
     }, IN(sensors), py::arg("stamp"), IN(raw));

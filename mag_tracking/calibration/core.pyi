@@ -1,6 +1,6 @@
-"""The calibration of one reading after the other, compiled: `readings.hpp` has the rules.
+"""Calibration of readings one by one, compiled; the rules are in `readings.hpp`.
 
-A `sensors` is an array of `SENSOR`, of which functions without a row take one of a single element.
+`sensors` is an array of `SENSOR`. Functions without a row take an array of a single element.
 """
 
 from typing import Any
@@ -54,71 +54,220 @@ def calibrate_readings(
         fields: FloatArray, own: IntArray, covariances: FloatArray, batches: StructArray,
         out_rows: IntArray, out_stamps: IntArray, out_fields: FloatArray,
         out_covariances: FloatArray) -> int:
-    """Calibrate a batch of readings, from `next` on, until Python has to do something.
+    """Calibrate a batch of readings from `next` on, until Python is required.
 
     Parameters
     ----------
-    sensors : (n_sensors,) SENSOR
-        Changed.
-    limits : (1,) LIMITS
-    rows, stamps, fields : (n,), (n,) ns, (n, 3) T
-        The readings: their sensors (negative: unknown), timestamps and raw fields.
-    own, covariances : (n,), (n, 3, 3) T^2
-        NONE, VALID or INVALID; read where it is not NONE.
-    batches : (1,) BATCH
-        Changed.
-    out_rows, out_stamps, out_fields, out_covariances
-        The calibrated readings are appended from `n_out` on; IndexError: there is no room.
+    sensors : (n_sensors,) SENSOR array
+        Updated.
+    limits : (1,) LIMITS array
+    rows : (n,) int array
+        Sensors of the readings; negative = unknown.
+    stamps : (n,) int array, ns
+    fields : (n, 3) array, T
+        Raw fields.
+    own : (n,) int array
+        NONE, VALID or INVALID.
+    covariances : (n, 3, 3) array, T²
+        Ignored where `own` is NONE.
+    batches : (1,) BATCH array
+        Updated.
+    out_rows : (m,) int array
+    out_stamps : (m,) int array, ns
+    out_fields : (m, 3) array, T
+    out_covariances : (m, 3, 3) array, T²
+        The calibrated readings are appended from `n_out` on.
 
     Returns
     -------
     int
-        DONE, or the reason of what `row` and `stamp_ns` are about.
+        DONE, or the reason that `row` and `stamp_ns` refer to.
+
+    Raises
+    ------
+    IndexError
+        If an output array is full, or a row is out of range.
     """
 
 def use_reading(
         sensors: StructArray, limits: StructArray, batches: StructArray, row: int, stamp: int,
         field: FloatArray, own: int, covariance: FloatArray, out_rows: IntArray,
         out_stamps: IntArray, out_fields: FloatArray, out_covariances: FloatArray) -> bool:
-    """Calibrate a reading of sensor `row` that has passed; False: a block has to be judged first.
+    """Calibrate a reading that has passed the screening.
 
-    The arguments are as for `calibrate_readings`.
+    Parameters
+    ----------
+    sensors : (n_sensors,) SENSOR array
+        Updated.
+    limits : (1,) LIMITS array
+    batches : (1,) BATCH array
+        Updated.
+    row : int
+        Sensor of the reading.
+    stamp : int, ns
+    field : (3,) array, T
+    own : int
+        NONE, VALID or INVALID.
+    covariance : (3, 3) array, T²
+    out_rows : (m,) int array
+    out_stamps : (m,) int array, ns
+    out_fields : (m, 3) array, T
+    out_covariances : (m, 3, 3) array, T²
+        As for `calibrate_readings`.
+
+    Returns
+    -------
+    bool
+        False if a block has to be evaluated first.
     """
 
 def subtract(sensors: StructArray, time: float, field: FloatArray, out: FloatArray) -> None:
-    """Field without the background at `time` [s]: from `field` (3,) [T] into `out` (3,)."""
+    """Subtract the background from a field.
+
+    Parameters
+    ----------
+    sensors : (1,) SENSOR array
+    time : float, s
+    field : (3,) array, T
+    out : (3,) array, T
+        Overwritten.
+    """
 
 def steps_of(sensors: StructArray, are_corrected: bool) -> FloatArray:
-    """(3,) [T] steps; 0 where they are too fine to be seen, inf where the axis never changed."""
+    """Steps of the axes of a sensor.
+
+    Parameters
+    ----------
+    sensors : (1,) SENSOR array
+    are_corrected : bool
+        Whether the steps are those after the soft-iron correction.
+
+    Returns
+    -------
+    (3,) array, T
+        0 if the steps are too fine to be observed, inf if the axis has never changed.
+    """
 
 def complete_steps(variance: FloatArray, steps: FloatArray) -> None:
-    """`resolution.completed_steps`, in place."""
+    """Complete unknown steps in place; see `resolution.completed_steps`.
+
+    Parameters
+    ----------
+    variance : (3,) array, T²
+    steps : (3,) array, T
+        Updated.
+    """
 
 def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> None:
-    """Add what the steps of a sensor do to its noise.
+    """Add the variance due to the steps of a sensor to its noise.
 
-    `noise` is read, `step_variance` and `noise_std` are written, and into `limits` (3,) [T] how far
-    the mean of a block may be off: `freeze_std` standard deviations.
+    Reads `noise`; writes `step_variance` and `noise_std`.
+
+    Parameters
+    ----------
+    sensors : (1,) SENSOR array
+        Updated.
+    freeze_std : float
+        Number of standard deviations of the limits.
+    limits : (3,) array, T
+        Overwritten: maximum deviation of the mean of a block.
     """
 
 def block_moments(sensors: StructArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-    """Of the complete block: as in `blocks.Block`."""
+    """Fields of `blocks.Block` for the complete block.
+
+    Parameters
+    ----------
+    sensors : (1,) SENSOR array
+
+    Returns
+    -------
+    time : float, s
+    mean : (3,) array, T
+    scatter : (3, 3) array, T²
+    n : (3,) array
+    """
 
 def line_through(time: FloatArray, n: FloatArray, y: FloatArray, centre: float
                  ) -> tuple[FloatArray, FloatArray]:
-    """Mean (3,) and slope (3,) at `centre`: `blocks.line_through`."""
+    """Weighted least-squares line of each axis; see `blocks.line_through`.
+
+    Parameters
+    ----------
+    time : (k,) array, s
+    n : (k, 3) array
+    y : (k, 3) array, T
+    centre : float, s
+
+    Returns
+    -------
+    mean : (3,) array, T
+    slope : (3,) array, T/s
+    """
 
 def pooled_covariance(scatter: FloatArray, n: FloatArray) -> FloatArray | None:
-    """`blocks.pooled_covariance`, of `scatter` (k, 3, 3) and `n` (k, 3)."""
+    """Pooled scatter within blocks; see `blocks.pooled_covariance`.
+
+    Parameters
+    ----------
+    scatter : (k, 3, 3) array, T²
+    n : (k, 3) array
+
+    Returns
+    -------
+    (3, 3) array or None, T²
+    """
 
 def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
-    """Update the steps of a sensor by a raw reading (3,) [T], and since when each axis rests."""
+    """Update the steps of a sensor and the time since which each axis is constant.
+
+    Parameters
+    ----------
+    sensors : (1,) SENSOR array
+        Updated.
+    stamp : int, ns
+    raw : (3,) array, T
+    """
 
 def is_stuck(sensors: StructArray, field: FloatArray) -> bool:
-    """Whether a reading (3,) [T] repeats the one before for longer than chance allows."""
+    """Whether a reading repeats the previous one for longer than chance can explain.
+
+    Parameters
+    ----------
+    sensors : (1,) SENSOR array
+        Updated.
+    field : (3,) array, T
+
+    Returns
+    -------
+    bool
+    """
 
 def screen_spike(sensors: StructArray, threshold: float, stamp: int, field: FloatArray) -> int:
-    """PASSES, HELD, SPIKE or RELEASED, for a reading without a covariance of its own."""
+    """Classify a reading without its own covariance.
+
+    Parameters
+    ----------
+    sensors : (1,) SENSOR array
+        Updated.
+    threshold : float
+        Minimum size of a spike in standard deviations of the noise.
+    stamp : int, ns
+    field : (3,) array, T
+
+    Returns
+    -------
+    int
+        PASSES, HELD, SPIKE or RELEASED.
+    """
 
 def collect(sensors: StructArray, time: float, field: FloatArray) -> None:
-    """Begin a block where the reading (3,) [T] is the first after the present one, and add it."""
+    """Add a reading to the current block, after starting a new one if it is due.
+
+    Parameters
+    ----------
+    sensors : (1,) SENSOR array
+        Updated.
+    time : float, s
+    field : (3,) array, T
+    """

@@ -1,8 +1,4 @@
-"""Fewer samples of a fast sensor, without what would be folded into them.
-
-Source: T10 section 6.3 (low-pass filter before 100 Hz becomes 12.5 Hz); the filter is
-`scipy.signal.firwin`'s, of linear phase, and its delay is taken from the stamps.
-"""
+"""Decimation of a fast sensor with an anti-aliasing filter."""
 
 from collections import deque
 
@@ -11,19 +7,31 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 
 ATTENUATION_DB = 60.0
-"""Of what would be folded into the pass band."""
+"""Attenuation of the frequencies that alias into the pass band."""
 PASS_SHARE = 0.5
-"""Of half the new rate; from there to its mirror image the filter falls. What is folded falls above
-it. A wider share would take longer: the filter's delay is now about four of the new intervals."""
-IRREGULAR = 0.5
-"""An interval that differs from the usual one by more than this share of it is a gap."""
+"""Pass band relative to half the output rate. The filter falls from there to the mirrored
+frequency, so that only frequencies above the pass band alias. A wider pass band would increase the
+delay, which is about four output intervals."""
+GAP_TOLERANCE = 0.5
+"""Relative deviation of an interval from the median interval beyond which there is a gap."""
 RATE_SAMPLES = 32
-"""Samples that the rate is measured by; they are not lost."""
+"""Number of samples for the measurement of the rate; they are not lost."""
 
 
 def lowpass(factor: int) -> FloatArray:
-    """(n,) taps, n odd, that sum to one: what `factor` times fewer samples need."""
-    # It takes a third of a second to import, and most sensors need no filter.
+    """Low-pass filter for decimation.
+
+    Parameters
+    ----------
+    factor : int
+        Ratio of input to output rate.
+
+    Returns
+    -------
+    (n,) array
+        Taps that sum to one; n is odd.
+    """
+    # The import takes 0.3 s, and most sensors need no filter.
     from scipy.signal import firwin, kaiserord
 
     width = 2.0 * (1.0 - PASS_SHARE) / factor
@@ -33,29 +41,52 @@ def lowpass(factor: int) -> FloatArray:
 
 
 class Decimator:
-    """Samples of one sensor in, fewer out; memory of one filter length.
+    """Decimates the samples of one sensor; stores one filter length.
 
-    It measures the rate by the first samples, and begins anew after a gap or a step
-    of the clock: a filter that runs across one would invent a field.
+    The filter is that of `scipy.signal.firwin`, of linear phase; its delay is subtracted from the
+    timestamps. The rate is measured from the first samples. After a gap or a step of the clock the
+    filter restarts, because filtering across it would produce an invalid field.
+
+    Parameters
+    ----------
+    rate : float, Hz
+        Requested output rate; the nearest integer fraction of the sensor's rate is used.
+
+    Attributes
+    ----------
+    factor : int or None
+        Ratio of input to output rate; None before the rate is known.
+
+    References
+    ----------
+    [T10]_ section 6.3: a low-pass filter before the reduction of 100 Hz to 12.5 Hz.
     """
 
     def __init__(self, rate: float) -> None:
-        """`rate` [Hz] is what is wanted; the nearest whole share of the sensor's is made."""
         self._rate = rate
         self.factor: int | None = None
         self._taps: FloatArray | None = None
         self.reset()
 
     def reset(self) -> None:
-        """Forget the samples; the rate stays."""
+        """Discard the samples; the measured rate remains."""
         self._window: deque[tuple[int, FloatArray]] = deque(
             maxlen=None if self._taps is None else len(self._taps))
         self._until_next = 0
 
     def feed(self, stamp_ns: int, field: FloatArray) -> list[tuple[int, FloatArray]]:
-        """A sample gives [(stamp_ns, field (3,))], of the middle of the filter; mostly [].
+        """Add a sample and return the outputs that it completes, usually none.
 
-        NaN where an axis is missing anywhere under the filter.
+        Parameters
+        ----------
+        stamp_ns : int, ns
+        field : (3,) array, T
+
+        Returns
+        -------
+        list of (int, (3,) array)
+            Timestamp [ns] of the centre of the filter and field [T]; NaN if an axis is missing in
+            any sample of the filter.
         """
         if self._window and self._is_gap(stamp_ns):
             self.reset()
@@ -69,23 +100,33 @@ class Decimator:
 
     @property
     def n_waiting(self) -> int:
-        """How many samples it may give at once: those that wait until the rate is known."""
+        """Number of samples that wait for the rate and may be output at once."""
         return len(self._window) if self.factor is None else 0
 
     def noise_gain(self) -> float:
-        """By what white noise's variance is multiplied; ValueError before the rate is known."""
+        """Ratio of output to input variance for white noise.
+
+        Returns
+        -------
+        float
+
+        Raises
+        ------
+        ValueError
+            If the rate is not known yet.
+        """
         if self.factor is None:
-            raise ValueError('the rate of the sensor is not known yet')
+            raise ValueError('the sampling rate of the sensor is not known yet')
         return 1.0 if self._taps is None else float(self._taps @ self._taps)
 
     def _is_gap(self, stamp_ns: int) -> bool:
-        """Whether the regular row of samples is broken."""
+        """Whether the interval to a sample is not the regular one."""
         interval = stamp_ns - self._window[-1][0]
         return interval <= 0 or (self.factor is not None and abs(
-            interval - self._interval) > IRREGULAR * self._interval)
+            interval - self._interval) > GAP_TOLERANCE * self._interval)
 
     def _measure(self) -> list[tuple[int, FloatArray]]:
-        """The factor, once there are enough samples; those go through then."""
+        """Determine the factor once there are enough samples, which are then output."""
         if len(self._window) < RATE_SAMPLES:
             return []
         stamps = np.array([s for s, _ in self._window], dtype=np.int64)
@@ -97,13 +138,13 @@ class Decimator:
         return [out for stamp, field in waiting for out in self.feed(stamp, field)]
 
     def _step(self, factor: int, taps: FloatArray) -> list[tuple[int, FloatArray]]:
-        """The filter's output where one is due."""
+        """Output of the filter if one is due."""
         if len(self._window) < len(taps):
             return []
         if self._until_next:
             self._until_next -= 1
             return []
         self._until_next = factor - 1
-        # The filter is symmetric: its output is of the middle sample.
+        # The filter is symmetric, so its output belongs to the centre sample.
         middle = self._window[len(taps) // 2][0]
         return [(middle, taps @ np.array([f for _, f in self._window]))]

@@ -1,4 +1,4 @@
-"""Directions: how evenly a sensor was turned through them, and what each reading weighs then."""
+"""Directions of the readings of a tumbled sensor: their coverage and weights."""
 
 from itertools import product
 
@@ -8,19 +8,19 @@ from scipy.spatial import cKDTree
 from mag_tracking.arrays import FloatArray, IntArray
 
 EMPTY_OCTANT = 0.125
-"""An octant with less weight than this share of the mean counts as empty."""
+"""Maximum weight of an empty octant relative to the mean weight."""
 
 N_CELLS = 500
-"""Directions are counted in so many equal cells, about 10 degrees across ..."""
+"""Number of equal cells of the directions, about 10 degrees wide."""
 
-CROWDED = 3.0
-"""... and readings in a cell with so many times the median number share the weight of that many."""
+MAX_CELL_WEIGHT = 3.0
+"""Maximum weight of the readings of a cell, in multiples of the median number per cell."""
 
 _OCTANTS = np.array(list(product([1.0, -1.0], repeat=3)))
 
 
 def _cells() -> cKDTree:
-    """Tree of N_CELLS unit vectors, evenly spread: a Fibonacci spiral."""
+    """Tree of N_CELLS evenly spread unit vectors (a Fibonacci spiral)."""
     i = np.arange(N_CELLS) + 0.5
     z, angle = 1.0 - 2.0 * i / N_CELLS, np.pi * (1.0 + np.sqrt(5.0)) * i
     rho = np.sqrt(1.0 - z * z)
@@ -31,26 +31,61 @@ _CELLS = _cells()
 
 
 def _octant_name(signs: FloatArray) -> str:
-    """Such as '+x-y+z'."""
+    """Name of an octant, e.g. '+x-y+z'."""
     return ''.join(('-' if sign < 0.0 else '+') + axis
                    for sign, axis in zip(signs, 'xyz', strict=True))
 
 
-def counted(q: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
-    """Unit vectors (n, 3) of `q`, their cells (n,), and how many there are in each cell."""
+def binned(q: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
+    """Assign directions to cells.
+
+    Parameters
+    ----------
+    q : (n, 3) array
+
+    Returns
+    -------
+    u : (n, 3) array
+        Unit vectors.
+    cell : (n,) int array
+    count : (N_CELLS,) int array
+        Number of directions in each cell.
+    """
     u = q / np.maximum(np.linalg.norm(q, axis=1), 1e-12)[:, None]
     cell = np.asarray(_CELLS.query(u)[1], dtype=np.int64)
     return u, cell, np.asarray(np.bincount(cell, minlength=N_CELLS), dtype=np.int64)
 
 
 def even_weights(q: FloatArray) -> FloatArray:
-    """(n,) 0 to 1 of `q` (n, 3): a crowded cell weighs at most CROWDED times the median one."""
-    _, cell, n = counted(q)
-    return np.minimum(1.0, CROWDED * np.median(n[n > 0]) / n[cell])
+    """Weights that limit the influence of crowded directions.
+
+    Parameters
+    ----------
+    q : (n, 3) array
+
+    Returns
+    -------
+    (n,) array
+        0 to 1. The total weight of a cell is at most `MAX_CELL_WEIGHT` times the median number
+        per cell.
+    """
+    _, cell, n = binned(q)
+    return np.minimum(1.0, MAX_CELL_WEIGHT * np.median(n[n > 0]) / n[cell])
 
 
 def coverage(u: FloatArray, w: FloatArray) -> float:
-    """Smallest eigenvalue of the weighted mean of f f^T, f the harmonics to degree two at `u`."""
+    """Smallest eigenvalue of the weighted mean of f fᵀ, with the harmonics f to degree two.
+
+    Parameters
+    ----------
+    u : (n, 3) array, unit vectors
+    w : (n,) array
+        Weights.
+
+    Returns
+    -------
+    float
+    """
     x, y, z = u.T
     s = np.sqrt(15.0)
     f = np.column_stack([np.ones(len(u)), np.sqrt(3.0) * u, s * x * y, s * y * z, s * x * z,
@@ -60,6 +95,18 @@ def coverage(u: FloatArray, w: FloatArray) -> float:
 
 
 def empty_octants(u: FloatArray, w: FloatArray) -> tuple[str, ...]:
-    """Names of the octants with hardly a reading among directions `u` (n, 3) of weights `w`."""
+    """Find the octants that contain hardly any reading.
+
+    Parameters
+    ----------
+    u : (n, 3) array, unit vectors
+    w : (n,) array
+        Weights.
+
+    Returns
+    -------
+    tuple of str
+        Names, e.g. '+x-y+z'.
+    """
     share = 8.0 * np.bincount(np.argmax(u @ _OCTANTS.T, axis=1), w, 8) / w.sum()
     return tuple(_octant_name(signs) for signs in _OCTANTS[share < EMPTY_OCTANT])

@@ -1,41 +1,76 @@
-"""When the background of a sensor was doubtful, by the timestamps of its readings."""
+"""Intervals in which the background of a sensor was doubtful, by the timestamps of its readings."""
 
 from collections.abc import Mapping
 from typing import TypeAlias
 
 DoubtfulTimes: TypeAlias = tuple[tuple[int, int | None], ...]
-"""((begin, end) [ns], ...), oldest first, without the ends; an end of None is not known yet."""
+"""((begin, end) [ns], ...), oldest first, ends excluded; an end of None is not known yet."""
 
-MOST = 16
-"""The latest stretches are kept."""
+MAX_INTERVALS = 16
+"""Maximum number of intervals; the latest ones are kept."""
 
 
-def noted(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool, most: int = MOST
-          ) -> DoubtfulTimes:
-    """The `times`, and from `stamp_ns` on as `is_doubtful` says; the latest `most` stretches."""
+def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
+            max_intervals: int = MAX_INTERVALS) -> DoubtfulTimes:
+    """Record the state of the background at a timestamp.
+
+    Parameters
+    ----------
+    times : DoubtfulTimes
+    stamp_ns : int, ns
+        Start of the state.
+    is_doubtful : bool
+    max_intervals : int
+        Maximum number of intervals; the latest ones are kept.
+
+    Returns
+    -------
+    DoubtfulTimes
+    """
     is_open = bool(times) and times[-1][1] is None
     if is_doubtful and not is_open:
-        return (*times, (stamp_ns, None))[-most:]
+        return (*times, (stamp_ns, None))[-max_intervals:]
     if is_open and not is_doubtful:
         return (*times[:-1], (times[-1][0], stamp_ns))
     return times
 
 
-def doubted_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
-    """The `times`, with one open stretch from `since_ns` on in place of those after it."""
+def doubtful_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
+    """Replace all intervals after a time by one open interval.
+
+    Parameters
+    ----------
+    times : DoubtfulTimes
+    since_ns : int, ns
+        Start of the open interval.
+
+    Returns
+    -------
+    DoubtfulTimes
+    """
     earlier = tuple((begin, end) for begin, end in times if begin < since_ns)
     if earlier and (earlier[-1][1] is None or earlier[-1][1] >= since_ns):
         return (*earlier[:-1], (earlier[-1][0], None))
-    return (*earlier, (since_ns, None))[-MOST:]
+    return (*earlier, (since_ns, None))[-MAX_INTERVALS:]
 
 
 def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTimes]
            ) -> dict[str, DoubtfulTimes]:
-    """{sensor: all its stretches}; `latest` has the most recent ones.
+    """Merge two records of the same sensors.
 
-    A stretch in `latest` replaces an earlier one that begins at the same time or during it. If the
-    end of an earlier stretch is missing, it ends where the next begins. If `latest` has no stretch
-    of a sensor, its background was replaced, and an open stretch is dropped.
+    An interval in `latest` replaces an earlier one that begins at the same time or during it. If
+    the end of an earlier interval is missing, it ends where the next begins. If `latest` has no
+    interval of a sensor, its background was replaced, and an open interval is removed.
+
+    Parameters
+    ----------
+    earlier : dict of str to DoubtfulTimes
+    latest : dict of str to DoubtfulTimes
+        The most recent intervals of each sensor.
+
+    Returns
+    -------
+    dict of str to DoubtfulTimes
     """
     out = dict(earlier)
     for name, times in latest.items():
@@ -48,15 +83,35 @@ def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTi
             segments.append((begin, end))
         if segments and segments[-1][1] is None and not times:
             segments.pop()
-        out[name] = tuple(segments[-MOST:])
+        out[name] = tuple(segments[-MAX_INTERVALS:])
     return out
 
 
 def shifted(times: DoubtfulTimes, ns: int) -> DoubtfulTimes:
-    """The `times` by a clock that is `ns` [ns] ahead."""
+    """Shift intervals by a clock offset.
+
+    Parameters
+    ----------
+    times : DoubtfulTimes
+    ns : int, ns
+
+    Returns
+    -------
+    DoubtfulTimes
+    """
     return tuple((begin + ns, None if end is None else end + ns) for begin, end in times)
 
 
 def are_doubtful(times: DoubtfulTimes, stamp_ns: int) -> bool:
-    """Whether the background was doubtful at `stamp_ns`."""
+    """Whether the background was doubtful at a timestamp.
+
+    Parameters
+    ----------
+    times : DoubtfulTimes
+    stamp_ns : int, ns
+
+    Returns
+    -------
+    bool
+    """
     return any(begin <= stamp_ns and (end is None or stamp_ns < end) for begin, end in times)

@@ -1,4 +1,4 @@
-"""How a background drifts, and what drifts faster."""
+"""Drift of a background, and detection of faster changes."""
 
 from dataclasses import dataclass
 
@@ -7,21 +7,22 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.blocks import Block, Blocks
 
-DRIFT = 3e-9
-"""[T/s] Usual drift of a background."""
+TYPICAL_DRIFT = 3e-9
+"""[T/s] Typical drift of a background."""
 
-STEEP = 1e-8
-"""[T/s] A sensor that is warming drifts so. What drifts faster may be a target that comes near."""
+STEEP_DRIFT = 1e-8
+"""[T/s] Maximum drift of a background, that of a sensor that is warming up. A faster change may be
+an approaching target."""
 
-FORGOTTEN_S = 600.0
-"""[s] A level that was the background so long ago is no longer remembered."""
+MAX_AGE_S = 600.0
+"""[s] Maximum age of a former level."""
 
 MAX_DRIFT = 4.0
-"""By at most so many of the limits of a block such a level may have drifted meanwhile: with a wider
-tolerance any vehicle that halts would seem to be it."""
+"""Maximum drift of a former level, in block limits. With a wider tolerance, any vehicle that stops
+would match it."""
 
-SIGNIFICANT = 4.0
-"""Standard deviations by which a drift is faster."""
+MIN_SLOPE_STDS = 4.0
+"""Number of standard deviations by which a drift must exceed the maximum."""
 
 
 @dataclass(frozen=True)
@@ -29,32 +30,49 @@ class FormerLevel:
     """The level that was the background before the present one."""
 
     until: float
-    """[s]"""
+    """[s] End of the level."""
     level: FloatArray
     """(3,) [T]"""
     seen_s: float
-    """[s] For how long it was seen."""
+    """[s] Duration for which it was observed."""
 
     def is_at(self, block: Block, limits: FloatArray) -> bool:
-        """Whether a block has this level, with `limits` (3,) [T] for its mean."""
+        """Whether a block is at this level.
+
+        Parameters
+        ----------
+        block : Block
+        limits : (3,) array, T
+            Tolerance of the mean of a block.
+
+        Returns
+        -------
+        bool
+        """
         since = block.time - self.until
-        tolerance = limits + np.minimum(DRIFT * since, MAX_DRIFT * limits)
-        # A comparison with NaN is false: an axis that is not reported differs from nothing.
+        tolerance = limits + np.minimum(TYPICAL_DRIFT * since, MAX_DRIFT * limits)
+        # A comparison with NaN is false: an axis that is not reported does not differ.
         is_off = bool((np.abs(block.mean - self.level) > tolerance).any())
-        return since <= FORGOTTEN_S and not is_off
+        return since <= MAX_AGE_S and not is_off
 
 
 def is_steep(blocks: Blocks, slope: FloatArray, variance: FloatArray) -> bool:
-    """Whether a line through blocks is steeper than a background drifts, on any axis.
+    """Whether a line through blocks is steeper than the drift of a background, on any axis.
 
     Parameters
     ----------
     blocks : Blocks
-    slope, variance : (3,) array, T/s and T^2
-        Of the line, and of one reading; NaN = axis not reported.
+    slope : (3,) array, T/s
+        Slope of the line; NaN = axis not reported.
+    variance : (3,) array, T²
+        Variance of one reading; NaN = axis not reported.
+
+    Returns
+    -------
+    bool
     """
     since = blocks.time - blocks.time.mean()
     spread = (blocks.n * np.square(since)[:, None]).sum(axis=0)
     std = np.sqrt(variance / np.where(spread > 0.0, spread, np.nan))
     # A comparison with NaN is false: an axis that is not reported has no slope.
-    return bool((np.abs(slope) > STEEP + SIGNIFICANT * std).any())
+    return bool((np.abs(slope) > STEEP_DRIFT + MIN_SLOPE_STDS * std).any())

@@ -1,8 +1,4 @@
-"""The ellipsoid through the readings of a tumbled sensor, by robust geometric least squares.
-
-Source: Kok and Schön, Magnetometer calibration using inertial sensors (2016), section V.A; the
-weights by direction and the robust loss are this package's own.
-"""
+"""Robust geometric least-squares fit of an ellipsoid to the readings of a tumbled sensor."""
 
 from typing import TypedDict
 
@@ -10,51 +6,72 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.directions import counted, coverage, empty_octants, even_weights
+from mag_tracking.calibration.directions import binned, coverage, empty_octants, even_weights
 from mag_tracking.calibration.quadric import OUTLIER, robust_std
 
-SOFT = 2.0
-"""[std] Where the loss turns from square to linear; costs Gaussian noise little precision."""
+LOSS_SCALE = 2.0
+"""[std] Residual at which the loss changes from quadratic to linear; the loss of precision for
+Gaussian noise is small."""
 
 N_BLOCKS = 40
-"""Stretches of time that are left out in turn for the covariance; each must be long against the
-time over which residuals are correlated."""
+"""Number of intervals of the block jackknife for the covariance. Each must be long compared with
+the correlation time of the residuals."""
 
 _UPPER = np.triu_indices(3)
 _ROWS, _COLUMNS = _UPPER
 
 BASIS = np.zeros((6, 3, 3))
-"""(6, 3, 3) The symmetric matrices that `correction` is a sum of, one for each of its entries."""
+"""(6, 3, 3) Symmetric basis matrices of `correction`, one for each of its entries."""
 
 BASIS[range(6), _ROWS, _COLUMNS] = BASIS[range(6), _COLUMNS, _ROWS] = 1.0
 
 
 class Quality(TypedDict):
-    """How well the readings tell the ellipsoid."""
+    """Quality of a fitted ellipsoid."""
 
     solved: bool
     """Whether the least squares converged."""
     directions: int
-    """Cells with readings."""
+    """Number of cells with readings."""
     coverage: float
-    """As in `EllipsoidFit`."""
+    """See `EllipsoidFit`."""
     scatter: float
-    """About the ellipsoid, over its radius, without outliers."""
+    """Scatter about the ellipsoid relative to its radius, without outliers."""
     n_outliers: int
     empty: tuple[str, ...]
-    """Octants with hardly a reading."""
+    """Octants with hardly any reading."""
 
 
 def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
         FloatArray, FloatArray, FloatArray, Quality]:
-    """Offset (3,), correction (3, 3), covariance (9, 9) and quality of a fit of |C (z - o)| = 1.
+    """Fit the ellipsoid |C (z - o)| = 1 to normalised readings.
 
-    `z` (n, 3) are normalised readings; `o` and `C` are where the fit begins.
+    Parameters
+    ----------
+    z : (n, 3) array
+        Normalised readings.
+    o : (3,) array
+        Initial offset.
+    C : (3, 3) array
+        Initial correction.
+
+    Returns
+    -------
+    offset : (3,) array
+    correction : (3, 3) array
+    covariance : (9, 9) array
+        Of the offset and the six entries of the correction.
+    quality : Quality
+
+    References
+    ----------
+    [KokSchon16]_ section V.A. The weights by direction and the robust loss are additions of this
+    package.
     """
     theta: FloatArray = np.concatenate([o, C[_UPPER]])
     for _ in range(2):
         w = even_weights(_model(theta, z)[0])
-        scale = SOFT * robust_std(_model(theta, z)[1], w)
+        scale = LOSS_SCALE * robust_std(_model(theta, z)[1], w)
         fit = least_squares(  # type: ignore[operator]  # mypy takes the stubs' module of that name
             lambda p, s=scale: _model(p, z)[1] / s, theta,
             jac=lambda p, s=scale: _model(p, z)[2] / s,
@@ -62,7 +79,7 @@ def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
         theta = fit.x
     q, d, J = _model(theta, z)
     fine = np.abs(d) <= OUTLIER * robust_std(d, w)
-    u, _, n = counted(q[fine])
+    u, _, n = binned(q[fine])
     quality: Quality = {
         'solved': fit.status > 0, 'directions': int((n > 0).sum()),
         'coverage': coverage(u, w[fine]),
@@ -73,12 +90,12 @@ def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
 
 
 def _symmetric(theta: FloatArray) -> FloatArray:
-    """(3, 3) correction from the parameters (9,)."""
+    """Correction (3, 3) from the parameters (9,)."""
     return np.asarray(np.tensordot(theta[3:], BASIS, 1), dtype=np.float64)
 
 
 def _model(theta: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Corrected readings (n, 3), their sizes less one (n,), and its Jacobian (n, 9)."""
+    """Corrected readings (n, 3), their sizes minus one (n,), and its Jacobian (n, 9)."""
     C = _symmetric(theta)
     y = z - theta[:3]
     q = y @ C
@@ -88,15 +105,16 @@ def _model(theta: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, Fl
 
 
 def _loss(square: FloatArray, w: FloatArray) -> FloatArray:
-    """Weighted soft L1 and its two derivatives, as scipy wants them."""
+    """Weighted soft L1 and its two derivatives, in scipy's format."""
     root = np.sqrt(1.0 + square)
     return w * np.stack([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3])
 
 
 def _covariance(f: FloatArray, J: FloatArray, w: FloatArray) -> FloatArray:
-    """(9, 9) by leaving out stretches of time in turn, one Newton step each; inf if one is vital.
+    """Covariance (9, 9) by a block jackknife in time, one Newton step per block.
 
-    Residuals of a real sensor are correlated in time; what their number promises is not true.
+    The residuals of a real sensor are correlated in time, so their number overstates the
+    information. Infinite if a block is indispensable.
     """
     n_blocks = min(N_BLOCKS, len(f))
     starts = np.arange(n_blocks) * len(f) // n_blocks

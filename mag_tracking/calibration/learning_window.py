@@ -1,4 +1,4 @@
-"""Blocks of a sensor before its background is known."""
+"""Blocks of a sensor whose background is not known yet."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -7,32 +7,50 @@ from mag_tracking.calibration.blocks import Block
 
 
 class LearningWindow:
-    """Collects blocks until a quiet stretch of them is long enough."""
+    """Collects blocks until there is a quiet interval of sufficient length.
 
-    def __init__(self, learn: float, length: float, most: int) -> None:
-        """A stretch of `learn` [s], in blocks of `length` [s], of which `most` are kept."""
-        # From centre to centre; the blocks of a slow sensor may be longer than `length`.
-        self._enough = learn - 1.5 * length
-        self._rested: deque[Block] = deque(maxlen=most)
-        self._moved: deque[Block] = deque()
+    Parameters
+    ----------
+    learn : float, s
+        Required length of a quiet interval.
+    length : float, s
+        Length of a block.
+    max_blocks : int
+        Maximum number of constant blocks that are kept.
+    """
+
+    def __init__(self, learn: float, length: float, max_blocks: int) -> None:
+        # Measured between block centres; the blocks of a slow sensor may be longer than `length`.
+        self._min_duration = learn - 1.5 * length
+        self._constant: deque[Block] = deque(maxlen=max_blocks)
+        self._changing: deque[Block] = deque()
 
     def clear(self) -> None:
-        """Begin again."""
-        self._rested.clear()
-        self._moved.clear()
+        """Discard all blocks."""
+        self._constant.clear()
+        self._changing.clear()
 
     def segments(self, block: Block, is_stuck: bool) -> Iterator[deque[Block]]:
-        """The stretches that are long enough with the next block, the best one first.
+        """Add a block and yield the intervals that are long enough, the best one first.
 
-        `is_stuck` says whether no reading of it differs from another.
+        Parameters
+        ----------
+        block : Block
+        is_stuck : bool
+            Whether all readings of the block are equal.
+
+        Yields
+        ------
+        deque of Block
         """
-        self._moved.append(block)
+        self._changing.append(block)
         if is_stuck:
-            # Without a change nothing is known of the steps. The first one comes with a target.
-            self._rested.append(block)
-        elif self._rested and self._rested[-1].time - self._rested[0].time >= self._enough:
-            yield self._rested
-        while len(self._moved) > 3 and block.time - self._moved[1].time >= self._enough:
-            self._moved.popleft()
-        if len(self._moved) >= 3 and block.time - self._moved[0].time >= self._enough:
-            yield self._moved
+            # The steps are unknown until the first change, which may be due to a target.
+            self._constant.append(block)
+        elif self._constant \
+                and self._constant[-1].time - self._constant[0].time >= self._min_duration:
+            yield self._constant
+        while len(self._changing) > 3 and block.time - self._changing[1].time >= self._min_duration:
+            self._changing.popleft()
+        if len(self._changing) >= 3 and block.time - self._changing[0].time >= self._min_duration:
+            yield self._changing

@@ -1,9 +1,10 @@
-"""Whether a vehicle has come or left where the field has changed for good, by the arrow of time.
+"""Classification of a lasting level change as the arrival or departure of a vehicle.
 
-A vehicle comes from afar, where its field grows with the cube of its distance, and stops as slowly
-as it brakes. One that stood there starts slowly, and its field fades with the cube of its distance.
-So a change is small for longer at its far end than at its near one; and where it is small it grows
-at the far end ever faster, at the near one ever more slowly. The test is this package's own.
+A vehicle approaches from far away, where its field grows with the inverse cube of its distance, and
+brakes to a stop. A departing vehicle starts slowly, and its field decays with the inverse cube of
+its distance. A change is therefore small for longer at its far end than at its near end, and its
+growth accelerates at the far end and decelerates at the near end. The test is an addition of this
+package.
 """
 
 from collections.abc import Callable
@@ -16,36 +17,37 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.blocks import Blocks
 from mag_tracking.calibration.growth import growth_of
 
-SMALL = 0.3
-"""A change is small at its beginning, and at its end, up to this share of its size."""
+MAX_SMALL_SHARE = 0.3
+"""Maximum size of the evaluated parts at the beginning and end of a change, relative to its
+size."""
 
-FELT = 3.0
-"""Standard deviations of the mean of a block, on each axis: so much is felt of a change."""
+DETECTION_STDS = 3.0
+"""Detection limit of a change in standard deviations of the mean of a block, per axis."""
 
-DECIDED = 0.8
-"""Binary logarithm of both ratios together from which on it is decided: it is 0 where both ends are
-alike."""
+MIN_ASYMMETRY = 0.8
+"""Minimum sum of the binary logarithms of both ratios for a decision; it is 0 for equal ends."""
 
 MIN_GROWTH = 3.5
-"""Both ends can be seen of a change that is small up to so many times what is felt."""
+"""Minimum ratio of the small part of a change to the detection limit."""
 
-STALLS = 0.5
-"""The growth stalls where one quarter of it takes this share of its time, and a block, at least. By
-theory 0.3 to 0.54, where the size grows to 4 to 300 times as much, half of it within few blocks."""
+MAX_QUARTER_SHARE = 0.5
+"""Maximum share of a quarter, less one block, of the total growth time; a longer quarter is a
+stall. The theoretical share is 0.3 to 0.54 for growth by a factor of 4 to 300, half of it within
+few blocks."""
 
-SLOW_START = 0.9
-"""At the near end the first half of the growth takes less than this share of the second one. By
-theory 0.7 to 0.24, at the far end 1.3 to 2.6."""
+MAX_START_RATIO = 0.9
+"""Maximum ratio of the first to the second half of the growth time at the near end. The theoretical
+ratio is 0.7 to 0.24 at the near end and 1.3 to 2.6 at the far end."""
 
 MIN_BLOCKS = 2.0
-"""The far end takes so many blocks at least: what jumps neither comes nor leaves."""
+"""Minimum duration of the far end in blocks; a step is neither an arrival nor a departure."""
 
 CLEAR_SIZE = 60.0
-"""In standard deviations of one reading: a change of this size is judged alone, a smaller one also
-by a larger one elsewhere."""
+"""Minimum size of a clear change in standard deviations of one reading. A clear change is evaluated
+alone; a smaller one also by a larger one at another sensor."""
 
-TOGETHER_S = 3.0
-"""[s] Sensors whose new levels begin within this time are changed by the same thing."""
+MAX_TIME_DIFFERENCE_S = 3.0
+"""[s] Maximum time between the new levels of sensors that are changed by the same target."""
 
 
 @dataclass(frozen=True)
@@ -53,86 +55,87 @@ class LevelChange:
     """A change from one steady level to another."""
 
     since: float
-    """[s] When the later level began."""
+    """[s] Start of the later level."""
     size: float
-    """Size of the change, in standard deviations of one reading."""
+    """Size of the change in standard deviations of one reading."""
     has_departed: bool | None
-    """Whether a vehicle that made the earlier level has left; False: one that makes the later level
-    has come; None: unknown."""
+    """Whether a vehicle that caused the earlier level has departed. False: one that causes the
+    later level has arrived. None: unknown."""
 
 
-Judge: TypeAlias = Callable[[LevelChange], bool | None]
-"""Takes the `LevelChange` of a sensor; whether a vehicle has left, as `has_departed` there."""
+ChangeEvaluator: TypeAlias = Callable[[LevelChange], bool | None]
+"""Takes the `LevelChange` of a sensor; returns whether a vehicle has departed, as
+`LevelChange.has_departed`."""
 
 
 def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: FloatArray,
                  origin: float) -> LevelChange:
-    """Judge a change to a steady level.
+    """Evaluate a change to a steady level.
 
     Parameters
     ----------
     blocks : Blocks
-        From the earlier level on, in their order.
+        From the earlier level on, in order of time.
     n_steady : int
-        So many of the last ones are of the later level.
+        Number of blocks at the end that are of the later level.
     before : (k, 3) array, T
-        Earlier level at their times; NaN = axis not reported.
+        Earlier level at the times of the blocks; NaN = axis not reported.
     noise_std : (3,) array, T
-        Of one reading.
-    origin : float [s]
-        Of the times of the blocks, on the clock of all sensors.
+        Standard deviation of one reading.
+    origin : float, s
+        Time zero of the blocks, by the clock of all sensors.
+
+    Returns
+    -------
+    LevelChange
     """
     after = np.average(blocks.mean[-n_steady:], axis=0)
     off_before, off_after = (_size((blocks.mean - level) / noise_std) for level in (before, after))
     size = float(_size((after - before[-1]) / noise_std))
     n_axes, n_readings = np.count_nonzero(~np.isnan(after)), np.median(blocks.n[blocks.n > 0.0])
-    felt = FELT * float(np.sqrt(n_axes / n_readings))
-    end = int(np.flatnonzero(off_after > felt).max(initial=-1)) + 1
+    detectable = DETECTION_STDS * float(np.sqrt(n_axes / n_readings))
+    end = int(np.flatnonzero(off_after > detectable).max(initial=-1)) + 1
     since = origin + float(blocks.time[min(end, len(blocks.time) - 1)])
-    # While the latest blocks are on their way to a level, its end seems shorter than it is.
-    is_there = not (off_after[-n_steady:] > felt).any()
-    arrow = _arrow(blocks.time, off_before, off_after, felt, SMALL * size) if is_there else 0.0
-    return LevelChange(since, size, None if abs(arrow) < DECIDED else arrow > 0.0)
+    # If the latest blocks still approach the level, the change is not complete.
+    is_there = not (off_after[-n_steady:] > detectable).any()
+    asymmetry = _asymmetry(blocks.time, off_before, off_after, detectable,
+                           MAX_SMALL_SHARE * size) if is_there else 0.0
+    return LevelChange(since, size, None if abs(asymmetry) < MIN_ASYMMETRY else asymmetry > 0.0)
 
 
 def _size(off: FloatArray) -> FloatArray:
-    """Norm over the axes that are reported."""
+    """Norm over the reported axes."""
     size: FloatArray = np.sqrt(np.nansum(np.square(off), axis=-1))
     return size
 
 
-def _arrow(time: FloatArray, off_before: FloatArray, off_after: FloatArray, felt: float,
+def _asymmetry(time: FloatArray, off_before: FloatArray, off_after: FloatArray, detectable: float,
            small: float) -> float:
-    """Binary logarithm by which the change is small for longer, and grows faster, at its last end.
+    """Binary logarithm of the asymmetry of a change; positive for a departure.
 
-    It is 0 where the growth at one end stalls, as it does when a second vehicle comes up to a first
-    one, and where neither end is that of a vehicle that starts or stops.
-
-    Parameters
-    ----------
-    time : (k,) array, s
-    off_before, off_after : (k,) array
-        Sizes of what is off either level, in deviations of one reading.
-    felt, small : float
-        From which size on an end is looked at, and up to which.
+    Zero if the growth stalls at one end, as when a second vehicle stops behind a first one, and if
+    neither end is that of a starting or stopping vehicle. `off_before` and `off_after` (k,) are
+    the distances from both levels in standard deviations of a reading; the ends are evaluated
+    from `detectable` to `small`.
     """
     length = float(np.median(np.diff(time)))
-    first = growth_of(time, off_before, felt, small)
-    last = growth_of(-time[::-1], off_after[::-1], felt, small)
-    if small < MIN_GROWTH * felt or first is None or last is None \
+    first = growth_of(time, off_before, detectable, small)
+    last = growth_of(-time[::-1], off_after[::-1], detectable, small)
+    if small < MIN_GROWTH * detectable or first is None or last is None \
             or max(first.whole, last.whole) < MIN_BLOCKS * length \
-            or any(max(end.quarters) > STALLS * end.whole + length for end in (first, last)):
+            or any(max(end.quarters) > MAX_QUARTER_SHARE * end.whole + length
+                   for end in (first, last)):
         return 0.0
-    # It is not known where within a block an end is.
+    # The position of an end within a block is unknown.
     longer = (last.whole + 0.5 * length) / (first.whole + 0.5 * length)
     rise, fall = ((end.early + 0.25 * length) / (end.late + 0.25 * length)
                   for end in (first, last))
-    starts_slowly = (rise if longer > 1.0 else fall) < SLOW_START
+    starts_slowly = (rise if longer > 1.0 else fall) < MAX_START_RATIO
     return float(np.log2(longer * fall / rise)) if starts_slowly else 0.0
 
 
 NO_CHANGE = LevelChange(np.nan, 0.0, None)
-"""Takes the place of an earlier change that is over."""
+"""Replaces an earlier change that is over."""
 
 
 class SharedChanges:
@@ -141,14 +144,25 @@ class SharedChanges:
     def __init__(self) -> None:
         self._latest: dict[int, LevelChange] = {}
 
-    def judge(self, sensor: int, change: LevelChange) -> bool | None:
-        """Whether a vehicle has left a `sensor`, by this change and those of the others.
+    def evaluate_change(self, sensor: int, change: LevelChange) -> bool | None:
+        """Evaluate a change of a sensor together with those of the other sensors.
 
-        A change that is not clear is judged by the largest one at the same time.
+        A change that is not clear is classified by the largest simultaneous one.
+
+        Parameters
+        ----------
+        sensor : int
+            Row of the network.
+        change : LevelChange
+
+        Returns
+        -------
+        bool or None
+            Whether a vehicle has departed, as `LevelChange.has_departed`.
         """
         self._latest[sensor] = change
         if change.size >= CLEAR_SIZE and change.has_departed is not None:
             return change.has_departed
         together = [other for other in self._latest.values() if other.has_departed is not None
-                    and abs(other.since - change.since) < TOGETHER_S]
+                    and abs(other.since - change.since) < MAX_TIME_DIFFERENCE_S]
         return max(together, key=lambda other: other.size).has_departed if together else None

@@ -1,7 +1,4 @@
-"""How a sensor is mounted: tilt from its accelerometer, heading from the Earth's field.
-
-Source: T10 section 6.3.1, eq. (6.2)-(6.9); how well each is known is this package's own.
-"""
+"""Orientation of a sensor: tilt from its accelerometer, heading from the Earth's field."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,152 +15,166 @@ from mag_tracking.geometry import (
 )
 
 GRAVITY = 9.81
-"""[m/s^2], to a percent anywhere on Earth."""
+"""[m/s²], to 1 % anywhere on Earth."""
 
-FARTHEST = 1.0
-"""[m/s^2] What is at rest and differs more from gravity is no accelerometer in m/s^2."""
+MAX_GRAVITY_DIFFERENCE = 1.0
+"""[m/s²] Maximum difference of the size of the acceleration at rest from gravity."""
 
-OUTLYING = 5.0
-"""Readings farther from the median than so many deviations are knocks, and left out."""
+OUTLIER_STDS = 5.0
+"""Distance from the median, in standard deviations, beyond which a reading is a knock and is
+excluded."""
 
-RIVAL = 9.0
-"""Another heading whose cost is less than this above the best is as good as that."""
+MAX_RIVAL_COST = 9.0
+"""Maximum cost difference of a rival heading from the best heading."""
 
-ALIKE = 1.0
-"""Headings whose costs differ by no more fit alike: which is nearer to what was stated decides."""
+MAX_EQUAL_COST = 1.0
+"""Maximum cost difference of headings that fit equally well; the one closest to the stated heading
+is used."""
 
-UNKNOWN = np.deg2rad(60.0)
-"""[rad] A heading that is less certain than this is none."""
+MAX_HEADING_STD = np.deg2rad(60.0)
+"""[rad] Maximum standard deviation of a heading."""
 
 _Fit: TypeAlias = Callable[[float], tuple[FloatArray, FloatArray]]
-"""Of a yaw [rad] the residual and the field's derivative by it, both (n,)."""
+"""Maps a yaw [rad] to the residual and to the derivative of the field by the yaw, both (n,)."""
 
 
 @dataclass(frozen=True)
-class Up:
-    """Where up is for a sensor at rest."""
+class UpDirection:
+    """Direction of up for a sensor at rest."""
 
     direction: FloatArray
     """(3,) unit vector, sensor frame."""
     size: float
-    """[m/s^2] of gravity as the sensor measures it."""
+    """[m/s²] Measured size of gravity."""
     std: float
-    """[rad] of the direction, about each level axis."""
+    """[rad] Standard deviation of the direction, about each level axis."""
     n: int
-    """Readings used."""
+    """Number of readings used."""
     n_left_out: int
-    """Readings that were knocks, or not finite."""
+    """Number of excluded readings: knocks and readings that are not finite."""
 
 
-def up_direction(acceleration: FloatArray, bias: float) -> Up:
-    """Where up is, by a sensor at rest: what it measures then is the reaction to gravity.
+def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
+    """Direction of up from the accelerometer of a sensor at rest.
+
+    At rest, an accelerometer measures the reaction to gravity.
 
     Parameters
     ----------
-    acceleration : (n, 3) [m/s^2], sensor frame
-        Knocks may be in it.
-    bias : float [m/s^2]
-        What the accelerometer may be off by, on each axis.
+    acceleration : (n, 3) array, m/s², sensor frame
+        May contain knocks.
+    bias : float, m/s²
+        Standard deviation of the bias of the accelerometer, per axis.
 
     Returns
     -------
-    Up
+    UpDirection
 
-    Raises ValueError with fewer than 8 readings, and where gravity is not there.
+    Raises
+    ------
+    ValueError
+        If fewer than 8 readings are at rest, or their size is not that of gravity.
     """
     a = np.asarray(acceleration, dtype=float).reshape(-1, 3)
     finite = a[np.isfinite(a).all(axis=1)]
     if len(finite) < 8:
-        raise ValueError(f'{len(finite)} accelerations are too few to tell the tilt; 8 would do')
+        raise ValueError(f'{len(finite)} accelerations are too few for the tilt, 8 are required')
     deviation = finite - np.median(finite, axis=0)
     scale = 1.4826 * np.median(np.abs(deviation), axis=0)
-    # An accelerometer of coarse steps at rest has no scatter at all.
-    quiet = (np.abs(deviation) <= OUTLYING * np.maximum(scale, 1e-3)).all(axis=1)
+    # The scatter of a coarse accelerometer at rest can be zero.
+    quiet = (np.abs(deviation) <= OUTLIER_STDS * np.maximum(scale, 1e-3)).all(axis=1)
     used = finite[quiet]
     if len(used) < 8:
-        raise ValueError(f'only {len(used)} of {len(finite)} accelerations are at rest')
+        raise ValueError(f'only {len(used)} of {len(finite)} accelerations are at rest, 8 are '
+                         'required')
     mean = used.mean(axis=0)
     size = float(np.linalg.norm(mean))
-    if abs(size - GRAVITY) > FARTHEST:
+    if abs(size - GRAVITY) > MAX_GRAVITY_DIFFERENCE:
         raise ValueError(f'the acceleration at rest is {size:.3g}, not {GRAVITY} m/s^2'
-                         + (' (in g?)' if 0.8 < size < 1.2 else ''))
+                         + (' (is its unit g?)' if 0.8 < size < 1.2 else ''))
     scatter = float(used.std(axis=0).max()) / np.sqrt(len(used))
-    return Up(mean / size, size, float(np.hypot(scatter, bias)) / GRAVITY, len(used),
+    return UpDirection(mean / size, size, float(np.hypot(scatter, bias)) / GRAVITY, len(used),
               len(a) - len(used))
 
 
 @dataclass(frozen=True)
 class Orientation:
-    """How a sensor is turned, and how well that is known."""
+    """Orientation of a sensor and its accuracy."""
 
     R_ws: FloatArray
     """(3, 3), sensor to world."""
     std: FloatArray
-    """(3,) [rad] of small rotations about the world's axes."""
+    """(3,) [rad] standard deviations of small rotations about the world axes."""
     bias: FloatArray
-    """(3,) [T], sensor frame: measured less the Earth's field; NaN of an axis not reported. Of it
-    the part across the heading was taken for heading."""
+    """(3,) [T], sensor frame: measured field minus the Earth's field; NaN for an axis not reported.
+    The component across the heading is not included, since it is absorbed by the heading."""
     rival: float
-    """[rad] Another heading that fits as well, from this one; NaN where there is none."""
+    """[rad] Difference to another heading that fits as well; NaN if there is none."""
 
 
-def compass_orientation(up: Up, field: FloatArray, earth_field: FloatArray, bias_std: float,
-                        stated: FloatArray | None = None) -> Orientation:
-    """The orientation of a sensor from where up is and the Earth's field.
+def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatArray,
+                        bias_std: float, stated: FloatArray | None = None) -> Orientation:
+    """Orientation of a sensor from the direction of up and the Earth's field.
 
     Parameters
     ----------
-    up : Up
-    field : (3,) [T], sensor frame
-        Without a target. NaN = axis not reported.
-    earth_field : (3,) [T], world (z up)
-    bias_std : float [T]
-        What the sensor and iron near it add to the Earth's field, on each axis. It
-        cannot be told from a heading: 0.6 uT turns a compass by two degrees.
-    stated : (3, 3), sensor to world, optional
-        Of headings that fit alike (a sensor with one axis sees two) the nearest to this; without
-        it the best.
+    up : UpDirection
+    field : (3,) array, T, sensor frame
+        Without a target; NaN = axis not reported.
+    earth_field : (3,) array, T, world frame
+    bias_std : float, T
+        Standard deviation of the bias of the sensor, including nearby iron, per axis. A bias is
+        not distinguishable from a heading error: 0.6 uT rotates a compass by two degrees.
+    stated : (3, 3) array, optional
+        Stated orientation, sensor to world. It selects one of several headings that fit equally
+        well (two for a sensor with one axis); otherwise the best is used.
 
     Returns
     -------
     Orientation
 
-    Raises ValueError where the field does not tell the heading: straight up or
-    down, or no axis across it.
+    Raises
+    ------
+    ValueError
+        If the heading is not observable: the field is vertical, or no measured axis is across it.
+
+    References
+    ----------
+    [T10]_ section 6.3.1, eq. (6.2)-(6.9). The standard deviations are an addition of this package.
     """
     y, B0 = np.asarray(field, dtype=float), np.asarray(earth_field, dtype=float)
-    there = ~np.isnan(y)
+    reported = ~np.isnan(y)
     R_level = rotation_from_quaternion(quaternion_between(up.direction, [0.0, 0.0, 1.0]))
     across = np.cross([0.0, 0.0, 1.0], B0)
 
     def fit(yaw: float) -> tuple[FloatArray, FloatArray]:
-        """Residual on the axes that are there, and the field's derivative by the yaw."""
+        """Residual on the reported axes, and the derivative of the field by the yaw."""
         R_sw = (rotation_about_z(yaw) @ R_level).T
-        return (y - R_sw @ B0)[there], -(R_sw @ across)[there]
+        return (y - R_sw @ B0)[reported], -(R_sw @ across)[reported]
 
     yaws = [_refined(fit, start) for start in np.deg2rad(np.arange(0.0, 360.0, 30.0))]
     costs = np.array([np.sum(fit(yaw)[0]**2) for yaw in yaws]) / bias_std**2
     away = costs if stated is None else np.array(
         [abs(yaw_between(rotation_about_z(yaw) @ R_level, stated)) for yaw in yaws])
-    yaw = yaws[int(np.argmin(np.where(costs <= costs.min() + ALIKE, away, np.inf)))]
+    yaw = yaws[int(np.argmin(np.where(costs <= costs.min() + MAX_EQUAL_COST, away, np.inf)))]
     slope = fit(yaw)[1]
     level, upright = np.hypot(*B0[:2]), abs(B0[2])
     information = slope @ slope / bias_std**2
-    if information * UNKNOWN**2 <= 1.0:
-        raise ValueError(f'the field does not tell the heading: of the {level:.2g} T across the '
-                         f'vertical too little is seen against {bias_std:.2g} T of unknown bias')
-    # A tilt that is wrong takes some of the upright field for level.
+    if information * MAX_HEADING_STD**2 <= 1.0:
+        raise ValueError('the heading is not observable: the measured part of the horizontal field '
+                         f'of {level:.2g} T is too small for a bias of {bias_std:.2g} T')
+    # A tilt error projects part of the vertical field onto the horizontal plane.
     heading_std = np.sqrt(1.0 / information + (up.std * upright / level)**2)
     others = [np.angle(np.exp(1j * (other - yaw))) for other in yaws]
     rivals = [d for d, c in zip(others, costs, strict=True)
-              if abs(d) > 0.1 and c < costs.min() + RIVAL]
+              if abs(d) > 0.1 and c < costs.min() + MAX_RIVAL_COST]
     R_ws = rotation_about_z(yaw) @ R_level
     return Orientation(R_ws, np.array([up.std, up.std, heading_std]), y - R_ws.T @ B0,
                        min(rivals, key=abs) if rivals else float('nan'))
 
 
 def _refined(fit: _Fit, yaw: float) -> float:
-    """The yaw where Gauss-Newton steps, none above half a radian, lead."""
+    """Yaw after Gauss-Newton steps of at most half a radian."""
     for _ in range(30):
         residual, slope = fit(yaw)
         square = slope @ slope
@@ -176,18 +187,22 @@ def _refined(fit: _Fit, yaw: float) -> float:
     return yaw
 
 
-def levelled(up: Up | None, stated: FloatArray, stated_std: FloatArray) -> Orientation | None:
-    """A stated orientation, tilted so that up is up.
+def levelled(up: UpDirection | None, stated: FloatArray,
+             stated_std: FloatArray) -> Orientation | None:
+    """Correct the tilt of a stated orientation.
 
     Parameters
     ----------
-    up : Up or None
-    stated : (3, 3), sensor to world
-    stated_std : (3,) [rad], about the world's axes
+    up : UpDirection or None
+    stated : (3, 3) array
+        Sensor to world.
+    stated_std : (3,) array, rad
+        About the world axes.
 
     Returns
     -------
-    Orientation, with a bias of NaN; None without `up`.
+    Orientation or None
+        With a bias of NaN; None without `up`.
     """
     if up is None:
         return None
@@ -198,17 +213,21 @@ def levelled(up: Up | None, stated: FloatArray, stated_std: FloatArray) -> Orien
 
 def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
                     weight: float = 4.0) -> float:
-    """[T] How large the biases of a network's sensors are, by what can be seen of them.
+    """Standard deviation of the biases of a network's sensors.
+
+    The biases along the heading and the vertical are observable, that across the heading is not.
+    Each sensor therefore counts with one axis less.
 
     Parameters
     ----------
-    orientations : list of Orientation
-    bias_std : float [T]
-        What was expected; it counts as `weight` values.
+    orientations : sequence of Orientation
+    bias_std : float, T
+        Prior standard deviation; it counts as `weight` values.
     weight : float
 
-    The bias along the heading and the upright one are seen, that across the
-    heading is not: of the axes of each sensor one less are counted.
+    Returns
+    -------
+    float, T
     """
     square = sum(float(np.nansum(o.bias**2)) for o in orientations)
     seen = sum(np.count_nonzero(~np.isnan(o.bias)) - 1 for o in orientations)
@@ -217,21 +236,23 @@ def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
 
 def with_stated_heading(orientation: Orientation, stated: FloatArray, stated_std: float,
                         limit: float = 3.0) -> Orientation | None:
-    """Heading by the compass and by what an installer stated, each as good as it is.
+    """Fuse the compass heading with a stated heading.
 
     Parameters
     ----------
     orientation : Orientation
-        By accelerometer and compass.
-    stated : (3, 3), sensor to world
-    stated_std : float [rad]
-        How far it may be turned about the vertical.
+        From accelerometer and compass.
+    stated : (3, 3) array
+        Sensor to world.
+    stated_std : float, rad
+        Standard deviation of the stated heading.
     limit : float
-        Where the two differ by more deviations than this, what was stated is wrong.
+        Maximum difference in standard deviations; beyond it, the stated heading is wrong.
 
     Returns
     -------
-    Orientation, or None where they differ by more.
+    Orientation or None
+        None if the difference is beyond the limit.
     """
     difference = yaw_between(orientation.R_ws, stated)
     compass = orientation.std[2]

@@ -1,8 +1,4 @@
-"""The quadric through the readings of a tumbled sensor, by linear least squares.
-
-Source: Renaudin, Afzal and Lachapelle, Complete triaxis magnetometer calibration in the magnetic
-domain (2010); the weights by direction and the outliers set aside are this package's own.
-"""
+"""Linear least-squares fit of a quadric to the readings of a tumbled sensor."""
 
 import numpy as np
 
@@ -10,20 +6,36 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.directions import even_weights
 
 OUTLIER = 4.0
-"""[std] Readings further from the ellipsoid are outliers."""
+"""[std] Distance from the ellipsoid beyond which a reading is an outlier."""
 
 MIN_SCALE = 1e-9
-"""Residual std, over the radius, below which it is rounding."""
+"""Residual std relative to the radius below which it is due to rounding."""
 
-DOUBT = 'too few directions, a sensor that lay still, or a field that is not uniform'
+POSSIBLE_CAUSES = ('possible causes are too few directions, a sensor at rest, or a field that is '
+                   'not uniform')
+"""Possible causes of a fit without an ellipsoid."""
 
 
 def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
-    """Offset (3,), correction (3, 3) and reason of a linear fit to normalised readings (n, 3).
+    """Fit an ellipsoid to normalised readings, without outliers.
 
-    Outliers are set aside.
+    Parameters
+    ----------
+    z : (n, 3) array
+
+    Returns
+    -------
+    offset : (3,) array
+    correction : (3, 3) array
+    reason : str
+        Why there is no ellipsoid; empty if there is one.
+
+    References
+    ----------
+    [Renaudin10]_. The weights by direction and the exclusion of outliers are additions of this
+    package.
     """
-    # Half-way between the extremes is inside, however long the sensor lay still somewhere.
+    # The midpoint of the extremes is inside the ellipsoid, even if the sensor was mostly at rest.
     w = even_weights(z - 0.5 * (z.min(axis=0) + z.max(axis=0)))
     o: FloatArray = np.full(3, np.nan)
     C: FloatArray = np.full((3, 3), np.nan)
@@ -38,12 +50,14 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
         A, a = (A, a) if np.trace(A) > 0.0 else (-A, -a)
         e = np.linalg.eigvalsh(A)
         if not e[0] > 1e-6 * e[2]:
-            return o, C, ('the readings lie on no ellipsoid, smallest over largest eigenvalue of '
-                          f'the quadric {e[0] / e[2]:.2g}, must be positive: {DOUBT}')
+            return o, C, ('the readings do not lie on an ellipsoid: smallest over largest '
+                          f'eigenvalue of the quadric {e[0] / e[2]:.2g}, must be positive; '
+                          f'{POSSIBLE_CAUSES}')
         o = -0.5 * np.linalg.solve(A, a[6:9])
         k = o @ A @ o - a[9]
         if not k > 0.0:
-            return o, C, f'the readings lie on no ellipsoid, squared radius {k:.2g}: {DOUBT}'
+            return o, C, ('the readings do not lie on an ellipsoid: squared radius '
+                          f'{k:.2g}, must be positive; {POSSIBLE_CAUSES}')
         e, V = np.linalg.eigh(A / k)
         C = (V * np.sqrt(e)) @ V.T
         q = (z - o) @ C
@@ -54,7 +68,18 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
 
 
 def robust_std(d: FloatArray, w: FloatArray) -> float:
-    """Standard deviation from the weighted median of |d|; `d` and weights `w` are (n,)."""
+    """Standard deviation from the weighted median of the absolute values.
+
+    Parameters
+    ----------
+    d : (n,) array
+    w : (n,) array
+        Weights.
+
+    Returns
+    -------
+    float
+    """
     order = np.argsort(np.abs(d))
     total = np.cumsum(w[order])
     middle = np.abs(d)[order][np.searchsorted(total, 0.5 * total[-1])]

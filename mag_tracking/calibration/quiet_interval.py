@@ -1,4 +1,4 @@
-"""The stretch of quiet blocks that a background is fitted to."""
+"""Interval of quiet blocks to which a background is fitted."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -16,36 +16,56 @@ from mag_tracking.calibration.blocks import (
 
 
 class QuietInterval:
-    """The latest quiet blocks, a while behind the present: a target comes near gradually.
+    """The latest quiet blocks, delayed because a target approaches gradually.
+
+    Parameters
+    ----------
+    guard : float, s
+        Delay of the interval.
+    max_blocks : int
+        Maximum number of blocks.
 
     Attributes
     ----------
     pending : deque of Block
-        Those that wait.
+        Blocks that are not delayed long enough.
     """
 
-    def __init__(self, guard: float, most: int) -> None:
-        """It stays `guard` [s] behind the present; `most` blocks are kept."""
+    def __init__(self, guard: float, max_blocks: int) -> None:
         self._guard = guard
-        self._window = BlockWindow(most)
+        self._window = BlockWindow(max_blocks)
         self.pending: deque[Block] = deque()
 
     def __len__(self) -> int:
         return len(self._window)
 
     def clear(self) -> None:
-        """Drop all blocks."""
+        """Discard all blocks."""
         self._window.clear()
         self.pending.clear()
 
     def begin(self, blocks: Iterable[Block]) -> None:
-        """Begin with `blocks`."""
+        """Restart with some blocks.
+
+        Parameters
+        ----------
+        blocks : iterable of Block
+        """
         self._window.clear()
         for block in blocks:
             self._window.append(block)
 
     def extend(self, block: Block) -> Iterator[Blocks]:
-        """Take the next quiet block; all `Blocks` after each one that has waited for long enough.
+        """Add the next quiet block.
+
+        Parameters
+        ----------
+        block : Block
+
+        Yields
+        ------
+        Blocks
+            All blocks of the interval, after each one that has been delayed long enough.
         """
         self.pending.append(block)
         while self.pending and self.pending[0].time <= block.time - self._guard:
@@ -53,19 +73,41 @@ class QuietInterval:
             yield self.blocks()
 
     def blocks(self) -> Blocks:
-        """The `Blocks`, in no order."""
+        """Blocks of the interval, in no particular order.
+
+        Returns
+        -------
+        Blocks
+        """
         return self._window.blocks()
 
     def scatter(self) -> FloatArray:
-        """(3,) [T^2] variance within the blocks; NaN = unknown."""
+        """Variance within the blocks.
+
+        Returns
+        -------
+        (3,) array, T²
+            NaN = unknown.
+        """
         found = pooled_covariance(self.blocks()) if self else None
         return np.full(3, np.nan) if found is None else found.diagonal()
 
 
 def line_of(blocks: Blocks) -> tuple[float, FloatArray, FloatArray, float]:
-    """Line through blocks, as `BackgroundLevel` has it.
+    """Fit a line to blocks, as for `BackgroundLevel`.
 
-    The drift holds for at most twice as long as the stretch that it is of.
+    The drift is extrapolated for at most twice the duration of the blocks.
+
+    Parameters
+    ----------
+    blocks : Blocks
+
+    Returns
+    -------
+    centre : float, s
+    mean : (3,) array, T
+    slope : (3,) array, T/s
+    horizon : float, s
     """
     first, last = float(blocks.time.min()), float(blocks.time.max())
     return *line_through(blocks), last + 2.0 * (last - first)

@@ -1,8 +1,8 @@
-// The calibration of one reading after the other.
+// Calibration of readings one by one.
 //
-// Every rule for a reading stands here once. What needs Python (a rejection that is counted by name,
-// a block to be judged, a clock that jumped back, ...) is returned as a reason, and `calibrate`
-// continues where it stopped.
+// This file contains all rules for single readings. A case that requires Python (a rejection that
+// is counted by name, a complete block, a clock that jumped back, ...) is returned as a reason, and
+// `calibrate` continues where it stopped.
 
 #pragma once
 
@@ -20,22 +20,22 @@ enum Reason {
     // The batch is finished, or the reading is rejected.
     DONE, UNKNOWN_SENSOR, NO_AXIS, INFINITE, TOO_LARGE, BAD_COVARIANCE, AXIS_MISSING, TOO_FAR_AHEAD,
     DUPLICATE, OUT_OF_ORDER, STUCK,
-    // To be handled before the same reading is taken again.
+    // To be handled before the same reading is processed again.
     BLOCK_COMPLETE = 20, JUMPED_BACK, RESTORABLE,
-    // The `n_spikes` readings before are rejected, or the `n_released` held readings are to be used.
+    // The previous `n_spikes` readings are rejected, or the `n_released` held readings are to be
+    // used.
     SPIKES = 30, PASSED
 };
 
-// The correlation of two axes that a message states may differ by this from the measured one.
+// Maximum difference between the correlation of two axes in a message and the measured one.
 constexpr double MAX_CORRELATION = 0.7;
-// The variance that a message states is used where it differs from the measured one by less than
-// this factor.
-constexpr double CREDIBLE = 25.0;
+// Maximum ratio between the variance in a message and the measured one.
+constexpr double MAX_VARIANCE_RATIO = 25.0;
 
 // Whether a reading has its own covariance.
 enum Own { NONE, VALID, INVALID };
 
-// As in `CalibrateSettings`.
+// Limits of `CalibrateSettings`.
 struct Limits {
     double max_field, longest_jump_ns, jump_back_ns;
     int64_t reject_stuck;
@@ -43,15 +43,15 @@ struct Limits {
     int64_t is_decimated, trust_covariances;
 };
 
-// Progress within a batch: the next reading; sensor and timestamp of the one that a reason is about;
-// how many calibrated readings there are; how many were spikes; of how many the background, or that
-// of one axis, is not known yet; of how many the covariance was overruled.
+// Progress within a batch: next reading; sensor and timestamp of the reading that a reason refers
+// to; numbers of calibrated readings, of spikes, of readings whose background (or that of one axis)
+// is not known yet, and of readings whose covariance was overruled.
 struct Batch {
     int64_t next, row, n_out, n_spikes, n_learning, n_partly_learning, n_overruled, stamp_ns;
 };
 
 // n readings: their sensors (negative: unknown), timestamps [ns], raw fields (n, 3) [T], `Own`, and
-// covariances (n, 3, 3) [T^2], which are read where `own` is not NONE.
+// covariances (n, 3, 3) [T^2], which are read if `own` is not NONE.
 struct RawReadings {
     int64_t n;
     const int64_t *rows, *stamps;
@@ -60,15 +60,15 @@ struct RawReadings {
     const double* covariances;
 };
 
-// Where calibrated readings are appended; there is room for n.
+// Output arrays of calibrated readings, with a capacity of n.
 struct Calibrated {
     int64_t n;
     int64_t *rows, *stamps;
     double *fields, *covariances;
 };
 
-// Why a raw reading cannot be used, or DONE.
-inline Reason fault(const Limits& limits, const double* raw, int64_t own) {
+// Why a raw reading is rejected, or DONE.
+inline Reason field_fault(const Limits& limits, const double* raw, int64_t own) {
     double largest = 0.0;
     bool is_known = false;
     for (int a = 0; a < 3; ++a)
@@ -79,28 +79,29 @@ inline Reason fault(const Limits& limits, const double* raw, int64_t own) {
     return own == INVALID && limits.trust_covariances ? BAD_COVARIANCE : DONE;
 }
 
-// A coefficient of zero needs no axis.
-inline double needed(double coefficient, double value) {
+// Product that is zero for a zero coefficient, even if the axis is missing (NaN).
+inline double product(double coefficient, double value) {
     return coefficient == 0.0 ? 0.0 : coefficient * value;
 }
 
-// Remove the sensor's own hard and soft iron: from `raw` into `field`; false: no axis is left.
+// Correct hard and soft iron of the sensor, from `raw` into `field`; false if no axis remains.
 //
-// An axis that the correction needs and that is missing makes those missing that need it.
+// A missing raw axis makes all corrected axes missing that depend on it.
 inline bool remove_iron(const Sensor& s, const double* raw, double* field) {
     double v[3];
     bool is_known = false;
     for (int a = 0; a < 3; ++a) v[a] = field[a] = raw[a] - s.offset[a];
     for (int a = 0; a < 3; ++a) {
         const auto& c = s.correction[a];
-        if (s.has_correction) field[a] = needed(c[0], v[0]) + needed(c[1], v[1]) + needed(c[2], v[2]);
+        if (s.has_correction)
+            field[a] = product(c[0], v[0]) + product(c[1], v[1]) + product(c[2], v[2]);
         is_known |= !std::isnan(field[a]);
     }
     return is_known;
 }
 
-// Why a timestamp cannot be used, or DONE.
-inline Reason misplaced(Sensor& s, const Limits& limits, int64_t stamp) {
+// Why a timestamp is rejected, or DONE.
+inline Reason timestamp_fault(Sensor& s, const Limits& limits, int64_t stamp) {
     if (s.last_ns != NEVER) {
         if (double(stamp - s.last_ns) > limits.longest_jump_ns) {
             const int64_t before = s.unconfirmed_ns;
@@ -123,19 +124,19 @@ inline Reason misplaced(Sensor& s, const Limits& limits, int64_t stamp) {
     return DONE;
 }
 
-// Why a reading cannot be used, or is not used yet, or DONE; without iron it is in `field`.
+// Why a reading is rejected or delayed, or DONE; writes the reading corrected for iron to `field`.
 inline Reason check(Sensor& s, const Limits& limits, int64_t stamp, const double* raw, int64_t own,
                     double* field) {
     if (s.is_full) return BLOCK_COMPLETE;
-    Reason reason = fault(limits, raw, own);
+    Reason reason = field_fault(limits, raw, own);
     if (reason != DONE) return reason;
     if (!remove_iron(s, raw, field)) return AXIS_MISSING;
-    reason = misplaced(s, limits, stamp);
+    reason = timestamp_fault(s, limits, stamp);
     if (reason != DONE) return reason;
     return limits.reject_stuck && is_stuck(s, field) ? STUCK : DONE;
 }
 
-// `screen_spike`, with the number of spikes noted.
+// `screen_spike`, counting the spikes.
 inline Verdict screen(Sensor& s, const Limits& limits, Batch& batch, const Reading& reading) {
     if (limits.spike_std <= 0.0) return PASSES;
     const Verdict verdict = screen_spike(s, limits.spike_std, reading);
@@ -145,14 +146,15 @@ inline Verdict screen(Sensor& s, const Limits& limits, Batch& batch, const Readi
     return screen_spike(s, limits.spike_std, reading);
 }
 
-// Whether the covariance `C` (3, 3) of a message agrees with the noise of the sensor.
+// Whether the covariance `C` (3, 3) of a message is consistent with the noise of the sensor.
 inline bool is_credible(const Sensor& s, const double* C) {
     for (int a = 0; a < 3; ++a) {
         const double stated = C[4 * a], known = s.noise[a][a] + s.step_variance[a];
-        // A comparison with NaN is false: an axis that is missing contradicts nothing.
-        if (stated > CREDIBLE * known || known > CREDIBLE * stated) return false;
+        // A comparison with NaN is false: a missing axis is not inconsistent.
+        if (stated > MAX_VARIANCE_RATIO * known || known > MAX_VARIANCE_RATIO * stated)
+            return false;
         for (int b = 0; b < a; ++b) {
-            // Axes that are said to err together, and do not.
+            // The correlation in the message must be close to the measured one.
             const double both = std::sqrt(stated * C[4 * b]);
             const double measured = s.noise[a][b]
                                     / std::sqrt(known * (s.noise[b][b] + s.step_variance[b]));
@@ -162,8 +164,8 @@ inline bool is_credible(const Sensor& s, const double* C) {
     return true;
 }
 
-// Covariance of a reading, into `out` (3, 3): its own where that is credible, else that of the
-// sensor. Either with that of a provisional background.
+// Covariance of a reading, into `out` (3, 3): its own if credible, otherwise that of the sensor,
+// plus that of a provisional background.
 inline void attach_covariance(Sensor& s, const Limits& limits, Batch& batch, const Reading& reading,
                               double* out) {
     const double* C = reading.covariance;
@@ -182,7 +184,7 @@ inline void attach_covariance(Sensor& s, const Limits& limits, Batch& batch, con
     }
 }
 
-// Calibrate a reading of the sensor of `row`; false if a block has to be judged first.
+// Calibrate a reading of the sensor of `row`; false if a block has to be evaluated first.
 inline bool use(Sensor& s, const Limits& limits, Batch& batch, int64_t row, const Reading& reading,
                 const Calibrated& out) {
     const double time = double(reading.stamp - s.first_ns) / 1e9;
@@ -201,7 +203,7 @@ inline bool use(Sensor& s, const Limits& limits, Batch& batch, int64_t row, cons
     int n_missing = 0;
     bool is_new = false;
     for (int a = 0; a < 3; ++a) {
-        // An axis that has only just begun to report: nothing is known of it yet.
+        // The background of an axis that has just started to report is unknown.
         if (!std::isnan(reading.field[a]) && (std::isnan(field[a]) || !(C[4 * a] > 0.0))) {
             is_new = true;
             field[a] = NAN;
@@ -225,10 +227,11 @@ inline void correct_covariance(const Sensor& s, const double* C, double* out) {
         for (int b = 0; b < 3; ++b)
             for (int c = 0; c < 3; ++c)
                 for (int d = 0; d < 3; ++d)
-                    out[3 * a + b] += needed(s.correction[a][c] * s.correction[b][d], C[3 * c + d]);
+                    out[3 * a + b] +=
+                        product(s.correction[a][c] * s.correction[b][d], C[3 * c + d]);
 }
 
-// Calibrate readings from `next` on, until the batch is finished or Python has to do something.
+// Calibrate readings from `next` on, until the batch is finished or Python is required.
 inline Reason calibrate(Sensor* sensors, const Limits& limits, const RawReadings& in, Batch& batch,
                         const Calibrated& out) {
     double field[3], C[9];
@@ -243,7 +246,7 @@ inline Reason calibrate(Sensor* sensors, const Limits& limits, const RawReadings
         if (in.own[i]) correct_covariance(s, in.covariances + 9 * i, C);
         const Reading reading{stamp, field, in.own[i], C};
         const Verdict verdict = screen(s, limits, batch, reading);
-        // A spike is no step of the sensor.
+        // Spikes do not update the steps of the sensor.
         if (verdict == PASSES || verdict == RELEASED) note_step(s, stamp, in.fields + 3 * i);
         if (verdict == PASSES) {
             ++s.accepted;
@@ -251,7 +254,7 @@ inline Reason calibrate(Sensor* sensors, const Limits& limits, const RawReadings
                 if (batch.n_spikes) return SPIKES;
                 continue;
             }
-            // It passes, and cannot be used before Python has done something.
+            // The reading passes, but cannot be used before Python has been called.
             store(s, 0, reading);
             s.n_held = s.n_released = 1;
         } else if (verdict != HELD) {

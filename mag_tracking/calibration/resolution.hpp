@@ -1,4 +1,4 @@
-// The steps of a sensor's readings, reading by reading; resolution.py says what they are.
+// Steps of a sensor's readings, updated for each reading; see resolution.py.
 
 #pragma once
 
@@ -9,23 +9,22 @@
 
 namespace mag_tracking {
 
-// Values that differ by a smaller share than this differ by rounding only: single precision.
+// Maximum relative difference of two values that is due to rounding (single precision).
 constexpr double SAME = 3e-7;
-// Noise of a larger variance, in squared steps, carries a reading over several steps, and averaging
-// works. A reading that toggles between two steps has a variance of 0.25 at most.
+// Minimum noise variance, in squared steps, at which readings cover several steps and averaging is
+// effective. A reading that toggles between two steps has a variance of at most 0.25.
 constexpr double DITHERED = 0.3;
-// [T] An axis that scatters less has not changed at all.
+// [T] Maximum scatter of an axis that has not changed.
 constexpr double MIN_STD = 1e-11;
-// [steps] An axis that rests on one value may rest on the next one a moment later.
+// [steps] Tolerance of an axis at rest, which may toggle between two adjacent values.
 constexpr double TOGGLE = 1.2;
-// An axis whose steps are larger than its noise stays the same more often than this, for each
-// change.
-constexpr double REPEATS = 0.2;
-// Readings that stay the same for longer count as several measurements, one in each such time.
+// Minimum number of repetitions per change of an axis whose steps are larger than its noise.
+constexpr double MIN_REPEATS = 0.2;
+// Maximum duration of a rest that counts as one measurement; a longer one counts as several.
 constexpr int64_t MAX_REST_NS = 300'000'000;
 
-// Update the steps of a sensor, and since when each axis rests on one value. `raw` (3) [T] is as
-// the sensor measured it; NaN = missing axis.
+// Update the steps of a sensor, and the time since which each axis is constant. `raw` (3) [T] is
+// the raw reading; NaN = missing axis.
 inline void note_step(Sensor& s, int64_t stamp, const double* raw) {
     for (int a = 0; a < 3; ++a) {
         const double value = raw[a];
@@ -35,8 +34,8 @@ inline void note_step(Sensor& s, int64_t stamp, const double* raw) {
             if (stamp - s.rest_since_ns[a] <= MAX_REST_NS) ++s.n_rest[a];
             continue;
         }
-        // A comparison with NaN is false: the first reading changes nothing. Only a rest that has
-        // ended counts: an axis that hangs rests for ever.
+        // A comparison with NaN is false: the first reading is no change. Only completed rests
+        // count, since a stuck axis rests indefinitely.
         if (change >= 0.0) {
             s.n_same[a] += s.n_rest[a] - 1;
             ++s.n_changed[a];
@@ -46,14 +45,15 @@ inline void note_step(Sensor& s, int64_t stamp, const double* raw) {
     }
 }
 
-// Step [T] of raw axis `a`; 0 where it is too fine to be seen: the smallest change is the step of an
-// axis that repeats itself, and a field that moves with every reading has a smallest change, too.
+// Step [T] of raw axis `a`; 0 if it is too fine to be observed. The smallest change is the step
+// only if the axis repeats values; a field that changes with every reading has a smallest change as
+// well.
 inline double seen_step(const Sensor& s, int a) {
-    return double(s.n_same[a]) >= REPEATS * double(s.n_changed[a]) ? s.step[a] : 0.0;
+    return double(s.n_same[a]) >= MIN_REPEATS * double(s.n_changed[a]) ? s.step[a] : 0.0;
 }
 
-// Steps of the axes after the soft-iron correction, into `out` (3): 0 where they are too fine to be
-// seen, infinite where the axis has never changed.
+// Steps of the axes after the soft-iron correction, into `out` (3): 0 if they are too fine to be
+// observed, infinite if the axis has never changed.
 inline void corrected_steps(const Sensor& s, double* out) {
     for (int a = 0; a < 3; ++a) {
         if (!s.has_correction) {
@@ -72,8 +72,8 @@ inline void corrected_steps(const Sensor& s, double* out) {
     }
 }
 
-// For how many readings axis `a` rests, after the correction: the raw axes count by what their
-// steps add.
+// Number of readings since axis `a`, after the correction, is constant: the mean over the raw axes,
+// weighted by the variances due to their steps.
 inline double rest_of(const Sensor& s, int a) {
     if (!s.has_correction) return double(s.n_rest[a]);
     double total = 0.0, weighted = 0.0;
@@ -86,12 +86,12 @@ inline double rest_of(const Sensor& s, int a) {
     return total > 0.0 ? weighted / total : 1.0;
 }
 
-// Whether a step [T] is larger than a noise of this variance [T^2], which may be NaN.
+// Whether an axis with this step [T] and noise variance [T^2], possibly NaN, repeats values.
 inline bool rests(double variance, double step) { return variance <= DITHERED * (step * step); }
 
-// `steps` (3) [T] of all axes: one that is not known yet (infinite) is that of the others if those
-// rest, too. An axis that has never changed is dead (NaN) where another one of the same sensor
-// changes with every reading; it may rest where none has changed so far.
+// Complete the `steps` (3) [T]: an unknown (infinite) step is taken from the other axes if those
+// are at rest. An axis that has never changed is dead (NaN) if another axis of the same sensor
+// changes with every reading. If no axis has changed, it may be at rest.
 inline void complete_steps(const double* variance, double* steps) {
     double largest = 0.0;
     bool is_known = false;
@@ -105,22 +105,22 @@ inline void complete_steps(const double* variance, double* steps) {
             steps[a] = largest > 0.0 ? largest : NAN;
 }
 
-// Add what the steps of a sensor do to its noise: `noise` is read, `step_variance` and `noise_std`
-// are written, and into `limits` (3) [T] how far the mean of a block may be off, `freeze_std`
-// standard deviations.
+// Add the variance due to the steps of a sensor to its noise: reads `noise`, writes `step_variance`
+// and `noise_std`, and writes the maximum deviation of the mean of a block, `freeze_std` standard
+// deviations, to `limits` (3) [T].
 inline void apply_steps(Sensor& s, double freeze_std, double* limits) {
     double steps[3], variance[3];
     for (int a = 0; a < 3; ++a) variance[a] = s.noise[a][a];
     corrected_steps(s, steps);
     constexpr double least = MIN_STD * MIN_STD;
     for (int a = 0; a < 3; ++a)
-        // An axis without any noise rests, also where it has moved with a target since.
+        // An axis without noise is at rest, even if a target has changed it since.
         if (steps[a] == 0.0 && variance[a] <= least)
             steps[a] = std::max(s.step[0], std::max(s.step[1], s.step[2]));
     complete_steps(variance, steps);
     for (int a = 0; a < 3; ++a) {
         const bool is_coarse = std::isfinite(steps[a]) && rests(variance[a], steps[a]);
-        // Another axis is louder now. This one rests as before.
+        // Only another axis has become noisier; this one is still at rest.
         if (!is_coarse && variance[a] <= least && s.step_variance[a] > 0.0) continue;
         s.step_variance[a] = is_coarse ? steps[a] * steps[a] / 12.0 : 0.0;
         s.noise_std[a] = std::sqrt(variance[a] + s.step_variance[a]);

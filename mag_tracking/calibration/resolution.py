@@ -1,8 +1,8 @@
-"""Resolution of a sensor: the steps of its readings, and the error that they add to the noise.
+"""Resolution of a sensor: the steps of its readings and the resulting error.
 
-Where the steps are larger than the noise, a reading stays the same while the field moves by up to a
-step. Averaging does not remove that error, and a reading that repeats the one before adds little.
-What is done for every reading is compiled: `resolution.hpp`.
+If the steps are larger than the noise, a reading is constant while the field changes by up to a
+step. Averaging does not remove that error, and a repeated reading adds little information. The
+operations on every reading are compiled: `resolution.hpp`.
 """
 
 import numpy as np
@@ -12,13 +12,13 @@ from mag_tracking.calibration import core
 from mag_tracking.records import plain
 
 SAME = core.SAME
-"""Values that differ by a smaller share than this differ by rounding only: single precision."""
+"""Maximum relative difference of two values that is due to rounding (single precision)."""
 
 MIN_STD = core.MIN_STD
-"""[T] An axis that scatters less has not changed at all."""
+"""[T] Maximum scatter of an axis that has not changed."""
 
 TOGGLE = core.TOGGLE
-"""[steps] An axis that rests on one value may rest on the next one a moment later."""
+"""[steps] Tolerance of an axis at rest, which may toggle between two adjacent values."""
 
 
 def corrected_steps(sensors: StructArray) -> FloatArray:
@@ -26,38 +26,48 @@ def corrected_steps(sensors: StructArray) -> FloatArray:
 
     Parameters
     ----------
-    sensors : (1,) SENSOR
+    sensors : (1,) SENSOR array
 
     Returns
     -------
     (3,) array, T
-        0 where they are too fine to be seen, inf where the axis has never changed.
+        0 if the steps are too fine to be observed, inf if the axis has never changed.
     """
     return core.steps_of(sensors, True)
 
 
 def raw_steps(sensors: StructArray) -> FloatArray:
-    """As `corrected_steps`, before the correction."""
-    return core.steps_of(sensors, False)
-
-
-def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
-    """Steps of all axes; one that is not known yet is that of the others if those rest, too.
-
-    An axis that has never changed is dead where another one of the same sensor changes with every
-    reading. It may rest where none has changed so far.
+    """Steps of a sensor's axes before the soft-iron correction.
 
     Parameters
     ----------
-    variance : (3,) array, T^2
-        Scatter of quiet readings; NaN = missing axis.
-    steps : (3,) array, T
-        As of `corrected_steps`.
+    sensors : (1,) SENSOR array
 
     Returns
     -------
     (3,) array, T
-        NaN of a dead axis; inf where none has changed.
+        0 if the steps are too fine to be observed, inf if the axis has never changed.
+    """
+    return core.steps_of(sensors, False)
+
+
+def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
+    """Steps of all axes, with unknown steps taken from the other axes if those are at rest.
+
+    An axis that has never changed is dead if another axis of the same sensor changes with every
+    reading. If no axis has changed, it may be at rest.
+
+    Parameters
+    ----------
+    variance : (3,) array, T²
+        Scatter of quiet readings; NaN = missing axis.
+    steps : (3,) array, T
+        From `corrected_steps`.
+
+    Returns
+    -------
+    (3,) array, T
+        NaN for a dead axis; inf if no axis has changed.
     """
     out = plain(steps).copy()
     core.complete_steps(plain(variance), out)
@@ -75,7 +85,7 @@ def smallest_steps(fields: FloatArray) -> FloatArray:
     Returns
     -------
     (3,) array, T
-        inf where an axis has never changed.
+        Infinite if an axis has never changed.
     """
     out = np.full(3, np.inf)
     for axis, values in enumerate(fields.T):

@@ -1,4 +1,4 @@
-"""Readings that a sensor cut off at the end of its range."""
+"""Readings of a saturated sensor."""
 
 import numpy as np
 
@@ -6,24 +6,24 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.screening import COARSE
 
 MIN_RUN = 3
-"""So many equal readings in a row at an extreme are cut off ..."""
+"""Minimum number of equal consecutive readings at an extreme of a saturated axis ..."""
 
 MIN_JUMP = 3.0
-"""... where they were reached by a jump of so many of the smallest steps that the sensor makes: the
-top of a gentle curve in coarse steps is reached by one."""
+"""... that are reached by a jump of at least this number of smallest steps; a smooth curve in
+coarse steps reaches its top by one step."""
 
 MARGIN = 6
-"""Readings so near in time to one that is cut off are not to be trusted either: noise took some of
-their neighbours over the limit, and what is left of them is on one side of the truth."""
+"""Number of readings before and after a saturated one that are not trusted either: noise takes some
+of them over the limit, which biases the others."""
 
 
-ISOLATED = 10.0
-"""A reading that differs from both its neighbours by so many times what they differ from each
-other, and from theirs, is an error of the bus."""
+MIN_ISOLATION = 10.0
+"""Minimum ratio of the differences of a reading from both neighbours to the differences between and
+around those neighbours. Beyond it, the reading is a bus error."""
 
 
-def isolated(values: FloatArray) -> IntArray:
-    """Readings of one axis that are far off both their neighbours, which agree.
+def isolated_readings(values: FloatArray) -> IntArray:
+    """Find readings of one axis that differ from both neighbours, which agree.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def isolated(values: FloatArray) -> IntArray:
     Returns
     -------
     (k,) int array
-        Their places.
+        Indices of the readings.
     """
     if len(values) < 5:
         return np.zeros(0, dtype=np.int64)
@@ -44,31 +44,31 @@ def isolated(values: FloatArray) -> IntArray:
     height = np.minimum(np.abs(before), np.abs(after))
     least = np.min(np.abs(change[change != 0.0]), initial=np.inf)
     found: IntArray = 2 + np.flatnonzero((before * after < 0.0) & (
-        height > ISOLATED * np.maximum(around, least)))
+        height > MIN_ISOLATION * np.maximum(around, least)))
     return found
 
 
-def cut_off(values: FloatArray) -> BoolArray:
-    """Which readings of one axis stand at the end of its range, or beside such.
+def saturated_readings(values: FloatArray) -> BoolArray:
+    """Find readings of one axis at the end of its range, and those next to them.
 
-    Noise makes equal neighbours rare, and where steps are coarse a curve comes to its extreme
-    step by step; only a limit makes several equal readings right after a jump.
+    Noise makes equal neighbours rare, and a curve in coarse steps reaches its extreme step by step.
+    Only saturation gives several equal readings directly after a jump.
 
     Parameters
     ----------
-    values : (n,)
-        In order of time, as the sensor gave them; NaN = missing.
+    values : (n,) array
+        Raw readings in order of time; NaN = missing.
 
     Returns
     -------
-    (n,) bool
+    (n,) bool array
     """
     values = np.asarray(values, dtype=float)
     out = np.zeros(len(values), dtype=bool)
     present = np.flatnonzero(~np.isnan(values))
     v = values[present]
     v = v.copy()
-    outliers = isolated(v)
+    outliers = isolated_readings(v)
     v[outliers] = v[outliers - 1]
     if max(np.count_nonzero(v == v.min(initial=np.inf)),
            np.count_nonzero(v == v.max(initial=-np.inf))) < MIN_RUN:
@@ -81,7 +81,7 @@ def cut_off(values: FloatArray) -> BoolArray:
     for extreme in (v.min(), v.max()):
         at = v == extreme
         if extreme == level and np.mean(jumps[~(at[1:] & at[:-1])] == 0.0) >= COARSE:
-            # An axis with coarse steps rests there.
+            # An axis with coarse steps is at rest at its median.
             continue
         edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]])))
         for first, end in edges.reshape(-1, 2):

@@ -1,4 +1,4 @@
-// Faulty readings of one sensor: spikes, and a sensor that is stuck.
+// Rejection of faulty readings of one sensor: spikes and stuck sensors.
 //
 // Only a suspect reading is held until the next ones decide; all others pass at once.
 
@@ -12,47 +12,46 @@
 
 namespace mag_tracking {
 
-// Readings over which the usual share of repetitions is counted, about.
+// Approximate number of readings over which the typical share of repetitions is determined.
 constexpr double MEMORY = 20'000.0;
-// A sensor that has changed less often may have steps so coarse that it repeats itself for long.
+// Minimum number of changes of a sensor; with fewer, its steps may be so coarse that it repeats
+// itself for long.
 constexpr double MIN_CHANGES = 50.0;
-// A run of equal readings is a fault where chance makes it no more often than this.
-const double LIKELY = std::log(1e-9);
+// Log-probability below which a run of equal readings is a fault.
+const double MIN_LOG_PROBABILITY = std::log(1e-9);
 constexpr int MIN_RUN = 4;
-// A sensor that repeats itself more often has steps so coarse that at rest it may do so for ever;
-// with a noise of one step or more, on three axes, the share is below this.
+// Share of repeated readings above which the steps of a sensor are coarse, so that it may repeat
+// itself indefinitely at rest. With a noise of one step or more on three axes, the share is lower.
 constexpr double COARSE = 0.05;
-// A spike is steeper than the steepest recent difference by this factor, and by more where readings
-// are rare.
-constexpr double STEEPER = 8.0;
-// [1/s] Highest speed of a target, in units of its distance: 30 m/s at one metre.
-constexpr double FASTEST = 30.0;
-// Largest of `RECENT` differences between readings of white noise, in its standard deviations; the
-// mean.
+// Minimum ratio of a spike to the largest recent difference; larger if the rate is low.
+constexpr double MIN_RATIO = 8.0;
+// [1/s] Maximum speed of a target relative to its distance: 30 m/s at one metre.
+constexpr double MAX_RATE = 30.0;
+// Mean of the largest of `RECENT` differences between readings of white noise, in its standard
+// deviations.
 constexpr double MAX_OF_RECENT = 2.4;
-// A dipole that moves by the share s of its distance between two readings, s above 0.4, makes a
-// difference steeper than the ones before by less than this times s^3, in 99.9 % of the cases
-// (simulated).
-constexpr double STEEPEST = 130.0;
-// [T] Steps of magnetometers are hardly larger than this. With the usual threshold steps of up to
-// 1.3e-5 T do not make a spike by it.
-constexpr double COARSEST = 1.5e-6;
-// After a spike the field is again where it was, to this share of the spike.
-constexpr double BACK = 0.3;
+// If a dipole moves by the share s > 0.4 of its distance between two readings, the ratio of their
+// difference to the previous ones is less than this times s^3 in 99.9 % of the cases (simulated).
+constexpr double RATIO_PER_CUBE = 130.0;
+// [T] Typical maximum step of magnetometers. With the default threshold, steps of up to 1.3e-5 T
+// are not classified as spikes.
+constexpr double MAX_STEP = 1.5e-6;
+// Maximum difference of the field after a spike from that before it, relative to the spike.
+constexpr double MAX_RETURN = 0.3;
 
-// The reading passes; it is held; what was held is a spike (call again for the reading itself); the
-// held readings and this one pass, in order.
+// The reading passes; it is held; the held readings are a spike (call again for the reading
+// itself); the held readings and this one pass, in order.
 enum Verdict { PASSES, HELD, SPIKE, RELEASED };
 
-// Whether the present run of equal readings is longer than chance makes it.
+// Whether the current run of equal readings is too long to be due to chance.
 inline bool is_too_long(const Sensor& s) {
     if (s.run < MIN_RUN || s.changes < MIN_CHANGES) return false;
     const double usual = (s.repeats + 1.0) / (s.repeats + s.changes + 2.0);
-    return usual < COARSE && double(s.run) * std::log(usual) < LIKELY;
+    return usual < COARSE && double(s.run) * std::log(usual) < MIN_LOG_PROBABILITY;
 }
 
-// Whether a reading `field` (3) [T], NaN = missing axis, repeats the one before for longer than
-// chance, or coarse steps, allow.
+// Whether a reading `field` (3) [T], NaN = missing axis, repeats the previous one for longer than
+// chance or coarse steps can explain.
 inline bool is_stuck(Sensor& s, const double* field) {
     bool is_same = true;
     for (int a = 0; a < 3; ++a) {
@@ -64,8 +63,8 @@ inline bool is_stuck(Sensor& s, const double* field) {
         ++s.run;
         return is_too_long(s);
     }
-    // A run that is a fault says little about what is usual. But if it counted for nothing, a sensor
-    // with coarse steps that started while a target passed would be stuck at rest.
+    // A faulty run counts only once. If it did not count at all, a sensor with coarse steps that
+    // started during a pass would be classified as stuck at rest.
     if (s.run) {
         s.repeats += is_too_long(s) ? 1.0 : double(s.run);
         s.run = 0;
@@ -87,33 +86,35 @@ inline double largest_recent(const Sensor& s, int a) {
 // Standard deviation [T] of axis `a`; before the noise is known, from recent differences.
 inline double usual_noise(const Sensor& s, int a) {
     if (s.is_ready) return s.noise_std[a];
-    // An axis that has only rested so far has steps like the others.
+    // An axis that has been constant so far is assumed to have the steps of the others.
     const double step = std::isfinite(s.step[a])
                             ? s.step[a]
-                            : std::min({s.step[0], s.step[1], s.step[2], COARSEST});
+                            : std::min({s.step[0], s.step[1], s.step[2], MAX_STEP});
     return std::max(largest_recent(s, a) / MAX_OF_RECENT, step / std::sqrt(12.0));
 }
 
-// Whether `steps` (3) [T] from the reading before are steeper than any target makes them.
+// Whether the differences `steps` (3) [T] from the previous reading are larger than those of a
+// target.
 inline bool is_off(const Sensor& s, double threshold, int64_t stamp, const double* steps) {
     // A comparison with NaN is false: a missing axis is no spike.
     bool is_high = false;
     for (int a = 0; a < 3; ++a) is_high |= steps[a] > threshold * usual_noise(s, a);
     if (!is_high) return false;
-    const double passed = FASTEST * double(stamp - s.before_ns) * 1e-9;
-    const double steeper = std::max(STEEPER, STEEPEST * passed * passed * passed);
+    const double passed = MAX_RATE * double(stamp - s.before_ns) * 1e-9;
+    const double ratio = std::max(MIN_RATIO, RATIO_PER_CUBE * passed * passed * passed);
     for (int a = 0; a < 3; ++a) {
         const double noise = usual_noise(s, a), largest = largest_recent(s, a);
-        // A sensor with coarse steps may not have changed at all recently. A comparison with NaN is
-        // false: of an axis without recent differences nothing is known.
-        if (largest >= 0.0 && steps[a] > threshold * noise && steps[a] > steeper * noise
-            && steps[a] > steeper * largest)
+        // A sensor with coarse steps may not have changed recently, hence the comparison with the
+        // noise. A comparison with NaN is false: an axis without recent differences is not
+        // evaluated.
+        if (largest >= 0.0 && steps[a] > threshold * noise && steps[a] > ratio * noise
+            && steps[a] > ratio * largest)
             return true;
     }
     return false;
 }
 
-// A reading with its own covariance (3, 3) [T^2], which counts where `own` is not zero.
+// A reading with its own covariance (3, 3) [T^2], which is used if `own` is not zero.
 struct Reading {
     int64_t stamp;
     const double* field;
@@ -121,7 +122,7 @@ struct Reading {
     const double* covariance;
 };
 
-// Store a reading at place `k` of those that are held.
+// Store a reading at index `k` of the held readings.
 inline void store(Sensor& s, int64_t k, const Reading& reading) {
     s.held_ns[k] = reading.stamp, s.held_own[k] = reading.own;
     for (int a = 0; a < 3; ++a) {
@@ -131,14 +132,14 @@ inline void store(Sensor& s, int64_t k, const Reading& reading) {
     }
 }
 
-// Append a reading, `steps` (3) from the one before, to those that are held.
+// Append a reading, with the differences `steps` (3) from the previous one, to the held readings.
 inline void hold(Sensor& s, const Reading& reading, const double* steps) {
     store(s, s.n_held, reading);
     for (int a = 0; a < 3; ++a) s.held_steps[s.n_held][a] = steps[a];
     ++s.n_held;
 }
 
-// Note a reading that passes; the next one is compared with it. Without `steps`: nullptr.
+// Record a reading that passes; the next one is compared with it. `steps` may be nullptr.
 inline void pass(Sensor& s, const Reading& reading, const double* steps) {
     double* place = s.steps[s.n_steps % RECENT];
     for (int a = 0; a < 3; ++a) {
@@ -149,9 +150,9 @@ inline void pass(Sensor& s, const Reading& reading, const double* steps) {
     s.n_steps += steps != nullptr;
 }
 
-// Whether the field is again where it was before the held readings.
+// Whether the field has returned to its value before the held readings.
 inline bool has_returned(const Sensor& s, const double* steps) {
-    // The axis in which they are highest decides.
+    // The axis with the largest difference decides.
     int axis = 0;
     double highest = -1.0;
     for (int a = 0; a < 3; ++a) {
@@ -160,18 +161,19 @@ inline bool has_returned(const Sensor& s, const double* steps) {
             if (s.held_steps[k][a] > largest) largest = s.held_steps[k][a];
         if (largest > highest) axis = a, highest = largest;
     }
-    return steps[axis] <= BACK * highest;
+    return steps[axis] <= MAX_RETURN * highest;
 }
 
-// Decide on a reading and on those that are held before it.
+// Classify a reading and the held readings before it.
 //
-// A reading is held where it differs from the one before by more than `threshold` noise deviations
-// and by `STEEPER` times more than readings did recently: a vehicle approaches smoothly. Where
-// readings are so rare that a target may pass between them, only a steeper difference is suspect.
-// Before the noise is known (not `is_ready`), recent differences are its measure.
+// A reading is held if it differs from the previous one by more than `threshold` standard
+// deviations of the noise and by more than `MIN_RATIO` times the recent differences, since a
+// vehicle approaches smoothly. If the rate is so low that a target may pass between two readings,
+// the ratio is larger. Before the noise is known (not `is_ready`), it is estimated from the recent
+// differences.
 inline Verdict screen_spike(Sensor& s, double threshold, const Reading& reading) {
     double steps[3] = {NAN, NAN, NAN};
-    // More are never held when a reading comes.
+    // There are never more when a reading arrives.
     if (s.n_held > MAX_HELD) throw std::out_of_range("n_held of a sensor: no room for another");
     if (s.before_ns == NEVER) {
         if (s.n_held) {
@@ -186,7 +188,7 @@ inline Verdict screen_spike(Sensor& s, double threshold, const Reading& reading)
         if (has_returned(s, steps)) return SPIKE;
         hold(s, reading, steps);
         if (s.n_held <= MAX_HELD) return HELD;
-        // A step: the differences before it say nothing of what is usual now.
+        // A step: the earlier differences are not representative any more.
         s.n_steps = 0, s.n_released = s.n_held;
         pass(s, reading, nullptr);
         return RELEASED;

@@ -1,4 +1,4 @@
-"""Faulty readings of one sensor: spikes, and a sensor that is stuck.
+"""Rejection of faulty readings of one sensor: spikes and stuck sensors.
 
 Only a suspect reading is held until the next ones decide; all others pass at once. The rules are
 compiled: `screening.hpp`.
@@ -9,16 +9,23 @@ from mag_tracking.calibration import core
 from mag_tracking.units import NEVER
 
 MIN_CHANGES = core.MIN_CHANGES
-"""A sensor that has changed less often may have steps so coarse that it repeats itself for long."""
+"""Minimum number of changes of a sensor; with fewer, its steps may be so coarse that it repeats
+itself for long."""
 COARSE = core.COARSE
-"""A sensor that repeats itself more often has steps so coarse that at rest it may do so for ever;
-with a noise of one step or more, on three axes, the share is below this."""
+"""Share of repeated readings above which the steps of a sensor are coarse, so that it may repeat
+itself indefinitely at rest. With a noise of one step or more on three axes, the share is lower."""
 
 PASSES, HELD, SPIKE, RELEASED = core.PASSES, core.HELD, core.SPIKE, core.RELEASED
-"""A reading passes; it is held; what was held is a spike; the held readings and this one pass."""
+"""Verdicts: the reading passes; it is held; the held readings are a spike; the held readings and
+this one pass."""
 
 
 def clear_spikes(sensor: Record) -> None:
-    """Forget the readings before, and those that are held."""
+    """Discard the previous and the held readings.
+
+    Parameters
+    ----------
+    sensor : SENSOR record
+    """
     sensor['before_ns'], sensor['n_steps'] = NEVER, 0
     sensor['n_held'] = sensor['n_released'] = 0

@@ -1,6 +1,6 @@
-"""State of each sensor that changes with every reading: one structured array for all sensors.
+"""State of each sensor that changes with every reading, as one structured array for all sensors.
 
-Compiled code reads and writes it reading by reading, Python block by block.
+Compiled code accesses it for each reading, Python for each block.
 """
 
 import numpy as np
@@ -10,16 +10,26 @@ from mag_tracking.calibration import core
 from mag_tracking.units import NEVER
 
 RECENT = core.RECENT
-"""Differences between consecutive readings that a spike is compared with."""
+"""Number of differences between consecutive readings that a spike is compared with."""
 MAX_HELD = core.MAX_HELD
-"""A spike has at most so many readings; what lasts longer is a step."""
+"""Maximum number of readings of a spike; a longer change is a step."""
 
 SENSOR = core.SENSOR
-"""State of one sensor, in [T] and [s], or [ns] where the name says so; `sensor.hpp` has it."""
+"""State of one sensor, in [T] and [s], or [ns] if the name ends with `_ns`; defined in
+`sensor.hpp`."""
 
 
 def new_sensors(n: int) -> StructArray:
-    """(n,) SENSOR without any reading."""
+    """Create the state of sensors without any reading.
+
+    Parameters
+    ----------
+    n : int
+
+    Returns
+    -------
+    (n,) SENSOR array
+    """
     sensors = np.zeros(n, SENSOR)
     for name in ('first_ns', 'last_ns', 'unconfirmed_ns', 'before_ns'):
         sensors[name] = NEVER

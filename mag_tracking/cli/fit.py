@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.analysis.correlated_motion import disagree
-from mag_tracking.analysis.pass_result import POOR, Bearing, PassFit
+from mag_tracking.analysis.correlated_motion import contradicts_delays
+from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, Bearing, PassFit
 from mag_tracking.apps.fit import RecordingFit, check_cpa_range, check_orders
 from mag_tracking.apps.pass_fitter import FittedPass
 from mag_tracking.arrays import FloatArray
@@ -159,7 +159,7 @@ def _print_pass(one: FittedPass) -> None:
     _print_delay(one)
     if one.chosen is not None:
         least = one.chosen.normalised_cost
-        if least > POOR:
+        if least > MAX_NORMALISED_COST:
             print(f'  a row of dipoles describes it poorly (cost {least:.1f}): '
                   'speed and position may be off by several of the deviations')
         centre = one.chosen.data.network.positions[one.chosen.data.sensors].mean(axis=0)
@@ -196,7 +196,7 @@ def _print_delay(one: FittedPass) -> None:
     print(f'  by the delay between sensors: {c.speed:.2f}({c.speed_std:.2f}) m/s, '
           f'{np.degrees(c.heading):.0f} deg{line}')
     best = one.chosen
-    if best is not None and disagree(best.speed, best.heading, c):
+    if best is not None and contradicts_delays(best.speed, best.heading, c):
         print('  warning: fit and delay contradict each other; believe neither (a clock, a '
               'position in the network file, a turn)')
 

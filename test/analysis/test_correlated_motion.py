@@ -5,7 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated_motion, disagree
+from mag_tracking.analysis.correlated_motion import (
+    CorrelatedMotion,
+    contradicts_delays,
+    correlated_motion,
+)
 from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
 from support.passes import NOISE, measured, network_of
 
@@ -26,7 +30,7 @@ def along_x(speed, aside=2.0, seed=0, places=((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 @pytest.mark.parametrize('heading', [0.0, np.pi])
 def test_the_delay_is_distance_over_speed(speed, heading):
     found = correlated_motion(along_x(speed, heading=heading))
-    assert not found.reason and found.alike > 0.99 and np.isnan(found.heading_std)
+    assert not found.reason and found.similarity > 0.99 and np.isnan(found.heading_std)
     assert abs(found.speed - speed) < max(3.0 * found.speed_std, 1e-3 * speed)
     assert found.speed_std < 0.05 * speed
     assert np.cos(found.heading - heading) > 0.999
@@ -82,7 +86,7 @@ def test_one_sensor_and_no_axis_in_common():
     field = data.field.copy()
     field[data.sensor == 0, 0] = field[data.sensor == 1, 1:] = np.nan
     found = correlated_motion(dataclasses.replace(data, field=field))
-    assert 'an axis, in common' in found.reason
+    assert 'on a common axis' in found.reason
 
 
 def test_one_axis_is_enough():
@@ -96,19 +100,21 @@ def test_one_axis_is_enough():
 def test_what_contradicts():
     c = CorrelatedMotion('', 10.0, 0.2, 0.0, np.nan, 1.0)
     straight = 0.1, 0.02
-    assert not disagree((10.4, 0.1), straight, c) and disagree((14.0, 0.3), straight, c)
-    assert disagree((10.0, 0.1), (np.pi, 0.1), c)
+    assert not contradicts_delays((10.4, 0.1), straight, c) \
+        and contradicts_delays((14.0, 0.3), straight, c)
+    assert contradicts_delays((10.0, 0.1), (np.pi, 0.1), c)
     # Either a large deviation or a small difference is no contradiction.
-    assert not disagree((14.0, 2.0), straight, c) and not disagree((10.9, 0.01), straight, c)
-    assert not disagree((10.0, 0.1), (np.radians(100.0), np.radians(40.0)), c)
+    assert not contradicts_delays((14.0, 2.0), straight, c) \
+        and not contradicts_delays((10.9, 0.01), straight, c)
+    assert not contradicts_delays((10.0, 0.1), (np.radians(100.0), np.radians(40.0)), c)
     # Obliquely across the line of the sensors the delay is shorter.
-    assert not disagree((10.0 * np.cos(0.5), 0.1), (0.5, 0.02), c)
-    assert disagree((10.0, 0.1), (0.5, 0.02), c)
+    assert not contradicts_delays((10.0 * np.cos(0.5), 0.1), (0.5, 0.02), c)
+    assert contradicts_delays((10.0, 0.1), (0.5, 0.02), c)
     off_line = CorrelatedMotion('', 10.0, 0.2, 0.0, 0.1, 1.0)
-    assert not disagree((10.0, 0.1), (0.5, 0.02), off_line)
+    assert not contradicts_delays((10.0, 0.1), (0.5, 0.02), off_line)
     for unknown in (CorrelatedMotion('one sensor'), CorrelatedMotion()):
-        assert not disagree((14.0, 0.1), straight, unknown)
-    assert not disagree((np.nan, 0.1), straight, c)
+        assert not contradicts_delays((14.0, 0.1), straight, unknown)
+    assert not contradicts_delays((np.nan, 0.1), straight, c)
 
 
 @pytest.mark.parametrize('places', [((0.0, 0.0, 0.0), (0.0, 0.0, 0.6)),
@@ -117,7 +123,7 @@ def test_sensors_above_one_another_have_no_delay(places):
     data = along_x(9.0, places=places)
     late = np.where(data.sensor == 1, 0.03, 0.0)
     found = correlated_motion(dataclasses.replace(data, t=data.t + late))
-    assert 'beside each other' in found.reason
+    assert 'no pair of separate sensors' in found.reason
 
 
 @pytest.mark.parametrize('spoilt', ['first constant', 'all zero', 'one infinite', 'stamps alike',

@@ -13,8 +13,8 @@ from mag_tracking.analysis.joint_fit import (
     path_from,
 )
 from mag_tracking.analysis.model_order import choose_order, order_criteria
+from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_description import assignment, fits_at_minimum
-from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_targets import fit_targets
 from mag_tracking.analysis.pass_trust import FittedRow, residual_elsewhere
@@ -66,7 +66,7 @@ def test_two_vehicles_are_found_with_honest_deviations(plan, n_dipoles):
         found = fit_joint(data, tracked(rng, paths), GROUND, (n_dipoles,))
         assert len(found) == 2
         for (fit,), path in zip(found, paths, strict=True):
-            assert fit.converged and fit.n_others == 6 + (n_dipoles > 1) + 3 * n_dipoles
+            assert fit.converged and fit.n_other_unknowns == 6 + (n_dipoles > 1) + 3 * n_dipoles
             assert not fit.reason and abs(fit.normalised_cost - 1.0) < 0.15
             true = path[:6].copy()
             true[:3] += fit.data.stamp_ns / 1e9 * path[3:6]
@@ -170,7 +170,7 @@ def test_what_is_not_believed_says_why():
                  data, t=data.t[::200], sensor=data.sensor[::200], field=data.field[::200],
                  covariance=data.covariance[::200]), two),
              # A third one that nobody tracked.
-             ('leave over', together(data, measured(
+             ('of the field unexplained', together(data, measured(
                  ROAD, *one_path(rng, 1.5, 1, 1), rng, seconds=6.0, noise=1e-15)), two)]
     for reason, of, tracks in cases:
         fits, = fit_targets(of, alone, tracks, GROUND, (1,))
@@ -247,7 +247,7 @@ def test_what_left_its_track_says_so():
     # As fast as nobody was.
     astray[1, 3] *= 3.0
     found = fit_joint(data, astray, GROUND, (1,))
-    assert sorted(fit.reason for fit, in found) == ['', 'it is not where it was tracked']
+    assert sorted(fit.reason for fit, in found) == ['', 'the fit is not at the tracked position']
     assert fit_joint(data, astray, GROUND, (1,), stopped=lambda: True) == ()
 
 
@@ -307,6 +307,6 @@ def test_what_is_left_over_may_be_of_any_of_them():
 
 def test_targets_that_are_described_poorly_together_are_ambiguous():
     *_, (first, _), _ = two_minima()
-    assert not first.ambiguous and first.n_others == 9
+    assert not first.ambiguous and first.n_other_unknowns == 9
     poor = replace(first, cost=2.1 * first.degrees_of_freedom)
-    assert poor.ambiguous and not replace(poor, n_others=0).ambiguous
+    assert poor.ambiguous and not replace(poor, n_other_unknowns=0).ambiguous

@@ -70,7 +70,7 @@ def test_what_is_no_pose_says_so():
     good = reading([0.06, 0.05, 0.08], MOMENT)
     for change, message in (
             ({'field': good[:8]}, r'expected field \(9, 3\)'), ({'moment': -1.0}, 'moment is -1.0'),
-            ({'high': LOW}, 'has no size'), ({'field': good * np.inf}, 'infinite'),
+            ({'high': LOW}, 'has no volume'), ({'field': good * np.inf}, 'infinite'),
             ({'network': replace(network, noise_std=(None,) * 9)}, 'noise_std is None')):
         with pytest.raises(ValueError, match=message):
             locate_magnet(**{'network': network, 'field': good, 'moment': MOMENT, 'low': LOW,

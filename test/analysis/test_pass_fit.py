@@ -8,8 +8,8 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from mag_tracking.analysis.model_order import choose_order, order_criteria
+from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_data import separable_problem
-from mag_tracking.analysis.pass_deviation import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.apps.fit import RecordingFit

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from mag_tracking.analysis.pass_mounting import MountingEvidence, fold_mounting, with_evidence
+from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting, with_evidence
 from mag_tracking.geometry import rotation_about_z
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
@@ -65,24 +65,24 @@ def toy(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=NETWORK, prio
 def test_folded_tracks_are_one_estimate_of_all(n_tracks, axes):
     # They claim too much noise, so that nothing is widened.
     t = toy(n_tracks, noise=0.01, claimed=3.0, axes=axes)
-    e = fold_mounting(NETWORK, PRIOR, t.tracks)
+    e = fuse_mounting(NETWORK, PRIOR, t.tracks)
     assert e.n_tracks == n_tracks
-    np.testing.assert_allclose(e.turn, t.mean, rtol=1e-6, atol=1e-10)
+    np.testing.assert_allclose(e.rotation, t.mean, rtol=1e-6, atol=1e-10)
     np.testing.assert_allclose(e.covariance, t.covariance, rtol=1e-6, atol=1e-12)
 
 
 def test_the_order_of_the_tracks_does_not_matter():
     t = toy(6)
-    a, b = (fold_mounting(NETWORK, PRIOR, tracks) for tracks in (t.tracks, t.tracks[::-1]))
-    for name in ('turn', 'covariance', 'scatter'):
+    a, b = (fuse_mounting(NETWORK, PRIOR, tracks) for tracks in (t.tracks, t.tracks[::-1]))
+    for name in ('rotation', 'covariance', 'scatter'):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-9)
 
 
 def test_no_track_leaves_what_was_known():
-    e = fold_mounting(NETWORK, PRIOR, [])
-    assert e.n_tracks == 0 and not e.turn.any() and np.isnan(e.scatter).all()
+    e = fuse_mounting(NETWORK, PRIOR, [])
+    assert e.n_tracks == 0 and not e.rotation.any() and np.isnan(e.scatter).all()
     np.testing.assert_allclose(np.sqrt(np.einsum('jii->ji', e.covariance)), PRIOR)
-    assert np.isnan(fold_mounting(NETWORK, PRIOR, toy(1).tracks).scatter).all()
+    assert np.isnan(fuse_mounting(NETWORK, PRIOR, toy(1).tracks).scatter).all()
 
 
 def test_a_track_that_learnt_nothing_says_nothing():
@@ -90,10 +90,10 @@ def test_a_track_that_learnt_nothing_says_nothing():
     prior = np.einsum('jik,jk,jlk->jil', NETWORK.R_sw, PRIOR**2, NETWORK.R_sw)
     idle = SimpleNamespace(id=9, mounting=np.zeros((3, 3)),
                            mounting_covariance=1.02 * prior)
-    e = fold_mounting(NETWORK, PRIOR, [idle, idle])
+    e = fuse_mounting(NETWORK, PRIOR, [idle, idle])
     np.testing.assert_allclose(e.covariance, np.array([np.diag(s**2) for s in PRIOR]),
                                rtol=1e-6, atol=1e-15)
-    assert np.abs(e.turn).max() < 1e-9
+    assert np.abs(e.rotation).max() < 1e-9
 
 
 def scatters(n_runs, n_tracks, **kwargs):
@@ -101,9 +101,9 @@ def scatters(n_runs, n_tracks, **kwargs):
     out, nees = [], []
     for seed in range(n_runs):
         t = toy(n_tracks, seed, **kwargs)
-        e = fold_mounting(NETWORK, PRIOR, t.tracks)
+        e = fuse_mounting(NETWORK, PRIOR, t.tracks)
         out += e.scatter.tolist()
-        off = e.turn - t.truth
+        off = e.rotation - t.truth
         nees += [d @ np.linalg.solve(C, d) for d, C in zip(off, e.covariance, strict=True)]
     return np.array(out), np.array(nees)
 
@@ -135,7 +135,7 @@ def test_what_tracks_claim_falsely_is_widened():
     # Without it, twenty-five; by it, as by a Student's t of twelve degrees of freedom.
     assert 0.6 < nees.mean() / 3 < 1.5
     t = toy(5, 3, noise=1e-3, claimed=0.2)
-    e = fold_mounting(NETWORK, PRIOR, t.tracks)
+    e = fuse_mounting(NETWORK, PRIOR, t.tracks)
     ratio = np.trace(e.covariance, axis1=1, axis2=2) / np.trace(t.covariance, axis1=1, axis2=2)
     np.testing.assert_allclose(ratio, e.scatter, rtol=0.02)
 
@@ -143,16 +143,17 @@ def test_what_tracks_claim_falsely_is_widened():
 def test_a_track_of_another_network_is_refused():
     t = toy(2)
     t.tracks[1].mounting = t.tracks[1].mounting[:2]
-    with pytest.raises(ValueError, match='track 2 has the mounting angles of 2 sensors, not of 3'):
-        fold_mounting(NETWORK, PRIOR, t.tracks)
+    with pytest.raises(ValueError, match='track 2 has mounting angles of 2 sensors, expected 3'):
+        fuse_mounting(NETWORK, PRIOR, t.tracks)
 
 
 def test_the_network_is_turned_about_the_worlds_axes():
-    turn = np.deg2rad([[0.0, 0.0, 6.0], [2.0, 0.0, 0.0], [1.0, -2.0, 3.0]])
+    rotation = np.deg2rad([[0.0, 0.0, 6.0], [2.0, 0.0, 0.0], [1.0, -2.0, 3.0]])
     C = np.tile(np.diag(np.deg2rad([1.0, 2.0, 3.0])**2), (3, 1, 1))
-    found = with_evidence(NETWORK, MountingEvidence(turn, C, np.full(3, np.nan), 1))
+    found = with_evidence(NETWORK, MountingEvidence(rotation, C, np.full(3, np.nan), 1))
     np.testing.assert_allclose(found.R_ws[0], rotation_about_z(np.deg2rad(6.0)) @ NETWORK.R_ws[0])
-    np.testing.assert_allclose(found.R_ws, Rotation.from_rotvec(turn).as_matrix() @ NETWORK.R_ws)
+    np.testing.assert_allclose(found.R_ws,
+                               Rotation.from_rotvec(rotation).as_matrix() @ NETWORK.R_ws)
     np.testing.assert_allclose(found.orientation_std[2], np.deg2rad([1.0, 2.0, 3.0]))
     assert found.names == NETWORK.names and found.earth_field is NETWORK.earth_field
 
@@ -179,7 +180,7 @@ def turned_passes():
         records = [r for s in samples for r in pipeline.feed(one(s))]
         tracks.append([r for r in records if isinstance(r, Track) and not r.ended][-1])
     prior = np.full((4, 3), np.deg2rad(5.0))
-    return stated, R_ws, fold_mounting(stated, prior, tracks)
+    return stated, R_ws, fuse_mounting(stated, prior, tracks)
 
 
 def test_passes_turn_a_sensor_to_where_it_points(turned_passes):
@@ -187,13 +188,13 @@ def test_passes_turn_a_sensor_to_where_it_points(turned_passes):
     found = with_evidence(stated, evidence)
     before, after = (Rotation.from_matrix(truth @ np.swapaxes(R, 1, 2)).as_rotvec()
                      for R in (stated.R_ws, found.R_ws))
-    print(np.degrees(evidence.turn).round(2), np.degrees(after).round(2),
+    print(np.degrees(evidence.rotation).round(2), np.degrees(after).round(2),
           np.degrees(found.orientation_std).round(2))
     # To the truth, not away from it, about the vertical.
-    assert evidence.turn[1, 2] > np.deg2rad(3.0)
+    assert evidence.rotation[1, 2] > np.deg2rad(3.0)
     assert abs(after[1, 2]) < 0.5 * abs(before[1, 2])
     # The others are left about where they were, and all are as well known as is claimed.
-    assert np.abs(evidence.turn[[0, 2, 3]]).max() < 3.0 * np.deg2rad(5.0) / 3.0
+    assert np.abs(evidence.rotation[[0, 2, 3]]).max() < 3.0 * np.deg2rad(5.0) / 3.0
     assert np.abs(after / np.array(found.orientation_std)).max() < 4.0
     assert np.array(found.orientation_std)[:, 2].max() < np.deg2rad(5.0)
 
@@ -203,5 +204,5 @@ def test_a_tracker_without_angles_is_refused():
     tracks, *_ = drive(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
                        Path(np.array([-70.0, -1.2]), 0.0, 10.0),
                        changes={'track.mounting_std_deg': 0.0})
-    with pytest.raises(ValueError, match='angles of 0 sensors, not of 2'):
-        fold_mounting(network, np.full((2, 3), 0.1), tracks[:1])
+    with pytest.raises(ValueError, match='angles of 0 sensors, expected 2'):
+        fuse_mounting(network, np.full((2, 3), 0.1), tracks[:1])

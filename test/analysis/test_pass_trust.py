@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mag_tracking.analysis.pass_deviation import SensorErrors
+from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.analysis.pass_trust import FittedRow, reach, residual_elsewhere, trusted
@@ -104,7 +104,7 @@ def test_errors_of_the_sensors_are_in_the_deviations(errors):
         data = measured(ROAD, path, moments, rng)
         field = data.field.copy()
         for j in range(2):
-            a, b, c = errors.turn_std * rng.standard_normal(3)
+            a, b, c = errors.rotation_std * rng.standard_normal(3)
             turn = np.array([[1.0, -c, b], [c, 1.0, -a], [-b, a, 1.0]])
             mine = data.sensor == j
             field[mine] = field[mine] @ turn * (1.0 + errors.gain_std * rng.standard_normal(3))

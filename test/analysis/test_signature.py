@@ -56,7 +56,7 @@ def test_quiet_ends_hardly_matter():
 
 @pytest.mark.parametrize(('t', 'field', 'why'), [
     (np.arange(5.0), np.ones((5, 3)), 'too few'),
-    (np.arange(20.0), np.ones((20, 3)), 'does not vary'),
+    (np.arange(20.0), np.ones((20, 3)), 'is constant'),
     (np.arange(20.0), np.full((20, 3), np.nan), 'not finite'),
     (np.zeros(20), np.random.default_rng(0).standard_normal((20, 3)), 'do not increase')])
 def test_what_has_no_shape_is_refused(t, field, why):

@@ -60,7 +60,7 @@ def test_training_is_repeated_exactly_and_survives_its_file(tmp_path):
         np.testing.assert_array_equal(found.posterior(other.x), model.posterior(other.x))
         assert found.names(other.x) == model.names(other.x)
     assert evaluate(stored, other.x, other.labels).accuracy[0] > 0.8
-    with pytest.raises(LabelsError, match="does not have 'tank'"):
+    with pytest.raises(LabelsError, match="does not have the classes 'tank'"):
         evaluate(stored, other.x, ['tank'] * len(other.labels))
 
 
@@ -76,7 +76,7 @@ def test_two_classes_have_probabilities_too():
 
 @pytest.mark.parametrize(('labels', 'why'), [
     (['car'] * 10, 'at least two classes, got car'), (['car'] * 9 + ['truck'], "got 1 of 'truck'"),
-    (['car'] * 5 + [''] * 5, 'no label'), (['car'] * 5 + ['unknown'] * 5, 'name the class')])
+    (['car'] * 5 + [''] * 5, 'no label'), (['car'] * 5 + ['unknown'] * 5, 'rename the class')])
 def test_labels_from_which_nothing_is_learnt_are_refused(labels, why):
     x = np.random.default_rng(0).standard_normal((10, 4))
     with pytest.raises(LabelsError, match=why):

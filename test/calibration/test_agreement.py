@@ -7,7 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from mag_tracking.calibration.agreement import IMPROBABLE, UNITS, consensus, disagreements
+from mag_tracking.calibration.agreement import (
+    FALSE_ALARM_PROBABILITY,
+    UNITS,
+    consensus,
+    disagreements,
+)
 from mag_tracking.geometry import rotation_about_z
 
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
@@ -83,8 +88,8 @@ def test_sensors_in_each_others_place_are_named(i, j):
     fields[[i, j]] = fields[[j, i]]
     found = told(fields)
     assert set(found) == {NAMES[i], NAMES[j]}
-    assert f'it and {NAMES[j]} are exchanged' in found[NAMES[i]]
-    assert f'it and {NAMES[i]} are exchanged' in found[NAMES[j]]
+    assert f'it is exchanged with {NAMES[j]}' in found[NAMES[i]]
+    assert f'it is exchanged with {NAMES[i]}' in found[NAMES[j]]
 
 
 def test_one_that_would_fit_anothers_place_is_not_exchanged_with_it():
@@ -102,7 +107,7 @@ def test_sensors_rotated_by_right_angles_in_each_others_place_are_named(turn):
     fields[[0, 1]] = fields[[1, 0]]
     found = told(fields, R_ws)
     assert set(found) == {'a', 'b'}
-    assert 'it and b are exchanged' in found['a'] and 'it and a are exchanged' in found['b']
+    assert 'it is exchanged with b' in found['a'] and 'it is exchanged with a' in found['b']
 
 
 def test_iron_beside_a_sensor_is_not_explained_away():
@@ -111,14 +116,14 @@ def test_iron_beside_a_sensor_is_not_explained_away():
     (d,) = disagreements(NAMES, fields, R_WS, np.tile(STD, (4, 1)), EARTH, BIAS)
     assert (d.sensor, d.explanations) == ('b', ())
     assert d.size == pytest.approx(np.sqrt(194.0) * 1e-6, rel=1e-9)
-    assert str(d).startswith('b is 13.9 uT from the field of the Earth: no axis, unit or')
+    assert str(d).startswith("b differs from the Earth's field by 13.9 uT: no axis, unit or")
 
 
 def test_the_message_names_what_would_explain_it():
     fields = right()
     fields[0, 2] *= -1.0
     (d,) = disagreements(NAMES, fields, R_WS, np.tile(STD, (4, 1)), EARTH, BIAS)
-    assert str(d).endswith('uT from the field of the Earth: z is flipped')
+    assert str(d) == f"a differs from the Earth's field by {d.size * 1e6:.3g} uT: z is flipped"
 
 
 def test_what_cannot_be_seen_is_not_claimed():
@@ -156,12 +161,12 @@ def test_false_alarms_are_as_rare_as_stated(std, missing, n=300):
         if missing is not None:
             fields[:, missing] = np.nan
         alarms += len(told(fields, R_ws, std))
-    assert alarms <= binom.ppf(0.999, 4 * n, IMPROBABLE)
+    assert alarms <= binom.ppf(0.999, 4 * n, FALSE_ALARM_PROBABILITY)
 
 
 def test_the_statistic_is_chi_square(monkeypatch, n=200):
     """With a limit that is met often, alarms are as frequent as it says."""
-    monkeypatch.setattr('mag_tracking.calibration.agreement.IMPROBABLE', 0.1)
+    monkeypatch.setattr('mag_tracking.calibration.agreement.FALSE_ALARM_PROBABILITY', 0.1)
     std, rng = np.deg2rad([0.3, 0.5, 2.0]), np.random.default_rng(12)
     for missing in ([], [2]):
         alarms = 0

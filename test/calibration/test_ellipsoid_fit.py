@@ -90,7 +90,7 @@ def test_half_of_a_recording_predicts_the_other(recordings, name, limit):
 
 def test_a_recording_of_a_still_sensor_is_refused(recordings):
     fit = fit_ellipsoid(recordings['counts'][:3000])
-    assert not fit.converged and 'lay still' in fit.reason
+    assert not fit.converged and 'a sensor at rest' in fit.reason
 
 
 @settings(derandomize=True, deadline=None, max_examples=25)
@@ -241,7 +241,7 @@ def test_missing_readings_are_left_out_and_counted():
     gaps = np.insert(y, range(0, 1000, 10), [np.nan, 1.0, 1.0], axis=0)
     fit, whole = fit_ellipsoid(gaps), fit_ellipsoid(y)
     assert fit.n_missing == 100 and fit.n_readings == 1000 and fit.converged
-    assert fit.warnings == ('100 readings with a missing axis are left out',)
+    assert fit.warnings == ('100 readings with a missing axis are excluded',)
     np.testing.assert_array_equal(fit.offset, whole.offset)
     assert fit.residual == whole.residual and fit.residual_before == whole.residual_before
 
@@ -254,8 +254,7 @@ def test_readings_at_the_end_of_the_range_are_left_out_and_named():
     fit = fit_ellipsoid(y)
     assert fit.n_readings + fit.n_missing + fit.n_saturated == 20000 and fit.n_missing == 400
     assert fit.converged and fit.n_saturated > (y[:, 1] == top).sum() > 1000
-    assert fit.warnings[1] == (f'{fit.n_saturated} readings at the end of the range of y '
-                               'are left out')
+    assert fit.warnings[1] == f'{fit.n_saturated} readings with saturation of y are excluded'
     assert (np.abs(fit.offset - OFFSET) < 4.0 * fit.offset_std).all()
     assert fit.residual == pytest.approx(spread(fit.correct(y[~np.isnan(y[:, 0])])), rel=1e-12)
 
@@ -273,27 +272,29 @@ LONG = np.diag([1.0, 1.0, 8.0])
 
 
 @pytest.mark.parametrize('y, reason', [
-    (np.zeros((0, 3)), '^0 readings, needs 50'),
-    (readings(EVEN[:49]), '^49 readings, needs 50'),
-    (np.full((100, 3), np.nan), '^0 readings, needs 50'),
+    (np.zeros((0, 3)), '^0 readings, minimum 50'),
+    (readings(EVEN[:49]), '^49 readings, minimum 50'),
+    (np.full((100, 3), np.nan), '^0 readings, minimum 50'),
     (np.zeros((100, 3)), '^all 100 readings are equal'),
-    (readings(np.tile(EVEN[0], (900, 1))), 'lay still'),
-    (readings(RING, 0.0), 'in a plane: thickness .* needs 0.05'),
-    (readings(RING), 'in a plane: thickness .* needs 0.05'),
-    (readings(0.9 * RING + [0.0, 0.0, np.sqrt(0.19)]), 'in a plane: thickness .* needs 0.05'),
-    (readings(U[np.abs(U[:, 2]) < 0.3]), r'^coverage 0.00.*, needs 0.01; .*: none'),
+    (readings(np.tile(EVEN[0], (900, 1))), 'a sensor at rest'),
+    (readings(RING, 0.0), 'in a plane: relative thickness .* minimum 0.05'),
+    (readings(RING), 'in a plane: relative thickness .* minimum 0.05'),
+    (readings(0.9 * RING + [0.0, 0.0, np.sqrt(0.19)]),
+     'in a plane: relative thickness .* minimum 0.05'),
+    (readings(U[np.abs(U[:, 2]) < 0.3]), r'^coverage 0.00.*, minimum 0.01; .*: none'),
     (readings(U[U[:, 2] > 0.0]),
-     r'^coverage 0.00.*, needs 0.01; .*: \+x\+y-z, \+x-y-z, -x\+y-z, -x-y-z$'),
-    (readings(U[U[:, 0] < 0.0], 0.0), r'^coverage 0.00.*, needs 0.01'),
-    (readings(U[U @ [0.6, 0.0, 0.8] > 0.6], 0.0), r'^coverage .*e-05, needs 0.01'),
-    (readings(U[U @ [0.6, 0.0, 0.8] > 0.6]), 'different directions|differ by a factor|no ellips'),
-    (readings(EVEN, correction=LONG), 'are as 0.73 to 5.8, at most 1 to 5 is'),
+     r'^coverage 0.00.*, minimum 0.01; .*: \+x\+y-z, \+x-y-z, -x\+y-z, -x-y-z$'),
+    (readings(U[U[:, 0] < 0.0], 0.0), r'^coverage 0.00.*, minimum 0.01'),
+    (readings(U[U @ [0.6, 0.0, 0.8] > 0.6], 0.0), r'^coverage .*e-05, minimum 0.01'),
+    (readings(U[U @ [0.6, 0.0, 0.8] > 0.6]),
+     'different directions|differ by a factor|not lie on an ellips'),
+    (readings(EVEN, correction=LONG), 'ratio of 0.73 to 5.8, maximum 1 to 5'),
     (readings(U) * np.where(np.arange(3000) % 12 == 0, 3.0, 1.0)[:, None],
-     'scatter 0.* of the radius .* at most 0.1'),
-    (readings(ball(3000)), 'scatter 0.* of the radius .* at most 0.1'),
-    (readings(POSES, 1e-4), '^15 different directions, needs 18'),
+     'scatter about the ellipsoid is 0.* of the radius, maximum 0.1'),
+    (readings(ball(3000)), 'scatter about the ellipsoid is 0.* of the radius, maximum 0.1'),
+    (readings(POSES, 1e-4), '^15 different directions, minimum 18'),
     (readings(EVEN) * np.where(np.arange(1500) % 25 == 0, 100.0, 1.0)[:, None],
-     'share of 0.96 of the readings are outliers, at most 0.2')])
+     'share of 0.96 of the readings are outliers, maximum 0.2')])
 def test_what_cannot_be_fitted_is_refused(y, reason):
     fit = fit_ellipsoid(y)
     print(fit.reason)
@@ -318,7 +319,7 @@ def test_a_fit_that_is_not_refused_is_near_the_truth(seed):
 def test_an_offset_that_is_uncertain_is_refused():
     fit = fit_ellipsoid(readings(U[U[:, 2] > -0.3][:60], 0.06, seed=4))
     print(fit.reason)
-    assert not fit.converged and 'offset uncertain by 0.' in fit.reason
+    assert not fit.converged and 'the standard deviation of the offset is 0.' in fit.reason
 
 
 def test_least_squares_that_stop_early_are_refused(monkeypatch):
@@ -330,9 +331,9 @@ def test_least_squares_that_stop_early_are_refused(monkeypatch):
 
 
 @pytest.mark.parametrize('y, note', [
-    (readings(U[np.abs(U[:, 2]) < 0.5]), 'coverage 0.0.*, good is 0.1'),
+    (readings(U[np.abs(U[:, 2]) < 0.5]), 'coverage 0.0.*, recommended at least 0.1'),
     (readings(U[(U < 0.0).any(axis=1)]), r'few or no readings from \+x\+y\+z$'),
-    (readings(EVEN, 0.08), 'residual 0.0.* after correction, good is 0.05')])
+    (readings(EVEN, 0.08), 'residual 0.0.* after correction, recommended at most 0.05')])
 def test_what_is_mediocre_is_warned_of(y, note):
     fit = fit_ellipsoid(y)
     assert fit.converged and len(fit.warnings) == 1 and re.match(note, fit.warnings[0])
@@ -350,10 +351,10 @@ def test_coverage_is_that_of_the_directions():
     (np.zeros((5, 2)), None, r'expected readings \(n, 3\), got \(5, 2\)'),
     (np.zeros(3), None, r'expected readings \(n, 3\), got \(3,\)'),
     (np.where(np.arange(1500)[:, None] == 7, -np.inf, EVEN), None, 'reading 7 is infinite'),
-    (EVEN, 0.0, 'field_size = 0.0, must be positive'),
-    (EVEN, -1.0, 'field_size = -1.0, must be positive'),
-    (EVEN, np.nan, 'field_size = nan, must be positive'),
-    (EVEN, np.inf, 'field_size = inf, must be positive')])
+    (EVEN, 0.0, 'field_size is 0.0, must be positive'),
+    (EVEN, -1.0, 'field_size is -1.0, must be positive'),
+    (EVEN, np.nan, 'field_size is nan, must be positive'),
+    (EVEN, np.inf, 'field_size is inf, must be positive')])
 def test_bad_input_is_named(y, size, message):
     with pytest.raises(ValueError, match=message):
         fit_ellipsoid(y, size)

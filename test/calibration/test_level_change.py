@@ -169,13 +169,13 @@ def test_a_change_that_is_not_clear_is_judged_by_a_clear_one():
     shared = SharedChanges()
     weak = LevelChange(100.0, 0.5 * CLEAR_SIZE, False)
     strong = LevelChange(101.0, 2.0 * CLEAR_SIZE, True)
-    assert shared.judge(0, weak) is False
-    assert shared.judge(1, strong) is True
-    assert shared.judge(0, weak) is True
+    assert shared.evaluate_change(0, weak) is False
+    assert shared.evaluate_change(1, strong) is True
+    assert shared.evaluate_change(0, weak) is True
     # Not by one of another time, and a clear one only by itself.
-    assert shared.judge(0, dataclasses.replace(weak, since=90.0)) is False
-    assert shared.judge(2, dataclasses.replace(strong, size=1.5 * CLEAR_SIZE, has_departed=False)) \
-        is False
+    assert shared.evaluate_change(0, dataclasses.replace(weak, since=90.0)) is False
+    assert shared.evaluate_change(2, dataclasses.replace(
+        strong, size=1.5 * CLEAR_SIZE, has_departed=False)) is False
 
 
 def is_clear(seed):
@@ -201,7 +201,7 @@ def test_a_vehicle_that_leaves_is_no_background_three_seconds_later(seed, rate):
     # All that was measured against it is doubtful, and nothing is from now on.
     (begin, end_ns), = b.doubtful_times
     assert 0 < begin < 1e9 and end_ns is not None and not b.doubtful
-    assert b.freed_at == pytest.approx(19.5, abs=2.5)
+    assert b.departed_at == pytest.approx(19.5, abs=2.5)
 
 
 @pytest.mark.parametrize('seed', CLEAR)
@@ -209,7 +209,7 @@ def test_a_vehicle_that_stops_is_no_background_while_a_traffic_light_is_red(seed
     """Though the background was seen for a few seconds only, it is not doubted for that."""
     b = running(relearn=120.0)
     feed(b, np.arange(0.0, 70.0, 0.02), signal=vehicle(seed, stops=True, at=12.0))
-    assert b.frozen and not b.n_relearnt and not b.doubtful and b.freed_at is None
+    assert b.frozen and not b.n_relearnt and not b.doubtful and b.departed_at is None
 
 
 def test_one_axis_is_judged_too_and_one_that_is_missing_holds_up_nothing():
@@ -227,10 +227,10 @@ def test_one_axis_is_judged_too_and_one_that_is_missing_holds_up_nothing():
 
 def test_a_level_of_before_the_time_jumped_back_judges_nothing():
     shared = SharedChanges()
-    b = running(judge=partial(shared.judge, 1))
-    shared.judge(1, LevelChange(100.0, 2.0 * CLEAR_SIZE, True))
+    b = running(evaluate_change=partial(shared.evaluate_change, 1))
+    shared.evaluate_change(1, LevelChange(100.0, 2.0 * CLEAR_SIZE, True))
     b.forget()
-    assert shared.judge(0, LevelChange(100.0, 1.0, None)) is None
+    assert shared.evaluate_change(0, LevelChange(100.0, 1.0, None)) is None
 
 
 def test_a_background_that_was_given_is_not_replaced_by_a_level_that_is_left():

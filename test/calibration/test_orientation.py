@@ -9,9 +9,9 @@ from scipy.stats import binom, chi2
 
 from mag_tracking.calibration.orientation import (
     GRAVITY,
-    RIVAL,
+    MAX_RIVAL_COST,
     Orientation,
-    Up,
+    UpDirection,
     compass_orientation,
     levelled,
     pooled_bias_std,
@@ -31,8 +31,8 @@ POSTURES = {'upright': np.eye(3), 'on its head': Rotation.from_euler('x', 180.0,
 
 
 def up_of(R_ws, std=0.0):
-    """`Up` of a sensor that is turned by `R_ws`."""
-    return Up(R_ws.T @ UP, GRAVITY, std, 100, 0)
+    """`UpDirection` of a sensor that is turned by `R_ws`."""
+    return UpDirection(R_ws.T @ UP, GRAVITY, std, 100, 0)
 
 
 def angles_between(R, S):
@@ -80,7 +80,7 @@ def test_knocks_and_what_is_not_finite_are_left_out():
     (np.zeros((0, 3)), '0 accelerations are too few'),
     (at_rest(np.eye(3), 7), '7 accelerations are too few'),
     (np.full((50, 3), np.nan), '0 accelerations are too few'),
-    (at_rest(np.eye(3)) / GRAVITY, r'in g\?'),
+    (at_rest(np.eye(3)) / GRAVITY, r'is its unit g\?'),
     (np.zeros((50, 3)), 'at rest is 0, not 9.81'),
     (1.2 * at_rest(np.eye(3)), 'at rest is 11.8, not 9.81')])
 def test_what_is_no_accelerometer_at_rest_is_refused(a, message):
@@ -120,7 +120,8 @@ def test_the_orientation_turns_with_the_sensor(R, S):
     rng = np.random.default_rng(0)
     y, up = R.T @ EARTH + BIAS * rng.standard_normal(3), up_of(R, 5e-3)
     a = compass_orientation(up, y, EARTH, BIAS)
-    b = compass_orientation(Up(S.T @ up.direction, GRAVITY, 5e-3, 100, 0), S.T @ y, EARTH, BIAS)
+    b = compass_orientation(UpDirection(S.T @ up.direction, GRAVITY, 5e-3, 100, 0), S.T @ y, EARTH,
+                            BIAS)
     np.testing.assert_allclose(angles_between(b.R_ws, a.R_ws @ S), 0.0, atol=1e-8)
     np.testing.assert_allclose(b.std, a.std, rtol=1e-6)
     np.testing.assert_allclose(b.bias, S.T @ a.bias, atol=1e-13)
@@ -170,7 +171,7 @@ def test_the_heading_is_as_far_off_as_its_deviation_says(lean, missing, n=300):
         assert low < np.sum(squares) < high
     assert len(heading) > (0.95 if missing is None or lean < 1.0 else 0.4) * n
     # The true one of two headings is dropped when its bias is worse than RIVAL.
-    assert gross <= binom.ppf(0.999, n, chi2.sf(RIVAL, 1)) * (missing is not None)
+    assert gross <= binom.ppf(0.999, n, chi2.sf(MAX_RIVAL_COST, 1)) * (missing is not None)
 
 
 @pytest.mark.parametrize('posture', POSTURES)
@@ -190,15 +191,15 @@ def test_a_compass_without_bias_is_as_far_off_as_its_tilt_makes_it(posture, n=20
 @pytest.mark.parametrize('earth', [[0.0, 0.0, -5e-5], [0.0, 0.0, 5e-5], [3e-7, 0.0, -5e-5],
                                    [0.0, 0.0, 0.0]])
 def test_a_field_straight_down_tells_no_heading(earth):
-    with pytest.raises(ValueError, match='does not tell the heading'):
+    with pytest.raises(ValueError, match='heading is not observable'):
         compass_orientation(up_of(np.eye(3)), np.array(earth), earth, BIAS)
 
 
 def test_an_upright_axis_alone_tells_no_heading():
     y = np.array([np.nan, np.nan, EARTH[2]])
-    with pytest.raises(ValueError, match='does not tell the heading'):
+    with pytest.raises(ValueError, match='heading is not observable'):
         compass_orientation(up_of(np.eye(3)), y, EARTH, BIAS)
-    with pytest.raises(ValueError, match='does not tell the heading'):
+    with pytest.raises(ValueError, match='heading is not observable'):
         compass_orientation(up_of(np.eye(3)), np.full(3, np.nan), EARTH, BIAS)
 
 

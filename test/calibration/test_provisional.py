@@ -7,10 +7,10 @@ import pytest
 
 from mag_tracking.calibration.doubtful_times import (
     are_doubtful,
-    doubted_since,
+    doubtful_since,
     merged,
-    noted,
     shifted,
+    updated,
 )
 from mag_tracking.settings import replace
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
@@ -205,18 +205,18 @@ def test_what_is_doubtful_is_not_kept_for_a_restart():
 def test_stretches_of_doubt():
     times = ()
     for stamp, is_doubtful in ((1, False), (2, True), (3, True), (5, False), (9, True)):
-        times = noted(times, stamp, is_doubtful)
+        times = updated(times, stamp, is_doubtful)
     assert times == ((2, 5), (9, None))
     assert [are_doubtful(times, t) for t in (1, 2, 4, 5, 9, 99)] == [False, True, True, False, True,
                                                                      True]
     for k in range(100):
-        times = noted(times, 10 + k, k % 2 == 1)
+        times = updated(times, 10 + k, k % 2 == 1)
     assert len(times) == 16 and times[-1] == (109, None)
     assert shifted(times, 5)[-1] == (114, None)
     # What turns out to have begun earlier takes the place of what was open.
     assert merged({'a': ((1, 2), (4, None))}, {'a': ((3, 6),)}) == {'a': ((1, 2), (3, 6))}
-    assert doubted_since(((1, 2), (4, 5), (6, None)), 3) == ((1, 2), (3, None))
-    assert doubted_since(((1, 4),), 3) == ((1, None),)
+    assert doubtful_since(((1, 2), (4, 5), (6, None)), 3) == ((1, 2), (3, None))
+    assert doubtful_since(((1, 4),), 3) == ((1, None),)
     assert merged({'a': ((1, 2), (4, None))}, {'a': ((4, 6),), 'b': ((3, None),)}) \
         == {'a': ((1, 2), (4, 6)), 'b': ((3, None),)}
     # A stretch with a missing end closes at the next begin.

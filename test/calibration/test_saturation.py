@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from mag_tracking.apps.pass_collector import PassCollector
-from mag_tracking.calibration.saturation import MARGIN, cut_off
+from mag_tracking.calibration.saturation import MARGIN, saturated_readings
 from mag_tracking.pipeline import settings_for
 from support.passes import ROAD, measured, random_path, unknowns_at
 from support.samples import MagSample, one
@@ -20,27 +20,29 @@ def test_a_limit_is_seen_through_noise():
     cut = np.minimum(noisy, 300.0)
     expected = np.convolve(noisy >= 300.0, np.ones(2 * MARGIN + 1), 'same') > 0.0
     assert expected.sum() < 60
-    assert np.array_equal(cut_off(cut), expected)
-    assert np.array_equal(cut_off(-cut), expected)
-    assert not cut_off(noisy).any()
+    assert np.array_equal(saturated_readings(cut), expected)
+    assert np.array_equal(saturated_readings(-cut), expected)
+    assert not saturated_readings(noisy).any()
 
 
 @pytest.mark.parametrize('step', [1.0, 5.0, 20.0])
 def test_coarse_steps_are_no_limit(step):
-    assert not cut_off(np.round(curve() / step) * step).any()
+    assert not saturated_readings(np.round(curve() / step) * step).any()
 
 
 def test_short_stretches():
-    assert cut_off([0.0, 1.0, 5.0, 5.0, 5.0, 1.0, 0.0]).all()
-    assert not cut_off([0.0, 1.0, 5.0, 5.0, 1.0]).any() and not cut_off([]).any()
+    assert saturated_readings([0.0, 1.0, 5.0, 5.0, 5.0, 1.0, 0.0]).all()
+    assert not saturated_readings([0.0, 1.0, 5.0, 5.0, 1.0]).any() \
+        and not saturated_readings([]).any()
 
 
 def test_what_is_missing_or_stuck_is_no_limit():
     cut = np.minimum(curve() + np.random.default_rng(1).standard_normal(200), 300.0)
     cut[::7] = np.nan
-    found = cut_off(cut)
+    found = saturated_readings(cut)
     assert found.any() and not found[::7].any()
-    assert not cut_off(np.full(50, 3.0)).any() and not cut_off(np.full(5, np.nan)).any()
+    assert not saturated_readings(np.full(50, 3.0)).any() \
+        and not saturated_readings(np.full(5, np.nan)).any()
 
 
 def test_a_saturated_stretch_is_left_out_of_a_pass_and_named():

@@ -127,7 +127,7 @@ def test_a_magnet_the_wrong_way_round_is_refused(tmp_path, capsys):
     assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
                    tmp_path / 'board.png', out=tmp_path / 'out.yaml') == 1
     out, err = capsys.readouterr()
-    assert 'refused: not what the model describes: the normalised cost is' in err
+    assert 'refused: the readings do not fit the model: the normalised cost is' in err
     assert 'the network is in' not in out
     assert {p.name for p in tmp_path.iterdir()} == {'stated.yaml', 'poses.csv'}
 
@@ -186,7 +186,8 @@ def test_bad_files_are_named(tmp_path, capsys):
     write_network(tmp_path / 'stated.yaml', stated)
     write_table(few, field, np.tile(stated.positions[0], (5, 1)), axes)
     assert command(few, '--network', tmp_path / 'stated.yaml', out=out) == 1
-    assert 'few.csv: pose 0: [0.0, 0.0, 0.0] m is the place of a sensor' in capsys.readouterr().err
+    assert 'few.csv: pose 0: [0.0, 0.0, 0.0] m is the position of a sensor' \
+        in capsys.readouterr().err
     assert not out.exists()
 
 

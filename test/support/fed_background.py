@@ -16,16 +16,16 @@ class FedBackground(RunningBackground):
 
     def add(self, time, field):
         """Add a reading: `time` [s], `field` (3,) [T]."""
-        self.judge_block()
+        self.evaluate_block()
         self.note(round(time * 1e9), field)
         self.collect(time, field)
 
     def collect(self, time, field):
         """Add a reading whose quantisation steps have been noted."""
-        self.judge_block()
+        self.evaluate_block()
         core.collect(self.sensors, time, np.array(field, dtype=float))
         if np.isnan(self.sensors[0]['phase']):
-            self.judge_block()
+            self.evaluate_block()
 
     def note(self, stamp, raw):
         """Plain Python version of `core.note_step`."""

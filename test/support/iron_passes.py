@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.analysis.pass_deviation import SensorErrors
+from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.writer import RecordingWriter
@@ -12,7 +12,7 @@ from support.samples import sample_dict, simulate
 
 HARD, SOFT = [240.0, -130.0, 90.0], 6.0
 """m0 [A m²] in the vehicle frame and D [m³] of the simulated vehicle."""
-ERRORS = SensorErrorModel(tilt_std=SensorErrors().turn_std, gain_std=SensorErrors().gain_std)
+ERRORS = SensorErrorModel(tilt_std=SensorErrors().rotation_std, gain_std=SensorErrors().gain_std)
 """Sensor errors that the fit assumes for uncalibrated sensors."""
 START_S, DURATION_S, SPEED = 1_000.0, 24.0, 10.0
 

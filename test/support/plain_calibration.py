@@ -118,7 +118,7 @@ class PlainCalibration:
         name = sample.sensor
         if name not in self.backgrounds:
             return self.reject(f'unknown sensor {name}')
-        self.backgrounds[name].judge_block()
+        self.backgrounds[name].evaluate_block()
         cause = self.fault(sample)
         if cause:
             return self.reject(cause)

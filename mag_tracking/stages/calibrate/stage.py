@@ -122,7 +122,8 @@ class Calibrate:
             s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std, s.relearn_s,
             network.background[i], network.noise_std[i],
             phase=i / len(network) if len(network) > AT_ONCE else None,
-            sensors=self._sensors[i:i + 1], judge=partial(self._changes.judge, i))
+            sensors=self._sensors[i:i + 1],
+            evaluate_change=partial(self._changes.evaluate_change, i))
 
     def unready(self) -> list[str]:
         """Names of the sensors whose background is not known."""
@@ -176,7 +177,7 @@ class Calibrate:
             self._reject(name, 'spike', int(batch['n_spikes']))
             batch['n_spikes'] = 0
         if reason == core.BLOCK_COMPLETE:
-            self._background[name].judge_block()
+            self._background[name].evaluate_block()
         elif reason == core.JUMPED_BACK:
             self._background[name].forget()
             self._give_up(i, 'time jumped back')
@@ -212,10 +213,10 @@ class Calibrate:
              out: OutputBuffer) -> None:
         """Calibrate a reading of sensor `i` that has passed."""
         background = self._background[self._network.names[i]]
-        background.judge_block()
+        background.evaluate_block()
         while not core.use_reading(self._sensors, self._limits, self._batches, i, stamp,
                                      plain(field), own, plain(covariance), *out.arrays):
-            background.judge_block()
+            background.evaluate_block()
 
     def _finished(self, out: OutputBuffer) -> list[Readings]:
         """The calibrated readings of a batch, counted."""
@@ -238,7 +239,7 @@ class Calibrate:
                      int(self._sensors[i]['n_held']))
         clear_spikes(self._sensors[i])
 
-    def begin_with(self, levels: Mapping[str, QuietLevel], steps: Mapping[str, FloatArray]) -> None:
+    def start_from(self, levels: Mapping[str, QuietLevel], steps: Mapping[str, FloatArray]) -> None:
         """Begin with what a first pass over the readings has found.
 
         Parameters
@@ -251,7 +252,7 @@ class Calibrate:
         for name, step in steps.items():
             self._of(name)['step'] = step
         for name, found in levels.items():
-            self._background[name].begin_with(found.level, found.covariance)
+            self._background[name].start_from(found.level, found.covariance)
 
     def resume(self, stored: Mapping[str, StoredBackground]) -> None:
         """Restore {sensor: `StoredBackground`} where its first reading comes soon after."""
@@ -276,7 +277,7 @@ class Calibrate:
         calibrated with what was known before.
         """
         for i in np.flatnonzero(self._sensors['is_full']):
-            self._background[self._network.names[i]].judge_block()
+            self._background[self._network.names[i]].evaluate_block()
 
     def flush(self) -> list[Readings]:
         """The readings that waited for the next."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.resolution import smallest_steps
-from mag_tracking.calibration.saturation import cut_off
+from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE, MIN_CHANGES
 from mag_tracking.stages.health.window import median_field, noise_of, quantiles
 from mag_tracking.units import NEVER, NS
@@ -161,7 +161,7 @@ class SensorHealth:
         self._counts['spikes'] += int(alone.any(axis=1).sum())
         if self._stuck_ago >= WINDOW:
             self._noise = self._made['noise'] = noise_of(self._fields)
-        cut = np.array([cut_off(axis) for axis in self._fields.T])[:, -n:]
+        cut = np.array([saturated_readings(axis) for axis in self._fields.T])[:, -n:]
         self._counts['saturated'] += int(np.count_nonzero(cut.any(axis=0)))
 
     def _stuck(self, n: int) -> None:

@@ -16,7 +16,7 @@ from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.clock import Lag, knock_lag, shock
 from mag_tracking.calibration.orientation import (
     Orientation,
-    Up,
+    UpDirection,
     compass_orientation,
     levelled,
     pooled_bias_std,
@@ -157,8 +157,8 @@ class Survey:
         return NetworkSurvey(self._surveyed(sensors, reference, date), tuple(sensors), tuple(odd),
                              bias_std, reference, shocks)
 
-    def _up(self, name: str, warnings: list[str]) -> Up | None:
-        """`Up` of a sensor, or None with a warning."""
+    def _up(self, name: str, warnings: list[str]) -> UpDirection | None:
+        """`UpDirection` of a sensor, or None with a warning."""
         if not self._kept[name]:
             warnings.append('no accelerations: its orientation is not surveyed')
             return None
@@ -182,7 +182,7 @@ class Survey:
             return []
         return disagreements(network.names, field, R, std, earth, self._settings.compass_bias_std)
 
-    def _compass(self, ups: Mapping[int, Up], field: FloatArray, stated_std: FloatArray,
+    def _compass(self, ups: Mapping[int, UpDirection], field: FloatArray, stated_std: FloatArray,
                  warnings: Mapping[str, list[str]]
                  ) -> tuple[float, dict[int, tuple[Orientation, str]]]:
         """(bias_std, {row: (Orientation, by)}) of the sensors that have what it takes."""

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful, noted
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful, updated
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.bayes_factor import TargetBayesFactor
 from mag_tracking.inference.innovation_consistency import InnovationConsistency
@@ -229,7 +229,7 @@ class TrackEvidence:
             These doubts and the earlier ones that persist.
         """
         passing = found.intersection(TRANSIENT_DOUBTS)
-        self._doubtful_times = noted(self._doubtful_times, stamp_ns, bool(passing), MAX_SEGMENTS)
+        self._doubtful_times = updated(self._doubtful_times, stamp_ns, bool(passing), MAX_SEGMENTS)
         self._found_ns |= dict.fromkeys(passing, stamp_ns)
         return found | {reason for reason, when in self._found_ns.items()
                         if (stamp_ns - when) / NS <= TRANSIENT_S} \

@@ -294,7 +294,7 @@ def ends_of_blocks(phase, times):
         assert state['is_full'][0] == (phase is not None and state['now'][0] != now)
         if state['now'][0] != now:
             ends.append(k)
-            background.judge_block()
+            background.evaluate_block()
         now = state['now'][0]
     return ends, background
 

@@ -154,7 +154,7 @@ def spoiled(name, function):
 def test_another_unit_than_metres_per_second_squared_is_named():
     found, _ = surveyed(change=spoiled('mag_3', lambda a: a / 9.81))
     assert list(warnings(found)) == ['mag_3']
-    assert 'in g?' in found.sensors[2].warnings[0]
+    assert 'is its unit g?' in found.sensors[2].warnings[0]
     assert found.sensors[2].orientation is None
     # How it is shaken still says when.
     assert found.network.clock_offset[2] == pytest.approx(CLOCK[2], abs=1e-3)
@@ -164,7 +164,7 @@ def test_without_a_knock_clocks_stay():
     network = stated(clock_offset=np.array([0.0, 0.5, -0.5]))
     found, _ = surveyed(network, knocks=())
     assert found.reference == ''
-    assert found.warnings() == ['clocks stay as they were: the reference felt no knock']
+    assert found.warnings() == ['clocks stay as they were: the reference measured no knock']
     np.testing.assert_array_equal(found.network.clock_offset, [0.0, 0.5, -0.5])
     assert np.isnan(found.network.calibrated[1].clock_offset_std)
 
@@ -175,7 +175,7 @@ def test_a_sensor_that_did_not_feel_the_knock_is_named():
     found, _ = surveyed(change=quiet)
     # Another sensor is the reference then.
     assert found.reference == 'mag_2'
-    assert found.sensors[0].lag.reason == 'the sensor felt no knock'
+    assert found.sensors[0].lag.reason == 'the sensor measured no knock'
     assert found.network.clock_offset[2] == pytest.approx(CLOCK[2] - CLOCK[1], abs=1e-3)
     assert np.isnan(found.network.calibrated[0].clock_offset_std)
     assert found.network.calibrated[1].clock_offset_std == 0.0
@@ -232,7 +232,7 @@ def test_a_field_that_tells_no_heading_is_told_once():
     found, _ = surveyed(stated(earth=np.array([0.0, 0.0, -5e-5])), fields=up)
     for s in found.sensors:
         assert s.by == 'accelerometer, heading as stated'
-        assert len(s.warnings) == 1 and 'does not tell the heading' in s.warnings[0]
+        assert len(s.warnings) == 1 and 'heading is not observable' in s.warnings[0]
 
 
 @pytest.mark.parametrize('stated_yaw', [0.0, 165.0, 180.0, 190.0])
