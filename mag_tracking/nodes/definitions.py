@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.types import definition, named_in
+from mag_tracking.messages.types import definition, referenced_types
 
 
 @functools.cache
@@ -27,7 +27,7 @@ def definition_of(type_name: str) -> str | None:
             return None
         package, _, leaf = name.split('/')
         text += own if not text else f'{"=" * 80}\nMSG: {package}/{leaf}\n{own}'
-        new = [t for t in named_in(own, package) if t not in seen]
+        new = [t for t in referenced_types(own, package) if t not in seen]
         seen += new
         queue += new
     return text

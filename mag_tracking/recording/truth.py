@@ -71,9 +71,9 @@ class TruthTopics:
             rows: IntArray = np.flatnonzero(block.channel == channel)
             if len(rows) and kind.type == POSE and kind.is_cdr and self.wants(kind.topic, POSE):
                 found = poses(block.data, block.begin[rows], block.end[rows], self._frame)
-                taken.append(rows[found.is_read])
+                taken.append(rows[found.is_decoded])
                 self._rows.setdefault(kind.topic, []).append(
-                    (found.stamp_ns[found.is_read], found.pose[found.is_read]))
+                    (found.stamp_ns[found.is_decoded], found.pose[found.is_decoded]))
         return np.concatenate(taken)
 
     def arrays(self) -> dict[str, Truth]:

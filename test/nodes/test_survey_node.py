@@ -77,4 +77,4 @@ def test_a_calibration_of_other_sensors_is_refused(ros):
         spin_until(lambda: False, 1.0)
     finally:
         codes, outputs = stop([process])
-    assert codes == [0] and 'does not fit the network of mag_1, mag_2' in outputs[0], outputs
+    assert codes == [0] and 'the network has mag_1, mag_2' in outputs[0], outputs
