@@ -63,7 +63,7 @@ class HealthDiagnostics:
         # Start of learning by the monotonic clock [s].
         self._unready_since: dict[str, float] = {}
         self._network_findings: dict[str, list[Finding]] = {}
-        # Number of relearnt backgrounds at the begin of the previous window and of this one.
+        # Number of relearnt backgrounds at the start of the previous window and of this one.
         self._relearnt: list[dict[str, int]] = [dict.fromkeys(network.names, 0)] * 2
         self._begin(network)
 
@@ -168,7 +168,7 @@ class HealthDiagnostics:
                 self._network_findings[finding.subject].append(finding)
 
     def _latest(self, name: str) -> SensorHealth:
-        """`SensorHealth` of the current window, or of the previous one if it is new."""
+        """`SensorHealth` of the current window, or of the previous one while it has few readings."""
         past, present = self._past[name], self._present[name]
         return past if past is not None and present.counts['readings'] < MIN_READINGS else present
 
