@@ -10,8 +10,8 @@ from mag_tracking.nodes.stage_node import title_of
 from mag_tracking.nodes.status_log import StatusLog
 
 EXPECTED_COUNTS = ('samples: ', 'came late: ', 'other messages: ', 'lines that are comments',
-            'lines without the prefix', 'lines that are empty', 'retained messages skipped',
-            'conversions overwritten', 'packets not used')
+                   'lines without the prefix', 'lines that are empty', 'retained messages skipped',
+                   'conversions overwritten', 'packets not used')
 """Counts that begin with one of these are reported, but do not cause a warning."""
 
 
@@ -52,7 +52,7 @@ class DriverDiagnostics:
         counts = driver.counts()
         before = self._reported.get(driver.name, {})
         increases = [f'{what}: {n - before.get(what, 0)} more' for what, n in sorted(counts.items())
-                if n > before.get(what, 0) and not what.startswith(EXPECTED_COUNTS)]
+                     if n > before.get(what, 0) and not what.startswith(EXPECTED_COUNTS)]
         self._reported[driver.name] = dict(counts)
         level, message = DiagnosticStatus.OK, 'open'
         if not active:

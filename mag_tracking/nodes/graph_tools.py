@@ -181,7 +181,7 @@ def topics(graph: Observer) -> list[tuple[str, str, int, int]]:
 
 
 def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
-           stopped: Callable[[], bool]) -> None:
+                     stopped: Callable[[], bool]) -> None:
     """Receive the messages of a topic until the handler or the caller stops.
 
     Latched messages are received if all publishers offer them.
@@ -289,9 +289,9 @@ def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list
     names = [name] if name is not None else list(graph.call(
         ListParameters, f'{node}/list_parameters', ListParameters.Request()).result.names)
     values = graph.call(GetParameters, f'{node}/get_parameters',
-                       GetParameters.Request(names=names)).values
+                        GetParameters.Request(names=names)).values
     descriptors = graph.call(DescribeParameters, f'{node}/describe_parameters',
-                      DescribeParameters.Request(names=names)).descriptors
+                             DescribeParameters.Request(names=names)).descriptors
     if name is not None and not (values and values[0].type):
         raise GraphError(f'{node} has no parameter {name}')
     return [f'{n}: {parameter_value_to_python(v)}'
@@ -321,7 +321,7 @@ def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
     try:
         value = yaml.safe_load(text)
         (kind,) = graph.call(GetParameterTypes, f'{node}/get_parameter_types',
-                            GetParameterTypes.Request(names=[name])).types or (0,)
+                             GetParameterTypes.Request(names=[name])).types or (0,)
         if kind == Parameter.Type.DOUBLE.value and isinstance(value, int):
             value = float(value)
         parameter = Parameter(name, value=value)
@@ -349,7 +349,7 @@ def lifecycle_state(graph: Observer, node: str) -> tuple[str, list[str]]:
     """
     state = graph.call(GetState, f'{node}/get_state', GetState.Request()).current_state.label
     possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
-                         GetAvailableTransitions.Request()).available_transitions
+                          GetAvailableTransitions.Request()).available_transitions
     return state, [t.transition.label for t in possible]
 
 
@@ -368,7 +368,7 @@ def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
         If the transition is not possible or fails.
     """
     possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
-                         GetAvailableTransitions.Request()).available_transitions
+                          GetAvailableTransitions.Request()).available_transitions
     found = [t.transition for t in possible if t.transition.label == transition]
     if not found:
         names = ', '.join(t.transition.label for t in possible)

@@ -77,9 +77,9 @@ class ReplayNode(ManagedNode):
         self._delay = fixed_parameter(self, 'start_delay', 2.0, 'Delay of playback after '
                                       'activation, for discovery of the subscribers [s].')
         self._paused = fixed_parameter(self, 'paused', False, 'Start paused.')
-        self._subscriber_timeout_s = fixed_parameter(self, 'wait_for_subscribers', 0.0,
-                                         'Maximum additional delay until all magnetic fields have '
-                                         'a subscriber [s].')
+        self._subscriber_timeout_s = fixed_parameter(
+            self, 'wait_for_subscribers', 0.0, 'Maximum additional delay until all magnetic fields '
+            'have a subscriber [s].')
         self._recording: Recording | None = None
         self.counts: Counter[str] = Counter()
         self.publishers_by_topic: dict[str, Publisher] = {}

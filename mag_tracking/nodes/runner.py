@@ -284,7 +284,7 @@ def _check_topics(node: StageNode, replay: ReplayNode) -> None:
 
 
 def _drain(executor: Executor, stages: list[StageNode], stopped: Callable[[], bool],
-              quiet_s: float = 1.0) -> None:
+           quiet_s: float = 1.0) -> None:
     """Spin until no stage has processed anything for `quiet_s` seconds, or until `stopped()`."""
     def moved() -> list[int]:
         return [sum(s.counts.values()) for node in stages for s in node.stages().values()]

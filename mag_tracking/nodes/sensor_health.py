@@ -168,7 +168,7 @@ class HealthDiagnostics:
                 self._network_findings[finding.subject].append(finding)
 
     def _latest(self, name: str) -> SensorHealth:
-        """`SensorHealth` of the current window, or of the previous one while it has few readings."""
+        """`SensorHealth` of the current window; of the previous one until it is long enough."""
         past, present = self._past[name], self._present[name]
         return past if past is not None and present.counts['readings'] < MIN_READINGS else present
 

@@ -119,7 +119,6 @@ class StageNode(Node):
         self._reported: dict[tuple[str, str], int] = {}
         self.flows: dict[str, Flow] = {}
         self._subscriber_monitors: list[SubscriberMonitor] = []
-
         self.now_ns = 0
         self._log, self._reported_state = StatusLog(self.get_logger()), ''
         steady_timer(self, 1.0, self._publish_diagnostics)
@@ -247,7 +246,7 @@ class StageNode(Node):
                 incompatible_qos=incompatible, message_lost=lost))
 
     def direct_input(self, source: str, topics: Sequence[str], callback: Callable[[_Record], None],
-               stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
+                     stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
         """Create a function that receives records of the preceding step, instead of subscriptions.
 
         Parameters

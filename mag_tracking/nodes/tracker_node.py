@@ -95,7 +95,6 @@ class TrackerNode(StageNode):
         super().__init__('tracker_node', 'track', **node_arguments)
         self._has_direct_input = has_direct_input
         self.after_pose: Callable[[], None] | None = None
-
         self._stage = TrackManager(self.network, self.settings.track)
         self._traffic = TrafficTopics(self)
         follow_changes(self, self.settings, lambda s: self._stage.configure(s.track))
@@ -125,7 +124,7 @@ class TrackerNode(StageNode):
         self._doubtful: dict[str, DoubtfulTimes] = {}
         if has_direct_input:
             self.receive_frame = self.direct_input('detection', [NETWORK_FRAME], self._feed,
-                                          lambda frame: frame.stamp_ns)
+                                                   lambda frame: frame.stamp_ns)
         else:
             self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, STREAM,
                               source='detection')

@@ -73,7 +73,7 @@ def test_a_profile_of_the_user_stays(begun, capfd, own, is_told):
     middleware.begin()
     assert os.environ[middleware.PROFILE_VARIABLE] == own and len(begun) == 1
     told = capfd.readouterr().err
-    assert ('/somewhere/else.xml, which does not exist' in told) == is_told == bool(told)
+    assert ('/somewhere/else.xml does not exist' in told) == is_told == bool(told)
 
 
 def test_a_profile_in_the_working_folder_stays(begun, tmp_path):

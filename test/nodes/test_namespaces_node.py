@@ -90,7 +90,7 @@ def test_two_networks_on_one_graph(ros, tmp_path, road_network):
         lost.kill()
         lost.communicate(timeout=MAX_S)
         assert spin_until(lambda: statuses['north/watchman: to tracker'].startswith(
-            '/north/follower has gone'))
+            '/north/follower is gone'))
         assert statuses['a/b/watchman: to tracker'] == 'running'
     finally:
         codes, outputs = stop(processes)
