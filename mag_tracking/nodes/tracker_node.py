@@ -80,7 +80,7 @@ class TrackerNode(StageNode):
     Parameters
     ----------
     has_direct_input : bool
-        Whether frames are passed to `receive_frame` within this process instead of a subscription.
+        Whether frames are passed to `receive_frame` within this process, not subscribed to.
     **node_arguments
         Arguments of `StageNode`.
 
