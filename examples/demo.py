@@ -21,7 +21,7 @@ from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import track_of
-from mag_tracking.nodes.runner import line_of, run
+from mag_tracking.nodes.runner import pose_line, run
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
 from mag_tracking.pipeline import settings_for
 from mag_tracking.report.figures import field_figure, map_figure, weights_figure
@@ -83,7 +83,7 @@ class Spectator(Node):
                 print(f'track {track.id} has ended', flush=True)
                 self.logs.setdefault(track.id, TrackLog(track.id)).ended = True
                 continue
-            print(line_of(track), flush=True)
+            print(pose_line(track), flush=True)
             frame = self._frames.get(track.stamp_ns)
             hypotheses = self._hypotheses.get(track.stamp_ns)
             if frame is None or hypotheses is None:

@@ -1,6 +1,6 @@
-"""Calibration, detection and tracking; with drivers:=FILE or recording:=FILE what feeds them.
+"""Launch calibration, detection and tracking, and optionally the drivers or a replay as input.
 
-ros2 launch mag_tracking tracking.launch.py network:=/path/to/network.yaml
+ros2 launch mag_tracking tracking.launch.py network:=/path/to/network.yaml [drivers:=FILE]
 """
 
 from launch.actions import DeclareLaunchArgument
@@ -14,12 +14,26 @@ from launch import LaunchDescription
 
 
 def config(name):
-    """Path of a file of config/."""
+    """Path of a file in config/.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    PathJoinSubstitution
+    """
     return PathJoinSubstitution([FindPackageShare('mag_tracking'), 'config', name])
 
 
 def generate_launch_description():
-    """The nodes with their arguments."""
+    """Nodes and their launch arguments.
+
+    Returns
+    -------
+    LaunchDescription
+    """
     network = LaunchConfiguration('network')
     target = LaunchConfiguration('target')
     recording = LaunchConfiguration('recording')
@@ -33,21 +47,26 @@ def generate_launch_description():
                'reliable_input': ParameterValue(has_recording, value_type=bool)},
               LaunchConfiguration('params')]
     return LaunchDescription([
-        DeclareLaunchArgument('network', description='path of a network.yaml'),
-        DeclareLaunchArgument('namespace', default_value='', description='of all nodes'),
+        DeclareLaunchArgument('network', description='Path of the network file.'),
+        DeclareLaunchArgument('namespace', default_value='', description='Namespace of all nodes.'),
         DeclareLaunchArgument('use_sim_time', default_value='false',
-                              description='take the time from /clock'),
-        DeclareLaunchArgument('target', default_value='vehicle', description='vehicle or magnet'),
-        DeclareLaunchArgument(
-            'params', description='parameter file', default_value=config('empty.yaml')),
-        DeclareLaunchArgument('drivers', default_value='', description='drivers file'),
+                              description='Take the time from /clock, for a replay.'),
+        DeclareLaunchArgument('target', default_value='vehicle',
+                              description='Kind of target: vehicle or magnet.'),
+        DeclareLaunchArgument('params', default_value=config('empty.yaml'),
+                              description='Parameter file of the nodes.'),
+        DeclareLaunchArgument('drivers', default_value='',
+                              description='Drivers file: start driver_node with it.'),
         DeclareLaunchArgument('batches', default_value='false',
-                              description='readings of many sensors go in one message'),
-        DeclareLaunchArgument('recording', default_value='', description='replay this as well'),
-        DeclareLaunchArgument('rate', default_value='1.0', description='speed of the replay'),
+                              description='Let driver_node publish readings of many sensors in '
+                              'one message.'),
+        DeclareLaunchArgument('recording', default_value='',
+                              description='Recording: start replay_node with it.'),
+        DeclareLaunchArgument('rate', default_value='1.0',
+                              description='Speed of the replay; 1 = as recorded.'),
         *(Node(package='mag_tracking', executable=name, namespace=namespace, parameters=common)
           for name in ('calibration_node', 'detection_node', 'tracker_node')),
-        # The last, when there is somebody to hear it.
+        # Sources come last, so that their first messages find subscribers.
         Node(package='mag_tracking', executable='driver_node', namespace=namespace,
              condition=IfCondition(has_drivers),
              parameters=[{'drivers': drivers, 'network': network,

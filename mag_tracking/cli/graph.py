@@ -43,7 +43,7 @@ def _topics(args: argparse.Namespace) -> int:
 
 def _echo(args: argparse.Namespace) -> int:
     """mag-tracking echo."""
-    from mag_tracking.nodes.graph_tools import as_text, listen, observer
+    from mag_tracking.nodes.graph_tools import as_text, observer, receive_messages
 
     if args.count is not None and args.count < 1:
         raise SettingsError(f'--count: {args.count} is not a number of at least 1')
@@ -62,7 +62,7 @@ def _echo(args: argparse.Namespace) -> int:
 
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         with observer(args.ros_arguments) as graph:
-            listen(graph, args.topic, show, lambda: bool(seen))
+            receive_messages(graph, args.topic, show, lambda: bool(seen))
     return 0
 
 

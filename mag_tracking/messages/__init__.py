@@ -1,1 +1,1 @@
-"""Records to and from message-shaped dicts: declared once, used by recordings and nodes."""
+"""Conversion of records to and from messages, shared by recordings and nodes."""

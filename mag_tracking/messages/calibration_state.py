@@ -1,4 +1,4 @@
-"""What the calibration knows of a network, to and from its message."""
+"""Conversion of the calibration of a network to and from its message."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,7 +16,7 @@ from mag_tracking.network import SensorNetwork
 
 
 class _Background(Protocol):
-    """A `RunningBackground`."""
+    """Interface of `RunningBackground`."""
 
     @property
     def ready(self) -> bool: ...
@@ -33,15 +33,30 @@ class _Background(Protocol):
 
 
 class _Calibration(Protocol):
-    """The stage that calibrates; see `Calibrate`."""
+    """Interface of the calibration stage, `Calibrate`."""
 
     def background(self, sensor: str) -> FloatArray: ...
     def backgrounds(self) -> Mapping[str, _Background]: ...
     def counts_of(self, sensor: str) -> Mapping[str, int]: ...
     def last_stamp_ns(self, sensor: str) -> int | None: ...
 
+
 def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> MessageDict:
-    """mag_tracking_msgs/SensorCalibration of sensor `j`."""
+    """Convert the calibration of sensor `j` to mag_tracking_msgs/SensorCalibration.
+
+    Parameters
+    ----------
+    calibrate : Calibrate
+        Calibration stage.
+    network : SensorNetwork
+    j : int
+        Index of the sensor in the network.
+
+    Returns
+    -------
+    dict (mag_tracking_msgs/SensorCalibration)
+        Unknown values are NaN.
+    """
     name = network.names[j]
     background, counts = calibrate.backgrounds()[name], calibrate.counts_of(name)
     ready = background.ready and calibrate.last_stamp_ns(name) is not None
@@ -65,9 +80,16 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
 
 
 def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
-    """{sensor: latest doubtful stretch of its background} of a message-shaped CalibrationState.
+    """Latest doubtful interval of the background of each sensor in a CalibrationState.
 
-    The tuple is empty if the background was never doubtful.
+    Parameters
+    ----------
+    message : CalibrationState
+
+    Returns
+    -------
+    dict of str to DoubtfulTimes
+        Empty for a sensor whose background was never doubtful.
     """
     times: dict[str, DoubtfulTimes] = {}
     for s in message.sensors:
@@ -77,26 +99,40 @@ def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
 
 
 def with_orientations(network: SensorNetwork, message: CalibrationState) -> SensorNetwork:
-    """The `SensorNetwork` turned as a message-shaped CalibrationState says.
+    """Copy of a network with the sensor orientations of a CalibrationState.
 
-    Raises RecordingError where that is of other sensors, or turns one by no rotation.
+    Parameters
+    ----------
+    network : SensorNetwork
+    message : CalibrationState
+
+    Returns
+    -------
+    SensorNetwork
+
+    Raises
+    ------
+    RecordingError
+        If sensors or frame differ from those of `network`, or an orientation or its standard
+        deviation is invalid.
     """
     names = tuple(s.sensor for s in message.sensors)
     if names != network.names:
-        raise RecordingError(f'a calibration of {", ".join(names)} does not fit the network of '
+        raise RecordingError(f'CalibrationState has sensors {", ".join(names)}; the network has '
                              f'{", ".join(network.names)}')
     if message.header.frame_id != network.frame:
-        raise RecordingError(f'a calibration in the frame {message.header.frame_id!r}, not '
-                             f'{network.frame!r}')
+        raise RecordingError(f'CalibrationState is in frame {message.header.frame_id!r}; the '
+                             f'network is in {network.frame!r}')
     q = np.array([[s.orientation.x, s.orientation.y, s.orientation.z, s.orientation.w]
                   for s in message.sensors])
     std = [np.array(s.orientation_std, dtype=float) for s in message.sensors]
     for name, v in zip(names, std, strict=True):
         if not (np.isnan(v).all() or (np.isfinite(v) & (v > 0.0)).all()):
-            raise RecordingError(f'a calibration of {name} with deviations of {v.tolist()} rad')
+            raise RecordingError(f'CalibrationState of {name}: orientation_std is {v.tolist()} '
+                                 'rad; expected positive values, or NaN for unknown')
     try:
         R_ws = rotation_from_quaternion(q)
     except ValueError as error:
-        raise RecordingError(f'a calibration with an orientation that is none: {error}') from error
+        raise RecordingError(f'CalibrationState: invalid orientation: {error}') from error
     return replace(network, R_ws=R_ws, orientation_std=tuple(
         None if np.isnan(v).all() else v for v in std))

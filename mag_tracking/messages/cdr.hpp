@@ -1,6 +1,6 @@
-// CDR, the bytes of ROS messages, from nested dicts of Python.
+// Encoding of ROS messages as CDR bytes, from nested Python dicts.
 //
-// Source: OMG DDS-XTypes 1.3, section 7.4.1 (XCDR version 1), little endian.
+// Reference: OMG DDS-XTypes 1.3, section 7.4.1 (XCDR version 1), little endian.
 
 #pragma once
 
@@ -16,11 +16,11 @@
 
 #include "../python.hpp"
 
-static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "numbers are written as they are");
+static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "numbers are copied byte by byte");
 
 namespace mag_tracking {
 
-// What is written; numbers begin at a multiple of their size behind the header.
+// Output buffer. Each number is aligned to its size, counted from the end of the header.
 class Bytes {
   public:
     Bytes() : data_("\0\1\0\0", HEADER) {}
@@ -31,7 +31,7 @@ class Bytes {
         data_.append(reinterpret_cast<const char*>(&value), sizeof(T));
     }
 
-    void add_text(const std::string& text) {
+    void add_string(const std::string& text) {
         add_length(text.size() + 1);
         data_.append(text.c_str(), text.size() + 1);
     }
@@ -49,15 +49,16 @@ class Bytes {
     std::string data_;
 };
 
-// One kind of number or text, or a nested message.
+// Encoder of a number, a string or a nested message.
 class Value {
   public:
     virtual ~Value() = default;
-    // `value` is what float(), int(), bool() or str() of Python takes; None: the default.
+    // `value` is anything that Python's float(), int(), bool() or str() accepts; None selects the
+    // default.
     virtual void add(const py::handle& value, Bytes& out) const = 0;
 };
 
-// Raises what Python has raised, if it has.
+// Throws the pending Python exception, if there is one.
 inline void check_python() {
     if (PyErr_Occurred()) throw py::error_already_set();
 }
@@ -65,59 +66,61 @@ inline void check_python() {
 template <class T>
 class Float : public Value {
   public:
-    explicit Float(const py::handle& standard) : standard_(number(standard)) {}
+    explicit Float(const py::handle& default_value) : default_(number(default_value)) {}
     void add(const py::handle& value, Bytes& out) const override {
-        out.add(value.is_none() ? standard_ : number(value));
+        out.add(value.is_none() ? default_ : number(value));
     }
 
   private:
     static T number(const py::handle& value) {
-        if (PyFloat_CheckExact(value.ptr())) return narrowed(PyFloat_AS_DOUBLE(value.ptr()));
-        // As float() does, which takes text, too.
-        const auto whole = py::reinterpret_steal<py::object>(PyNumber_Float(value.ptr()));
+        if (PyFloat_CheckExact(value.ptr())) return narrow(PyFloat_AS_DOUBLE(value.ptr()));
+        // Like float(), which also accepts strings.
+        const auto converted = py::reinterpret_steal<py::object>(PyNumber_Float(value.ptr()));
         check_python();
-        return narrowed(PyFloat_AS_DOUBLE(whole.ptr()));
+        return narrow(PyFloat_AS_DOUBLE(converted.ptr()));
     }
-    static T narrowed(double value) {
+    static T narrow(double value) {
         if (std::isfinite(value) && std::abs(value) > double(std::numeric_limits<T>::max()))
             throw std::overflow_error("beyond the range of its type: " + std::to_string(value));
         return T(value);
     }
-    T standard_;
+    T default_;
 };
 
 template <class T>
-class Whole : public Value {
+class Integer : public Value {
   public:
-    explicit Whole(const py::handle& standard) : standard_(number(standard)) {}
+    explicit Integer(const py::handle& default_value) : default_(number(default_value)) {}
     void add(const py::handle& value, Bytes& out) const override {
-        out.add(value.is_none() ? standard_ : number(value));
+        out.add(value.is_none() ? default_ : number(value));
     }
 
   private:
     static T number(const py::handle& value) {
-        const auto whole = py::reinterpret_steal<py::object>(
+        const auto integer = py::reinterpret_steal<py::object>(
             PyLong_CheckExact(value.ptr()) ? value.inc_ref().ptr() : PyNumber_Long(value.ptr()));
         check_python();
-        // Raises OverflowError beyond 64 bits.
-        const auto wide = widest(whole.ptr(), std::is_signed<T>());
+        // Raises OverflowError if the value exceeds 64 bits.
+        const auto wide = to_64_bits(integer.ptr(), std::is_signed<T>());
         check_python();
         if (wide < std::numeric_limits<T>::min() || wide > std::numeric_limits<T>::max())
             throw py::value_error("beyond the range of its type: " + std::to_string(wide));
         return T(wide);
     }
-    static std::int64_t widest(PyObject* whole, std::true_type) { return PyLong_AsLongLong(whole); }
-    static std::uint64_t widest(PyObject* whole, std::false_type) {
-        return PyLong_AsUnsignedLongLong(whole);
+    static std::int64_t to_64_bits(PyObject* integer, std::true_type) {
+        return PyLong_AsLongLong(integer);
     }
-    T standard_;
+    static std::uint64_t to_64_bits(PyObject* integer, std::false_type) {
+        return PyLong_AsUnsignedLongLong(integer);
+    }
+    T default_;
 };
 
-class Truth : public Value {
+class Boolean : public Value {
   public:
-    explicit Truth(const py::handle& standard) : standard_(is_true(standard)) {}
+    explicit Boolean(const py::handle& default_value) : default_(is_true(default_value)) {}
     void add(const py::handle& value, Bytes& out) const override {
-        out.add(value.is_none() ? standard_ : is_true(value));
+        out.add(value.is_none() ? default_ : is_true(value));
     }
 
   private:
@@ -126,31 +129,31 @@ class Truth : public Value {
         check_python();
         return truth != 0;
     }
-    bool standard_;
+    bool default_;
 };
 
-class Text : public Value {
+class String : public Value {
   public:
-    explicit Text(const py::handle& standard) : standard_(py::str(standard)) {}
+    explicit String(const py::handle& default_value) : default_(py::str(default_value)) {}
     void add(const py::handle& value, Bytes& out) const override {
-        out.add_text(value.is_none() ? standard_ : std::string(py::str(value)));
+        out.add_string(value.is_none() ? default_ : std::string(py::str(value)));
     }
 
   private:
-    std::string standard_;
+    std::string default_;
 };
 
-// A field of a message.
+// Field of a message.
 struct Field {
     py::str name;
     std::shared_ptr<const Value> value;
-    Size length;  // Of an array; SEQUENCE: it says so itself, ONE: it is none.
+    Size length;  // Length of a fixed-size array, SEQUENCE (length is encoded) or ONE (no array).
 
     static constexpr Size SEQUENCE = -1, ONE = -2;
 
     void add(const py::handle& content, Bytes& out) const {
         if (length == ONE) return value->add(content, out);
-        // Text and dicts are sequences, too.
+        // Strings and dicts would also pass as sequences.
         if (PyUnicode_Check(content.ptr()) || PyDict_Check(content.ptr()))
             throw py::type_error(std::string(name) + ": not a list");
         const auto items = py::reinterpret_steal<py::object>(
@@ -166,7 +169,7 @@ struct Field {
     }
 };
 
-// A message: a dict of its fields. Those that are missing have their defaults.
+// Message, a dict of its fields. Missing fields get their defaults.
 class Message : public Value {
   public:
     explicit Message(std::vector<Field> fields) : fields_(std::move(fields)) {}
@@ -174,7 +177,7 @@ class Message : public Value {
     void add(const py::handle& value, Bytes& out) const override {
         if (!value.is_none() && !PyDict_Check(value.ptr()))
             throw py::type_error("a message that is not a dict");
-        // What has no fields has one byte: IDL knows no empty structure.
+        // A message without fields is one byte, because IDL has no empty structures.
         if (fields_.empty()) out.add(std::uint8_t(0));
         for (const Field& field : fields_) {
             PyObject* content = value.is_none()

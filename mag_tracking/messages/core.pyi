@@ -1,18 +1,43 @@
-"""The bytes of messages, compiled; `types.py` says what it is for."""
+"""Encoding of messages as CDR bytes, compiled; used by `types.py`."""
 
 from collections.abc import Sequence
 from typing import Any
 
 SEQUENCE: int
-"""The length of an array that says it itself."""
+"""Length of an array of variable size."""
 ONE: int
-"""The length of what is no array."""
+"""Length of a field that is not an array."""
 
 class Encoder:
-    """Function from the messages of one type, as nested dicts, to CDR bytes."""
+    """Encoder from nested dicts to the CDR bytes of one message type.
 
-    def __init__(self, fields: Sequence[tuple[str, int, str | Encoder, Any]]) -> None:
-        """Of each field the name, the length of an array, the type and the default or None."""
+    Parameters
+    ----------
+    fields : sequence of (str, int, str or Encoder, object)
+        Name, array length (`SEQUENCE` and `ONE` are special values), built-in type or encoder of
+        the contained message, and default (None: zero or empty).
+    """
+
+    def __init__(self, fields: Sequence[tuple[str, int, str | Encoder, Any]]) -> None: ...
     def __call__(self, message: dict[str, Any]) -> bytes:
-        """Raises ValueError, which names the field, TypeError or OverflowError where it does not
-        fit the type."""
+        """Encode a message.
+
+        Parameters
+        ----------
+        message : dict
+            Nested dicts of the fields; missing fields get their defaults.
+
+        Returns
+        -------
+        bytes
+
+        Raises
+        ------
+        ValueError
+            If a value is out of range or an array has the wrong length. The message names the
+            field.
+        TypeError
+            If a value has the wrong type.
+        OverflowError
+            If a number exceeds 64 bits or the range of a float.
+        """

@@ -1,6 +1,7 @@
-"""Definitions of message types without comments, for recordings that are written without ROS.
+"""Message definitions without comments, for recordings that are written without ROS.
 
-Those of Jazzy, and of this package's own messages, which stand in `msg_defs/`; a test compares.
+The standard types are those of ROS 2 Jazzy; those of this package come from `msg_defs/`. A test
+compares them.
 """
 
 DEFINITIONS: dict[str, str] = {
@@ -90,4 +91,4 @@ DEFINITIONS: dict[str, str] = {
     'mag_tracking_msgs/msg/TrackArray': (
         'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
 }
-"""{type: text}."""
+"""{type: text of its definition}."""

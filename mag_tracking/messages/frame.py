@@ -1,4 +1,4 @@
-"""Frames of a network to and from messages, as nested dicts, without ROS."""
+"""Conversion of network frames to and from messages, as nested dicts, without ROS."""
 
 from typing import Protocol
 
@@ -6,13 +6,13 @@ import numpy as np
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.inference.axes import MIN_PIVOT, smallest_pivots
-from mag_tracking.messages.schema import doubles, header_dict, stamp_ns
+from mag_tracking.messages.schema import float64_array, header_dict, stamp_ns
 from mag_tracking.messages.shapes import MessageDict, NetworkFrame
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 
 MAX_OFFSET_S = 60.0
-"""[s] The longest frame there can be (`align.period_s`)."""
+"""[s] Maximum time offset of a sensor within a frame: the largest `align.period_s`."""
 
 
 class NamedSensors(Protocol):
@@ -26,28 +26,53 @@ class NamedSensors(Protocol):
 
 
 def frame_dict(frame: FieldFrame, network: SensorNetwork) -> MessageDict:
-    """mag_tracking_msgs/NetworkFrame of a `FieldFrame`."""
+    """Convert a `FieldFrame` to mag_tracking_msgs/NetworkFrame.
+
+    Parameters
+    ----------
+    frame : FieldFrame
+    network : SensorNetwork
+
+    Returns
+    -------
+    dict (mag_tracking_msgs/NetworkFrame)
+    """
     return {'header': header_dict(frame.stamp_ns, network.frame), 'sensors': list(network.names),
-            'field': doubles(frame.field), 'covariance': doubles(frame.covariance),
-            'n_samples': frame.n_samples.tolist(), 'time_offset': doubles(frame.time_offset),
+            'field': float64_array(frame.field), 'covariance': float64_array(frame.covariance),
+            'n_samples': frame.n_samples.tolist(), 'time_offset': float64_array(frame.time_offset),
             'target_present': frame.target_present,
             'statistic': frame.statistic, 'degrees_of_freedom': frame.degrees_of_freedom}
 
 
 def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
-    """`FieldFrame` of a message-shaped NetworkFrame.
+    """Convert a NetworkFrame to a `FieldFrame`.
 
-    Raises RecordingError where sensors or lengths are not those of the network.
+    Parameters
+    ----------
+    message : NetworkFrame
+        ROS message or decoded message.
+    network : NamedSensors
+        Sensors that the frame must have, in the same order.
+
+    Returns
+    -------
+    FieldFrame
+
+    Raises
+    ------
+    RecordingError
+        If sensors or array lengths do not match the network, a value is out of range, or a
+        covariance is not positive definite.
     """
     n = len(network)
     if tuple(message.sensors) != network.names:
-        raise RecordingError(f'a frame of {", ".join(message.sensors)} does not fit the network '
-                             f'of {", ".join(network.names)}')
+        raise RecordingError(f'NetworkFrame has sensors {", ".join(message.sensors)}; the network '
+                             f'has {", ".join(network.names)}')
     lengths = {name: len(getattr(message, name)) for name in (
         'field', 'covariance', 'n_samples', 'time_offset')}
     expected = dict(zip(lengths, (3 * n, 9 * n, n, n), strict=True))
     if lengths != expected:
-        raise RecordingError(f'a frame of {n} sensors needs arrays of lengths {expected}, '
+        raise RecordingError(f'NetworkFrame of {n} sensors: expected array lengths {expected}; '
                              f'got {lengths}')
     frame = FieldFrame(
         stamp_ns(message.header.stamp), np.array(message.field).reshape(n, 3),
@@ -59,10 +84,12 @@ def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
 
 
 def _check_numbers(frame: FieldFrame) -> None:
-    """Raise RecordingError where a frame holds what no alignment gives."""
+    """Raise RecordingError if a frame holds values that the alignment stage never outputs."""
     if np.isinf(frame.field).any():
-        raise RecordingError('a frame with an infinite field')
+        raise RecordingError('NetworkFrame: a field is infinite; expected finite values, or NaN '
+                             'for a missing axis')
     if not (np.abs(frame.time_offset) <= MAX_OFFSET_S).all():
-        raise RecordingError(f'a frame with time offsets of {frame.time_offset.tolist()} s')
+        raise RecordingError(f'NetworkFrame: time offsets are {frame.time_offset.tolist()} s; '
+                             f'the maximum is {MAX_OFFSET_S:g} s')
     if not (smallest_pivots(frame.field, frame.covariance) > MIN_PIVOT).all():
-        raise RecordingError('a frame with a covariance that is not positive definite')
+        raise RecordingError('NetworkFrame: a covariance is not positive definite')

@@ -1,7 +1,7 @@
-"""Markers for RViz: a track as a 90 % ellipsoid, an arrow along the moment and a label; sensors.
+"""RViz markers of tracks (90 % ellipsoid, moment arrow, label) and sensors.
 
-One namespace a kind of marker, one id a track, so that a viewer can switch a kind off. Markers of
-a track vanish by themselves where nobody takes them away.
+Each kind of marker has its own namespace, so that a viewer can hide it, and each track its own id.
+Markers of a track expire if they are not deleted.
 """
 
 from typing import Any
@@ -15,38 +15,70 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import PoseUncertainty, Track
 
 TRACK_KINDS = ('ellipsoid', 'moment', 'label')
-"""Namespaces of the markers of a track."""
+"""Marker namespaces of a track."""
 SENSOR_KINDS = ('sensors', 'sensor_labels')
+"""Marker namespaces of a sensor."""
 LIFETIME_S = 2
 """[s] Lifetime of the markers of a track."""
 _ARROW, _CUBE, _SPHERE, _TEXT = 0, 1, 2, 9
 _ADD, _DELETE = 0, 2
 _SCALE_3D = 2.5003
-"""Deviations to the surface of the 90 % region in space (chi-square, 3 degrees of freedom)."""
+"""Standard deviations to the surface of the 90 % region (chi-square, 3 degrees of freedom)."""
 SENSOR_SIZE_M = 0.3
-"""[m] Largest size of a sensor's marker; on a board half of the smallest distance."""
+"""[m] Maximum size of a sensor marker; half of the smallest sensor distance if that is less."""
 _UPRIGHT = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
 _BLUE, _RED = {'r': 0.0, 'g': 0.45, 'b': 0.7}, {'r': 0.84, 'g': 0.37, 'b': 0.0}
-"""Colours that colour-blind people tell apart (Okabe and Ito)."""
+"""Colours that remain distinguishable with colour blindness (Okabe and Ito)."""
 _GREY = {'r': 0.35, 'g': 0.35, 'b': 0.35, 'a': 1.0}
 
 
 def track_markers(track: Track, frame: str) -> dict[str, Any]:
-    """visualization_msgs/MarkerArray of a `Track`, as a dict.
+    """Markers of a `Track`.
 
-    The ellipsoid is that of the pose topics: of an ambiguous track that of all that is possible.
+    The ellipsoid shows the covariance of the pose topics. If the track is ambiguous, that covers
+    all hypotheses.
+
+    Parameters
+    ----------
+    track : Track
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (visualization_msgs/MarkerArray)
     """
     return {'markers': [_ellipsoid(track, frame), _arrow(track, frame), _label(track, frame)]}
 
 
 def delete_markers(track: Track, frame: str) -> dict[str, Any]:
-    """visualization_msgs/MarkerArray that takes the markers of an ended `Track` away."""
+    """Markers that delete those of an ended `Track`.
+
+    Parameters
+    ----------
+    track : Track
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (visualization_msgs/MarkerArray)
+    """
     return {'markers': [_marker(track, frame, kind, _SPHERE, action=_DELETE)
                         for kind in TRACK_KINDS]}
 
 
 def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
-    """visualization_msgs/MarkerArray of the sensors, with their names."""
+    """Markers of the sensors and their names.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+
+    Returns
+    -------
+    dict (visualization_msgs/MarkerArray)
+    """
     size = min(SENSOR_SIZE_M, 0.5 * _smallest_distance(network.positions))
     markers = []
     for j, name in enumerate(network.names):
@@ -64,40 +96,40 @@ def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
 
 
 def _smallest_distance(positions: FloatArray) -> float:
-    """[m] Between two sensors; infinite for one alone."""
-    apart = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    np.fill_diagonal(apart, np.inf)
-    return float(apart.min())
+    """Smallest distance between two sensors [m]; infinite for a single sensor."""
+    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    return float(distances.min())
 
 
 def _marker(track: Track, frame: str, kind: str, shape: int, **content: Any) -> dict[str, Any]:
-    """A visualization_msgs/Marker as a dict."""
+    """visualization_msgs/Marker as a dict."""
     return {'header': header_dict(track.stamp_ns, frame), 'ns': kind, 'id': track.id,
             'type': shape, **content}
 
 
 def _quaternion(R: FloatArray) -> dict[str, float]:
-    """A geometry_msgs/Quaternion as a dict."""
+    """geometry_msgs/Quaternion of a rotation matrix, as a dict."""
     return dict(zip('xyzw', quaternion_from_rotation(R).tolist(), strict=True))
 
 
 def _ellipsoid(track: Track, frame: str) -> dict[str, Any]:
-    """The 90 % region of the position."""
-    about: Track | PoseUncertainty = track.topic_uncertainty or track
-    values, R = np.linalg.eigh(about.covariance[:3, :3])
+    """90 % region of the position."""
+    uncertainty: Track | PoseUncertainty = track.topic_uncertainty or track
+    values, R = np.linalg.eigh(uncertainty.covariance[:3, :3])
     if np.linalg.det(R) < 0.0:
         R = -R
     axes = 2.0 * _SCALE_3D * np.sqrt(np.maximum(values, 0.0))
     return _marker(
         track, frame, 'ellipsoid', _SPHERE, action=_ADD, lifetime={'sec': LIFETIME_S},
         pose={'position': xyz(track.position), 'orientation': _quaternion(R)},
-        # A sphere of no thickness is refused by RViz.
+        # RViz rejects spheres with zero thickness.
         scale=xyz(np.maximum(axes, 1e-6)),
         color={**_BLUE, 'a': 0.15 if track.ambiguous else 0.35})
 
 
 def _arrow(track: Track, frame: str) -> dict[str, Any]:
-    """Along the moment, as long as three deviations of the position."""
+    """Arrow along the moment; its length is three standard deviations of the position."""
     length = max(float(np.sqrt(np.trace(track.covariance[:3, :3]))), 1e-3) * 3.0
     tip = track.position + length * track.moment / np.linalg.norm(track.moment)
     return _marker(
@@ -108,7 +140,7 @@ def _arrow(track: Track, frame: str) -> dict[str, Any]:
 
 
 def _label(track: Track, frame: str) -> dict[str, Any]:
-    """Label with kind and speed of the target, and a question mark where the track is ambiguous."""
+    """Track id, kind and speed; a question mark is appended if the track is ambiguous."""
     size = float(np.clip(np.sqrt(np.trace(track.covariance[:3, :3])), 0.005, 0.5))
     words = [word for word in (f'{track.id}', track.kind,
                                f'{np.hypot(*track.velocity[:2]):.1f} m/s') if word]

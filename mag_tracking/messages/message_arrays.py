@@ -1,7 +1,7 @@
-"""Many messages of one type at once, from their CDR bytes.
+"""Decoding of many messages of one type at once, from their CDR bytes.
 
-A message of a header and numbers has a fixed size but for the name of its frame, so that many can
-be read as arrays, twenty times faster than one by one.
+A message that consists of a header and numbers has a fixed size, except for the frame name. Many
+messages can therefore be decoded as arrays, twenty times faster than one by one.
 """
 
 from typing import NamedTuple
@@ -14,89 +14,114 @@ from mag_tracking.messages.schema import known_covariances
 
 _HEAD = np.dtype([('encapsulation', 'u1', 4), ('sec', '<i4'), ('nanosec', '<u4'),
                   ('length', '<u4')])
-"""Before the name of the frame, whose `length` counts the zero at its end."""
+"""Layout up to the frame name, whose `length` includes the terminating zero."""
 _FIELD_DOUBLES = 12
-"""x, y, z and the covariance."""
+"""Values of a MagneticField: x, y, z and the covariance."""
 _POSE_DOUBLES = 7
-"""x, y, z and the quaternion."""
+"""Values of a pose: x, y, z and the quaternion."""
 
 
 class FieldArrays(NamedTuple):
-    """The contents of magnetic fields as arrays."""
+    """Contents of sensor_msgs/MagneticField messages as arrays."""
 
-    is_read: BoolArray
-    """(n,) False: the message is unusual or damaged, and left to a decoder. Its elements of the
-    other arrays are meaningless."""
+    is_decoded: BoolArray
+    """(n,) False for an unusual or damaged message, which has to be decoded on its own. The
+    corresponding elements of the other arrays are meaningless."""
     stamp_ns: IntArray
-    """(n,)"""
+    """(n,) Timestamps."""
     field: FloatArray
-    """(n, 3) [T]"""
+    """(n, 3) [T], sensor frame."""
     covariance: FloatArray | None
-    """(n, 3, 3) [T^2] as in `Readings`."""
+    """(n, 3, 3) [T^2], as in `Readings`."""
 
 
 class PoseArrays(NamedTuple):
-    """The contents of poses as arrays."""
+    """Contents of geometry_msgs/PoseStamped messages as arrays."""
 
-    is_read: BoolArray
-    """(n,) False: the message is of another frame, unusual or damaged, and left to a decoder. Its
-    elements of the other arrays are meaningless."""
+    is_decoded: BoolArray
+    """(n,) False for a message in another frame, or an unusual or damaged one, which has to be
+    decoded on its own. The corresponding elements of the other arrays are meaningless."""
     stamp_ns: IntArray
-    """(n,)"""
+    """(n,) Timestamps."""
     pose: FloatArray
-    """(n, 7) position [m] and quaternion xyzw."""
+    """(n, 7) Position [m] and quaternion xyzw."""
 
 
 def magnetic_fields(content: bytes, begins: IntArray, ends: IntArray) -> FieldArrays:
-    """Read the CDR bytes of sensor_msgs/MagneticField, which begin and end there in `content`."""
-    stamped = _Stamped(content, begins, ends, _FIELD_DOUBLES)
-    rows = np.flatnonzero(stamped.is_read)
-    stamped.is_read[rows] = stamped.have_plain_frames(rows)
+    """Decode sensor_msgs/MagneticField messages.
+
+    Parameters
+    ----------
+    content : bytes
+        CDR bytes of all messages.
+    begins, ends : (n,) int array
+        First byte of each message in `content`, and the byte after its last.
+
+    Returns
+    -------
+    FieldArrays
+    """
+    stamped = _StampedMessages(content, begins, ends, _FIELD_DOUBLES)
+    rows = np.flatnonzero(stamped.is_decoded)
+    stamped.is_decoded[rows] = stamped.have_ascii_frames(rows)
     numbers = stamped.numbers()
-    return FieldArrays(stamped.is_read, stamped.stamp_ns, numbers[:, :3].copy(),
+    return FieldArrays(stamped.is_decoded, stamped.stamp_ns, numbers[:, :3].copy(),
                        known_covariances(numbers[:, 3:].reshape(-1, 3, 3)))
 
 
 def poses(content: bytes, begins: IntArray, ends: IntArray, frame: str) -> PoseArrays:
-    """Read the CDR bytes of geometry_msgs/PoseStamped in a `frame`, which begin and end there in
-    `content`."""
-    stamped = _Stamped(content, begins, ends, _POSE_DOUBLES)
-    rows = np.flatnonzero(stamped.is_read)
-    stamped.is_read[rows] = stamped.have_frame(rows, frame)
-    return PoseArrays(stamped.is_read, stamped.stamp_ns, stamped.numbers())
+    """Decode geometry_msgs/PoseStamped messages in a given frame.
+
+    Parameters
+    ----------
+    content : bytes
+        CDR bytes of all messages.
+    begins, ends : (n,) int array
+        First byte of each message in `content`, and the byte after its last.
+    frame : str
+        Messages in other frames are not decoded.
+
+    Returns
+    -------
+    PoseArrays
+    """
+    stamped = _StampedMessages(content, begins, ends, _POSE_DOUBLES)
+    rows = np.flatnonzero(stamped.is_decoded)
+    stamped.is_decoded[rows] = stamped.have_frame(rows, frame)
+    return PoseArrays(stamped.is_decoded, stamped.stamp_ns, stamped.numbers())
 
 
-class _Stamped:
-    """Messages of a header and numbers of eight bytes.
+class _StampedMessages:
+    """Messages that consist of a header and float64 values.
 
     Attributes
     ----------
-    is_read : (n,) bool
-        Neither cut off nor of another encapsulation than little-endian CDR.
-    stamp_ns : (n,)
+    is_decoded : (n,) bool array
+        False for a message that is truncated or not little-endian CDR.
+    stamp_ns : (n,) int array
     """
 
     def __init__(self, content: bytes, begins: IntArray, ends: IntArray, n_doubles: int) -> None:
         self._data: NDArray[np.uint8] = np.frombuffer(content, np.uint8)
         self._begins, self._n_doubles = begins, n_doubles
-        # Of a message that is cut off the head may lie beyond the end.
+        # The head of a truncated message may extend beyond the end of the data.
         head = self._data.take(begins[:, None] + np.arange(_HEAD.itemsize), mode='clip'
                                ).view(_HEAD)[:, 0] \
             if len(self._data) else np.zeros(len(begins), dtype=_HEAD)
         self._length = head['length'].astype(np.int64)
-        # Numbers of eight bytes are aligned from behind the encapsulation on.
+        # 8-byte values are aligned relative to the end of the encapsulation header.
         self._first = (_HEAD.itemsize - 4 + self._length + 7) // 8 * 8 + 4
-        self.is_read: BoolArray = (ends - begins >= self._first + 8 * n_doubles) \
+        self.is_decoded: BoolArray = (ends - begins >= self._first + 8 * n_doubles) \
             & (self._length > 0) \
             & (head['encapsulation'][:, 0] == 0) & (head['encapsulation'][:, 1] == 1)
         self.stamp_ns: IntArray = head['sec'].astype(np.int64) * 1_000_000_000 + head['nanosec']
 
     def _frames(self, rows: IntArray, length: int) -> NDArray[np.uint8]:
-        """(k, length) the names of the frames of `rows` (k,), which have that length."""
+        """Frame names of `rows` (k,), all of which have `length` bytes: (k, length) array."""
         return self._data[(self._begins[rows] + _HEAD.itemsize)[:, None] + np.arange(length)]
 
-    def have_plain_frames(self, rows: IntArray) -> BoolArray:
-        """(k,) whether the names of the frames of `rows` (k,) are ASCII that ends with a zero."""
+    def have_ascii_frames(self, rows: IntArray) -> BoolArray:
+        """Whether the frame names of `rows` are zero-terminated ASCII: (k,) array."""
         out = np.zeros(len(rows), dtype=bool)
         for length in np.unique(self._length[rows]):
             same = np.flatnonzero(self._length[rows] == length)
@@ -105,16 +130,16 @@ class _Stamped:
         return out
 
     def have_frame(self, rows: IntArray, frame: str) -> BoolArray:
-        """(k,) whether the messages of `rows` (k,) name this frame."""
+        """Whether the messages of `rows` are in `frame`: (k,) array."""
         name = np.frombuffer(frame.encode() + b'\0', np.uint8)
         out: BoolArray = self._length[rows] == len(name)
         out[out] = (self._frames(rows[out], len(name)) == name).all(axis=1)
         return out
 
     def numbers(self) -> FloatArray:
-        """(n, n_doubles) those of the messages that are read; 0 of the others."""
+        """Values of the decoded messages, (n, n_doubles); 0 for the others."""
         out = np.zeros((len(self._begins), self._n_doubles))
-        rows = np.flatnonzero(self.is_read)
+        rows = np.flatnonzero(self.is_decoded)
         if len(rows):
             at = (self._begins + self._first)[rows, None] + np.arange(8 * self._n_doubles)
             out[rows] = self._data[at].view('<f8')

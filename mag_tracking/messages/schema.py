@@ -1,4 +1,4 @@
-"""Records to and from messages, as nested dicts, without ROS."""
+"""Conversion of records to and from messages, as nested dicts, without ROS."""
 
 from array import array
 from collections.abc import Sequence
@@ -30,19 +30,47 @@ from mag_tracking.units import LATEST_NS
 
 
 def stamp_ns(stamp: Time) -> int:
-    """Nanoseconds of a builtin_interfaces/Time."""
+    """Convert builtin_interfaces/Time to nanoseconds.
+
+    Parameters
+    ----------
+    stamp : Time
+
+    Returns
+    -------
+    int, ns
+    """
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
 def stamp_dict(ns: int) -> MessageDict:
-    """A builtin_interfaces/Time of nanoseconds."""
+    """Convert nanoseconds to builtin_interfaces/Time.
+
+    Parameters
+    ----------
+    ns : int, ns
+
+    Returns
+    -------
+    dict (builtin_interfaces/Time)
+    """
     return {'sec': ns // 1_000_000_000, 'nanosec': ns % 1_000_000_000}
 
 
 def reading_of(message: MagneticField, sensor: str) -> Readings:
-    """`Readings` of a message-shaped sensor_msgs/MagneticField of `sensor`: a batch of one.
+    """Convert a MagneticField message to `Readings` with a single reading.
 
-    A covariance that is all zero, or begins with -1, is unknown.
+    Parameters
+    ----------
+    message : MagneticField
+        ROS message or decoded message. A covariance that is all zero, or whose first element is -1,
+        is unknown.
+    sensor : str
+        Sensor name.
+
+    Returns
+    -------
+    Readings
     """
     f = message.magnetic_field
     C = known_covariances(np.array(message.magnetic_field_covariance, dtype=float).reshape(1, 3, 3))
@@ -51,10 +79,20 @@ def reading_of(message: MagneticField, sensor: str) -> Readings:
 
 
 def known_covariances(C: FloatArray) -> FloatArray | None:
-    """(n, 3, 3) covariances of `Readings` from those of messages; None: all are unknown.
+    """Convert the covariances of messages to those of `Readings`.
 
-    NaN says "unknown" in `Readings` only. In a message it is a fault, and becomes a zero that the
-    calibration rejects.
+    A NaN covariance means "unknown" in `Readings` only. In a message it is a fault: it becomes
+    zero, which the calibration stage rejects.
+
+    Parameters
+    ----------
+    C : (n, 3, 3) array, T²
+        Covariances of the messages; unknown if all zero or if the first element is -1.
+
+    Returns
+    -------
+    (n, 3, 3) array or None, T²
+        NaN where unknown; None if all are unknown.
     """
     known = (C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))
     if not known.any():
@@ -64,38 +102,89 @@ def known_covariances(C: FloatArray) -> FloatArray | None:
 
 
 def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
-    """`AccelerationSample` of a message-shaped sensor_msgs/Imu of `sensor`.
+    """Convert an Imu message to an `AccelerationSample`.
 
-    NaN where the message says that it has none (its covariance begins with -1).
+    Parameters
+    ----------
+    message : Imu
+        ROS message or decoded message.
+    sensor : str
+        Sensor name.
+
+    Returns
+    -------
+    AccelerationSample
+        NaN if the message carries no acceleration (its covariance begins with -1).
     """
     a = message.linear_acceleration
-    there = message.linear_acceleration_covariance[0] != -1.0
+    is_present = message.linear_acceleration_covariance[0] != -1.0
     return AccelerationSample(stamp_ns(message.header.stamp), sensor,
-                              np.array([a.x, a.y, a.z]) if there else np.full(3, np.nan))
+                              np.array([a.x, a.y, a.z]) if is_present else np.full(3, np.nan))
 
 
-def doubles(values: ArrayLike) -> 'array[float]':
-    """Numbers for a float64[] of a message, which takes an array.array as it is.
+def float64_array(values: ArrayLike) -> 'array[float]':
+    """Convert numbers to the array type that a float64[] field takes without conversion.
 
-    A list it would look at number by number.
+    A message would check a list number by number.
+
+    Parameters
+    ----------
+    values : array
+        Any shape; flattened in row-major order.
+
+    Returns
+    -------
+    array.array
+        One-dimensional.
     """
     return array('d', np.ascontiguousarray(values, dtype=float).tobytes())
 
 
 def xyz(v: Sequence[float] | FloatArray) -> dict[str, float]:
-    """Vector as a dict."""
+    """Convert a vector to a geometry_msgs/Vector3 or Point.
+
+    Parameters
+    ----------
+    v : (3,) array
+        Only the first three elements are used.
+
+    Returns
+    -------
+    dict
+        Keys x, y and z.
+    """
     return {'x': float(v[0]), 'y': float(v[1]), 'z': float(v[2])}
 
 
 def header_dict(ns: int, frame: str) -> MessageDict:
-    """A std_msgs/Header."""
+    """Build a std_msgs/Header.
+
+    Parameters
+    ----------
+    ns : int, ns
+        Timestamp.
+    frame : str
+
+    Returns
+    -------
+    dict (std_msgs/Header)
+    """
     return {'stamp': stamp_dict(ns), 'frame_id': frame}
 
 
 def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str, MessageDict]]:
-    """[(sensor, sensor_msgs/MagneticField)] of `Readings`, in `frame`, or the sensor's name.
+    """Convert `Readings` to sensor_msgs/MagneticField, one message per reading.
 
-    An unknown covariance is all zero.
+    Parameters
+    ----------
+    readings : Readings
+    frame : str, optional
+        Frame of the messages; by default the name of the sensor.
+
+    Returns
+    -------
+    list of (str, dict)
+        Sensor name and sensor_msgs/MagneticField; an unknown covariance is all zero.
     """
     C: FloatArray = np.zeros((len(readings), 9))
     if readings.covariance is not None:
@@ -109,37 +198,67 @@ def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str,
 
 
 def readings_dict(readings: Readings) -> MessageDict:
-    """mag_tracking_msgs/FieldReadings of `Readings`, whose covariances are all known or none.
+    """Convert `Readings` to mag_tracking_msgs/FieldReadings.
 
-    Raises RecordingError where some are known, or there is no reading at all.
+    Parameters
+    ----------
+    readings : Readings
+        The covariances must be all known or all unknown.
+
+    Returns
+    -------
+    dict (mag_tracking_msgs/FieldReadings)
+
+    Raises
+    ------
+    RecordingError
+        If only some covariances are known, or `readings` is empty.
     """
     C = readings.covariance
     if not len(readings) or C is not None and np.isnan(C).all(axis=(1, 2)).any():
-        raise RecordingError('readings in one message: expected some, and the covariance of all '
-                             'or of none')
+        raise RecordingError('FieldReadings needs at least one reading, and covariances of all '
+                             'readings or of none')
     return {'header': header_dict(int(readings.stamp_ns.max()), ''),
             'sensors': list(readings.names),
             'sensor': array('H', readings.sensor.astype(np.uint16).tobytes()),
             'stamp': array('q', np.ascontiguousarray(readings.stamp_ns).tobytes()),
-            'field': doubles(readings.field),
-            'covariance': doubles(np.zeros(0) if C is None else C)}
+            'field': float64_array(readings.field),
+            'covariance': float64_array(np.zeros(0) if C is None else C)}
 
 
 def readings_of(message: FieldReadings) -> Readings:
-    """`Readings` of a message-shaped FieldReadings; raises RecordingError where it is none."""
+    """Convert a FieldReadings message to `Readings`.
+
+    Parameters
+    ----------
+    message : FieldReadings
+        ROS message or decoded message.
+
+    Returns
+    -------
+    Readings
+
+    Raises
+    ------
+    RecordingError
+        If array lengths, sensor names, indices or timestamps are invalid.
+    """
     n, names = len(message.sensor), tuple(message.sensors)
     sizes = len(message.stamp), len(message.field), len(message.covariance)
     if sizes not in ((n, 3 * n, 0), (n, 3 * n, 9 * n)):
-        raise RecordingError(f'{n} readings with {sizes[0]} stamps, {sizes[1]} numbers of their '
-                             f'fields and {sizes[2]} of their covariances')
+        raise RecordingError(f'FieldReadings of {n} readings: got {sizes[0]} timestamps, '
+                             f'{sizes[1]} field values and {sizes[2]} covariance values; expected '
+                             'one, 3 and 9 (or no covariances) per reading')
     if len(set(names)) < len(names):
-        raise RecordingError(f'readings of sensors of which one is there twice: {", ".join(names)}')
+        raise RecordingError(f'FieldReadings names a sensor twice: {", ".join(names)}')
     sensor = np.array(message.sensor, dtype=np.int64)
     if n and not 0 <= sensor.min() <= sensor.max() < len(names):
-        raise RecordingError(f'a reading of sensor {sensor.max()} of {len(names)}')
+        raise RecordingError(f'FieldReadings: sensor index {sensor.max()} is out of range; there '
+                             f'are {len(names)} sensor names')
     stamps = np.array(message.stamp, dtype=np.int64)
     if n and not -LATEST_NS <= stamps.min() <= stamps.max() <= LATEST_NS:
-        raise RecordingError(f'readings of {stamps.min()} to {stamps.max()} ns')
+        raise RecordingError(f'FieldReadings: timestamps {stamps.min()} to {stamps.max()} ns are '
+                             'out of range')
     C: FloatArray | None = None
     if len(message.covariance):
         C = known_covariances(np.array(message.covariance, dtype=float).reshape(n, 3, 3))
@@ -147,47 +266,103 @@ def readings_of(message: FieldReadings) -> Readings:
 
 
 def acceleration_dict(sample: AccelerationSample, frame: str) -> MessageDict:
-    """sensor_msgs/Imu of an `AccelerationSample`; `frame` is the sensor's.
+    """Convert an `AccelerationSample` to sensor_msgs/Imu.
 
-    Its deviations are unknown, and of orientation and angular velocity there is nothing.
+    Orientation and angular velocity are marked as not provided. The covariance of the acceleration
+    is zero, which means unknown.
+
+    Parameters
+    ----------
+    sample : AccelerationSample
+    frame : str
+        Sensor frame.
+
+    Returns
+    -------
+    dict (sensor_msgs/Imu)
     """
-    nothing = [-1.0] + 8 * [0.0]
+    not_provided = [-1.0] + 8 * [0.0]
     return {'header': header_dict(sample.stamp_ns, frame),
-            'orientation_covariance': nothing, 'angular_velocity_covariance': nothing,
+            'orientation_covariance': not_provided, 'angular_velocity_covariance': not_provided,
             'linear_acceleration': xyz(sample.acceleration)}
 
 
 def pose_dict(ns: int, frame: str, position: FloatArray, quaternion: FloatArray) -> MessageDict:
-    """geometry_msgs/PoseStamped."""
+    """Build a geometry_msgs/PoseStamped.
+
+    Parameters
+    ----------
+    ns : int, ns
+        Timestamp.
+    frame : str
+    position : (3,) array, m
+    quaternion : (4,) array
+        Order xyzw, body to `frame`.
+
+    Returns
+    -------
+    dict (geometry_msgs/PoseStamped)
+    """
     return {'header': header_dict(ns, frame), 'pose': _pose(position, quaternion)}
 
 
 def _pose(position: FloatArray, quaternion: FloatArray) -> MessageDict:
-    """geometry_msgs/Pose."""
+    """geometry_msgs/Pose as a dict."""
     return {'position': xyz(position),
             'orientation': {**xyz(quaternion), 'w': float(quaternion[3])}}
 
 
-def pose_covariance(about: Track | SmoothedPose | PoseUncertainty) -> FloatArray:
-    """(6, 6) of position and small rotations about fixed axes, as ROS orders them."""
+def pose_covariance(uncertainty: Track | SmoothedPose | PoseUncertainty) -> FloatArray:
+    """Covariance of position and small rotations about the fixed axes, in the order of ROS.
+
+    Parameters
+    ----------
+    uncertainty : Track, SmoothedPose or PoseUncertainty
+
+    Returns
+    -------
+    (6, 6) array, m² and rad², world frame
+    """
     C = np.empty((6, 6))
-    C[:3, :3] = about.covariance[:3, :3]
-    C[:3, 3:] = about.position_orientation_covariance
-    C[3:, :3] = about.position_orientation_covariance.T
-    C[3:, 3:] = about.orientation_covariance
+    C[:3, :3] = uncertainty.covariance[:3, :3]
+    C[:3, 3:] = uncertainty.position_orientation_covariance
+    C[3:, :3] = uncertainty.position_orientation_covariance.T
+    C[3:, 3:] = uncertainty.orientation_covariance
     return C
 
 
 def pose_with_covariance_dict(track: Track | SmoothedPose,
                               uncertainty: PoseUncertainty | None = None) -> MessageDict:
-    """geometry_msgs/PoseWithCovariance of a `Track` or `SmoothedPose`, with its own or another
-    uncertainty."""
+    """Convert a pose to geometry_msgs/PoseWithCovariance.
+
+    Parameters
+    ----------
+    track : Track or SmoothedPose
+    uncertainty : PoseUncertainty, optional
+        Replaces the covariance of `track`.
+
+    Returns
+    -------
+    dict (geometry_msgs/PoseWithCovariance)
+    """
     return {'pose': _pose(track.position, track.orientation),
             'covariance': pose_covariance(uncertainty or track).ravel().tolist()}
 
 
 def pose_message_dict(track: Track, frame: str) -> MessageDict | None:
-    """geometry_msgs/PoseWithCovarianceStamped of a `Track`; None where it is held back."""
+    """Convert a `Track` to the geometry_msgs/PoseWithCovarianceStamped of the pose topic.
+
+    Parameters
+    ----------
+    track : Track
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (geometry_msgs/PoseWithCovarianceStamped) or None
+        None if the pose is withheld as ambiguous.
+    """
     if track.topic_uncertainty is None:
         return None
     return {'header': header_dict(track.stamp_ns, frame),
@@ -195,7 +370,18 @@ def pose_message_dict(track: Track, frame: str) -> MessageDict | None:
 
 
 def track_dict(track: Track, frame: str) -> MessageDict:
-    """mag_tracking_msgs/Track of a `Track`."""
+    """Convert a `Track` to mag_tracking_msgs/Track.
+
+    Parameters
+    ----------
+    track : Track
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (mag_tracking_msgs/Track)
+    """
     return {'header': header_dict(track.stamp_ns, frame), 'id': track.id,
             'status': int(track.ended), 'pose': pose_with_covariance_dict(track),
             'velocity': xyz(track.velocity), 'covariance': track.covariance.ravel().tolist(),
@@ -203,37 +389,71 @@ def track_dict(track: Track, frame: str) -> MessageDict:
             'moment_covariance': track.moment_covariance.ravel().tolist(),
             'existence': track.existence, 'weight': track.weight,
             'normalised_innovation': track.nis, 'degrees_of_freedom': track.degrees_of_freedom,
-            'innovation_by_sensor': doubles(track.nis_by_sensor),
+            'innovation_by_sensor': float64_array(track.nis_by_sensor),
             'arrival': track.arrival, 'kind': track.kind, 'kind_weight': track.kind_weight,
             'length': track.length, 'length_std': track.length_std, 'ambiguous': track.ambiguous,
             'unobservable': list(track.unobservable),
-            'predicted_field': doubles(track.predicted),
-            'mounting': doubles(track.mounting),
-            'mounting_covariance': doubles(track.mounting_covariance),
+            'predicted_field': float64_array(track.predicted),
+            'mounting': float64_array(track.mounting),
+            'mounting_covariance': float64_array(track.mounting_covariance),
             'doubts': list(track.doubts),
             'arrivals': [_hypothesis_dict(h) for h in best_of_arrivals(track.hypotheses)]}
 
 
 def hypotheses_dict(track: Track, frame: str) -> MessageDict:
-    """mag_tracking_msgs/HypothesisArray of a `Track`."""
+    """Convert the hypotheses of a `Track` to mag_tracking_msgs/HypothesisArray.
+
+    Parameters
+    ----------
+    track : Track
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (mag_tracking_msgs/HypothesisArray)
+    """
     return {'header': header_dict(track.stamp_ns, frame), 'track_id': track.id,
             'hypotheses': [_hypothesis_dict(h) for h in track.hypotheses]}
 
 
 def _hypothesis_dict(h: Hypothesis) -> MessageDict:
-    """mag_tracking_msgs/Hypothesis of a `Hypothesis`."""
+    """mag_tracking_msgs/Hypothesis of a `Hypothesis`, as a dict."""
     return {'arrival': h.arrival, 'kind': h.kind, 'weight': h.weight,
             'position': xyz(h.position), 'velocity': xyz(h.velocity),
             'covariance': h.covariance.ravel().tolist(), 'moment': xyz(h.moment)}
 
 
 def smoothed_pose_dict(pose: SmoothedPose, frame: str) -> MessageDict:
-    """geometry_msgs/PoseWithCovarianceStamped of a `SmoothedPose`."""
+    """Convert a `SmoothedPose` to geometry_msgs/PoseWithCovarianceStamped.
+
+    Parameters
+    ----------
+    pose : SmoothedPose
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (geometry_msgs/PoseWithCovarianceStamped)
+    """
     return {'header': header_dict(pose.stamp_ns, frame), 'pose': pose_with_covariance_dict(pose)}
 
 
 def smoothed_track_dict(poses: Sequence[SmoothedPose], frame: str) -> MessageDict:
-    """mag_tracking_msgs/SmoothedTrack of the `SmoothedPose`s of one track."""
+    """Convert the smoothed poses of one track to mag_tracking_msgs/SmoothedTrack.
+
+    Parameters
+    ----------
+    poses : sequence of SmoothedPose
+        In order of time, at least one.
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (mag_tracking_msgs/SmoothedTrack)
+    """
     last = poses[-1]
     return {'header': header_dict(last.stamp_ns, frame), 'track_id': last.id, 'kind': last.kind,
             'length': last.length, 'length_std': last.length_std,
@@ -244,7 +464,18 @@ def smoothed_track_dict(poses: Sequence[SmoothedPose], frame: str) -> MessageDic
 
 
 def detection_dict(d: Detection, frame: str) -> MessageDict:
-    """mag_tracking_msgs/Detection of a `Detection`."""
+    """Convert a `Detection` to mag_tracking_msgs/Detection.
+
+    Parameters
+    ----------
+    d : Detection
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (mag_tracking_msgs/Detection)
+    """
     return {'header': header_dict(d.stamp_ns, frame), 'id': d.id, 'kind': int(not d.onset),
             'statistic': d.statistic, 'degrees_of_freedom': d.degrees_of_freedom,
             'threshold': d.threshold, 'false_alarm_probability': d.false_alarm_probability,
@@ -252,26 +483,59 @@ def detection_dict(d: Detection, frame: str) -> MessageDict:
 
 
 def disturbance_dict(d: Disturbance, frame: str) -> MessageDict:
-    """mag_tracking_msgs/Disturbance of a `Disturbance`."""
+    """Convert a `Disturbance` to mag_tracking_msgs/Disturbance.
+
+    Parameters
+    ----------
+    d : Disturbance
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (mag_tracking_msgs/Disturbance)
+    """
     return {'header': header_dict(d.stamp_ns, frame), 'id': d.id, 'ended': d.ended,
             'begin': stamp_dict(d.begin_ns), 'largest': d.largest, 'sensors': list(d.sensors),
             'uniform': d.uniform, 'track_id': d.track_id}
 
 
 def pass_event_dict(e: PassEvent) -> MessageDict:
-    """mag_tracking_msgs/PassEvent of a `PassEvent`."""
+    """Convert a `PassEvent` to mag_tracking_msgs/PassEvent.
+
+    Parameters
+    ----------
+    e : PassEvent
+
+    Returns
+    -------
+    dict (mag_tracking_msgs/PassEvent)
+    """
     return {'header': header_dict(e.release_ns, e.sensor), 'sensor': e.sensor, 'number': e.number,
             'ended': e.ended, 'onset': stamp_dict(e.onset_ns),
             'release': stamp_dict(e.release_ns), 'peak_time': stamp_dict(e.peak_ns),
             'peak': xyz(e.peak), 'energy': e.energy, 'axes': e.axes,
             'closest_time': stamp_dict(e.closest_ns), 'closest_std': e.closest_std,
             'time_scale': e.time_scale, 'left_to_right': e.left_to_right,
-            'signature': doubles(e.signature.ravel())}
+            'signature': float64_array(e.signature.ravel())}
 
 
 def vehicle_passage_dict(p: VehiclePassage, class_names: Sequence[str],
                          frame: str) -> MessageDict:
-    """mag_tracking_msgs/VehiclePassage of a `VehiclePassage`."""
+    """Convert a `VehiclePassage` to mag_tracking_msgs/VehiclePassage.
+
+    Parameters
+    ----------
+    p : VehiclePassage
+    class_names : sequence of str
+        Names that belong to `p.class_probabilities`.
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (mag_tracking_msgs/VehiclePassage)
+    """
     return {'header': header_dict(p.stamp_ns, frame), 'number': p.number, 'line': p.line,
             'track_id': p.track_id, 'forward': p.forward, 'direction_error': p.direction_error,
             'position': xyz(p.position), 'lateral': p.lateral, 'velocity': xyz(p.velocity),
@@ -279,12 +543,23 @@ def vehicle_passage_dict(p: VehiclePassage, class_names: Sequence[str],
             'length': p.length, 'length_std': p.length_std, 'moment': xyz(p.moment),
             'moment_covariance': p.moment_covariance.ravel().tolist(),
             'vehicle_class': p.vehicle_class, 'class_names': list(class_names),
-            'class_probabilities': doubles(p.class_probabilities), 'headway': p.headway,
+            'class_probabilities': float64_array(p.class_probabilities), 'headway': p.headway,
             'ambiguous': p.ambiguous, 'doubts': list(p.doubts)}
 
 
 def traffic_summary_dict(s: TrafficSummary, frame: str) -> MessageDict:
-    """mag_tracking_msgs/TrafficSummary of a `TrafficSummary`."""
+    """Convert a `TrafficSummary` to mag_tracking_msgs/TrafficSummary.
+
+    Parameters
+    ----------
+    s : TrafficSummary
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (mag_tracking_msgs/TrafficSummary)
+    """
     return {'header': header_dict(s.end_ns, frame), 'begin': stamp_dict(s.begin_ns),
             'line': s.line, 'observed_s': s.observed_s, 'counts': [
                 {'forward': c.forward, 'vehicle_class': c.vehicle_class, 'count': c.count,
@@ -293,10 +568,23 @@ def traffic_summary_dict(s: TrafficSummary, frame: str) -> MessageDict:
 
 
 def odometry_dict(track: Track, frame: str, child_frame: str) -> MessageDict | None:
-    """nav_msgs/Odometry: the twist is in the child frame, as REP-105 has it.
+    """Convert a `Track` to nav_msgs/Odometry.
 
-    The angular velocity is not estimated here: zero, with variance pi^2. None where the pose is
-    held back.
+    The twist is in the child frame, as REP-105 requires. The angular velocity is not estimated: it
+    is zero with variance π².
+
+    Parameters
+    ----------
+    track : Track
+    frame : str
+        World frame.
+    child_frame : str
+        Frame of the target.
+
+    Returns
+    -------
+    dict (nav_msgs/Odometry) or None
+        None if the pose is withheld as ambiguous.
     """
     uncertainty = track.topic_uncertainty
     if uncertainty is None:

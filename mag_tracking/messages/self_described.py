@@ -1,8 +1,8 @@
-"""Magnetic fields in JSON or protobuf messages, which their schema describes.
+"""Magnetic fields in JSON or protobuf messages, which are described by their schema.
 
-Such messages come from Foxglove's tools and from programs without ROS. A message is a magnetic
-field where it has `magnetic_field` with x, y and z [T], and a time in `header.stamp`, `stamp` or
-`timestamp`.
+Such messages are written by Foxglove's tools and by programs without ROS. A message is treated as
+a magnetic field if it has `magnetic_field` with x, y and z [T], and a time in `header.stamp`,
+`stamp` or `timestamp`.
 """
 
 import functools
@@ -22,27 +22,55 @@ _SECONDS = ('sec', 'secs', 'seconds')
 _NANOSECONDS = ('nanosec', 'nsec', 'nsecs', 'nanos')
 
 SCHEMAS = ('jsonschema', 'protobuf')
-"""Encodings of schemas that are read here."""
+"""Schema encodings that are supported."""
 
 
 def type_of(schema: Schema) -> str:
-    """The type of the messages of a schema: MagneticField where it has the fields of one."""
+    """Message type that a schema describes.
+
+    Parameters
+    ----------
+    schema : Schema
+
+    Returns
+    -------
+    str
+        The type sensor_msgs/msg/MagneticField if the schema has a magnetic field; otherwise the
+        name of the schema.
+    """
     is_field = schema.encoding in SCHEMAS and b'magnetic_field' in schema.data
     return MAGNETIC_FIELD if is_field else schema.name
 
 
 def cdr_of(schema: Schema, data: bytes) -> bytes:
-    """CDR bytes of sensor_msgs/MagneticField; b'' of a message that is no magnetic field."""
+    """Convert a message to the CDR bytes of sensor_msgs/MagneticField.
+
+    Parameters
+    ----------
+    schema : Schema
+    data : bytes
+
+    Returns
+    -------
+    bytes
+        Empty if the message is not a magnetic field.
+    """
     try:
-        return encoder(MAGNETIC_FIELD)(reader_of(schema.encoding, schema.name, schema.data)(data))
-    except bad_bytes():
+        return encoder(MAGNETIC_FIELD)(
+            field_decoder(schema.encoding, schema.name, schema.data)(data))
+    except decode_errors():
         return b''
 
 
 @functools.cache
-def bad_bytes() -> tuple[type[Exception], ...]:
-    """Exceptions that invalid message bytes cause."""
-    # Most recordings are CDR, and should not wait for another library.
+def decode_errors() -> tuple[type[Exception], ...]:
+    """Exceptions that invalid message bytes cause.
+
+    Returns
+    -------
+    tuple of exception types
+    """
+    # Imported here because most recordings are CDR and do not need protobuf.
     from google.protobuf.message import DecodeError
 
     return (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError,
@@ -50,18 +78,26 @@ def bad_bytes() -> tuple[type[Exception], ...]:
 
 
 @functools.cache
-def reader_of(encoding: str, name: str, content: bytes) -> Callable[[bytes], MessageDict]:
-    """Function from the bytes of a message to sensor_msgs/MagneticField as nested dicts.
+def field_decoder(encoding: str, name: str, content: bytes) -> Callable[[bytes], MessageDict]:
+    """Create a decoder of magnetic fields for one schema.
 
     Parameters
     ----------
-    encoding, name, content : str, str, bytes
-        Of the schema.
+    encoding, name : str
+        Encoding and name of the schema.
+    content : bytes
+        Text or descriptor of the schema.
 
     Returns
     -------
     function
-        It raises ValueError where the message is no magnetic field.
+        Converts the bytes of a message to sensor_msgs/MagneticField as nested dicts. It raises
+        ValueError if the message is not a magnetic field.
+
+    Raises
+    ------
+    ValueError
+        If a protobuf schema cannot be read.
     """
     if encoding == 'jsonschema':
         return lambda data: _field(json.loads(data, object_hook=lambda d: SimpleNamespace(**d)))
@@ -69,22 +105,22 @@ def reader_of(encoding: str, name: str, content: bytes) -> Callable[[bytes], Mes
 
     decode = DecoderFactory().decoder_for('protobuf', Schema(1, content, encoding, name))
     if decode is None:
-        raise ValueError('its protobuf schema cannot be read')
+        raise ValueError('the protobuf schema cannot be read')
     return lambda data: _field(decode(data))
 
 
 def _field(message: Any) -> MessageDict:
-    """The message as sensor_msgs/MagneticField; raises ValueError."""
+    """Convert a message to sensor_msgs/MagneticField; raise ValueError if it lacks the fields."""
     field = getattr(message, 'magnetic_field', None)
     header = getattr(message, 'header', message)
     stamp = next((s for name in _STAMPS for s in (getattr(header, name, None),
                                                   getattr(message, name, None))
                   if s is not None), None)
     if field is None or stamp is None:
-        raise ValueError('it has no magnetic_field, or no time')
+        raise ValueError('magnetic_field or timestamp is missing')
     covariance = [float(v) for v in getattr(message, 'magnetic_field_covariance', ())]
     if len(covariance) not in (0, 9):
-        raise ValueError(f'its covariance has {len(covariance)} elements, not 9')
+        raise ValueError(f'magnetic_field_covariance has {len(covariance)} elements; expected 9')
     return {
         'header': {'stamp': {'sec': _whole(stamp, _SECONDS, 2**31),
                              'nanosec': _whole(stamp, _NANOSECONDS, 10**9)},
@@ -94,23 +130,23 @@ def _field(message: Any) -> MessageDict:
 
 
 def _whole(stamp: Any, names: tuple[str, ...], limit: int) -> int:
-    """The first of the fields `names` of a time, below `limit`. Raises ValueError."""
+    """First of the fields `names` that a time has; raise ValueError unless it is in [0, limit)."""
     for name in names:
         value = getattr(stamp, name, None)
         if isinstance(value, int) and not isinstance(value, bool):
             if not 0 <= value < limit:
-                raise ValueError(f'its time has {name} = {str(value)[:20]}')
+                raise ValueError(f'timestamp: {name} is out of range: {str(value)[:20]}')
             return int(value)
-    raise ValueError(f'its time has no {names[0]}')
+    raise ValueError(f'timestamp: {names[0]} is missing')
 
 
 def _number(field: Any, axis: str) -> float:
-    """[T] of one axis; null = NaN, not measured. Raises ValueError where it is missing."""
+    """Field of one axis [T]; null becomes NaN (not measured). Raise ValueError if it is missing."""
     if not hasattr(field, axis):
-        raise ValueError(f'its magnetic_field has no {axis}')
+        raise ValueError(f'magnetic_field.{axis} is missing')
     value = getattr(field, axis)
     if value is None:
         return float('nan')
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f'its magnetic_field.{axis} is {value!r}')
+        raise ValueError(f'magnetic_field.{axis} is not a number: {value!r}')
     return float(value)

@@ -1,28 +1,28 @@
-"""Shapes of the messages that are read: ROS's own objects have them, and decoded ones."""
+"""Interfaces of the messages that are read, whether ROS objects or decoded messages."""
 
 from collections.abc import Sequence
 from typing import Any, Protocol, TypeAlias
 
 MessageDict: TypeAlias = dict[str, Any]
-"""A message to be written: its fields by name, nested."""
+"""Message to be written, as nested dicts of its fields."""
 
 
 class Time(Protocol):
-    """builtin_interfaces/Time."""
+    """Interface of builtin_interfaces/Time."""
 
     sec: int
     nanosec: int
 
 
 class Header(Protocol):
-    """std_msgs/Header."""
+    """Interface of std_msgs/Header."""
 
     stamp: Time
     frame_id: str
 
 
 class Vector3(Protocol):
-    """geometry_msgs/Vector3, or a Point."""
+    """Interface of geometry_msgs/Vector3 and Point."""
 
     x: float
     y: float
@@ -30,13 +30,13 @@ class Vector3(Protocol):
 
 
 class Quaternion(Vector3, Protocol):
-    """geometry_msgs/Quaternion."""
+    """Interface of geometry_msgs/Quaternion."""
 
     w: float
 
 
 class MagneticField(Protocol):
-    """sensor_msgs/MagneticField."""
+    """Interface of sensor_msgs/MagneticField."""
 
     header: Header
     magnetic_field: Vector3
@@ -44,7 +44,7 @@ class MagneticField(Protocol):
 
 
 class Imu(Protocol):
-    """sensor_msgs/Imu, of which only the acceleration is read."""
+    """Interface of sensor_msgs/Imu; only the acceleration is read."""
 
     header: Header
     linear_acceleration: Vector3
@@ -52,7 +52,7 @@ class Imu(Protocol):
 
 
 class FieldReadings(Protocol):
-    """mag_tracking_msgs/FieldReadings."""
+    """Interface of mag_tracking_msgs/FieldReadings."""
 
     header: Header
     sensors: Sequence[str]
@@ -63,7 +63,7 @@ class FieldReadings(Protocol):
 
 
 class NetworkFrame(Protocol):
-    """mag_tracking_msgs/NetworkFrame."""
+    """Interface of mag_tracking_msgs/NetworkFrame."""
 
     header: Header
     sensors: Sequence[str]
@@ -77,7 +77,7 @@ class NetworkFrame(Protocol):
 
 
 class SensorCalibration(Protocol):
-    """mag_tracking_msgs/SensorCalibration, of which only this is read."""
+    """Interface of mag_tracking_msgs/SensorCalibration, limited to the fields that are read."""
 
     sensor: str
     doubtful: bool
@@ -88,21 +88,21 @@ class SensorCalibration(Protocol):
 
 
 class CalibrationState(Protocol):
-    """mag_tracking_msgs/CalibrationState."""
+    """Interface of mag_tracking_msgs/CalibrationState."""
 
     header: Header
     sensors: Sequence[SensorCalibration]
 
 
 class Pose(Protocol):
-    """geometry_msgs/Pose."""
+    """Interface of geometry_msgs/Pose."""
 
     position: Vector3
     orientation: Quaternion
 
 
 class PoseStamped(Protocol):
-    """geometry_msgs/PoseStamped."""
+    """Interface of geometry_msgs/PoseStamped."""
 
     header: Header
     pose: Pose

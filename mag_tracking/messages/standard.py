@@ -1,4 +1,4 @@
-"""Tracks and sensors as the messages of other packages: transforms and detections in space."""
+"""Tracks and sensors as messages of other packages: transforms and 3D detections."""
 
 import numpy as np
 
@@ -10,9 +10,21 @@ from mag_tracking.records import Track
 
 
 def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageDict | None:
-    """tf2_msgs/TFMessage from `frame` to the pose of a `Track`.
+    """Transform from the world frame to the pose of a `Track`.
 
-    None for an ambiguous pose: a transform has neither a flag nor a covariance.
+    Parameters
+    ----------
+    track : Track
+    frame : str
+        World frame.
+    child_frame : str
+        Frame of the target.
+
+    Returns
+    -------
+    dict (tf2_msgs/TFMessage) or None
+        None if the pose is ambiguous, because a transform has neither a flag
+        nor a covariance.
     """
     if track.ambiguous:
         return None
@@ -23,7 +35,18 @@ def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageD
 
 
 def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[MessageDict]:
-    """geometry_msgs/TransformStamped from the frame of the network to each sensor, by its name."""
+    """Transforms from the world frame to each sensor.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    stamp_ns : int, ns
+
+    Returns
+    -------
+    list of dict (geometry_msgs/TransformStamped)
+        The child frames are the sensor names.
+    """
     quaternions = map(quaternion_from_rotation, network.R_ws)
     return [{'header': header_dict(stamp_ns, network.frame),
              'child_frame_id': name,
@@ -34,10 +57,21 @@ def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[Messag
 
 
 def detections_3d_dict(track: Track, frame: str) -> MessageDict:
-    """vision_msgs/Detection3DArray of a `Track`; empty when it has ended, or is held back.
+    """Convert a `Track` to vision_msgs/Detection3DArray.
 
-    Its hypotheses are the kinds of target, each with its probability; all have the pose of the
-    track. The box is as long as the iron, and its width and height, which no field tells, are 0.
+    The results are the kinds of target with their probabilities; each has the pose of the track.
+    The box has the length of the row of dipoles; width and height are not observable and set to 0.
+
+    Parameters
+    ----------
+    track : Track
+    frame : str
+        World frame.
+
+    Returns
+    -------
+    dict (vision_msgs/Detection3DArray)
+        Empty if the track has ended or its pose is withheld.
     """
     header = header_dict(track.stamp_ns, frame)
     if track.ended or track.topic_uncertainty is None:

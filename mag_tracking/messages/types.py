@@ -1,6 +1,6 @@
-"""Message types as text, and their CDR bytes, without ROS.
+"""Message definitions as text, and encoding and decoding of CDR bytes, without ROS.
 
-The texts are those of `definitions`; a recording carries them.
+Recordings carry the texts of `definitions` as their schemas.
 """
 
 import functools
@@ -33,14 +33,14 @@ MARKERS = 'visualization_msgs/msg/MarkerArray'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 
 RAW_READINGS = 'field_readings'
-"""The topic of raw readings of many sensors. It and the next ones are relative to the namespace of
-the nodes, whatever these are called."""
+"""Topic of raw readings of many sensors. Like the topics below, it is relative to the namespace of
+the nodes and independent of their names."""
 CALIBRATED_READINGS = 'field_readings_calibrated'
-"""The same, calibrated."""
+"""Topic of calibrated readings of many sensors."""
 CALIBRATION_STATE = 'calibration_state'
-"""The topic of the sensors' calibration."""
+"""Topic of the calibration of all sensors."""
 NETWORK_FRAME = 'network_frame'
-"""The topic of frames of the network."""
+"""Topic of network frames."""
 
 _BUILT_IN = {'bool', 'byte', 'char', 'string', 'wstring', 'float32', 'float64',
              *(f'{u}int{n}' for u in ('', 'u') for n in (8, 16, 32, 64))}
@@ -49,13 +49,26 @@ _FIELD = re.compile(r'\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?P<array>(?:<=)
 
 
 def _full_name(kind: str, package: str) -> str:
-    """The name of a type that a definition of a `package` names."""
+    """Full name of a type that a definition of `package` refers to."""
     owner, _, leaf = kind.rpartition('/')
     return f'{(owner or package).partition("/")[0]}/msg/{leaf}'
 
 
-def named_in(text: str, package: str) -> list[str]:
-    """The types that a definition of a `package` names, each once."""
+def referenced_types(text: str, package: str) -> list[str]:
+    """Message types that a definition refers to.
+
+    Parameters
+    ----------
+    text : str
+        Definition of a message type.
+    package : str
+        Package of that type.
+
+    Returns
+    -------
+    list of str
+        Full names without duplicates, in order of appearance.
+    """
     out: list[str] = []
     for line in text.splitlines():
         field = _FIELD.match(line.partition('#')[0])
@@ -66,27 +79,39 @@ def named_in(text: str, package: str) -> list[str]:
     return out
 
 
-def _closure(type_name: str) -> list[str]:
-    """The types below `type_name`, each once, in the order met."""
+def _dependencies(type_name: str) -> list[str]:
+    """Types that `type_name` contains, without duplicates, breadth first."""
     seen: list[str] = []
     queue = [type_name]
     while queue:
         name = queue.pop(0)
         if name not in seen:
             seen.append(name)
-            queue += named_in(DEFINITIONS[name], name.partition('/')[0])
+            queue += referenced_types(DEFINITIONS[name], name.partition('/')[0])
     return seen[1:]
 
 
 def definition(type_name: str) -> str:
-    """The text of a type with all that it needs, as a `ros2msg` schema has it.
+    """Definition of a type with those of all contained types, in the format of a `ros2msg` schema.
 
-    Raises RecordingError for a type that is not defined here.
+    Parameters
+    ----------
+    type_name : str
+        For example `std_msgs/msg/Header`.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    RecordingError
+        If `definitions` does not contain the type.
     """
     if type_name not in DEFINITIONS:
-        raise RecordingError(f'no definition of {type_name} to write it with')
+        raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
     text = DEFINITIONS[type_name]
-    for name in _closure(type_name):
+    for name in _dependencies(type_name):
         package, _, leaf = name.split('/')
         text += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name]}'
     return text
@@ -94,7 +119,17 @@ def definition(type_name: str) -> str:
 
 @functools.cache
 def schema_of(type_name: str) -> Schema:
-    """The schema of a message type; empty where this package does not use the type."""
+    """MCAP schema of a message type.
+
+    Parameters
+    ----------
+    type_name : str
+
+    Returns
+    -------
+    Schema
+        Empty if `definitions` does not contain the type.
+    """
     known = type_name in DEFINITIONS
     return Schema(1, definition(type_name).encode() if known else b'',
                   'ros2msg' if known else '', type_name)
@@ -102,12 +137,23 @@ def schema_of(type_name: str) -> Schema:
 
 @functools.cache
 def encoder(type_name: str) -> core.Encoder:
-    """Function from nested dicts to CDR bytes.
+    """Encoder from nested dicts to the CDR bytes of a message type.
 
-    Raises RecordingError for a type that is not defined here.
+    Parameters
+    ----------
+    type_name : str
+
+    Returns
+    -------
+    Encoder
+
+    Raises
+    ------
+    RecordingError
+        If `definitions` does not contain the type.
     """
     if type_name not in DEFINITIONS:
-        raise RecordingError(f'no definition of {type_name} to write it with')
+        raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
     package, fields = type_name.partition('/')[0], []
     for line in DEFINITIONS[type_name].splitlines():
         field = _FIELD.match(line)
@@ -122,8 +168,8 @@ def encoder(type_name: str) -> core.Encoder:
     return core.Encoder(fields)
 
 
-class _Raw(Protocol):
-    """A `RawMessage`."""
+class _RawMessage(Protocol):
+    """Interface of `RawMessage`."""
 
     @property
     def topic(self) -> str: ...
@@ -140,10 +186,22 @@ _DECODE_ERRORS = (ValueError, TypeError, IndexError, KeyError, OverflowError, st
                   McapError)
 
 
-def decode(message: _Raw) -> SimpleNamespace:
-    """A `RawMessage` as an object with the fields of its type.
+def decode(message: _RawMessage) -> SimpleNamespace:
+    """Decode the CDR bytes of a message.
 
-    Raises RecordingError where the bytes do not fit the type.
+    Parameters
+    ----------
+    message : RawMessage
+
+    Returns
+    -------
+    SimpleNamespace
+        Has the fields of the message type as attributes.
+
+    Raises
+    ------
+    RecordingError
+        If the bytes do not match the type, or the schema is not supported.
     """
     key = message.schema.name, message.schema.data
     try:
@@ -151,9 +209,10 @@ def decode(message: _Raw) -> SimpleNamespace:
             _decoders[key] = DecoderFactory().decoder_for('cdr', message.schema)
         decoder = _decoders[key]
         if decoder is None:
-            raise ValueError(f'it has no ros2msg schema (encoding '
-                             f'{message.schema.encoding!r})')
+            raise RecordingError(
+                f'{message.topic}: cannot decode a message as {message.type}: schema encoding '
+                f'{message.schema.encoding!r} is not supported; expected ros2msg')
         return decoder(message.data)
     except _DECODE_ERRORS as error:
-        raise RecordingError(f'a message on {message.topic} is not a {message.type}: '
+        raise RecordingError(f'{message.topic}: cannot decode a message as {message.type}: '
                              f'{error}') from error

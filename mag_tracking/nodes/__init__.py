@@ -1,1 +1,1 @@
-"""ROS 2 nodes: the only place that imports rclpy and messages."""
+"""ROS 2 nodes; the only package that imports rclpy and ROS messages."""

@@ -1,4 +1,4 @@
-"""Backgrounds of a calibration, stored in a file so that a restarted node restores them."""
+"""Storage of learnt backgrounds in a file, from which a restarted node restores them."""
 
 import time
 from collections.abc import Iterable
@@ -17,11 +17,21 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 
 WRITE_EVERY_S = 5.0
-"""[s] Interval of writing; shorter where `calibrate.max_resume_gap_s` is short."""
+"""[s] Maximum interval between writes; shorter if `calibrate.max_resume_gap_s` is short."""
 
 
 class BackgroundStore:
-    """Stores the background of each sensor that is known; without a path it does nothing."""
+    """Stores the current background of each sensor in a file.
+
+    Parameters
+    ----------
+    path : Path or None
+        File to write; None disables storage.
+    stage : Calibrate
+        Calibration stage.
+    settings : CalibrateSettings
+    logger : RcutilsLogger
+    """
 
     def __init__(self, path: Path | None, stage: Calibrate, settings: CalibrateSettings,
                  logger: RcutilsLogger) -> None:
@@ -32,24 +42,37 @@ class BackgroundStore:
         self._next_write = 0.0
 
     def restore(self, network: SensorNetwork) -> None:
-        """Offer the stored backgrounds to the stage; the first readings decide on their use."""
+        """Offer the stored backgrounds to the stage; its first readings decide whether to use them.
+
+        Parameters
+        ----------
+        network : SensorNetwork
+        """
         if self._path is None:
             return
         try:
             kept, refused = read_backgrounds(self._path, network, self._settings)
         except RecordingError as error:
-            self._logger.warning(f'what was learnt before is not used: {error}')
+            self._logger.warning(f'stored backgrounds are not used: {error}')
             return
         for name, why in refused.items():
-            self._logger.warning(f'what was learnt of {name} before is not used: {why}')
+            self._logger.warning(f'{name}: the stored background is not used: {why}')
         self._stage.resume(kept)
         if kept:
             self._logger.info(
-                f'goes on with the backgrounds of {", ".join(kept)}, where their readings go on '
-                f'within {self._settings.max_resume_gap_s:g} s; ~/calibrate learns anew')
+                f'stored backgrounds of {", ".join(kept)} are restored for sensors whose readings '
+                f'resume within {self._settings.max_resume_gap_s:g} s of the stored ones; call '
+                '~/calibrate to learn them again')
 
     def update(self, network: SensorNetwork, j: int) -> None:
-        """Take the present background of sensor `j`, if it is known."""
+        """Add the current background of a sensor; it is dropped from the file if it is unknown.
+
+        Parameters
+        ----------
+        network : SensorNetwork
+        j : int
+            Index of the sensor.
+        """
         name = network.names[j]
         kept = None if self._path is None else self._stage.stored(name)
         if kept is None:
@@ -58,9 +81,12 @@ class BackgroundStore:
             self._texts[name] = background_text(kept, network, j, self._settings)
 
     def write_if_due(self, is_live: bool) -> None:
-        """Write the file if it is time to, and the readings are live, not of a recording.
+        """Write the file if the interval is over or a background has become known.
 
-        A background that has only now become known is not left to the next interval.
+        Parameters
+        ----------
+        is_live : bool
+            False for readings of a recording: nothing is written.
         """
         now = time.monotonic()
         is_new = not self._texts.keys() <= self._written
@@ -71,11 +97,18 @@ class BackgroundStore:
             write_backgrounds(self._path, self._texts)
             self._written = frozenset(self._texts)
         except OutputError as error:
-            self._logger.warning(f'backgrounds are not kept for a restart: {error}',
+            self._logger.warning(f'backgrounds cannot be stored for a restart: {error}',
                                  throttle_duration_sec=60.0)
 
     def drop(self, sensors: Iterable[str], is_live: bool) -> None:
-        """Remove `sensors` from the file."""
+        """Remove sensors from the file.
+
+        Parameters
+        ----------
+        sensors : iterable of str
+        is_live : bool
+            False for readings of a recording: the file is left unchanged.
+        """
         for name in sensors:
             self._texts.pop(name, None)
         self._next_write = 0.0

@@ -1,7 +1,7 @@
-"""calibration_node: raw magnetic fields in, calibrated ones out."""
+"""calibration_node: converts raw magnetic fields to calibrated ones."""
 
 if __name__ == '__main__':
-    # Does not return: a signal during the imports below would end in a traceback.
+    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import calibration_node
 
     calibration_node()
@@ -35,7 +35,14 @@ from mag_tracking.nodes.sensor_graph import shortened
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.sensor_rounds import SensorRounds
 from mag_tracking.nodes.sensor_transforms import SensorTransforms
-from mag_tracking.nodes.stage_node import LATCHED, READY, SENT, STREAM, StageNode, has_subscribers
+from mag_tracking.nodes.stage_node import (
+    LATCHED,
+    READY,
+    STREAM,
+    STREAM_OUTPUT,
+    StageNode,
+    has_subscribers,
+)
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.nodes.survey_service import SurveyService
 from mag_tracking.nodes.tracker_node import TrackerNode
@@ -50,19 +57,26 @@ from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.survey.stage import Survey
 
 MIN_STEP_S = 0.01
-"""[s] A round over the sensors takes a second, or where they are too many for that, its steps come
-at this interval."""
+"""[s] Minimum interval between the steps of a round over the sensors. A round takes one second
+unless there are too many sensors for that."""
 DEFERRED_S = 0.0055
-"""[s] Delay of deferred work after publishing many readings. A pose of a hundred sensors takes
-about that long: until then the processes that compute it need the cores."""
+"""[s] Delay of deferred work after a batch of readings has been published. A pose of a hundred
+sensors takes about that long to compute, and until then the tracker needs the processor cores."""
 
 
 class CalibrationNode(StageNode):
-    """Subscribes to each sensor's topic; publishes it with `_calibrated` appended to its name."""
+    """Calibrates the readings of each sensor; topics of calibrated fields end in `_calibrated`.
+
+    Parameters
+    ----------
+    next_steps : tuple of DetectionNode and TrackerNode, optional
+        Nodes of the same process that receive calibrated readings and doubtful intervals directly.
+    **node_arguments
+        Arguments of `StageNode`.
+    """
 
     def __init__(self, next_steps: tuple[DetectionNode, TrackerNode] | None = None,
                  **node_arguments: Any) -> None:
-        """`next_steps` in the same process take calibrated readings and doubtful times directly."""
         super().__init__('calibration_node', 'calibrate', **node_arguments)
         self._next_steps = next_steps
         self.settings = declare_settings(self, self.settings, 'survey')
@@ -75,7 +89,7 @@ class CalibrationNode(StageNode):
             self._survey, self._stage, self._survey_path(),
             [self.resolve_topic_name(t) for t in self.network.imu_topics if t is not None])
         self._health = HealthDiagnostics(self.network, self.settings, self, self.is_replayed)
-        self._unseen: list[tuple[Readings, int]] = []
+        self._health_backlog: list[tuple[Readings, int]] = []
         self._deferred = Deferred(self, DEFERRED_S, self._do_deferred_work)
         self._connect()
         self._rounds = SensorRounds(
@@ -88,79 +102,91 @@ class CalibrationNode(StageNode):
         self.report_state()
 
     def _connect(self) -> None:
-        """Subscribe to the sensors and advertise what comes of them."""
+        """Subscribe to the sensors and advertise the outputs."""
         self._publishers_by_sensor = {}
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self._publishers_by_sensor[sensor] = self.publisher(
-                MagneticField, f'{topic}_calibrated', SENT)
-            self.subscription(MagneticField, topic, partial(self._take, sensor), self.input_qos,
+                MagneticField, f'{topic}_calibrated', STREAM_OUTPUT)
+            self.subscription(MagneticField, topic, partial(self._receive, sensor), self.input_qos,
                               source='sensors')
         for sensor, imu_topic in zip(self.network.names, self.network.imu_topics, strict=True):
             if imu_topic is not None:
-                self.subscription(Imu, imu_topic, partial(self._take_acceleration, sensor),
+                self.subscription(Imu, imu_topic, partial(self._receive_acceleration, sensor),
                                   self.input_qos)
-        self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, SENT)
-        self.subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM, source='sensors',
-                          batches=True)
+        self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, STREAM_OUTPUT)
+        self.subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM,
+                          source='sensors', batches=True)
         if self._next_steps is None:
-            self.expect('detection', CALIBRATED_READINGS, 'mag_tracking_msgs/msg/NetworkFrame')
+            self.monitor_subscriber('detection', CALIBRATED_READINGS,
+                                    'mag_tracking_msgs/msg/NetworkFrame')
         self._state = self.publisher(CalibrationState, CALIBRATION_STATE, LATCHED)
         self._tf = SensorTransforms(self) if fixed_parameter(
-            self, 'publish_sensor_tf', True, 'Publish where the sensors are as static '
-            'transforms.') else None
+            self, 'publish_sensor_tf', True, 'Publish static transforms from the world frame to '
+            'each sensor.') else None
         self._publish_transforms()
 
     def _publish_transforms(self) -> None:
-        """Publish where the sensors are."""
+        """Publish the transforms of the sensors."""
         if self._tf is not None:
             self._tf.publish(self.network)
 
     def _state_path(self) -> Path | None:
-        """File in which the backgrounds are stored; None during the replay of a recording."""
-        place = fixed_parameter(self, 'state_file', '', 'File in which the backgrounds are kept '
-                                'for a restart; left out: below $ROS_HOME, or ~/.ros.')
+        """File in which backgrounds are stored; None during a replay or if storage is disabled."""
+        name = fixed_parameter(self, 'state_file', '', 'File in which backgrounds are stored for a '
+                               'restart. Empty: a file below $ROS_HOME or ~/.ros.')
         if self.is_replayed or not self.settings.calibrate.max_resume_gap_s:
             return None
-        if not place:
+        if not name:
             return default_path(self.network_path, self.get_fully_qualified_name())
-        path = self._own_path('state_file', place)
+        path = self._output_path('state_file', name)
         if path.exists() and not is_background_file(path):
-            raise SettingsError(f'calibration_node: parameter state_file: {path} is another file '
-                                'than one with backgrounds; it would be replaced')
+            raise SettingsError(f'calibration_node: parameter state_file: {path} exists and is not '
+                                'a file of backgrounds; choose another name, or delete it')
         return path
 
-    def _own_path(self, parameter: str, name: str) -> Path:
-        """The path of a file to write; raises SettingsError for one that is not its place."""
-        what = f'calibration_node: parameter {parameter}: '
+    def _output_path(self, parameter: str, name: str) -> Path:
+        """Path of an output file; raise SettingsError unless it is in an allowed folder."""
+        prefix = f'calibration_node: parameter {parameter}: '
         beside, below = self.network_path.parent, state_folder().resolve()
         path = checked_path(beside / name, SettingsError)
         folder = path.parent.resolve()
         if not path.name or path.name == '..' or path.is_dir():
-            raise SettingsError(f'{what}{name!r} is not the name of a file')
+            raise SettingsError(f'{prefix}{name!r} is not a file name')
         if folder / path.name == self.network_path:
-            raise SettingsError(f'{what}{path} is the network file itself')
+            raise SettingsError(f'{prefix}{path} is the network file, which must not be '
+                                'overwritten')
         if folder != beside and not folder.is_relative_to(below):
-            raise SettingsError(f'{what}{path} is neither beside the network file, in {beside}, '
-                                f'nor below {below}')
+            raise SettingsError(f'{prefix}{path} must be in the folder of the network file, '
+                                f'{beside}, or below {below}')
         return folder / path.name
 
     def _survey_path(self) -> Path:
-        """File to which a survey is saved: beside the network file, which is written by hand."""
-        save_as = fixed_parameter(self, 'save_as', '', 'Network file that a survey writes; left '
-                                  'out: <network>_calibrated.yaml.')
+        """File to which a survey is saved; never the network file, which is edited by hand."""
+        save_as = fixed_parameter(self, 'save_as', '', 'Network file to which a survey is saved. '
+                                  'Empty: <network>_calibrated.yaml.')
         path = self.network_path
-        return self._own_path('save_as', save_as or f'{path.stem}_calibrated.yaml')
+        return self._output_path('save_as', save_as or f'{path.stem}_calibrated.yaml')
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """{name: stage} whose counts are published."""
+        """Stages whose counts are published.
+
+        Returns
+        -------
+        dict of str to Stage
+        """
         return {'calibrate': self._stage, 'survey': self._survey}
 
     def state(self) -> str:
-        """Waiting for sensors, learning their backgrounds, or ready."""
+        """State of the node: waiting for sensors, learning backgrounds, ready, or several of these.
+
+        Returns
+        -------
+        str
+        """
         waiting = [topic for name, topic in zip(self.network.names, self.sensor_topics,
-                                                strict=True) if self._health.is_waited_for(name)]
+                                                strict=True) if self._health.is_awaited(name)]
         learning = [name for name in self._stage.unready()
-                    if not self._health.is_waited_for(name)]
+                    if not self._health.is_awaited(name)]
         parts = [f'waiting for {shortened(waiting)}'] if waiting else []
         if learning:
             parts.append(f'learning backgrounds, {self.settings.calibrate.learn_s:g} s')
@@ -169,58 +195,64 @@ class CalibrationNode(StageNode):
         return ', '.join(parts)
 
     def queues(self) -> dict[str, int]:
-        """{name of a stage: how many records it holds}."""
+        """Number of readings that are held back.
+
+        Returns
+        -------
+        dict of str to int
+            By stage name.
+        """
         return {'calibrate': self._stage.n_held}
 
     def _is_live(self) -> bool:
-        """Whether the readings are of the present, not of a recording."""
+        """Whether the readings are live, not of a recording."""
         return self.flows['sensors'].is_live
 
-    def _take(self, sensor: str, message: MagneticField) -> None:
-        """One raw reading."""
+    def _receive(self, sensor: str, message: MagneticField) -> None:
+        """Calibrate a raw reading and publish the result."""
         raw = reading_of(message, sensor)
         publisher = self._publishers_by_sensor[sensor]
         for calibrated in self._calibrated(raw):
             if self._next_steps is None or has_subscribers(publisher):
                 for _, content in magnetic_field_dicts(calibrated, message.header.frame_id):
                     publisher.publish(to_message(MagneticField, content))
-        self._unseen.append((raw, self.now_ns))
+        self._health_backlog.append((raw, self.now_ns))
         self._do_deferred_work()
 
-    def _take_many(self, message: FieldReadings) -> None:
-        """Raw readings of many sensors; they go on together."""
+    def _receive_batch(self, message: FieldReadings) -> None:
+        """Calibrate raw readings of many sensors and publish them as one message."""
         raw = self.readings_of(message, self._stage)
         if raw is None:
             return
         for calibrated in self._calibrated(raw):
             if self._next_steps is None or has_subscribers(self._readings):
                 self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
-        self._unseen.append((raw, self.now_ns))
+        self._health_backlog.append((raw, self.now_ns))
         self._deferred.request()
 
     def _calibrated(self, raw: Readings) -> list[Readings]:
-        """Calibrated readings; the next steps in this process have taken them."""
+        """Calibrate readings and pass them to the next steps in this process."""
         calibrated = self._stage.feed(raw)
         if self._next_steps is not None:
             detection, tracker = self._next_steps
             tracker.doubt(self._stage.doubtful_intervals())
             for readings in calibrated:
-                detection.take_readings(readings)
+                detection.receive_readings(readings)
         return calibrated
 
     def _do_deferred_work(self) -> None:
-        """Learn from what has come, update the health, and do a step of the round if it is due."""
+        """Do idle work of the stages, update the sensor health, and do a step that is due."""
         self._stage.idle()
         if self._next_steps is not None:
             self._next_steps[1].idle()
-        unseen, self._unseen = self._unseen, []
-        for raw, now_ns in unseen:
+        backlog, self._health_backlog = self._health_backlog, []
+        for raw, now_ns in backlog:
             self._health.add(raw, now_ns)
         self._rounds.step_if_due()
         self._rounds.report_doubts()
 
-    def _take_acceleration(self, sensor: str, message: Imu) -> None:
-        """One acceleration."""
+    def _receive_acceleration(self, sensor: str, message: Imu) -> None:
+        """Pass an acceleration to the survey."""
         self._survey.feed(acceleration_of(message, sensor))
 
     def _publish_states(self, states: list[SensorCalibration]) -> None:
@@ -232,7 +264,7 @@ class CalibrationNode(StageNode):
 
     def _calibrate(self, request: CalibrateService.Request,
                    response: CalibrateService.Response) -> CalibrateService.Response:
-        """Learn backgrounds again, as the service asks."""
+        """Handle ~/calibrate: learn backgrounds again."""
         try:
             self._stage.forget(tuple(request.sensors))
         except NetworkError as error:
@@ -240,19 +272,20 @@ class CalibrationNode(StageNode):
             return response
         self._store.drop(request.sensors or self.network.names, self._is_live())
         response.success = True
-        response.message = f'learning {", ".join(request.sensors) or "all sensors"} anew'
+        response.message = (f'learning the backgrounds of '
+                            f'{", ".join(request.sensors) or "all sensors"} again')
         return response
 
     def _solve(self, request: SurveyMessage.Request,
                response: SurveyMessage.Response) -> SurveyMessage.Response:
-        """Orientations and clocks, as the service asks; running tracks keep theirs to the end."""
+        """Handle ~/survey: update orientations and clocks; running tracks keep the old ones."""
         network = self._survey_service.solve(self.network, request.save, response)
         if network is None:
             return response
         self.network = network
         self._stage.renew(network)
         self._publish_transforms()
-        self._health.renew(network)
+        self._health.use_network(network)
         self._rounds.begin(network)
         self._rounds.publish()
         self._store.drop(network.names, self._is_live())
@@ -262,5 +295,16 @@ class CalibrationNode(StageNode):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node; returns the exit status."""
+    """Run the node as a process.
+
+    Parameters
+    ----------
+    arguments : list of str, optional
+        Command line; `sys.argv` by default.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
     return stage_node.main(CalibrationNode, arguments)

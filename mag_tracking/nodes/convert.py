@@ -1,8 +1,8 @@
-"""The only conversions between records and ROS messages.
+"""Conversion of records to and from ROS messages.
 
-What a message holds is said once, in `messages.schema`, as nested dicts; here dicts
-become message objects. Messages read as records through the same functions
-that read a recording: both have the same attributes.
+The content of each message is defined once, in `messages.schema`, as nested dicts; here dicts
+become message objects. ROS messages have the same attributes as decoded messages of a recording, so
+the functions that read a recording also read them.
 """
 
 import functools
@@ -18,7 +18,18 @@ from mag_tracking.records import Hypothesis, Track
 
 
 def message_class(type_name: str) -> Any:
-    """The class of a type such as `std_msgs/msg/Header`; None where it is not installed."""
+    """Class of a message type.
+
+    Parameters
+    ----------
+    type_name : str
+        For example `std_msgs/msg/Header`.
+
+    Returns
+    -------
+    type or None
+        None if the type is not installed.
+    """
     package, _, name = type_name.split('/')
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name, None)
@@ -27,9 +38,24 @@ def message_class(type_name: str) -> Any:
 
 
 def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
-    """A message of class `cls` with the `content` of nested dicts.
+    """Convert nested dicts to a ROS message.
 
-    Raises AttributeError for a field that the message does not have.
+    Parameters
+    ----------
+    cls : type
+        Class of the message.
+    content : mapping of str to object
+        Fields; missing ones keep their defaults.
+
+    Returns
+    -------
+    object
+        Message of class `cls`.
+
+    Raises
+    ------
+    AttributeError
+        If the message does not have a field of `content`.
     """
     message = cls()
     for name, value in content.items():
@@ -44,21 +70,30 @@ def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
 
 @functools.cache
 def _element_class(cls: Any, name: str) -> Any:
-    """The class of what is in the sequence `name` of a message."""
+    """Class of the elements of the sequence `name` of a message."""
     element = cls.get_fields_and_field_types()[name].removeprefix('sequence<').removesuffix('>')
     package, leaf = element.split('/')
     return message_class(f'{package}/msg/{leaf}')
 
 
 def _vector(v: Any) -> FloatArray:
-    """(3,) of anything with x, y, z."""
+    """Array (3,) of an object with x, y and z."""
     return np.array([v.x, v.y, v.z])
 
 
 def track_of(message: Any, hypotheses: Any = None) -> Track:
-    """`Track` of a mag_tracking_msgs/Track and, if given, its HypothesisArray.
+    """Convert mag_tracking_msgs/Track to a `Track`.
 
-    Without that its hypotheses are the best of each arrival.
+    Parameters
+    ----------
+    message : Track message
+    hypotheses : HypothesisArray message, optional
+        Hypotheses of that track; by default the best ones of each arrival direction, from
+        `message`.
+
+    Returns
+    -------
+    Track
     """
     pose = np.array(message.pose.covariance).reshape(6, 6)
     q = message.pose.pose.orientation

@@ -1,5 +1,5 @@
-// A watch over the end of a process, which works while Python is blocked, as a Python module;
-// core.pyi says what the arguments are.
+// Python module that ends the process after a timeout, even while Python is blocked. The arguments
+// are described in core.pyi.
 
 #include <poll.h>
 #include <unistd.h>
@@ -16,13 +16,13 @@ namespace mag_tracking {
 namespace {
 
 constexpr double MAX_S = 1e6;
-// A pipe that can be written to takes as much without blocking (PIPE_BUF).
+// A writable pipe accepts this much without blocking (PIPE_BUF).
 constexpr std::size_t MAX_MESSAGE = 4096;
 
 [[noreturn]] void end_process(int status, const std::string& message) {
     pollfd error_output{STDERR_FILENO, POLLOUT, 0};
     if (poll(&error_output, 1, 0) > 0) {
-        // If it cannot be written, there is no other place for it.
+        // A failure is ignored, because the message cannot be written anywhere else.
         [[maybe_unused]] const auto written =
             write(STDERR_FILENO, message.data(), std::min(message.size(), MAX_MESSAGE));
     }
@@ -68,7 +68,7 @@ class Deadline {
     std::mutex mutex_;
     std::condition_variable changed_;
     bool cancelled_ = false;
-    // Last, because it starts with all of the others in place.
+    // Declared last, because the thread uses all other members.
     std::thread thread_;
 };
 
@@ -82,7 +82,7 @@ PYBIND11_MODULE(core, m) {
     m.def(
         "end_within",
         [](double seconds, int status, const std::string& message) {
-            // Never deleted: it outlives the interpreter.
+            // Never deleted, because it must outlive the interpreter.
             new Deadline(seconds, status, message);
         },
         py::arg("seconds"), py::arg("status"), py::arg("message"));

@@ -1,28 +1,44 @@
-"""A watch over the end of a process, which works while Python is blocked; compiled."""
+"""Timeout for the end of the process that works even while Python is blocked; compiled."""
 
 class Deadline:
     """Ends the process unless it is cancelled in time.
 
-    A native thread waits, so code that keeps the interpreter's lock does not delay it. When the
-    process ends, no buffer is flushed and no `finally` runs.
+    A native thread waits, so code that holds the interpreter lock does not delay it. When the
+    process is ended, no buffer is flushed and no `finally` runs.
+
+    Parameters
+    ----------
+    seconds : float, s
+        Time from now.
+    status : int
+        Exit status of the process.
+    message : bytes
+        Written to standard error, up to 4096 bytes, unless that would block.
+
+    Raises
+    ------
+    ValueError
+        If `seconds` is not between 0 and 1e6.
     """
 
-    def __init__(self, seconds: float, status: int, message: bytes) -> None:
-        """
-        Parameters
-        ----------
-        seconds : float
-            From now on.
-        status : int
-            Exit status of the process.
-        message : bytes
-            Written to the standard error, up to 4096 bytes, unless that would block.
-
-        Raises ValueError unless `seconds` is between 0 and 1e6.
-        """
-
+    def __init__(self, seconds: float, status: int, message: bytes) -> None: ...
     def cancel(self) -> None:
-        """Cancel the deadline; may be called again."""
+        """Cancel the deadline; may be called repeatedly."""
 
 def end_within(seconds: float, status: int, message: bytes) -> None:
-    """A `Deadline` that cannot be cancelled; it includes the end of the interpreter."""
+    """Start a `Deadline` that cannot be cancelled; it also covers the end of the interpreter.
+
+    Parameters
+    ----------
+    seconds : float, s
+        Time from now.
+    status : int
+        Exit status of the process.
+    message : bytes
+        Written to standard error, up to 4096 bytes, unless that would block.
+
+    Raises
+    ------
+    ValueError
+        If `seconds` is not between 0 and 1e6.
+    """

@@ -1,4 +1,4 @@
-"""Work that can wait until those who wait for the results have them."""
+"""Work that is deferred until the recipients of published results have processed them."""
 
 from collections.abc import Callable
 
@@ -8,10 +8,17 @@ from mag_tracking.nodes.steady_timer import steady_timer
 
 
 class Deferred:
-    """Calls a function once, a while after it was asked to; meanwhile the node sleeps.
+    """Calls a function once, after a delay during which the node is idle.
 
-    What a node does at once behind its publishing takes a core from those that it has just
-    woken, if there are few.
+    On a computer with few cores, work done immediately after publishing would take a core from the
+    processes that the messages have just woken.
+
+    Parameters
+    ----------
+    node : Node
+    delay_s : float, s
+    call : function
+        Called without arguments.
     """
 
     def __init__(self, node: Node, delay_s: float, call: Callable[[], None]) -> None:
@@ -19,11 +26,11 @@ class Deferred:
         self._timer = steady_timer(node, delay_s, self._due, autostart=False)
 
     def request(self) -> None:
-        """Have it called; who has asked already waits no longer for that."""
+        """Schedule the call, unless it is already scheduled."""
         if self._timer.is_canceled():
             self._timer.reset()
 
     def _due(self) -> None:
-        """Call it, once."""
+        """Call the function once."""
         self._timer.cancel()
         self._call()

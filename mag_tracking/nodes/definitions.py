@@ -1,4 +1,4 @@
-"""The texts of message types, for the schemas of recordings."""
+"""Definitions of message types, for the schemas of recordings."""
 
 import functools
 import os
@@ -6,14 +6,22 @@ import sys
 from pathlib import Path
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.types import definition, named_in
+from mag_tracking.messages.types import definition, referenced_types
 
 
 @functools.cache
 def definition_of(type_name: str) -> str | None:
-    """The text of a type with all that it needs, as a `ros2msg` schema has it.
+    """Definition of a type with those of all contained types, in the format of a `ros2msg` schema.
 
-    None where a type's .msg file is not installed.
+    Parameters
+    ----------
+    type_name : str
+        For example `std_msgs/msg/Header`.
+
+    Returns
+    -------
+    str or None
+        None if the .msg file of a type is not installed.
     """
     try:
         return definition(type_name)
@@ -27,14 +35,14 @@ def definition_of(type_name: str) -> str | None:
             return None
         package, _, leaf = name.split('/')
         text += own if not text else f'{"=" * 80}\nMSG: {package}/{leaf}\n{own}'
-        new = [t for t in named_in(own, package) if t not in seen]
+        new = [t for t in referenced_types(own, package) if t not in seen]
         seen += new
         queue += new
     return text
 
 
 def _own_text(type_name: str) -> str | None:
-    """The text of the type's .msg file, or None."""
+    """Text of the .msg file of a type, or None."""
     package, kind, leaf = type_name.split('/')
     # The wheels leave AMENT_PREFIX_PATH unset and install below sys.prefix.
     prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]

@@ -1,7 +1,7 @@
-"""detection_node: calibrated fields in, frames of the network and detections out."""
+"""detection_node: combines calibrated fields to network frames and detects targets."""
 
 if __name__ == '__main__':
-    # Does not return: a signal during the imports below would end in a traceback.
+    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import detection_node
 
     detection_node()
@@ -20,7 +20,7 @@ from mag_tracking.messages.types import CALIBRATED_READINGS, NETWORK_FRAME, TRAC
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
-from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM, StageNode, has_subscribers
+from mag_tracking.nodes.stage_node import RESULTS, STREAM, STREAM_OUTPUT, StageNode, has_subscribers
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.records import Detection, FieldFrame, Readings
@@ -30,21 +30,27 @@ from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.events.stage import Events
 from mag_tracking.stages.stage import Stage
 
-DESCRIBED_S = 0.5
-"""[s] Events are sought once a frame, since a search costs as much as many readings. Without frames
-they are sought at this interval."""
+EVENT_INTERVAL_S = 0.5
+"""[s] Interval of the search for pass events while there are no frames. Otherwise the search runs
+once per frame, because it costs as much as many readings."""
 
 
 class DetectionNode(StageNode):
-    """Aligns the sensors to frames and tests each for a target."""
+    """Aligns the readings of all sensors to frames and tests each frame for a target.
+
+    Parameters
+    ----------
+    tracker : TrackerNode, optional
+        Tracker of the same process, which receives the frames directly. Calibrated readings are
+        then passed to `receive_readings`.
+    **node_arguments
+        Arguments of `StageNode`.
+    """
 
     def __init__(self, tracker: TrackerNode | None = None, **node_arguments: Any) -> None:
-        """With a `tracker` in the same process, which takes the frames, calibrated readings come by
-        `take_readings`.
-        """
         super().__init__('detection_node', 'align', **node_arguments)
         self._tracker = tracker
-        self._unpublished: FieldFrame | None = None
+        self._pending_frame: FieldFrame | None = None
         self.settings = declare_settings(self, self.settings, 'detect')
         self.settings = declare_settings(self, self.settings, 'events')
         self._align = Align(self.network, self.settings.align)
@@ -53,69 +59,81 @@ class DetectionNode(StageNode):
             self.get_logger().warning(warning)
         self._events = Events(self.network, self.settings.align, self.settings.detect) \
             if len(self.network) <= self.settings.events.max_sensors else None
-        self._undescribed: list[Readings] = []
+        self._event_backlog: list[Readings] = []
         if self._events is not None:
-            steady_timer(self, DESCRIBED_S, self._describe)
-        self._described = self.publisher(PassEventMessage, '~/events', RESULTS)
+            steady_timer(self, EVENT_INTERVAL_S, self._publish_events)
+        self._event_publisher = self.publisher(PassEventMessage, '~/events', RESULTS)
         self._detect = Detect(self.network, self.settings.detect)
-        self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, SENT)
+        self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, STREAM_OUTPUT)
         self._detections = self.publisher(DetectionMessage, '~/detections', RESULTS)
         if tracker is None:
             self._subscribe()
         else:
-            tracker.behind_pose = self._publish_frame_behind
-            self.take_readings = self.direct('calibration', [CALIBRATED_READINGS], self._feed,
-                                             lambda readings: int(readings.stamp_ns[-1]))
+            tracker.after_pose = self._publish_pending_frame
+            self.receive_readings = self.direct_input(
+                'calibration', [CALIBRATED_READINGS], self._feed,
+                lambda readings: int(readings.stamp_ns[-1]))
         self.report_state()
 
     def _subscribe(self) -> None:
-        """Listen to the calibration, as a process of its own."""
+        """Subscribe to the calibrated fields, if the node is a process of its own."""
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
-            self.subscription(MagneticField, f'{topic}_calibrated', partial(self._take, sensor),
+            self.subscription(MagneticField, f'{topic}_calibrated', partial(self._receive, sensor),
                               STREAM, source='calibration')
-        self.subscription(FieldReadings, CALIBRATED_READINGS, self._take_many, STREAM,
+        self.subscription(FieldReadings, CALIBRATED_READINGS, self._receive_batch, STREAM,
                           source='calibration', batches=True)
-        self.expect('tracker', NETWORK_FRAME, TRACK_ARRAY)
+        self.monitor_subscriber('tracker', NETWORK_FRAME, TRACK_ARRAY)
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """{name: stage} whose counts are published."""
+        """Stages whose counts are published.
+
+        Returns
+        -------
+        dict of str to Stage
+        """
         events: dict[str, Stage[Any, Any]] = \
             {} if self._events is None else {'events': self._events}
         return {'align': self._align, 'detect': self._detect, **events}
 
     def queues(self) -> dict[str, int]:
-        """{name of a stage: how many records it holds}."""
-        held = {} if self._events is None else {'events': sum(map(len, self._undescribed))}
+        """Number of readings that are held back.
+
+        Returns
+        -------
+        dict of str to int
+            By stage name.
+        """
+        held = {} if self._events is None else {'events': sum(map(len, self._event_backlog))}
         return {'align': self._align.n_held, **held}
 
-    def _take(self, sensor: str, message: MagneticField) -> None:
-        """One calibrated reading."""
+    def _receive(self, sensor: str, message: MagneticField) -> None:
+        """Process a calibrated reading."""
         self._feed(reading_of(message, sensor))
 
-    def _take_many(self, message: FieldReadings) -> None:
-        """Calibrated readings of many sensors."""
+    def _receive_batch(self, message: FieldReadings) -> None:
+        """Process calibrated readings of many sensors."""
         readings = self.readings_of(message, self._align)
         if readings is not None:
             self._feed(readings)
 
     def _feed(self, readings: Readings) -> None:
-        """Calibrated readings: the frames and events that they complete."""
+        """Publish the frames and events that calibrated readings complete."""
         frames = self._align.feed(readings)
         self._publish(frames)
         if self._events is not None:
-            self._undescribed.append(readings)
+            self._event_backlog.append(readings)
             if frames:
-                self._describe()
+                self._publish_events()
 
-    def _describe(self) -> None:
-        """Publish the events that the readings since the last time complete."""
+    def _publish_events(self) -> None:
+        """Publish the events that are completed by the readings received since the last call."""
         assert self._events is not None
-        readings, self._undescribed = Readings.joined(self._undescribed), []
+        readings, self._event_backlog = Readings.joined(self._event_backlog), []
         for event in self._events.feed(readings):
-            self._described.publish(to_message(PassEventMessage, pass_event_dict(event)))
+            self._event_publisher.publish(to_message(PassEventMessage, pass_event_dict(event)))
 
     def _publish(self, frames: list[FieldFrame]) -> None:
-        """Frames that are complete, and what is detected in them."""
+        """Publish completed frames and their detections."""
         for frame in frames:
             for record in self._detect.feed(frame):
                 if isinstance(record, Detection):
@@ -124,21 +142,32 @@ class DetectionNode(StageNode):
                 elif self._tracker is None:
                     self._publish_frame(record)
                 else:
-                    self._unpublished = record
-                    self._tracker.take_frame(record)
-                    self._publish_frame_behind()
+                    self._pending_frame = record
+                    self._tracker.receive_frame(record)
+                    self._publish_pending_frame()
 
-    def _publish_frame_behind(self) -> None:
-        """Publish the frame that the tracker has, once, where somebody listens."""
-        frame, self._unpublished = self._unpublished, None
+    def _publish_pending_frame(self) -> None:
+        """Publish the frame that the tracker has processed, once, if it has subscribers."""
+        frame, self._pending_frame = self._pending_frame, None
         if frame is not None and has_subscribers(self._frames):
             self._publish_frame(frame)
 
     def _publish_frame(self, frame: FieldFrame) -> None:
-        """Publish a frame with its verdict."""
+        """Publish a frame with its detection result."""
         self._frames.publish(to_message(NetworkFrame, frame_dict(frame, self.network)))
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node; returns the exit status."""
+    """Run the node as a process.
+
+    Parameters
+    ----------
+    arguments : list of str, optional
+        Command line; `sys.argv` by default.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
     return stage_node.main(DetectionNode, arguments)

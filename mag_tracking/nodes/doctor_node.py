@@ -1,4 +1,4 @@
-"""The doctor on a live system: listens to the sensors' topics for a while."""
+"""Live input of `mag-tracking doctor`: receives readings for a limited time."""
 
 import time
 from collections import Counter
@@ -26,7 +26,17 @@ from mag_tracking.stages.health.sensor_health import Finding
 
 
 class DoctorNode(Node):
-    """Hands the readings of a network to a `Doctor`, with the time at which they came."""
+    """Passes the readings of a network, with their times of arrival, to a `Doctor`.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : Settings
+
+    Attributes
+    ----------
+    doctor : Doctor
+    """
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         super().__init__('doctor', namespace=network.namespace)
@@ -34,17 +44,17 @@ class DoctorNode(Node):
         self._topics = dict(zip(network.names, map(self.resolve_topic_name, network.topics),
                                 strict=True))
         for sensor, topic in self._topics.items():
-            self.create_subscription(MagneticField, topic, partial(self._take, sensor), SENSORS)
+            self.create_subscription(MagneticField, topic, partial(self._receive, sensor), SENSORS)
         self._in_batches: set[str] = set()
         self._bad: Counter[str] = Counter()
-        self.create_subscription(FieldReadings, RAW_READINGS, self._take_many, STREAM)
+        self.create_subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM)
 
-    def _take(self, sensor: str, message: MagneticField) -> None:
-        """One reading."""
+    def _receive(self, sensor: str, message: MagneticField) -> None:
+        """Pass a reading to the doctor."""
         self.doctor.feed(reading_of(message, sensor), time.time_ns())
 
-    def _take_many(self, message: FieldReadings) -> None:
-        """Readings of many sensors; of those in the network."""
+    def _receive_batch(self, message: FieldReadings) -> None:
+        """Pass the readings of sensors of the network to the doctor; count invalid messages."""
         try:
             readings = readings_of(message)
         except RecordingError as error:
@@ -56,10 +66,15 @@ class DoctorNode(Node):
         self.doctor.feed(readings, time.time_ns())
 
     def findings(self) -> list[Finding]:
-        """What only the graph tells: list of `Finding`."""
+        """Faults that are visible in the ROS graph only.
+
+        Returns
+        -------
+        list of Finding
+        """
         topic = self.resolve_topic_name(RAW_READINGS)
-        found = [Finding(True, topic, f'{n} messages that are none: {error}', 'look at the driver '
-                         'that publishes it') for error, n in self._bad.items()]
+        found = [Finding(True, topic, f'{n} invalid messages: {error}', 'check the driver that '
+                         'publishes this topic') for error, n in self._bad.items()]
         for sensor, topic in self._topics.items():
             found += topic_findings(self, sensor, topic)
             if sensor not in self._in_batches and not self.count_publishers(topic):
@@ -69,32 +84,48 @@ class DoctorNode(Node):
 
 @dataclass
 class DoctorResult:
-    """Result of listening."""
+    """Result of `listening`."""
 
     doctor: Doctor
+    """Has received all readings."""
     findings: list[Finding]
-    """Findings that only the graph shows."""
+    """Faults that are visible in the ROS graph only."""
     status: int = 1
-    """Exit status if the middleware does not shut down; set it when the report is written."""
+    """Exit status if the middleware does not shut down; set it once the report has been written."""
 
 
 @contextmanager
 def listening(network: SensorNetwork, settings: Settings, seconds: float,
               stopped: Callable[[], bool], ros_arguments: Sequence[str] = ()
               ) -> Iterator[DoctorResult]:
-    """Listen for `seconds` or until `stopped()`; leave the graph after the context.
+    """Receive readings for a limited time; the node is shut down when the context ends.
 
-    If the middleware hangs, the process ends there: see `leave`.
+    If the middleware hangs, the process ends there: see `shut_down`.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : Settings
+    seconds : float, s
+        Maximum duration.
+    stopped : function
+        Returns True to stop earlier.
+    ros_arguments : sequence of str, optional
+        Begin with `--ros-args`.
+
+    Yields
+    ------
+    DoctorResult
     """
     begin(list(ros_arguments))
     executor = make_executor()
     node = DoctorNode(network, settings)
-    heard = DoctorResult(node.doctor, [])
+    result = DoctorResult(node.doctor, [])
     try:
         executor.add_node(node)
         end = time.monotonic() + seconds
         spin(executor, lambda: stopped() or time.monotonic() > end)
-        heard.findings = node.findings()
-        yield heard
+        result.findings = node.findings()
+        yield result
     finally:
-        shut_down([node], executor, heard.status)
+        shut_down([node], executor, result.status)

@@ -1,4 +1,4 @@
-"""The health of the drivers as diagnostics."""
+"""Diagnostics of the drivers."""
 
 from collections.abc import Collection, Sequence
 
@@ -9,14 +9,19 @@ from mag_tracking.drivers.driver import Driver
 from mag_tracking.nodes.stage_node import title_of
 from mag_tracking.nodes.status_log import StatusLog
 
-HARMLESS = ('samples: ', 'late arrivals: ', 'other messages: ', 'lines that are comments',
-            'lines without the prefix', 'lines that are empty', 'retained messages skipped',
-            'conversions overwritten', 'packets not used')
-"""What begins so is counted, but nothing to be warned of."""
+EXPECTED_COUNTS = ('samples: ', 'late arrivals: ', 'other messages: ', 'lines that are comments',
+                   'lines without the prefix', 'lines that are empty', 'retained messages skipped',
+                   'conversions overwritten', 'packets not used')
+"""Counts that begin with one of these are reported, but do not cause a warning."""
 
 
 class DriverDiagnostics:
-    """Says how each device is, and logs when that changes."""
+    """Reports the state of each device and logs changes.
+
+    Parameters
+    ----------
+    node : Node
+    """
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -25,36 +30,50 @@ class DriverDiagnostics:
 
     def statuses(self, drivers: Sequence[Driver], served: Collection[str],
                  active: bool) -> list[DiagnosticStatus]:
-        """[DiagnosticStatus], one a device; `served` are the names of those with a thread."""
+        """Diagnostics of all devices.
+
+        Parameters
+        ----------
+        drivers : sequence of Driver
+        served : collection of str
+            Names of the drivers whose thread is running.
+        active : bool
+            Whether the node is active.
+
+        Returns
+        -------
+        list of DiagnosticStatus
+            One per driver.
+        """
         return [self._status(driver, driver.name in served, active) for driver in drivers]
 
     def _status(self, driver: Driver, served: bool, active: bool) -> DiagnosticStatus:
-        """The DiagnosticStatus of one device."""
+        """Diagnostics of one device."""
         counts = driver.counts()
         before = self._reported.get(driver.name, {})
-        news = [f'{what}: {n - before.get(what, 0)} more' for what, n in sorted(counts.items())
-                if n > before.get(what, 0) and not what.startswith(HARMLESS)]
+        increases = [f'{what}: {n - before.get(what, 0)} more' for what, n in sorted(counts.items())
+                     if n > before.get(what, 0) and not what.startswith(EXPECTED_COUNTS)]
         self._reported[driver.name] = dict(counts)
         level, message = DiagnosticStatus.OK, 'open'
         if not active:
             message = 'not active'
         elif not served:
-            level, message = DiagnosticStatus.ERROR, 'its thread has ended: start the node again'
+            level, message = DiagnosticStatus.ERROR, 'driver thread has ended: restart the node'
         elif driver.fault:
             level, message = DiagnosticStatus.ERROR, driver.fault
         elif not driver.is_open:
-            # It has no trouble, and some devices take seconds.
+            # No fault has occurred, and opening some devices takes seconds.
             message = 'opening'
-        elif news:
-            level, message = DiagnosticStatus.WARN, '; '.join(news)
+        elif increases:
+            level, message = DiagnosticStatus.WARN, '; '.join(increases)
         values = {what: str(n) for what, n in sorted(counts.items())}
         for source, clock in driver.clocks().items():
-            behind = f' ({source})' if source else ''
-            values[f'drift of its clock [ppm]{behind}'] = f'{clock.drift_ppm:.2f}'
-            values[f'messages behind the quickest [ms]{behind}'] = f'{1e3 * clock.spread_s:.3g}'
-            values[f'std of its stamps [ms]{behind}'] = f'{1e3 * clock.stamp_std:.3g}'
+            suffix = f' ({source})' if source else ''
+            values[f'clock drift [ppm]{suffix}'] = f'{clock.drift_ppm:.2f}'
+            values[f'delay above the minimum, 95 % [ms]{suffix}'] = f'{1e3 * clock.spread_s:.3g}'
+            values[f'timestamp std [ms]{suffix}'] = f'{1e3 * clock.stamp_std:.3g}'
         status = DiagnosticStatus(
             level=level, name=f'{title_of(self._node)}: {driver.name}', hardware_id=driver.name,
             message=message, values=[KeyValue(key=k, value=v) for k, v in values.items()])
-        self._log.note(status)
+        self._log.add(status)
         return status

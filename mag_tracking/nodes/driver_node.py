@@ -1,11 +1,11 @@
-"""driver_node: devices in, magnetic fields and accelerations out.
+"""driver_node: reads devices and publishes magnetic fields and accelerations.
 
-A lifecycle node: configuring reads the drivers file, activating opens the
-devices. With `autostart` (the default) it does both by itself.
+A lifecycle node: configuration reads the drivers file, activation opens the devices. With
+`autostart` (the default) it does both at startup.
 """
 
 if __name__ == '__main__':
-    # Does not return: a signal during the imports below would end in a traceback.
+    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import driver_node
 
     driver_node()
@@ -32,25 +32,36 @@ from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.driver_health import DriverDiagnostics
 from mag_tracking.nodes.managed_node import ManagedNode
 from mag_tracking.nodes.ros_params import fixed_parameter
-from mag_tracking.nodes.stage_node import RESULTS, SENT
+from mag_tracking.nodes.stage_node import RESULTS, STREAM_OUTPUT
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.records import AccelerationSample, Readings
 
-PATIENCE_S = 15.0
-"""[s] Time that a driver has to stop; a broker that does not answer takes a while."""
+STOP_TIMEOUT_S = 15.0
+"""[s] Maximum time for a driver to stop. Disconnecting from an MQTT broker that does not answer
+takes several seconds."""
 
 
 class DriverNode(ManagedNode):
-    """One thread a device, which publishes what the device says."""
+    """Runs one thread per device, which publishes its readings.
+
+    Parameters
+    ----------
+    **node_arguments
+        Arguments of `Node`.
+
+    Raises
+    ------
+    MagTrackingError
+        If `autostart` is set and the settings are invalid.
+    """
 
     def __init__(self, **node_arguments: Any) -> None:
-        """Raises MagTrackingError where `autostart` finds that the settings are unusable."""
         super().__init__('driver_node', **node_arguments)
         self._path = fixed_parameter(self, 'drivers', '', 'Path of the drivers file.')
         self._network_path = fixed_parameter(self, 'network', '', 'Path of the network file.')
-        self._readings = self.create_publisher(FieldReadings, RAW_READINGS, SENT) \
-            if fixed_parameter(self, 'batches', False, 'Readings of many sensors in one '
-                               'message.') else None
+        self._readings = self.create_publisher(FieldReadings, RAW_READINGS, STREAM_OUTPUT) \
+            if fixed_parameter(self, 'batches', False, 'Publish the readings of many sensors in '
+                               'one message (FieldReadings).') else None
         self._drivers: list[Driver] = []
         self._threads: list[threading.Thread] = []
         self._publishers_by_sensor: dict[str, tuple[Publisher, Publisher]] = {}
@@ -58,12 +69,21 @@ class DriverNode(ManagedNode):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
         self._health = DriverDiagnostics(self)
         steady_timer(self, 1.0, self._publish_diagnostics)
-        self.start_by_itself()
+        self.start_automatically()
 
     def prepare(self) -> None:
-        """Read the drivers file and advertise the sensors' topics."""
+        """Read the drivers file and advertise the topics of the sensors.
+
+        Raises
+        ------
+        SettingsError
+            If parameter `drivers` is empty or the drivers file is invalid.
+        NetworkError
+            If the network file is invalid.
+        """
         if not self._path:
-            raise SettingsError('parameter drivers: the path of a drivers.yaml is needed')
+            raise SettingsError('driver_node: parameter drivers is empty; set it to the path of a '
+                                'drivers file')
         network = read_network(self._network_path) if self._network_path else None
         self._drivers = read_drivers(self._path, network)
         for driver in self._drivers:
@@ -71,11 +91,23 @@ class DriverNode(ManagedNode):
                 self._publishers_by_sensor[sensor] = self._advertise(sensor, network)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
-        """Open the devices, each in a thread of its own."""
+        """Open the devices, each in a thread of its own.
+
+        Parameters
+        ----------
+        state : State
+            Previous state.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            FAILURE if a thread of an earlier activation is still running.
+        """
         if self._threads:
-            self.get_logger().error(f'{self._threads[0].name} has not stopped yet')
+            self.get_logger().error(f'driver {self._threads[0].name} is still stopping; activate '
+                                    'again later')
             return TransitionCallbackReturn.FAILURE
-        # One for each time: an old thread must not be told to go on.
+        # A new event for each activation, so that a thread that is still stopping does not resume.
         self._stopping = threading.Event()
         self._threads = [threading.Thread(
             target=serve, args=(driver, self._publish, self._stopping.is_set),
@@ -85,44 +117,74 @@ class DriverNode(ManagedNode):
         return super().on_activate(state)
 
     def on_deactivate(self, state: State) -> TransitionCallbackReturn:
-        """Close the devices."""
+        """Close the devices.
+
+        Parameters
+        ----------
+        state : State
+            Previous state.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+        """
         self._stop()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: State) -> TransitionCallbackReturn:
-        """Forget the drivers file."""
-        self._forget()
+        """Release the drivers and withdraw the topics.
+
+        Parameters
+        ----------
+        state : State
+            Previous state.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+        """
+        self._release()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: State) -> TransitionCallbackReturn:
-        """Close the devices for good."""
+        """Close the devices, release the drivers and withdraw the topics.
+
+        Parameters
+        ----------
+        state : State
+            Previous state.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+        """
         self._stop()
-        self._forget()
+        self._release()
         return TransitionCallbackReturn.SUCCESS
 
     def close(self) -> None:
-        """Stop the threads, which publish; each closes its device."""
+        """Stop the threads; each closes its device."""
         self._stop()
-        # A thread that has not stopped is not waited for again.
+        # Threads that did not stop in time are not waited for again.
         self._threads = []
 
     def destroy_node(self) -> None:
-        """Close and destroy the node."""
+        """Close the devices and destroy the node."""
         self.close()
         ManagedNode.destroy_node(self)
 
     def _advertise(self, sensor: str,
                    network: SensorNetwork | None) -> tuple[Publisher, Publisher]:
-        """Publishers (field, acceleration) of a sensor."""
+        """Publishers of the field and the acceleration of a sensor."""
         topic, imu_topic = f'{sensor}/imu/mag', f'{sensor}/imu/data_raw'
         if network is not None:
             j = network.names.index(sensor)
             topic, imu_topic = network.topics[j], network.imu_topics[j] or imu_topic
-        return (self.create_publisher(MagneticField, topic, SENT),
-                self.create_publisher(Imu, imu_topic, SENT))
+        return (self.create_publisher(MagneticField, topic, STREAM_OUTPUT),
+                self.create_publisher(Imu, imu_topic, STREAM_OUTPUT))
 
     def _publish(self, readings: Readings, accelerations: list[AccelerationSample]) -> None:
-        """Each reading on its sensor's topic, or with `batches` together."""
+        """Publish each reading on its sensor topic or, with `batches`, all in one message."""
         if self._readings is None:
             for sensor, content in magnetic_field_dicts(readings):
                 self._publishers_by_sensor[sensor][0].publish(to_message(MagneticField, content))
@@ -133,25 +195,26 @@ class DriverNode(ManagedNode):
                 to_message(Imu, acceleration_dict(acceleration, acceleration.sensor)))
 
     def _stop(self) -> None:
-        """End the threads; they close their devices."""
+        """Stop the threads, which close their devices."""
         if self._stopping is not None:
             self._stopping.set()
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + STOP_TIMEOUT_S
         for thread in self._threads:
             thread.join(max(0.0, end - time.monotonic()))
             if thread.is_alive():
-                self.get_logger().error(f'{thread.name} has not stopped within {PATIENCE_S:g} s')
+                self.get_logger().error(f'driver {thread.name} did not stop within '
+                                        f'{STOP_TIMEOUT_S:g} s')
         self._threads = [thread for thread in self._threads if thread.is_alive()]
 
-    def _forget(self) -> None:
-        """Withdraw topics and drivers."""
+    def _release(self) -> None:
+        """Release the drivers and withdraw the topics."""
         for pair in self._publishers_by_sensor.values():
             for publisher in pair:
                 self.destroy_publisher(publisher)
         self._drivers, self._publishers_by_sensor = [], {}
 
     def _publish_diagnostics(self) -> None:
-        """How the devices are."""
+        """Publish the state of the devices."""
         array = DiagnosticArray(status=self._health.statuses(
             self._drivers, {thread.name for thread in self._threads if thread.is_alive()},
             self._stopping is not None and not self._stopping.is_set()))
@@ -160,5 +223,16 @@ class DriverNode(ManagedNode):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node; returns the exit status."""
+    """Run the node as a process.
+
+    Parameters
+    ----------
+    arguments : list of str, optional
+        Command line; `sys.argv` by default.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
     return stage_node.main(DriverNode, arguments)

@@ -1,4 +1,4 @@
-"""What goes through a node: how much, how late, and whether somebody still sends and listens."""
+"""Monitoring of the inputs and outputs of a node: throughput, latency, missing neighbours."""
 
 import time
 from collections.abc import Callable, Collection
@@ -10,94 +10,129 @@ from mag_tracking.stages.health.sensor_health import REPLAYED_S
 from mag_tracking.stages.health.window import quantiles
 from mag_tracking.units import NS
 
-SILENT_S = 2.0
-"""[s] A sensor or a node of which nothing came for longer is silent."""
-PATIENCE_S = 8.0
-"""[s] Grace period for the first message, longer than learning a background takes."""
-MAX_BUSY = 0.95
-"""Largest share of the time that a node can spend on messages and keep up."""
-LATE_S = 1.0
-"""[s] A median latency above this is a fault: such poses are too old for control."""
-MAX_RECORDED = 10_000
-"""Messages between two reports whose times are kept; a second of a thousand sensors has less."""
+SILENCE_TIMEOUT_S = 2.0
+"""[s] A sensor or node that has sent nothing for longer is reported as silent."""
+FIRST_MESSAGE_TIMEOUT_S = 8.0
+"""[s] Grace period for the first message; longer than learning a background takes."""
+MAX_LOAD = 0.95
+"""Maximum share of time that a node can spend on messages without falling behind."""
+MAX_LATENCY_S = 1.0
+"""[s] A larger median latency is reported as a fault: such poses are too old for control."""
+MAX_LATENCIES = 10_000
+"""Maximum number of latencies stored between two reports; a thousand sensors have fewer per
+second."""
 
 
 class Flow:
-    """The messages that a node takes from a `source`: the sensors, or the step before."""
+    """Statistics of the messages that a node receives from one source.
+
+    Parameters
+    ----------
+    source : str
+        Name of the source: the sensors, or the preceding node.
+
+    Attributes
+    ----------
+    source : str
+    topics : list of str
+        Absolute topic names, after remapping.
+    batches : list of str
+        Topics of batches of readings, which may be used instead of `topics`.
+    last_received : float or None, s
+        Time of the latest message, by `time.monotonic()`.
+    n_lost : int
+        Number of messages lost because the input queue was full.
+    """
 
     def __init__(self, source: str) -> None:
         self.source = source
         self.topics: list[str] = []
-        """Absolute names, as remapped."""
         self.batches: list[str] = []
-        """Topics that may take their place."""
         self._began = time.monotonic()
-        self.heard: float | None = None
-        """`time.monotonic()` [s] of the latest message, or None."""
+        self.last_received: float | None = None
         self.n_lost = 0
-        self._n, self._told_lost = 0, 0
+        self._n, self._n_reported_lost = 0, 0
         self._ages: list[float] = []
         self._age_s: float | None = None
         self._busy_s, self._reported = 0.0, time.monotonic()
 
-    def note(self, stamp_ns: int, came_ns: int, began: float) -> None:
-        """A message of `stamp_ns`, which came at `came_ns`, has been worked off since `began`.
+    def add(self, stamp_ns: int, came_ns: int, began: float) -> None:
+        """Add a message that has been processed.
 
-        That is in seconds by the monotonic clock.
+        Parameters
+        ----------
+        stamp_ns : int, ns
+            Timestamp of the message.
+        came_ns : int, ns
+            Time of arrival, by the clock of the node.
+        began : float, s
+            Start of processing, by `time.monotonic()`.
         """
         self._n += 1
-        self.heard = time.monotonic()
-        took_s = self.heard - began
+        self.last_received = time.monotonic()
+        took_s = self.last_received - began
         self._busy_s += took_s
         self._age_s = (came_ns - stamp_ns) / NS + took_s
-        if len(self._ages) < MAX_RECORDED:
+        if len(self._ages) < MAX_LATENCIES:
             self._ages.append(self._age_s)
 
     @property
     def n_ages(self) -> int:
-        """How many messages the latency of the next report is of."""
+        """Number of latencies in the next report."""
         return len(self._ages)
 
     @property
     def is_live(self) -> bool:
-        """Whether the latest message was of the present, not of a recording."""
+        """Whether the latest message was live, not of a recording."""
         return self._age_s is not None and abs(self._age_s) < REPLAYED_S
 
-    def status(self, node: str, is_there: Callable[[], bool]) -> DiagnosticStatus:
-        """The DiagnosticStatus of what came since the last one.
+    def status(self, node: str, has_publisher: Callable[[], bool]) -> DiagnosticStatus:
+        """Diagnostics of the messages received since the last call.
 
-        `is_there` is a function: whether somebody would still send.
+        Parameters
+        ----------
+        node : str
+            Title of the node that reports.
+        has_publisher : function
+            Returns whether a publisher of the topics still exists.
+
+        Returns
+        -------
+        DiagnosticStatus
         """
         now = time.monotonic()
         elapsed, self._reported = max(now - self._reported, 1e-9), now
         ages, self._ages = self._ages, []
-        news, self._told_lost = self.n_lost - self._told_lost, self.n_lost
+        new_losses, self._n_reported_lost = self.n_lost - self._n_reported_lost, self.n_lost
         level, message = DiagnosticStatus.OK, 'running'
         busy = self._busy_s / elapsed
-        middle, late = quantiles([a for a in ages if abs(a) < REPLAYED_S], 0.5, 0.99)
-        if self.heard is None:
+        median, percentile_99 = quantiles([a for a in ages if abs(a) < REPLAYED_S], 0.5, 0.99)
+        if self.last_received is None:
             message = f'waiting for {shortened(self.topics)}'
-            if now - self._began > PATIENCE_S:
+            if now - self._began > FIRST_MESSAGE_TIMEOUT_S:
                 level = DiagnosticStatus.WARN
-                message = f'nothing has come on {shortened(self.topics)}' + (
-                    '' if is_there() else ', which nobody publishes')
-        elif now - self.heard > SILENT_S:
+                message = f'no message received on {shortened(self.topics)}' + (
+                    '' if has_publisher() else ': it has no publisher; start the node or driver '
+                    'that publishes it')
+        elif now - self.last_received > SILENCE_TIMEOUT_S:
             level = DiagnosticStatus.WARN
-            message = f'nothing has come from {self.source} for {now - self.heard:.0f} s'
-            if not is_there():
+            message = f'no message from {self.source} for {now - self.last_received:.0f} s'
+            if not has_publisher():
                 level = DiagnosticStatus.ERROR
-                message += ', and it has gone; does it still run?'
-        elif news:
+                message += ', and its publisher is gone: check that it is running'
+        elif new_losses:
             level = DiagnosticStatus.WARN
-            message = f'{news} messages from {self.source} did not fit the queue'
-        elif busy > MAX_BUSY or middle > LATE_S:
+            message = f'{new_losses} messages from {self.source} were lost: the input queue was ' \
+                'full; reduce the load of this computer'
+        elif busy > MAX_LOAD or median > MAX_LATENCY_S:
             level = DiagnosticStatus.WARN
-            message = f'{self.source}: {100.0 * busy:.0f} % busy' + (
-                f', {1e3 * middle:.0f} ms behind: this computer is too slow, or its clock is not '
-                'that of the sensors' if middle > LATE_S else ': this computer is too slow')
+            message = f'input from {self.source}: load {100.0 * busy:.0f} %' + (
+                f', latency {1e3 * median:.0f} ms: this computer is too slow, or its clock differs '
+                'from that of the sensors' if median > MAX_LATENCY_S else
+                ': this computer is too slow')
         values = {'messages': self._n, 'lost in the queue': self.n_lost,
-                  'latency, median [ms]': f'{1e3 * middle:.4g}',
-                  'latency, 99 % [ms]': f'{1e3 * late:.4g}',
+                  'latency, median [ms]': f'{1e3 * median:.4g}',
+                  'latency, 99 % [ms]': f'{1e3 * percentile_99:.4g}',
                   'busy [%]': f'{100.0 * busy:.3g}'}
         self._busy_s = 0.0
         return DiagnosticStatus(
@@ -105,11 +140,20 @@ class Flow:
             message=message, values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])
 
 
-class Listener:
-    """The node of the next step, `role`, which subscribes to a topic.
+class SubscriberMonitor:
+    """Checks that the node of the next step still subscribes to a topic.
 
-    It may have any name: it is known by the type of message that it publishes. Others that
-    subscribe, such as recorders, come and go.
+    That node may have any name: it is identified by the message type that it publishes. Other
+    subscribers, such as recorders, may come and go.
+
+    Parameters
+    ----------
+    role : str
+        Role of the next step, for messages.
+    topic : str
+        Absolute topic name.
+    publishes : str
+        Message type that the node of the next step publishes.
     """
 
     def __init__(self, role: str, topic: str, publishes: str) -> None:
@@ -118,24 +162,28 @@ class Listener:
 
     def status(self, node: str, names: Collection[str],
                types_of: Callable[[str], Collection[str]]) -> DiagnosticStatus:
-        """The DiagnosticStatus of the next step.
+        """Diagnostics of the next step.
 
         Parameters
         ----------
         node : str
             Title of the node that reports.
         names : collection of str
-            Nodes that subscribe to the topic now.
+            Nodes that currently subscribe to the topic.
         types_of : function
-            {node: types of the messages that it publishes}.
+            Returns the types of the messages that a node publishes.
+
+        Returns
+        -------
+        DiagnosticStatus
         """
         self._seen |= {name for name in set(names) - self._seen
                        if self._publishes in types_of(name)}
         gone = sorted(self._seen - set(names))
         is_gone = bool(gone) and not self._seen.intersection(names)
         message = 'running' if self._seen else \
-            f'no {self.role} node subscribes to {self.topic} yet'
+            f'no {self.role} node has subscribed to {self.topic} yet'
         return DiagnosticStatus(
             level=DiagnosticStatus.ERROR if is_gone else DiagnosticStatus.OK,
             name=f'{node}: to {self.role}', hardware_id='magnetometer network',
-            message=f'{", ".join(gone)} has gone; does it still run?' if is_gone else message)
+            message=f'{", ".join(gone)} is gone: check that it is running' if is_gone else message)

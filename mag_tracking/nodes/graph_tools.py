@@ -1,4 +1,4 @@
-"""Small substitutes for the command `ros2`, which ROS from PyPI lacks."""
+"""Tools for a ROS graph; small substitutes for the command `ros2`, which ROS from PyPI lacks."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -28,16 +28,23 @@ from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import make_executor, spin
 
 DISCOVERY_S = 1.5
-"""[s] Time for the nodes of the graph to be found."""
-ANSWER_S = 5.0
-"""[s] Longest wait for an answer."""
-TRIES = 3
-CHANGE_S = 60.0
-"""[s] Longest wait for a change: a device may take long to open."""
+"""[s] Time allowed for discovery of the nodes of the graph."""
+RESPONSE_TIMEOUT_S = 5.0
+"""[s] Maximum time for a response."""
+MAX_ATTEMPTS = 3
+"""Maximum number of attempts at a query."""
+CHANGE_TIMEOUT_S = 60.0
+"""[s] Maximum time for a change of state; some devices take long to open."""
 
 
 class Observer:
-    """A node that looks at the graph, asks, and listens.
+    """Node that examines the graph, calls services and receives messages.
+
+    Parameters
+    ----------
+    node : Node
+    executor : Executor
+        Executor of the node.
 
     Attributes
     ----------
@@ -48,38 +55,81 @@ class Observer:
         self.node, self._executor = node, executor
 
     def wait(self, condition: Callable[[], bool], seconds: float) -> bool:
-        """Spin until the condition holds or the time is over; whether it holds."""
+        """Spin until a condition holds or the time is over.
+
+        Parameters
+        ----------
+        condition : function
+            Returns bool.
+        seconds : float, s
+            Maximum time.
+
+        Returns
+        -------
+        bool
+            Whether the condition holds.
+        """
         end = time.monotonic() + seconds
         spin(self._executor, lambda: condition() or time.monotonic() > end)
         return condition()
 
-    def ask(self, service_type: Any, name: str, request: Any, once: bool = False) -> Any:
-        """Response of a service; raises GraphError where none comes.
+    def call(self, service_type: Any, name: str, request: Any, once: bool = False) -> Any:
+        """Call a service.
 
-        A query is repeated: the answer of a server that has not discovered the client is lost. A
-        change is requested `once`, after a wait for the discovery.
+        A query is repeated, because the response of a server that has not yet discovered the client
+        is lost. A change is requested only once, after a wait for discovery.
+
+        Parameters
+        ----------
+        service_type : type
+        name : str
+            Name of the service.
+        request : object
+        once : bool
+            Whether the call changes something and must not be repeated.
+
+        Returns
+        -------
+        object
+            Response of the service.
+
+        Raises
+        ------
+        GraphError
+            If the service does not exist or does not respond in time.
         """
         with valid_names():
             client = self.node.create_client(service_type, name)
         try:
-            if not self.wait(client.service_is_ready, ANSWER_S):
-                raise GraphError(f'there is no service {name}')
+            if not self.wait(client.service_is_ready, RESPONSE_TIMEOUT_S):
+                raise GraphError(f'service {name} not found; check the name and that the node is '
+                                 'running')
             if once:
                 self.wait(lambda: False, DISCOVERY_S)
             futures: list[Any] = []
-            for _ in range(1 if once else TRIES):
+            for _ in range(1 if once else MAX_ATTEMPTS):
                 futures.append(client.call_async(request))
                 if self.wait(lambda: any(f.done() for f in futures),
-                             CHANGE_S if once else ANSWER_S / TRIES):
+                             CHANGE_TIMEOUT_S if once else RESPONSE_TIMEOUT_S / MAX_ATTEMPTS):
                     return next(f for f in futures if f.done()).result()
-            raise GraphError(f'{name} does not answer')
+            raise GraphError(f'service {name} does not respond')
         finally:
             self.node.destroy_client(client)
 
 
 @contextmanager
 def valid_names() -> Iterator[None]:
-    """Names that ROS does not allow are a GraphError."""
+    """Convert the exceptions for invalid ROS names to GraphError.
+
+    Yields
+    ------
+    None
+
+    Raises
+    ------
+    GraphError
+        If the context uses an invalid name.
+    """
     try:
         yield
     except (NameValidationException, RCLError) as error:
@@ -88,7 +138,19 @@ def valid_names() -> Iterator[None]:
 
 @contextmanager
 def observer(ros_arguments: Sequence[str] = ()) -> Iterator[Observer]:
-    """An `Observer` while the context lasts; if the middleware hangs then, see `leave`."""
+    """Create an `Observer` that is shut down when the context ends.
+
+    If the middleware hangs, the process ends there: see `shut_down`.
+
+    Parameters
+    ----------
+    ros_arguments : sequence of str, optional
+        Begin with `--ros-args`.
+
+    Yields
+    ------
+    Observer
+    """
     begin(list(ros_arguments))
     executor, node = make_executor(), Node('mag_tracking_observer', start_parameter_services=False)
     executor.add_node(node)
@@ -101,41 +163,66 @@ def observer(ros_arguments: Sequence[str] = ()) -> Iterator[Observer]:
 
 
 def topics(graph: Observer) -> list[tuple[str, str, int, int]]:
-    """[(topic, type, publishers, subscribers)] of the graph."""
+    """List the topics of the graph.
+
+    Parameters
+    ----------
+    graph : Observer
+
+    Returns
+    -------
+    list of (str, str, int, int)
+        Topic, type, number of publishers and number of subscribers.
+    """
     graph.wait(lambda: False, DISCOVERY_S)
     node = graph.node
     return [(name, ', '.join(kinds), node.count_publishers(name), node.count_subscribers(name))
             for name, kinds in sorted(node.get_topic_names_and_types())]
 
 
-def listen(graph: Observer, topic: str, take: Callable[[Any], bool],
-           stopped: Callable[[], bool]) -> None:
-    """Hand the messages of a topic to `take` until it returns False, or until `stopped()`.
+def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
+                     stopped: Callable[[], bool]) -> None:
+    """Receive the messages of a topic until the handler or the caller stops.
 
-    The quality of service is that of the publishers: latched messages come, too. Raises
-    GraphError where nobody publishes the topic, or its type is not installed.
+    Latched messages are received if all publishers offer them.
+
+    Parameters
+    ----------
+    graph : Observer
+    topic : str
+        Topic name; relative names are resolved.
+    handle : function
+        Called with each message; returns False to stop.
+    stopped : function
+        Returns True to stop.
+
+    Raises
+    ------
+    GraphError
+        If the name is invalid, the topic has no publisher, or its type is not installed.
     """
     with valid_names():
         name = graph.node.resolve_topic_name(topic)
         graph.node.count_publishers(name)
-    if not graph.wait(lambda: graph.node.count_publishers(name) > 0 or stopped(), ANSWER_S):
-        raise GraphError(f'nobody publishes {name}')
+    if not graph.wait(lambda: graph.node.count_publishers(name) > 0 or stopped(),
+                      RESPONSE_TIMEOUT_S):
+        raise GraphError(f'{name} has no publisher; check the name and that the node is running')
     if stopped():
         return
     infos = graph.node.get_publishers_info_by_topic(name)
     cls = message_class(infos[0].topic_type)
     if cls is None:
-        raise GraphError(f'{name}: {infos[0].topic_type} is not installed')
+        raise GraphError(f'{name}: message type {infos[0].topic_type} is not installed')
     latched = all(i.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for i in infos)
     done: list[bool] = []
 
-    def take_one(message: Any) -> None:
-        # Several may wait when the last one that is wanted comes.
-        if not done and not take(message):
+    def handle_one(message: Any) -> None:
+        # More messages may be queued behind the last one that is wanted.
+        if not done and not handle(message):
             done.append(True)
 
     graph.node.create_subscription(
-        cls, name, take_one, QoSProfile(
+        cls, name, handle_one, QoSProfile(
             depth=100, reliability=ReliabilityPolicy.RELIABLE if latched
             else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
@@ -144,7 +231,16 @@ def listen(graph: Observer, topic: str, take: Callable[[Any], bool],
 
 
 def as_dict(message: Any) -> Any:
-    """A message as nested dicts and lists."""
+    """Convert a message to nested dicts and lists.
+
+    Parameters
+    ----------
+    message : object
+
+    Returns
+    -------
+    object
+    """
     if hasattr(message, 'get_fields_and_field_types'):
         return {name: as_dict(getattr(message, name))
                 for name in message.get_fields_and_field_types()}
@@ -152,66 +248,133 @@ def as_dict(message: Any) -> Any:
         return message.tolist()
     if isinstance(message, (list, tuple)):
         return [as_dict(v) for v in message]
-    # A byte, as the level of a diagnostic status is.
+    # Type byte, such as the level of a DiagnosticStatus.
     return int.from_bytes(message, 'big') if isinstance(message, bytes) else message
 
 
 def as_text(message: Any) -> str:
-    """A message as YAML."""
+    """Convert a message to YAML.
+
+    Parameters
+    ----------
+    message : object
+
+    Returns
+    -------
+    str
+    """
     return str(yaml.safe_dump(as_dict(message), sort_keys=False, default_flow_style=None,
                               width=100, allow_unicode=True))
 
 
 def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list[str]:
-    """The parameters of a node with their values and meanings, or one of them."""
-    names = [name] if name is not None else list(graph.ask(
+    """List parameters of a node with their values and descriptions.
+
+    Parameters
+    ----------
+    graph : Observer
+    node : str
+    name : str, optional
+        Parameter; by default all of them.
+
+    Returns
+    -------
+    list of str
+
+    Raises
+    ------
+    GraphError
+        If node or parameter does not exist.
+    """
+    names = [name] if name is not None else list(graph.call(
         ListParameters, f'{node}/list_parameters', ListParameters.Request()).result.names)
-    values = graph.ask(GetParameters, f'{node}/get_parameters',
-                       GetParameters.Request(names=names)).values
-    about = graph.ask(DescribeParameters, f'{node}/describe_parameters',
-                      DescribeParameters.Request(names=names)).descriptors
+    values = graph.call(GetParameters, f'{node}/get_parameters',
+                        GetParameters.Request(names=names)).values
+    descriptors = graph.call(DescribeParameters, f'{node}/describe_parameters',
+                             DescribeParameters.Request(names=names)).descriptors
     if name is not None and not (values and values[0].type):
         raise GraphError(f'{node} has no parameter {name}')
     return [f'{n}: {parameter_value_to_python(v)}'
             + ('  (read-only)' if d.read_only else '')
             + (f'  # {d.description}' if d.description else '')
-            for n, v, d in sorted(zip(names, values, about, strict=True), key=lambda row: row[0])]
+            for n, v, d in sorted(zip(names, values, descriptors, strict=True),
+                                  key=lambda row: row[0])]
 
 
 def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
-    """Set a parameter to a YAML value; raises GraphError where the node refuses."""
+    """Set a parameter of a node.
+
+    Parameters
+    ----------
+    graph : Observer
+    node : str
+    name : str
+        Parameter.
+    text : str
+        Value as YAML; an integer is accepted for a float.
+
+    Raises
+    ------
+    GraphError
+        If the value is invalid, or the node does not exist or rejects it.
+    """
     try:
         value = yaml.safe_load(text)
-        (kind,) = graph.ask(GetParameterTypes, f'{node}/get_parameter_types',
-                            GetParameterTypes.Request(names=[name])).types or (0,)
+        (kind,) = graph.call(GetParameterTypes, f'{node}/get_parameter_types',
+                             GetParameterTypes.Request(names=[name])).types or (0,)
         if kind == Parameter.Type.DOUBLE.value and isinstance(value, int):
             value = float(value)
         parameter = Parameter(name, value=value)
     except (yaml.YAMLError, TypeError, ValueError) as error:
-        raise GraphError(f'{name}: {text!r} is not a value: {error}') from error
-    result = graph.ask(SetParameters, f'{node}/set_parameters', SetParameters.Request(
+        raise GraphError(f'parameter {name}: {text!r} is not a valid value: {error}') from error
+    result = graph.call(SetParameters, f'{node}/set_parameters', SetParameters.Request(
         parameters=[parameter.to_parameter_msg()]), once=True).results[0]
     if not result.successful:
-        raise GraphError(f'{node} refuses {name}: {result.reason}')
+        raise GraphError(f'{node} rejects parameter {name}: {result.reason}')
 
 
 def lifecycle_state(graph: Observer, node: str) -> tuple[str, list[str]]:
-    """(state, transitions that are possible) of a lifecycle node."""
-    state = graph.ask(GetState, f'{node}/get_state', GetState.Request()).current_state.label
-    possible = graph.ask(GetAvailableTransitions, f'{node}/get_available_transitions',
-                         GetAvailableTransitions.Request()).available_transitions
+    """State of a lifecycle node.
+
+    Parameters
+    ----------
+    graph : Observer
+    node : str
+
+    Returns
+    -------
+    state : str
+    transitions : list of str
+        Transitions that are currently possible.
+    """
+    state = graph.call(GetState, f'{node}/get_state', GetState.Request()).current_state.label
+    possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
+                          GetAvailableTransitions.Request()).available_transitions
     return state, [t.transition.label for t in possible]
 
 
 def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
-    """Make a transition; raises GraphError where it is not possible or fails."""
-    possible = graph.ask(GetAvailableTransitions, f'{node}/get_available_transitions',
-                         GetAvailableTransitions.Request()).available_transitions
+    """Request a transition of a lifecycle node.
+
+    Parameters
+    ----------
+    graph : Observer
+    node : str
+    transition : str
+
+    Raises
+    ------
+    GraphError
+        If the transition is not possible or fails.
+    """
+    possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
+                          GetAvailableTransitions.Request()).available_transitions
     found = [t.transition for t in possible if t.transition.label == transition]
     if not found:
         names = ', '.join(t.transition.label for t in possible)
-        raise GraphError(f'{node}: {transition} is not possible now, but {names}')
+        raise GraphError(f'{node}: transition {transition} is not possible in the current state; '
+                         f'possible: {names}')
     request = ChangeState.Request()
     request.transition.id = found[0].id
-    if not graph.ask(ChangeState, f'{node}/change_state', request, once=True).success:
-        raise GraphError(f'{node}: {transition} has failed')
+    if not graph.call(ChangeState, f'{node}/change_state', request, once=True).success:
+        raise GraphError(f'{node}: transition {transition} failed; see the log of the node')

@@ -9,39 +9,67 @@ from mag_tracking.nodes.ros_params import fixed_parameter
 
 
 class ManagedNode(LifecycleNode):
-    """Lifecycle node that configures and activates itself unless `autostart` is false."""
+    """Lifecycle node that configures and activates itself unless `autostart` is false.
+
+    Parameters
+    ----------
+    name : str
+        Default name of the node.
+    **node_arguments
+        Arguments of `Node`.
+    """
 
     def __init__(self, name: str, **node_arguments: Any) -> None:
         super().__init__(name, **node_arguments)
-        self._refused: MagTrackingError | None = None
+        self._configuration_error: MagTrackingError | None = None
 
-    def start_by_itself(self) -> None:
+    def start_automatically(self) -> None:
         """Configure and activate the node if `autostart` is true.
 
-        Raises MagTrackingError if the settings are invalid.
+        Raises
+        ------
+        MagTrackingError
+            If the settings are invalid.
         """
-        if not fixed_parameter(self, 'autostart', True, 'Configure and activate at the start.'):
+        if not fixed_parameter(self, 'autostart', True,
+                               'Configure and activate the node at startup.'):
             return
         done = self.trigger_configure()
-        if self._refused is not None:
-            raise self._refused
+        if self._configuration_error is not None:
+            raise self._configuration_error
         if done == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
 
     def prepare(self) -> None:
-        """Read files and advertise topics; called on configuration. Raises MagTrackingError."""
+        """Read files and advertise topics; called on configuration.
+
+        Raises
+        ------
+        MagTrackingError
+            If a file or setting is invalid.
+        """
         raise NotImplementedError
 
     def close(self) -> None:
-        """Stop threads of the node; called before it is destroyed."""
+        """Stop the threads of the node; called before it is destroyed."""
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
-        """Call `prepare`; an error is logged and leaves the node unconfigured."""
+        """Call `prepare`; an error is logged and leaves the node unconfigured.
+
+        Parameters
+        ----------
+        state : State
+            Previous state.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+        """
         try:
             self.prepare()
         except MagTrackingError as error:
-            self._refused = error
+            self._configuration_error = error
             self.get_logger().error(str(error))
             return TransitionCallbackReturn.FAILURE
-        self._refused = None
+        self._configuration_error = None
         return TransitionCallbackReturn.SUCCESS

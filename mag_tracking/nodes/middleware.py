@@ -1,4 +1,4 @@
-"""How every process begins with ROS."""
+"""Initialisation of ROS, common to all processes."""
 
 import os
 import sys
@@ -16,22 +16,30 @@ RCLError, UnknownROSArgsError = (rclpy_implementation.RCLError,
                                  rclpy_implementation.UnknownROSArgsError)
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
-"""Nodes that find each other at once, also one that was killed and is started again."""
+"""Fast DDS profile for fast discovery, also of a node that was killed and restarted."""
 PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-"""Names a profile to the Fast DDS of Jazzy (2.14)."""
+"""Environment variable that selects a profile in Fast DDS of Jazzy (2.14)."""
 PROFILE_IN_FOLDER = 'DEFAULT_FASTRTPS_PROFILES.xml'
-"""What it takes by itself, if there is one in the working folder."""
+"""Profile that Fast DDS loads from the working folder by default."""
 ROS_ARGUMENTS, PARAMETER_FILE = '--ros-args', '--params-file'
 
 
 def begin(arguments: list[str] | None = None) -> None:
-    """`rclpy.init`, with the project's profile of the middleware unless the user has his own.
+    """Call `rclpy.init` with the Fast DDS profile of this package, unless the user selects another.
 
-    Other middlewares do not look at it. Signals stay with the caller: rclpy's own handlers raise
-    KeyboardInterrupt wherever Python is, in its C++ too. Parameter files (`--params-file`) may be
-    plain files, as for `--params`.
+    Other middlewares ignore the profile. Signals stay with the caller, because rclpy's own handlers
+    raise KeyboardInterrupt wherever Python is, even within C++ code of rclpy. Parameter files
+    (`--params-file`) may also have the plain format of `--params`.
 
-    Raises SettingsError for arguments that are not those of ROS.
+    Parameters
+    ----------
+    arguments : list of str, optional
+        Command line; `sys.argv` by default.
+
+    Raises
+    ------
+    SettingsError
+        If the ROS arguments or a parameter file are invalid.
     """
     named = os.environ.get(PROFILE_VARIABLE)
     if named is None and not Path(PROFILE_IN_FOLDER).exists():
@@ -40,23 +48,24 @@ def begin(arguments: list[str] | None = None) -> None:
         _init(_with_ros_files(arguments, Path(folder)))
     if named and not Path(named).exists():
         rclpy.logging.get_logger('middleware').warning(
-            f'{PROFILE_VARIABLE} names {named}, which does not exist: no profile is in force, and '
-            'a node that is started again may not be heard for seconds')
+            f'{PROFILE_VARIABLE}: file {named} does not exist: no Fast DDS profile is active, and '
+            'messages of a restarted node may be lost for several seconds; correct or unset the '
+            'variable')
 
 
 def _init(arguments: list[str] | None) -> None:
-    """`rclpy.init`; raises SettingsError for arguments that are not those of ROS."""
+    """Call `rclpy.init`; raise SettingsError for invalid ROS arguments."""
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except (RCLError, UnknownROSArgsError) as error:
-        # What follows are places in the source of rcl.
-        raise SettingsError(f'arguments of ROS: {str(error).partition(", at /")[0]}') from error
+        # The rest of the message consists of source locations in rcl.
+        raise SettingsError(f'ROS arguments: {str(error).partition(", at /")[0]}') from error
 
 
 def _with_ros_files(arguments: list[str] | None, folder: Path) -> list[str] | None:
-    """Arguments in which plain parameter files are replaced by converted copies.
+    """Arguments with plain parameter files replaced by converted copies; raise SettingsError.
 
-    None selects `sys.argv`. The files are read once, in `rclpy.init`. Raises SettingsError.
+    None selects `sys.argv`. The copies are only needed until `rclpy.init` has returned.
     """
     words = list(sys.argv if arguments is None else arguments)
     for k, word in enumerate(words[:-1]):

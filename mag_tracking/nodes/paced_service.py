@@ -1,4 +1,4 @@
-"""Services that answer each of many calls."""
+"""Services that respond to many simultaneous calls."""
 
 from collections import deque
 from collections.abc import Callable
@@ -11,17 +11,30 @@ from rclpy.service import Service
 from mag_tracking.nodes.steady_timer import steady_timer
 
 PACE_S = 0.002
-"""[s] Between two answers."""
+"""[s] Interval between two responses."""
 CALLS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-"""Calls that wait for their turn."""
+"""QoS of the calls, which may have to be queued."""
 
 
 def paced_service(node: Node, service_type: Any, name: str,
                   callback: Callable[[Any, Any], Any]) -> Service:
-    """A service whose answers do not overrun its callers.
+    """Create a service whose responses do not overflow the queues of its clients.
 
-    Every client of a service receives the answers to all of them, and by default keeps the latest
-    ten that it has not yet looked at: of forty calls at once about half would get no answer.
+    Every client of a service receives the responses to all clients, and by default stores the
+    latest ten that it has not yet read. About half of forty simultaneous calls would otherwise get
+    no response.
+
+    Parameters
+    ----------
+    node : Node
+    service_type : type
+    name : str
+    callback : function
+        As for `Node.create_service`.
+
+    Returns
+    -------
+    Service
     """
     service = node.create_service(service_type, name, callback, qos_profile=CALLS)
     send, waiting = service.send_response, deque[tuple[Any, Any]]()

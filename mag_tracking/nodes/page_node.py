@@ -1,4 +1,4 @@
-"""Node that shows running nodes on a live page; it needs no network file."""
+"""Node of the live page, which shows running nodes; it needs no network file."""
 
 import os
 import signal
@@ -36,54 +36,59 @@ NICENESS = 10
 FRAMES_KEPT = 64
 """Number of recent serialised frames kept for matching with tracks."""
 TRACKS_KEPT = 1000
-"""Maximum number of messages about tracks that are kept for the next tick."""
+"""Maximum number of track messages kept for the next tick."""
 TRACKS = 'mag_tracking_msgs/msg/TrackArray'
-SILENT_S = 5.0
+STALE_TIMEOUT_S = 5.0
 """[s] A diagnostic status that was not repeated for longer is stale."""
 _LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warning',
            DiagnosticStatus.ERROR: 'error', DiagnosticStatus.STALE: 'stale'}
 
 
 @dataclass(frozen=True, eq=False)
-class SensorPlaces:
+class SensorLayout:
     """Names and positions of the sensors, as published by the tracker."""
 
     frame: str
+    """World frame."""
     names: tuple[str, ...]
     positions: FloatArray
-    """(n, 3) [m]."""
+    """(n, 3) [m], world frame."""
 
     def __len__(self) -> int:
         return len(self.names)
 
 
-NOWHERE = SensorPlaces('', (), np.zeros((0, 3)))
+NO_SENSORS = SensorLayout('', (), np.zeros((0, 3)))
 """Placeholder until the tracker has published its sensors."""
 
 
 class PageNode(Node):
-    """Subscribes to the tracker's topics and adds their messages to a scene.
+    """Subscribes to the topics of the tracker and adds their messages to a scene.
 
-    The topics `tracker_node/tracks` and `network_frame` are relative and can be remapped; the
-    other topics of the tracker are beside its tracks. A tracker of another name is found by the
-    type of its tracks, if it is the only one in the namespace.
+    The topics `tracker_node/tracks` and `network_frame` are relative and can be remapped; the other
+    topics of the tracker are in the same namespace as its tracks. A tracker with another name is
+    found by the type of its tracks, if it is the only one in the namespace.
+
+    Parameters
+    ----------
+    scene : LiveScene
     """
 
     def __init__(self, scene: LiveScene) -> None:
         super().__init__('mag_tracking_page', start_parameter_services=False)
         self._scene = scene
-        self._places = NOWHERE
+        self._layout = NO_SENSORS
         self._frames: deque[bytes] = deque(maxlen=FRAMES_KEPT)
         self._tracks: deque[Any] = deque(maxlen=TRACKS_KEPT)
         self._statuses: dict[str, tuple[float, DiagnosticStatus]] = {}
         self._tracker: list[Subscription] = []
         self._attach(self.resolve_topic_name('tracker_node/tracks'))
-        # Frames are frequent and large: only those that are shown are deserialised.
+        # Frames are frequent and large, so only those that are shown are deserialised.
         self._frames_topic = self.resolve_topic_name(NETWORK_FRAME)
-        self.create_subscription(NetworkFrame, NETWORK_FRAME, self._take_frame, STREAM, raw=True)
-        self.create_subscription(DiagnosticArray, '/diagnostics', self._take_diagnostics, STREAM)
+        self.create_subscription(NetworkFrame, NETWORK_FRAME, self._receive_frame, STREAM, raw=True)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._receive_diagnostics, STREAM)
         steady_timer(self, TICK_S, self._tick)
-        steady_timer(self, 1.0, self._tell_health)
+        steady_timer(self, 1.0, self._update_health)
 
     def _attach(self, tracks: str) -> None:
         """Subscribe to the topics of the tracker that publishes `tracks`."""
@@ -91,14 +96,14 @@ class PageNode(Node):
             self.destroy_subscription(subscription)
         self._tracks_topic, base = tracks, tracks.rpartition('/')[0]
         self._tracker = [
-            self.create_subscription(MarkerArray, f'{base}/sensor_markers', self._take_sensors,
+            self.create_subscription(MarkerArray, f'{base}/sensor_markers', self._receive_sensors,
                                      LATCHED),
-            self.create_subscription(TrackArray, tracks, self._take_tracks, STREAM),
-            self.create_subscription(SmoothedTrack, f'{base}/smoothed', self._take_smoothed,
+            self.create_subscription(TrackArray, tracks, self._receive_tracks, STREAM),
+            self.create_subscription(SmoothedTrack, f'{base}/smoothed', self._receive_smoothed,
                                      RESULTS)]
 
-    def _look_for_tracker(self) -> list[str]:
-        """Attach to the only tracker in the namespace if it has another name; all tracks topics."""
+    def _find_tracker(self) -> list[str]:
+        """Attach to the only tracker in the namespace; return the topics of all trackers."""
         namespace = self.get_namespace().rstrip('/')
         found = [name for name, kinds in self.get_topic_names_and_types()
                  if TRACKS in kinds and name.startswith(f'{namespace}/')
@@ -107,50 +112,50 @@ class PageNode(Node):
             self._attach(found[0])
         return found
 
-    def _take_sensors(self, message: MarkerArray) -> None:
+    def _receive_sensors(self, message: MarkerArray) -> None:
         """Store the sensor positions; another network starts a new scene."""
         bodies = [m for m in message.markers if m.ns == SENSOR_KINDS[0]]
         texts = {m.id: m.text for m in message.markers if m.ns == SENSOR_KINDS[1]}
         if not bodies or {m.id for m in bodies} - texts.keys():
             return
-        places = SensorPlaces(
+        layout = SensorLayout(
             bodies[0].header.frame_id, tuple(texts[m.id] for m in bodies),
             np.array([[m.pose.position.x, m.pose.position.y, m.pose.position.z] for m in bodies]))
-        if (places.names, places.frame) != (self._places.names, self._places.frame) \
-                or not np.array_equal(places.positions, self._places.positions):
-            self._places = places
+        if (layout.names, layout.frame) != (self._layout.names, self._layout.frame) \
+                or not np.array_equal(layout.positions, self._layout.positions):
+            self._layout = layout
             self._frames.clear()
             self._tracks.clear()
-            self._scene.subtitle = f'{len(places)} sensors, frame {places.frame}'
-            self._scene.use_network(places)
+            self._scene.subtitle = f'{len(layout)} sensors, frame {layout.frame}'
+            self._scene.use_network(layout)
 
-    def _take_frame(self, message: bytes) -> None:
-        """Keep a serialised frame for the next tick."""
+    def _receive_frame(self, message: bytes) -> None:
+        """Store a serialised frame for the next tick."""
         self._frames.append(message)
 
-    def _take_tracks(self, message: TrackArray) -> None:
-        """Keep tracks for the next tick."""
+    def _receive_tracks(self, message: TrackArray) -> None:
+        """Store tracks for the next tick."""
         self._tracks.extend(message.tracks)
 
-    def _take_smoothed(self, message: SmoothedTrack) -> None:
+    def _receive_smoothed(self, message: SmoothedTrack) -> None:
         """Add the smoothed path of an ended track."""
         self._tick()
         points = [p.pose.pose.position for p in message.poses]
         self._scene.add_smoothed(message.track_id, np.array([[p.x, p.y, p.z] for p in points]))
 
-    def _take_diagnostics(self, message: DiagnosticArray) -> None:
-        """Keep the latest message of each status."""
+    def _receive_diagnostics(self, message: DiagnosticArray) -> None:
+        """Store the latest message of each status."""
         now = time.monotonic()
         self._statuses.update({s.name: (now, s) for s in message.status if self._is_ours(s.name)})
 
     def _is_ours(self, status: str) -> bool:
-        """True if a diagnostic status belongs to a node of this namespace."""
+        """Whether a diagnostic status belongs to a node of this namespace."""
         namespace = status.partition(':')[0].rpartition('/')[0]
         return namespace == self.get_namespace().strip('/')
 
     def _tick(self) -> None:
-        """Add received messages to the scene: all frames during a track, otherwise the latest."""
-        if not len(self._places):
+        """Add received messages to the scene: all frames during a track, else only the latest."""
+        if not len(self._layout):
             return
         raw = list(self._frames)
         self._frames.clear()
@@ -159,65 +164,75 @@ class PageNode(Node):
         for one in raw:
             try:
                 self._scene.add_frame(
-                    frame_of(deserialize_message(one, NetworkFrame), self._places))
+                    frame_of(deserialize_message(one, NetworkFrame), self._layout))
             except RecordingError as error:
                 self.get_logger().error(str(error), throttle_duration_sec=10.0)
         tracks = list(self._tracks)
         self._tracks.clear()
         for message in tracks:
-            if len(message.predicted_field) == 3 * len(self._places):
+            if len(message.predicted_field) == 3 * len(self._layout):
                 self._scene.add_track(track_of(message))
 
-    def _tell_health(self) -> None:
-        """Update the notes with faults, and the table of all statuses."""
+    def _update_health(self) -> None:
+        """Update the notes on faults and the table of all statuses."""
         now = time.monotonic()
         notes, rows = [], []
-        for name, (heard, status) in sorted(self._statuses.items()):
-            old = now - heard > SILENT_S
+        for name, (received, status) in sorted(self._statuses.items()):
+            old = now - received > STALE_TIMEOUT_S
             level = 'stale' if old else _LEVELS.get(status.level, 'error')
             rows.append([name, level, status.message])
             if level in ('warning', 'error'):
                 notes.append(Note(ERROR if level == 'error' else WARNING,
                                   f'{name}: {status.message}'))
-        self._scene.set_health([*self._missing(), *notes],
+        self._scene.set_health([*self._missing_topics(), *notes],
                                [Table('Health', ['node', 'level', 'message'], rows)])
 
-    def _missing(self) -> Iterator[Note]:
+    def _missing_topics(self) -> Iterator[Note]:
         """Notes on topics without a publisher."""
-        found = self._look_for_tracker()
+        found = self._find_tracker()
         if len(found) > 1 and self._tracks_topic not in found:
-            yield Note(WARNING, f'several trackers: {", ".join(found)}; choose one (--ros-args -r '
+            yield Note(WARNING, f'several trackers: {", ".join(found)}; select one (--ros-args -r '
                        'tracker_node/tracks:=...)')
         elif not found:
             yield Note(WARNING, f'no publisher on {self._tracks_topic}: start the tracker, or '
                        'select its namespace (--ros-args -r __ns:=...)')
-        elif not len(self._places):
-            yield Note(WARNING, 'no sensors from the tracker yet')
+        elif not len(self._layout):
+            yield Note(WARNING, 'waiting for the sensor positions from the tracker')
         if not self.count_publishers(self._frames_topic):
             yield Note(WARNING, f'no publisher on {self._frames_topic}: fields are not shown')
 
 
 def watch(host: str, port: int, report: Callable[[str], object],
           ros_arguments: Sequence[str] = (), ended: Callable[[], bool] = lambda: False) -> int:
-    """Serve the page of running nodes until SIGINT or SIGTERM; returns the exit status.
+    """Serve the page of running nodes until SIGINT or SIGTERM.
 
-    If the middleware hangs at the end, the process ends: see `leave`.
+    If the middleware hangs at the end, the process is ended: see `shut_down`.
 
     Parameters
     ----------
-    host, port : str, int
-        Arguments of `PageServer`.
+    host : str
+        Address of the page, see `PageServer`.
+    port : int
+        Port of the page, see `PageServer`.
     report : function
         Called with a line that contains the address of the page.
-    ros_arguments : sequence of str
-        LearningWindow with `--ros-args`.
+    ros_arguments : sequence of str, optional
+        Begin with `--ros-args`.
     ended : function, optional
-        The page is closed when it returns True.
+        Returns True to close the page.
 
-    Raises DeviceError where the port cannot be opened.
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    DeviceError
+        If the port cannot be opened.
     """
     os.nice(NICENESS)
-    scene = LiveScene('mag_tracking', NOWHERE)
+    scene = LiveScene('mag_tracking', NO_SENSORS)
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen, \
             PageServer(scene, host, port) as server:
         report(f'live page: {server.url}')

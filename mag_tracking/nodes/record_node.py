@@ -1,4 +1,4 @@
-"""record_node: records topics as they are, serialised, and counts what did not reach it."""
+"""Recorder node: writes serialised messages without decoding them, and counts lost ones."""
 
 import signal
 import sys
@@ -28,25 +28,25 @@ from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.recording.recorder import Recorder
 from mag_tracking.recording.writer import offered_qos
 
-POLL_S = 0.02
-"""How often messages are fetched [s]."""
-DISCOVER_S = 0.5
-"""How often topics are looked for [s]."""
-LINE_S = 10.0
-"""Time between two lines of progress where there is no terminal [s]."""
+POLL_INTERVAL_S = 0.02
+"""[s] Interval between fetches of messages."""
+DISCOVERY_INTERVAL_S = 0.5
+"""[s] Interval between searches for topics."""
+PROGRESS_INTERVAL_S = 10.0
+"""[s] Interval between progress lines if the output is not a terminal."""
 DEPTHS = {MAGNETIC_FIELD: 1000, IMU: 1000, FIELD_READINGS: 1000}
-"""Messages that may wait between two fetches (a disk may stall for a second or more)."""
+"""Queue length between two fetches, by type. A disk may stall for a second or more."""
 OTHER_DEPTH = 100
-"""The same of other types: images are large."""
+"""Queue length for other types; images are large."""
 
 
 class _Source:
-    """A subscription that is asked for its messages, and what is known of its publishers."""
+    """Subscription that is polled, with the state of its publishers."""
 
     def __init__(self, node: Node, topic: str, type_name: str, latched: bool) -> None:
         self.node, self.type, self.latched = node, type_name, latched
         self.depth = DEPTHS.get(type_name, OTHER_DEPTH)
-        # A best-effort reader matches every publisher, but is not given what was latched.
+        # A best-effort subscription matches every publisher, but does not get latched messages.
         self.subscription = node.create_subscription(
             message_class(type_name), topic, lambda _: None, QoSProfile(
                 depth=self.depth, reliability=ReliabilityPolicy.RELIABLE if latched
@@ -58,7 +58,7 @@ class _Source:
         self.lost = 0
 
     def take(self) -> list[tuple[int, int, bytes]]:
-        """The messages that wait: [(received_ns, sent_ns, data)]."""
+        """Fetch the queued messages: [(received_ns, sent_ns, data)]."""
         out: list[tuple[int, int, bytes]] = []
         handle = self.subscription.handle
         with handle:
@@ -73,7 +73,7 @@ class _Source:
         return out
 
     def _count_lost(self, number: int | None) -> None:
-        """Count the gap before a message, where one publisher numbers them."""
+        """Count the messages missing before `number`, if a single publisher numbers them."""
         if number is None or len(self.publishers) > 1:
             self.last = None
             return
@@ -82,7 +82,7 @@ class _Source:
         self.last = number
 
     def set_publishers(self, infos: list[TopicEndpointInfo]) -> None:
-        """Who publishes now; another publisher counts anew."""
+        """Update the publishers; counting restarts if one has disappeared."""
         publishers = tuple(sorted(tuple(i.endpoint_gid) for i in infos))
         if set(self.publishers) - set(publishers):
             self.last = None
@@ -90,11 +90,25 @@ class _Source:
 
 
 class RecordNode(Node):
-    """Subscribes to what is wanted and hands it to a `Recorder`.
+    """Subscribes to the selected topics and passes their messages to a `Recorder`.
 
-    No executor spins it: `poll` fetches. The events executor of the Jazzy wheels
-    fails on callbacks that ask for a message's time and number, and the other one
-    takes most of a core for twenty sensors.
+    It is polled instead of being spun by an executor. The events executor of the Jazzy wheels fails
+    in callbacks that request time and sequence number of a message; the other executor takes most
+    of a processor core for twenty sensors.
+
+    Parameters
+    ----------
+    recorder : Recorder
+    selection : Selection
+        Topics to record.
+    report : function
+        Called with lines for the user.
+
+    Attributes
+    ----------
+    recorder : Recorder
+    selection : Selection
+        With absolute topic names.
     """
 
     def __init__(self, recorder: Recorder, selection: Selection,
@@ -106,7 +120,7 @@ class RecordNode(Node):
         self._refused: dict[str, str] = {}
         self._described: set[str] = set()
         self._lost_before: Counter[str] = Counter()
-        # Their type is known: nothing is missed of a driver that starts later.
+        # Their types are known, so messages of a driver that starts later are not missed.
         for topic in self.selection.fields:
             self._subscribe(topic, MAGNETIC_FIELD, [])
         for topic in self.selection.imus:
@@ -114,22 +128,30 @@ class RecordNode(Node):
 
     @property
     def lost(self) -> 'Counter[str]':
-        """{topic: messages that were published and never fetched}, where there were any."""
+        """Number of lost messages by topic; topics without losses are omitted."""
         now = Counter({topic: s.lost for topic, s in self._sources.items()})
         return +(now + self._lost_before)
 
     @property
     def refused(self) -> dict[str, str]:
-        """{topic: why it is not recorded}."""
+        """Reason why a topic is not recorded, by topic."""
         return self._refused
 
-    def heard(self) -> tuple[int, int]:
-        """(topics that have a publisher, topics subscribed to)."""
+    def topic_counts(self) -> tuple[int, int]:
+        """Count the subscribed topics.
+
+        Returns
+        -------
+        n_published : int
+            Number of subscribed topics that have a publisher.
+        n_subscribed : int
+            Number of subscribed topics.
+        """
         return (sum(s.subscription.get_publisher_count() > 0 for s in self._sources.values()),
                 len(self._sources))
 
     def discover(self) -> None:
-        """Subscribe to wanted topics that are new, and follow changes of the known ones."""
+        """Subscribe to new topics that are selected, and update the publishers of known ones."""
         for topic, _ in self.get_topic_names_and_types():
             if topic in self._refused or not self.selection.wants(topic):
                 continue
@@ -137,24 +159,25 @@ class RecordNode(Node):
             if not infos:
                 continue
             if topic in self._sources:
-                self._follow(topic, infos)
+                self._update_publishers(topic, infos)
             else:
                 self._subscribe(topic, infos[0].topic_type, infos)
 
     def _subscribe(self, topic: str, type_name: str, infos: list[TopicEndpointInfo]) -> None:
-        """Begin to record a topic."""
+        """Start recording a topic."""
         if message_class(type_name) is None:
-            self._refuse(topic, f'{type_name} is not installed')
+            self._refuse(topic, f'message type {type_name} is not installed')
             return
         latched = bool(infos) and all(map(_latched, infos))
         self._sources[topic] = _Source(self, topic, type_name, latched)
         self._sources[topic].set_publishers(infos)
 
     def _describe(self, topic: str, source: _Source) -> None:
-        """Tell the recorder about a topic, whose publishers are known at its first message."""
+        """Add a topic to the recorder; its publishers are known once a message has arrived."""
         text = definition_of(source.type)
         if text is None:
-            self._report(f'{topic}: no definition of {source.type} found: only ROS can read it')
+            self._report(f'{topic}: no definition of {source.type} found: the recording of this '
+                         'topic can be read with ROS only')
         infos = self.get_publishers_info_by_topic(topic)
         reliable = all(i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos)
         self.recorder.add_topic(topic, source.type, text or '',
@@ -163,19 +186,19 @@ class RecordNode(Node):
         self._described.add(topic)
 
     def _refuse(self, topic: str, why: str) -> None:
-        """Say once that a topic is not recorded."""
+        """Report once that a topic is not recorded."""
         self._refused[topic] = why
         self._report(f'{topic} is not recorded: {why}')
 
-    def _follow(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
-        """Keep up with a topic's publishers."""
+    def _update_publishers(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
+        """Update the publishers of a topic."""
         source = self._sources[topic]
         others = sorted({i.topic_type for i in infos} - {source.type})
         if others and f'{topic} as {others[0]}' not in self._refused:
-            self._refuse(f'{topic} as {others[0]}', f'it is expected as {source.type}')
+            self._refuse(f'{topic} as {others[0]}', f'the topic has type {source.type}')
         source.set_publishers(infos)
         if source.latched and not all(map(_latched, infos)):
-            # It asks for more than the new publisher gives, and would get nothing of it.
+            # The subscription requests more than the new publisher offers and would not match it.
             self.poll()
             self._lost_before[topic] += source.lost
             self.destroy_subscription(source.subscription)
@@ -184,7 +207,13 @@ class RecordNode(Node):
             self.recorder.add_topic(topic, source.type, latched=len(infos))
 
     def poll(self) -> int:
-        """Record what has come; the number of messages."""
+        """Record the messages that have arrived.
+
+        Returns
+        -------
+        int
+            Number of messages.
+        """
         found = []
         for topic, source in self._sources.items():
             messages = source.take()
@@ -197,41 +226,58 @@ class RecordNode(Node):
 
 
 def _latched(info: TopicEndpointInfo) -> bool:
-    """Whether a publisher keeps its messages for those who come later."""
+    """Whether a publisher sends its latest messages to late subscribers."""
     return bool(info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def say(text: str) -> None:
-    """A line for the user, beside a progress bar; nobody may be there to read it."""
+def log(text: str) -> None:
+    """Print a line for the user without disturbing a progress bar; a closed terminal is ignored.
+
+    Parameters
+    ----------
+    text : str
+    """
     with suppress(OSError):
         tqdm.write(f'record: {text}', file=sys.stderr)
 
 
 def run(selection: Selection, out: Path, split_bytes: int = 10**9,
         split_ns: int = 3600 * 10**9, ros_arguments: Sequence[str] = ()) -> int:
-    """Record until SIGINT, SIGTERM or SIGHUP; returns the exit status.
+    """Record until SIGINT, SIGTERM or SIGHUP.
 
-    If the middleware hangs at the end, the process ends: see `leave`. The recording is closed then.
+    If the middleware hangs at the end, the process is ended: see `shut_down`. The recording has
+    been closed by then.
 
     Parameters
     ----------
     selection : Selection
-    out : path
-        Folder for the recording.
-    split_bytes, split_ns : int
-        A new file begins when one is that large, or has been open for that long.
-    ros_arguments : sequence of str
-        Of the node, beginning with `--ros-args`.
+        Topics to record.
+    out : Path
+        Folder of the recording.
+    split_bytes : int
+        Size in bytes at which a new file begins.
+    split_ns : int, ns
+        Duration after which a new file begins.
+    ros_arguments : sequence of str, optional
+        Begin with `--ros-args`.
 
-    Raises OutputError where `out` cannot take a recording.
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    OutputError
+        If the recording cannot be written to `out`.
     """
     node, status = None, 1
     with recorded_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as seen:
         try:
-            with Recorder(out, split_bytes, split_ns, report=say) as recorder:
+            with Recorder(out, split_bytes, split_ns, report=log) as recorder:
                 begin(list(ros_arguments))
-                node = RecordNode(recorder, selection, say)
-                say(f'recording into {out}; Ctrl-C ends it')
+                node = RecordNode(recorder, selection, log)
+                log(f'recording to {out}; press Ctrl-C to stop')
                 _record(node, lambda: bool(seen))
             for line in summary(recorder, node.selection, node.lost, node.refused):
                 print(line)
@@ -242,9 +288,9 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
 
 
 def _record(node: RecordNode, stopped: Callable[[], bool]) -> None:
-    """Fetch and record until `stopped()`, and show it."""
+    """Poll, record and show progress until `stopped()`."""
     begin = time.monotonic()
-    next_look, next_line, heard = begin, begin + LINE_S, None
+    next_look, next_line, topic_counts = begin, begin + PROGRESS_INTERVAL_S, None
     bar = tqdm(unit=' messages', unit_scale=True, disable=None)
     try:
         while rclpy.ok() and not stopped():
@@ -253,18 +299,18 @@ def _record(node: RecordNode, stopped: Callable[[], bool]) -> None:
             node.recorder.tick(time.monotonic_ns())
             if now >= next_look:
                 node.discover()
-                next_look = now + DISCOVER_S
-                heard, before = node.heard(), heard
-                if heard != before:
-                    say(f'{heard[0]} of {heard[1]} topics have a publisher')
+                next_look = now + DISCOVERY_INTERVAL_S
+                topic_counts, before = node.topic_counts(), topic_counts
+                if topic_counts != before:
+                    log(f'{topic_counts[0]} of {topic_counts[1]} topics have a publisher')
             if bar.disable and now >= next_line:
-                say(progress_line(node.recorder, now - begin))
-                next_line += LINE_S
+                log(progress_line(node.recorder, now - begin))
+                next_line += PROGRESS_INTERVAL_S
             with suppress(OSError):
                 bar.update(n)
-            time.sleep(max(0.0, now + POLL_S - time.monotonic()))
+            time.sleep(max(0.0, now + POLL_INTERVAL_S - time.monotonic()))
         node.poll()
     finally:
-        # The terminal may be gone (SIGHUP); the recording goes on to its end.
+        # The terminal may have been closed (SIGHUP); the recording must still be finished.
         with suppress(OSError):
             bar.close()

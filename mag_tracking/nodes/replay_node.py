@@ -1,11 +1,11 @@
-"""replay_node: plays a recording over topics, with /clock, pause, resume and seek.
+"""replay_node: plays a recording on topics, with /clock, pause, resume and seek.
 
 A lifecycle node: configuration opens the recording and advertises its topics, activation starts
-playback, deactivation stops it. `autostart` (the default) does both at startup.
+playback, deactivation stops it. With `autostart` (the default) it does both at startup.
 """
 
 if __name__ == '__main__':
-    # Does not return: a signal during the imports below would end in a traceback.
+    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import replay_node
 
     replay_node()
@@ -33,32 +33,57 @@ from mag_tracking.nodes.stage_node import STREAM
 from mag_tracking.recording.reader import Recording
 
 TICK_S = 0.005
-"""How often the node looks for messages that are due [s]."""
+"""[s] Interval of the search for messages that are due."""
 MAX_STEP_S = 0.02
-"""Time on the wall that one look may make good for [s]."""
-MAX_AT_ONCE = 200
-"""Messages published at one look; the subscribers' queues hold more than that."""
+"""[s] Maximum elapsed time that a tick makes up for."""
+MAX_MESSAGES_PER_TICK = 200
+"""Maximum number of messages published per tick; subscribers have longer queues."""
 
 
 class ReplayNode(ManagedNode):
-    """Publishes a recording's messages as they were, at its pace or another."""
+    """Publishes the messages of a recording at the recorded or another rate.
+
+    Parameters
+    ----------
+    **node_arguments
+        Arguments of `Node`.
+
+    Attributes
+    ----------
+    counts : Counter of str
+        Numbers of messages played and rejected.
+    publishers_by_topic : dict of str to Publisher
+        Publisher of each recorded topic.
+    finished : bool
+        Whether the end has been reached.
+
+    Raises
+    ------
+    RecordingError
+        If `autostart` is set and the recording cannot be played.
+    SettingsError
+        If `autostart` is set and a parameter is invalid.
+    """
 
     def __init__(self, **node_arguments: Any) -> None:
-        """Raises RecordingError or SettingsError where `autostart` finds nothing to play."""
         super().__init__('replay_node', **node_arguments)
         self._path = fixed_parameter(self, 'recording', '', 'Path of the recording.')
-        self._rate = fixed_parameter(self, 'rate', 1.0, 'Speed of the replay.')
-        self._loop = fixed_parameter(self, 'loop', False, 'Begin again at the end.')
-        self._offset = fixed_parameter(self, 'start_offset', 0.0, 'Where to begin [s].')
-        self._topics = fixed_parameter(self, 'topics', [''], 'Recorded topics to play; none: all.')
-        self._delay = fixed_parameter(self, 'start_delay', 2.0, 'Time for discovery [s].')
-        self._paused = fixed_parameter(self, 'paused', False, 'Begin paused.')
-        self._patience = fixed_parameter(self, 'wait_for_subscribers', 0.0,
-                                         'Longest wait for subscribers to the fields [s].')
+        self._rate = fixed_parameter(self, 'rate', 1.0, 'Playback rate; 1 = as recorded.')
+        self._loop = fixed_parameter(self, 'loop', False, 'Restart at the end of the recording.')
+        self._offset = fixed_parameter(self, 'start_offset', 0.0,
+                                       'Start position, from the first message [s].')
+        self._topics = fixed_parameter(self, 'topics', [''], 'Recorded topics to play; empty = '
+                                       'all.')
+        self._delay = fixed_parameter(self, 'start_delay', 2.0, 'Delay of playback after '
+                                      'activation, for discovery of the subscribers [s].')
+        self._paused = fixed_parameter(self, 'paused', False, 'Start paused.')
+        self._subscriber_timeout_s = fixed_parameter(
+            self, 'wait_for_subscribers', 0.0, 'Maximum additional delay until all magnetic fields '
+            'have a subscriber [s].')
         self._recording: Recording | None = None
         self.counts: Counter[str] = Counter()
         self.publishers_by_topic: dict[str, Publisher] = {}
-        self._missing: set[str] = set()
+        self._not_installed: set[str] = set()
         self._clock_publisher = self.create_publisher(Clock, '/clock', STREAM)
         self.finished, self._is_active, self._start = False, False, 0.0
         self._wall: float | None = None
@@ -66,18 +91,27 @@ class ReplayNode(ManagedNode):
         paced_service(self, Trigger, '~/resume', self._resume)
         paced_service(self, Seek, '~/seek', self._seek_service)
         self.create_timer(TICK_S, self._tick)
-        self.start_by_itself()
+        self.start_automatically()
 
     def prepare(self) -> None:
-        """Open the recording and advertise its topics."""
+        """Open the recording and advertise its topics.
+
+        Raises
+        ------
+        SettingsError
+            If a parameter is invalid.
+        RecordingError
+            If the recording cannot be read, is empty, or lacks a topic.
+        """
         if not self._path:
-            raise SettingsError('replay_node: parameter recording: a path is needed')
+            raise SettingsError('replay_node: parameter recording is empty; set it to the path of '
+                                'a recording')
         if not 0.0 < self._rate < float('inf'):
-            raise SettingsError(f'replay_node: parameter rate: {self._rate} is not a number '
-                                'above 0')
+            raise SettingsError(f'replay_node: parameter rate: {self._rate} is not a finite '
+                                'number above 0')
         recording = Recording(self._path)
-        self._begin = _begin_of(recording)
-        self._wanted = _wanted(recording, self._topics)
+        self._begin = _first_time_ns(recording)
+        self._selected_topics = _selected_topics(recording, self._topics)
         end = recording.end_ns
         if not self._offset >= 0.0 or (
                 end is not None and self._begin + self._offset * 1e9 > end):
@@ -85,87 +119,128 @@ class ReplayNode(ManagedNode):
                                 'the recording')
         self._recording = recording
         for topic, kind in recording.types.items():
-            if self._wanted is None or topic in self._wanted:
+            if self._selected_topics is None or topic in self._selected_topics:
                 self._publisher_for(topic, kind)
         self._seek(self._offset)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
-        """Start playback at the current position."""
-        # Discovery takes a moment; what is published before it is lost.
+        """Start playback at the current position.
+
+        Parameters
+        ----------
+        state : State
+            Previous state.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+        """
+        # Messages published before discovery is complete are lost.
         self._start = time.monotonic() + self._delay
         self._is_active, self._wall = True, None
         return super().on_activate(state)
 
     def on_deactivate(self, state: State) -> TransitionCallbackReturn:
-        """Stop playback; the position is kept."""
+        """Stop playback; the position is kept.
+
+        Parameters
+        ----------
+        state : State
+            Previous state.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+        """
         self._is_active = False
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: State) -> TransitionCallbackReturn:
-        """Close the recording and withdraw its topics."""
-        self._forget()
+        """Close the recording and withdraw its topics.
+
+        Parameters
+        ----------
+        state : State
+            Previous state.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+        """
+        self._release()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: State) -> TransitionCallbackReturn:
-        """Stop playback and close the recording."""
-        self._forget()
+        """Stop playback, close the recording and withdraw its topics.
+
+        Parameters
+        ----------
+        state : State
+            Previous state.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+        """
+        self._release()
         return TransitionCallbackReturn.SUCCESS
 
-    def _forget(self) -> None:
+    def _release(self) -> None:
         """Close the recording and withdraw its topics."""
         self._is_active, self._recording, self.finished = False, None, False
         for publisher in self.publishers_by_topic.values():
             self.destroy_publisher(publisher)
         self.publishers_by_topic.clear()
-        self._missing.clear()
+        self._not_installed.clear()
 
     def _publisher_for(self, topic: str, kind: str) -> Publisher | None:
-        """The publisher of a topic; None where its type is not installed."""
-        if topic not in self.publishers_by_topic and topic not in self._missing:
+        """Publisher of a topic; None if its type is not installed."""
+        if topic not in self.publishers_by_topic and topic not in self._not_installed:
             cls = message_class(kind)
             if cls is None:
-                self._missing.add(topic)
-                self.get_logger().warning(f'{topic} is not played: {kind} is not installed')
+                self._not_installed.add(topic)
+                self.get_logger().warning(f'{topic} is not played: message type {kind} is not '
+                                          'installed')
             else:
                 self.publishers_by_topic[topic] = self.create_publisher(
                     cls, self._within_namespace(topic), STREAM)
         return self.publishers_by_topic.get(topic)
 
     def _within_namespace(self, topic: str) -> str:
-        """The name under which a recorded topic is played: below the namespace of this node."""
+        """Name of a recorded topic within the namespace of this node."""
         namespace = self.get_namespace().rstrip('/')
         return topic if topic.startswith(f'{namespace}/') else f'{namespace}{topic}'
 
     def _seek(self, offset: float) -> None:
-        """Go on from `offset` seconds after the first message."""
-        assert self._recording is not None, 'a place in no recording'
+        """Continue at `offset` seconds after the first message."""
+        assert self._recording is not None, 'seek without a recording'
         self._position = self._begin + int(offset * 1e9)
-        self._messages = self._recording.messages(self._wanted, self._position)
+        self._messages = self._recording.messages(self._selected_topics, self._position)
         self._next = next(self._messages, None)
         self._wall = None
 
     def _tick(self) -> None:
-        """Publish what is due."""
+        """Publish the messages that are due."""
         now = time.monotonic()
         if not self._is_active or self._paused or self.finished or now < self._start \
-                or not self._heard(now):
+                or not self._has_subscribers(now):
             return
-        # After a stall it goes on at its pace: a burst would overrun the subscribers' queues.
+        # After a stall, playback continues at its rate: a burst would overflow subscriber queues.
         elapsed = 0.0 if self._wall is None else min(now - self._wall, MAX_STEP_S)
         self._wall = now
         self._position += int(elapsed * self._rate * 1e9)
         self._clock_publisher.publish(Clock(clock=Time(sec=self._position // 10**9,
                                              nanosec=self._position % 10**9)))
-        room = MAX_AT_ONCE
+        room = MAX_MESSAGES_PER_TICK
         while self._next is not None and self._next.log_time_ns <= self._position:
             if room == 0:
-                # Slower than asked for, rather than more than the queues hold.
+                # Slow down rather than overflow the queues.
                 self._position = self._next.log_time_ns
                 return
             room -= 1
             publisher = self._publisher_for(self._next.topic, self._next.type)
             if publisher is not None and not self._next.data:
-                # Damaged, or of a ROS 1 type that is not converted.
+                # Damaged, or a ROS 1 type that cannot be converted.
                 self.counts['rejected: undecodable message'] += 1
             elif publisher is not None:
                 publisher.publish(self._next.data)
@@ -174,80 +249,92 @@ class ReplayNode(ManagedNode):
         if self._next is None:
             self._end()
 
-    def _heard(self, now: float) -> bool:
-        """Whether somebody listens to every magnetic field, or has been waited for long enough."""
+    def _has_subscribers(self, now: float) -> bool:
+        """Whether every magnetic field has a subscriber, or the wait for them has timed out."""
         recording = self._recording
-        if recording is not None and now < self._start + self._patience:
+        if recording is not None and now < self._start + self._subscriber_timeout_s:
             return all(p.get_subscription_count() for topic, p in self.publishers_by_topic.items()
                        if recording.types.get(topic) == MAGNETIC_FIELD)
         return True
 
     def _end(self) -> None:
-        """The recording is over: begin again, or stay."""
-        assert self._recording is not None, 'the end of no recording'
+        """Handle the end of the recording: loop, or stop."""
+        assert self._recording is not None, 'end without a recording'
         for what, n in self._recording.losses.items():
             self.get_logger().warning(f'{what}: {n}')
         if self._loop:
             self._seek(0.0)
             return
         self.finished = True
-        self.get_logger().info(f'{self.counts["messages"]} messages played')
+        self.get_logger().info(f'end of the recording: {self.counts["messages"]} messages played')
 
     def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Stop where it is."""
+        """Handle ~/pause."""
         self._paused, self._wall = True, None
         response.success, response.message = True, 'paused'
         return response
 
     def _resume(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Go on."""
+        """Handle ~/resume."""
         self.resume()
         response.success, response.message = True, 'playing'
         return response
 
     def resume(self) -> None:
-        """Go on from where it was paused, without the rest of `start_delay`."""
+        """Continue at the position of the pause, without the rest of `start_delay`."""
         self._paused = False
         self._start = min(self._start, time.monotonic())
 
     def _seek_service(self, request: Seek.Request, response: Seek.Response) -> Seek.Response:
-        """Move to another place; a negative or too large offset is refused."""
+        """Handle ~/seek; an offset outside the recording is refused."""
         if self._recording is None:
-            response.success, response.message = False, 'no recording is open: configure first'
+            response.success, response.message = \
+                False, 'no recording is open: configure the node first'
             return response
         last = self._recording.end_ns
         if not request.offset >= 0.0 or (
                 last is not None and self._begin + request.offset * 1e9 > last):
             response.success = False
-            response.message = f'offset {request.offset} s is outside the recording'
+            response.message = f'offset: {request.offset} s is outside the recording'
             return response
         self._seek(request.offset)
         self.finished = False
-        response.success, response.message = True, f'at {request.offset} s'
+        response.success, response.message = True, f'position: {request.offset} s'
         return response
 
 
-def _begin_of(recording: Recording) -> int:
-    """[ns] Time of the first message; raises RecordingError for an empty recording."""
+def _first_time_ns(recording: Recording) -> int:
+    """Time of the first message [ns]; raise RecordingError for an empty recording."""
     if recording.start_ns is not None:
         return recording.start_ns
-    # A file without an end does not tell: read on until it does.
+    # An unfinished file has no index: read the first message.
     first = next(recording.messages(), None)
     if first is None:
-        raise RecordingError(f'{recording.path} holds no message')
+        raise RecordingError(f'{recording.path} contains no messages')
     return first.log_time_ns
 
 
-def _wanted(recording: Recording, topics: Sequence[str]) -> set[str] | None:
-    """Topics to play, None for all; raises RecordingError for an unknown topic."""
+def _selected_topics(recording: Recording, topics: Sequence[str]) -> set[str] | None:
+    """Topics to play, None for all; raise RecordingError for an unknown topic."""
     wanted = [t for t in topics if t]
     unknown = [t for t in wanted if t not in recording.types]
     if unknown and recording.message_counts:
-        raise RecordingError(f'{recording.path} has no topic {unknown[0]}; it has '
+        raise RecordingError(f'{recording.path} does not contain topic {unknown[0]}; it contains '
                              f'{", ".join(sorted(recording.types))}')
     return set(wanted) or None
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node; returns the exit status."""
+    """Run the node as a process.
+
+    Parameters
+    ----------
+    arguments : list of str, optional
+        Command line; `sys.argv` by default.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
     return stage_node.main(ReplayNode, arguments)

@@ -21,19 +21,33 @@ NODE_PARAMETERS = frozenset({
     'save_as', 'state_file', 'publish_sensor_tf', 'child_frame', 'publish_tf', 'drivers', 'batches',
     'autostart', 'recording', 'rate', 'loop', 'start_offset', 'topics', 'start_delay', 'paused',
     'wait_for_subscribers'})
-"""Parameters of the nodes that are no settings. Those of one are no errors of another: a parameter
-file, and the arguments of one process, are for all of them."""
+"""Parameters of the nodes that are not settings. Every node accepts those of the others, because a
+parameter file and the arguments of a process may be shared by all nodes."""
 
 
 def fixed_parameter(node: Node, name: str, default: Any, description: str) -> Any:
-    """Declare a parameter that is read once, at the start; its value."""
+    """Declare a read-only parameter.
+
+    Parameters
+    ----------
+    node : Node
+    name : str
+        One of `NODE_PARAMETERS`.
+    default : object
+    description : str
+
+    Returns
+    -------
+    object
+        Value of the parameter.
+    """
     assert name in NODE_PARAMETERS, name
     return node.declare_parameter(name, default, ParameterDescriptor(
         description=description, read_only=True)).value
 
 
 def _descriptor(p: Parameter) -> ParameterDescriptor:
-    """Description, unit and range of one setting."""
+    """Description, unit and range of a setting."""
     d = ParameterDescriptor(description=p.doc, read_only=not p.live,
                             additional_constraints=f'unit: {p.unit}' if p.unit else
                             f'one of {", ".join(p.choices)}' if p.choices else '')
@@ -46,21 +60,28 @@ def _descriptor(p: Parameter) -> ParameterDescriptor:
 
 
 def declare_settings(node: Node, settings: Settings, group: str) -> Settings:
-    """Declare the settings of one group as parameters of `node`; returns the settings in force.
+    """Declare the settings of one group as parameters of a node.
 
     Parameters
     ----------
-    node : rclpy.node.Node
+    node : Node
     settings : Settings
-        The whole tree, with the defaults of the target.
+        All settings, with the defaults of the target.
     group : str
-        Only `group.*` become parameters; a parameter file may hold the others.
+        Only settings of this group become parameters; a parameter file may contain others.
 
-    Raises SettingsError for an override that names no setting at all, or with
-    a wrong type, length or range.
+    Returns
+    -------
+    Settings
+        Settings in force.
+
+    Raises
+    ------
+    SettingsError
+        If an override does not name a setting, or has a wrong type, length or range.
     """
     known = {p.name: p for p in flatten(settings)}
-    overrides = dict(node._parameter_overrides)  # rclpy has no public way to list them
+    overrides = dict(node._parameter_overrides)  # rclpy has no public accessor
     for name in overrides:
         if name not in known and name not in NODE_PARAMETERS \
                 and not name.startswith('qos_overrides.'):
@@ -75,12 +96,21 @@ def declare_settings(node: Node, settings: Settings, group: str) -> Settings:
 
 
 def _plain(value: Any) -> Any:
-    """A parameter's value with arrays as lists."""
+    """Value of a parameter, with arrays as lists."""
     return list(value) if hasattr(value, '__iter__') and not isinstance(value, str) else value
 
 
 def follow_changes(node: Node, settings: Settings, apply: Callable[[Settings], None]) -> None:
-    """Check live changes of parameters and hand the new settings to `apply`."""
+    """Check live changes of parameters and apply valid ones.
+
+    Parameters
+    ----------
+    node : Node
+    settings : Settings
+        Settings in force.
+    apply : function
+        Called with the new settings.
+    """
     state = {'settings': settings}
 
     def check(parameters: list[RosParameter]) -> SetParametersResult:
@@ -90,7 +120,7 @@ def follow_changes(node: Node, settings: Settings, apply: Callable[[Settings], N
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def take(parameters: list[RosParameter]) -> None:
+    def apply_changes(parameters: list[RosParameter]) -> None:
         changes = _changes(parameters)
         if changes:
             state['settings'] = replace(state['settings'], changes)
@@ -102,4 +132,4 @@ def follow_changes(node: Node, settings: Settings, apply: Callable[[Settings], N
         return {p.name: _plain(p.value) for p in parameters if p.name in known}
 
     node.add_on_set_parameters_callback(check)
-    node.add_post_set_parameters_callback(take)
+    node.add_post_set_parameters_callback(apply_changes)

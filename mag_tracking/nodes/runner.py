@@ -1,4 +1,4 @@
-"""All nodes in one process: what a launch file does, for those who have none."""
+"""All nodes in one process, as a launch file does with several; for use without `ros2 launch`."""
 
 import signal
 import sys
@@ -34,33 +34,51 @@ PathLike = str | OsPathLike[str]
 
 
 MAX_DISCOVERY_S = 60.0
-"""[s] Nodes that have not found each other by then never will; a busy machine takes several."""
+"""[s] Maximum time for the nodes to discover each other; several seconds on a busy computer."""
 
 
 class TrackPrinter(Node):
-    """Prints the track as it grows; subscribes like any other program."""
+    """Prints the poses of tracks; subscribes like any other program.
+
+    Parameters
+    ----------
+    topic : str
+        Topic of the tracks.
+    every : int
+        Print only every n-th pose.
+    out : text stream
+    """
 
     def __init__(self, topic: str = 'tracker_node/tracks', every: int = 1,
                  out: TextIO = sys.stdout) -> None:
         super().__init__('track_printer')
         self._every, self._out = every, out
         self._n = 0
-        self.create_subscription(TrackArray, topic, self._take, STREAM)
+        self.create_subscription(TrackArray, topic, self._receive, STREAM)
 
-    def _take(self, message: TrackArray) -> None:
-        """One line a pose."""
+    def _receive(self, message: TrackArray) -> None:
+        """Print one line per pose."""
         for track in map(track_of, message.tracks):
             if track.ended:
                 print(f'track {track.id} has ended', file=self._out, flush=True)
                 self._n = 0
                 continue
             if self._n % self._every == 0:
-                print(line_of(track), file=self._out, flush=True)
+                print(pose_line(track), file=self._out, flush=True)
             self._n += 1
 
 
-def line_of(track: Track) -> str:
-    """One pose as a line of text: position with 1-sigma, speed, moment, arrival, kind."""
+def pose_line(track: Track) -> str:
+    """Format a pose as a line: position with standard deviations, speed, moment, arrival, kind.
+
+    Parameters
+    ----------
+    track : Track
+
+    Returns
+    -------
+    str
+    """
     x, y, z = track.position
     sx, sy, sz = (float(v) ** 0.5 for v in track.covariance.diagonal()[:3])
     unit, f = ('m', 1.0) if max(sx, sy) > 0.02 or max(abs(x), abs(y)) > 2.0 else ('mm', 1e3)
@@ -74,9 +92,20 @@ def line_of(track: Track) -> str:
 
 
 def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> list[Parameter]:
-    """ROS parameters that put `settings` in force in the nodes.
+    """ROS parameters that put settings in force in the nodes.
 
-    Defaults are left out: the arguments of ROS may change them.
+    Default values are omitted, so that ROS arguments can change them.
+
+    Parameters
+    ----------
+    network_path : path
+    settings : Settings
+    reliable : bool
+        Whether the topics of the sensors are reliable, as those of a replay are.
+
+    Returns
+    -------
+    list of Parameter
     """
     out = [Parameter('network', value=str(network_path)),
            Parameter('target', value=settings.track.target),
@@ -87,7 +116,19 @@ def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> li
 
 
 def driver_node(drivers_path: PathLike, network_path: PathLike, batches: bool) -> DriverNode:
-    """The driver node; it begins at once."""
+    """Create the driver node, which starts immediately.
+
+    Parameters
+    ----------
+    drivers_path : path
+    network_path : path
+    batches : bool
+        Publish the readings of many sensors in one message.
+
+    Returns
+    -------
+    DriverNode
+    """
     return DriverNode(parameter_overrides=[
         Parameter('drivers', value=str(drivers_path)),
         Parameter('network', value=str(network_path)), Parameter('batches', value=batches)])
@@ -96,13 +137,29 @@ def driver_node(drivers_path: PathLike, network_path: PathLike, batches: bool) -
 def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike | None = None,
                rate: float = 1.0, loop: bool = False
                ) -> tuple[list[StageNode], ReplayNode | None]:
-    """(stage nodes, replay node or None), ready to be added to an executor.
+    """Create the nodes, ready to be added to an executor.
 
-    Each stage calls the next one, without a message between them, and publishes when the pose is
-    out. The replay waits, paused, until `all_connected`.
+    Each stage passes its results to the next one directly and publishes them once the pose has been
+    published. The replay node is paused.
+
+    Parameters
+    ----------
+    network_path : path
+    settings : Settings
+    recording : path, optional
+        Recording to play.
+    rate : float
+        Playback rate.
+    loop : bool
+        Restart the recording at its end.
+
+    Returns
+    -------
+    stages : list of StageNode
+    replay : ReplayNode or None
     """
     overrides = parameters(network_path, settings, reliable=recording is not None)
-    tracker = TrackerNode(is_fed=True, parameter_overrides=overrides)
+    tracker = TrackerNode(has_direct_input=True, parameter_overrides=overrides)
     detection = DetectionNode(tracker, parameter_overrides=overrides)
     stages: list[StageNode] = [
         CalibrationNode((detection, tracker), parameter_overrides=overrides), detection, tracker]
@@ -115,7 +172,18 @@ def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike |
 
 
 def all_connected(stages: list[StageNode], replay: ReplayNode) -> bool:
-    """Whether all that is played of the sensors has found its subscriber."""
+    """Whether each played topic of a sensor has a subscriber.
+
+    Parameters
+    ----------
+    stages : list of StageNode
+        As returned by `make_nodes`.
+    replay : ReplayNode
+
+    Returns
+    -------
+    bool
+    """
     raw = [p for p in replay.publishers_by_topic.values()
            if p.topic_name in stages[0].sensor_topics]
     return all(p.get_subscription_count() > 0 for p in raw)
@@ -125,28 +193,36 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
         rate: float = 1.0, loop: bool = False, observers: Sequence[Callable[[], Node]] = (),
         drivers: PathLike | None = None, batches: bool = False,
         ros_arguments: Sequence[str] = ()) -> int:
-    """Run the nodes until Ctrl-C, or until the recording has been played and worked off.
+    """Run the nodes until Ctrl-C, or until a recording has been played and processed.
+
+    If the middleware hangs at the end, the process is ended: see `shut_down`.
 
     Parameters
     ----------
     network_path : path
     settings : Settings
     recording : path, optional
+        Recording to play.
     rate : float
+        Playback rate.
     loop : bool
-    observers : nodes to run beside, created after `rclpy.init`, given as functions;
-        a `TrackPrinter` if there are none.
+        Restart the recording at its end.
+    observers : sequence of functions, optional
+        Create further nodes, after `rclpy.init`; by default a `TrackPrinter`.
     drivers : path, optional
-        A drivers file: run its devices as well.
+        Drivers file; its devices are run as well.
     batches : bool
-        Readings of many sensors go in one message.
-    ros_arguments : sequence of str
-        Of all nodes, beginning with `--ros-args`.
+        Publish the readings of many sensors in one message.
+    ros_arguments : sequence of str, optional
+        For all nodes; begin with `--ros-args`.
 
-    Returns the exit status. If the middleware hangs at the end, the process ends: see `leave`.
+    Returns
+    -------
+    int
+        Exit status.
     """
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
-        # The driver node comes last, when there is somebody to hear it.
+        # The driver node comes last, so that its first messages find subscribers.
         last = [partial(driver_node, drivers, network_path, batches)] if drivers else []
         begin(list(ros_arguments))
         return _run_until(lambda: bool(seen), network_path, settings, recording, rate, loop,
@@ -156,7 +232,7 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
 def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Settings,
                recording: PathLike | None, rate: float, loop: bool,
                observers: Sequence[Callable[[], Node]], last: Sequence[Callable[[], Node]]) -> int:
-    """As `run`, until `stopped()`; the nodes `last` are created after all others."""
+    """Run as described for `run` until `stopped()`; `last` creates the nodes that come last."""
     executor = make_executor()
     nodes: list[Node] = []
     status = 1
@@ -181,33 +257,35 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
 
 def _play(executor: Executor, stages: list[StageNode], replay: ReplayNode,
           stopped: Callable[[], bool]) -> None:
-    """Play the recording once all have found each other, and wait until it is worked off."""
+    """Play the recording once all nodes are connected, and wait until it has been processed."""
     _check_topics(stages[0], replay)
     deadline = time.monotonic() + MAX_DISCOVERY_S
     spin(executor, lambda: all_connected(stages, replay) or stopped()
          or time.monotonic() > deadline)
     if not all_connected(stages, replay) and not stopped():
-        raise MagTrackingError('the nodes did not find each other within '
-                               f'{MAX_DISCOVERY_S:g} s')
+        raise MagTrackingError('the nodes did not discover each other within '
+                               f'{MAX_DISCOVERY_S:g} s; check the network interfaces and the '
+                               'load of this computer')
     replay.resume()
     spin(executor, lambda: replay.finished or stopped())
-    _work_off(executor, stages, stopped)
+    _drain(executor, stages, stopped)
 
 
 def _check_topics(node: StageNode, replay: ReplayNode) -> None:
-    """Raise MagTrackingError where nothing that is played is of the network."""
+    """Raise MagTrackingError unless a played topic belongs to the network."""
     played = {p.topic_name for p in replay.publishers_by_topic.values()}
     if played & {*node.sensor_topics, node.resolve_topic_name(RAW_READINGS)}:
         return
     found = namespaces_of((*node.network.topics, RAW_READINGS), list(replay.publishers_by_topic))
     hint = f'; start the nodes in its namespace: --ros-args -r __ns:={found[0]}' \
         if found and found != ['/'] else ''
-    raise MagTrackingError(f'the recording has none of {", ".join(node.sensor_topics)}{hint}')
+    raise MagTrackingError(f'the recording contains none of the topics '
+                           f'{", ".join(node.sensor_topics)}{hint}')
 
 
-def _work_off(executor: Executor, stages: list[StageNode], stopped: Callable[[], bool],
-              quiet_s: float = 1.0) -> None:
-    """Spin until nothing has moved for `quiet_s` seconds, or until `stopped()`."""
+def _drain(executor: Executor, stages: list[StageNode], stopped: Callable[[], bool],
+           quiet_s: float = 1.0) -> None:
+    """Spin until no stage has processed anything for `quiet_s` seconds, or until `stopped()`."""
     def moved() -> list[int]:
         return [sum(s.counts.values()) for node in stages for s in node.stages().values()]
 

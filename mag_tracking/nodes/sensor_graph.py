@@ -1,4 +1,4 @@
-"""Publishers of the sensors' topics, and faults in how they are connected."""
+"""Faults in how the topics of the sensors are published."""
 
 from collections.abc import Mapping
 
@@ -10,14 +10,27 @@ from mag_tracking.network.topics import absolute
 from mag_tracking.stages.health.sensor_health import Finding
 
 MAX_NAMED = 4
-"""Topics that a message names; of more it gives the number."""
+"""Maximum number of names in a message; the rest are counted."""
 
 
 def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
-    """Faults of a sensor's topic, an absolute name."""
+    """Faults of the publishers of a sensor topic: wrong type, or several of them.
+
+    Parameters
+    ----------
+    node : Node
+        Node whose graph is examined.
+    sensor : str
+    topic : str
+        Absolute topic name.
+
+    Returns
+    -------
+    list of Finding
+    """
     publishers = node.get_publishers_info_by_topic(topic)
     found = [Finding(True, sensor, f'{p.node_name} publishes {p.topic_type} on {topic}',
-                     f'it has to be {MAGNETIC_FIELD}')
+                     f'the type must be {MAGNETIC_FIELD}')
              for p in publishers if p.topic_type != MAGNETIC_FIELD]
     if len(publishers) > 1:
         names = ', '.join(sorted(name for name in map(node_of, publishers) if name)) or 'unknown'
@@ -27,22 +40,43 @@ def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
 
 
 def node_of(endpoint: TopicEndpointInfo) -> str | None:
-    """Absolute name of the node of an endpoint; None where it is not discovered yet.
+    """Absolute name of the node of an endpoint.
 
-    The middleware announces endpoints and nodes separately, and has a placeholder in between.
+    The middleware announces endpoints and nodes separately; in between, the name is a placeholder.
+
+    Parameters
+    ----------
+    endpoint : TopicEndpointInfo
+
+    Returns
+    -------
+    str or None
+        None if the node is not yet discovered.
     """
     namespace = endpoint.node_namespace
     return absolute(endpoint.node_name, namespace) if namespace.startswith('/') else None
 
 
 def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, str]) -> Finding:
-    """Fault of a sensor whose `topic` is silent, with the fields that are published instead.
+    """Fault of a sensor from which no message has been received.
 
-    `known` is {sensor: topic} of the whole network.
+    Parameters
+    ----------
+    node : Node
+        Node whose graph is examined.
+    sensor : str
+    topic : str
+        Absolute topic name.
+    known : mapping of str to str
+        Topics of all sensors of the network; others that are published are suggested.
+
+    Returns
+    -------
+    Finding
     """
     if node.count_publishers(topic):
-        return Finding(True, sensor, f'nothing has come on {topic}, which is published',
-                       'look at the sensor and its driver')
+        return Finding(True, sensor, f'no message received on {topic}, although it has a '
+                       'publisher', 'check the sensor and its driver')
     own = node.get_namespace().rstrip('/')
     others = sorted((name for name, kinds in node.get_topic_names_and_types()
                      if MAGNETIC_FIELD in kinds and name not in known.values()
@@ -51,10 +85,19 @@ def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, s
     advice = 'start its driver, or remap its topic'
     if others:
         advice += f'; magnetic fields are published on {shortened(others)}'
-    return Finding(True, sensor, f'nothing has come: {topic} is not published', advice)
+    return Finding(True, sensor, f'no message received: {topic} has no publisher', advice)
 
 
 def shortened(names: list[str]) -> str:
-    """The first of many names, and how many more there are."""
+    """Join names; of many, only the first ones and the number of the rest.
+
+    Parameters
+    ----------
+    names : list of str
+
+    Returns
+    -------
+    str
+    """
     more = len(names) - MAX_NAMED
     return ', '.join(names[:MAX_NAMED]) + (f' and {more} more' if more > 0 else '')

@@ -1,6 +1,6 @@
-"""Work on each sensor in turn: its health, its calibration state, its stored background.
+"""Periodic work on each sensor in turn: health, calibration state, stored background.
 
-Done for all sensors at once it would delay the readings.
+Done for all sensors at once, it would delay the readings.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,19 +17,22 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 
 
 class SensorRounds:
-    """Rounds over the sensors of a network, in steps that take about the same time.
+    """Rounds over the sensors of a network, in steps of about the same duration.
 
     Parameters
     ----------
+    node : str
+        Title of the node, for diagnostics.
+    network : SensorNetwork
     stage : Calibrate
     health : HealthDiagnostics
     store : BackgroundStore
     is_live : function
-        Whether the readings are of the present, not of a recording.
+        Returns whether the readings are live, not of a recording.
     publish_status : function
-        Takes the `DiagnosticStatus` of one sensor.
+        Called with the `DiagnosticStatus` of a sensor.
     publish_states : function
-        Takes the `SensorCalibration` of all sensors; the list is reused.
+        Called with the list of `SensorCalibration` of all sensors; the list is reused.
     """
 
     def __init__(self, node: str, network: SensorNetwork, stage: Calibrate,
@@ -44,24 +47,30 @@ class SensorRounds:
         self.begin(network)
 
     def begin(self, network: SensorNetwork) -> None:
-        """Begin a round; `network` is the one from now on."""
+        """Begin a new round.
+
+        Parameters
+        ----------
+        network : SensorNetwork
+            Replaces the previous network.
+        """
         self._network = network
         self._steps = self._rounds()
         self._states = [self._state(j) for j in range(len(network))]
 
     def tick(self) -> None:
-        """A step is due: it is done after the next readings, or at the next tick."""
+        """Mark a step as due; it is done after the next readings, or at the next tick."""
         if self._is_due:
             self._step()
         self._is_due = True
 
     def step_if_due(self) -> None:
-        """Do the step that is due."""
+        """Do a step if one is due."""
         if self._is_due:
             self._step()
 
     def report_doubts(self) -> None:
-        """Publish immediately if a background becomes doubtful or certain again.
+        """Publish immediately if a background has become doubtful or certain.
 
         The tracker flags tracks only after it has received this.
         """
@@ -75,7 +84,7 @@ class SensorRounds:
         self._reported = latest
 
     def _step(self) -> None:
-        """Go on with the round."""
+        """Do the next step of the round."""
         self._is_due = False
         next(self._steps)
 
@@ -84,16 +93,16 @@ class SensorRounds:
         self._publish_states(self._states)
 
     def _state(self, j: int) -> SensorCalibration:
-        """How sensor `j` is calibrated."""
+        """`SensorCalibration` of sensor `j`."""
         return to_message(SensorCalibration, sensor_dict(self._stage, self._network, j))
 
     def _rounds(self) -> Iterator[None]:
-        """Compare all sensors, report on each, publish and store; again and again."""
+        """Endless rounds: compare all sensors, report on each, publish, store."""
         while True:
             self._health.begin_round(self._stage)
             yield
             for j in range(len(self._network)):
-                self._health.look(j)
+                self._health.update(j)
                 self._states[j] = self._state(j)
                 self._store.update(self._network, j)
                 yield

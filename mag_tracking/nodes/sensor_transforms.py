@@ -1,4 +1,4 @@
-"""Where the sensors are, as static transforms."""
+"""Static transforms of the sensors."""
 
 from rclpy.node import Node
 from tf2_msgs.msg import TFMessage
@@ -10,10 +10,14 @@ from mag_tracking.nodes.stage_node import LATCHED
 
 
 class SensorTransforms:
-    """Publishes a frame for each sensor on /tf_static, named as the sensor.
+    """Publishes a frame for each sensor on /tf_static, with the name of the sensor.
 
-    The `frame_id` of its messages may be the part of a robot that somebody else publishes: a frame
-    with two parents would break the tree.
+    The `frame_id` of the sensor messages is not used. It may be a link of a robot that another node
+    publishes, and a frame with two parents would break the tree.
+
+    Parameters
+    ----------
+    node : Node
     """
 
     def __init__(self, node: Node) -> None:
@@ -21,6 +25,11 @@ class SensorTransforms:
         self._publisher = node.create_publisher(TFMessage, '/tf_static', LATCHED)
 
     def publish(self, network: SensorNetwork) -> None:
-        """Publish the transforms of a `network`."""
+        """Publish the transforms of a network.
+
+        Parameters
+        ----------
+        network : SensorNetwork
+        """
         self._publisher.publish(to_message(TFMessage, {'transforms': sensor_transform_dicts(
             network, self._node.get_clock().now().nanoseconds)}))

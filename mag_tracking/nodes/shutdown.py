@@ -1,4 +1,4 @@
-"""How every process with ROS ends."""
+"""Shutdown of ROS, common to all processes."""
 
 import sys
 import traceback
@@ -13,24 +13,25 @@ from mag_tracking.errors import MagTrackingError
 from mag_tracking.nodes.core import Deadline, end_within
 from mag_tracking.nodes.managed_node import ManagedNode
 
-LEAVING_S = 4.0
-"""[s] Longest time for leaving the middleware. Usually it takes 0.3 s; `ros2 launch` sends the next
-signal 5 s after the first."""
-HUNG = f'the middleware did not shut down within {LEAVING_S:g} s; the process was ended\n'
+SHUTDOWN_TIMEOUT_S = 4.0
+"""[s] Maximum time for the shutdown of the middleware. It usually takes 0.3 s; `ros2 launch` sends
+the next signal 5 s after the first."""
+HUNG_MESSAGE = (f'the middleware did not shut down within {SHUTDOWN_TIMEOUT_S:g} s; '
+                'the process was ended\n')
 
 
 def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: int = 0) -> None:
     """Close and destroy nodes and shut ROS down; end the process if the middleware hangs.
 
-    Workaround: Fast DDS 2.14 blocks for ever, and holds the interpreter's lock, when a participant
-    is destroyed while another one leaves (eProsima/Fast-DDS 6513): 1 of 1165 nodes of which five
-    were signalled at once. The deadline can be removed once that is fixed.
+    Workaround: Fast DDS 2.14 blocks forever, while it holds the interpreter lock, if a participant
+    is destroyed while another one leaves (eProsima/Fast-DDS 6513). This happened to 1 of 1165 nodes
+    when five were signalled at once. The deadline can be removed once that is fixed.
 
     Parameters
     ----------
     nodes : sequence of Node
     executor : Executor, optional
-        The executor of the nodes.
+        Executor of the nodes.
     status : int
         Exit status of the process if it is ended here.
     """
@@ -39,12 +40,12 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
             if executor is not None:
                 executor.remove_node(node)
             if isinstance(node, ManagedNode):
-                # Devices have their own, longer time limit.
+                # Closing devices has its own, longer timeout.
                 node.close()
     finally:
         flush()
         with ExitStack() as stack:
-            stack.callback(Deadline(LEAVING_S, status, _final_message()).cancel)
+            stack.callback(Deadline(SHUTDOWN_TIMEOUT_S, status, _final_message()).cancel)
             stack.callback(rclpy.try_shutdown)
             if executor is not None:
                 stack.callback(executor.shutdown)
@@ -53,16 +54,22 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
 
 
 def limit_exit_time(status: int) -> None:
-    """Limit the time until the process has ended, as `leave` does.
+    """Limit the time until the process ends, with the same timeout as `shut_down`.
 
-    A node whose constructor raised is destroyed only with the interpreter.
+    A node whose constructor raised is destroyed together with the interpreter, which may hang as
+    well.
+
+    Parameters
+    ----------
+    status : int
+        Exit status of the process if it is ended by the timeout.
     """
     flush()
-    end_within(LEAVING_S, status, HUNG.encode())
+    end_within(SHUTDOWN_TIMEOUT_S, status, HUNG_MESSAGE.encode())
 
 
 def flush() -> None:
-    """Flush the standard streams; an error remains for the end of Python, which reports it."""
+    """Flush the standard streams; errors are left to Python, which reports them at exit."""
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             if stream is not None:
@@ -70,7 +77,7 @@ def flush() -> None:
 
 
 def _final_message() -> bytes:
-    """Message of the deadline; begins with the pending error, which would not be printed."""
+    """Message of the deadline; begins with the pending error, which is not printed otherwise."""
     error = sys.exc_info()[1]
     if error is None or isinstance(error, KeyboardInterrupt):
         pending = ''
@@ -78,4 +85,4 @@ def _final_message() -> bytes:
         pending = f'{error}\n'
     else:
         pending = ''.join(traceback.format_exception(error))
-    return (pending + HUNG).encode(errors='backslashreplace')
+    return (pending + HUNG_MESSAGE).encode(errors='backslashreplace')

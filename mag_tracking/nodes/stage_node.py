@@ -1,4 +1,4 @@
-"""The generic node: parameters, network, diagnostics and the main loop."""
+"""Base class of the nodes with stages: parameters, network, diagnostics and the main loop."""
 
 import gc
 import signal
@@ -24,7 +24,7 @@ from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.network.file import read_network
-from mag_tracking.nodes.flow import Flow, Listener
+from mag_tracking.nodes.flow import Flow, SubscriberMonitor
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.sensor_graph import node_of, shortened
@@ -36,39 +36,76 @@ from mag_tracking.records import Readings
 from mag_tracking.stages.stage import Stage
 
 RESULTS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-"""For what people subscribe to."""
+"""QoS of results for users."""
 STREAM = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
-"""Between the nodes, for who hears, and for a replay, which may be fast: nothing may be lost while
-the tracker starts a bank."""
-SENT = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
-"""Between the nodes, for who sends. So much is kept for a node that was killed; the one that comes
-after it has to be told that this is not for it, and can ask of 256 messages at once (RTPS 2.3,
-8.3.5.5). Of a longer past it asks for the rest only seconds later, and hears nothing till then."""
+"""QoS of subscriptions between the nodes, and of a replay, which may be fast. The queue is long
+enough for the time that the tracker needs to initiate a track."""
+STREAM_OUTPUT = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
+"""QoS of publishers between the nodes. A node that replaces a killed one can skip at most 256 older
+messages with a single request (RTPS 2.3, 8.3.5.5). With a longer history it would request the rest
+seconds later and receive nothing until then."""
 SENSORS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Best effort matches reliable and best-effort drivers alike."""
+"""QoS of subscriptions to sensors; best effort matches reliable and best-effort publishers."""
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""QoS of topics whose latest message is sent to late subscribers."""
 
 
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of /tf, that of tf2."""
+"""QoS of /tf, the same as that of tf2."""
 READY = 'ready'
+"""State of a node that receives input and works normally."""
 
 _Record = TypeVar('_Record')
 
 
 class StageNode(Node):
-    """A node that knows the network and the settings of one group of stages."""
+    """Node that reads the network file and the settings of one group of stages.
+
+    Parameters
+    ----------
+    name : str
+        Default name of the node.
+    group : str
+        Group of settings that become parameters.
+    **node_arguments
+        Arguments of `Node`.
+
+    Attributes
+    ----------
+    network_path : Path
+        Network file.
+    network : SensorNetwork
+    settings : Settings
+        Settings in force.
+    title : str
+        Name of the node in diagnostics.
+    input_qos : QoSProfile
+        QoS of subscriptions to sensors.
+    is_replayed : bool
+        Whether the input is a recording.
+    flows : dict of str to Flow
+        Statistics of the inputs, by source.
+    now_ns : int, ns
+        Arrival time of the message that is being processed, by the ROS clock.
+
+    Raises
+    ------
+    SettingsError
+        If a parameter is invalid.
+    NetworkError
+        If the network file is invalid.
+    """
 
     def __init__(self, name: str, group: str, **node_arguments: Any) -> None:
-        """Raises SettingsError or NetworkError where parameters or network are unusable."""
         super().__init__(name, **node_arguments)
         path = fixed_parameter(self, 'network', '', 'Path of the network file.')
         if not path:
-            raise SettingsError(f'{name}: parameter network: the path of a network.yaml is needed')
-        target = fixed_parameter(self, 'target', 'vehicle', 'What moves: vehicle or magnet.')
-        reliable = fixed_parameter(self, 'reliable_input', False, 'The sensors\' topics are '
-                                   'reliable, as those of a replay are.')
+            raise SettingsError(f'{name}: parameter network is empty; set it to the path of a '
+                                'network file')
+        target = fixed_parameter(self, 'target', 'vehicle', 'Kind of target: vehicle or magnet.')
+        reliable = fixed_parameter(self, 'reliable_input', False, 'Subscribe to the sensors with '
+                                   'reliable QoS, for a replay.')
         self.network_path = Path(path).resolve()
         self.title = title_of(self)
         self.input_qos = STREAM if reliable else SENSORS
@@ -76,111 +113,183 @@ class StageNode(Node):
         self.network = read_network(self.network_path)
         self.settings = declare_settings(self, settings_for(target), group)
         if self.settings.track.target != target:
-            raise SettingsError(f'{name}: track.target is {self.settings.track.target!r}, but '
-                                f'target is {target!r}')
+            raise SettingsError(f'{name}: parameter track.target is {self.settings.track.target!r}'
+                                f', but target is {target!r}; set target only')
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
         self._reported: dict[tuple[str, str], int] = {}
         self.flows: dict[str, Flow] = {}
-        self._listeners: list[Listener] = []
-        # When the message came that is worked on, by the clock of ROS.
+        self._subscriber_monitors: list[SubscriberMonitor] = []
         self.now_ns = 0
         self._log, self._reported_state = StatusLog(self.get_logger()), ''
         steady_timer(self, 1.0, self._publish_diagnostics)
 
     def state(self) -> str:
-        """State of the node: waiting for its input, or ready."""
-        silent = [topic for flow in self.flows.values() if flow.heard is None
+        """State of the node: waiting for its input, or ready.
+
+        Returns
+        -------
+        str
+        """
+        silent = [topic for flow in self.flows.values() if flow.last_received is None
                   for topic in flow.topics]
         return f'waiting for {shortened(silent)}' if silent else READY
 
     def report_state(self) -> None:
-        """Log the state where it has changed."""
+        """Log the state if it has changed."""
         state = self.state()
         if state != self._reported_state:
             self._reported_state = state
-            self._log.tell(state)
+            self._log.info(state)
 
     @property
     def sensor_topics(self) -> tuple[str, ...]:
-        """The sensors' topics: absolute names, as remapped."""
+        """Topics of the sensors: absolute names, after remapping."""
         return tuple(map(self.resolve_topic_name, self.network.topics))
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """{name: stage} whose counts are published."""
+        """Stages whose counts are published.
+
+        Returns
+        -------
+        dict of str to Stage
+        """
         raise NotImplementedError
 
     def queues(self) -> dict[str, int]:
-        """{name of a stage: how many records it holds}."""
+        """Number of records that are held back.
+
+        Returns
+        -------
+        dict of str to int
+            By stage name.
+        """
         return {}
 
-    def expect(self, role: str, topic: str, publishes: str) -> None:
-        """Report in diagnostics when the node of the next step no longer subscribes to `topic`.
+    def monitor_subscriber(self, role: str, topic: str, publishes: str) -> None:
+        """Report in diagnostics if the node of the next step no longer subscribes to a topic.
 
-        `publishes` is a type of message, by which it is known.
+        Parameters
+        ----------
+        role : str
+            Role of the next step, for messages.
+        topic : str
+        publishes : str
+            Message type that the node of the next step publishes, by which it is identified.
         """
-        self._listeners.append(Listener(role, self.resolve_topic_name(topic), publishes))
+        self._subscriber_monitors.append(
+            SubscriberMonitor(role, self.resolve_topic_name(topic), publishes))
 
     def publisher(self, message_type: Any, topic: str, qos: QoSProfile) -> Publisher:
-        """A publisher that logs a subscriber with unfit QoS."""
-        def unfit(event: Any) -> None:
-            self.get_logger().warning(
-                f'a subscriber of {topic} asks for another QoS (policy '
-                f'{event.last_policy_kind}): it gets nothing')
+        """Create a publisher that logs subscribers with incompatible QoS.
 
-        events = PublisherEventCallbacks(incompatible_qos=unfit)
+        Parameters
+        ----------
+        message_type : type
+        topic : str
+        qos : QoSProfile
+
+        Returns
+        -------
+        Publisher
+        """
+        def incompatible(event: Any) -> None:
+            self.get_logger().warning(
+                f'a subscriber of {topic} requests incompatible QoS (policy '
+                f'{event.last_policy_kind}) and receives nothing; adapt its QoS')
+
+        events = PublisherEventCallbacks(incompatible_qos=incompatible)
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
     def subscription(self, message_type: Any, topic: str, callback: Callable[[Any], None],
                      qos: QoSProfile, source: str = '', batches: bool = False) -> Subscription:
-        """A subscription that logs a publisher with unfit QoS.
+        """Create a subscription that logs publishers with incompatible QoS.
 
-        With a `source`, the step that sends, diagnostics tell of what comes and how
-        late; `batches` may come in place of the other topics.
+        Parameters
+        ----------
+        message_type : type
+        topic : str
+        callback : function
+            Called with each message.
+        qos : QoSProfile
+        source : str, optional
+            Sender; diagnostics report throughput and latency of its messages.
+        batches : bool
+            Whether `topic` is an alternative to the other topics of `source`.
+
+        Returns
+        -------
+        Subscription
         """
         flow = self.flows.setdefault(source, Flow(source)) if source else None
         if flow is not None:
             (flow.batches if batches else flow.topics).append(self.resolve_topic_name(topic))
 
-        def unfit(event: Any) -> None:
+        def incompatible(event: Any) -> None:
             self.get_logger().warning(
-                f'the publisher of {topic} offers another QoS (policy {event.last_policy_kind}): '
-                'nothing comes from it')
+                f'a publisher of {topic} offers incompatible QoS (policy '
+                f'{event.last_policy_kind}): its messages are not received; adapt its QoS')
 
         def lost(event: Any) -> None:
             if flow is not None:
                 flow.n_lost += event.total_count_change
 
-        def take(message: Any) -> None:
+        def receive(message: Any) -> None:
             assert flow is not None
             began = time.monotonic()
             self.now_ns = self.get_clock().now().nanoseconds
             callback(message)
-            flow.note(stamp_ns(message.header.stamp), self.now_ns, began)
+            flow.add(stamp_ns(message.header.stamp), self.now_ns, began)
 
         return self.create_subscription(
-            message_type, topic, callback if flow is None else take, qos,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=unfit, message_lost=lost))
+            message_type, topic, callback if flow is None else receive, qos,
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=incompatible, message_lost=lost))
 
-    def direct(self, source: str, topics: Sequence[str], callback: Callable[[_Record], None],
-               stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
-        """A function that takes records of the step before, in place of subscriptions.
+    def direct_input(self, source: str, topics: Sequence[str], callback: Callable[[_Record], None],
+                     stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
+        """Create a function that receives records of the preceding step, instead of subscriptions.
 
-        Diagnostics tell the same of them: `source` is that step, which publishes on the `topics`;
-        `stamp_of` gives the timestamp [ns] of a record.
+        Parameters
+        ----------
+        source : str
+            Preceding step; diagnostics report throughput and latency of its records.
+        topics : sequence of str
+            Topics on which it publishes.
+        callback : function
+            Called with each record.
+        stamp_of : function
+            Returns the timestamp of a record [ns].
+
+        Returns
+        -------
+        function
+            Takes a record.
         """
         flow = self.flows.setdefault(source, Flow(source))
         flow.topics += map(self.resolve_topic_name, topics)
 
-        def take(record: _Record) -> None:
+        def receive(record: _Record) -> None:
             began = time.monotonic()
             self.now_ns = self.get_clock().now().nanoseconds
             callback(record)
-            flow.note(stamp_of(record), self.now_ns, began)
+            flow.add(stamp_of(record), self.now_ns, began)
 
-        return take
+        return receive
 
     def readings_of(self, message: FieldReadings, stage: Stage[Any, Any]) -> Readings | None:
-        """`Readings` of a FieldReadings; one that is none is a rejection of `stage`, and None."""
+        """Convert a FieldReadings message; an invalid one is logged and counted as a rejection.
+
+        Parameters
+        ----------
+        message : FieldReadings
+        stage : Stage
+            Stage that counts the rejection.
+
+        Returns
+        -------
+        Readings or None
+            None if the message is invalid.
+        """
         try:
             return readings_of(message)
         except RecordingError as error:
@@ -189,22 +298,22 @@ class StageNode(Node):
             return None
 
     def _publish_diagnostics(self) -> None:
-        """Counts of the stages; a warning where something was rejected since the last time."""
+        """Publish the counts of the stages; warn of rejections since the last time."""
         statuses, queues = [], self.queues()
         for name, stage in self.stages().items():
             bad = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')}
-            news = {k: n for k, n in bad.items() if n != self._reported.get((name, k), 0)}
-            self._reported |= {(name, cause): n for cause, n in news.items()}
+            increases = {k: n for k, n in bad.items() if n != self._reported.get((name, k), 0)}
+            self._reported |= {(name, cause): n for cause, n in increases.items()}
             statuses.append(DiagnosticStatus(
-                level=DiagnosticStatus.WARN if news else DiagnosticStatus.OK,
+                level=DiagnosticStatus.WARN if increases else DiagnosticStatus.OK,
                 name=f'{self.title}: {name}', hardware_id='magnetometer network',
-                message='; '.join(f'{cause}: {n}' for cause, n in news.items()) or 'running',
+                message='; '.join(f'{cause}: {n}' for cause, n in increases.items()) or 'running',
                 values=[KeyValue(key=k, value=str(n)) for k, n in sorted(
                     {**stage.counts, **({'queue': queues[name]} if name in queues else {})}.items()
                 )]))
         statuses += [flow.status(self.title, partial(self._has_publisher, flow))
                      for flow in self.flows.values()]
-        for listener in self._listeners:
+        for listener in self._subscriber_monitors:
             ends = self.get_subscriptions_info_by_topic(listener.topic)
             statuses.append(listener.status(self.title, {
                 name for name in map(node_of, ends) if name}, self._published_types))
@@ -218,10 +327,11 @@ class StageNode(Node):
         n_same = self.get_node_names_and_namespaces().count(own)
         if n_same > 1:
             faults.append(f'{n_same} nodes are named {self.get_fully_qualified_name()}: stop all '
-                          'but one, or rename it (-r __node:=NAME; where several run in one '
-                          f'process, -r {self.get_name()}:__node:=NAME)')
+                          'but one, or rename this one (-r __node:=NAME; if several nodes run in '
+                          f'one process, -r {self.get_name()}:__node:=NAME)')
         if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
-            faults.append('use_sim_time is set, and nothing has come on /clock')
+            faults.append('use_sim_time is set, but no message was received on /clock: start a '
+                          'replay, or unset it')
         return [DiagnosticStatus(
             level=DiagnosticStatus.ERROR if faults else DiagnosticStatus.OK,
             name=f'{self.title}: start', hardware_id='magnetometer network',
@@ -237,13 +347,19 @@ class StageNode(Node):
         return {kind for _, kinds in found for kind in kinds}
 
     def _has_publisher(self, flow: Flow) -> bool:
-        """Whether somebody would still publish what the flow is of."""
+        """Whether the topics of a flow still have a publisher."""
         return any(map(self.count_publishers, (*flow.topics, *flow.batches)))
 
     def publish_statuses(self, statuses: list[DiagnosticStatus]) -> None:
-        """Publish [DiagnosticStatus], if there are any, and log faults."""
+        """Publish statuses on /diagnostics and log faults.
+
+        Parameters
+        ----------
+        statuses : list of DiagnosticStatus
+            Nothing is published if it is empty.
+        """
         for status in statuses:
-            self._log.note(status)
+            self._log.add(status)
         if statuses:
             array = DiagnosticArray(status=statuses)
             array.header.stamp = self.get_clock().now().to_msg()
@@ -251,17 +367,41 @@ class StageNode(Node):
 
 
 def has_subscribers(publisher: Publisher) -> bool:
-    """Whether somebody listens: what is large is made for nobody else."""
+    """Whether a topic has subscribers; large messages are built only in that case.
+
+    Parameters
+    ----------
+    publisher : Publisher
+
+    Returns
+    -------
+    bool
+    """
     return publisher.get_subscription_count() > 0
 
 
 def title_of(node: Node) -> str:
-    """The name of a node in diagnostics: with its namespace, where it has one."""
+    """Name of a node in diagnostics, including its namespace.
+
+    Parameters
+    ----------
+    node : Node
+
+    Returns
+    -------
+    str
+    """
     return node.get_fully_qualified_name().removeprefix('/')
 
 
 def make_executor() -> Executor:
-    """The events executor, a tenth of the cost of the others; else the single-threaded one."""
+    """Create the events executor, which has a tenth of the overhead of others, if it is available.
+
+    Returns
+    -------
+    Executor
+        Otherwise a `SingleThreadedExecutor`.
+    """
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:
@@ -270,33 +410,54 @@ def make_executor() -> Executor:
 
 
 def freeze() -> None:
-    """Keep what was loaded for good: to look through it again and again for garbage takes longer
-    than a reading may be late.
+    """Exclude all existing objects from garbage collection.
+
+    Scanning them again and again would delay readings by more than is acceptable.
     """
     gc.collect()
     gc.freeze()
 
 
 def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
-    """Run `executor` until ROS shuts down or `until` is true (asked a few times a second)."""
+    """Run an executor until ROS shuts down or a condition holds.
+
+    Parameters
+    ----------
+    executor : Executor
+    until : function
+        Returns True to stop; called a few times per second.
+    """
     try:
         while rclpy.ok() and not until():
-            # EventsExecutor.spin() of these wheels hangs (a time-out overflows):
-            # a future that never comes, with a finite time-out, does not.
+            # EventsExecutor.spin() of the Jazzy wheels hangs because a timeout overflows. Waiting
+            # for a future that never completes, with a finite timeout, works.
             executor.spin_until_future_complete(Future(), 0.2)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
 
 
 def main(node_class: Callable[[], Node], arguments: list[str] | None = None) -> int:
-    """Run one node as a process until SIGINT or SIGTERM; returns the exit status."""
+    """Run a node as a process until SIGINT or SIGTERM.
+
+    Parameters
+    ----------
+    node_class : function
+        Creates the node.
+    arguments : list of str, optional
+        Command line; `sys.argv` by default.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         return _run_until(seen, node_class, arguments)
 
 
 def _run_until(seen: list[int], node_class: Callable[[], Node],
                arguments: list[str] | None) -> int:
-    """Run one node until there is something in `seen`."""
+    """Run a node until `seen` contains a signal."""
     try:
         begin(arguments)
     except SettingsError as error:
@@ -311,7 +472,7 @@ def _run_until(seen: list[int], node_class: Callable[[], Node],
         status = 0
     except (MagTrackingError, ParameterException) as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
-        # A node that is only half built leaves the middleware when the error is deleted.
+        # A node that is only partly constructed is destroyed when the error is deleted.
         limit_exit_time(status)
     except (KeyboardInterrupt, ExternalShutdownException):
         status = 0

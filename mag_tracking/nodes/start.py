@@ -1,9 +1,9 @@
-"""Entry points of the nodes: signals are handled before anything that takes time is imported.
+"""Entry points of the nodes, with signal handling before any slow import.
 
-The imports of a node take a second, on a small computer several. From the first line here on,
-SIGINT and SIGTERM end the process with status 0: at once while modules are imported, and later by
-`stage_node.main`, which lets the node leave the middleware. What comes before, the start of Python
-itself, is out of reach.
+The imports of a node take a second, several on a small computer. From the first line of this module
+on, SIGINT and SIGTERM end the process with status 0: immediately during imports, later through
+`stage_node.main`, which shuts the node down. Signals during the startup of Python itself cannot be
+handled.
 """
 
 import signal
@@ -14,11 +14,17 @@ from typing import NoReturn
 from mag_tracking.interrupts import exit_on_signals
 
 ENDING = (signal.SIGINT, signal.SIGTERM)
-"""The signals that end a node."""
+"""Signals that end a node."""
 
 
 def run_node(name: str) -> NoReturn:
-    """Run the node of the module `name` as a process; does not return."""
+    """Run a node as a process; does not return.
+
+    Parameters
+    ----------
+    name : str
+        Module of the node.
+    """
     status = 1
     try:
         with exit_on_signals(0, *ENDING):
@@ -26,7 +32,7 @@ def run_node(name: str) -> NoReturn:
     except KeyboardInterrupt:
         status = 130
     finally:
-        # The end of Python takes a while, too: a second signal is ignored.
+        # Finalisation of Python takes time as well, during which further signals are ignored.
         for s in ENDING:
             signal.signal(s, signal.SIG_IGN)
         limit_exit_time(status)
@@ -34,31 +40,37 @@ def run_node(name: str) -> NoReturn:
 
 
 def limit_exit_time(status: int) -> None:
-    """Limit the time until the process has ended, if it has used ROS."""
+    """Limit the time until the process ends, if it has used ROS.
+
+    Parameters
+    ----------
+    status : int
+        Exit status of the process if it is ended by the timeout.
+    """
     if 'rclpy' in sys.modules:
         import_module('mag_tracking.nodes.shutdown').limit_exit_time(status)
 
 
 def driver_node() -> NoReturn:
-    """The command driver_node."""
+    """Run the command driver_node."""
     run_node('driver_node')
 
 
 def replay_node() -> NoReturn:
-    """The command replay_node."""
+    """Run the command replay_node."""
     run_node('replay_node')
 
 
 def calibration_node() -> NoReturn:
-    """The command calibration_node."""
+    """Run the command calibration_node."""
     run_node('calibration_node')
 
 
 def detection_node() -> NoReturn:
-    """The command detection_node."""
+    """Run the command detection_node."""
     run_node('detection_node')
 
 
 def tracker_node() -> NoReturn:
-    """The command tracker_node."""
+    """Run the command tracker_node."""
     run_node('tracker_node')

@@ -7,32 +7,42 @@ from collections import Counter
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
-REPEATED_S = 60.0
-"""[s] Interval at which a fault that lasts is logged again."""
-MAX_CORRELATION = 4
-"""Lines within that interval that differ in numbers only, as those of many sensors do."""
+REPEAT_INTERVAL_S = 60.0
+"""[s] Interval at which a lasting fault is logged again."""
+MAX_SIMILAR_LINES = 4
+"""Maximum number of lines within that interval that differ in numbers only, as for many sensors."""
 MAX_FAULTS = 1000
-"""Faults that are remembered; more are those of a loop that makes up names."""
+"""Maximum number of faults remembered; more than that come from names generated without limit."""
 _NUMBER = re.compile(r'[\d.]+')
 
 
 class StatusLog:
-    """Logs what a `DiagnosticStatus` warns of, and that it is over."""
+    """Logs faults from `DiagnosticStatus` messages, and their end.
+
+    Parameters
+    ----------
+    logger : RcutilsLogger
+    """
 
     def __init__(self, logger: RcutilsLogger) -> None:
         self._logger = logger
         self._faulty: set[str] = set()
         self._logged: dict[tuple[str, str], float] = {}
-        self._alike: Counter[str] = Counter()
-        self._alike_since = 0.0
+        self._similar: Counter[str] = Counter()
+        self._similar_since = 0.0
 
     @property
     def n_remembered(self) -> int:
-        """Faults and kinds of lines that are remembered."""
-        return len(self._logged) + len(self._alike)
+        """Number of faults and kinds of lines that are remembered."""
+        return len(self._logged) + len(self._similar)
 
-    def note(self, status: DiagnosticStatus) -> None:
-        """Log a status, where it is news."""
+    def add(self, status: DiagnosticStatus) -> None:
+        """Log a status if it is new.
+
+        Parameters
+        ----------
+        status : DiagnosticStatus
+        """
         subject = str(status.name.rpartition(': ')[2])
         if status.level == DiagnosticStatus.OK:
             if status.name in self._faulty:
@@ -40,30 +50,35 @@ class StatusLog:
                 self._log(DiagnosticStatus.OK, f'{subject}: {status.message} again')
             return
         self._faulty.add(status.name)
-        # The same fault has other numbers every second.
+        # The numbers in the message of a lasting fault change every second.
         fault, now = (status.name, _NUMBER.sub('#', status.message)), time.monotonic()
-        if now - self._logged.get(fault, -REPEATED_S) < REPEATED_S:
+        if now - self._logged.get(fault, -REPEAT_INTERVAL_S) < REPEAT_INTERVAL_S:
             return
         if len(self._logged) >= MAX_FAULTS:
             self._logged.clear()
         self._logged[fault] = now
         self._log(status.level, f'{subject}: {status.message}')
 
-    def tell(self, text: str) -> None:
-        """Log a line of information."""
+    def info(self, text: str) -> None:
+        """Log a line at level INFO.
+
+        Parameters
+        ----------
+        text : str
+        """
         self._log(DiagnosticStatus.OK, text)
 
     def _log(self, level: bytes, text: str) -> None:
-        """Log a line, but of many that are alike only the first."""
+        """Log a line; of many similar ones, only the first."""
         now, pattern = time.monotonic(), _NUMBER.sub('#', text)
-        if now - self._alike_since > REPEATED_S or len(self._alike) >= MAX_FAULTS:
-            self._alike.clear()
-            self._alike_since = now
-        self._alike[pattern] += 1
-        if self._alike[pattern] > MAX_CORRELATION:
+        if now - self._similar_since > REPEAT_INTERVAL_S or len(self._similar) >= MAX_FAULTS:
+            self._similar.clear()
+            self._similar_since = now
+        self._similar[pattern] += 1
+        if self._similar[pattern] > MAX_SIMILAR_LINES:
             return
-        if self._alike[pattern] == MAX_CORRELATION:
-            text += ' (more that are alike are in /diagnostics only)'
+        if self._similar[pattern] == MAX_SIMILAR_LINES:
+            text += ' (further similar messages are in /diagnostics only)'
         if level == DiagnosticStatus.ERROR:
             self._logger.error(text)
         elif level == DiagnosticStatus.OK:

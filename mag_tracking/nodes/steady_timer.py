@@ -10,6 +10,21 @@ from rclpy.timer import Timer
 
 def steady_timer(node: Node, seconds: float, call: Callable[[], None],
                  autostart: bool = True) -> Timer:
-    """A timer that does not follow the time of a recording, which may stand still."""
+    """Create a timer that does not follow simulated time, which may stop.
+
+    Parameters
+    ----------
+    node : Node
+    seconds : float, s
+        Period.
+    call : function
+        Called without arguments.
+    autostart : bool
+        Whether the timer starts immediately.
+
+    Returns
+    -------
+    Timer
+    """
     return node.create_timer(seconds, call, autostart=autostart,
                              clock=Clock(clock_type=ClockType.STEADY_TIME))

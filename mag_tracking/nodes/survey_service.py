@@ -1,4 +1,4 @@
-"""The service `~/survey` of calibration_node: orientations and clocks of a running network."""
+"""Service `~/survey` of calibration_node: orientations and clock offsets of a running network."""
 
 import datetime
 import time
@@ -13,24 +13,51 @@ from mag_tracking.network.file import write_network
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.survey.stage import Survey, with_noise
 
-PAUSE_S = 0.5
-"""[s] Calls that come sooner after the last one are refused: readings wait while it is solved."""
+MIN_INTERVAL_S = 0.5
+"""[s] Minimum interval between calls; readings have to wait while a survey is solved."""
 
 
 class SurveyService:
-    """Solves a survey and saves the network that it found."""
+    """Solves a survey and saves the resulting network.
+
+    Parameters
+    ----------
+    survey : Survey
+        Survey stage.
+    stage : Calibrate
+        Calibration stage.
+    save_as : Path
+        File to which the network is saved.
+    imu_topics : sequence of str
+        Absolute topics of the accelerometers, for messages.
+    """
 
     def __init__(self, survey: Survey, stage: Calibrate, save_as: Path,
                  imu_topics: Sequence[str]) -> None:
         self._survey, self._stage, self._save_as = survey, stage, save_as
         self._imu_topics = imu_topics
-        self._ended = -PAUSE_S
+        self._ended = -MIN_INTERVAL_S
 
     def solve(self, network: SensorNetwork, save: bool,
               response: SurveyMessage.Response) -> SensorNetwork | None:
-        """The network as it was found, or None; the response says what came of it."""
-        if time.monotonic() - self._ended < PAUSE_S:
-            response.message = f'a survey has just run: try again in {PAUSE_S:g} s'
+        """Solve a survey.
+
+        Parameters
+        ----------
+        network : SensorNetwork
+            Network in force.
+        save : bool
+            Also write the resulting network file.
+        response : Survey.Response
+            Filled with the result.
+
+        Returns
+        -------
+        SensorNetwork or None
+            None if the survey failed; `response` contains the reason.
+        """
+        if time.monotonic() - self._ended < MIN_INTERVAL_S:
+            response.message = f'a survey has just been run; try again in {MIN_INTERVAL_S:g} s'
             return None
         try:
             return self._solve(network, save, response)
@@ -39,14 +66,15 @@ class SurveyService:
 
     def _solve(self, network: SensorNetwork, save: bool,
                response: SurveyMessage.Response) -> SensorNetwork | None:
-        """As `solve`, now."""
-        # Of a sensor with a target nearby, the background from before it came.
+        """Solve a survey now."""
+        # For a sensor with a target nearby, this is the background from before its arrival.
         fields = {name: self._stage.background(name)
                   for name, background in self._stage.backgrounds().items()
                   if background.certain and self._stage.last_stamp_ns(name) is not None}
         if not fields or not self._survey.counts['accelerations']:
-            response.message = 'no background has been learnt yet' if not fields else \
-                f'no acceleration has come on {", ".join(filter(None, self._imu_topics))}'
+            response.message = 'no background has been learnt yet; wait for a quiet interval' \
+                if not fields else 'no acceleration received on ' \
+                f'{", ".join(filter(None, self._imu_topics))}'
             return None
         date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
         found = self._survey.solve(fields, date)
@@ -59,10 +87,11 @@ class SurveyService:
                 return None
         response.success = True
         response.message = (
-            'in force'
-            + (f', and saved in {self._save_as}, to be given at the next start' if save else '')
-            + f'; clocks against {found.reference or "none: no knock was felt"}')
+            'result in force'
+            + (f' and saved to {self._save_as}; use that file at the next start' if save else '')
+            + f'; clock reference: {found.reference or "none, no knock was sensed"}')
         response.warnings = found.warnings()
-        response.warnings += [f'{name}: no background has been learnt: its heading stays as stated'
+        response.warnings += [f'{name}: no background has been learnt; its heading stays as in '
+                              'the network file'
                               for name in surveyed.names if name not in fields]
         return surveyed

@@ -1,7 +1,7 @@
-"""tracker_node: frames of the network in, poses and tracks out."""
+"""tracker_node: tracks targets from network frames and publishes their poses."""
 
 if __name__ == '__main__':
-    # Does not return: a signal during the imports below would end in a traceback.
+    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import tracker_node
 
     tracker_node()
@@ -53,8 +53,8 @@ from mag_tracking.nodes.ros_params import fixed_parameter, follow_changes
 from mag_tracking.nodes.stage_node import (
     LATCHED,
     RESULTS,
-    SENT,
     STREAM,
+    STREAM_OUTPUT,
     TRANSFORMS,
     StageNode,
     has_subscribers,
@@ -68,89 +68,107 @@ from mag_tracking.stages.track.running_track import TrackRecord
 from mag_tracking.stages.track.settings import BEST
 from mag_tracking.stages.traffic.stage import TrackedFrame
 
-SLACK_S = 1.0
-"""[s] What the way of a frame may take on top of the longest gap."""
+TRANSPORT_MARGIN_S = 1.0
+"""[s] Margin for the transport of a frame, in addition to the maximum gap."""
 MAX_PATH = 2000
-"""Poses kept in `~/path`."""
+"""Maximum number of poses in `~/path`."""
 
 
 class TrackerNode(StageNode):
-    """The bank of filters behind a topic."""
+    """Tracks targets with a bank of filters and publishes the results.
 
-    def __init__(self, is_fed: bool = False, **node_arguments: Any) -> None:
-        """`is_fed`: frames come by `take_frame`, in the process of the other nodes."""
+    Parameters
+    ----------
+    has_direct_input : bool
+        Whether frames are passed to `receive_frame` within this process, not subscribed to.
+    **node_arguments
+        Arguments of `StageNode`.
+
+    Attributes
+    ----------
+    after_pose : function or None
+        Called once a pose has been published, before everything else; publishes the frame of the
+        pose ahead of the track.
+    """
+
+    def __init__(self, has_direct_input: bool = False, **node_arguments: Any) -> None:
         super().__init__('tracker_node', 'track', **node_arguments)
-        self._is_fed = is_fed
-        self.behind_pose: Callable[[], None] | None = None
-        """Called when a pose is out, before all else: a track follows the frame it is of."""
+        self._has_direct_input = has_direct_input
+        self.after_pose: Callable[[], None] | None = None
         self._stage = TrackManager(self.network, self.settings.track)
         self._traffic = TrafficTopics(self)
         follow_changes(self, self.settings, lambda s: self._stage.configure(s.track))
         self._child_frame = fixed_parameter(
-            self, 'child_frame', '', 'Frame of the target in odometry and transforms, as '
-            'robot_localization wants it; left out: track_<id>.')
+            self, 'child_frame', '', 'Frame of the target in odometry and transforms, for example '
+            'for robot_localization. Empty: track_<id>.')
         self._tf = self.publisher(TFMessage, '/tf', TRANSFORMS) if fixed_parameter(
-            self, 'publish_tf', False, 'Publish the transform from the frame of the network to '
-            'that of the target.') else None
-        self._pose = self.publisher(PoseWithCovarianceStamped, '~/pose', SENT)
+            self, 'publish_tf', False, 'Publish the transform from the world frame to the frame '
+            'of the target.') else None
+        self._pose = self.publisher(PoseWithCovarianceStamped, '~/pose', STREAM_OUTPUT)
         self._odometry = self.publisher(Odometry, '~/odometry', RESULTS)
-        self._tracks = self.publisher(TrackArray, '~/tracks', SENT)
-        self._hypotheses = self.publisher(HypothesisArray, '~/hypotheses', SENT)
+        self._tracks = self.publisher(TrackArray, '~/tracks', STREAM_OUTPUT)
+        self._hypotheses = self.publisher(HypothesisArray, '~/hypotheses', STREAM_OUTPUT)
         self._path_publisher = self.publisher(Path, '~/path', RESULTS)
         self._smoothed_pose = self.publisher(
-            PoseWithCovarianceStamped, '~/pose_smoothed', SENT)
+            PoseWithCovarianceStamped, '~/pose_smoothed', STREAM_OUTPUT)
         self._smoothed = self.publisher(SmoothedTrack, '~/smoothed', RESULTS)
         self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULTS)
-        self._disturbances = self.publisher(DisturbanceMessage, '~/disturbances', SENT)
+        self._disturbances = self.publisher(DisturbanceMessage, '~/disturbances', STREAM_OUTPUT)
         self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
         self._detections_3d = self.publisher(Detection3DArray, '~/detections_3d', RESULTS)
         self._sensor_markers = self.publisher(MarkerArray, '~/sensor_markers', LATCHED)
         self._sensor_markers.publish(to_message(MarkerArray, sensor_markers(self.network)))
-        # The poses of each running track.
+        # Poses of each running track.
         self._paths: dict[int, deque[PoseStamped]] = {}
         self._is_silent, self._latest_id = False, -1
         self._doubtful: dict[str, DoubtfulTimes] = {}
-        if is_fed:
-            self.take_frame = self.direct('detection', [NETWORK_FRAME], self._feed,
-                                          lambda frame: frame.stamp_ns)
+        if has_direct_input:
+            self.receive_frame = self.direct_input('detection', [NETWORK_FRAME], self._feed,
+                                                   lambda frame: frame.stamp_ns)
         else:
-            self.subscription(NetworkFrame, NETWORK_FRAME, self._take, STREAM, source='detection')
+            self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, STREAM,
+                              source='detection')
         steady_timer(self, 0.25, self.end_without_frames)
         self.subscription(CalibrationState, CALIBRATION_STATE, self._calibrated, LATCHED)
         self.report_state()
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """{name: stage} whose counts are published."""
+        """Stages whose counts are published.
+
+        Returns
+        -------
+        dict of str to Stage
+        """
         return {'track': self._stage, 'traffic': self._traffic.stage}
 
     def end_without_frames(self) -> None:
-        """Tell of a track that is lost because no frame comes any more.
+        """End the tracks if frames no longer arrive.
 
-        By when they came: a clock may be behind. A recording may be played as slowly as
-        one likes, or pause.
+        The time of arrival counts, because a clock may be wrong. During a replay nothing is ended,
+        because it may be slow or paused.
         """
         if self._stage.bank is None or self.is_replayed:
             return
-        heard = self.flows['detection'].heard
-        assert heard is not None, 'a track without a frame'
-        silent_s = time.monotonic() - heard
-        # Twice in a row: while the node was busy, frames may have come that wait.
+        last_received = self.flows['detection'].last_received
+        assert last_received is not None, 'a track without a frame'
+        silent_s = time.monotonic() - last_received
+        # Required twice in a row, because frames may be queued while the node is busy.
         was_silent, self._is_silent = self._is_silent, \
-            silent_s > self.settings.track.end_gap_s + SLACK_S
+            silent_s > self.settings.track.end_gap_s + TRANSPORT_MARGIN_S
         if was_silent and self._is_silent:
-            self._publish_all(self._stage.give_up('no frames came'), None)
+            self._publish_all(self._stage.give_up('no frames received'), None)
 
     def _calibrated(self, message: CalibrationState) -> None:
-        """The sensors' orientations, which a survey may have changed, and doubtful backgrounds."""
+        """Apply the orientations of a survey and the doubtful intervals of the backgrounds."""
         try:
             network = with_orientations(self.network, message)
         except RecordingError as error:
             self._stage.counts['rejected: bad calibration'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
-        if not self._is_fed:
-            # The message has the latest stretch of each sensor; frames of others may be on their
-            # way.
+        if not self._has_direct_input:
+            # The message has only the latest interval of each sensor; frames of earlier ones may
+            # still arrive.
             self._doubtful = merged(self._doubtful, doubtful_times(message))
             self._stage.doubt(self._doubtful)
         if _same_orientations(network, self.network):
@@ -158,10 +176,10 @@ class TrackerNode(StageNode):
         self.network = network
         self._stage.use_network(network)
         self._sensor_markers.publish(to_message(MarkerArray, sensor_markers(network)))
-        self.get_logger().info('the next track is of sensors as they were surveyed')
+        self.get_logger().info('surveyed sensor orientations received; used from the next track on')
 
-    def _take(self, message: NetworkFrame) -> None:
-        """One frame."""
+    def _receive(self, message: NetworkFrame) -> None:
+        """Process a network frame."""
         try:
             frame = frame_of(message, self.network)
         except RecordingError as error:
@@ -172,25 +190,28 @@ class TrackerNode(StageNode):
         self._stage.idle()
 
     def doubt(self, times: Mapping[str, DoubtfulTimes]) -> None:
-        """Doubt tracks of frames in which the background of a sensor is doubtful.
+        """Set the intervals with doubtful backgrounds; tracks with such frames are ambiguous.
 
-        `times` {sensor: ((begin, end) [ns], ...)} of all, as `calibration.doubtful_times` has them.
+        Parameters
+        ----------
+        times : mapping of str to DoubtfulTimes
+            Intervals of each sensor.
         """
         self._stage.doubt(times)
 
     def idle(self) -> None:
-        """Do what may wait until the step before has published its results."""
+        """Do work that can wait until the preceding step has published its results."""
         self._stage.idle()
 
     def _feed(self, frame: FieldFrame) -> None:
-        """What follows from a frame, published."""
+        """Process a frame and publish the results."""
         self._publish_all(self._stage.feed(frame), frame)
         if self._stage.clocks_apart:
             self.get_logger().warning(self._stage.clocks_apart, throttle_duration_sec=60.0)
 
     def _publish_all(self, records: list[TrackRecord], frame: FieldFrame | None) -> None:
-        """`Track`s, `SmoothedPose`s and `Disturbance`s of a frame, each where it belongs."""
-        whole = []
+        """Publish the records of a frame on their topics."""
+        complete = []
         for record in records:
             if isinstance(record, Disturbance):
                 self._disturbances.publish(to_message(
@@ -198,34 +219,34 @@ class TrackerNode(StageNode):
             elif not isinstance(record, SmoothedPose):
                 self._publish(record)
             elif record.complete:
-                whole.append(record)
-            # It has no flag, and what else is possible is not smoothed.
+                complete.append(record)
+            # The message has no flag for ambiguity, and other hypotheses are not smoothed.
             elif not record.ambiguous or self.settings.track.ambiguous_poses == BEST:
                 self._smoothed_pose.publish(to_message(
                     PoseWithCovarianceStamped, smoothed_pose_dict(record, self.network.frame)))
-        for id in dict.fromkeys(pose.id for pose in whole):
-            mine = [pose for pose in whole if pose.id == id]
+        for id in dict.fromkeys(pose.id for pose in complete):
+            poses = [pose for pose in complete if pose.id == id]
             self._smoothed.publish(to_message(
-                SmoothedTrack, smoothed_track_dict(mine, self.network.frame)))
-            self._smoothed_path.publish(self._path_of(mine))
-        self._traffic.take(TrackedFrame(frame, records))
+                SmoothedTrack, smoothed_track_dict(poses, self.network.frame)))
+            self._smoothed_path.publish(self._path_of(poses))
+        self._traffic.add(TrackedFrame(frame, records))
 
     def _path_of(self, poses: list[SmoothedPose]) -> Path:
-        """nav_msgs/Path of `SmoothedPose`s, with the header of the latest."""
+        """nav_msgs/Path of smoothed poses, with the header of the latest."""
         steps = [to_message(PoseStamped, pose_dict(p.stamp_ns, self.network.frame, p.position,
                                                    p.orientation)) for p in poses]
         return Path(header=steps[-1].header, poses=steps)
 
     def _publish(self, track: Track) -> None:
-        """Everything about one track at one time."""
+        """Publish the state of a track at one time."""
         frame = self.network.frame
         if not track.ended:
-            # The pose first: it may be steered by.
+            # The pose comes first, because it may be used for control.
             publish_if_any(self._pose, PoseWithCovarianceStamped, pose_message_dict(track, frame))
-        if self.behind_pose is not None:
-            self.behind_pose()
+        if self.after_pose is not None:
+            self.after_pose()
         if not track.ended:
-            # Then the hypotheses: a subscriber of the track has them already.
+            # The hypotheses come before the track, so that its subscribers already have them.
             if has_subscribers(self._hypotheses):
                 self._hypotheses.publish(
                     to_message(HypothesisArray, hypotheses_dict(track, frame)))
@@ -240,10 +261,10 @@ class TrackerNode(StageNode):
             self._markers.publish(to_message(MarkerArray, delete_markers(track, frame)))
         else:
             self._publish_views(track, frame)
-        self._log_life(track)
+        self._log_lifecycle(track)
 
-    def _log_life(self, track: Track) -> None:
-        """Log that a track begins, and that it has ended."""
+    def _log_lifecycle(self, track: Track) -> None:
+        """Log the beginning and the end of a track."""
         if track.id > self._latest_id:
             self._latest_id = track.id
             self.get_logger().info(f'track {track.id} begins' + (
@@ -252,7 +273,7 @@ class TrackerNode(StageNode):
             self.get_logger().info(f'track {track.id} has ended')
 
     def _publish_views(self, track: Track, frame: str) -> None:
-        """Odometry, transform, path and markers of a running track."""
+        """Publish odometry, transform, path and markers of a running track."""
         child_frame = self._child_frame or f'track_{track.id}'
         publish_if_any(self._odometry, Odometry, odometry_dict(track, frame, child_frame))
         if self._tf is not None:
@@ -261,7 +282,7 @@ class TrackerNode(StageNode):
         if track.topic_uncertainty is not None:
             path.append(to_message(PoseStamped, pose_dict(
                 track.stamp_ns, frame, track.position, track.orientation)))
-        # One path fits the topic: that of the track that began first.
+        # The topic carries a single path: that of the oldest running track.
         if path and track.id == min(self._paths) and has_subscribers(self._path_publisher):
             self._path_publisher.publish(Path(header=path[-1].header, poses=list(path)))
         if has_subscribers(self._markers):
@@ -269,18 +290,38 @@ class TrackerNode(StageNode):
 
 
 def publish_if_any(publisher: Publisher, cls: Any, content: MessageDict | None) -> None:
-    """Publish a message of class `cls`, unless it is held back."""
+    """Publish a message unless it is withheld.
+
+    Parameters
+    ----------
+    publisher : Publisher
+    cls : type
+        Class of the message.
+    content : dict or None
+        None publishes nothing.
+    """
     if content is not None:
         publisher.publish(to_message(cls, content))
 
 
 def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:
-    """Whether two networks are turned alike, but for the rounding of quaternions."""
+    """Whether two networks have the same orientations, except for rounding of quaternions."""
     known = [a is b if a is None or b is None else np.allclose(a, b)
              for a, b in zip(one.orientation_std, other.orientation_std, strict=True)]
     return all(known) and bool(np.abs(one.R_ws - other.R_ws).max() < 1e-9)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node; returns the exit status."""
+    """Run the node as a process.
+
+    Parameters
+    ----------
+    arguments : list of str, optional
+        Command line; `sys.argv` by default.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
     return stage_node.main(TrackerNode, arguments)

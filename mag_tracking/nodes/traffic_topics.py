@@ -1,4 +1,4 @@
-"""The topics of the traffic statistics, of the tracker node."""
+"""Topics of the traffic statistics of the tracker node."""
 
 from mag_tracking_msgs.msg import TrafficSummary as TrafficSummaryMessage
 from mag_tracking_msgs.msg import VehiclePassage as VehiclePassageMessage
@@ -7,23 +7,38 @@ from mag_tracking.event_records import VehiclePassage
 from mag_tracking.messages.schema import traffic_summary_dict, vehicle_passage_dict
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
-from mag_tracking.nodes.stage_node import RESULTS, SENT, StageNode
+from mag_tracking.nodes.stage_node import RESULTS, STREAM_OUTPUT, StageNode
 from mag_tracking.stages.traffic.stage import TrackedFrame, Traffic
 
 
 class TrafficTopics:
-    """Counts the vehicles of a tracker node, and publishes passages and summaries."""
+    """Counts the vehicles of a tracker node, and publishes passages and summaries.
+
+    Parameters
+    ----------
+    node : StageNode
+
+    Attributes
+    ----------
+    stage : Traffic
+        Traffic stage.
+    """
 
     def __init__(self, node: StageNode) -> None:
         node.settings = declare_settings(node, node.settings, 'traffic')
         self.stage = Traffic(node.network, node.settings.traffic,
                              node.settings.track.target == 'vehicle')
         self._classes, self._frame = node.settings.traffic.class_names, node.network.frame
-        self._passages = node.publisher(VehiclePassageMessage, '~/passages', SENT)
+        self._passages = node.publisher(VehiclePassageMessage, '~/passages', STREAM_OUTPUT)
         self._summaries = node.publisher(TrafficSummaryMessage, '~/traffic', RESULTS)
 
-    def take(self, item: TrackedFrame) -> None:
-        """Publish what follows from what the tracker made of a frame."""
+    def add(self, item: TrackedFrame) -> None:
+        """Process the records of a frame and publish the results.
+
+        Parameters
+        ----------
+        item : TrackedFrame
+        """
         for record in self.stage.feed(item):
             if isinstance(record, VehiclePassage):
                 self._passages.publish(to_message(VehiclePassageMessage, vehicle_passage_dict(

@@ -126,15 +126,15 @@ class SampleReader:
                  if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD and kind.is_cdr}
         rows = np.flatnonzero(np.isin(block.channel, list(names)))
         fields = magnetic_fields(block.data, block.begin[rows], block.end[rows])
-        rows = rows[fields.is_read]
+        rows = rows[fields.is_decoded]
         # The same sensor may have several channels.
         sensors = tuple(dict.fromkeys(names.values()))
         place = np.zeros(max(names, default=0) + 1, dtype=np.int64)
         place[list(names)] = [sensors.index(name) for name in names.values()]
         C = fields.covariance
         batch = Readings(
-            sensors, place[block.channel[rows]], fields.stamp_ns[fields.is_read],
-            fields.field[fields.is_read], None if C is None else C[fields.is_read])
+            sensors, place[block.channel[rows]], fields.stamp_ns[fields.is_decoded],
+            fields.field[fields.is_decoded], None if C is None else C[fields.is_decoded])
         others = np.setdiff1d(np.arange(len(block)), np.append(rows, self._truth.add_block(block)))
         parts, done = [], 0
         for k in others:

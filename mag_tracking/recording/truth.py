@@ -100,9 +100,9 @@ class TruthTopics:
             rows: IntArray = np.flatnonzero(block.channel == channel)
             if len(rows) and kind.type == POSE and kind.is_cdr and self.accepts(kind.topic, POSE):
                 found = poses(block.data, block.begin[rows], block.end[rows], self._frame)
-                collected.append(rows[found.is_read])
+                collected.append(rows[found.is_decoded])
                 self._rows.setdefault(kind.topic, []).append(
-                    (found.stamp_ns[found.is_read], found.pose[found.is_read]))
+                    (found.stamp_ns[found.is_decoded], found.pose[found.is_decoded]))
         return np.concatenate(collected)
 
     def arrays(self) -> dict[str, Truth]:

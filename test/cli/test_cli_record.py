@@ -40,12 +40,12 @@ def arguments_of(*words):
 
 def test_the_command_in_this_process(tmp_path, monkeypatch, capsys):
     """Lines of progress, a SIGINT, the summary; a best-effort driver's QoS is noted."""
-    monkeypatch.setattr(record_node, 'LINE_S', 0.2)
+    monkeypatch.setattr(record_node, 'PROGRESS_INTERVAL_S', 0.2)
     # So seldom that what came just before the end is fetched at the end.
-    monkeypatch.setattr(record_node, 'POLL_S', 0.5)
+    monkeypatch.setattr(record_node, 'POLL_INTERVAL_S', 0.5)
     stopped, told = threading.Event(), []
-    monkeypatch.setattr(record_node, 'say', lambda text, say=record_node.say: (
-        told.append(text), say(text)))
+    monkeypatch.setattr(record_node, 'log', lambda text, log=record_node.log: (
+        told.append(text), log(text)))
 
     def n_recorded():
         numbers = [re.search(r' s: (\d+) messages', text) for text in told]

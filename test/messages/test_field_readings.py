@@ -86,19 +86,19 @@ def test_some_covariances_known_or_no_sample_is_no_message():
     rng = np.random.default_rng(0)
     for samples in ([], some(2, True, rng) + some(1, False, rng),
                     some(1, False, rng) + some(2, True, rng)):
-        with pytest.raises(RecordingError, match='covariance of all or of none'):
+        with pytest.raises(RecordingError, match='covariances of all readings or of none'):
             readings_dict(batch(samples))
 
 
 @pytest.mark.parametrize('changes, said', [
-    ({'stamp': array('q', [1])}, '2 readings with 1 stamps, 6 numbers'),
-    ({'sensor': array('H', [0])}, '1 readings with 2 stamps'),
-    ({'field': array('d', range(5))}, '5 numbers of their fields'),
-    ({'covariance': array('d', range(9))}, '9 of their covariances'),
-    ({'sensor': array('H', [0, 1])}, 'a reading of sensor 1 of 1'),
-    ({'sensors': []}, 'a reading of sensor 0 of 0'),
-    ({'stamp': array('q', [0, 2**63 - 1])}, 'readings of 0 to 9223372036854775807 ns'),
-    ({'stamp': array('q', [-2**63, 0])}, 'readings of -9223372036854775808')])
+    ({'stamp': array('q', [1])}, 'of 2 readings: got 1 timestamps, 6 field values'),
+    ({'sensor': array('H', [0])}, 'of 1 readings: got 2 timestamps'),
+    ({'field': array('d', range(5))}, '5 field values'),
+    ({'covariance': array('d', range(9))}, '9 covariance values'),
+    ({'sensor': array('H', [0, 1])}, 'sensor index 1 is out of range; there are 1'),
+    ({'sensors': []}, 'sensor index 0 is out of range; there are 0'),
+    ({'stamp': array('q', [0, 2**63 - 1])}, 'timestamps 0 to 9223372036854775807 ns'),
+    ({'stamp': array('q', [-2**63, 0])}, 'timestamps -9223372036854775808')])
 def test_what_does_not_fit_is_told(changes, said):
     content = readings_dict(batch(
         [MagSample(k, 'a', np.ones(3), np.eye(3)) for k in range(2)]))

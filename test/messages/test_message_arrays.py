@@ -41,7 +41,7 @@ def test_all_that_the_decoder_reads_is_read_the_same(frames, known):
          for k in range(40)]
     data = [message(k, frames[k % len(frames)], C[k]) for k in range(40)]
     found, expected = read(data), Readings.joined(decoded(m) for m in data)
-    assert found.is_read.all()
+    assert found.is_decoded.all()
     np.testing.assert_array_equal(found.stamp_ns, expected.stamp_ns)
     np.testing.assert_array_equal(found.field, expected.field)
     assert (found.covariance is None) == (expected.covariance is None)
@@ -71,15 +71,15 @@ def test_what_is_damaged_or_unusual_is_left_to_the_decoder(spoil):
     good = read(data)
     data[2] = spoil(data[2])
     found = read(data)
-    assert found.is_read.tolist() == [True, True, False, True, True]
-    others = found.is_read
+    assert found.is_decoded.tolist() == [True, True, False, True, True]
+    others = found.is_decoded
     np.testing.assert_array_equal(found.field[others], good.field[others])
     np.testing.assert_array_equal(found.stamp_ns[others], good.stamp_ns[others])
 
 
 def test_of_no_message_nothing_is_read():
     found = read([])
-    assert found.is_read.shape == (0,) and found.field.shape == (0, 3)
+    assert found.is_decoded.shape == (0,) and found.field.shape == (0, 3)
     assert found.covariance is None
 
 
@@ -89,8 +89,8 @@ def test_any_bytes_are_read_or_left_out():
     data = [message(k)[:rng.integers(0, 130)] + rng.bytes(int(rng.integers(0, 40)))
             for k in range(2000)]
     found = read(data)
-    for m, is_read, field in zip(data, found.is_read, found.field, strict=True):
-        if is_read:
+    for m, is_decoded, field in zip(data, found.is_decoded, found.field, strict=True):
+        if is_decoded:
             np.testing.assert_array_equal(field, decoded(m).field[0])
 
 
@@ -114,8 +114,8 @@ def test_poses_of_a_frame_are_read_as_by_the_decoder(frame):
     frames = ['map', 'utm', '', 'a', 'a much longer name', 'möp', 'odom']
     data = [pose_message(k, frames[k % len(frames)]) for k in range(28)]
     found = poses_of(data, frame)
-    assert found.is_read.tolist() == [frames[k % len(frames)] == frame for k in range(28)]
-    for k in np.flatnonzero(found.is_read):
+    assert found.is_decoded.tolist() == [frames[k % len(frames)] == frame for k in range(28)]
+    for k in np.flatnonzero(found.is_decoded):
         said = decode(RawMessage('/p', POSE, 0, data[k], schema_of(POSE)))
         p, q = said.pose.position, said.pose.orientation
         assert found.pose[k].tolist() == [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
@@ -130,4 +130,4 @@ def test_poses_of_a_frame_are_read_as_by_the_decoder(frame):
 def test_poses_that_are_damaged_or_unusual_are_left_to_the_decoder(spoil):
     data = [pose_message(k, 'map') for k in range(5)]
     data[2] = spoil(data[2])
-    assert poses_of(data).is_read.tolist() == [True, True, False, True, True]
+    assert poses_of(data).is_decoded.tolist() == [True, True, False, True, True]

@@ -181,9 +181,10 @@ def test_an_attack(ros, place, tmp_path):
 
 @pytest.mark.parametrize('parameter', ['save_as', 'state_file'])
 @pytest.mark.parametrize('name, told', [
-    ('/etc/x.yaml', 'is neither beside the network file'), ('../x.yaml', 'is neither beside'),
-    ('outside/x.yaml', 'is neither beside'), ('..', 'is not the name of a file'),
-    ('network.yaml', 'is the network file itself')])
+    ('/etc/x.yaml', 'must be in the folder of the network file'),
+    ('../x.yaml', 'must be in the folder of'),
+    ('outside/x.yaml', 'must be in the folder of'), ('..', 'is not a file name'),
+    ('network.yaml', 'is the network file, which must not be')])
 def test_a_place_outside_is_refused_at_the_start(place, parameter, name, told):
     here, theirs = place
     with pytest.raises(SettingsError, match=told):
@@ -207,7 +208,7 @@ def created(here, parameter, name):
 def test_a_file_of_somebody_else_is_not_taken_for_backgrounds(place):
     here, _ = place
     (here / 'notes.txt').write_text('theirs')
-    with pytest.raises(SettingsError, match='another file than one with backgrounds'):
+    with pytest.raises(SettingsError, match='exists and is not a file of backgrounds'):
         created(here, 'state_file', 'notes.txt')
     write_backgrounds(here / 'kept.json', {})
     created(here, 'state_file', 'kept.json')

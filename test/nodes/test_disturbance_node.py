@@ -10,7 +10,7 @@ from mag_tracking.event_records import Disturbance
 from mag_tracking.messages.schema import disturbance_dict, readings_dict, stamp_ns
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.stage_node import RESULTS, SENT, STREAM
+from mag_tracking.nodes.stage_node import RESULTS, STREAM, STREAM_OUTPUT
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.units import NS
 from support.bundled import NETWORK_FILE
@@ -32,9 +32,10 @@ def test_the_tracker_publishes_the_disturbance_that_a_replay_finds(ros):
     # A node whose diagnostics come has also found what this one subscribes to.
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: heard.update(
         s.name.split(':')[0].strip('/') for s in m.status), RESULTS)
-    node.create_subscription(DisturbanceMessage, '/tracker_node/disturbances', found.append, SENT)
+    node.create_subscription(DisturbanceMessage, '/tracker_node/disturbances', found.append,
+                             STREAM_OUTPUT)
     node.create_subscription(NetworkFrame, '/network_frame', frames.append, STREAM)
-    publisher = node.create_publisher(FieldReadings, RAW_READINGS, SENT)
+    publisher = node.create_publisher(FieldReadings, RAW_READINGS, STREAM_OUTPUT)
     processes = [start(name, '-p', f'network:={NETWORK_FILE}') for name in NAMES]
     try:
         assert spin_until(lambda: publisher.get_subscription_count() > 0

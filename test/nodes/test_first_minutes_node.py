@@ -61,8 +61,8 @@ class Newcomer:
 
 
 CASES = {
-    'no sensor': (Newcomer(sensors=()), 'is not published'),
-    'one of two missing': (Newcomer(sensors=('mag_1',)), '/mag_2/imu/mag is not published'),
+    'no sensor': (Newcomer(sensors=()), 'has no publisher'),
+    'one of two missing': (Newcomer(sensors=('mag_1',)), '/mag_2/imu/mag has no publisher'),
     'another topic': (Newcomer('{}/magnetic_field'), 'are published on /case_2/mag_1/magnetic_f'),
     'another type': (Newcomer(sensors=()), 'publishes sensor_msgs/msg/Imu on /case_3/mag_1'),
     'gauss': (Newcomer(unit=1e4), 'gauss or microtesla published as tesla'),
@@ -70,7 +70,8 @@ CASES = {
     'time since the device was switched on': (
         Newcomer(behind_ns=time.time_ns() - 100 * 1_000_000_000), 'years behind the clock'),
     'a bag without use_sim_time': (Newcomer(behind_ns=3 * YEAR_NS), 'use_sim_time'),
-    'use_sim_time without a clock': (Newcomer(use_sim_time=True), 'nothing has come on /clock'),
+    'use_sim_time without a clock': (
+        Newcomer(use_sim_time=True), 'no message was received on /clock'),
     'another time zone': (Newcomer(behind_ns=7200 * 1_000_000_000), 'stamps are 7200.')}
 
 

@@ -7,9 +7,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.nodes import flow as module
-from mag_tracking.nodes.flow import MAX_RECORDED, Flow, Listener
+from mag_tracking.nodes.flow import MAX_LATENCIES, Flow, SubscriberMonitor
 from mag_tracking.nodes.stage_node import RESULTS, STREAM
-from mag_tracking.nodes.tracker_node import SLACK_S, TrackerNode
+from mag_tracking.nodes.tracker_node import TRANSPORT_MARGIN_S, TrackerNode
 from mag_tracking.pipeline import settings_for
 from support.bundled import NETWORK_FILE
 from support.node_processes import start, stop
@@ -40,7 +40,7 @@ def test_latency_is_from_the_stamp_to_the_end_of_the_work(clock):
     begin = clock[0]
     for k in range(101):
         clock[0] = begin + 0.01 * k
-        flow.note(10 * NS, 10 * NS + (k - 2) * 1_000_000, clock[0] - 0.002)
+        flow.add(10 * NS, 10 * NS + (k - 2) * 1_000_000, clock[0] - 0.002)
     clock[0] = begin + 1.01
     status = status_of(flow)
     assert status.name == 'me: from a_node' and status.level == DiagnosticStatus.OK
@@ -63,29 +63,30 @@ def test_an_input_that_has_stopped_is_an_error_until_it_is_back(clock):
     first = status_of(flow)
     # At first that may be as it should: the calibration learns.
     assert first.level == DiagnosticStatus.OK and first.message == 'waiting for /a'
-    clock[0] += module.PATIENCE_S
+    clock[0] += module.FIRST_MESSAGE_TIMEOUT_S
     late = status_of(flow, is_there=False)
     assert late.level == DiagnosticStatus.WARN
-    assert late.message == 'nothing has come on /a, which nobody publishes'
-    assert status_of(flow).message == 'nothing has come on /a'
-    flow.note(0, 0, clock[0])
-    clock[0] += module.SILENT_S
+    assert late.message == 'no message received on /a: it has no publisher; start the ' \
+        'node or driver that publishes it'
+    assert status_of(flow).message == 'no message received on /a'
+    flow.add(0, 0, clock[0])
+    clock[0] += module.SILENCE_TIMEOUT_S
     assert status_of(flow).message == 'running'
     clock[0] += 1.0
     silent = status_of(flow)
     # It may have nothing to say.
     assert silent.level == DiagnosticStatus.WARN
-    assert silent.message == 'nothing has come from a_node for 3 s'
+    assert silent.message == 'no message from a_node for 3 s'
     gone = status_of(flow, is_there=False)
     assert gone.level == DiagnosticStatus.ERROR
-    assert gone.message == silent.message + ', and it has gone; does it still run?'
-    flow.note(0, 0, clock[0])
+    assert gone.message == silent.message + ', and its publisher is gone: check that it is running'
+    flow.add(0, 0, clock[0])
     assert status_of(flow).message == 'running'
 
 
 def test_what_did_not_fit_the_queue_is_told_once(clock):
     flow = Flow('a_node')
-    flow.note(0, 0, clock[0])
+    flow.add(0, 0, clock[0])
     flow.n_lost += 7
     status = status_of(flow)
     assert status.level == DiagnosticStatus.WARN and status.message.startswith('7 messages')
@@ -98,10 +99,10 @@ def test_what_did_not_fit_the_queue_is_told_once(clock):
 def test_a_recording_of_old_is_not_late_and_not_live(clock):
     flow = Flow('a_node')
     assert not flow.is_live
-    flow.note(0, 10**18, clock[0])
+    flow.add(0, 10**18, clock[0])
     assert not flow.is_live
     assert values(status_of(flow))['latency, median [ms]'] == 'nan'
-    flow.note(10**18, 10**18 + NS, clock[0])
+    flow.add(10**18, 10**18 + NS, clock[0])
     assert flow.is_live
     status_of(flow)
     assert flow.is_live
@@ -111,33 +112,33 @@ def test_a_recording_of_old_is_not_late_and_not_live(clock):
 def test_a_computer_that_is_too_slow_is_told(clock, busy_s, age_s):
     flow = Flow('a_node')
     clock[0] += 1.0
-    flow.note(10 * NS, round((10 + age_s) * NS), clock[0] - busy_s)
+    flow.add(10 * NS, round((10 + age_s) * NS), clock[0] - busy_s)
     status = status_of(flow)
     assert status.level == DiagnosticStatus.WARN and 'too slow' in status.message
     clock[0] += 1.0
-    flow.note(11 * NS, 11 * NS, clock[0] - 0.01)
+    flow.add(11 * NS, 11 * NS, clock[0] - 0.01)
     assert status_of(flow).level == DiagnosticStatus.OK
 
 
 def test_memory_is_bounded(clock):
     flow = Flow('a_node')
-    for _ in range(MAX_RECORDED + 50):
-        flow.note(0, 0, clock[0])
-    assert flow.n_ages == MAX_RECORDED
-    assert values(status_of(flow))['messages'] == str(MAX_RECORDED + 50)
+    for _ in range(MAX_LATENCIES + 50):
+        flow.add(0, 0, clock[0])
+    assert flow.n_ages == MAX_LATENCIES
+    assert values(status_of(flow))['messages'] == str(MAX_LATENCIES + 50)
 
 
 def test_a_listener_is_missed_when_it_was_there():
-    listener = Listener('tracker', '/network_frame', 'its type')
+    listener = SubscriberMonitor('tracker', '/network_frame', 'its type')
 
     def status(*names):
         return listener.status('me', set(names), lambda name: {
             '/other': {'its type'}, '/second': {'its type', 'more'}}.get(name, set()))
-    assert status('/rviz').message == 'no tracker node subscribes to /network_frame yet'
+    assert status('/rviz').message == 'no tracker node has subscribed to /network_frame yet'
     assert status('/rviz', '/other').message == 'running'
     gone = status('/rviz')
     assert gone.level == DiagnosticStatus.ERROR and gone.name == 'me: to tracker'
-    assert gone.message == '/other has gone; does it still run?'
+    assert gone.message == '/other is gone: check that it is running'
     assert status('/other').level == DiagnosticStatus.OK
     # One that takes its place under another name is as good; what only records is missed by none.
     assert status('/second').level == DiagnosticStatus.OK
@@ -162,19 +163,19 @@ class StandIn:
         for _ in range(round(4 * seconds)):
             self._clock[0] += 0.25
             if frames:
-                self.flows['detection'].note(0, 3600 * NS, self._clock[0])
+                self.flows['detection'].add(0, 3600 * NS, self._clock[0])
             TrackerNode.end_without_frames(self)
 
 
 def test_a_track_ends_when_frames_stop_not_when_they_are_old(clock):
-    end_s = settings_for('magnet').track.end_gap_s + SLACK_S
+    end_s = settings_for('magnet').track.end_gap_s + TRANSPORT_MARGIN_S
     node = StandIn(clock)
     node.ticks(end_s + 5.0, frames=True)
     assert not node.published
     node.ticks(end_s, frames=False)
     assert not node.published
     node.ticks(0.5, frames=False)
-    assert node.published[0] == 'no frames came'
+    assert node.published[0] == 'no frames received'
 
 
 def test_what_waits_while_a_node_is_busy_is_no_silence(clock):

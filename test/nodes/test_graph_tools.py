@@ -76,7 +76,7 @@ def check_parameters(command):
     code, text = command('param', '/lab/calibration_node', 'network')
     assert code == 0 and text.startswith(f'network: {NETWORK_FILE}  (read-only)  # Path'), text
     code, text = command('param', '/lab/calibration_node', 'network', 'other.yaml')
-    assert code == 1 and 'refuses network' in text, text
+    assert code == 1 and 'rejects parameter network' in text, text
     code, text = command('param', '/lab/calibration_node', 'nonsense')
     assert code == 1 and 'has no parameter nonsense' in text, text
 
@@ -88,7 +88,7 @@ def check_lifecycle(command):
     code, text = command('lifecycle', 'driver_node', 'deactivate', *WITHIN)
     assert code == 0 and text.startswith('inactive; possible: '), text
     code, text = command('lifecycle', 'driver_node', 'deactivate', *WITHIN)
-    assert code == 1 and 'deactivate is not possible now, but ' in text, text
+    assert code == 1 and 'deactivate is not possible in the current state; possible: ' in text, text
 
 
 def test_whole_numbers_are_taken_where_others_are_expected(command):
@@ -118,8 +118,8 @@ def test_a_transition_that_takes_long_is_made_once(command):
 @pytest.mark.parametrize('words, told', [
     (('echo', 'a b'), 'topic name'), (('param', '/live/bad name'), 'service name'),
     (('lifecycle', '/1abc', 'activate'), 'service name'), (('echo', '/a', '--count', '0'), '0 is'),
-    (('echo', ''), 'topic name'), (('echo', '/nowhere'), 'nobody publishes /nowhere'),
-    (('param', '/nowhere'), 'there is no service /nowhere/list_parameters')])
+    (('echo', ''), 'topic name'), (('echo', '/nowhere'), '/nowhere has no publisher'),
+    (('param', '/nowhere'), 'service /nowhere/list_parameters not found')])
 def test_what_is_not_there_is_one_line(command, words, told):
     code, text = command(*words)
     assert code == 1 and told in text and 'Traceback' not in text, text

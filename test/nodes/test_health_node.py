@@ -106,7 +106,7 @@ def test_a_parked_car_is_not_swallowed_without_a_word(talking, statuses):
         assert talking(lambda: 'taken for its background' in message('mag_1'), step=1e-6)
         assert 'background' not in message('mag_2')
         state = {v.key: v.value for v in statuses['calibration_node: mag_1'].values}
-        assert state['backgrounds taken anew'] == '1' and state['background'] == 'ready'
+        assert state['backgrounds relearnt'] == '1' and state['background'] == 'ready'
     finally:
         codes, outputs = stop([process])
     assert codes == [0], outputs
@@ -155,7 +155,7 @@ def test_each_sensor_has_its_status(talking, statuses):
         assert talking(lambda: status('mag_1').level == DiagnosticStatus.ERROR,
                        silent=('mag_1', 'mag_2'))
         assert status('mag_1').message.startswith(
-            'nothing has come: /mag_1/imu/mag is not published; start its driver')
+            'no message received: /mag_1/imu/mag has no publisher; start its driver')
         # Long, for one stall of the machine that loses readings counts until so many have come.
         assert talking(lambda: all(values(name)['background'] == 'ready' and status(name).level
                                    == DiagnosticStatus.OK for name in ('mag_1', 'mag_2')),
@@ -249,7 +249,7 @@ def test_another_clock_is_no_step_of_it():
                                 EARTH + 1.2e-8 * rng.standard_normal((2, 3)))
             health.add(readings, k * 10_000_000 + 2_000_000)
     feed(0, 90)
-    health.renew(dataclasses.replace(network, clock_offset=np.array([0.5, -0.5])))
+    health.use_network(dataclasses.replace(network, clock_offset=np.array([0.5, -0.5])))
     feed(90, 300)
     for status in health.statuses('node', stage):
         told = [status.message, *(v.value for v in status.values)]
@@ -276,5 +276,5 @@ def test_what_was_wrong_is_forgotten_after_two_terms(monkeypatch):
             said.append((now[0], [s.message for s in health.statuses('node', stage)]))
     told = [t for t, messages in said if 'taken for its background 1 times' in messages[0]]
     assert 20.0 < min(told) < 35.0
-    assert sensor_health.TERM_S < max(told) - min(told) <= 2.0 * sensor_health.TERM_S + 5.0
+    assert sensor_health.WINDOW_S < max(told) - min(told) <= 2.0 * sensor_health.WINDOW_S + 5.0
     assert said[-1][1] == ['running', 'running']

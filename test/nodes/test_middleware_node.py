@@ -12,7 +12,7 @@ from sensor_msgs.msg import MagneticField
 from mag_tracking.nodes import middleware
 from mag_tracking.nodes.driver_node import DriverNode
 from mag_tracking.nodes.runner import make_nodes
-from mag_tracking.nodes.stage_node import SENT
+from mag_tracking.nodes.stage_node import STREAM_OUTPUT
 from mag_tracking.pipeline import settings_for
 from support.bundled import NETWORK_FILE, ROOT
 from support.node_processes import environment
@@ -73,7 +73,7 @@ def test_a_profile_of_the_user_stays(begun, capfd, own, is_told):
     middleware.begin()
     assert os.environ[middleware.PROFILE_VARIABLE] == own and len(begun) == 1
     told = capfd.readouterr().err
-    assert ('/somewhere/else.xml, which does not exist' in told) == is_told == bool(told)
+    assert ('/somewhere/else.xml does not exist' in told) == is_told == bool(told)
 
 
 def test_a_profile_in_the_working_folder_stays(begun, tmp_path):
@@ -85,7 +85,7 @@ def test_a_profile_in_the_working_folder_stays(begun, tmp_path):
 def test_a_node_that_is_killed_and_started_again_hears_at_once(ros, tmp_path):
     """By itself the middleware often keeps it waiting for 1 to 4 s."""
     node, spin_until = ros
-    publisher = node.create_publisher(MagneticField, '/field', SENT)
+    publisher = node.create_publisher(MagneticField, '/field', STREAM_OUTPUT)
     # So fast that what is kept for those who were killed is full when the next comes.
     node.create_timer(0.005, lambda: publisher.publish(MagneticField()))
     waits = []

@@ -90,7 +90,7 @@ def test_two_networks_on_one_graph(ros, tmp_path, road_network):
         lost.kill()
         lost.communicate(timeout=MAX_S)
         assert spin_until(lambda: statuses['north/watchman: to tracker'].startswith(
-            '/north/follower has gone'))
+            '/north/follower is gone'))
         assert statuses['a/b/watchman: to tracker'] == 'running'
     finally:
         codes, outputs = stop(processes)
@@ -136,8 +136,8 @@ def test_a_recording_of_a_namespace_is_not_played_to_nobody(tmp_path):
                     MagSample(stamp_ns(header.stamp), 'mag_1', [0.0, 0.0, 0.0]), 'mag_1'),
                     message.log_time_ns)
     code, output = run_command('run', '--network', str(NETWORK_FILE), '--recording', str(path))
-    assert code == 1 and 'none of /mag_1/imu/mag, /mag_2/imu/mag; start the nodes in its ' \
-        'namespace: --ros-args -r __ns:=/robot1' in output, output
+    assert code == 1 and 'none of the topics /mag_1/imu/mag, /mag_2/imu/mag; start the ' \
+        'nodes in its namespace: --ros-args -r __ns:=/robot1' in output, output
 
 
 @pytest.mark.parametrize('arguments, told', [

@@ -125,17 +125,17 @@ def test_a_node_is_killed_and_started_again(here, name):
 
 
 @pytest.mark.parametrize('name, by, words', [
-    ('calibration_node', 'detection_node: from calibration', 'nothing has come'),
-    ('detection_node', 'tracker_node: from detection', 'nothing has come'),
-    ('tracker_node', 'detection_node: to tracker', 'tracker_node has gone')])
+    ('calibration_node', 'detection_node: from calibration', 'no message from'),
+    ('detection_node', 'tracker_node: from detection', 'no message from'),
+    ('tracker_node', 'detection_node: to tracker', 'tracker_node is gone')])
 def test_a_dead_node_is_named_by_its_neighbour(here, name, by, words):
     """And of a track that gets no frames any more it is said that it is lost."""
     here.use('mqtt')
     began = call_and_drive_to(here, -4.0)
     killed = time.time_ns()
     here.kill(name)
-    assert here.wait(lambda: here.told(killed, by, words, 'does it still run?'))
-    [(came, status), *_] = here.told(killed, by, words, 'does it still run?')
+    assert here.wait(lambda: here.told(killed, by, words, 'check that it is running'))
+    [(came, status), *_] = here.told(killed, by, words, 'check that it is running')
     assert status.level == DiagnosticStatus.ERROR
     named_s = (came - killed) / NS
     print(f'a dead {name}: named after {named_s:.1f} s')

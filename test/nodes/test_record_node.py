@@ -198,5 +198,5 @@ def test_other_types_are_told(desk):
     finally:
         node.destroy_node()
         context.shutdown()
-    assert d.told == [f'{FIELDS[0]} as std_msgs/msg/Header is not recorded: it is expected as '
+    assert d.told == [f'{FIELDS[0]} as std_msgs/msg/Header is not recorded: the topic has type '
                       'sensor_msgs/msg/MagneticField']

@@ -33,7 +33,7 @@ from support.shared_memory import left_behind, segments_of
 pytestmark = pytest.mark.timeout(600)
 S = 10**9
 COMMAND = ('import argparse, sys; from mag_tracking.cli import record; '
-           'from mag_tracking.nodes import record_node; record_node.LINE_S = 0.2; '
+           'from mag_tracking.nodes import record_node; record_node.PROGRESS_INTERVAL_S = 0.2; '
            'p = argparse.ArgumentParser(); record.add(p.add_subparsers()); '
            'a = p.parse_args(); sys.exit(a.run_command(a))')
 
@@ -44,7 +44,7 @@ def recording_process(out, *options):
         [sys.executable, '-u', '-c', COMMAND, 'record', '--network', NETWORK_FILE, '--out', out,
          *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     line = process.stdout.readline()
-    assert f'recording into {out}' in line, line + process.stdout.read()
+    assert f'recording to {out}' in line, line + process.stdout.read()
     return process
 
 
@@ -151,7 +151,7 @@ def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):
     assert killed - sent[numbers[-1]] < S
     # Received after it was sent, and soon: the time is of the arrival, not of the fetching.
     delays = [m.log_time_ns - sent[k] for m, k in zip(messages, numbers, strict=True)]
-    assert min(delays) > 0 and np.median(delays) < record_node.POLL_S * S / 4
+    assert min(delays) > 0 and np.median(delays) < record_node.POLL_INTERVAL_S * S / 4
     assert repair(tmp_path / 'a', report=lambda _: None) == 1
     with Reader(tmp_path / 'a') as reader:
         assert reader.message_count == len(numbers)

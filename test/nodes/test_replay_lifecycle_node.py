@@ -33,7 +33,7 @@ def test_a_life_cycle(ros):
         found = call(ros, GetState, '/replay_node/get_state', GetState.Request()).current_state.id
         assert found == State.PRIMARY_STATE_UNCONFIGURED
         refused = call(ros, Seek, '/replay_node/seek', Seek.Request(offset=1.0))
-        assert not refused.success and 'configure first' in refused.message
+        assert not refused.success and 'configure the node first' in refused.message
         assert change(Transition.TRANSITION_CONFIGURE)
         assert spin_until(lambda: node.count_publishers('/mag_1/imu/mag') == 1)
         assert not spin_until(lambda: fields, 0.5)

@@ -11,7 +11,7 @@ import pytest
 
 from mag_tracking.errors import MagTrackingError
 from mag_tracking.nodes.core import Deadline, end_within
-from mag_tracking.nodes.shutdown import HUNG, LEAVING_S, shut_down
+from mag_tracking.nodes.shutdown import HUNG_MESSAGE, SHUTDOWN_TIMEOUT_S, shut_down
 from support.bundled import NETWORK_FILE, ROOT
 from support.node_processes import MAX_S, environment
 
@@ -74,19 +74,19 @@ def test_a_node_that_cannot_leave_is_ended_with_its_status():
         # By the stream that has read a line, and may have read more.
         output, errors = process.stdout.read(), process.stderr.read()
         assert process.wait(MAX_S) == 0 and output == 'not flushed', (output, errors)
-    assert time.monotonic() - begin > LEAVING_S
-    assert errors.endswith(HUNG)
+    assert time.monotonic() - begin > SHUTDOWN_TIMEOUT_S
+    assert errors.endswith(HUNG_MESSAGE)
 
 
 def test_an_error_on_its_way_is_printed_before_the_end():
     process = started(['-c', STUCK], 'fails')
     _, errors = process.communicate(timeout=MAX_S)
-    assert process.returncode == 1 and f'RuntimeError: on its way\n{HUNG}' in errors, errors
+    assert process.returncode == 1 and f'RuntimeError: on its way\n{HUNG_MESSAGE}' in errors, errors
 
 
 def test_a_node_that_is_only_half_built_does_not_hold_up_the_end_of_python():
     output, errors = started(['-c', HALF_BUILT]).communicate(timeout=MAX_S)
-    assert (output, errors) == ('there is no such file', HUNG)
+    assert (output, errors) == ('there is no such file', HUNG_MESSAGE)
 
 
 @pytest.mark.parametrize('module, words, status, told', [
@@ -123,7 +123,7 @@ def test_what_was_said_stays_when_the_middleware_hangs(hanging_middleware, modul
         ROS_HOME=os.environ['ROS_HOME'], LD_PRELOAD=str(hanging_middleware)))
     output, errors = process.communicate(timeout=MAX_S)
     assert process.returncode == status and told in output + errors, (output, errors)
-    assert errors.endswith(HUNG), errors
+    assert errors.endswith(HUNG_MESSAGE), errors
 
 
 class Recorded:
@@ -169,10 +169,10 @@ def test_the_doctor_reports_before_it_leaves(monkeypatch, capfd):
     left = []
 
     def reported(nodes, executor, status):
-        left.append((status, 'nothing' in capfd.readouterr().out))
+        left.append((status, 'has no publisher' in capfd.readouterr().out))
         shut_down(nodes, executor, status)
 
-    monkeypatch.setattr(doctor_node, 'leave', reported)
+    monkeypatch.setattr(doctor_node, 'shut_down', reported)
     assert main(['doctor', '--live', '1', '--network', str(NETWORK_FILE)]) == 2
     assert left == [(2, True)]
 
@@ -183,5 +183,5 @@ def test_ros_is_left_in_one_place(path):
     names = {ast.unparse(node) for node in ast.walk(ast.parse(path.read_text()))
              if isinstance(node, ast.Attribute)}
     shutdown = names & {'rclpy.try_shutdown', 'rclpy.shutdown', 'node.destroy_node'}
-    assert shutdown == ({'rclpy.try_shutdown', 'node.destroy_node'} if path.stem == 'leaving'
+    assert shutdown == ({'rclpy.try_shutdown', 'node.destroy_node'} if path.stem == 'shutdown'
                        else set())

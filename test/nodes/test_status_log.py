@@ -4,7 +4,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from mag_tracking.nodes import status_log
-from mag_tracking.nodes.status_log import MAX_FAULTS, REPEATED_S, StatusLog
+from mag_tracking.nodes.status_log import MAX_FAULTS, REPEAT_INTERVAL_S, StatusLog
 
 
 class Logger:
@@ -30,12 +30,12 @@ def log(monkeypatch):
     monkeypatch.setattr(status_log.time, 'monotonic', lambda: now[0])
     statuses = StatusLog(logger)
 
-    def note(seconds, level, message, name='node: mag_1'):
+    def add(seconds, level, message, name='node: mag_1'):
         now[0], logger.lines = seconds, []
-        statuses.note(DiagnosticStatus(level=level, name=name, message=message))
+        statuses.add(DiagnosticStatus(level=level, name=name, message=message))
         return logger.lines
-    note.statuses = statuses
-    return note
+    add.statuses = statuses
+    return add
 
 
 def test_a_fault_is_told_when_it_appears_and_when_it_is_over(log):
@@ -54,7 +54,7 @@ def test_a_fault_that_lasts_or_flickers_is_told_once_a_minute(log):
         level == 'error' for level, _ in log(float(k), DiagnosticStatus.ERROR if k % 3
                                              else DiagnosticStatus.OK, f'silent for {k} s'))]
     assert told[0] == 1 and len(told) == 4
-    assert all(b - a >= REPEATED_S for a, b in zip(told, told[1:], strict=False))
+    assert all(b - a >= REPEAT_INTERVAL_S for a, b in zip(told, told[1:], strict=False))
 
 
 def test_memory_is_bounded(log):
@@ -65,14 +65,14 @@ def test_memory_is_bounded(log):
 
 def test_a_hundred_sensors_with_one_fault_do_not_fill_the_log(log):
     lines = [line for j in range(100) for line in log(
-        0.0, DiagnosticStatus.ERROR, f'nothing has come on /mag_{j}/imu/mag', f'node: mag_{j}')]
-    assert len(lines) == status_log.MAX_CORRELATION
-    assert lines[0] == ('error', 'mag_0: nothing has come on /mag_0/imu/mag')
-    assert lines[-1][1].endswith('(more that are alike are in /diagnostics only)')
+        0.0, DiagnosticStatus.ERROR, f'no message on /mag_{j}/imu/mag', f'node: mag_{j}')]
+    assert len(lines) == status_log.MAX_SIMILAR_LINES
+    assert lines[0] == ('error', 'mag_0: no message on /mag_0/imu/mag')
+    assert lines[-1][1].endswith('(further similar messages are in /diagnostics only)')
     lines = [line for j in range(100) for line in log(
         1.0, DiagnosticStatus.OK, 'running', f'node: mag_{j}')]
-    assert len(lines) == status_log.MAX_CORRELATION
+    assert len(lines) == status_log.MAX_SIMILAR_LINES
     # Another fault is told all the same, and this one in the next minute.
     assert log(2.0, DiagnosticStatus.WARN, 'noisy', 'node: mag_7') == [('warning', 'mag_7: noisy')]
-    assert log(2.0 * REPEATED_S, DiagnosticStatus.ERROR, 'nothing has come on /mag_7/imu/mag',
+    assert log(2.0 * REPEAT_INTERVAL_S, DiagnosticStatus.ERROR, 'no message on /mag_7/imu/mag',
                'node: mag_7')

@@ -62,7 +62,7 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
         assert state[j].clock_offset == found.clock_offset[j]
         assert state[j].calibrated_by == found.calibrated[j].by != ''
     # A tracker that still had the old network would begin with five degrees about each axis.
-    assert 'as they were surveyed' in outputs[2]
+    assert 'surveyed sensor orientations received' in outputs[2]
     first = next(track_of(t) for m in tracks for t in m.tracks if t.status == t.ACTIVE)
     assert (first.mounting_std.min(axis=1) < np.deg2rad(0.4)).all()
 
@@ -77,4 +77,4 @@ def test_a_calibration_of_other_sensors_is_refused(ros):
         spin_until(lambda: False, 1.0)
     finally:
         codes, outputs = stop([process])
-    assert codes == [0] and 'does not fit the network of mag_1, mag_2' in outputs[0], outputs
+    assert codes == [0] and 'the network has mag_1, mag_2' in outputs[0], outputs

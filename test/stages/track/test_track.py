@@ -179,11 +179,11 @@ def test_gaps_and_backward_jumps_end_a_track():
 def test_a_track_may_be_given_up_and_the_next_is_another():
     network, frames, _ = magnet_frames(4)
     stage = TrackManager(network, settings_for('magnet').track)
-    assert stage.give_up('no frames came') == []
+    assert stage.give_up('no frames received') == []
     stage.feed(frames[0])
-    ended = [t for t in stage.give_up('no frames came') if isinstance(t, Track)]
+    ended = [t for t in stage.give_up('no frames received') if isinstance(t, Track)]
     assert [(t.id, t.ended) for t in ended] == [(1, True)] and stage.bank is None
-    assert stage.counts['tracks ended: no frames came'] == 1
+    assert stage.counts['tracks ended: no frames received'] == 1
     assert [(t.id, t.ended) for t in stage.feed(frames[1])] == [(2, False)]
 
 
