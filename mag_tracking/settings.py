@@ -348,26 +348,3 @@ def to_yaml(settings: 'DataclassInstance', node: str = '/**') -> str:
         lines.append(f'{pad}# {p.doc}' + (f' [{"; ".join(notes)}]' if notes else ''))
         lines.append(f'{pad}{leaf}: {_yaml_value(p.value)}')
     return '\n'.join(lines) + '\n'
-
-
-def to_reference(settings: 'DataclassInstance', live: bool = True) -> str:
-    """Format settings as the Markdown table of the parameter reference.
-
-    Parameters
-    ----------
-    settings : dataclass instance
-    live : bool, optional
-        Whether to include the column `live`.
-
-    Returns
-    -------
-    str
-    """
-    head = ['parameter', 'default', 'unit', 'range', *(['live'] if live else []), 'description']
-    lines = [f'| {" | ".join(head)} |', '|' + '---|' * len(head)]
-    for p in flatten(settings):
-        bounds = f'{p.range[0]} .. {p.range[1]}' if p.range else ', '.join(p.choices)
-        row = [f'`{p.name}`', f'`{_yaml_value(p.value)}`', p.unit, bounds,
-               *(['yes' if p.live else ''] if live else []), p.doc.replace('|', '\\|')]
-        lines.append(f'| {" | ".join(row)} |')
-    return '\n'.join(lines) + '\n'

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 POLICIES = ROOT / 'config' / 'security' / 'policies.xml'
 SENSORS = ('mag_1', 'mag_2')
 """Sensors of the bundled network file; the policies have a wildcard in their place."""
-COMMENT = ' Written by tools/generate_policies.py; do not edit. How to use it: docs/ros.md. '
+COMMENT = ' Written by tools/generate_policies.py; do not edit. How to use it: docs/guides/ros.md. '
 RECORDING = ROOT / 'test' / 'data' / 'vehicles' / 'straight_car_right.mcap'
 
 

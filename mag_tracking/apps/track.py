@@ -185,7 +185,7 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
     target : 'vehicle' or 'magnet'
     settings : {name: value}, optional
         What differs from the defaults of the target, such as {'track.iterations': 5};
-        docs/parameters.md has all names.
+        config/default.yaml lists all names.
 
     Returns
     -------
