@@ -72,7 +72,8 @@ def main():
         run = archive([ROOT / 'test' / 'data' / 'vehicles'],
                       mt.read_network(ROOT / 'config' / 'network.yaml'), settings_for('vehicle'),
                       folder, workers=2, report=print)
-        print(f'{len(run.done)} recordings tracked into {folder}, {len(run.were_done)} were there')
+        print(f'{len(run.done)} recordings tracked into {folder}, '
+              f'{len(run.already_done)} skipped')
     connection = tables_of(folder)
     for question, sql in QUESTIONS.items():
         print(f'\n{question}\n{connection.sql(sql)}')

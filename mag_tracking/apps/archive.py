@@ -34,7 +34,7 @@ class ArchiveRun:
 
     done: list[Path] = field(default_factory=list)
     """Recordings that were tracked."""
-    were_done: list[Path] = field(default_factory=list)
+    already_done: list[Path] = field(default_factory=list)
     """Those that an earlier run had tracked."""
     failed: dict[Path, str] = field(default_factory=dict)
     """{recording: why it was not tracked}."""
@@ -153,7 +153,7 @@ def archive(recordings: Iterable[str | PathLike[str]],
             if known is None:
                 todo.append(path)
             else:
-                run.were_done.append(path)
+                run.already_done.append(path)
                 if progress is not None:
                     progress(known['size'])
         try:

@@ -50,7 +50,7 @@ class GeometrySurvey:
     """(sensor, axes) that never reported, of sensors that did."""
 
     @property
-    def turned(self) -> FloatArray:
+    def rotation_angle(self) -> FloatArray:
         """(n,) [rad] from the stated orientations."""
         trace: FloatArray = np.einsum('nij,nij->n', self.stated.R_ws, self.network.R_ws)
         return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))

@@ -18,7 +18,7 @@ LOW_SHARE = 0.02
 
 
 def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
-    """Write `report.html` with the lines of `answers` into folder `out`; returns its path.
+    """Write `report.html` with the lines of `summary_lines` into folder `out`; returns its path.
 
     Raises OutputError.
     """
@@ -27,7 +27,7 @@ def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
     return path
 
 
-def answers(p: Plan) -> list[str]:
+def summary_lines(p: Plan) -> list[str]:
     """Summary of a plan, one line per result."""
     noise, out = float(np.median(p.sampling.noise_std)), list[str]()
     out.append(f'{len(p.network)} sensors, noise of a frame {1e9 * noise:.2g} nT; '

@@ -72,7 +72,7 @@ class _Survey(Protocol):
     def suspect_rows(self) -> tuple[int, ...]: ...
 
     @property
-    def turned(self) -> FloatArray: ...
+    def rotation_angle(self) -> FloatArray: ...
 
 
 def geometry_figure(found: _Survey) -> Figure:
@@ -95,7 +95,8 @@ def geometry_figure(found: _Survey) -> Figure:
     moved = found.network.positions - found.stated.positions
     _spread(rows[0], along, 1e3 * np.linalg.norm(moved, axis=1), 1e3 * g.position_std,
             'moved [mm]')
-    _spread(rows[1], along, np.rad2deg(found.turned), np.rad2deg(g.rotation_std), 'turned [deg]')
+    _spread(rows[1], along, np.rad2deg(found.rotation_angle), np.rad2deg(g.rotation_std),
+            'turned [deg]')
     rows[2].errorbar(along, g.gain, yerr=SCALE_1D * g.gain_std, fmt='o', ms=4, capsize=2,
                      color='tab:blue')
     rows[2].axhline(1.0, color='k', lw=0.8, ls=':')

@@ -127,7 +127,7 @@ def test_an_archive_of_recordings(tmp_path, recordings, capsys):
 
     written = {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')}
     again = archive([recordings / '*.mcap', recordings / 'below'], NETWORK_FILE, settings, out)
-    assert sorted(again.were_done) == sorted(run.done) and not again.done
+    assert sorted(again.already_done) == sorted(run.done) and not again.done
     assert {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')} == written
     assert len(rows(out, 'recordings')) == 4
 
@@ -153,7 +153,7 @@ def test_a_run_that_is_stopped_is_gone_on_with(tmp_path, recordings, whole):
     assert first.interrupted and 1 <= len(first.done) < 3
     second = archive([recordings], NETWORK_FILE, settings, out)
     assert not second.interrupted and len(second.done) + len(first.done) == 3
-    assert sorted(second.were_done) == sorted(first.done)
+    assert sorted(second.already_done) == sorted(first.done)
     assert same_tables(out, whole)
 
 

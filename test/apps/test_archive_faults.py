@@ -194,7 +194,7 @@ def test_a_recording_that_grows_while_it_is_tracked_is_tracked_again(tmp_path):
     archive([path], NETWORK_FILE, settings, out, stopped=grows)
     second = archive([path], NETWORK_FILE, settings, out)
     assert len(second.done) == 1 and second.tracks == 1
-    assert archive([path], NETWORK_FILE, settings, out).were_done == [path]
+    assert archive([path], NETWORK_FILE, settings, out).already_done == [path]
 
 
 def test_nothing_of_another_state_of_a_recording_is_used(tmp_path):

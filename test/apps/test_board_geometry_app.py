@@ -101,7 +101,7 @@ def test_rows_of_unknown_poses(tmp_path):
     magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0), MOMENT)
     r = magnet.poses(x[1], x[2])[0][found.rows - 2]
     assert np.median(np.linalg.norm(found.geometry.poses[0] - r, axis=1)) < 3e-3
-    np.testing.assert_allclose(found.turned, np.linalg.norm(
+    np.testing.assert_allclose(found.rotation_angle, np.linalg.norm(
         [rotation_vector(a.T @ b) for a, b in zip(stated.R_ws, found.network.R_ws, strict=True)],
         axis=1), rtol=1e-6)
 
