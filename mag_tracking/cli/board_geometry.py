@@ -78,7 +78,7 @@ def add(commands: Commands) -> None:
         p.add_argument(name, nargs=3, type=float, metavar=('X', 'Y', 'Z'),
                        help=f'{corner} corner of the box that contains the magnet [m]')
     p.add_argument('--params', type=Path, metavar='FILE',
-                   help='parameter file with the settings that differ from the defaults')
+                   help='YAML file with the settings to override')
     p.add_argument('--figure', type=Path, metavar='FILE',
                    help='draw the estimated geometry (.png, .pdf)')
 

@@ -28,9 +28,10 @@ Estimates the orientation of each sensor (accelerometer and compass), its clock 
 twice, at uneven intervals, so that all sensors are shaken) and its noise, from a recording that
 begins without a target. Checks that all sensors measure the same Earth field, and reports flipped
 or swapped axes and wrong units. Passing vehicles improve the headings (disable with --no-passes).
-A bias of 0.6 uT rotates a compass heading by two degrees, so that the standard deviations are
-written to the network file and used by the tracker. The orientations stated by hand are kept in
-the file, and the next calibration starts from them. Exit status 2 if a sensor must be wrong.
+Headings remain uncertain (a bias of 0.6 uT rotates a compass by two degrees): their standard
+deviations are written to the network file and used by the tracker. Orientations stated by hand are
+kept in the file, and the next calibration starts from them. Exit status 2 if a sensor must be
+wrong.
 
 The network file must contain the Earth's field, as earth_field (tesla) or as site:
   site: {latitude: 58.4, longitude: 15.6, height: 60, date: 2026-05-01, x_azimuth_deg: 90}

@@ -70,7 +70,7 @@ def add(commands: Commands) -> None:
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
-    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
+    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
     p.add_argument('--orders', nargs='+', type=int, default=[1, 2, 3, 4], metavar='N',
                    help='numbers of dipoles to try (default: 1 2 3 4)')
     p.add_argument('--cpa-range', nargs=2, type=float, metavar=('RANGE', 'STD'),
@@ -79,7 +79,7 @@ def add(commands: Commands) -> None:
     p.add_argument('--same-vehicle', action='store_true',
                    help='estimate hard and soft iron, assuming one vehicle in all passes')
     p.add_argument('--params', type=Path, metavar='FILE',
-                   help='parameter file with the settings that differ from the defaults')
+                   help='YAML file with the settings to override')
     p.add_argument('--no-figures', action='store_true', help='do not draw figures')
 
 

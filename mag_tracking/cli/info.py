@@ -17,7 +17,8 @@ def add(commands: Commands) -> None:
     commands : Commands
     """
     p = add_command(commands, 'info', _info)
-    p.add_argument('recording', type=Path, metavar='RECORDING')
+    p.add_argument('recording', type=Path, metavar='RECORDING',
+                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_network(p, False, 'report which topics of this network are recorded')
 
 

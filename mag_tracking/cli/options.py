@@ -69,7 +69,7 @@ def add_recorded_network(parser: argparse._ActionsContainer) -> None:
     """
     add_network(parser)
     parser.add_argument('--namespace', metavar='NAMESPACE', help='namespace of the relative topics '
-                        'in the network file, for a recording with several (e.g. /robot1)')
+                        'in the network file (e.g. /robot1), if the recording contains several')
 
 
 def recorded_network(args: argparse.Namespace) -> SensorNetwork:

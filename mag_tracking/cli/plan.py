@@ -20,8 +20,8 @@ from mag_tracking.settings import read_parameter_file
 _PLAN = '''
 Predicts, before installation, the position accuracy, the detection probability, and the best place
 for an additional sensor. The accuracies are Cramer-Rao bounds for a point target at constant
-speed, which no unbiased estimator exceeds. Errors beyond the noise (clocks, mountings, extended
-vehicles) are modelled as a relative error of the field (--field-error).
+speed: a good estimator approaches them, and none exceeds them. Errors beyond the noise (clocks,
+mountings, extended vehicles) are modelled as a relative error of the field (--field-error).
 
 files written to DIR:
   plan_position.png    map: standard deviation of the position from a whole pass
@@ -48,7 +48,7 @@ def add(commands: Commands) -> None:
     """
     p = add_command(commands, 'plan', _plan, _PLAN)
     add_network(p)
-    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
+    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
     p.add_argument('--target', metavar='KIND', help='small, car or truck: moment and height of '
                    'this kind of vehicle in the settings (default: car); or magnet')
     p.add_argument('--moment', type=float, metavar='A_M2',
@@ -76,7 +76,7 @@ def add(commands: Commands) -> None:
     p.add_argument('--grid', type=int, default=41, metavar='N',
                    help='number of points along the longer side of the maps (default: 41)')
     p.add_argument('--params', type=Path, metavar='FILE',
-                   help='parameter file with the settings that differ from the defaults')
+                   help='YAML file with the settings to override')
 
 
 def _inputs(args: argparse.Namespace, network: SensorNetwork, settings: Settings) -> PlanInputs:

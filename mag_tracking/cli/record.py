@@ -36,7 +36,7 @@ def add(commands: Commands) -> None:
     p = add_command(commands, 'record', _record, _RECORD)
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR',
-                   help='folder for the recording')
+                   help='output folder')
     p.add_argument('--topics', nargs='+', default=[], metavar='TOPIC',
                    help='record these topics as well')
     p.add_argument('--results', action='store_true',

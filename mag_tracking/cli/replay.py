@@ -52,8 +52,8 @@ examples:
   mag-tracking replay magnet/ --network magnet/network.yaml --target magnet --out out
   mag-tracking replay night.mcap --network site.yaml --params mine.yaml --out out
 
-A parameter file contains the settings that differ from the defaults. config/default.yaml
-describes all settings. Example:
+The file of --params contains only the settings to override; config/default.yaml describes all
+settings. Example:
   track:
     vehicle:
       arrival_names: ['east', 'west']
@@ -84,7 +84,7 @@ def add(commands: Commands) -> None:
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
-    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
+    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
     add_settings(p)
     p.add_argument('--truth', metavar='TOPIC|FILE.csv', help='ground truth: a topic '
                    'with PoseStamped, PoseWithCovarianceStamped or Odometry, or a CSV table with '

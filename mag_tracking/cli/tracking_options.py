@@ -15,7 +15,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
     """
     parser.add_argument('--params', type=Path, metavar='FILE',
-                        help='parameter file with the settings that differ from the defaults')
+                        help='YAML file with the settings to override')
     parser.add_argument('--target', choices=list(TARGET_DEFAULTS), default='vehicle',
                         help='type of target (default: vehicle)')
 

@@ -45,7 +45,7 @@ def archived(folder, recording, network, settings, in_order=True):
     work = folder / 'unfinished'
     work.mkdir(parents=True)
     job = Job(recording, work, folder, network, settings)
-    segments = range(cut(job)['stretches'])
+    segments = range(cut(job)['segments'])
     for k in segments if in_order else reversed(segments):
         track_segment(job, k)
     return join(job), len(segments)
@@ -75,7 +75,7 @@ def assert_rows_of_replay(folder, result):
 def test_a_recording_that_is_cut_gives_the_rows_of_one_that_is_not(
         tmp_path, monkeypatch, road_network_file):
     monkeypatch.setattr(archive_segments, 'FEWEST', 60)
-    monkeypatch.setattr(archive_segments, 'PIECE', 50)
+    monkeypatch.setattr(archive_segments, 'CHUNK_FRAMES', 50)
     settings, network = settings_for('vehicle', QUICK), read_network(road_network_file)
     known, n = archived(tmp_path, ROAD, network, settings, in_order=False)
     result = mt.track(ROAD, network, settings=QUICK)
@@ -198,7 +198,7 @@ def frames(*segments):
 @pytest.mark.parametrize('quiet_s, n', [(0.5, 1), (2.5, 1), (3.5, 2), (30.0, 2)])
 def test_stretches_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quiet_s, n):
     monkeypatch.setattr(archive_segments, 'FEWEST', 10)
-    monkeypatch.setattr(archive_segments, 'PIECE', 7)
+    monkeypatch.setattr(archive_segments, 'CHUNK_FRAMES', 7)
     given = frames((20.0, False), (2.0, True), (quiet_s, False), (2.0, True), (9.0, False))
     writer = SegmentWriter(tmp_path, 3.0)
     for f in given:
@@ -206,14 +206,14 @@ def test_stretches_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quie
     writer.close()
     assert writer.n_segments == n
     for k in range(n):
-        kept = [f for piece in read_segment(tmp_path / f'stretch-{k}.pickle')
+        kept = [f for piece in read_segment(tmp_path / f'segment-{k}.pickle')
                 for f, _ in piece.frames()]
         first = next(i for i, f in enumerate(kept) if f.target_present)
         # All frames that a track may look back to, and the one that ends it.
         assert kept[first].stamp_ns - kept[0].stamp_ns in (3_000_000_000, 3_100_000_000)
         assert not kept[-1].target_present
     assert max(len(p.stamp_ns) for k in range(n) for p in read_segment(
-        tmp_path / f'stretch-{k}.pickle')) <= 7 + 31
+        tmp_path / f'segment-{k}.pickle')) <= 7 + 31
 
 
 def test_a_time_that_jumps_back_between_stretches_blocks_nothing(tmp_path):
