@@ -82,10 +82,10 @@ def test_two_archives_into_one_folder(tmp_path, recordings):
 
 
 def test_a_scheduler_that_does_not_answer(tmp_path, recordings, monkeypatch):
-    monkeypatch.setattr(cluster, 'PATIENCE_S', 1.0)
+    monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT_S', 1.0)
     settings = settings_for('vehicle', QUICK)
-    for address, why in ((f'tcp://127.0.0.1:{free_port()}', 'no Dask scheduler answers'),
-                         ('nonsense://x', 'no Dask scheduler answers')):
+    for address, why in ((f'tcp://127.0.0.1:{free_port()}', 'no response from a Dask scheduler'),
+                         ('nonsense://x', 'no response from a Dask scheduler')):
         with pytest.raises(ClusterError, match=why):
             archive([recordings], NETWORK_FILE, settings, tmp_path / 'out', scheduler=address)
 
@@ -96,8 +96,8 @@ def test_a_scheduler_without_workers_and_with(tmp_path, recordings, monkeypatch)
     settings = settings_for('vehicle', QUICK)
     with LocalCluster(n_workers=0, processes=True, dashboard_address=None,
                       threads_per_worker=1) as there:
-        monkeypatch.setattr(cluster, 'PATIENCE_S', 1.0)
-        with pytest.raises(ClusterError, match='the scheduler has no worker'):
+        monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT_S', 1.0)
+        with pytest.raises(ClusterError, match='the scheduler has no workers'):
             archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
                     scheduler=there.scheduler_address)
         monkeypatch.undo()
@@ -125,7 +125,7 @@ def test_a_client_that_failed_does_not_hold_up_the_next(tmp_path, recordings, mo
                       threads_per_worker=1) as there:
         gc.disable()
         try:
-            with pytest.raises(ClusterError, match='no Dask scheduler answers'):
+            with pytest.raises(ClusterError, match='no response from a Dask scheduler'):
                 archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
                         scheduler='nonsense://x')
             monkeypatch.setattr(IOLoop, 'current', collecting)
