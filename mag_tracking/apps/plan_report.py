@@ -56,8 +56,8 @@ def summary_lines(p: Plan) -> list[str]:
         One line per result.
     """
     noise, out = float(np.median(p.sampling.noise_std)), list[str]()
-    out.append(f'{len(p.network)} sensors, noise of a frame {1e9 * noise:.2g} nT; '
-          f'target of {p.target.moment:g} A m^2 at {p.target.speed:g} m/s')
+    out.append(f'{len(p.network)} sensors, {1e9 * noise:.2g} nT noise per frame; '
+               f'target with {p.target.moment:g} A m^2 at {p.target.speed:g} m/s')
     o = p.observability
     seen = (f'not observable: {", ".join(o.unobservable)}' if o.unobservable
             else f'observable, condition number {o.condition_number:.3g}')
@@ -75,7 +75,7 @@ def summary_lines(p: Plan) -> list[str]:
                    f'(filter), {f_text(lane.pass_std[closest, 0])} (whole pass)')
     caught = p.missed[p.missed[:, 1] < 0.01, 0]
     out.append(f'99% of passes are detected up to {caught.max():.3g} m from the centre'
-               if len(caught) else '99% of passes are detected nowhere')
+               if len(caught) else 'the detection probability of a pass is below 99% everywhere')
     out.append('(bounds for a point target; errors with real vehicles are several times larger)')
     if not np.isfinite(p.with_one_more).any():
         out.append('additional sensor: the area has no place clear of the lanes')

@@ -181,7 +181,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path, recordings):
     # As a terminal does it: to all processes.
     os.killpg(process.pid, signal.SIGINT)
     text, errors = process.communicate(timeout=60)
-    assert process.returncode == 130 and 'the same command goes on' in text, errors
+    assert process.returncode == 130 and 'run the same command to continue' in text, errors
     assert 'Traceback' not in errors
 
 

@@ -168,7 +168,7 @@ def test_names_of_recordings(tmp_path, recordings):
     (tmp_path / 'bag' / 'metadata.yaml').write_text('')
     assert recordings_of([tmp_path]) == [(tmp_path / 'bag').resolve()]
     for nothing in (tmp_path / 'none', tmp_path / '*.bag', recordings / 'notes.txt'):
-        with pytest.raises(RecordingError, match='there is no recording'):
+        with pytest.raises(RecordingError, match='no recording found'):
             recordings_of([nothing])
 
 
@@ -178,7 +178,7 @@ def test_command_line_errors(tmp_path, recordings, capsys):
     assert main([*words, '--workers', '0']) == 1
     assert '--workers: expected 1 or more' in capsys.readouterr().err
     assert main(['archive', str(tmp_path / 'none'), *words[2:]]) == 1
-    assert 'there is no recording' in capsys.readouterr().err
+    assert 'no recording found' in capsys.readouterr().err
 
 
 def test_a_recording_that_grows_while_it_is_tracked_is_tracked_again(tmp_path):

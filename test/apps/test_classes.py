@@ -77,7 +77,7 @@ def test_intervals_of_a_recording(tmp_path):
 @pytest.mark.parametrize(('rows', 'why'), [
     ([('car', 5, 9), ('truck', 8, 11)], 'rows 2 and 3 overlap'),
     ([('', 5, 9)], 'row 2: the label is empty'), ([('car', 9, 5)], 'ends before it begins'),
-    ([('car', 5000, 5009)], 'no readings in the interval')])
+    ([('car', 5000, 5009)], 'the interval contains no readings')])
 def test_bad_intervals_are_named(tmp_path, rows, why):
     with pytest.raises(LabelsError, match=why):
         labelled_signatures(vehicle_path('straight_car_right'),

@@ -56,13 +56,13 @@ def test_enrolled_vehicles_are_recognised(recordings, tmp_path, capsys):
 def test_what_cannot_be_enrolled_is_named(recordings, tmp_path, capsys):
     file = tmp_path / 'fleet.json'
     assert command(recordings['van_east'], '--enrol', 'van') == 1
-    assert '--fleet names the file' in capsys.readouterr().err
+    assert '--enrol: give the fleet file with --fleet' in capsys.readouterr().err
     for name in ('', '  ', UNKNOWN):
         assert command(recordings['van_east'], '--fleet', str(file), '--enrol', name) == 1
-        assert f'--enrol: {name!r} is not a name' in capsys.readouterr().err
+        assert f'--enrol: {name!r} is not a valid name' in capsys.readouterr().err
     assert command(str(DATA / 'two_way_road' / 'two_way_road_start.mcap'), '--fleet', str(file),
                    '--enrol', 'van') == 1
-    assert 'expected one vehicle to enrol, 0 crossed' in capsys.readouterr().err
+    assert 'expected exactly one vehicle to enrol, but 0 crossed' in capsys.readouterr().err
     assert not file.exists()
     for text in ('{}', '[]', '{"mag_tracking.fleet": 1, "vehicles": {"a": [{"moment": [1]}]}}',
                  'nothing'):

@@ -103,7 +103,7 @@ def test_a_parked_car_is_not_swallowed_without_a_word(talking, statuses):
 
     try:
         assert talking(lambda: background('mag_1') == background('mag_2') == 'ready')
-        assert talking(lambda: 'taken for its background' in message('mag_1'), step=1e-6)
+        assert talking(lambda: 'became its background' in message('mag_1'), step=1e-6)
         assert 'background' not in message('mag_2')
         state = {v.key: v.value for v in statuses['calibration_node: mag_1'].values}
         assert state['backgrounds taken anew'] == '1' and state['background'] == 'ready'

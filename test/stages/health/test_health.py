@@ -278,10 +278,10 @@ def test_clocks_that_are_far_apart_are_named_but_not_those_of_a_replay():
 def test_the_doctor_looks_at_backgrounds():
     # What was seen for a moment only would give way earlier.
     steps = doctored(lambda k, field: field + 1e-6 * (k > 1000), seconds=75.0)
-    assert len(steps) == 2 and 'its background has not been learnt for 5' in steps[1]
+    assert len(steps) == 2 and 'its background has been frozen for 5' in steps[1]
     assert 'its background is doubtful' in steps[0]
     parked = doctored(lambda k, field: field + 1e-6 * (k > 1000), seconds=155.0)
-    assert len(parked) == 1 and 'was taken for its background 1 times' in parked[0]
+    assert len(parked) == 1 and 'became its background 1 times' in parked[0]
     early = doctored(seconds=2.0)
     assert len(early) == 3 and all('no background was learnt' in text for text in early)
 
@@ -310,12 +310,12 @@ def test_the_command(tmp_path, capsys):
     arguments = ['doctor', '--network', str(NETWORK_FILE)]
     assert main([*arguments, str(vehicle_path('straight_car_right'))]) == 0
     said = capsys.readouterr().out
-    assert 'nothing is wrong' in said and '100.0 Hz      0 lost' in said
+    assert 'no faults found' in said and '100.0 Hz      0 lost' in said
     assert main(arguments) == 1
     assert main([*arguments, 'x.mcap', '--live', '3']) == 1
-    assert capsys.readouterr().err.count('either a RECORDING or --live SECONDS') == 2
+    assert capsys.readouterr().err.count('give either RECORDING or --live SECONDS') == 2
     assert main([*arguments, '--live', '0']) == 1
-    assert 'is not between 1 and 86400 s' in capsys.readouterr().err
+    assert '--live: expected 1 to 86400 s, got 0' in capsys.readouterr().err
 
 
 def test_the_command_on_one_silent_sensor(tmp_path, capsys):
