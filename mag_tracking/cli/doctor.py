@@ -83,7 +83,7 @@ def _report(args: argparse.Namespace, doctor: Doctor, more: list[Finding],
         print(f'{name:11s} {_row(health)}')
     findings = sorted(more + doctor.findings(), key=lambda f: not f.serious)
     for finding in findings:
-        print(f'{"WRONG" if finding.serious else "note "} {finding.subject}: {finding.what}\n'
+        print(f'{"ERROR" if finding.serious else "note "} {finding.subject}: {finding.what}\n'
               f'      {finding.advice}')
     if not findings:
         print('no faults found')

@@ -208,7 +208,7 @@ def line_of(vehicle: CountedVehicle) -> str:
     """
     p = vehicle.passage
     at = datetime.fromtimestamp(p.stamp_ns / NS, tz=timezone.utc)
-    error = '' if np.isnan(p.direction_error) else f' (P_E {p.direction_error:.3f})'
+    error = '' if np.isnan(p.direction_error) else f' (error probability {p.direction_error:.3f})'
     known = f'{p.vehicle_class} ({p.class_probabilities.max():.0%})'
     length = f', {p.length:.1f} m' if p.length else ''
     headway = '' if np.isnan(p.headway) else f', headway {p.headway:.1f} s'

@@ -74,7 +74,7 @@ def assert_rows_of_replay(folder, result):
 
 def test_a_recording_that_is_cut_gives_the_rows_of_one_that_is_not(
         tmp_path, monkeypatch, road_network_file):
-    monkeypatch.setattr(archive_segments, 'FEWEST', 60)
+    monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 60)
     monkeypatch.setattr(archive_segments, 'CHUNK_FRAMES', 50)
     settings, network = settings_for('vehicle', QUICK), read_network(road_network_file)
     known, n = archived(tmp_path, ROAD, network, settings, in_order=False)
@@ -89,7 +89,7 @@ def test_a_recording_that_is_cut_gives_the_rows_of_one_that_is_not(
 def test_clocks_that_are_apart_are_remembered_from_stretch_to_stretch(
         tmp_path, monkeypatch, road_network_file, ahead_s):
     """Tracks are doubted then, by the passes of all stretches before."""
-    monkeypatch.setattr(archive_segments, 'FEWEST', 60)
+    monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 60)
     path = tmp_path / 'network.yaml'
     text = road_network_file.read_text()
     path.write_text(text.replace('mag_2:', f'mag_2:\n    clock_offset: {ahead_s}'))
@@ -168,7 +168,7 @@ def test_a_run_that_is_killed_is_gone_on_with(tmp_path, recordings, whole):
     process.kill()
     process.communicate()
     done = subprocess.run(words, capture_output=True, text=True)
-    assert done.returncode == 1 and '1 failed' in done.stdout, done.stderr
+    assert done.returncode == 1 and 'recordings failed: 1' in done.stdout, done.stderr
     assert same_tables(out, whole)
 
 
@@ -197,7 +197,7 @@ def frames(*segments):
 
 @pytest.mark.parametrize('quiet_s, n', [(0.5, 1), (2.5, 1), (3.5, 2), (30.0, 2)])
 def test_stretches_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quiet_s, n):
-    monkeypatch.setattr(archive_segments, 'FEWEST', 10)
+    monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 10)
     monkeypatch.setattr(archive_segments, 'CHUNK_FRAMES', 7)
     given = frames((20.0, False), (2.0, True), (quiet_s, False), (2.0, True), (9.0, False))
     writer = SegmentWriter(tmp_path, 3.0)
@@ -221,7 +221,7 @@ def test_a_time_that_jumps_back_between_stretches_blocks_nothing(tmp_path):
     for f in frames((60.0, False)) + frames((60.0, False), (2.0, True), (9.0, False)):
         writer.add_frame(f, {})
     writer.close()
-    kept = [f for p in read_segment(tmp_path / 'stretch-0.pickle') for f, _ in p.frames()]
+    kept = [f for p in read_segment(tmp_path / 'segment-0.pickle') for f, _ in p.frames()]
     assert len(kept) == 31 + 20 + 1
     assert not (tmp_path / 'stretch-1.pickle').exists()
 
@@ -233,7 +233,7 @@ def test_doubts_go_with_the_frames_of_a_stretch(tmp_path):
     for k, f in enumerate(frames((5.0, False), (2.0, True), (9.0, False))):
         writer.add_frame(f, first if k < 60 else second)
     writer.close()
-    found = [(f.stamp_ns, doubts) for piece in read_segment(tmp_path / 'stretch-0.pickle')
+    found = [(f.stamp_ns, doubts) for piece in read_segment(tmp_path / 'segment-0.pickle')
              for f, doubts in piece.frames() if doubts is not None]
     assert [doubts for _, doubts in found] == [first, second]
     assert found[0][0] < 5_000_000_000 and found[1][0] == 6_000_000_000

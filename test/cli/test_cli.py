@@ -261,7 +261,7 @@ def test_fit_opens_everything_before_it_writes(tmp_path, capsys):
 @pytest.mark.parametrize('options, text', [
     (['--orders', '0'], '--orders: expected different numbers from 1 to 8'),
     (['--orders', '2', '2'], '--orders'),
-    (['--cpa-range', '4', '1'], 'for one sensor; the network has 2'),
+    (['--cpa-range', '4', '1'], 'only for a single sensor; the 2 sensors'),
 ])
 def test_fit_refuses_options_that_make_no_sense(tmp_path, capsys, options, text):
     assert main(['fit', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), *options,

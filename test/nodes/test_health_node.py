@@ -274,7 +274,7 @@ def test_what_was_wrong_is_forgotten_after_two_terms(monkeypatch):
             stage.feed(one(sample))
         if k % 100 == 99:
             said.append((now[0], [s.message for s in health.statuses('node', stage)]))
-    told = [t for t, messages in said if 'taken for its background 1 times' in messages[0]]
+    told = [t for t, messages in said if 'became its background 1 times' in messages[0]]
     assert 20.0 < min(told) < 35.0
     assert sensor_health.TERM_S < max(told) - min(told) <= 2.0 * sensor_health.TERM_S + 5.0
     assert said[-1][1] == ['running', 'running']

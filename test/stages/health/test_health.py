@@ -245,7 +245,7 @@ def test_a_background_in_the_file_does_not_hide_what_the_sensor_says():
 
 
 def test_without_an_earth_field_sensors_are_compared_with_each_other():
-    for n, said in ((3, 'mag_2: is'), (2, 'network: sensors are not compared')):
+    for n, said in ((3, 'mag_2: is'), (2, 'network: sensors were not compared')):
         network = replace(line_network(n), earth_field=None)
         doctor = Doctor(network, settings_for('vehicle'))
         rng = np.random.default_rng(7)
@@ -272,7 +272,7 @@ def test_clocks_that_are_far_apart_are_named_but_not_those_of_a_replay():
                 doctor.feed(one(MagSample(stamp, name, field)), received)
         found = [str(f) for f in doctor.findings()]
         assert len(found) == n, found
-        assert not n or found[0].startswith('mag_2: its stamps are -120 s off those of other')
+        assert not n or found[0].startswith('mag_2: its timestamps differ by -120 s from those of other')
 
 
 def test_the_doctor_looks_at_backgrounds():
@@ -327,7 +327,7 @@ def test_the_command_on_one_silent_sensor(tmp_path, capsys):
                          sample_dict(MagSample(stamp, 'mag_1', field), 'mag_1'), stamp)
     assert main(['doctor', str(tmp_path / 'one.mcap'), '--network', str(NETWORK_FILE)]) == 2
     said = capsys.readouterr().out
-    assert 'WRONG mag_2: no reading' in said and 'mag_1: ' not in said
+    assert 'ERROR mag_2: no reading' in said and 'mag_1: ' not in said
     assert len(network) == 2
 
 
