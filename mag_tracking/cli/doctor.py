@@ -66,9 +66,9 @@ def _doctor(args: argparse.Namespace) -> int:
             from mag_tracking.nodes.doctor_node import listening
 
             with listening(network, settings, args.live, lambda: bool(seen),
-                           args.ros_arguments) as heard:
-                heard.status = _report(args, heard.doctor, heard.findings, bool(seen))
-            return heard.status
+                           args.ros_arguments) as live:
+                live.status = _report(args, live.doctor, live.findings, bool(seen))
+            return live.status
         recording = Recording(args.recording)
         with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
                   disable=None) as bar:

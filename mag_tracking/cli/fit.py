@@ -163,10 +163,10 @@ def _print_pass(one: FittedPass) -> None:
                   + (f' and length {abs(path[6]):.1f} m' if len(path) > 6 else ''))
     _print_delay(one)
     if one.chosen is not None:
-        cost = one.chosen.normalised_cost
-        if cost > POOR:
-            print(f'  poor fit (cost {cost:.1f}): errors of speed and position may be several '
-                  'standard deviations')
+        chosen_cost = one.chosen.normalised_cost
+        if chosen_cost > POOR:
+            print(f'  poor fit (cost {chosen_cost:.1f}): errors of speed and position may be '
+                  'several standard deviations')
         centre = one.chosen.data.network.positions[one.chosen.data.sensors].mean(axis=0)
         time, std, distance, distance_std = one.chosen.closest_approach(centre)
         print(f'  closest to the centre of the sensors {time:+.2f} ({std:.2f}) s after the '

@@ -31,7 +31,8 @@ def test_train_evaluate_and_predict(tables, tmp_path, capsys, name):
     table, model = str(tables / f'{name}.csv'), str(tmp_path / 'classes.json')
     assert main(['classes', 'evaluate', table, '--splits', '3']) == 0
     printed = capsys.readouterr().out
-    for what in ('largest class: 7', 'balanced accuracy: ', 'recall of truck: ', 'calibration error'):
+    for what in ('largest class: 7', 'balanced accuracy: ', 'recall of truck: ',
+                 'calibration error'):
         assert what in printed
     assert main(['classes', 'train', table, '--out', model]) == 0
     assert '25 of car, 10 of truck' in capsys.readouterr().out

@@ -144,8 +144,8 @@ def test_a_folder_that_is_not_there_is_told_before_the_work(tmp_path, capsys, op
     missing = ['--out', str(tmp_path / 'o.yaml')] if option == '--figure' else []
     assert main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), *missing, option,
                  str(tmp_path / 'no' / 'x.png')]) == 1
-    assert f'the folder {tmp_path / "no"} does not exist' in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
+    assert (f'the folder {tmp_path / "no"} does not exist' in capsys.readouterr().err
+            and not list(tmp_path.iterdir()))
 
 
 def test_interrupted_it_writes_nothing(tmp_path):

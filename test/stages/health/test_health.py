@@ -272,7 +272,8 @@ def test_clocks_that_are_far_apart_are_named_but_not_those_of_a_replay():
                 doctor.feed(one(MagSample(stamp, name, field)), received)
         found = [str(f) for f in doctor.findings()]
         assert len(found) == n, found
-        assert not n or found[0].startswith('mag_2: its timestamps differ by -120 s from those of other')
+        assert not n or found[0].startswith(
+            'mag_2: its timestamps differ by -120 s from those of other')
 
 
 def test_the_doctor_looks_at_backgrounds():
