@@ -73,7 +73,7 @@ def main():
         run = archive([ROOT / 'test' / 'data' / 'vehicles'],
                       mt.read_network(ROOT / 'config' / 'network.yaml'), settings_for('vehicle'),
                       folder, workers=2, report=print)
-        print(f'{len(run.done)} recordings archived in {folder}, {len(run.were_done)} already '
+        print(f'{len(run.done)} recordings archived in {folder}, {len(run.already_done)} already '
               'complete')
     connection = tables_of(folder)
     for question, sql in QUESTIONS.items():

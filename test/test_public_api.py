@@ -215,7 +215,7 @@ def test_no_target_gives_empty_arrays(recorded, result, source):
     assert found.tracks == {} and found.rejections == {}
     assert found.sensors_without_background == (() if source == 'noise' else ('mag_1', 'mag_2'))
     assert ('no background of mag_1' in repr(found)) is (source == 'nothing')
-    with pytest.raises(mt.UnknownTrackError, match='the result has none'):
+    with pytest.raises(mt.UnknownTrackError, match='not in the result, which has none'):
         found.map_figure()
 
 
@@ -244,12 +244,12 @@ FIELD, STAMPS = np.zeros((3, 3)), np.arange(3)
     (['a'] * 3, STAMPS, np.zeros((3, 2)), None, r'field: expected shape \(3, 3\).*got \(3, 2\)'),
     (['a'] * 3, STAMPS, np.zeros(9), None, r'field: expected shape \(3, 3\)'),
     (['a'] * 2, STAMPS, FIELD, None, r'stamp_ns: expected shape \(2,\).*got \(3,\)'),
-    (['a'] * 3, 0.01 * STAMPS, FIELD, None, 'stamp_ns: expected integers, nanoseconds; got float'),
+    (['a'] * 3, 0.01 * STAMPS, FIELD, None, 'stamp_ns: expected integers, nanoseconds, got float'),
     (['a'] * 3, 5, FIELD, None, 'stamp_ns'),
-    (['a'] * 3, STAMPS, FIELD.astype(str), None, 'field: expected floats; got <U'),
+    (['a'] * 3, STAMPS, FIELD.astype(str), None, 'field: expected floats, got <U'),
     (['a'] * 3, STAMPS, FIELD, np.eye(3), r'covariance: expected shape \(3, 3, 3\)'),
     (['a', 'b', 'a'], [5, 3, 7], FIELD, None, r'reading 1 \(b\) is 2e-09 s older .* sort'),
-    ('abc', STAMPS, FIELD, None, "a name for each reading; got the text 'abc'"),
+    ('abc', STAMPS, FIELD, None, "one name per reading, got the text 'abc'"),
     (['a'] * 3, np.arange(3, dtype=np.uint64) + 2**63, FIELD, None, 'nanoseconds since 1970'),
     (['a'] * 3, np.full(3, -2**63), FIELD, None, 'nanoseconds since 1970'),
 ])
@@ -271,7 +271,7 @@ def test_masked_stamps_are_refused_also_where_the_order_is_that_of_a_recording(
         recorded, of_recording):
     r = recorded.readings
     broken = replace(r, stamp_ns=np.ma.masked_equal(r.stamp_ns, r.stamp_ns[5]))
-    with pytest.raises(mt.ReadingsError, match='stamp_ns: a masked array'):
+    with pytest.raises(mt.ReadingsError, match='stamp_ns: masked arrays are not supported'):
         mt.track(replace(recorded, readings=broken) if of_recording else broken, NETWORK_FILE)
 
 
@@ -280,7 +280,7 @@ def test_masked_stamps_are_refused_also_where_the_order_is_that_of_a_recording(
     ({'sensor': np.array([0, 1, -1, 0, 1, 0])}, r'-1 \.\. 1 is outside'),
     ({'field': np.zeros((5, 3))}, r'field: expected shape \(6, 3\)'),
     ({'stamp_ns': np.arange(6.0)}, 'stamp_ns: expected integers, nanoseconds'),
-    ({'names': ('left', 'right')}, 'readings of left, right, but the network has mag_1, mag_2'),
+    ({'names': ('left', 'right')}, 'from left, right, the sensors of the network are mag_1, mag_2'),
     ({'stamp_ns': np.array([0, 60, 120, 1, 61, 121]) * 1_000_000_000},
      r'reading 3 \(mag_2\) is 119 s older'),
 ])
@@ -325,7 +325,7 @@ def test_figures_of_a_track(result):
     assert len(titles) == 3 and all('Track 1' in title for title in titles)
     labels = [line.get_label() for line in result.map_figure(1).axes[0].lines]
     assert {'truth', 'smoothed', 'magnetometers'} <= set(labels)
-    with pytest.raises(mt.UnknownTrackError, match='track 7: the result has 1'):
+    with pytest.raises(mt.UnknownTrackError, match='track 7: not in the result, which has 1'):
         result.map_figure(7)
 
 
@@ -355,7 +355,7 @@ def test_a_recording_without_a_pass_gives_an_empty_fit(tmp_path):
 @pytest.mark.parametrize('named, text', [
     ({'orders': [0]}, r'orders: expected different numbers from 1 to 8, got \[0\]'),
     ({'orders': []}, 'orders'),
-    ({'cpa_range': (4.0, 0.3)}, 'cpa_range is for one sensor'),
+    ({'cpa_range': (4.0, 0.3)}, 'cpa_range: only for a single sensor'),
 ])
 def test_fit_refuses_bad_arguments(named, text):
     with pytest.raises(mt.SettingsError, match=text):
@@ -369,7 +369,7 @@ def test_a_plan_is_that_of_the_command(tmp_path):
     found = mt.plan(NETWORK_FILE, 'truck', heading=np.array([0.0]), grid=9)
     assert found.position_std.tolist() == written['position_std']
     assert list(found.best_place) == written['best_place']
-    with pytest.raises(mt.SettingsError, match='^moment: needed for a magnet'):
+    with pytest.raises(mt.SettingsError, match='^moment: required for a magnet'):
         mt.plan(NETWORK_FILE, 'magnet')
 
 

@@ -1,1 +1,1 @@
-"""The use cases, callable from Python without ROS: one module a command, with its name."""
+"""Applications, callable from Python without ROS; each command has a module of its name."""

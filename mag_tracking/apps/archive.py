@@ -1,4 +1,4 @@
-"""Many recordings, or long ones, tracked on a cluster into one dataset."""
+"""Tracking of many or long recordings on a cluster into one dataset."""
 
 import dataclasses
 import glob
@@ -25,36 +25,48 @@ from mag_tracking.recording.reader import SUFFIXES
 _Cluster = Cluster[tuple[str, Job]]
 
 METADATA = 'metadata.yaml'
-"""A folder that has one is a recording."""
+"""File that marks a folder as a recording."""
 
 
 @dataclass
 class ArchiveRun:
-    """The results of a run."""
+    """Results of a run."""
 
     done: list[Path] = field(default_factory=list)
-    """Recordings that were tracked."""
-    were_done: list[Path] = field(default_factory=list)
-    """Those that an earlier run had tracked."""
+    """Recordings tracked in this run."""
+    already_done: list[Path] = field(default_factory=list)
+    """Recordings tracked by an earlier run."""
     failed: dict[Path, str] = field(default_factory=dict)
-    """{recording: why it was not tracked}."""
+    """{recording: reason} of the recordings that were not tracked."""
     tracks: int = 0
+    """Number of tracks in the recordings tracked in this run."""
     passes: int = 0
-    """Numbers of tracks and fitted passes, of the recordings that were tracked now."""
+    """Number of fitted passes in the recordings tracked in this run."""
     lost_workers: int = 0
-    """How often a worker was lost; its tasks were run again."""
+    """Number of workers lost; their tasks were repeated."""
     interrupted: bool = False
+    """Whether the run was stopped before all recordings were tracked."""
 
 
 def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
-    """The recordings that folders, patterns and paths name, each once, in order.
+    """Find the recordings given by folders, patterns and paths.
 
-    A folder is searched with all that are in it; one with a metadata.yaml is a recording.
+    Folders are searched recursively; a folder with a metadata.yaml is a recording.
+
+    Parameters
+    ----------
+    names : iterable of path
+        Recordings, folders and glob patterns.
+
+    Returns
+    -------
+    list of Path
+        Each recording once, in order.
 
     Raises
     ------
     RecordingError
-        If a name has no recording.
+        If a name matches no recording.
     """
     found: dict[Path, None] = {}
     for name in names:
@@ -63,16 +75,16 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
             glob.glob(str(path), recursive=True))]
         recordings = [r for p in here for r in _recordings_at(p, set())]
         if not recordings:
-            raise RecordingError(f'{path}: there is no recording ({", ".join(SUFFIXES)})')
+            raise RecordingError(f'{path}: no recording found ({", ".join(SUFFIXES)})')
         found.update(dict.fromkeys(recordings))
-    # A pattern may name a recording and the files in it.
+    # A pattern may match a recording and the files in it.
     return [path for path in found if path.parent not in found]
 
 
 def _recordings_at(path: Path, seen: set[Path]) -> list[Path]:
-    """The recordings at a path: itself, or what is in it; folders that were `seen` are left out.
+    """Recordings at or below a path, without folders already `seen`.
 
-    A folder that cannot be read is among them, and fails as one.
+    An unreadable folder is included, so that it is reported as a failed recording.
     """
     path = path.resolve()
     if not path.is_dir():
@@ -90,7 +102,17 @@ def _recordings_at(path: Path, seen: set[Path]) -> list[Path]:
 
 
 def size_of(recording: Path) -> int:
-    """Bytes of the files of a recording; 0 where it cannot be read, and will fail."""
+    """Return the size of a recording.
+
+    Parameters
+    ----------
+    recording : Path
+
+    Returns
+    -------
+    int, bytes
+        0 if the recording is not readable.
+    """
     try:
         return sum(size for _, size, _ in recording_state(recording))
     except OSError:
@@ -103,29 +125,29 @@ def archive(recordings: Iterable[str | PathLike[str]],
             progress: Callable[[int], object] | None = None,
             stopped: Callable[[], bool] | None = None,
             report: Callable[[str], object] | None = None) -> ArchiveRun:
-    """Track recordings into a dataset; those that an earlier run has tracked are left alone.
+    """Track recordings into a dataset; recordings tracked by an earlier run are skipped.
 
-    The rows are those of a replay of each recording by itself.
+    The rows equal those of a separate replay of each recording.
 
     Parameters
     ----------
     recordings : iterable of str or path
-        Recordings, folders of them, and patterns.
+        Recordings, folders and glob patterns.
     network : SensorNetwork or path of a network file
     settings : Settings
     out : path
-        The folder of the dataset; `recording.archive_folder` says what is in it.
+        Folder of the dataset; `recording.archive_folder` describes its content.
     workers : int
-        Processes on this machine.
+        Number of processes on this machine.
     scheduler : str, optional
-        Address of a Dask scheduler, such as tcp://10.0.0.5:8786, whose workers have this package,
-        and see the recordings and `out` under the same paths; in place of `workers`.
+        Address of a Dask scheduler, such as tcp://10.0.0.5:8786, used instead of `workers`. Its
+        workers need this package, and the recordings and `out` under the same paths.
     progress : function, optional
-        Called with the bytes of each recording when it is done.
+        Called with the size of each completed recording in bytes.
     stopped : function, optional
-        Asked several times a second; when it is true the run ends, and another one goes on.
+        Called several times per second; the run ends when it returns true. A later run continues.
     report : function, optional
-        Takes a line for the user, of each recording that fails.
+        Called with a line for the user for each recording that fails.
 
     Returns
     -------
@@ -136,9 +158,9 @@ def archive(recordings: Iterable[str | PathLike[str]],
     RecordingError
         If there is no recording.
     OutputError
-        If the dataset cannot be written, is of other settings, or of another version.
+        If the dataset cannot be written, or has other settings or another version.
     ClusterError
-        If the scheduler does not answer, or has no worker.
+        If the scheduler does not respond or has no workers.
     MissingDependencyError
         If Dask or pyarrow is not installed.
     """
@@ -146,14 +168,14 @@ def archive(recordings: Iterable[str | PathLike[str]],
     network, paths, run = network_of(network), recordings_of(recordings), ArchiveRun()
     folder = checked_path(out, OutputError).resolve()
     paths = [path for path in paths if folder not in path.parents]
-    with ArchiveFolder(folder, _head(network, settings)) as dataset:
+    with ArchiveFolder(folder, _configuration(network, settings)) as dataset:
         todo: list[Path] = []
         for path in paths:
             known = dataset.done(path)
             if known is None:
                 todo.append(path)
             else:
-                run.were_done.append(path)
+                run.already_done.append(path)
                 if progress is not None:
                     progress(known['size'])
         try:
@@ -168,8 +190,8 @@ def archive(recordings: Iterable[str | PathLike[str]],
     return run
 
 
-def _head(network: SensorNetwork, settings: Settings) -> dict[str, Any]:
-    """The settings that all runs into a folder share, JSON-ready."""
+def _configuration(network: SensorNetwork, settings: Settings) -> dict[str, Any]:
+    """Settings that all runs into a folder must share, JSON-ready."""
     def plain(value: Any) -> Any:
         return value.tolist() if hasattr(value, 'tolist') else str(value)
     text = json.dumps(dataclasses.asdict(network), default=plain, sort_keys=True)
@@ -178,7 +200,7 @@ def _head(network: SensorNetwork, settings: Settings) -> dict[str, Any]:
 
 
 class _Scheduler:
-    """Gives the tasks of all recordings to a cluster, each when those before it are done."""
+    """Submits the tasks of all recordings to a cluster, each after those it depends on."""
 
     def __init__(self, dataset: ArchiveFolder, cluster: _Cluster, network: SensorNetwork,
                  settings: Settings, run: ArchiveRun, progress: Callable[[int], object] | None,
@@ -190,34 +212,34 @@ class _Scheduler:
         self._states: dict[Path, list[list[Any]]] = {}
 
     def work(self, todo: Sequence[Path], stopped: Callable[[], bool]) -> None:
-        """Track the recordings; a few at a time, which bounds the files that wait."""
-        waiting = list(reversed(todo))
-        while waiting or self._cluster.n_running:
-            while waiting and self._n_begun() < 2 * self._cluster.n_workers + 1:
-                self._begin(waiting.pop())
+        """Track the recordings, a few at a time to bound the number of intermediate files."""
+        queued = list(reversed(todo))
+        while queued or self._cluster.n_running:
+            while queued and self._n_started() < 2 * self._cluster.n_workers + 1:
+                self._start(queued.pop())
             if stopped():
                 self._run.interrupted = True
                 return
             for (kind, job), result in self._cluster.finished():
-                self._take(kind, job, result)
+                self._on_finished(kind, job, result)
 
-    def _n_begun(self) -> int:
-        """Recordings that have tasks."""
+    def _n_started(self) -> int:
+        """Number of recordings that have tasks."""
         return len({job.recording for _, job in self._cluster.keys()})
 
-    def _begin(self, path: Path) -> None:
-        """Cut a recording."""
+    def _start(self, path: Path) -> None:
+        """Submit the first task of a recording."""
         try:
             self._states[path] = recording_state(path)
         except OSError as error:
-            self._fail(path, f'cannot read it: {error.strerror}')
+            self._fail(path, f'cannot read the recording: {error.strerror}')
             return
         job = Job(path, self._dataset.begin(path, self._states[path]), self._dataset.path,
                   self._network, self._settings)
         self._cluster.submit(('cut', job), 0, cut, job)
 
-    def _take(self, kind: str, job: Job, result: Any) -> None:
-        """A task is done: what follows from it."""
+    def _on_finished(self, kind: str, job: Job, result: Any) -> None:
+        """Process the result of a task and submit the tasks that depend on it."""
         path = job.recording
         if isinstance(result, OutputError | ClusterError):
             raise result
@@ -234,8 +256,8 @@ class _Scheduler:
             self._progress(result['size'])
         else:
             if kind == 'cut':
-                self._segments[path] = result['stretches']
-                for k in range(result['stretches']):
+                self._segments[path] = result['segments']
+                for k in range(result['segments']):
                     self._cluster.submit(('track', job), 1, track_segment, job, k)
             else:
                 self._segments[path] -= 1
@@ -243,6 +265,6 @@ class _Scheduler:
                 self._cluster.submit(('join', job), 2, join, job)
 
     def _fail(self, path: Path, why: str) -> None:
-        """A recording that cannot be tracked: the others go on."""
+        """Record and report a failed recording; the others continue."""
         self._run.failed[path] = why
         self._report(f'{path.name}: {why}')

@@ -1,4 +1,4 @@
-"""How the sensors of a recording were, as rows of an archive."""
+"""Health of the sensors during a recording, as rows of an archive table."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,12 +12,18 @@ from mag_tracking.recording.archive_folder import common_columns
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.units import NS
 
-EVERY_S = 600.0
-"""[s] Between the rows of a sensor."""
+ROW_INTERVAL_S = 600.0
+"""Interval between the rows of a sensor [s]."""
 
 
 class HealthRows:
-    """Gives a row a sensor every ten minutes, and at the end."""
+    """Creates one row per sensor every ten minutes and at the end of the recording.
+
+    Parameters
+    ----------
+    recording : Path
+    network : SensorNetwork
+    """
 
     def __init__(self, recording: Path, network: SensorNetwork) -> None:
         self._recording, self._network = recording, network
@@ -25,15 +31,37 @@ class HealthRows:
         self._next_ns: int | None = None
 
     def due(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
-        """The rows at the time of a frame, where ten minutes are over."""
-        if self._next_ns is None or stamp_ns < self._next_ns - EVERY_S * NS:
-            self._next_ns = stamp_ns + int(EVERY_S * NS)
+        """Create the rows that are due at the time of a frame.
+
+        Parameters
+        ----------
+        stamp_ns : int, ns
+        calibrate : Calibrate
+
+        Yields
+        ------
+        dict
+            Columns of the table `health`.
+        """
+        if self._next_ns is None or stamp_ns < self._next_ns - ROW_INTERVAL_S * NS:
+            self._next_ns = stamp_ns + int(ROW_INTERVAL_S * NS)
         if stamp_ns >= self._next_ns:
-            self._next_ns = stamp_ns + int(EVERY_S * NS)
+            self._next_ns = stamp_ns + int(ROW_INTERVAL_S * NS)
             yield from self.rows(stamp_ns, calibrate)
 
     def rows(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
-        """A row a sensor."""
+        """Create one row per sensor.
+
+        Parameters
+        ----------
+        stamp_ns : int, ns
+        calibrate : Calibrate
+
+        Yields
+        ------
+        dict
+            Columns of the table `health`.
+        """
         for name, background in calibrate.backgrounds().items():
             counts = calibrate.counts_of(name)
             before, now = self._counted[name], (counts['accepted'], counts['rejected'])
@@ -52,6 +80,6 @@ class HealthRows:
 
 
 def _axes(name: str, values: FloatArray) -> dict[str, float | None]:
-    """Three columns; None where the value is not known."""
+    """Columns of the three axes of a vector; None where the value is unknown."""
     return {f'{name}_{axis}': None if np.isnan(v) else float(v)
             for axis, v in zip('xyz', values, strict=True)}

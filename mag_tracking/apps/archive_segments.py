@@ -1,9 +1,9 @@
-"""Cut a long recording into the stretches in which a target is near, for the tracker.
+"""Segments of a long recording in which a target is near, written to files for the tracker.
 
-A recording is read once, from its beginning to its end, by all stages before the tracker, which
-keep their backgrounds from stretch to stretch. The tracker starts without memory in each, and finds
-the same as in the whole recording: a stretch begins with the frames that a track looks back to, and
-ends where it is quiet for longer than that.
+All stages before the tracker read the recording once, from beginning to end, and keep their
+backgrounds from segment to segment. The tracker starts each segment without memory and finds the
+same tracks as in the whole recording: a segment begins with the frames that a new track uses
+retrospectively, and ends when a quiet interval exceeds their duration.
 """
 
 import dataclasses
@@ -21,36 +21,54 @@ from mag_tracking.errors import OutputError
 from mag_tracking.records import FieldFrame
 from mag_tracking.units import NS
 
-FEWEST = 300
-"""Frames of a stretch: shorter ones would cost more than they hold."""
-PIECE = 2000
-"""Frames that are kept in memory at once."""
-QUIET_S = 1.0
-"""[s] At least so long no target was near where a stretch ends."""
+MIN_SEGMENT_FRAMES = 300
+"""Minimum number of frames in a segment; the overhead of shorter segments is too large."""
+CHUNK_FRAMES = 2000
+"""Maximum number of frames kept in memory."""
+MIN_QUIET_S = 1.0
+"""Minimum duration of the quiet interval at the end of a segment [s]."""
 
 Doubts = Mapping[str, DoubtfulTimes]
-CutPass = tuple[int, PassData, tuple[str, ...]]
-"""The number of a pass in its recording, its measurements, and notes."""
+"""{sensor: times at which its background is doubtful}."""
+NumberedPass = tuple[int, PassData, tuple[str, ...]]
+"""Number of a pass in its recording, its measurements, and notes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FrameChunk:
-    """Frames that follow each other, as arrays (n, ...), and the passes that ended with them."""
+    """Consecutive frames as arrays, and the passes that ended with them."""
 
     stamp_ns: IntArray
+    """(n,) ns."""
     field: FloatArray
+    """(n, n_sensors, 3) T, sensor frame, background removed."""
     covariance: FloatArray
+    """(n, n_sensors, 3, 3) T², sensor frame."""
     n_samples: IntArray
+    """(n, n_sensors) number of samples averaged; 0 = missing."""
     time_offset: FloatArray
+    """(n, n_sensors) s, mean time of the samples of a sensor relative to `stamp_ns`."""
     target_present: BoolArray
+    """(n,)."""
     statistic: FloatArray
+    """(n,) detection statistic."""
     degrees_of_freedom: IntArray
+    """(n,) degrees of freedom of the detection statistic."""
     doubts: dict[int, Doubts] = dataclasses.field(default_factory=dict)
-    """{index of a frame: the doubtful times from it on}."""
-    passes: tuple[CutPass, ...] = ()
+    """{index of a frame: doubtful times from this frame on}."""
+    passes: tuple[NumberedPass, ...] = ()
+    """Passes that ended within the chunk."""
 
     def frames(self) -> Iterator[tuple[FieldFrame, Doubts | None]]:
-        """Each frame with its verdict, and the doubtful times where they are new."""
+        """Iterate over the frames.
+
+        Yields
+        ------
+        frame : FieldFrame
+            With its detection result.
+        doubts : Doubts or None
+            Doubtful times if they have changed.
+        """
         for k in range(len(self.stamp_ns)):
             yield FieldFrame(
                 int(self.stamp_ns[k]), self.field[k], self.covariance[k], self.n_samples[k],
@@ -59,35 +77,66 @@ class FrameChunk:
 
 
 def read_segment(path: Path) -> Iterator[FrameChunk]:
-    """The pieces of a stretch that `SegmentWriter` has written."""
+    """Read a segment written by `SegmentWriter`.
+
+    Parameters
+    ----------
+    path : Path
+
+    Yields
+    ------
+    FrameChunk
+    """
     with open(path, 'rb') as stream:
         while stream.peek(1):
             yield pickle.load(stream)
 
 
 class SegmentWriter:
-    """Writes each stretch of a recording into a file of its own; memory stays bounded."""
+    """Writes each segment of a recording to its own file, with bounded memory.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder for the files `segment-0.pickle`, ...
+    lookback_s : float, s
+        Duration of the earlier frames that a new track uses.
+
+    Attributes
+    ----------
+    n_segments : int
+        Number of completed segments.
+    n_frames : int
+        Number of frames added.
+    """
 
     def __init__(self, folder: Path, lookback_s: float) -> None:
-        """Files are `stretch-0.pickle`, ... in `folder`; a track looks `lookback_s` back."""
         self._folder = folder
-        self._quiet_ns = int(max(lookback_s, QUIET_S) * NS)
+        self._quiet_ns = int(max(lookback_s, MIN_QUIET_S) * NS)
         self.n_segments = self.n_frames = 0
-        # Frames and doubts: quiet ones that a track may look back to, and those of the stretch.
+        # Frames and doubts: quiet ones that a new track may use, and those of the segment.
         self._recent: deque[tuple[FieldFrame, Doubts]] = deque()
         self._kept: list[tuple[FieldFrame, Doubts]] = []
-        self._passes: list[CutPass] = []
+        self._passes: list[NumberedPass] = []
         self._n_written, self._is_open = 0, False
         self._quiet_since_ns = 0
         self._last: FieldFrame | None = None
 
     def add_frame(self, frame: FieldFrame, doubts: Doubts) -> None:
-        """Take the next frame, with its verdict, and the doubtful times that are known by now."""
+        """Add the next frame.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+            With its detection result.
+        doubts : Doubts
+            Doubtful times known so far.
+        """
         last, self._last = self._last, frame
         self.n_frames += 1
         if last is not None and frame.stamp_ns <= last.stamp_ns:
-            # The time jumped back: a track looks back to nothing of before. Where frames were left
-            # out, the tracker of the stretch would not see it.
+            # The time jumped back: a new track does not use earlier frames. If quiet frames were
+            # omitted, the tracker of the segment could not detect the jump.
             if not last.target_present:
                 self.close()
             self._recent.clear()
@@ -101,28 +150,36 @@ class SegmentWriter:
             self._kept.append((frame, doubts))
             self._quiet_since_ns = frame.stamp_ns
         else:
-            if self._n_written + len(self._kept) >= FEWEST \
+            if self._n_written + len(self._kept) >= MIN_SEGMENT_FRAMES \
                     and frame.stamp_ns - self._quiet_since_ns > self._quiet_ns:
                 self.close()
             self._recent.append((frame, doubts))
             while self._recent[0][0].stamp_ns < frame.stamp_ns - self._quiet_ns:
                 self._recent.popleft()
-        if len(self._kept) >= PIECE:
+        if len(self._kept) >= CHUNK_FRAMES:
             self._write()
 
     def add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
-        """Take a pass that has ended with the latest frame."""
+        """Add a pass that ended with the latest frame.
+
+        Parameters
+        ----------
+        number : int
+            Number of the pass in the recording.
+        data : PassData
+        notes : tuple of str
+        """
         self._passes.append((number, data, notes))
 
     def close(self) -> None:
-        """End the stretch, where there is one: the recording has ended, or it is quiet."""
+        """End the current segment, if there is one."""
         if self._kept or self._passes:
             self._write()
         self.n_segments += self._is_open
         self._n_written, self._is_open = 0, False
 
     def _write(self) -> None:
-        """Append what is kept to the file of the stretch; raises OutputError."""
+        """Append the kept frames and passes to the file of the segment; raises OutputError."""
         frames = [frame for frame, _ in self._kept]
         doubts: dict[int, Doubts] = {}
         known: Doubts | None = None
@@ -133,11 +190,11 @@ class SegmentWriter:
         arrays = {name: np.array([getattr(frame, name) for frame in frames]) for name in (
             'stamp_ns', 'field', 'covariance', 'n_samples', 'time_offset', 'target_present',
             'statistic', 'degrees_of_freedom')}
-        piece = FrameChunk(**arrays, doubts=doubts, passes=tuple(self._passes))
-        path = self._folder / f'stretch-{self.n_segments}.pickle'
+        chunk = FrameChunk(**arrays, doubts=doubts, passes=tuple(self._passes))
+        path = self._folder / f'segment-{self.n_segments}.pickle'
         try:
             with open(path, 'ab' if self._is_open else 'wb') as stream:
-                pickle.dump(piece, stream)
+                pickle.dump(chunk, stream)
         except OSError as error:
             raise OutputError(f'cannot write {path}: {error.strerror}') from error
         self._n_written += len(frames)

@@ -1,4 +1,4 @@
-"""The tracks of one stretch of a recording, as rows of the tables of an archive."""
+"""Tracks and passes of one segment of a recording, as rows of the tables of an archive."""
 
 import math
 from contextlib import ExitStack
@@ -24,23 +24,29 @@ from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
 
 TRACKED = ('tracks', 'poses', 'smoothed', 'passes')
-"""The tables that a stretch has rows of."""
+"""Tables with rows from a segment."""
 
 
 class SegmentTables:
-    """Takes what a tracker and the passes of a stretch give; a context manager.
+    """Writes the tracks and passes of a segment to tables; a context manager.
+
+    Parameters
+    ----------
+    recording : Path
+    paths : dict of str to Path
+        Files of the tables `TRACKED`.
+    n_dipoles : int
+        Number of dipoles of the row that is fitted to a pass.
+    settings : TrackSettings
 
     Attributes
     ----------
     n_tracks, n_passes : int
+        Number of tracks and fitted passes written.
     """
 
     def __init__(self, recording: Path, paths: dict[str, Path], n_dipoles: int,
                  settings: TrackSettings) -> None:
-        """`paths` of the tables `TRACKED`; passes are fitted with rows of `n_dipoles`.
-
-        `settings` are those of the tracker.
-        """
         self._recording, self._n_dipoles = recording, n_dipoles
         self._tracks, self._ground = PassTracks(settings), ground_prior(settings)
         self._files = ExitStack()
@@ -55,48 +61,84 @@ class SegmentTables:
     def __exit__(self, *error: Any) -> None:
         self._files.__exit__(*error)
 
-    def track(self, piece: FrameChunk, tracker: TrackManager) -> None:
-        """Run the tracker over a piece of the stretch, and fit the passes of it."""
-        for frame, doubts in piece.frames():
+    def track(self, chunk: FrameChunk, tracker: TrackManager) -> None:
+        """Track the targets in a chunk of the segment and fit its passes.
+
+        Parameters
+        ----------
+        chunk : FrameChunk
+        tracker : TrackManager
+        """
+        for frame, doubts in chunk.frames():
             if doubts is not None:
                 tracker.doubt(doubts)
             records = tracker.feed(frame)
-            self._tracks.take(records)
-            self._collector.take([frame, *records])
+            self._tracks.add(records)
+            self._collector.add([frame, *records])
         for log in [log for log in self._collector.logs.values() if log.ended]:
             self._add_track_row(log)
-        for one in piece.passes:
+        for one in chunk.passes:
             self._add_pass(*one)
 
     def finish(self, tracker: TrackManager) -> None:
-        """The stretch has ended."""
-        self._collector.take(tracker.flush())
+        """End the segment.
+
+        Parameters
+        ----------
+        tracker : TrackManager
+        """
+        self._collector.add(tracker.flush())
         for log in list(self._collector.logs.values()):
             self._add_track_row(log)
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Frames have no table."""
+        """Do nothing: frames have no table.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+        """
 
     def add_detection(self, detection: Detection) -> None:
-        """Detections have no table."""
+        """Do nothing: detections have no table.
+
+        Parameters
+        ----------
+        detection : Detection
+        """
 
     def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Disturbances have no table."""
+        """Do nothing: disturbances have no table.
+
+        Parameters
+        ----------
+        disturbance : Disturbance
+        """
 
     def add_track(self, track: Track) -> None:
-        """One row a pose; the closing record of a track has no row."""
+        """Write the row of a pose; the closing record of a track has no row.
+
+        Parameters
+        ----------
+        track : Track
+        """
         if not track.ended:
             self._tables['poses'].add(self._pose(track) | {
                 'weight': track.weight, 'kind_weight': _number(track.kind_weight),
                 'arrival': track.arrival, 'doubts': ' '.join(track.doubts)})
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """One row for a pose of a whole track; those of a fixed lag have none."""
+        """Write the row of a pose smoothed over a whole track; fixed-lag poses have no row.
+
+        Parameters
+        ----------
+        pose : SmoothedPose
+        """
         if pose.complete:
             self._tables['smoothed'].add(self._pose(pose))
 
     def _pose(self, pose: Track | SmoothedPose) -> dict[str, Any]:
-        """The columns of any pose."""
+        """Columns shared by published and smoothed poses."""
         sd = np.sqrt(np.diagonal(pose.covariance))
         values = np.concatenate([pose.position, pose.velocity, sd, pose.moment]).tolist()
         return {**common_columns(self._recording, pose.stamp_ns), 'track_id': pose.id,
@@ -105,7 +147,7 @@ class SegmentTables:
                 'length': _number(pose.length), 'ambiguous': pose.ambiguous}
 
     def _add_track_row(self, log: TrackLog) -> None:
-        """The row of a track that has ended; nothing of it is kept."""
+        """Write the row of a track that has ended and discard its history."""
         del self._collector.logs[log.id]
         smoothed = self._collector.smoothed.pop(log.id, None)
         self.n_tracks += 1
@@ -114,9 +156,9 @@ class SegmentTables:
             | _track_columns(log, smoothed))
 
     def _add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
-        """The rows of a pass, one a vehicle, fitted as a whole."""
-        alone = (fit_pass(data, self._n_dipoles),)
-        for one in fitted_vehicles(self._recording.stem, number, data, alone,
+        """Fit a pass as a whole and write one row per vehicle."""
+        single = (fit_pass(data, self._n_dipoles),)
+        for one in fitted_vehicles(self._recording.stem, number, data, single,
                                    self._tracks.paths(data), self._ground,
                                    (self._n_dipoles - 1, self._n_dipoles), notes):
             rows = pass_rows(one)
@@ -134,7 +176,7 @@ _STATE = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_
 
 
 def _track_columns(log: TrackLog, smoothed: SmoothedLog | None) -> dict[str, Any]:
-    """The numbers of a track."""
+    """Columns of a track."""
     summary = log.summary()
     out = {name: summary[name] for name in (
         'end_ns', 'poses', 'arrival', 'kind', 'verdict', 'kind_weight', 'ambiguous_share',
@@ -143,11 +185,11 @@ def _track_columns(log: TrackLog, smoothed: SmoothedLog | None) -> dict[str, Any
     out |= {'doubts': ' '.join(summary['doubts']),
             'arrival_weight': summary['arrival_weights'][summary['arrival']]}
     if smoothed is not None:
-        of = smoothed.summary()
-        out |= {'smoothed_speed': of['speed'], 'smoothed_moment_size': of['moment_size']}
+        values = smoothed.summary()
+        out |= {'smoothed_speed': values['speed'], 'smoothed_moment_size': values['moment_size']}
     return {name: _number(v) if isinstance(v, float) else v for name, v in out.items()}
 
 
 def _number(value: float) -> float | None:
-    """None in place of NaN: a table has a null for what is not known."""
+    """Replace NaN by None, the null of a table."""
     return None if math.isnan(value) else value

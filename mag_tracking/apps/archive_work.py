@@ -1,7 +1,7 @@
-"""The tasks of an archive: cut a recording, track its stretches, join the tables.
+"""Tasks of an archive: cut a recording into segments, track each segment, join the tables.
 
-Each task leaves a folder in that of its recording and does nothing where it is there, so that it
-may be run again at any time.
+Each task writes one folder below the folder of its recording, and does nothing if its folder
+exists, so that every task can be repeated at any time.
 """
 
 import copy
@@ -39,10 +39,10 @@ from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.rigid_pass import RigidPass
 
 N_DIPOLES = 3
-"""Number of dipoles of the rows that passes are fitted with."""
+"""Number of dipoles of the row that is fitted to a pass."""
 
-KNOWN, TRACKED_FILE = 'known.json', 'tracked.pickle'
-"""Files in which a task leaves its result for the next one, beside the tables."""
+CUT_FILE, TRACKED_FILE = 'columns.json', 'tracked.pickle'
+"""Files with the result of a task for the next one, stored beside the tables."""
 
 
 @dataclass(frozen=True)
@@ -50,31 +50,49 @@ class Job:
     """One recording of an archive."""
 
     recording: Path
+    """Path of the recording."""
     work: Path
-    """The folder of results that are not complete."""
+    """Folder of the intermediate results."""
     folder: Path
-    """The folder of the archive."""
+    """Folder of the archive."""
     network: SensorNetwork
+    """Network of sensors."""
     settings: Settings
+    """Settings of all stages."""
 
     @property
     def cut(self) -> Path:
-        """The folder of what `cut` leaves: stretches, health, and what is known."""
+        """Folder written by `cut`: segments, health table, and columns of the recording."""
         return self.work / 'cut'
 
     def segment(self, k: int) -> Path:
-        """The folder of what `track_segment` leaves."""
-        return self.work / f'stretch-{k}'
+        """Folder written by `track_segment`.
+
+        Parameters
+        ----------
+        k : int
+            Index of the segment.
+
+        Returns
+        -------
+        Path
+        """
+        return self.work / f'segment-{k}'
 
 
 class RecordedEvidence(ClockComparison):
-    """Notes the passes that it counts.
+    """Clock comparison that records the passes added to it.
+
+    Parameters
+    ----------
+    n_sensors : int
 
     Attributes
     ----------
-    passes : list of (RigidPass, IntArray)
+    passes : list of (RigidPass, (n,) int array)
+        Passes and the rows of their sensors.
     was_apart : bool
-        Whether clocks were ever apart: then what was tracked depends on the passes before.
+        Whether clocks were ever found apart, so that tracks depend on earlier passes.
     """
 
     def __init__(self, n_sensors: int) -> None:
@@ -83,7 +101,14 @@ class RecordedEvidence(ClockComparison):
         self.was_apart = False
 
     def add(self, found: RigidPass, rows: IntArray) -> None:
-        """Count a pass of the sensors `rows`."""
+        """Add a pass.
+
+        Parameters
+        ----------
+        found : RigidPass
+        rows : (n,) int array
+            Rows of its sensors in the network.
+        """
         super().add(found, rows)
         self.passes.append((found, rows))
         self.was_apart |= self.apart is not None
@@ -91,7 +116,7 @@ class RecordedEvidence(ClockComparison):
 
 @dataclass
 class _Tracked:
-    """The result of `track_segment` beside its tables."""
+    """Result of `track_segment` besides its tables."""
 
     n_tracks: int
     n_passes: int
@@ -99,46 +124,53 @@ class _Tracked:
 
 
 def cut(job: Job) -> dict[str, Any]:
-    """Read the recording: its stretches go to files, its health to a table.
+    """Read a recording, and write its segments and the table of sensor health.
 
-    Returns the columns of the recording itself.
+    Parameters
+    ----------
+    job : Job
+
+    Returns
+    -------
+    dict
+        Columns of the recording in the table `recordings`, without its tracks.
 
     Raises
     ------
     MagTrackingError
-        If the recording cannot be read, or something cannot be written.
+        If the recording cannot be read, or a file cannot be written.
     """
     if not job.cut.exists():
-        with _attempt(job.cut) as folder:
+        with _atomic_folder(job.cut) as folder:
             with TableWriter(folder / 'health.parquet', TABLES['health']) as table:
-                known = _Cut(job, folder, table).read()
-            replace_text(folder / KNOWN, json.dumps(known))
-    read: dict[str, Any] = json.loads((job.cut / KNOWN).read_text())
+                columns = _Segmenter(job, folder, table).read()
+            replace_text(folder / CUT_FILE, json.dumps(columns))
+    read: dict[str, Any] = json.loads((job.cut / CUT_FILE).read_text())
     return read
 
 
 @contextmanager
-def _attempt(final: Path) -> Iterator[Path]:
-    """A folder to write to, which gets the name `final` when all is in it.
+def _atomic_folder(final: Path) -> Iterator[Path]:
+    """Folder to write to, which is renamed to `final` when it is complete; raises OutputError.
 
-    Another attempt at the same task may be going on, on a worker that was taken for lost or for a
-    run that was killed: whichever is the first counts, and both have the same. Raises OutputError.
+    The same task may run elsewhere, on a worker that was considered lost or for a run that was
+    killed. The first one to finish counts; the results are the same.
     """
     draft = final.with_name(f'.{secrets.token_hex(8)}.{final.name}')
-    with _written(final):
+    with _output_errors(final):
         draft.mkdir()
     try:
         yield draft
         if not final.exists():
-            with _written(final):
+            with _output_errors(final):
                 draft.rename(final)
     finally:
         shutil.rmtree(draft, ignore_errors=True)
 
 
 @contextmanager
-def _written(path: Path) -> Iterator[None]:
-    """Errors of the system name what could not be written, unless it is there by now."""
+def _output_errors(path: Path) -> Iterator[None]:
+    """Turn an OSError into an OutputError that names `path`, unless `path` exists by now."""
     try:
         yield
     except OSError as error:
@@ -146,13 +178,13 @@ def _written(path: Path) -> Iterator[None]:
             raise OutputError(f'cannot write {path}: {error.strerror}') from error
 
 
-class _Cut:
-    """Reads a recording once, with the stages before the tracker."""
+class _Segmenter:
+    """Reads a recording once with the stages before the tracker, and writes its segments."""
 
     def __init__(self, job: Job, folder: Path, health: TableWriter) -> None:
         self._recording, self._path = Recording(job.recording), job.recording
         self._reader = SampleReader(self._recording, job.network)
-        self._passes = PassCollector(job.network, job.settings, self._see)
+        self._passes = PassCollector(job.network, job.settings, self._add_frame)
         prescan_of(self._recording, job.network, job.settings.calibrate).apply(
             self._passes.calibrate)
         self._writer = SegmentWriter(folder, job.settings.track.lookback_s)
@@ -162,73 +194,97 @@ class _Cut:
         self._n_passes = 0
 
     def read(self) -> dict[str, Any]:
-        """Write stretches and health; the columns of the recording itself."""
+        """Write segments and health; return the columns of the recording."""
         for readings in self._reader.readings():
-            self._add(self._passes.feed(readings))
-        self._add(self._passes.flush())
+            self._add_passes(self._passes.feed(readings))
+        self._add_passes(self._passes.flush())
         self._writer.close()
         if self._last_ns is not None:
             self._add_health(self._health.rows(self._last_ns, self._passes.calibrate))
         missing = self._reader.missing_topics()
         return {
             **common_columns(self._path, self._first_ns), 'end_ns': self._last_ns,
-            'frames': self._writer.n_frames, 'stretches': self._writer.n_segments,
+            'frames': self._writer.n_frames, 'segments': self._writer.n_segments,
             'size': self._recording.size, 'lost': _text(self._recording.losses),
             'rejected': _text(self._reader.rejected + Counter(self._passes.rejected)),
             'missing_topics': ' '.join(missing),
             'no_detection_reason': self._passes.no_detection_reason(missing) or ''}
 
-    def _see(self, frame: FieldFrame) -> None:
-        """Take a frame with its verdict."""
+    def _add_frame(self, frame: FieldFrame) -> None:
+        """Write a frame with its detection result."""
         self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
         self._last_ns = frame.stamp_ns
         self._writer.add_frame(frame, self._passes.calibrate.doubtful_intervals())
         self._add_health(self._health.due(frame.stamp_ns, self._passes.calibrate))
 
-    def _add(self, passes: Iterable[tuple[PassData, tuple[str, ...]]]) -> None:
-        """Take the passes that are over."""
+    def _add_passes(self, passes: Iterable[tuple[PassData, tuple[str, ...]]]) -> None:
+        """Write completed passes."""
         for data, notes in passes:
             self._n_passes += 1
             self._writer.add_pass(self._n_passes, data, notes)
 
     def _add_health(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Take rows of the sensors."""
+        """Write rows of the health table."""
         for row in rows:
             self._health_table.add(row)
 
 
 def track_segment(job: Job, k: int) -> None:
-    """Track a stretch and fit its passes: its tables. Raises OutputError."""
+    """Track a segment, fit its passes, and write its tables.
+
+    Parameters
+    ----------
+    job : Job
+    k : int
+        Index of the segment.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
     if not job.segment(k).exists():
-        with _attempt(job.segment(k)) as folder:
+        with _atomic_folder(job.segment(k)) as folder:
             _track_into(folder, job, k, RecordedEvidence(len(job.network)))
 
 
 def _track_into(folder: Path, job: Job, k: int, evidence: RecordedEvidence) -> None:
-    """Track a stretch by the `evidence` on the clocks of those before it; its tables."""
+    """Track a segment, given the `evidence` on clocks from earlier ones, and write its tables."""
     tracker = TrackManager(job.network, job.settings.track, evidence)
     with SegmentTables(job.recording, {name: folder / f'{name}.parquet' for name in TRACKED},
                        N_DIPOLES, job.settings.track) as tables:
-        for piece in read_segment(job.cut / f'stretch-{k}.pickle'):
-            tables.track(piece, tracker)
+        for chunk in read_segment(job.cut / f'segment-{k}.pickle'):
+            tables.track(chunk, tracker)
         tables.finish(tracker)
-    with _written(folder / TRACKED_FILE), open(folder / TRACKED_FILE, 'wb') as stream:
+    with _output_errors(folder / TRACKED_FILE), open(folder / TRACKED_FILE, 'wb') as stream:
         pickle.dump(_Tracked(tables.n_tracks, tables.n_passes, evidence), stream)
 
 
 def join(job: Job) -> dict[str, Any]:
-    """Put the tables of the stretches together; what is known of the recording.
+    """Join the tables of the segments and write them to the archive.
 
-    Where the clocks of the sensors are apart, a stretch depends on the passes of those before it,
-    and is tracked once more.
+    If the clocks of sensors are apart, the tracks of a segment depend on the passes of earlier
+    segments, and the segment is tracked again.
 
-    Raises OutputError.
+    Parameters
+    ----------
+    job : Job
+
+    Returns
+    -------
+    dict
+        Columns of the recording in the table `recordings`.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
     """
-    known = cut(job)
+    columns = cut(job)
     name, evidence = recording_key(job.recording), RecordedEvidence(len(job.network))
     folders, shifts, n_tracks, n_passes = [], [], 0, 0
     with tempfile.TemporaryDirectory(dir=job.work, prefix='.again.') as again:
-        for k in range(known['stretches']):
+        for k in range(columns['segments']):
             folder = job.segment(k)
             found = _tracked(folder)
             evidence.passes = []
@@ -236,7 +292,7 @@ def join(job: Job) -> dict[str, Any]:
             for one in found.evidence.passes:
                 together.add(*one)
             if k and (together.was_apart or found.evidence.was_apart):
-                folder = Path(again) / f'stretch-{k}'
+                folder = Path(again) / f'segment-{k}'
                 folder.mkdir()
                 _track_into(folder, job, k, evidence)
                 found = _tracked(folder)
@@ -250,16 +306,16 @@ def join(job: Job) -> dict[str, Any]:
             join_tables([folder / f'{table}.parquet' for folder in folders],
                         shifts if table != 'passes' else [0] * len(shifts), table, job.folder, name)
     join_tables([job.cut / 'health.parquet'], [0], 'health', job.folder, name)
-    return {**known, 'tracks': n_tracks, 'passes': n_passes, 'error': ''}
+    return {**columns, 'tracks': n_tracks, 'passes': n_passes, 'error': ''}
 
 
 def _tracked(folder: Path) -> _Tracked:
-    """The result of `track_segment` in a folder, beside its tables."""
+    """Read the result that `track_segment` stored in a folder."""
     with open(folder / TRACKED_FILE, 'rb') as stream:
         tracked: _Tracked = pickle.load(stream)
     return tracked
 
 
 def _text(counts: Mapping[str, int]) -> str:
-    """Causes and numbers."""
+    """Format {cause: number} as text."""
     return '; '.join(f'{n} {cause}' for cause, n in counts.items())

@@ -1,4 +1,4 @@
-"""Geometry of a board of sensors from a table of poses: what `mag-tracking board-geometry` does."""
+"""Calibration of the geometry of a sensor board, as by `mag-tracking board-geometry`."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,43 +23,61 @@ from mag_tracking.recording.pose_table import (
 )
 
 ASSUMED_NOISE = 1e-7
-"""[T] Of sensors of which nobody says it; near a magnet the error of the field is larger."""
+"""Noise of sensors without a stated noise; near a magnet, the error of the field is larger [T]."""
 
-MIN_TURN = 1e-7
-"""[rad] A smaller deviation is one of an orientation that was held fixed."""
+MIN_ROTATION_STD = 1e-7
+"""Standard deviation below which an orientation was held fixed [rad]."""
 
 FIRST_ROW = 2
-"""The row of the first pose, as messages count them: the header is row 1."""
+"""Row of the first pose in messages; the header is row 1."""
 
 
 @dataclass(frozen=True)
 class GeometrySurvey:
-    """What a table of poses told of a board."""
+    """Calibrated geometry of a board."""
 
     stated: SensorNetwork
-    """As it was, with the noise that was counted with."""
+    """Network before the calibration, with the noise assumed for it."""
     network: SensorNetwork
-    """To be written; not to be used where the geometry has not converged."""
+    """Calibrated network; invalid if the geometry has not converged."""
     geometry: NetworkGeometry
+    """Result of the estimation."""
     rows: IntArray
-    """(K,) rows of the table, of the poses that were used."""
+    """(K,) rows of the table with the poses used."""
     suspect_rows: tuple[int, ...]
+    """Rows of the table with inconsistent poses."""
     n_poses: int
-    """In the table."""
+    """Number of poses in the table."""
     silent_axes: tuple[tuple[str, str], ...]
-    """(sensor, axes) that never reported, of sensors that did."""
+    """(sensor, axes) that never reported, for sensors with other axes that did."""
 
     @property
-    def turned(self) -> FloatArray:
-        """(n,) [rad] from the stated orientations."""
+    def rotation_angle(self) -> FloatArray:
+        """Angle between stated and estimated orientation of each sensor, (n,) rad."""
         trace: FloatArray = np.einsum('nij,nij->n', self.stated.R_ws, self.network.R_ws)
         return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 
 
 def board_of(path: str | PathLike[str]) -> SensorNetwork:
-    """A network of untried sensors `mag_0`, `mag_1`, ... at the positions of a CSV, along x, y, z.
+    """Create a network of uncalibrated sensors from a table of positions.
 
-    Raises RecordingError and NetworkError.
+    The sensors are named `mag_0`, `mag_1`, ... and are aligned with the axes.
+
+    Parameters
+    ----------
+    path : path
+        CSV file with x, y, z [m].
+
+    Returns
+    -------
+    SensorNetwork
+
+    Raises
+    ------
+    RecordingError
+        If the table cannot be read.
+    NetworkError
+        If the positions do not form a valid network.
     """
     positions = read_sensor_positions(path)
     names = tuple(f'mag_{j}' for j in range(len(positions)))
@@ -74,42 +92,46 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
                     settings: GeometrySettings, date: str,
                     box: tuple[Sequence[float], Sequence[float]] | None = None,
                     noise_std: float | None = None) -> GeometrySurvey:
-    """Geometry of a network from a table of a magnet's poses.
+    """Estimate the geometry of a network from readings of a magnet in many poses.
 
     Parameters
     ----------
     table : path
-        As for `read_pose_table`.
+        CSV file; see `read_pose_table`.
     network : SensorNetwork
-        As stated; the order of its sensors is that of the table's columns. What it has of offsets
-        and corrections is applied to the readings, as it will be later.
-    moment : float [A m^2]
+        Nominal geometry, sensors in the order of the table's columns. Its offsets and corrections
+        are applied to the readings.
+    moment : float, A m²
+        Magnitude of the magnet's moment.
     settings : GeometrySettings
     date : str
-        What the calibration is marked with.
+        Date of the calibration, stored in the network.
     box : (low, high), optional
-        Corners (3,) [m] of where the magnet was; with it the table needs no poses.
-    noise_std : float [T], optional
-        Of the sensors of which the network does not say it; without it `ASSUMED_NOISE` is counted
-        with, and not written.
+        Corners (3,) [m] of the box that contains the magnet. With a box, the table needs no poses.
+    noise_std : float, T, optional
+        Noise of sensors without a stated noise. Without it, `ASSUMED_NOISE` is used but not
+        stored in the network.
 
     Returns
     -------
     GeometrySurvey
 
-    Raises RecordingError for a table that cannot be read or used.
+    Raises
+    ------
+    RecordingError
+        If the table cannot be read or used.
     """
     if box is None:
         readings, positions, axes = read_pose_table(table)
     else:
         readings = read_readings(table)
     if readings.shape[1] != len(network):
-        raise RecordingError(f'{table} has readings of {readings.shape[1]} sensors, but the '
+        raise RecordingError(f'{table}: readings of {readings.shape[1]} sensors, but the '
                              f'network has {len(network)}')
     known = _with_noise(network, noise_std)
     stated = _with_noise(known, ASSUMED_NOISE)
     field = corrected(stated, readings)
-    # A pose without any reading tells nothing; without a tracker it is left out below.
+    # Poses without readings are dropped here with a tracker, and by the estimation without one.
     given = np.arange(len(field)) if box is not None else np.flatnonzero(
         ~np.isnan(field).all(axis=(1, 2)))
     try:
@@ -129,7 +151,18 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
 
 
 def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
-    """Readings (K, n, 3) [T] as the stage Calibrate has them before it removes the background."""
+    """Apply the offsets and corrections of a network to readings, as the stage Calibrate does.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    readings : (K, n, 3) array, T, sensor frame
+
+    Returns
+    -------
+    (K, n, 3) array, T, sensor frame
+        The background is not removed.
+    """
     out = np.array(readings, dtype=float)
     for j, (offset, C) in enumerate(zip(network.offset, network.correction, strict=True)):
         if offset is not None:
@@ -137,18 +170,32 @@ def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
         if C is not None:
             missing = np.isnan(out[:, j])
             field = np.where(missing, 0.0, out[:, j]) @ C.T
-            # An axis is missing where one is that it needs.
+            # A corrected axis is missing if any axis that contributes to it is missing.
             out[:, j] = np.where(missing @ (C != 0.0).T, np.nan, field)
     return out
 
 
 def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: str,
                        by: str) -> SensorNetwork:
-    """The network to be written: positions, orientations, gains and biases as found.
+    """Apply estimated positions, orientations, gains and biases to a network.
 
-    A reading is gain * field + bias; the stage Calibrate corrects first and takes the background
-    from what it has corrected, so that gain, bias and noise are those of corrected readings. A
-    sensor that was never heard stays as it was.
+    A reading is gain * field + bias. The stage Calibrate applies the correction before it removes
+    the background, so that the background and noise stored here refer to corrected readings. A
+    sensor without readings is not changed.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+        Network before the calibration.
+    geometry : NetworkGeometry
+    date : str
+        Date of the calibration.
+    by : str
+        Method of the calibration.
+
+    Returns
+    -------
+    SensorNetwork
     """
     found = geometry.network
     columns = {name: list(getattr(network, name)) for name in (
@@ -163,7 +210,7 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
         if network.noise_std[j] is not None:
             columns['noise_std'][j] = network.noise_std[j] / abs(gain)
         std = _world_std(geometry, j)
-        if (std > MIN_TURN).all():
+        if (std > MIN_ROTATION_STD).all():
             columns['orientation_std'][j] = std
         before = network.calibrated[j]
         columns['calibrated'][j] = network.calibration_record(
@@ -173,16 +220,16 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
 
 
 def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
-    """(3,) [rad] how far sensor `j` may be turned about the world's axes."""
-    # Its rotation is the third block of its ten numbers: bias, gain, rotation, position.
-    turn = slice(10 * j + 4, 10 * j + 7)
+    """Standard deviations (3,) [rad] of the orientation of sensor `j` about the world axes."""
+    # The ten parameters of a sensor are bias, gain, rotation and position.
+    rotation = slice(10 * j + 4, 10 * j + 7)
     R = geometry.network.R_ws[j]
-    std: FloatArray = np.sqrt(np.diagonal(R @ geometry.covariance[turn, turn] @ R.T))
+    std: FloatArray = np.sqrt(np.diagonal(R @ geometry.covariance[rotation, rotation] @ R.T))
     return std
 
 
 def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:
-    """The network, `noise_std` [T] where it says nothing; None changes nothing."""
+    """Set the noise [T] of sensors without a stated noise; None leaves the network unchanged."""
     if noise_std is None:
         return network
     return replace(network, noise_std=tuple(
@@ -190,7 +237,7 @@ def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwor
 
 
 def _silent_axes(network: SensorNetwork, field: FloatArray) -> Iterator[tuple[str, str]]:
-    """(sensor, axes) of sensors of which some axes, but not all, never reported."""
+    """(sensor, axes) of sensors with some, but not all, axes that never reported."""
     silent: BoolArray = np.all(np.isnan(field), axis=0)
     for name, axes in zip(network.names, silent, strict=True):
         if axes.any() and not axes.all():

@@ -1,4 +1,4 @@
-"""Calibration of a network from a recording: what `mag-tracking calibrate` does."""
+"""Calibration of a network from a recording, as by `mag-tracking calibrate`."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -19,63 +19,69 @@ from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.survey.stage import NetworkSurvey, Survey, with_noise
 
 MIN_POSES = 8
-"""A track with fewer tells nothing of the sensors."""
+"""Minimum number of unambiguous poses of a track used for the calibration."""
 
 
 @dataclass
 class Calibration:
-    """What a recording told."""
+    """Calibration of a network."""
 
     network: SensorNetwork
-    """To be used from now on."""
+    """Calibrated network."""
     survey: NetworkSurvey
-    """From accelerometers, compasses and knocks."""
+    """Results from accelerometers, compasses and knocks."""
     evidence: MountingEvidence | None
-    """From the passes; None where they were not asked, or there was none."""
+    """Results from the passes; None if passes were not used or there were none."""
     levels: dict[str, FloatArray]
-    """{sensor: (3,) [T], sensor frame} the field without a target."""
+    """{sensor: (3,) field without a target, T, sensor frame}."""
     rejected: dict[str, int]
-    """{cause: number}."""
+    """Rejected samples: {cause: number}."""
     without_background: tuple[str, ...]
+    """Sensors whose background was not learnt."""
     interrupted: bool
+    """Whether the calibration was stopped before the end of the recording."""
 
 
 def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, date: str,
               passes: bool = True, progress: Callable[[int], object] | None = None,
               stopped: Callable[[], bool] | None = None) -> Calibration:
-    """Orientations, clock offsets and noise of a network, from one recording of it.
+    """Estimate orientations, clock offsets and noise of a network from a recording.
 
-    The recording begins without a target, and with knocks where clocks are to be compared.
+    The recording must begin without a target; clock offsets require knocks.
 
     Parameters
     ----------
     recording : Recording
     network : SensorNetwork
-        As it was installed.
+        Network as installed.
     settings : Settings
     date : str
-        What the calibration is marked with.
+        Date of the calibration, stored in the network.
     passes : bool
-        Track what passes, too, and take what it tells of the orientations. Only where
-        `track.mounting_std_deg` is not zero.
+        Whether to estimate orientations from passing targets as well; ignored if
+        `track.mounting_std_deg` is zero.
     progress : function, optional
-        Called with the bytes done since the last call; with passes the recording is read twice.
+        Called with the number of bytes read since the last call; with `passes`, the recording is
+        read twice.
     stopped : function, optional
-        Asked after every batch of readings; when it is true, what was read so far counts.
+        Called after every batch of readings; reading ends when it returns true.
 
     Returns
     -------
     Calibration
 
-    Raises RecordingError where the recording has none of the network's topics, or no sample.
+    Raises
+    ------
+    RecordingError
+        If the recording has none of the network's topics, or no samples.
     """
     levels, survey, calibrated, interrupted = _surveyed(
         recording, network, settings, date, progress, stopped)
     if not calibrated.counts.total():
-        raise RecordingError(f'{recording.path} has no sample of the network')
+        raise RecordingError(f'{recording.path}: no samples of the sensors of the network')
     found = with_noise(survey.network, calibrated)
     evidence = None
-    # A sensor that cannot be right would spoil what passes tell of the others.
+    # A faulty sensor would bias the orientations of the others.
     if passes and not interrupted and settings.track.mounting_std_deg \
             and not survey.disagreements:
         tracks, interrupted = _passes(recording, found, settings, progress, stopped)
@@ -85,19 +91,19 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
                 for s in found.orientation_std])
             evidence = fuse_mounting(found, prior, tracks)
             found = _marked(with_evidence(found, evidence), found, date, evidence.n_tracks)
-    waiting = tuple(name for name in network.names if name not in levels)
-    return Calibration(found, survey, evidence, levels, rejected(calibrated.counts), waiting,
-                       interrupted)
+    without_background = tuple(name for name in network.names if name not in levels)
+    return Calibration(found, survey, evidence, levels, rejected(calibrated.counts),
+                       without_background, interrupted)
 
 
 def _surveyed(recording: Recording, network: SensorNetwork, settings: Settings, date: str,
               progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
               ) -> tuple[dict[str, FloatArray], NetworkSurvey, Calibrate, bool]:
-    """First reading: (levels, NetworkSurvey, Calibrate, interrupted)."""
+    """First pass over the recording: (levels, NetworkSurvey, Calibrate, interrupted)."""
     reader = SampleReader(recording, network)
-    # What the file says of backgrounds and noise is not what the sensors say now.
-    untold = replace(network, background=(), noise_std=())
-    stage, survey = Calibrate(untold, settings.calibrate), Survey(network, settings.survey)
+    # Backgrounds and noise in the network file may be outdated; they are learnt again.
+    unlearnt = replace(network, background=(), noise_std=())
+    stage, survey = Calibrate(unlearnt, settings.calibrate), Survey(network, settings.survey)
     levels: dict[str, FloatArray] = {}
     interrupted = False
     try:
@@ -106,7 +112,7 @@ def _surveyed(recording: Recording, network: SensorNetwork, settings: Settings, 
                 survey.feed(record)
                 continue
             stage.feed(record)
-            # The first that is known: later a target may stand there.
+            # The first known background is used: later, a target may be standing near the sensor.
             levels.update({name: stage.background(name) for name in record.names
                            if name not in levels and stage.backgrounds()[name].certain})
     except ReadingStopped:
@@ -119,12 +125,12 @@ def _surveyed(recording: Recording, network: SensorNetwork, settings: Settings, 
 def _passes(recording: Recording, network: SensorNetwork, settings: Settings,
             progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
             ) -> tuple[list[Track], bool]:
-    """Second reading: (the last certain pose of each track, interrupted)."""
+    """Second pass over the recording: (last unambiguous pose of each track, interrupted)."""
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
     poses: dict[int, tuple[int, Track]] = {}
     interrupted = False
 
-    def take(records: Iterable[object]) -> None:
+    def add(records: Iterable[object]) -> None:
         for record in records:
             if isinstance(record, Track) and not record.ended and not record.ambiguous:
                 n = poses[record.id][0] + 1 if record.id in poses else 1
@@ -132,16 +138,16 @@ def _passes(recording: Recording, network: SensorNetwork, settings: Settings,
 
     try:
         for readings in until_stopped(reader.readings, progress, stopped):
-            take(pipeline.feed(readings))
+            add(pipeline.feed(readings))
     except ReadingStopped:
         interrupted = True
-    take(pipeline.flush())
+    add(pipeline.flush())
     return [track for n, track in poses.values() if n >= MIN_POSES], interrupted
 
 
 def _marked(network: SensorNetwork, surveyed: SensorNetwork, date: str,
             n_tracks: int) -> SensorNetwork:
-    """The `network` whose calibration says that passes are in it; before them it was `surveyed`."""
+    """Record in the calibration of `network` that it includes passes, based on `surveyed`."""
     passes = f'{n_tracks} pass{"es" if n_tracks > 1 else ""}'
     return replace(network, calibrated=tuple(
         surveyed.calibration_record(j, date, f'as stated; {passes}') if c is None

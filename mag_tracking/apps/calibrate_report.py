@@ -1,4 +1,4 @@
-"""Report of a calibration: clock alignment, headings, noise, warnings."""
+"""Report of a calibration: clock offsets, headings, noise, warnings."""
 
 from pathlib import Path
 
@@ -16,17 +16,46 @@ from mag_tracking.report.palette import SERIES
 
 MAX_KNOCKS = 8
 """Maximum number of sensors in the charts of knocks."""
-SHOWN_S = 0.25
-"""[s] Time shown before and after a knock."""
+KNOCK_MARGIN_S = 0.25
+"""Time shown before and after a knock [s]."""
 
 
 def write_report(found: Calibration, stated: SensorNetwork, name: str, path: Path) -> None:
-    """Write the page of a calibration from recording `name`; raises OutputError."""
+    """Write the report of a calibration.
+
+    Parameters
+    ----------
+    found : Calibration
+    stated : SensorNetwork
+        Network before the calibration.
+    name : str
+        Name of the recording.
+    path : Path
+        File to write.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
     replace_text(path, report_html(calibration_page(found, stated, name)))
 
 
 def calibration_page(found: Calibration, stated: SensorNetwork, name: str) -> Page:
-    """Page of a calibration."""
+    """Create the page of a calibration.
+
+    Parameters
+    ----------
+    found : Calibration
+    stated : SensorNetwork
+        Network before the calibration.
+    name : str
+        Name of the recording.
+
+    Returns
+    -------
+    Page
+    """
     survey = found.survey
     level = ERROR if survey.disagreements else WARNING
     notes = [Note(level, text) for text in survey.warnings()]
@@ -35,7 +64,7 @@ def calibration_page(found: Calibration, stated: SensorNetwork, name: str) -> Pa
     notes += [Note(WARNING, f'{cause}: {n}') for cause, n in found.rejected.items()]
     if found.evidence is not None:
         n = found.evidence.n_tracks
-        notes.append(Note(NOTE, f'{n} pass{"es" * (n != 1)} counted in'))
+        notes.append(Note(NOTE, f'{n} pass{"es" * (n != 1)} used'))
     return Page(f'Calibration from {name}', f'{len(stated)} sensors', notes, None,
                 [*_knocks(found), _headings(found, stated)], [_table(found)])
 
@@ -51,14 +80,14 @@ def _knocks(found: Calibration) -> list[Chart]:
         traces = []
         for k, (name, (t, size)) in enumerate(shocks.items()):
             offset = found.network.clock_offset[found.network.index(name)] if is_set else 0.0
-            near = np.abs(t - offset - first) < SHOWN_S
+            near = np.abs(t - offset - first) < KNOCK_MARGIN_S
             traces.append(curve(t[near] - offset - first, size[near], name, k, 'lines+markers'))
         charts.append(Chart(title, traces, axes('time [s]', 'acceleration from rest [m/s²]')))
     return charts
 
 
 def _headings(found: Calibration, stated: SensorNetwork) -> Chart:
-    """Chart of each sensor's rotation about the vertical against the network file."""
+    """Chart of the rotation of each sensor about the vertical, relative to the network file."""
     steps = [('compass', found.survey.network)]
     if found.evidence is not None:
         steps.append(('compass and passes', found.network))
@@ -73,7 +102,7 @@ def _headings(found: Calibration, stated: SensorNetwork) -> Chart:
             'y': [plain(name) for name in stated.names],
             'error_x': {'type': 'data', 'array': half, 'color': SERIES[k]},
             'marker': {'color': SERIES[k], 'size': 8, 'symbol': ('circle', 'square')[k]}})
-    return Chart('Rotation about the vertical against the network file (90 %)', traces,
+    return Chart('Rotation about the vertical relative to the network file (90%)', traces,
                  axes('[degrees]', ''))
 
 

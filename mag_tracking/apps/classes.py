@@ -1,4 +1,4 @@
-"""Classes of passes by the signature at one sensor: train, evaluate, predict."""
+"""Classification of passes by the signature at one sensor: training and evaluation."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -35,24 +35,34 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 
 @dataclass(frozen=True)
 class Examples:
-    """Signatures as features."""
+    """Features of signatures."""
 
     x: FloatArray
-    """(n, n_features)"""
+    """(n, n_features)."""
     labels: tuple[str, ...]
-    """(n,)"""
+    """(n,) classes; empty texts without labels."""
     sources: tuple[str, ...]
-    """(n,)"""
+    """(n,) descriptions for messages."""
     groups: tuple[str, ...]
-    """(n,) signatures of one target have the same."""
+    """(n,) identifiers of targets; equal for signatures of the same target."""
     axes: tuple[str, ...]
+    """Axes of all signatures."""
     unit: str
+    """Unit of all signatures; empty if unknown."""
     left_out: tuple[str, ...]
-    """A sentence for each signature that has no features."""
+    """Reasons, one per signature without features."""
 
 
 def examples_of(signatures: list[Signature]) -> Examples:
-    """The `Examples` of signatures.
+    """Compute the features of signatures.
+
+    Parameters
+    ----------
+    signatures : list of Signature
+
+    Returns
+    -------
+    Examples
 
     Raises
     ------
@@ -60,10 +70,10 @@ def examples_of(signatures: list[Signature]) -> Examples:
         If there is no usable signature, or axes or units differ.
     """
     if not signatures:
-        raise LabelsError('there is no signature')
+        raise LabelsError('no signatures were found')
     x, rows, reasons = feature_table(signatures)
     if not len(rows):
-        raise LabelsError(f'no signature can be used; {reasons[0]}')
+        raise LabelsError(f'no signature is usable; {reasons[0]}')
     kept = [signatures[i] for i in rows.tolist()]
     return Examples(x, tuple(s.label for s in kept), tuple(s.source for s in kept),
                     tuple(s.group for s in kept), kept[0].axes, kept[0].unit, tuple(reasons))
@@ -72,23 +82,27 @@ def examples_of(signatures: list[Signature]) -> Examples:
 def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] | None = None,
                         network: SensorNetwork | None = None, is_labelled: bool = True
                         ) -> list[Signature]:
-    """Signatures of a table, or of the labelled intervals of a recording.
+    """Read the signatures in a table, or extract the labelled intervals of a recording.
 
     Parameters
     ----------
     path : path
         A CSV table of signatures, or a recording.
     labels : path, optional
-        A CSV table of the intervals; needed for a recording.
+        A CSV table of the intervals; required for a recording.
     network : SensorNetwork, optional
-        Needed for a recording.
+        Required for a recording.
     is_labelled : bool
-        Whether a table of signatures needs labels.
+        Whether a table of signatures must have labels.
+
+    Returns
+    -------
+    list of Signature
 
     Raises
     ------
     LabelsError
-        If labels are missing, overlap or are empty, or an interval holds no readings.
+        If labels are missing, overlap or are empty, or an interval contains no readings.
     RecordingError
         If a file cannot be read.
     """
@@ -96,49 +110,48 @@ def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] |
         return read_signatures(path, is_labelled)
     if labels is None or network is None:
         raise LabelsError(f'{path}: a recording needs a table of labelled intervals and a network')
-    return list(_cut_out(Path(path), labels, network))
+    return list(_extracted(Path(path), labels, network))
 
 
-def _cut_out(path: Path, labels: str | PathLike[str], network: SensorNetwork
-             ) -> Iterator[Signature]:
-    """The signatures of the intervals, for each sensor that measured in them."""
+def _extracted(path: Path, labels: str | PathLike[str], network: SensorNetwork
+               ) -> Iterator[Signature]:
+    """Signatures of the labelled intervals, one per interval and sensor."""
     readings = _calibrated(path, network)
     if not len(readings):
-        raise LabelsError(f'{path}: no sensor has a calibrated reading')
+        raise LabelsError(f'{path}: no sensor has calibrated readings')
     names = np.array(readings.names)[readings.sensor]
     for interval in read_intervals(labels, int(readings.stamp_ns.min())):
         if interval.sensor and interval.sensor not in network.names:
             raise LabelsError(f'{labels}: row {interval.row}: the network has no sensor '
-                              f'{interval.sensor!r}; it has {", ".join(network.names)}')
+                              f'{interval.sensor!r}; its sensors are {", ".join(network.names)}')
         found = list(_signatures(path, readings, names, interval))
         if not found:
-            raise LabelsError(f'{labels}: row {interval.row}: there are no readings in the '
-                              'interval')
+            raise LabelsError(f'{labels}: row {interval.row}: the interval contains no readings')
         yield from found
 
 
 def _signatures(path: Path, readings: Readings, names: Any,
                 interval: LabelledInterval) -> Iterator[Signature]:
-    """The signatures of one interval."""
+    """Signatures of one interval."""
     inside = (interval.begin_ns <= readings.stamp_ns) & (readings.stamp_ns <= interval.end_ns)
     for name in readings.names:
         mine = inside & (names == name)
         if interval.sensor not in ('', name) or not mine.any():
             continue
         field = readings.field[mine]
-        there = ~np.isnan(field).all(axis=0)
-        field = field[:, there]
-        whole = ~np.isnan(field).any(axis=1)
-        if there.any() and whole.any():
-            yield Signature((readings.stamp_ns[mine][whole] - interval.begin_ns) / 1e9,
-                            field[whole], interval.label,
+        has_axis = ~np.isnan(field).all(axis=0)
+        field = field[:, has_axis]
+        complete = ~np.isnan(field).any(axis=1)
+        if has_axis.any() and complete.any():
+            yield Signature((readings.stamp_ns[mine][complete] - interval.begin_ns) / 1e9,
+                            field[complete], interval.label,
                             f'{path.name}: {name}, row {interval.row}',
-                            tuple(np.array(list('xyz'))[there].tolist()), 'T',
+                            tuple(np.array(list('xyz'))[has_axis].tolist()), 'T',
                             f'row {interval.row}')
 
 
 def _calibrated(path: Path, network: SensorNetwork) -> Readings:
-    """The calibrated readings of a recording."""
+    """Calibrated readings of a recording."""
     settings = settings_for('vehicle')
     recording = Recording(path)
     calibrate = Calibrate(network, settings.calibrate)
@@ -149,19 +162,50 @@ def _calibrated(path: Path, network: SensorNetwork) -> Readings:
 
 
 def train_classes(examples: Examples) -> SignatureModel:
-    """Train on examples; raises LabelsError and MissingDependencyError."""
+    """Train a classifier.
+
+    Parameters
+    ----------
+    examples : Examples
+
+    Returns
+    -------
+    SignatureModel
+
+    Raises
+    ------
+    LabelsError
+        If there are too few examples or classes.
+    MissingDependencyError
+        If scikit-learn is not installed.
+    """
     return train(examples.x, examples.labels, examples.groups, examples.axes, examples.unit)
 
 
 def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_splits: int = 20,
                      progress: Callable[[Iterable[int]], Iterable[int]] = iter) -> Evaluation:
-    """Evaluate a trained model, or training itself on stratified splits.
+    """Evaluate a trained model, or the training on stratified splits.
+
+    Parameters
+    ----------
+    examples : Examples
+    model : SignatureModel, optional
+        Model to evaluate; by default, a model is trained for each split.
+    n_splits : int
+        Number of splits without `model`.
+    progress : function
+        Wraps the iterable of splits, as `tqdm` does.
+
+    Returns
+    -------
+    Evaluation
 
     Raises
     ------
     LabelsError
         If there are too few examples, or the model has other axes or classes.
     MissingDependencyError
+        If scikit-learn is not installed.
     """
     if model is None:
         return evaluate_splits(examples.x, examples.labels, examples.groups, examples.axes,
@@ -171,11 +215,22 @@ def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_
 
 
 def check_axes(examples: Examples, model: SignatureModel) -> None:
-    """Raise LabelsError where signatures do not have the axes and the unit of a model."""
+    """Check that signatures have the axes and the unit of a model.
+
+    Parameters
+    ----------
+    examples : Examples
+    model : SignatureModel
+
+    Raises
+    ------
+    LabelsError
+        If axes or unit differ.
+    """
     if examples.axes != model.axes:
-        raise LabelsError(f'the signatures have the axes {" ".join(examples.axes)}, the model was '
-                          f'trained on {" ".join(model.axes)}')
+        raise LabelsError(f'the signatures have the axes {" ".join(examples.axes)}, but the model '
+                          f'was trained on {" ".join(model.axes)}')
     if examples.unit != model.unit:
-        raise LabelsError(f'the signatures are in {examples.unit or "an unknown unit"}, the model '
-                          f'was trained on {model.unit or "an unknown unit"}; columns such as '
-                          'x_nt, x_ut and x_t have one')
+        raise LabelsError(f'the signatures are in {examples.unit or "an unknown unit"}, but the '
+                          f'model was trained on {model.unit or "an unknown unit"}; column names '
+                          'such as x_nt, x_ut and x_t state the unit')

@@ -1,4 +1,4 @@
-"""What is wrong with a network and its readings: what `mag-tracking doctor` finds."""
+"""Diagnosis of a sensor network and its readings, as by `mag-tracking doctor`."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -21,34 +21,46 @@ from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NS
 
-STEADY_S = 30.0
-"""[s] A background that has been frozen for longer is worth a word."""
+MAX_FROZEN_S = 30.0
+"""Time for which a background may be frozen before it is reported [s]."""
 
-APART_S = 60.0
-"""[s] Stamps of sensors that are farther apart are not of one time."""
+MAX_CLOCK_DIFFERENCE_S = 60.0
+"""Maximum difference between the clocks of sensors [s]."""
 
 _ADVICE = (
-    ('above', 'gauss or microtesla published as tesla? Near a magnet raise calibrate.max_field'),
-    ('unknown sensor', 'it is not in the network file'),
-    ('duplicate', 'the driver publishes readings twice, or stamps too coarsely'),
-    ('out of order', 'two publishers on one topic, or a clock that was set'),
-    ('stamp too far ahead', 'a clock stepped, or a message is corrupt'),
-    ('no axis', 'look at the sensor and its driver'),
-    ('infinite', 'look at the driver'),
-    ('covariance', 'publish zeros where the noise is not known'),
-    ('undecodable', 'the recording is damaged, or its type is another'))
+    ('above', 'check for gauss or microtesla published as tesla; near a magnet, raise '
+     'calibrate.max_field'),
+    ('unknown sensor', 'add the sensor to the network file'),
+    ('duplicate', 'the driver publishes readings twice, or its timestamps are too coarse'),
+    ('out of order', 'check for two publishers on one topic, and for a clock that was set'),
+    ('stamp too far ahead', 'check for a clock step or corrupt messages'),
+    ('no axis', 'check the sensor and its driver'),
+    ('infinite', 'check the driver'),
+    ('covariance', 'publish zeros if the noise is unknown'),
+    ('undecodable', 'the recording is damaged, or its message type differs'))
+"""Advice for rejected readings: (part of the cause, advice)."""
 
-MISSED = 3
-"""Targets that another sensor felt while a reading stayed the same, at least."""
+MIN_MISSED_TARGETS = 3
+"""Number of missed targets in succession after which a sensor is reported."""
 
 LEVEL_STEP = 1e-8
-"""[T] A fiftieth of what iron near a sensor adds."""
+"""Rounding of levels that are compared; a fiftieth of the field of iron near a sensor [T]."""
 
 
 def level_of(calibrate: Calibrate, name: str, health: SensorHealth) -> FloatArray:
-    """(3,) [T] field of a sensor without a target, as well as it is known.
+    """Return the field of a sensor without a target.
 
-    Its background where that was learnt from readings, else the median of what it read last.
+    Parameters
+    ----------
+    calibrate : Calibrate
+    name : str
+        Sensor.
+    health : SensorHealth
+
+    Returns
+    -------
+    (3,) array, T, sensor frame
+        Background if it was learnt from readings, otherwise the median of the latest readings.
     """
     background = calibrate.backgrounds()[name]
     if background.measured and calibrate.last_stamp_ns(name) is not None:
@@ -58,7 +70,7 @@ def level_of(calibrate: Calibrate, name: str, health: SensorHealth) -> FloatArra
 
 def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: Calibrate,
                      sensors: Mapping[str, SensorHealth]) -> list[Finding]:
-    """What is only seen by comparing sensors: list of `Finding`.
+    """Diagnose faults that are visible only by comparing sensors.
 
     Parameters
     ----------
@@ -66,10 +78,14 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
     survey : SurveySettings
     calibrate : Calibrate
     sensors : {name: SensorHealth}
+
+    Returns
+    -------
+    list of Finding
     """
     found = list(_clock_findings(network, sensors))
     levels = np.array([level_of(calibrate, name, sensors[name]) for name in network.names])
-    # What has hardly changed since the last time need not be compared anew.
+    # Rounded levels are equal after small changes, which need no new comparison.
     levels = LEVEL_STEP * np.round(levels / LEVEL_STEP)
     std = np.array([np.full(3, np.deg2rad(survey.stated_std_deg)) if s is None else s
                     for s in network.orientation_std])
@@ -78,70 +94,95 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
         try:
             earth = consensus(levels, network.R_ws)
         except ValueError as error:
-            return [*found, Finding(False, 'network', f'sensors are not compared: {error}',
-                                    'give earth_field or site in the network file')]
+            return [*found, Finding(False, 'network', f'sensors were not compared: {error}',
+                                    'add earth_field or site to the network file')]
     return found + [
         Finding(True, d.sensor, str(d).removeprefix(f'{d.sensor} '),
-                'mend it, or its orientation in the network file')
+                'fix the sensor, or its orientation in the network file')
         for d in disagreements(network.names, levels, network.R_ws, std, earth,
                                survey.compass_bias_std)]
 
 
 def _clock_findings(network: SensorNetwork,
                     sensors: Mapping[str, SensorHealth]) -> Iterator[Finding]:
-    """Sensors whose clock is far from that of the others."""
+    """Report sensors whose clock differs from those of the others."""
     delays = {name: sensors[name].delay_s[0] for name in network.names}
     delays = {name: d for name, d in delays.items() if not np.isnan(d)}
     if not delays:
         return
-    # The one nearest to the host's clock is right; in a replay all are as far from it.
-    right = min(delays.values(), key=abs)
+    # The clock nearest to that of the host is the reference; in a replay, all differ equally.
+    reference = min(delays.values(), key=abs)
     for name, delay in delays.items():
-        if abs(delay - right) > APART_S:
-            yield Finding(True, name, f'its stamps are {right - delay:+.4g} s off those of other '
-                          'sensors', 'set its clock (chrony, PTP); knocks compare only what is '
-                          'within survey.max_clock_offset_s')
+        if abs(delay - reference) > MAX_CLOCK_DIFFERENCE_S:
+            yield Finding(True, name, f'its timestamps differ by {reference - delay:+.4g} s from '
+                          'those of other sensors', 'set its clock (chrony, PTP); knocks correct '
+                          'only offsets below survey.max_clock_offset_s')
 
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
-                        n_known: int = 0) -> Iterator[Finding]:
-    """What is wrong with the background of one sensor: iterator of `Finding`.
+                        n_reported: int = 0) -> Iterator[Finding]:
+    """Diagnose the background of one sensor.
 
-    `frozen_since_ns` is the stamp since which it has been frozen, or None; `n_known` of the
-    backgrounds that were taken anew are no news.
+    Parameters
+    ----------
+    name : str
+        Sensor.
+    calibrate : Calibrate
+    frozen_since_ns : int, ns, or None
+        Timestamp since which the background has been frozen.
+    n_reported : int
+        Number of relearnt backgrounds that were already reported.
+
+    Yields
+    ------
+    Finding
     """
     background, last = calibrate.backgrounds()[name], calibrate.last_stamp_ns(name)
     if last is not None and not background.ready and background.stuck:
-        yield Finding(True, name, 'its readings do not change, and it is not used', 'it hangs, or '
-                      'its steps are coarser than all that it felt: move something of iron beside '
-                      'it; with background and noise_std in the network file it is used')
+        yield Finding(True, name, 'its readings do not change, and it is not used', 'the sensor is '
+                      'stuck, or its resolution is too coarse: move iron near it; with background '
+                      'and noise_std in the network file it is used')
     elif last is not None and not background.ready:
         yield Finding(True, name, 'no background was learnt', 'begin without a target for a few '
-                      'seconds, or give background and noise_std in the network file')
+                      'seconds, or set background and noise_std in the network file')
     if background.doubtful:
         yield Finding(False, name, 'its background is doubtful, and its tracks are ambiguous',
-                      'begin without a target for a few seconds, or give background and noise_std '
+                      'begin without a target for a few seconds, or set background and noise_std '
                       'in the network file')
-    if background.n_relearnt > n_known:
-        yield Finding(False, name, f'a steady change was taken for its background '
-                      f'{background.n_relearnt - n_known} times', 'a parked vehicle, or something '
-                      'that was put beside it; calibrate.relearn_s: 0 would wait for ever')
+    if background.n_relearnt > n_reported:
+        yield Finding(False, name, 'a lasting change of the field became its background '
+                      f'{background.n_relearnt - n_reported} times', 'check for a parked vehicle '
+                      'or an object near it; calibrate.relearn_s: 0 disables relearning')
     if last is not None and frozen_since_ns is not None \
-            and (last - frozen_since_ns) / NS > STEADY_S:
-        yield Finding(False, name, f'its background has not been learnt for '
-                      f'{(last - frozen_since_ns) / NS:.0f} s', 'a target stays near, or the field '
-                      'has changed for good: call the service calibrate')
+            and (last - frozen_since_ns) / NS > MAX_FROZEN_S:
+        yield Finding(False, name, 'its background has been frozen for '
+                      f'{(last - frozen_since_ns) / NS:.0f} s', 'a target stays near it, or the '
+                      'field has changed permanently: call the service calibrate')
 
 
 class MissedTargets:
-    """Counts, for each sensor, the targets of another one during which its reading stays the same.
+    """Counts the targets sensed by other sensors while the reading of a sensor stays constant.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Sensors.
     """
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self._missed: dict[str, Counter[str]] = {name: Counter() for name in names}
 
-    def end(self, name: str, begin_ns: int, sensors: Mapping[str, SensorHealth]) -> None:
-        """Take a target that sensor `name` felt from `begin_ns` until now."""
+    def add_target(self, name: str, begin_ns: int, sensors: Mapping[str, SensorHealth]) -> None:
+        """Add a target that has ended at one sensor.
+
+        Parameters
+        ----------
+        name : str
+            Sensor that detected the target.
+        begin_ns : int, ns
+            Beginning of the target.
+        sensors : {name: SensorHealth}
+        """
         for other, health in sensors.items():
             since_ns = health.unchanged_since_ns
             if since_ns is not None and since_ns < begin_ns:
@@ -150,17 +191,36 @@ class MissedTargets:
                 self._missed[other].clear()
 
     def findings(self) -> Iterator[Finding]:
-        """`Finding` of each sensor that missed several targets in succession."""
+        """Report each sensor that missed several targets in succession.
+
+        Yields
+        ------
+        Finding
+        """
         for name, missed in self._missed.items():
             for other, n in missed.most_common(1):
-                if n >= MISSED:
-                    yield Finding(True, name, f'its readings did not change while {other} felt {n} '
-                                  'targets', 'it hangs, is too far away, or its steps are too '
-                                  'coarse: move something of iron beside it')
+                if n >= MIN_MISSED_TARGETS:
+                    yield Finding(True, name, f'its readings did not change while {other} sensed '
+                                  f'{n} targets', 'the sensor is stuck, too far away, or too '
+                                  'coarse: move iron near it')
 
 
 class Doctor:
-    """Looks at the readings of a network as they come, and says what is wrong."""
+    """Diagnoses a network from its readings.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : Settings
+
+    Attributes
+    ----------
+    network : SensorNetwork
+    sensors : dict of str to SensorHealth
+        Health of each sensor.
+    calibrate : Calibrate
+        Calibration stage.
+    """
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network, self._settings = network, settings
@@ -171,7 +231,14 @@ class Doctor:
         self._missed = MissedTargets(network.names)
 
     def feed(self, readings: Readings, received_ns: int | None = None) -> None:
-        """Look at raw `Readings` of the network that were received at `received_ns`."""
+        """Add raw readings.
+
+        Parameters
+        ----------
+        readings : Readings
+        received_ns : int, ns, optional
+            Time of reception.
+        """
         names, stamps = readings.sensor_names(), readings.stamp_ns.tolist()
         for name, stamp, field in zip(names, stamps, readings.field, strict=True):
             self.sensors[name].add(stamp - self._clock_ns[name], field, received_ns)
@@ -181,10 +248,16 @@ class Doctor:
             if backgrounds[name].frozen:
                 self._frozen_ns.setdefault(name, stamp)
             elif (begin_ns := self._frozen_ns.pop(name, None)) is not None:
-                self._missed.end(name, begin_ns, self.sensors)
+                self._missed.add_target(name, begin_ns, self.sensors)
 
     def findings(self) -> list[Finding]:
-        """List of `Finding`, the serious ones first."""
+        """Return all findings so far.
+
+        Returns
+        -------
+        list of Finding
+            Serious ones first.
+        """
         found: list[Finding] = []
         for j, (name, health) in enumerate(self.sensors.items()):
             found += health.findings(name, self.network.noise_std[j],
@@ -195,7 +268,7 @@ class Doctor:
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)
         for cause, n in rejected(self.calibrate.counts).items():
-            advice = next((a for key, a in _ADVICE if key in cause), 'look at the driver')
+            advice = next((a for key, a in _ADVICE if key in cause), 'check the driver')
             found.append(Finding(n > 100, 'calibrate', f'{n} readings rejected: {cause}', advice))
         warning = too_long(self._settings.align, self.network)
         if warning:
@@ -206,7 +279,7 @@ class Doctor:
 def examine(recording: Recording, network: SensorNetwork, settings: Settings,
             progress: Callable[[int], object] | None = None,
             stopped: Callable[[], bool] | None = None) -> tuple[Doctor, list[Finding]]:
-    """A `Doctor` that has seen a whole recording, and what the reading itself lost.
+    """Diagnose a network from a recording.
 
     Parameters
     ----------
@@ -214,15 +287,21 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
     network : SensorNetwork
     settings : Settings
     progress : function, optional
-        Called with the bytes done since the last call.
+        Called with the number of bytes read since the last call.
     stopped : function, optional
-        Asked before every message; when it is true, what was read so far counts.
+        Called after every message; reading ends when it returns true.
 
     Returns
     -------
-    (Doctor, list of Finding)
+    doctor : Doctor
+        After the recording has been read.
+    findings : list of Finding
+        Damage of the recording, not included in the findings of the doctor.
 
-    Raises RecordingError where the recording has none of the network's topics.
+    Raises
+    ------
+    RecordingError
+        If the recording has none of the network's topics.
     """
     reader, doctor = SampleReader(recording, network), Doctor(network, settings)
     prescan_of(recording, network, settings.calibrate, stopped).apply(doctor.calibrate)
@@ -230,8 +309,8 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
         doctor.feed(readings, received_ns)
         if stopped is not None and stopped():
             break
-    lost = [Finding(True, recording.path.name, f'{what}: {n}', 'the recording is damaged: see '
+    lost = [Finding(True, recording.path.name, f'{what}: {n}', 'the recording is damaged: run '
                     'mag-tracking repair') for what, n in recording.losses.items()]
-    lost += [Finding(False, 'recording', f'{n} times {what}', 'the recording is damaged, or its '
-                     'type is another') for what, n in reader.rejected.items()]
+    lost += [Finding(False, 'recording', f'{what}: {n}', 'the recording is damaged, or its '
+                     'message type differs') for what, n in reader.rejected.items()]
     return doctor, lost

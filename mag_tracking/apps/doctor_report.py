@@ -1,4 +1,4 @@
-"""Report of the doctor: faults of the sensors and advice."""
+"""Report of `mag-tracking doctor`: faults of the sensors and advice."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,14 +14,41 @@ from mag_tracking.stages.health.sensor_health import Finding
 
 
 def write_report(doctor: Doctor, findings: Sequence[Finding], subject: str, path: Path) -> None:
-    """Write the page with the findings in `subject`; raises OutputError."""
+    """Write the report of the findings.
+
+    Parameters
+    ----------
+    doctor : Doctor
+    findings : sequence of Finding
+    subject : str
+        Name of what was examined.
+    path : Path
+        File to write.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
     replace_text(path, report_html(doctor_page(doctor, findings, subject)))
 
 
 def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Page:
-    """Page with findings, noise and rates."""
+    """Create the page with findings, noise and sample rates.
+
+    Parameters
+    ----------
+    doctor : Doctor
+    findings : sequence of Finding
+    subject : str
+        Name of what was examined.
+
+    Returns
+    -------
+    Page
+    """
     notes = [Note(ERROR if f.serious else NOTE, f'{f.subject}: {f.what}. {f.advice}')
-             for f in findings] or [Note(NOTE, 'nothing is wrong')]
+             for f in findings] or [Note(NOTE, 'no faults found')]
     serious = sum(f.serious for f in findings)
     return Page(f'Health of {subject}', f'{serious} serious findings, {len(findings) - serious} '
                 'notes', notes, None, [_noise(doctor), _rates(doctor)], [_table(doctor)])
@@ -53,10 +80,11 @@ def _table(doctor: Doctor) -> Table:
     rows: list[list[str | float | None]] = []
     for name, health in doctor.sensors.items():
         c, delay = health.counts, float(health.delay_s[0])
-        there = bool(c['readings'])
+        has_readings = bool(c['readings'])
         rows.append([
-            name, c['readings'], float(health.rate) if there else None, c['lost'], c['duplicates'],
-            c['spikes'], 1e6 * float(np.sqrt(np.nansum(health.field**2))) if there else None,
+            name, c['readings'], float(health.rate) if has_readings else None, c['lost'],
+            c['duplicates'], c['spikes'],
+            1e6 * float(np.sqrt(np.nansum(health.field**2))) if has_readings else None,
             None if np.isnan(delay) else 1e3 * delay])
     return Table('Sensors', ['sensor', 'readings', 'rate [Hz]', 'lost', 'duplicates', 'spikes',
                              'field [µT]', 'delay [ms]'], rows)

@@ -1,4 +1,4 @@
-"""Passes described by each sensor of a network, without tracking and without metres."""
+"""Description of the passes at each sensor of a network, without tracking."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -21,17 +21,25 @@ from mag_tracking.stages.stage import rejected
 
 @dataclass(frozen=True, eq=False)
 class EventsResult:
-    """The events of a recording."""
+    """Events in a recording."""
 
     events: tuple[PassEvent, ...]
-    """In the order in which they ended."""
+    """Events in the order in which they ended."""
     rejections: dict[str, int]
-    """{cause: number} of readings that were not used."""
+    """Readings that were not used: {cause: number}."""
     sensors_without_background: tuple[str, ...]
+    """Sensors whose background was not learnt."""
     missing_topics: tuple[str, ...]
+    """Topics of the network that are not in the recording."""
 
     def counts(self) -> dict[str, int]:
-        """{sensor: number of events}."""
+        """Count the events of each sensor.
+
+        Returns
+        -------
+        dict of str to int
+            {sensor: number of events}.
+        """
         return dict(Counter(event.sensor for event in self.events))
 
     def __repr__(self) -> str:
@@ -48,7 +56,7 @@ def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLi
     recording : path
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
-        What differs from the defaults for a vehicle.
+        Settings that differ from the defaults for a vehicle.
 
     Returns
     -------
@@ -59,9 +67,9 @@ def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLi
     RecordingError
         If the recording cannot be read, or has none of the network's topics.
     NetworkError
-        If the network file is not valid.
+        If the network file is invalid.
     SettingsError
-        If a setting is not valid.
+        If a setting is invalid.
     """
     return find_events(Recording(recording), network_of(network), settings_for('vehicle', settings))
 
@@ -69,11 +77,26 @@ def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLi
 def find_events(recording: Recording, network: SensorNetwork, settings: Settings,
                 progress: Callable[[int], object] | None = None,
                 stopped: Callable[[], bool] | None = None) -> EventsResult:
-    """The events of a recording; `progress` and `stopped` are as for `apps.replay.replay`.
+    """Describe the passes in an open recording.
+
+    Parameters
+    ----------
+    recording : Recording
+    network : SensorNetwork
+    settings : Settings
+    progress : function, optional
+        Called with the number of bytes read since the last call.
+    stopped : function, optional
+        Called after every batch of readings; reading ends when it returns true.
+
+    Returns
+    -------
+    EventsResult
 
     Raises
     ------
     RecordingError
+        If the recording has none of the network's topics.
     """
     reader = SampleReader(recording, network)
     calibrate = Calibrate(network, settings.calibrate)

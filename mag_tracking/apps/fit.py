@@ -30,24 +30,27 @@ FIT_UNITS = {
     **dict.fromkeys(('rate', 'sd_rate'), '1/s'),
     **dict.fromkeys(('delay_speed', 'sd_delay_speed'), 'm/s'),
     **dict.fromkeys(('delay_heading_deg', 'sd_delay_heading_deg'), 'deg')}
-"""Units of the columns of `fits.csv`."""
+"""Units of the columns of `fits.csv`: {column: unit}."""
 
 
 class RecordingFit:
-    """Fits every pass of a recording, one after the other.
+    """Fits every pass in a recording.
 
     Parameters
     ----------
     recording : Recording
     network : SensorNetwork
     settings : Settings
-        Of calibration, alignment, detection and tracking.
+        Settings of calibration, alignment, detection and tracking.
     orders : sequence of int
-        Numbers of dipoles.
-    cpa_range : (range, std) [m], optional
-        For a network of one sensor; see `fit_pass`.
+        Numbers of dipoles to try.
+    cpa_range : (range, std), m, optional
+        Range at the closest point of approach, for a network of one sensor; see `fit_pass`.
 
-    Raises RecordingError where the recording does not fit the network.
+    Raises
+    ------
+    RecordingError
+        If the recording has none of the network's topics.
     """
 
     def __init__(self, recording: Recording, network: SensorNetwork, settings: Settings,
@@ -60,12 +63,22 @@ class RecordingFit:
 
     def passes(self, progress: Callable[[int], object] | None = None,
                stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """Iterate over the `FittedPass`es, each as soon as it is done.
+        """Iterate over the fitted passes as they are completed.
 
-        `progress` and `stopped` are as for `apps.replay.replay`.
+        Parameters
+        ----------
+        progress : function, optional
+            Called with the number of bytes read since the last call.
+        stopped : function, optional
+            Called after every batch of readings and every fit; iteration ends when it returns
+            true.
+
+        Yields
+        ------
+        FittedPass
         """
         prescan_of(self._recording, self._network, self._settings,
-                      stopped).apply(self._fitter.collector.calibrate)
+                   stopped).apply(self._fitter.collector.calibrate)
         for readings in self._reader.readings(progress):
             if stopped is not None and stopped():
                 return
@@ -73,12 +86,18 @@ class RecordingFit:
         yield from self._fitter.flush(stopped)
 
     def warnings(self) -> list[str]:
-        """What was lost or rejected, and which sensors were never heard; a list of lines."""
+        """Describe missing topics, missing backgrounds, and lost or rejected readings.
+
+        Returns
+        -------
+        list of str
+            One line per warning.
+        """
         collector = self._fitter.collector
-        lines = [f'nothing on {topic}' for topic in self._reader.missing_topics()]
-        lines += [f'no background was learnt for {name}: the field was not steady for long enough; '
-                  'give background and noise_std in the network file'
-                  for name in collector.waiting()]
+        lines = [f'no messages on {topic}' for topic in self._reader.missing_topics()]
+        lines += [f'no background was learnt for {name}: its quiet intervals are too short; '
+                  'set background and noise_std in the network file'
+                  for name in collector.sensors_without_background()]
         why = collector.no_detection_reason(self._reader.missing_topics())
         lines += [f'nothing was detected: {why}'] if why else []
         for counts in (self._reader.rejected, collector.rejected, self._recording.losses):
@@ -88,25 +107,32 @@ class RecordingFit:
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """The fitted passes of a recording."""
+    """Fitted passes of a recording."""
 
     passes: tuple[FittedPass, ...]
+    """One entry per pass and vehicle."""
     warnings: tuple[str, ...]
-    """Readings that were lost or rejected, and sensors that were not used."""
+    """Lines on lost or rejected readings and on unused sensors."""
 
     def __repr__(self) -> str:
         return (f'FitResult({len(self.passes)} passes'
                 + (f'; warnings: {"; ".join(self.warnings)}' if self.warnings else '') + ')')
 
     def to_dataframe(self) -> 'pd.DataFrame':
-        """One row a pass and number of dipoles, with the columns of `fits.csv`.
+        """Convert the fits to a table.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row per pass and number of dipoles, with the columns of `fits.csv`.
 
         Raises
         ------
         MissingDependencyError
+            If pandas is not installed.
         """
         rows = [row for one in self.passes for row in pass_rows(one)]
-        # A fit without an answer has no number there.
+        # A fit without an estimate has an empty text in this column.
         columns = {c: [np.nan if c == 'ambiguous' and row[c] == '' else row[c] for row in rows]
                    for c in FIT_COLUMNS}
         return dataframe(columns, FIT_UNITS)
@@ -115,9 +141,9 @@ class FitResult:
 def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],
         settings: Mapping[str, Any] | None = None, orders: Sequence[int] = (1, 2, 3, 4),
         cpa_range: tuple[float, float] | None = None) -> FitResult:
-    """Fit every pass of a recording as a row of dipoles at constant velocity.
+    """Fit every pass in a recording as a row of dipoles at constant velocity.
 
-    Up to three vehicles that are seen at once are fitted together.
+    Up to three simultaneous vehicles are fitted together.
 
     Parameters
     ----------
@@ -125,11 +151,12 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
         An .mcap, .db3 or .bag file, or a rosbag2 folder.
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
-        What differs from the defaults for a vehicle.
+        Settings that differ from the defaults for a vehicle.
     orders : sequence of int
         Numbers of dipoles to try, 1 to 8.
-    cpa_range : (range, std) [m], optional
-        For a network of one sensor; see `analysis.pass_fit.fit_pass`.
+    cpa_range : (range, std), m, optional
+        Range at the closest point of approach, for a network of one sensor; see
+        `analysis.pass_fit.fit_pass`.
 
     Returns
     -------
@@ -140,9 +167,9 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
     RecordingError
         If the recording cannot be read, or has none of the network's topics.
     NetworkError
-        If the network file is not valid.
+        If the network file is invalid.
     SettingsError
-        If a setting or an argument is not valid.
+        If a setting or an argument is invalid.
     """
     network = network_of(network)
     check_orders('orders', orders)
@@ -154,17 +181,42 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
 
 
 def check_orders(name: str, orders: Sequence[int]) -> None:
-    """Raise SettingsError, which begins with `name`, unless `orders` are different, 1 to 8."""
+    """Check that the numbers of dipoles are different and from 1 to 8.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument in the message.
+    orders : sequence of int
+
+    Raises
+    ------
+    SettingsError
+        If they are not.
+    """
     if not len(orders) or min(orders) < 1 or max(orders) > 8 or len(set(orders)) < len(orders):
         raise SettingsError(f'{name}: expected different numbers from 1 to 8, got {list(orders)}')
 
 
 def check_cpa_range(name: str, cpa_range: Sequence[float] | None, network: SensorNetwork) -> None:
-    """Raise SettingsError, which begins with `name`, for a range that is not valid."""
+    """Check the range at the closest point of approach.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument in the message.
+    cpa_range : (range, std), m, or None
+    network : SensorNetwork
+
+    Raises
+    ------
+    SettingsError
+        If the values are not positive, or the network has several sensors.
+    """
     if cpa_range is None:
         return
     if len(network) > 1:
-        raise SettingsError(f'{name} is for one sensor; the network has {len(network)}, '
-                            'which tell the scale themselves')
+        raise SettingsError(f'{name}: only for a single sensor; the {len(network)} sensors of the '
+                            'network determine the scale')
     if len(cpa_range) != 2 or not (np.isfinite(cpa_range).all() and min(cpa_range) > 0.0):
         raise SettingsError(f'{name}: expected two positive numbers, got {list(cpa_range)}')

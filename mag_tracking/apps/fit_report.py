@@ -16,17 +16,34 @@ from mag_tracking.report.page_charts import axes, curve
 from mag_tracking.report.page_scene import field_entry, fitted_entry, scene_of
 from mag_tracking.units import NS
 
-BETWEEN_S = 5.0
-"""[s] Gap between two recordings on the time axis of the page."""
-STEPS = 120
+RECORDING_GAP_S = 5.0
+"""Gap between two recordings on the time axis of the page [s]."""
+N_POSES = 120
 """Number of poses shown per pass."""
 
 
 def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
                  out: Path) -> Path:
-    """Write `report.html` into folder `out`; returns its path. Raises OutputError.
+    """Write `report.html`.
 
-    `warnings` are the lines of `RecordingFit.warnings` of all recordings.
+    Parameters
+    ----------
+    passes : sequence of FittedPass
+    network : SensorNetwork
+    warnings : sequence of str
+        Lines of `RecordingFit.warnings` of all recordings.
+    out : Path
+        Folder.
+
+    Returns
+    -------
+    Path
+        File written.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
     """
     path = out / REPORT
     replace_text(path, report_html(fit_page(passes, network, warnings)))
@@ -35,30 +52,44 @@ def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings:
 
 def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
              warnings: Sequence[str]) -> Page:
-    """Page of fitted passes; a pass without an answer appears only in the table."""
+    """Create the page of fitted passes.
+
+    A pass without an estimate appears only in the table.
+
+    Parameters
+    ----------
+    passes : sequence of FittedPass
+    network : SensorNetwork
+    warnings : sequence of str
+        Lines for the notes.
+
+    Returns
+    -------
+    Page
+    """
     notes = [Note(WARNING, text) for text in warnings]
     if not passes:
-        notes.append(Note(NOTE, 'no pass: nothing was detected'))
+        notes.append(Note(NOTE, 'no passes: nothing was detected'))
     if any(one.n_vehicles > 1 for one in passes):
-        notes.append(Note(NOTE, 'of vehicles that were fitted together the measured field is shown '
-                          'without that of the others'))
+        notes.append(Note(NOTE, 'for vehicles fitted together, the measured field is shown without '
+                          'that of the others'))
     begins = [ns / NS for ns in _begins_ns(passes)]
     if len({one.recording for one in passes}) > 1:
-        notes.append(Note(NOTE, 'the time axis places the recordings one after another'))
+        notes.append(Note(NOTE, 'the recordings follow each other on the time axis'))
     tracks = [_track(k + 1, one, one.chosen, begins[k])
               for k, one in enumerate(passes) if one.chosen is not None]
     ends = [begins[k] + float(one.fits[0].data.t.max()) for k, one in enumerate(passes)]
     scene = scene_of(network, 0, int(max(ends) * NS), tracks) if tracks else None
-    n_answers = len(tracks)
+    n_estimates = len(tracks)
     n_passes = len({(one.recording, one.number) for one in passes})
     several = f', {len(passes)} vehicles' if len(passes) > n_passes else ''
-    return Page(f'{n_passes} pass{"es" * (n_passes != 1)}{several}, {n_answers} with an answer',
+    return Page(f'{n_passes} pass{"es" * (n_passes != 1)}{several}, {n_estimates} with an estimate',
                 'each fitted as a row of dipoles at constant velocity', notes, scene,
                 [_order_chart(passes)] if passes else [], [_table(passes)])
 
 
 def _begins_ns(passes: Sequence[FittedPass]) -> list[int]:
-    """[ns] Time of the strongest field of each pass on the time axis of the page."""
+    """Time of the strongest field of each pass on the time axis of the page [ns]."""
     out: list[int] = []
     recording, shift, end = '', 0, 0
     for one in passes:
@@ -66,17 +97,17 @@ def _begins_ns(passes: Sequence[FittedPass]) -> list[int]:
         if one.recording != recording:
             recording = one.recording
             first = data.stamp_ns + int(NS * data.t.min())
-            shift = end + (int(BETWEEN_S * NS) if out else 0) - first
+            shift = end + (int(RECORDING_GAP_S * NS) if out else 0) - first
         out.append(data.stamp_ns + shift)
         end = out[-1] + int(NS * data.t.max())
     return out
 
 
 def _track(number: int, one: FittedPass, fit: PassFit, begin: float) -> dict[str, Any]:
-    """Chosen fit of a pass, as JSON."""
+    """Chosen fit of a pass, JSON-ready."""
     data = fit.data
-    t = np.linspace(data.t.min(), data.t.max(), STEPS)
-    F = np.tile(np.eye(6), (STEPS, 1, 1))
+    t = np.linspace(data.t.min(), data.t.max(), N_POSES)
+    F = np.tile(np.eye(6), (N_POSES, 1, 1))
     F[:, :3, 3:] = t[:, None, None] * np.eye(3)
     state = F @ fit.x[:6]
     C = F @ fit.robust_covariance[:6, :6] @ F.transpose(0, 2, 1)
@@ -107,7 +138,7 @@ def _order_chart(passes: Sequence[FittedPass]) -> Chart:
                             f'{one.recording}, {one.label}', k, 'lines+markers'))
     layout = axes('number of dipoles', 'normalised cost (1 = the model is right)', log_y=True)
     layout['xaxis']['dtick'] = 1
-    return Chart('How well a row of dipoles describes each pass', traces, layout)
+    return Chart('Quality of the fits by number of dipoles', traces, layout)
 
 
 def _table(passes: Sequence[FittedPass]) -> Table:

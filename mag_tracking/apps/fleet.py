@@ -1,4 +1,4 @@
-"""Enrolled vehicles: add the passages of a recording, and recognise them in others."""
+"""Enrolment of vehicles from recorded passages, and their recognition in other recordings."""
 
 from collections.abc import Sequence
 
@@ -19,35 +19,79 @@ from mag_tracking.recording.fleet_file import FleetPass
 
 
 def induction_of(network: SensorNetwork) -> FloatArray:
-    """(3,) [A/m] of the earth's field; raises NetworkError where it is not known."""
+    """Return the magnetic field strength of the Earth at a network.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+
+    Returns
+    -------
+    (3,) array, A/m, world frame
+
+    Raises
+    ------
+    NetworkError
+        If the Earth's field is unknown.
+    """
     if network.earth_field is None or not network.earth_field.any():
-        raise NetworkError('the network file has no earth_field, without which hard and soft iron '
-                           'cannot be separated')
+        raise NetworkError('add earth_field to the network file; hard and soft iron cannot be '
+                           'separated without it')
     return network.earth_field / MU0
 
 
 def pass_of(recording: str, passages: Sequence[VehiclePassage]) -> FleetPass:
-    """The only passage of a recording, to enrol a vehicle.
+    """Convert the only passage in a recording to a pass of an enrolled vehicle.
+
+    Parameters
+    ----------
+    recording : str
+        Name of the recording.
+    passages : sequence of VehiclePassage
+        All passages in the recording.
+
+    Returns
+    -------
+    FleetPass
 
     Raises
     ------
     LabelsError
-        If there is no passage, more than one, or a doubtful one.
+        If there is not exactly one passage, or it is ambiguous.
     """
     if len(passages) != 1:
-        raise LabelsError(f'{recording}: expected one vehicle to enrol, {len(passages)} crossed a '
-                          'line')
+        raise LabelsError(f'{recording}: expected exactly one vehicle to enrol, but '
+                          f'{len(passages)} crossed a line')
     (p,) = passages
     if p.ambiguous:
-        raise LabelsError(f'{recording}: the passage is doubtful ({", ".join(p.doubts)})')
+        raise LabelsError(f'{recording}: the passage is ambiguous ({", ".join(p.doubts)}); record '
+                          'another one')
     return FleetPass(p.moment, p.moment_covariance, _heading(p), f'{recording} {p.number}')
 
 
 class Fleet:
-    """Enrolled vehicles of one site."""
+    """Enrolled vehicles of one site.
+
+    Parameters
+    ----------
+    passes : dict of str to list of FleetPass
+        Passes of each vehicle.
+    network : SensorNetwork
+
+    Attributes
+    ----------
+    vehicles : list of EnrolledVehicle
+        One entry per vehicle.
+
+    Raises
+    ------
+    LabelsError
+        If a vehicle cannot be enrolled.
+    NetworkError
+        If the Earth's field is unknown.
+    """
 
     def __init__(self, passes: dict[str, list[FleetPass]], network: SensorNetwork) -> None:
-        """Raises LabelsError for a vehicle that cannot be enrolled, and NetworkError."""
         self._induction = induction_of(network)
         self.vehicles: list[EnrolledVehicle] = []
         for name, mine in passes.items():
@@ -60,11 +104,20 @@ class Fleet:
                 raise LabelsError(str(error)) from error
 
     def identify(self, passage: VehiclePassage) -> Identification:
-        """Which of the vehicles crossed a line."""
+        """Identify the vehicle of a passage.
+
+        Parameters
+        ----------
+        passage : VehiclePassage
+
+        Returns
+        -------
+        Identification
+        """
         return identify(self.vehicles, passage.moment, passage.moment_covariance,
                         _heading(passage), passage.heading_std, self._induction)
 
 
 def _heading(passage: VehiclePassage) -> float:
-    """[rad] of the velocity."""
+    """Heading of the velocity [rad]."""
     return float(np.arctan2(passage.velocity[1], passage.velocity[0]))

@@ -1,4 +1,4 @@
-"""Cut the passes out of a recording: what the network measured around each detection."""
+"""Extraction of passes: the measurements of a network around each detection."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -19,22 +19,29 @@ from mag_tracking.stages.stage import rejected
 from mag_tracking.units import NS
 
 PAD_S = 1.0
-"""[s] What is taken before a detection begins: there the background is seen alone."""
-MAX_S = 60.0
-"""[s] What is seen for longer does not pass; it is cut there."""
+"""Duration of the background included before the onset of a detection [s]."""
+MAX_PASS_S = 60.0
+"""Maximum duration of a pass; a longer detection is truncated [s]."""
 
 
 class PassCollector:
-    """Readings to passes: what the network measured from before a detection until it ended."""
+    """Extracts passes from readings: all measurements from before a detection until its end.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : Settings
+    on_frame : function, optional
+        Called with every `FieldFrame` after detection.
+    """
 
     def __init__(self, network: SensorNetwork, settings: Settings,
-                 seen: Callable[[FieldFrame], object] | None = None) -> None:
-        """`seen` is called with every frame, with its verdict."""
-        self._network, self._settings, self._seen = network, settings, seen
+                 on_frame: Callable[[FieldFrame], object] | None = None) -> None:
+        self._network, self._settings, self._on_frame = network, settings, on_frame
         self._max_field = settings.calibrate.max_field
         self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
                         Detect(network, settings.detect))
-        # Raw and calibrated readings by the network's clock, since before the latest onset.
+        # Raw and calibrated readings, in network time, from before the latest onset.
         self._raw: deque[Readings] = deque()
         self._calibrated: deque[Readings] = deque()
         self._onset_ns: int | None = None
@@ -42,12 +49,12 @@ class PassCollector:
 
     @property
     def calibrate(self) -> Calibrate:
-        """The first stage."""
+        """Calibration stage."""
         return self._stages[0]
 
     @property
     def rejected(self) -> dict[str, int]:
-        """{cause: number} of samples that were not used."""
+        """Number of unused samples by cause: {cause: number}."""
         total: dict[str, int] = {}
         for stage in self._stages[:2]:
             for cause, n in rejected(stage.counts).items():
@@ -55,17 +62,43 @@ class PassCollector:
         return total
 
     def no_detection_reason(self, missing_topics: Sequence[str]) -> str | None:
-        """One sentence, or None where something was detected; see `no_detection_reason`."""
+        """Explain why nothing was detected; see `apps.no_detection.no_detection_reason`.
+
+        Parameters
+        ----------
+        missing_topics : sequence of str
+            Topics of the network that were not recorded.
+
+        Returns
+        -------
+        str or None
+            One sentence; None if a target was detected.
+        """
         calibrate, _, detect = self._stages
         return no_detection_reason(self._network, self._settings, calibrate, detect, missing_topics,
                                 self.rejected)
 
-    def waiting(self) -> list[str]:
-        """Names of sensors whose background was never learnt."""
+    def sensors_without_background(self) -> list[str]:
+        """Names of the sensors whose background was never learnt.
+
+        Returns
+        -------
+        list of str
+        """
         return self._stages[0].unready()
 
     def feed(self, readings: Readings) -> list[tuple[PassData, tuple[str, ...]]]:
-        """Raw `Readings` of the network give the passes that they complete: [(PassData, notes)]."""
+        """Add raw readings and return the passes completed by them.
+
+        Parameters
+        ----------
+        readings : Readings
+
+        Returns
+        -------
+        list of (PassData, notes)
+            Notes are texts for the user.
+        """
         calibrate, align, _ = self._stages
         out: list[tuple[PassData, tuple[str, ...]]] = []
         batches = calibrate.feed(readings)
@@ -78,38 +111,42 @@ class PassCollector:
         for calibrated in batches:
             self._calibrated.append(calibrated)
             for frame in align.feed(calibrated):
-                out += self._judge(frame)
+                out += self._add_frame(frame)
         return out
 
     def flush(self) -> list[tuple[PassData, tuple[str, ...]]]:
-        """The recording has ended: the pass that was still going on."""
+        """End the recording and return the pass that was still in progress.
+
+        Returns
+        -------
+        list of (PassData, notes)
+        """
         calibrate, align, _ = self._stages
         out: list[tuple[PassData, tuple[str, ...]]] = []
         for calibrated in calibrate.flush():
             self._calibrated.append(calibrated)
-            out += [p for frame in align.feed(calibrated) for p in self._judge(frame)]
-        out += [p for frame in align.flush() for p in self._judge(frame)]
+            out += [p for frame in align.feed(calibrated) for p in self._add_frame(frame)]
+        out += [p for frame in align.flush() for p in self._add_frame(frame)]
         if self._onset_ns is not None and self._last_ns is not None:
             out.append(self._cut(self._onset_ns, self._last_ns,
-                                 'the recording ends while it is still seen'))
+                                 'the recording ends before the target has passed'))
         return out
 
-    def _judge(self, frame: FieldFrame) -> list[tuple[PassData, tuple[str, ...]]]:
-        """Take a frame; the pass that has ended with it."""
+    def _add_frame(self, frame: FieldFrame) -> list[tuple[PassData, tuple[str, ...]]]:
+        """Detect targets in a frame; return the passes that end with it."""
         out = []
         for record in self._stages[2].feed(frame):
             if not isinstance(record, Detection):
-                if self._seen is not None:
-                    self._seen(record)
+                if self._on_frame is not None:
+                    self._on_frame(record)
                 continue
             if record.onset:
                 self._onset_ns = record.stamp_ns
             elif self._onset_ns is not None:
                 out.append(self._cut(self._onset_ns, record.stamp_ns))
-        if self._onset_ns is not None and frame.stamp_ns - self._onset_ns > MAX_S * NS:
-            out.append(self._cut(self._onset_ns, frame.stamp_ns, 'it is seen for more than '
-                                 f'{MAX_S:.0f} s: what comes after, until it is gone, is '
-                                 'left out'))
+        if self._onset_ns is not None and frame.stamp_ns - self._onset_ns > MAX_PASS_S * NS:
+            out.append(self._cut(self._onset_ns, frame.stamp_ns, 'the detection lasts for more '
+                                 f'than {MAX_PASS_S:.0f} s; the remainder is not used'))
         self._last_ns = frame.stamp_ns
         begin = (frame.stamp_ns if self._onset_ns is None else self._onset_ns) - PAD_S * NS
         for kept in (self._raw, self._calibrated):
@@ -119,7 +156,7 @@ class PassCollector:
 
     def _cut(self, onset_ns: int, end_ns: int,
              *remarks: str) -> tuple[PassData, tuple[str, ...]]:
-        """(PassData, notes) of what was kept from an onset to a time; the pass is over."""
+        """End a pass: (PassData, notes) of the readings from an onset to `end_ns`."""
         begin = onset_ns - int(PAD_S * NS)
         found = Readings.joined(self._calibrated)
         found = found.part((begin <= found.stamp_ns) & (found.stamp_ns <= end_ns))
@@ -130,40 +167,40 @@ class PassCollector:
         for j in np.unique(sensor):
             mine = np.flatnonzero(sensor == j)
             if found.covariance is not None:
-                covariance[mine] = _settled(found.covariance[mine])
+                covariance[mine] = _common_covariance(found.covariance[mine])
             for a, axis in enumerate('xyz'):
                 bad = mine[saturated_readings(raw[mine, a])]
                 if len(bad):
                     field[bad, a] = np.nan
                     notes.append(f'{self._network.names[j]}: {axis} was saturated in {len(bad)} '
-                                 f'of {len(mine)} samples at {raw[bad[0], a]:.3g} T; left out')
+                                 f'of {len(mine)} samples at {raw[bad[0], a]:.3g} T; not used')
         self._onset_ns = None
         t = (found.stamp_ns - begin) / NS
         return PassData(self._network, begin, t, sensor, field, covariance), tuple(notes)
 
     def _raw_fields(self, calibrated: Readings) -> FloatArray:
-        """Raw fields (n, 3) [T] of calibrated readings; NaN where a reading has none."""
+        """Raw fields (n, 3) [T] of calibrated readings; NaN if the raw reading is unavailable."""
         raw = Readings.joined(self._raw)
         known: dict[tuple[int, int], int] = {}
         for k, key in enumerate(zip(raw.sensor.tolist(), raw.stamp_ns.tolist(), strict=True)):
-            # Of two with the same timestamp the calibration accepts the first usable one.
+            # The calibration accepts the first usable reading of a timestamp.
             if np.nanmax(np.abs(raw.field[k]), initial=0.0) <= self._max_field:
                 known.setdefault(key, k)
-        # Row -1 is NaN.
+        # Row -1 contains NaN.
         rows = [known.get(key, -1) for key in zip(
             calibrated.sensor.tolist(), calibrated.stamp_ns.tolist(), strict=True)]
         fields: FloatArray = np.concatenate([raw.field, np.full((1, 3), np.nan)])[rows]
         return fields
 
 
-def _settled(covariances: FloatArray) -> FloatArray:
-    """(n, 3, 3) covariances of readings; the first for all where they are about the same.
+def _common_covariance(covariances: FloatArray) -> FloatArray:
+    """Covariances (n, 3, 3) of readings, replaced by the first if they are similar.
 
-    Noise that is still being learnt differs a little from reading to reading, and the sensor's
-    does not. That of a coarse sensor at rest is many times that of one that moves.
+    While the noise is being learnt, its estimate varies slightly although the noise does not. The
+    covariance of a coarse sensor in a constant field is many times that in a changing field.
     """
     size = np.nansum(np.einsum('kii->ki', covariances), axis=1)
     if size.max() > 2.0 * size.min():
         return covariances
-    settled: FloatArray = np.broadcast_to(covariances[0], covariances.shape)
-    return settled
+    common: FloatArray = np.broadcast_to(covariances[0], covariances.shape)
+    return common

@@ -1,4 +1,4 @@
-"""Readings to fitted passes: cut out, tracked, and fitted as one vehicle or several."""
+"""Fits of the passes in a stream of readings, as one vehicle or several."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,42 +22,45 @@ from mag_tracking.pipeline import Settings
 from mag_tracking.records import FieldFrame, Readings
 from mag_tracking.stages.track.manager import TrackManager
 
-TRAILER = 8.0
-"""[m] A car and its trailer are rows that are nearer to each other than this."""
+MAX_TRAILER_DISTANCE = 8.0
+"""Maximum distance between a car and its trailer [m]."""
 
 
 @dataclass(frozen=True)
 class FittedPass:
-    """A vehicle of a detection of a recording, fitted with several numbers of dipoles."""
+    """One vehicle in a detection, fitted with several numbers of dipoles."""
 
     recording: str
+    """Name of the recording."""
     number: int
     """Number of the detection."""
     fits: tuple[PassFit, ...]
+    """One fit per number of dipoles."""
     notes: tuple[str, ...]
-    """Measurements that were left out, with the reason, and remarks."""
+    """Remarks, such as measurements that were not used and the reason."""
     correlated: CorrelatedMotion = CorrelatedMotion()
-    """The velocity by the delays between the sensors, which needs no model; missing if several
+    """Velocity from the delays between the sensors, independent of the model; missing if several
     vehicles were fitted together."""
     vehicle: int = 1
     """Number among the vehicles that were fitted together, in the order in which they passed."""
     n_vehicles: int = 1
+    """Number of vehicles that were fitted together."""
 
     @property
     def label(self) -> str:
-        """Its name in texts and files."""
+        """Name in texts and file names."""
         return f'pass {self.number}' + (f', vehicle {self.vehicle}' if self.n_vehicles > 1 else '')
 
     @property
     def chosen(self) -> PassFit | None:
-        """The fit of the order that the measurements are worth, or None."""
+        """Fit with the number of dipoles that the measurements support, or None."""
         return choose_order(self.fits)
 
     @property
     def known(self) -> PassFit | None:
-        """The fit whose trusted numbers count: the chosen one, else the one that fits best.
+        """Fit whose trusted values are reported: the chosen one, or else the best one.
 
-        None where any fit says that the target turned or was not one: that holds for all.
+        None if any fit shows that the target turned or was not a single target.
         """
         if self.chosen is not None:
             return self.chosen
@@ -68,10 +71,10 @@ class FittedPass:
 
     @property
     def disagreement(self) -> tuple[float, float]:
-        """Largest difference [m], [m/s] to the chosen fit of those with nearly its cost.
+        """Largest differences [m], [m/s] between the chosen fit and fits with a similar cost.
 
-        That is what the model leaves open. NaN where there is no other fit, and where the chosen
-        one describes the measurements to the noise: then richer ones only fit noise.
+        They indicate the error of the model. NaN without such a fit, and if the residuals of the
+        chosen fit are consistent with the noise: then fits with more dipoles only fit noise.
         """
         best = self.chosen
         if best is None or not best.cost > energy_threshold(1e-3, best.degrees_of_freedom):
@@ -85,9 +88,20 @@ class FittedPass:
 
 
 class PassFitter:
-    """Fits every pass of a stream of readings, one after the other.
+    """Fits every pass in a stream of readings.
 
-    A tracker runs in parallel and determines the number of vehicles of a pass.
+    A tracker runs in parallel and determines the number of vehicles in each pass.
+
+    Parameters
+    ----------
+    recording : str
+        Name of the recording.
+    network : SensorNetwork
+    settings : Settings
+    orders : sequence of int
+        Numbers of dipoles.
+    cpa_range : (range, std), m, optional
+        Range at the closest point of approach, for a network of one sensor.
 
     Attributes
     ----------
@@ -96,7 +110,6 @@ class PassFitter:
 
     def __init__(self, recording: str, network: SensorNetwork, settings: Settings,
                  orders: Sequence[int], cpa_range: tuple[float, float] | None = None) -> None:
-        """`recording` is its name; the others as for `apps.fit.RecordingFit`."""
         self._recording = recording
         self.collector = PassCollector(network, settings, self._track)
         self._tracker = TrackManager(network, settings.track)
@@ -106,21 +119,42 @@ class PassFitter:
 
     def feed(self, readings: Readings,
              stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """Iterate over what raw `Readings` complete, until `stopped` says so."""
+        """Add raw readings and fit the passes completed by them.
+
+        Parameters
+        ----------
+        readings : Readings
+        stopped : function, optional
+            Fitting ends when it returns true.
+
+        Returns
+        -------
+        iterator of FittedPass
+        """
         return self._fitted(self.collector.feed(readings), stopped)
 
     def flush(self, stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """The readings have ended: the pass that was still going on."""
+        """End the readings and fit the pass that was still in progress.
+
+        Parameters
+        ----------
+        stopped : function, optional
+            Fitting ends when it returns true.
+
+        Returns
+        -------
+        iterator of FittedPass
+        """
         return self._fitted(self.collector.flush(), stopped)
 
     def _track(self, frame: FieldFrame) -> None:
-        """Take a frame for the tracks."""
+        """Track the targets in a frame."""
         self._tracker.doubt(self.collector.calibrate.doubtful_intervals())
-        self._tracks.take(self._tracker.feed(frame))
+        self._tracks.add(self._tracker.feed(frame))
 
     def _fitted(self, passes: Iterable[tuple[PassData, tuple[str, ...]]],
                 stopped: Callable[[], bool] | None) -> Iterator[FittedPass]:
-        """The fits of what the collector gave; a pass that is stopped in the middle is left out."""
+        """Fit passes of the collector; a pass whose fitting is stopped is discarded."""
         for data, notes in passes:
             fits = []
             for n_dipoles in self._orders:
@@ -135,22 +169,44 @@ class PassFitter:
             yield from found
 
 
-def fitted_vehicles(recording: str, number: int, data: PassData, alone: Sequence[PassFit],
+def fitted_vehicles(recording: str, number: int, data: PassData, single: Sequence[PassFit],
                     paths: FloatArray, ground: GroundPrior, orders: Sequence[int],
                     notes: tuple[str, ...],
                     stopped: Callable[[], bool] | None = None) -> list[FittedPass]:
-    """A `FittedPass` of each vehicle of a pass.
+    """Fit the vehicles in a pass, jointly if there are several.
 
-    `recording`, `number` and `notes` are those of the `FittedPass`; the others as for
-    `analysis.pass_targets.fit_targets`.
+    Parameters
+    ----------
+    recording : str
+        Name of the recording.
+    number : int
+        Number of the detection.
+    data : PassData
+    single : sequence of PassFit
+        Fits of the pass as a single vehicle.
+    paths : (K, 6) array, m and m/s, world frame
+        Position and velocity of each tracked vehicle when `data.t` is zero.
+    ground : GroundPrior
+    orders : sequence of int
+        Numbers of dipoles to try if there are several vehicles.
+    notes : tuple of str
+        Remarks on the pass.
+    stopped : function, optional
+        Fitting ends when it returns true; the result is then invalid.
+
+    Returns
+    -------
+    list of FittedPass
+        One entry per vehicle.
     """
-    found = fit_targets(data, alone, paths, ground, orders, stopped)
+    found = fit_targets(data, single, paths, ground, orders, stopped)
     if len(found) == 1:
         return [FittedPass(recording, number, found[0], notes, correlated_motion(data))]
     chosen = [fit for fit in map(choose_order, found) if fit is not None]
-    notes = (*notes, f'{len(found)} vehicles were fitted together: what was measured is given '
+    notes = (*notes, f'{len(found)} vehicles were fitted together; the measurements are given '
                      'without the field of the others')
-    if not are_separate(data, [path_from(data, fit) for fit in chosen], TRAILER):
-        notes = (*notes, f'they are less than {TRAILER:.0f} m apart: perhaps parts of one vehicle')
+    if not are_separate(data, [path_from(data, fit) for fit in chosen], MAX_TRAILER_DISTANCE):
+        notes = (*notes, f'the vehicles are less than {MAX_TRAILER_DISTANCE:.0f} m apart: they may '
+                         'be parts of one vehicle')
     return [FittedPass(recording, number, fits, notes, CorrelatedMotion(
-        'several vehicles were seen at once'), k, len(found)) for k, fits in enumerate(found, 1)]
+        'several vehicles passed together'), k, len(found)) for k, fits in enumerate(found, 1)]

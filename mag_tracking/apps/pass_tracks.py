@@ -21,26 +21,35 @@ class _Pose:
     stamp_ns: int
     path: FloatArray
     """(6,) position and velocity."""
-    spread: float
-    """[m^2] Trace of the covariance of the position."""
+    variance: float
+    """Trace of the covariance of the position [m²]."""
 
 
 class PassTracks:
-    """Takes the records of a tracker, and gives the targets of each pass."""
+    """Determines the targets in each pass from the records of a tracker.
+
+    Parameters
+    ----------
+    settings : TrackSettings
+    """
 
     def __init__(self, settings: TrackSettings) -> None:
-        """`settings` of the tracker."""
         self._of_vehicles = settings.target == 'vehicle'
-        # The surest pose of each track in earlier passes, and all later poses.
+        # The pose of each track with the smallest variance in earlier passes, and all later poses.
         self._poses: dict[int, list[_Pose]] = {}
         self._ended: set[int] = set()
         self._latest_ns = 0
 
-    def take(self, records: Iterable[object]) -> None:
-        """Note the poses among the records of a tracker."""
+    def add(self, records: Iterable[object]) -> None:
+        """Store the poses among the records of a tracker.
+
+        Parameters
+        ----------
+        records : iterable
+        """
         for record in records:
             if isinstance(record, Track) and record.stamp_ns < self._latest_ns:
-                # The time jumped back: what was is of another pass.
+                # The time jumped back: earlier poses belong to another pass.
                 self._poses.clear()
                 self._ended.clear()
             if isinstance(record, Track):
@@ -53,15 +62,24 @@ class PassTracks:
                     float(np.trace(record.covariance[:3, :3]))))
 
     def paths(self, data: PassData) -> FloatArray:
-        """Position and velocity (K, 6) [m], [m/s] of each vehicle when `data.t` is zero.
+        """Return the path of each vehicle in a pass.
 
-        A vehicle belongs to the pass if its pose with the smallest covariance does. Of tracks that
-        overlap only the most certain one counts: the vehicle was lost and found again. Passes have
-        to come in order; magnets have no paths.
+        A vehicle belongs to the pass if its pose with the smallest variance does. Overlapping
+        tracks are one vehicle that was lost and found again; the most certain one is used. Passes
+        must be given in order.
+
+        Parameters
+        ----------
+        data : PassData
+
+        Returns
+        -------
+        (K, 6) array, m and m/s, world frame
+            Position and velocity when `data.t` is zero. Empty for magnets.
         """
         end_ns = data.stamp_ns + int(NS * data.t.max())
-        mine = sorted((pose for pose in self._surest_until(end_ns)
-                       if pose.stamp_ns >= data.stamp_ns), key=lambda pose: pose.spread)
+        mine = sorted((pose for pose in self._most_certain_until(end_ns)
+                       if pose.stamp_ns >= data.stamp_ns), key=lambda pose: pose.variance)
         paths: list[FloatArray] = []
         for pose in mine:
             path = propagated_path(pose.path, (data.stamp_ns - pose.stamp_ns) / NS)
@@ -69,21 +87,23 @@ class PassTracks:
                 paths.append(path)
         return np.array(paths).reshape(-1, 6)
 
-    def _surest_until(self, end_ns: int) -> list[_Pose]:
-        """The surest pose of each track until a time, but for vehicles that are still approaching:
-        their latest pose is the surest. Older poses are dropped.
+    def _most_certain_until(self, end_ns: int) -> list[_Pose]:
+        """Pose of each track with the smallest variance until a time; drops older poses.
+
+        Vehicles that are still approaching are omitted: their latest pose has the smallest
+        variance.
         """
         found = []
         for track, poses in list(self._poses.items()):
             until = [pose for pose in poses if pose.stamp_ns <= end_ns]
             later = poses[len(until):]
-            surest = min(until, key=lambda pose: pose.spread, default=None)
-            if surest is None:
+            best = min(until, key=lambda pose: pose.variance, default=None)
+            if best is None:
                 continue
             has_ended = track in self._ended and not later
-            if surest is not until[-1] or has_ended:
-                found.append(surest)
-            self._poses[track] = [surest, *later]
+            if best is not until[-1] or has_ended:
+                found.append(best)
+            self._poses[track] = [best, *later]
             if has_ended:
                 del self._poses[track]
                 self._ended.remove(track)
@@ -91,8 +111,17 @@ class PassTracks:
 
 
 def ground_prior(settings: TrackSettings) -> GroundPrior:
-    """The prior of height and climb that the settings of a tracker describe."""
+    """Prior of height and climb rate from the settings of a tracker.
+
+    Parameters
+    ----------
+    settings : TrackSettings
+
+    Returns
+    -------
+    GroundPrior
+    """
     vehicle = settings.vehicle
     height, std = np.array(vehicle.heights), np.array(vehicle.height_stds)
-    spread = float(np.sqrt(height.var() + np.square(std).mean()))
-    return GroundPrior((float(height.mean()), spread), vehicle.climb_std)
+    height_std = float(np.sqrt(height.var() + np.square(std).mean()))
+    return GroundPrior((float(height.mean()), height_std), vehicle.climb_std)

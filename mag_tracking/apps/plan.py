@@ -1,4 +1,4 @@
-"""What an installer wants to know before the first hole is drilled."""
+"""Prediction of accuracy and coverage of a sensor network before its installation."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,68 +25,99 @@ from mag_tracking.pipeline import Settings
 from mag_tracking.stages.track.settings import acceleration_density
 
 MAX_FRAMES = 1000
-"""Of a pass, when it is asked whether it is missed: slower ones are not missed more."""
+"""Maximum number of frames of a pass for the probability of a miss, which no longer depends on
+the number for slower passes."""
 
 Area: TypeAlias = tuple[float, float, float, float]
 """(x0, y0, x1, y1) [m]."""
 
 GOOD_PD = 0.9
-"""A target is counted as seen where a frame detects it with this probability."""
+"""Detection probability per frame at which a target counts as detectable."""
 
 
 @dataclass(frozen=True)
 class Lane:
-    """A straight way through the network, with what is known along it."""
+    """Straight lane through the network, with bounds and detection along it."""
 
     name: str
+    """Name in texts."""
     heading: float
-    """[rad]."""
+    """Anticlockwise from x [rad]."""
     along: FloatArray
-    """(n,) [m] from the point nearest to the middle of the sensors."""
+    """(n,) m, distance from the point nearest to the centre of the sensors."""
     points: FloatArray
-    """(n, 2) [m]."""
+    """(n, 2) m, world frame."""
     pass_std: FloatArray
-    """(n, 3) position, velocity, moment, by the whole pass; median over the moment's directions."""
+    """(n, 3) m, m/s, A m²: bounds of position, velocity and moment from the whole pass; median over
+    the directions of the moment."""
     filter_std: FloatArray
-    """(n,) [m] position, by what a filter has seen so far."""
+    """(n,) m, bound of the position for a filter that has received the measurements so far."""
     detection: FloatArray
-    """(n,) probability that a frame detects it, mean over the moment's directions."""
+    """(n,) probability that a frame detects the target; mean over the directions of the moment."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The answers; maps are [y, x]."""
+    """Predicted performance of a network; maps are indexed [y, x]."""
 
     network: SensorNetwork
+    """Planned network."""
     target: PlannedTarget
+    """Assumed target."""
     sampling: Sampling
+    """Noise and sampling of the sensors."""
     x: FloatArray
+    """(nx,) m, coordinates of the maps."""
     y: FloatArray
+    """(ny,) m, coordinates of the maps."""
     position_std: FloatArray
-    """[m] bound by a whole pass through the point, median over headings and directions."""
+    """(ny, nx) m, bound of the position from a whole pass through the point; median over headings
+    and directions of the moment."""
     detection: FloatArray
-    """Probability that one frame detects the target at the point."""
+    """(ny, nx) probability that one frame detects the target at the point."""
     lanes: tuple[Lane, ...]
+    """Lanes through the network."""
     with_one_more: FloatArray
-    """[m] median bound over the lanes, near the network, with one more sensor there; NaN where none
-    may stand."""
+    """Coarser map: median bound [m] over the lanes, near the network, with an additional sensor at
+    the point; NaN where no sensor is allowed."""
     without: float
-    """[m] the same as it is."""
+    """The same bound without the additional sensor [m]."""
     best_place: tuple[float, float]
+    """Best position of the additional sensor (x, y) [m]."""
     observability: Observability
-    """Of the first lane's closest point, for one direction of the moment, without priors."""
+    """Observability at the closest point of the first lane, for one direction of the moment,
+    without priors."""
     blocks: dict[str, FloatArray]
-    """{'with prior', 'without prior': (3,)} bounds at the first lane's closest point."""
+    """{'with prior' or 'without prior': (3,) bounds of position, velocity and moment} at the
+    closest point of the first lane."""
     missed: FloatArray
-    """(n, 2) [m] lateral distance of a pass on the first lane's heading, probability that it is
-    not detected at all."""
+    """(n, 2) lateral distance [m] of a pass with the heading of the first lane, and probability
+    that the pass is not detected at all."""
 
 
 def detection_range(target: PlannedTarget, noise_std: float, n_axes: int,
                     false_alarm: float) -> float:
-    """[m] where a frame of one sensor detects half of such targets, about; T10 eq. (5.20).
+    """Approximate range at which a frame of one sensor detects half of the targets.
 
-    Over all directions of the moment the energy is twice that of a dipole abeam.
+    Averaged over all directions of the moment, the energy is twice that of a dipole abeam.
+
+    Parameters
+    ----------
+    target : PlannedTarget
+    noise_std : float, T
+        Noise of one axis of a frame.
+    n_axes : int
+        Number of axes of the sensor.
+    false_alarm : float
+        False-alarm probability.
+
+    Returns
+    -------
+    float, m
+
+    References
+    ----------
+    [T10]_ eq. (5.20).
     """
     return float(snr_range(np.sqrt(2.0) * target.moment, noise_std,
                            energy_threshold(false_alarm, n_axes)))
@@ -96,7 +127,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
                  lanes: Sequence[tuple[str, float, float]], area: Area, settings: Settings,
                  clearance: float = 0.0, n_grid: int = 41,
                  progress: Callable[[int], object] | None = None) -> Plan:
-    """Bounds, detection and the best place for one more sensor.
+    """Compute bounds, detection probabilities and the best place for an additional sensor.
 
     Parameters
     ----------
@@ -104,16 +135,16 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     target : PlannedTarget
     sampling : Sampling
     lanes : sequence of (name, heading [rad], lateral offset [m])
-        The offset is to the left of the line through the middle of the sensors.
-    area : (x0, y0, x1, y1) [m]
+        The offset is to the left of the line through the centre of the sensors.
+    area : (x0, y0, x1, y1), m
     settings : Settings
-        Of detection and tracking.
-    clearance : float [m]
-        No sensor may stand nearer to a lane.
+        Settings of detection and tracking.
+    clearance : float, m
+        Minimum distance of an additional sensor from a lane.
     n_grid : int
-        Points of the map on its longer side.
+        Number of points along the longer side of the maps.
     progress : function, optional
-        Called with 1 whenever one of the `n_parts` parts is done.
+        Called with 1 whenever one of the `n_parts` parts is completed.
 
     Returns
     -------
@@ -135,7 +166,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     step(1)
     done = tuple(_lane(network, target, sampling, *lane, area, settings) for lane in lanes)
     step(1)
-    # One more sensor: where the lanes are near the network, as that is where it is to be good.
+    # The additional sensor is evaluated where the lanes are near the network.
     reach = 0.5 * max(np.ptp(network.positions[:, :2], axis=0).max(), 8.0 * target.height)
     near = [(lane.heading, lane.points[np.abs(lane.along) <= reach][::4]) for lane in done]
     coarse_x, coarse_y = _grid(area, max(11, n_grid // 2))
@@ -158,7 +189,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
 
 def _at_closest(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, lane: Lane,
                 reach: float) -> tuple[Observability, dict[str, FloatArray]]:
-    """`Plan.observability` and `Plan.blocks`; `reach` [m] is a typical distance."""
+    """Compute `Plan.observability` and `Plan.blocks`; `reach` [m] is a typical distance."""
     closest = lane.points[np.argmin(np.abs(lane.along))][None]
     J = pass_information(network.positions, network.R_sw, target, sampling, closest,
                          lane.heading)[0].sum(axis=1)
@@ -169,7 +200,7 @@ def _at_closest(network: SensorNetwork, target: PlannedTarget, sampling: Samplin
 
 
 def _distance(lane: Lane, places: FloatArray) -> FloatArray:
-    """(n,) [m] of places (n, 2) from the line of a lane."""
+    """Distances (n,) [m] of places (n, 2) from the line of a lane."""
     u = lane.points[-1] - lane.points[0]
     r = places - lane.points[0]
     distance: FloatArray = np.abs(u[0] * r[:, 1] - u[1] * r[:, 0]) / np.hypot(*u)
@@ -177,7 +208,16 @@ def _distance(lane: Lane, places: FloatArray) -> FloatArray:
 
 
 def n_parts(lanes: Sequence[tuple[str, float, float]]) -> int:
-    """How often `plan` calls its `progress`."""
+    """Return the number of times that `compute_plan` calls its `progress`.
+
+    Parameters
+    ----------
+    lanes : sequence of (name, heading [rad], lateral offset [m])
+
+    Returns
+    -------
+    int
+    """
     return len({heading % np.pi for _, heading, _ in lanes}) + 3
 
 
@@ -191,7 +231,7 @@ def _grid(area: Area, n: int) -> tuple[FloatArray, FloatArray]:
 
 def _lane(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, name: str,
           heading: float, offset: float, area: Area, settings: Settings) -> Lane:
-    """What is known along one lane, every frame."""
+    """Compute bounds and detection along one lane."""
     u = np.array([np.cos(heading), np.sin(heading)])
     half = 0.5 * np.hypot(area[2] - area[0], area[3] - area[1])
     n = int(np.clip(half / (target.speed * sampling.period), 10, 60))
@@ -210,9 +250,10 @@ def _lane(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, nam
 
 def _filter_bound(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                   points: FloatArray, heading: float, settings: Settings) -> FloatArray:
-    """(n,) [m] the path bound of a filter that follows a lane from its beginning.
+    """Path bound (n,) [m] of a filter that follows a lane from its beginning.
 
-    Its motion is the tracker's, the backgrounds are states as well; median over directions.
+    The motion model is that of the tracker, and the backgrounds are part of the state. Median over
+    the directions of the moment.
     """
     n_sensors, dt = len(network), np.hypot(*(points[1] - points[0])) / target.speed
     each = dt / sampling.period
@@ -247,7 +288,7 @@ def _filter_bound(network: SensorNetwork, target: PlannedTarget, sampling: Sampl
 def _one_more(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
               near: Sequence[tuple[float, FloatArray]],
               places: FloatArray) -> tuple[float, FloatArray]:
-    """(median bound as it is, (n_places,) with one more sensor at each of the places)."""
+    """(median bound, (n_places,) median bounds with an additional sensor at each place) [m]."""
     height = network.positions[:, 2].mean()
     candidates = np.column_stack([places, np.full(len(places), height)])
     upright = np.tile(np.eye(3), (len(places), 1, 1))
@@ -269,7 +310,7 @@ def _one_more(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
 
 def _missed(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, lane: Lane,
             area: Area, settings: Settings) -> FloatArray:
-    """`Plan.missed`: no so many frames in a row detect the target as an onset needs."""
+    """Compute `Plan.missed`: fewer consecutive frames than an onset requires detect the target."""
     half = 0.5 * max(area[2] - area[0], area[3] - area[1])
     offsets = np.linspace(0.0, 2.0 * half, 25)
     u = np.array([np.cos(lane.heading), np.sin(lane.heading)])

@@ -1,4 +1,4 @@
-"""The inputs of a plan from few numbers: what is not given comes from network and settings."""
+"""Inputs of a plan; missing values are taken from the network and the settings."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -19,10 +19,10 @@ from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 from mag_tracking.stages.track.settings import TrackSettings
 
 NOISE_STD = 1.2e-8
-"""[T] of one sample, where neither the caller nor the network file has another."""
+"""Default noise of one sample [T]."""
 
 CLEARANCE = 2.0
-"""[m] between a lane for vehicles and a further sensor."""
+"""Default distance between a lane for vehicles and an additional sensor [m]."""
 
 
 @dataclass(frozen=True)
@@ -30,22 +30,38 @@ class PlanInputs:
     """Checked arguments of `compute_plan`."""
 
     target: PlannedTarget
+    """Target."""
     sampling: Sampling
+    """Noise and sampling of the sensors."""
     lanes: tuple[tuple[str, float, float], ...]
-    """(name, heading [rad], lateral offset [m])."""
+    """(name, heading [rad], lateral offset [m]) of each lane."""
     area: Area
+    """Area of the maps (x0, y0, x1, y1) [m]."""
     clearance: float
-    """[m]"""
+    """Minimum distance of an additional sensor from a lane [m]."""
     n_grid: int
+    """Number of points along the longer side of the maps."""
 
     @property
     def n_parts(self) -> int:
-        """How often `run` calls its `progress`."""
+        """Number of times that `run` calls its `progress`."""
         return n_parts(self.lanes)
 
     def run(self, network: SensorNetwork, settings: Settings,
             progress: Callable[[int], object] | None = None) -> Plan:
-        """The plan; `progress` is called with 1 whenever a part is done."""
+        """Compute the plan.
+
+        Parameters
+        ----------
+        network : SensorNetwork
+        settings : Settings
+        progress : function, optional
+            Called with 1 whenever one of the `n_parts` parts is completed.
+
+        Returns
+        -------
+        Plan
+        """
         return compute_plan(network, self.target, self.sampling, self.lanes, self.area, settings,
                             self.clearance, self.n_grid, progress)
 
@@ -56,7 +72,34 @@ def plan_inputs(network: SensorNetwork, settings: Settings, target: str | None =
                 noise_std: float | None = None, rate: float = 100.0,
                 field_error: float | None = None, area: Sequence[float] | None = None,
                 clearance: float | None = None, grid: int = 41) -> PlanInputs:
-    """Check and complete the inputs of a plan; see `plan`, which takes the same."""
+    """Check and complete the inputs of a plan, which are described in `plan`.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : Settings
+    target : str, optional
+    moment : float, A m², optional
+    height : float, m, optional
+    speed : float, m/s
+    heading : sequence of float, deg, optional
+    offset : sequence of float, m, optional
+    noise_std : float, T, optional
+    rate : float, Hz
+    field_error : float, optional
+    area : (x0, y0, x1, y1), m, optional
+    clearance : float, m, optional
+    grid : int
+
+    Returns
+    -------
+    PlanInputs
+
+    Raises
+    ------
+    SettingsError
+        If an input is out of range; the message begins with its name.
+    """
     planned = _target(settings.track, target, moment, height, speed)
     lanes = _lanes(settings.track.vehicle, _floats(heading), _floats(offset))
     _within('grid', grid, 5, 200)
@@ -76,34 +119,39 @@ def plan(network: SensorNetwork | str | PathLike[str], target: str | None = None
          noise_std: float | None = None, rate: float = 100.0, field_error: float | None = None,
          area: Sequence[float] | None = None, clearance: float | None = None, grid: int = 41,
          settings: Mapping[str, Any] | None = None) -> Plan:
-    """Bounds and detection for a target that passes a network; one more sensor.
+    """Predict accuracy, detection and the best place for an additional sensor.
 
     Parameters
     ----------
     network : SensorNetwork or path of a network file
     target : str, optional
-        A kind of vehicle of the settings ('small', 'car', 'truck'; default: 'car'), which gives
-        moment and height; or 'magnet', which needs both.
-    moment, height : float [A m^2], [m], optional
-        Of the target instead.
-    speed : float [m/s]
-    heading, offset : sequence of float [deg], [m], optional
-        Of the lanes: 0 = along x, anticlockwise; to the left of the line through the middle of
-        the sensors. The arrivals of the settings and 0 if left out.
-    noise_std : float [T], optional
-        Noise of one sample. That of the network file, or 12 nT, if left out.
-    rate : float [Hz]
-        Samples per second and sensor.
+        'small', 'car' or 'truck' (default: 'car'): moment and height of this kind of vehicle in
+        the settings; or 'magnet', which requires `moment` and `height`.
+    moment : float, A m², optional
+        Magnitude of the moment; requires `height`.
+    height : float, m, optional
+        Height of the magnetic centre, z in the frame of the network.
+    speed : float, m/s
+    heading : sequence of float, deg, optional
+        Heading of each lane, anticlockwise from x; default: the arrival directions of the
+        settings.
+    offset : sequence of float, m, optional
+        Lateral offset of each lane, to the left of the centre of the sensors; default: 0.
+    noise_std : float, T, optional
+        Noise of one sample; default: that of the network file, or 12 nT.
+    rate : float, Hz
+        Sample rate of each sensor.
     field_error : float, optional
-        Relative error of the field; `track.field_error` if left out.
-    area : (x0, y0, x1, y1) [m], optional
-        Of the maps; as far as half of the targets are detected if left out.
-    clearance : float [m], optional
-        No further sensor nearer to a lane; 2 for vehicles, 0 with `moment`, if left out.
+        Relative error of the field; default: `track.field_error`.
+    area : (x0, y0, x1, y1), m, optional
+        Area of the maps; default: where at least half of the targets are detected.
+    clearance : float, m, optional
+        Minimum distance of an additional sensor from a lane; default: 2 for vehicles, 0 with
+        `moment`.
     grid : int
-        Points of the maps on their longer side.
+        Number of points along the longer side of the maps.
     settings : {name: value}, optional
-        What differs from the defaults of the target.
+        Settings that differ from the defaults of the target.
 
     Returns
     -------
@@ -112,9 +160,9 @@ def plan(network: SensorNetwork | str | PathLike[str], target: str | None = None
     Raises
     ------
     SettingsError
-        If an input is out of range; the message names it.
+        If an input is out of range; the message begins with its name.
     NetworkError
-        If the network file is not valid.
+        If the network file is invalid.
     """
     network = network_of(network)
     tree = settings_for('magnet' if target == 'magnet' else 'vehicle', settings)
@@ -126,35 +174,35 @@ def plan(network: SensorNetwork | str | PathLike[str], target: str | None = None
 
 
 def _within(name: str, value: float, low: float, high: float) -> float:
-    """`value`, or a SettingsError."""
+    """Return `value`; raises SettingsError if it is out of range."""
     if not low <= value <= high:
         raise SettingsError(f'{name}: expected {low:g} to {high:g}, got {value:g}')
     return value
 
 
 def _floats(values: Sequence[float] | None) -> list[float] | None:
-    """Numbers of a list or an array."""
+    """Convert the values of a list or array to float."""
     return None if values is None else [float(v) for v in values]
 
 
 def _target(track: TrackSettings, target: str | None, moment: float | None,
             height: float | None, speed: float) -> PlannedTarget:
-    """The target of a kind, or of a moment and a height."""
+    """Target of a kind, or with a moment and a height."""
     vehicle = track.vehicle
     _within('speed', speed, 1e-4, 1e3)
     if height is not None:
         _within('height', height, -1e3, 1e3)
     if moment is not None:
         if target not in (None, 'magnet'):
-            raise SettingsError('target: give one of target and moment')
+            raise SettingsError('target: give either target or moment')
         if height is None:
-            raise SettingsError('height: needed with a moment')
+            raise SettingsError('height: required together with moment')
         return PlannedTarget(_within('moment', moment, 1e-6, 1e6), height, speed)
     if target == 'magnet':
-        raise SettingsError('moment: needed for a magnet, and height')
+        raise SettingsError('moment: required for a magnet, together with height')
     kind = target or 'car'
     if kind not in vehicle.kinds:
-        raise SettingsError(f'target: expected one of {", ".join(vehicle.kinds)}, magnet; got '
+        raise SettingsError(f'target: expected one of {", ".join(vehicle.kinds)}, magnet, got '
                             f'{kind!r}')
     k = vehicle.kinds.index(kind)
     return PlannedTarget(vehicle.moments[k], vehicle.heights[k] if height is None else height,
@@ -171,7 +219,7 @@ def _lanes(vehicle: VehicleSettings, heading: Sequence[float] | None,
         names = [f'{angle:g} deg' for angle in heading]
     offsets = offset or [0.0] * len(heading)
     if len(offsets) != len(heading):
-        raise SettingsError(f'offset: expected {len(heading)} numbers, one a lane '
+        raise SettingsError(f'offset: expected {len(heading)} numbers, one per lane '
                             f'({", ".join(names)}), got {len(offsets)}')
     for value in heading:
         _within('heading', value, -1e5, 1e5)
@@ -181,16 +229,17 @@ def _lanes(vehicle: VehicleSettings, heading: Sequence[float] | None,
         names = [f'{name}, {value:+g} m' for name, value in zip(names, offset, strict=True)]
     lanes = tuple(zip(names, map(math.radians, heading), offsets, strict=True))
     if len(set(lanes)) < len(lanes):
-        raise SettingsError('heading: a lane is there twice; give each its offset')
+        raise SettingsError('heading: two lanes are equal; give them different offsets')
     return lanes
 
 
 def _sampling(network: SensorNetwork, settings: Settings, noise_std: float | None, rate: float,
               field_error: float | None) -> Sampling:
-    """The sampling, but for how long the target is followed.
+    """Sampling of the sensors, without the duration of a pass.
 
-    An error of the field that lasts tells as little in many frames as in one: it counts as so much
-    more noise in each (the architecture page says why the tracker has it as a state).
+    An error of the field that persists over many frames is not averaged out; it is represented by
+    correspondingly more noise in each frame. (The tracker models it as a state; see
+    docs/architecture.md.)
     """
     track = settings.track
     period = max(frame_period(settings.align, network), 1.0 / _within('rate', rate, 1e-2, 1e5))
@@ -214,6 +263,6 @@ def _area(network: SensorNetwork, reach: float, area: Sequence[float] | None) ->
         raise SettingsError(f'area: expected X0 < X1 and Y0 < Y1, got {area}')
     for side in (x1 - x0, y1 - y0):
         _within('area: a side', side, 1e-3, 1e5)
-    _within('area: its longer side over the other', max((x1 - x0) / (y1 - y0),
-                                                        (y1 - y0) / (x1 - x0)), 1.0, 50.0)
+    _within('area: ratio of its sides', max((x1 - x0) / (y1 - y0),
+                                            (y1 - y0) / (x1 - x0)), 1.0, 50.0)
     return x0, y0, x1, y1

@@ -18,57 +18,94 @@ LOW_SHARE = 0.02
 
 
 def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
-    """Write `report.html` with the lines of `answers` into folder `out`; returns its path.
+    """Write `report.html`.
 
-    Raises OutputError.
+    Parameters
+    ----------
+    plan : Plan
+    lines : list of str
+        Lines of `summary_lines`.
+    out : Path
+        Folder.
+
+    Returns
+    -------
+    Path
+        File written.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
     """
     path = out / REPORT
     replace_text(path, report_html(plan_page(plan, lines)))
     return path
 
 
-def answers(p: Plan) -> list[str]:
-    """Summary of a plan, one line per result."""
+def summary_lines(p: Plan) -> list[str]:
+    """Summarise a plan.
+
+    Parameters
+    ----------
+    p : Plan
+
+    Returns
+    -------
+    list of str
+        One line per result.
+    """
     noise, out = float(np.median(p.sampling.noise_std)), list[str]()
-    out.append(f'{len(p.network)} sensors, noise of a frame {1e9 * noise:.2g} nT; '
-          f'target of {p.target.moment:g} A m^2 at {p.target.speed:g} m/s')
+    out.append(f'{len(p.network)} sensors, {1e9 * noise:.2g} nT noise per frame; '
+               f'target with {p.target.moment:g} A m^2 at {p.target.speed:g} m/s')
     o = p.observability
     seen = (f'not observable: {", ".join(o.unobservable)}' if o.unobservable
             else f'observable, condition number {o.condition_number:.3g}')
-    out.append(f'one pass on lane {p.lanes[0].name}, without priors: {seen}')
+    out.append(f'single pass on lane {p.lanes[0].name}, without priors: {seen}')
     for name, (r, v, m) in p.blocks.items():
-        out.append(f'  closest point, {name}: position {length_text(r)}, velocity {v:.3g} m/s, '
-              f'moment {m:.3g} A m^2')
+        out.append(f'  bounds at the closest point, {name}: position {length_text(r)}, '
+                   f'velocity {v:.3g} m/s, moment {m:.3g} A m^2')
     for lane in p.lanes:
         good = np.flatnonzero(lane.detection >= GOOD_PD)
-        first = (f'from {-lane.along[good[0]]:.3g} m before the middle on' if len(good)
+        first = (f'at {-lane.along[good[0]]:.3g} m before the centre' if len(good)
                  else 'nowhere')
         closest = int(np.argmin(np.abs(lane.along)))
-        out.append(f'lane {lane.name}: a frame detects it with {GOOD_PD:.0%} {first}; '
-              f'at the middle a filter knows it to {length_text(lane.filter_std[closest])}, a '
-              f'whole pass to {length_text(lane.pass_std[closest, 0])}')
+        out.append(f'lane {lane.name}: the detection probability of a frame reaches {GOOD_PD:.0%} '
+                   f'{first}; position bound at the centre {length_text(lane.filter_std[closest])} '
+                   f'(filter), {length_text(lane.pass_std[closest, 0])} (whole pass)')
     caught = p.missed[p.missed[:, 1] < 0.01, 0]
-    out.append(f'99 % of passes are detected up to {caught.max():.3g} m from the middle'
-               if len(caught) else 'nowhere are 99 % of the passes detected')
-    out.append('(bounds of a point: real vehicles are followed several times less well)')
+    out.append(f'99% of passes are detected up to {caught.max():.3g} m from the centre'
+               if len(caught) else 'the detection probability of a pass is below 99% everywhere')
+    out.append('(bounds for a point target; errors with real vehicles are several times larger)')
     if not np.isfinite(p.with_one_more).any():
-        out.append('one more sensor: nowhere in the area is it clear of the lanes')
+        out.append('additional sensor: the area has no place clear of the lanes')
     elif np.nanmin(p.with_one_more) > 0.99 * p.without:
-        out.append('one more sensor helps nowhere in the area')
+        out.append('additional sensor: no improvement anywhere in the area')
     else:
         x, y = p.best_place
         edge = ' (on the edge of the area)' if x in p.x[[0, -1]] or y in p.y[[0, -1]] else ''
-        out.append(f'one more sensor helps most at ({x:.2f}, {y:.2f}) m{edge}: the median bound '
-                   f'near the sensors becomes {length_text(np.nanmin(p.with_one_more))}, now '
+        out.append(f'additional sensor: best at ({x:.2f}, {y:.2f}) m{edge}, where the median bound '
+                   f'near the sensors is {length_text(np.nanmin(p.with_one_more))} instead of '
                    f'{length_text(p.without)}')
     return out
 
 
 def plan_page(plan: Plan, lines: list[str]) -> Page:
-    """Page of a plan."""
+    """Create the page of a plan.
+
+    Parameters
+    ----------
+    plan : Plan
+    lines : list of str
+        Lines of `summary_lines`.
+
+    Returns
+    -------
+    Page
+    """
     network = plan.network
     return Page(f'Plan for {len(network)} sensors',
-                f'target of {plan.target.moment:g} A m^2 at {plan.target.speed:g} m/s',
+                f'target with {plan.target.moment:g} A m^2 at {plan.target.speed:g} m/s',
                 [Note(NOTE, line.strip()) for line in lines], None,
                 [*_maps(plan), *_lanes(plan)],
                 [Table('Sensors', ['sensor', 'x [m]', 'y [m]', 'z [m]'],
@@ -77,13 +114,13 @@ def plan_page(plan: Plan, lines: list[str]) -> Page:
 
 
 def _maps(plan: Plan) -> list[Chart]:
-    """Maps of the position bound, the detection probability and the gain of one more sensor."""
+    """Maps of position bound, detection probability and gain of an additional sensor."""
     f, unit = scale_of(np.ptp(plan.x))
     layout = axes(f'x [{unit}]', f'y [{unit}]', is_map=True)
     x, y = f * plan.x, f * plan.y
     bound = np.log10(f * np.clip(plan.position_std, None, np.ptp(plan.x)))
     low, high = np.nanquantile(bound, [LOW_SHARE, 1.0 - LOW_SHARE])
-    bar = _log_bar(low, high, f'deviation [{unit}]')
+    bar = _log_bar(low, high, f'standard deviation [{unit}]')
     position = heat_map(x, y, bound, 'Viridis', '', float(low), float(high)) | {
         'colorbar': bar, 'text': [[f'{10.0**v:.3g} {unit}' for v in row] for row in bound],
         'hoverinfo': 'x+y+text'}
@@ -94,9 +131,9 @@ def _maps(plan: Plan) -> list[Chart]:
                   heat_map(x, y, plan.detection, 'Cividis', 'probability', 0.0, 1.0),
                   *_marks(plan, f)], layout)]
     if np.isfinite(gain).any():
-        charts.append(Chart('Where one more sensor helps', [
+        charts.append(Chart('Gain of an additional sensor', [
             heat_map(np.linspace(x[0], x[-1], nx), np.linspace(y[0], y[-1], ny), gain, 'Cividis',
-                     'smaller by [%]'), *_marks(plan, f),
+                     'reduction [%]'), *_marks(plan, f),
             {'type': 'scatter', 'mode': 'markers', 'x': [f * plan.best_place[0]],
              'y': [f * plan.best_place[1]], 'name': 'best place', 'hoverinfo': 'name+x+y',
              'marker': {'symbol': 'star', 'size': 15, 'color': '#D55E00',
@@ -134,11 +171,11 @@ def _lanes(plan: Plan) -> list[Chart]:
                    curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]
         seen.append(curve(along, lane.detection, name, k))
     known = plan.missed[plan.missed[:, 1] >= MIN_MISSED]
-    way = f'distance along the lane, 0 = nearest to the middle [{unit}]'
+    label = f'distance along the lane, 0 = nearest to the centre [{unit}]'
     return [Chart('Position bound along the lanes', bounds,
-                  axes(way, f'deviation [{unit}]', log_y=True)),
-            Chart('Detection along the lanes', seen, axes(way, 'probability per frame')),
-            Chart('Passes that are missed', [curve(f * known[:, 0], known[:, 1], '', 0,
-                                                   'lines+markers')],
-                  axes(f'lateral distance from the middle of the sensors [{unit}]',
+                  axes(label, f'standard deviation [{unit}]', log_y=True)),
+            Chart('Detection along the lanes', seen, axes(label, 'probability per frame')),
+            Chart('Missed passes', [curve(f * known[:, 0], known[:, 1], '', 0,
+                                          'lines+markers')],
+                  axes(f'lateral distance from the centre of the sensors [{unit}]',
                        'probability of a miss', log_y=True))]

@@ -1,4 +1,4 @@
-"""A first pass over a recording: the quiet stretches of sensors that have no quiet beginning."""
+"""First pass over a recording: backgrounds of sensors whose recording begins with a target."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -15,53 +15,68 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.units import NS
 
-PATIENCE_S = 1.0
-"""[s] A beginning is quiet where the background is known so long after the shortest time."""
+LEARNING_TOLERANCE_S = 1.0
+"""Time beyond the minimum within which the background of a quiet beginning is learnt [s]."""
 
-FEWEST_BLOCKS = 6.0
-"""The shortest time of a slow sensor, whose blocks are longer."""
+MIN_BLOCKS = 6.0
+"""Minimum learning time in blocks; it matters for slow sensors, whose blocks are longer."""
 
-LEAST = 1.0 / 3.0
-"""A level is a background where it was seen for this share of the usual time, in all."""
+MIN_LEVEL_SHARE = 1.0 / 3.0
+"""Minimum total duration of a background level, as a share of the learning time."""
 
-FEW = 8
-"""Readings that are fed at once while the beginning is learnt."""
+N_READINGS_AT_ONCE = 8
+"""Number of readings fed at once while the beginning is learnt."""
 
 
 @dataclass(frozen=True)
 class Prescan:
-    """Backgrounds and steps that a first pass over a recording found."""
+    """Backgrounds and resolutions found by a first pass over a recording."""
 
     levels: dict[str, QuietLevel]
-    """{sensor: most frequent level}; empty where the beginning is quiet."""
+    """{sensor: most frequent level}; empty if the recording begins quietly."""
     steps: dict[str, FloatArray]
-    """{sensor: (3,) [T] smallest change of each axis}."""
+    """{sensor: (3,) smallest change of each axis, T}."""
 
     def segment_of(self, sensor: str) -> list[float] | None:
-        """[begin, end] of the stretch of its background, in s after its first reading, or None."""
+        """Return the interval in which the background level of a sensor was observed.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        [begin, end], s, or None
+            Relative to the first reading of the sensor.
+        """
         level = self.levels.get(sensor)
         return None if level is None else [level.begin, level.end]
 
     def apply(self, calibrate: Calibrate) -> None:
-        """Begin a calibration with what was found."""
+        """Initialise a calibration with the backgrounds and resolutions.
+
+        Parameters
+        ----------
+        calibrate : Calibrate
+        """
         calibrate.start_from(self.levels, self.steps)
 
 
 def prescan(batches: Iterable[Readings], network: SensorNetwork,
-               settings: CalibrateSettings) -> Prescan:
+            settings: CalibrateSettings) -> Prescan:
     """Find the backgrounds of sensors whose recording begins with a target.
 
     Parameters
     ----------
     batches : iterable of Readings
-        Raw, from the beginning of the recording; read up to `look_ahead_s`.
+        Raw readings from the beginning of the recording; consumed up to `look_ahead_s`.
     network : SensorNetwork
     settings : CalibrateSettings
 
     Returns
     -------
     Prescan
-        Empty where the network file has all backgrounds, or `look_ahead_s` is 0.
+        Empty if the network file contains all backgrounds, or `look_ahead_s` is 0.
     """
     wanted = [name for name, level in zip(network.names, network.background, strict=True)
               if level is None]
@@ -82,19 +97,20 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
         steps[name] = background.steps
         level, was_freed = _level_of(background, learner.backgrounds()[name].departed_at,
                                      learnt.get(name)) if name in wanted else (None, False)
-        if level is not None and level.n_blocks * level.block_s >= LEAST * settings.learn_s:
+        if level is not None \
+                and level.n_blocks * level.block_s >= MIN_LEVEL_SHARE * settings.learn_s:
             found[name] = level
             is_quiet &= not was_freed \
                 and _begins_quietly(learnt.get(name), level, background, settings)
-    # A target that one sensor feels at the beginning may be in the background of all.
+    # A target sensed by one sensor at the beginning may be in the backgrounds of all sensors.
     return Prescan({} if is_quiet else found, steps)
 
 
 def _level_of(recorder: BlockRecorder, departed_at: float | None,
               learnt: tuple[float, FloatArray] | None) -> tuple[QuietLevel | None, bool]:
-    """Most frequent level of a sensor, and whether something stood there until `departed_at` [s].
+    """Most frequent level of a sensor, and whether a target stood near it until `departed_at` [s].
 
-    It had not where the level of the beginning, as it was `learnt`, comes back.
+    No target stood there if the level `learnt` at the beginning returns.
     """
     level = recorder.quiet_level()
     if level is None or departed_at is None or learnt is None \
@@ -105,16 +121,15 @@ def _level_of(recorder: BlockRecorder, departed_at: float | None,
 
 def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
            learnt: dict[str, tuple[float, FloatArray]]) -> None:
-    """Note the first reading of each sensor, and when its background is known.
+    """Update `first_ns` {sensor: first timestamp} and `learnt`.
 
-    `learnt` {sensor: (seconds after its first reading, (3,) [T])} and `first_ns` {sensor: [ns]}
-    are changed.
+    `learnt` is {sensor: (time of the background after the first reading [s], (3,) background [T])}.
     """
-    for i in range(0, len(readings), FEW):
+    for i in range(0, len(readings), N_READINGS_AT_ONCE):
         if len(learnt) == len(learner.backgrounds()):
             learner.feed(readings.part(slice(i, None)))
             return
-        part = readings.part(slice(i, i + FEW))
+        part = readings.part(slice(i, i + N_READINGS_AT_ONCE))
         for name, stamp_ns in zip(part.sensor_names(), part.stamp_ns.tolist(), strict=True):
             first_ns.setdefault(name, stamp_ns)
         learner.feed(part)
@@ -126,24 +141,36 @@ def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
 
 def _begins_quietly(learnt: tuple[float, FloatArray] | None, found: QuietLevel,
                     recorder: BlockRecorder, settings: CalibrateSettings) -> bool:
-    """Whether a sensor's background was known early, and is the one that it has."""
-    longest = PATIENCE_S + max(settings.learn_s, FEWEST_BLOCKS * found.block_s)
-    if learnt is None or learnt[0] > longest:
+    """Whether the background of a sensor was learnt early and equals the most frequent level."""
+    max_time = LEARNING_TOLERANCE_S + max(settings.learn_s, MIN_BLOCKS * found.block_s)
+    if learnt is None or learnt[0] > max_time:
         return False
-    # Without relearning, a level stays the background whatever else lasts.
+    # Without relearning, a level remains the background even if another level lasts.
     return not settings.relearn_s or recorder.is_known_level(learnt[1], found)
 
 
 def prescan_of(recording: Recording, network: SensorNetwork, settings: CalibrateSettings,
-                  stopped: Callable[[], bool] | None = None) -> Prescan:
-    """`prescan` over a recording; when `stopped` returns true it ends with what it has.
+               stopped: Callable[[], bool] | None = None) -> Prescan:
+    """Find the backgrounds of sensors in a recording that begins with a target.
+
+    Parameters
+    ----------
+    recording : Recording
+    network : SensorNetwork
+    settings : CalibrateSettings
+    stopped : function, optional
+        Called after every batch of readings; reading ends when it returns true.
+
+    Returns
+    -------
+    Prescan
 
     Raises
     ------
     RecordingError
         If the recording has none of the network's topics.
     """
-    # What is lost or rejected is counted when the recording is read for its readings.
+    # A separate Recording, because losses are counted when the recording is read again.
     reader = SampleReader(Recording(recording.path), network)
 
     def batches() -> Iterator[Readings]:

@@ -1,4 +1,4 @@
-"""Readings as arrays: of a recording, or from arrays of the caller's own."""
+"""Readings as arrays, from a recording or from arrays of the caller."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,22 +19,22 @@ from mag_tracking.report.metrics import Truth
 from mag_tracking.units import LATEST_NS, NS
 
 MAX_DELAY_S = 10.0
-"""[s] Readings that are further behind are taken for unsorted, not for delayed."""
+"""Delay above which a reading is considered unsorted rather than delayed [s]."""
 
 
 @dataclass(frozen=True)
 class RecordedReadings:
-    """The content of a recording in arrays."""
+    """Content of a recording as arrays."""
 
     readings: Readings
-    """In the order in which they were logged; `names` are those of the network."""
+    """Readings in the order in which they were logged; `names` are those of the network."""
     truth: dict[str, Truth]
-    """{target: (stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4) xyzw)}; empty where the
-    recording has no ground truth."""
+    """{target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}; empty without
+    ground truth."""
     rejected: dict[str, int]
-    """{cause: number} of messages without a usable reading."""
+    """Messages without a usable reading: {cause: number}."""
     lost: dict[str, int]
-    """{damage: number} of what could not be read."""
+    """Unreadable parts of the recording: {damage: number}."""
     missing_topics: tuple[str, ...]
     """Topics of the network that are not in the recording."""
 
@@ -44,13 +44,27 @@ class RecordedReadings:
 
 
 def network_of(network: SensorNetwork | str | PathLike[str]) -> SensorNetwork:
-    """The network itself, or that in a file; raises NetworkError."""
+    """Return a network, or read it from a file.
+
+    Parameters
+    ----------
+    network : SensorNetwork or path of a network file
+
+    Returns
+    -------
+    SensorNetwork
+
+    Raises
+    ------
+    NetworkError
+        If the network file is invalid.
+    """
     return network if isinstance(network, SensorNetwork) else read_network(network)
 
 
 def read_recording(path: str | PathLike[str],
                    network: SensorNetwork | str | PathLike[str]) -> RecordedReadings:
-    """Read all readings of a network and the ground truth from a recording.
+    """Read the readings of a network and the ground truth from a recording.
 
     Parameters
     ----------
@@ -65,39 +79,52 @@ def read_recording(path: str | PathLike[str],
     Raises
     ------
     RecordingError
-        If there is no readable recording, or it has none of the network's topics.
+        If the recording cannot be read, or has none of the network's topics.
     NetworkError
-        If the network file is not valid.
+        If the network file is invalid.
     """
     network = network_of(network)
     recording = Recording(path)
     reader = SampleReader(recording, network)
     found = Readings.joined(reader.readings())
     rows = found.rows({name: i for i, name in enumerate(network.names)})
-    return recorded(recording, reader, Readings(network.names, rows, found.stamp_ns, found.field,
-                                                found.covariance))
+    return recorded_readings(recording, reader, Readings(
+        network.names, rows, found.stamp_ns, found.field, found.covariance))
 
 
-def recorded(recording: Recording, reader: SampleReader, readings: Readings) -> RecordedReadings:
-    """The `readings` with what else `reader` found in the recording by now."""
+def recorded_readings(recording: Recording, reader: SampleReader,
+                      readings: Readings) -> RecordedReadings:
+    """Combine readings with the ground truth and the counts of a reader.
+
+    Parameters
+    ----------
+    recording : Recording
+    reader : SampleReader
+        After the recording has been read.
+    readings : Readings
+
+    Returns
+    -------
+    RecordedReadings
+    """
     return RecordedReadings(readings, reader.truth_arrays(), dict(reader.rejected),
                             dict(recording.losses), tuple(reader.missing_topics()))
 
 
 def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: ArrayLike,
                          covariance: ArrayLike | None = None) -> Readings:
-    """Readings from arrays, for `track`.
+    """Create readings from arrays, for `track`.
 
     Parameters
     ----------
-    sensor : (n,) str
+    sensor : (n,) sequence of str
         Name of the sensor of each reading, as in the network file.
-    stamp_ns : (n,) int, ns
-        Time of measurement, sorted; several sensors may share one.
+    stamp_ns : (n,) int array, ns
+        Timestamps, sorted; sensors may have equal timestamps.
     field : (n, 3) array, T, sensor frame
         NaN = axis not measured.
-    covariance : (n, 3, 3) array, T^2, sensor frame, optional
-        A matrix of NaN = unknown.
+    covariance : (n, 3, 3) array, T², sensor frame, optional
+        NaN = unknown.
 
     Returns
     -------
@@ -109,7 +136,7 @@ def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: Arra
         If shapes or types are wrong, or the timestamps are not sorted.
     """
     if isinstance(sensor, str):
-        raise ReadingsError(f'sensor: expected a name for each reading; got the text {sensor!r}')
+        raise ReadingsError(f'sensor: expected one name per reading, got the text {sensor!r}')
     names = tuple(dict.fromkeys(str(name) for name in sensor))
     rows = {name: i for i, name in enumerate(names)}
     fields, C = _filled(field), None if covariance is None else _filled(covariance)
@@ -121,14 +148,14 @@ def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: Arra
 
 
 def _filled(values: ArrayLike) -> NDArray[Any]:
-    """The array, with NaN where it is masked."""
+    """Array with NaN for masked elements."""
     if isinstance(values, np.ma.MaskedArray):
         return np.where(values.mask, np.nan, values.data)
     return np.asarray(values)
 
 
 def checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
-    """The readings with arrays of the types that the stages expect.
+    """Convert readings to the array types that the stages expect.
 
     Parameters
     ----------
@@ -142,17 +169,18 @@ def checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
     Raises
     ------
     ReadingsError
-        If shapes or types are wrong, or all readings are of sensors that the network does not have.
+        If shapes or types are wrong, or no reading belongs to a sensor of the network.
     """
     readings = _checked(readings)
     if len(readings) and not set(readings.names) & set(network.names):
-        raise ReadingsError(f'readings of {", ".join(readings.names)}, but the network has '
+        raise ReadingsError(f'no readings of the network: the readings are from '
+                            f'{", ".join(readings.names)}, the sensors of the network are '
                             f'{", ".join(network.names)}')
     return readings
 
 
 def _checked(readings: Readings) -> Readings:
-    """The readings in int64 and float64; raises ReadingsError for another shape or type."""
+    """Convert readings to int64 and float64; raises ReadingsError for a wrong shape or type."""
     n, kinds = len(readings), {'sensor': 'iu', 'stamp_ns': 'iu', 'field': 'iuf',
                                'covariance': 'iuf'}
     for name, allowed in kinds.items():
@@ -160,17 +188,18 @@ def _checked(readings: Readings) -> Readings:
         if values is None:
             continue
         if isinstance(values, np.ma.MaskedArray):
-            raise ReadingsError(f'{name}: a masked array; use NaN for what is missing')
+            raise ReadingsError(f'{name}: masked arrays are not supported; use NaN for missing '
+                                'values')
         values = np.asarray(values)
-        # An empty list has no integers.
+        # An empty list is converted to float.
         if values.dtype.kind not in allowed and values.size:
             wanted = 'floats' if 'f' in allowed else (
                 'integers, nanoseconds' if name == 'stamp_ns' else 'integers, rows of names')
-            raise ReadingsError(f'{name}: expected {wanted}; got {values.dtype}')
+            raise ReadingsError(f'{name}: expected {wanted}, got {values.dtype}')
     stamps = np.asarray(readings.stamp_ns)
     if n and not -LATEST_NS <= int(stamps.min()) <= int(stamps.max()) <= LATEST_NS:
         raise ReadingsError(f'stamp_ns: {stamps.min()} .. {stamps.max()} is outside '
-                            f'{-LATEST_NS} .. {LATEST_NS}: nanoseconds since 1970?')
+                            f'{-LATEST_NS} .. {LATEST_NS}; expected nanoseconds since 1970')
     sensor = np.asarray(readings.sensor, dtype=np.int64)
     if n and not 0 <= sensor.min() <= sensor.max() < len(readings.names):
         raise ReadingsError(f'sensor: {sensor.min()} .. {sensor.max()} is outside 0 .. '
@@ -182,15 +211,26 @@ def _checked(readings: Readings) -> Readings:
 
 
 def check_order(readings: Readings, tolerance: float = MAX_DELAY_S) -> None:
-    """Raise ReadingsError where a reading is `tolerance` [s] older than one before it."""
+    """Check the chronological order of readings.
+
+    Parameters
+    ----------
+    readings : Readings
+    tolerance : float, s
+        Maximum delay of a reading relative to an earlier one.
+
+    Raises
+    ------
+    ReadingsError
+        If a reading is delayed by more than `tolerance`.
+    """
     if not len(readings):
         return
-    behind = np.maximum.accumulate(readings.stamp_ns) - readings.stamp_ns
-    late: BoolArray = behind > tolerance * NS
+    delay_ns = np.maximum.accumulate(readings.stamp_ns) - readings.stamp_ns
+    late: BoolArray = delay_ns > tolerance * NS
     if late.any():
         k = int(np.argmax(late))
         raise ReadingsError(
             f'stamp_ns: reading {k} ({readings.names[readings.sensor[k]]}) is '
-            f'{behind[k] / NS:.3g} s older than one before it; sort the readings '
-            "(np.argsort(stamp_ns, kind='stable')), and track what was recorded in another run "
-            'by itself')
+            f'{delay_ns[k] / NS:.3g} s older than an earlier one; sort the readings '
+            "(np.argsort(stamp_ns, kind='stable')), and track separate recordings separately")

@@ -1,4 +1,4 @@
-"""Which topics `mag-tracking record` records, and what it reports."""
+"""Selection of the topics that `mag-tracking record` records, and its reports."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -13,18 +13,18 @@ from mag_tracking.messages.types import (
 )
 
 RESULTS_OF = ('calibration_node/', 'detection_node/', 'tracker_node/')
-"""Prefixes of topics of results, in the namespace of the recorder."""
+"""Prefixes of result topics, relative to the namespace of the recorder."""
 RESULTS = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
-"""Other topics of results."""
+"""Other result topics."""
 
 
-class Recorded(Protocol):
-    """What is asked of a recorder."""
+class RecorderState(Protocol):
+    """State of a recorder used in reports."""
 
     counts: Counter[str]
-    """Messages written, per topic."""
+    """Number of messages written per topic."""
     dropped: Counter[str]
-    """Messages dropped while the disk was full, per topic."""
+    """Number of messages dropped per topic while the disk was full."""
 
     @property
     def folder(self) -> Path:
@@ -32,26 +32,40 @@ class Recorded(Protocol):
 
     @property
     def size(self) -> int:
-        """Bytes written."""
+        """Number of bytes written."""
 
 
 class Selection(NamedTuple):
-    """Which topics to record, as the user names them or, `resolved`, as the graph does."""
+    """Topics to record, with names as given by the user or, if resolved, absolute names."""
 
     fields: tuple[str, ...] = ()
-    """Magnetic fields of the network."""
+    """Topics of the magnetic fields of the network."""
     imus: tuple[str, ...] = ()
-    """Where its sensors may publish sensor_msgs/Imu."""
+    """Topics on which its sensors may publish sensor_msgs/Imu."""
     topics: tuple[str, ...] = ()
+    """Other topics to record."""
     results: bool = False
+    """Whether to record the results of the nodes."""
     everything: bool = False
+    """Whether to record all topics."""
     readings: str = RAW_READINGS
-    """Topic of the readings of many sensors."""
+    """Topic with the readings of many sensors."""
     results_of: tuple[str, ...] = RESULTS_OF
+    """Prefixes of result topics."""
     result_topics: tuple[str, ...] = RESULTS
+    """Other result topics."""
 
     def resolved(self, resolve: Callable[[str], str]) -> 'Selection':
-        """The selection with absolute names; `resolve` takes a name and returns its absolute one.
+        """Return the selection with absolute names.
+
+        Parameters
+        ----------
+        resolve : function
+            Returns the absolute name of a topic.
+
+        Returns
+        -------
+        Selection
         """
         return self._replace(
             fields=tuple(map(resolve, self.fields)), imus=tuple(map(resolve, self.imus)),
@@ -60,10 +74,20 @@ class Selection(NamedTuple):
             result_topics=tuple(map(resolve, self.result_topics)))
 
     def wants(self, topic: str) -> bool:
-        """Whether to record a topic."""
+        """Whether to record a topic.
+
+        Parameters
+        ----------
+        topic : str
+            Absolute name.
+
+        Returns
+        -------
+        bool
+        """
         if topic == self.readings or topic in self.fields + self.imus + self.topics:
             return True
-        # ROS hides what has a part that begins with an underscore, and so does rosbag2.
+        # Topics with a name component that begins with an underscore are hidden, as in rosbag2.
         if self.everything and '/_' not in topic:
             return True
         return self.results and (topic.startswith(self.results_of) or topic == '/diagnostics'
@@ -71,25 +95,51 @@ class Selection(NamedTuple):
                                  or topic.removesuffix('_calibrated') in self.fields)
 
 
-def progress_line(recorder: Recorded, seconds: float) -> str:
-    """What there is so far, as a line."""
+def progress_line(recorder: RecorderState, seconds: float) -> str:
+    """Describe the progress of a recording in one line.
+
+    Parameters
+    ----------
+    recorder : RecorderState
+    seconds : float, s
+        Time since the start.
+
+    Returns
+    -------
+    str
+    """
     dropped = recorder.dropped.total()
     return (f'{seconds:.0f} s: {recorder.counts.total()} messages, {recorder.size / 1e6:.1f} MB'
             + (f', dropped: {dropped}' if dropped else ''))
 
 
-def summary(recorder: Recorded, selection: Selection, lost: Mapping[str, int],
+def summary(recorder: RecorderState, selection: Selection, lost: Mapping[str, int],
             refused: Mapping[str, str]) -> Iterator[str]:
-    """Lines that say what is in a recording, and what is not."""
+    """Summarise the content of a recording and the missing messages.
+
+    Parameters
+    ----------
+    recorder : RecorderState
+    selection : Selection
+    lost : {topic: number}
+        Messages lost before they were recorded.
+    refused : {topic: reason}
+        Topics that could not be recorded.
+
+    Yields
+    ------
+    str
+        One line.
+    """
     yield f'{recorder.folder}: {recorder.counts.total()} messages, {recorder.size / 1e6:.2f} MB'
     for topic, n in sorted((+recorder.counts).items()):
         yield f'  {topic}  {n}'
     for topic in selection.fields + selection.topics:
         if not recorder.counts[topic] and topic not in refused:
-            yield f'  warning: nothing on {topic}'
+            yield f'  warning: no messages on {topic}'
     for topic, n in sorted((+recorder.dropped).items()):
-        yield f'  warning: {topic}: dropped while the disk was full: {n}'
+        yield f'  warning: {topic}: messages dropped while the disk was full: {n}'
     for topic, n in sorted(lost.items()):
-        yield f'  warning: {topic}: lost before they were recorded: {n}'
+        yield f'  warning: {topic}: messages lost before recording: {n}'
     for topic, why in sorted(refused.items()):
-        yield f'  warning: {topic} is not recorded: {why}'
+        yield f'  warning: {topic} was not recorded: {why}'

@@ -1,4 +1,4 @@
-"""One recording through the chain, offline: tables, summary, recording and figures."""
+"""Offline replay of a recording through all stages: tables, summary, recording and figures."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -39,40 +39,41 @@ from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.stages.align.frame_period import too_long
 from mag_tracking.stages.track.settings import acceleration_density
 
-SUSPICIOUS = 2.0
-"""A sensor that seems to be turned by more prior deviations than this is reported."""
+SUSPECT_MOUNTING_RATIO = 2.0
+"""Mounting error above which a sensor is reported, in prior standard deviations."""
 
 
 class Configured(Protocol):
-    """A network and the settings that it is tracked with, such as a `Pipeline`."""
+    """A network with the settings of its tracking, such as a `Pipeline`."""
 
     @property
     def network(self) -> SensorNetwork:
-        """The sensors."""
+        """Sensors."""
 
     @property
     def settings(self) -> Settings:
-        """The settings of all stages."""
+        """Settings of all stages."""
 
 
 @dataclass
 class Run:
-    """What came of a recording."""
+    """Results of a replay."""
 
     summary: dict[str, Any]
+    """Content of `summary.json`."""
     logs: dict[int, TrackLog] = field(default_factory=dict)
-    """{track id: TrackLog}."""
+    """{track id: history of the track}."""
     smoothed: dict[int, SmoothedLog] = field(default_factory=dict)
-    """{track id: SmoothedLog}, of the tracks that were smoothed."""
+    """{track id: history of the smoothed track}."""
     truth: dict[str, Truth] = field(default_factory=dict)
-    """{name: (stamps, positions, quaternions)}."""
+    """{target: (timestamps, positions, quaternions)}."""
 
 
 def replay(recording: Recording, network: SensorNetwork, settings: Settings,
            out: str | PathLike[str], progress: Callable[[int], object] | None = None,
            stopped: Callable[[], bool] | None = None,
            report: Callable[[str], object] | None = None, truth: str | None = None) -> Run:
-    """Track everything in a recording and write the results.
+    """Track the targets in a recording and write the results.
 
     Parameters
     ----------
@@ -80,27 +81,32 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     network : SensorNetwork
     settings : Settings
     out : path
-        Folder for the results; made if it is not there.
+        Folder for the results; created if it does not exist.
     progress : function, optional
-        Called with the bytes done since the last call.
+        Called with the number of bytes read since the last call.
     stopped : function, optional
-        Asked after every batch of readings and whenever the reading has got on. When it is
-        true the reading ends, what was done is written, and the summary says so.
+        Called after every batch of readings and with every progress. When it returns true,
+        reading ends, partial results are written, and the summary is marked as interrupted.
     report : function, optional
-        Takes a line for the user where the results of an earlier run are replaced.
+        Called with a line for the user if the results of an earlier run are replaced.
     truth : str, optional
         A CSV file (`recording.truth`), or a topic of the recording with PoseStamped,
-        PoseWithCovarianceStamped or Odometry; left out: the topics below /ground_truth.
+        PoseWithCovarianceStamped or Odometry; default: all topics below /ground_truth.
 
     Returns
     -------
     Run
 
-    Raises RecordingError and OutputError.
+    Raises
+    ------
+    RecordingError
+        If the recording has none of the network's topics, or the ground truth cannot be read.
+    OutputError
+        If the results cannot be written, or `out` is the folder of the recording.
     """
     if recording.lies_in(out):
-        raise OutputError(f'{out} is the folder of the recording; the results would overwrite it')
-    # A file that does not exist is no topic: no topic has a point in its name.
+        raise OutputError(f'{out} is the folder of the recording; choose another output folder')
+    # Topic names contain no dot: a name with a dot is a file, even if it does not exist.
     is_table = truth is not None and (Path(truth).is_file() or '.' in truth)
     table = read_truth_table(truth) if truth is not None and is_table else None
     reader = SampleReader(recording, network, truth if table is None else None)
@@ -111,54 +117,97 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
 
     with ResultFolder(out, network) as results:
         if results.replaces_earlier and report is not None:
-            report(f'replaces the results of an earlier run in {out}')
-        taker = RunCollector(results)
+            report(f'replacing the results of an earlier run in {out}')
+        collector = RunCollector(results)
         try:
             for readings in until_stopped(reader.readings, progress, stopped):
-                taker.take(pipeline.feed(readings))
+                collector.add(pipeline.feed(readings))
         except ReadingStopped:
             interrupted = True
-        taker.take(pipeline.flush())
+        collector.add(pipeline.flush())
         arrays = reader.truth_arrays() if table is None else table
-        summary = summarise(recording, reader, pipeline, taker, arrays, found)
+        summary = summarise(recording, reader, pipeline, collector, arrays, found)
         summary['interrupted'] = interrupted
         results.write_summary(summary)
-    return Run(summary, taker.logs, taker.smoothed, arrays)
+    return Run(summary, collector.logs, collector.smoothed, arrays)
 
 
 class Results(Protocol):
-    """Takes detections and poses, such as a `ResultFolder`."""
+    """Receives detections and poses, such as a `ResultFolder`."""
 
     def add_detection(self, detection: Detection, /) -> None:
-        """Take an onset or a release."""
+        """Add an onset or a release.
+
+        Parameters
+        ----------
+        detection : Detection
+        """
 
     def add_disturbance(self, disturbance: Disturbance, /) -> None:
-        """Take a disturbance, when it is found and once more when it has ended."""
+        """Add a disturbance, when it is found and again when it has ended.
+
+        Parameters
+        ----------
+        disturbance : Disturbance
+        """
 
     def add_frame(self, frame: FieldFrame, /) -> None:
-        """Take a frame with a target in it."""
+        """Add a frame in which a target is present.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+        """
 
     def add_smoothed(self, pose: SmoothedPose, /) -> None:
-        """Take a smoothed pose."""
+        """Add a smoothed pose.
+
+        Parameters
+        ----------
+        pose : SmoothedPose
+        """
 
     def add_track(self, track: Track, /) -> None:
-        """Take a pose, or the closing record of a track."""
+        """Add a pose, or the closing record of a track.
+
+        Parameters
+        ----------
+        track : Track
+        """
 
 
 class RunCollector:
-    """Passes the pipeline's outputs on to the results, and keeps the history of each track."""
+    """Forwards the outputs of the pipeline to the results and keeps the history of each track.
+
+    Parameters
+    ----------
+    results : Results
+
+    Attributes
+    ----------
+    logs : dict of int to TrackLog
+        History of each track.
+    smoothed : dict of int to SmoothedLog
+        History of each smoothed track.
+    disturbances : dict of int to Disturbance
+        Latest record of each disturbance.
+    """
 
     def __init__(self, results: Results) -> None:
         self._results = results
-        # Set by the first frame; every track follows one.
+        # Set by the first frame; every track follows a frame.
         self._frame: FieldFrame
         self.logs: dict[int, TrackLog] = {}
         self.smoothed: dict[int, SmoothedLog] = {}
         self.disturbances: dict[int, Disturbance] = {}
-        """{id: the latest record of it}."""
 
-    def take(self, records: Iterable[Output]) -> None:
-        """Take the outputs of a batch of readings."""
+    def add(self, records: Iterable[Output]) -> None:
+        """Add the outputs of a batch of readings.
+
+        Parameters
+        ----------
+        records : iterable of Output
+        """
         for record in records:
             if isinstance(record, FieldFrame):
                 self._frame = record
@@ -179,9 +228,26 @@ class RunCollector:
 
 
 def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
-              taker: RunCollector, truth: Mapping[str, Truth],
+              collector: RunCollector, truth: Mapping[str, Truth],
               found: Prescan) -> dict[str, Any]:
-    """The content of `summary.json`."""
+    """Summarise a replay.
+
+    Parameters
+    ----------
+    recording : Recording
+    reader : SampleReader
+        After the whole recording has been read.
+    pipeline : Pipeline
+        After the whole recording has been processed.
+    collector : RunCollector
+    truth : {target: (timestamps, positions, quaternions)}
+    found : Prescan
+
+    Returns
+    -------
+    dict
+        Content of `summary.json`.
+    """
     rejections = dict(reader.rejected + Counter(pipeline.rejections()))
     sensors: dict[str, dict[str, Any]] = {}
     for name, background in pipeline.calibrate.backgrounds().items():
@@ -197,11 +263,11 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
             sensors[name]['noise_std'] = [None if np.isnan(v) else float(v) for v in std]
             sensors[name]['background'] = [
                 None if np.isnan(v) else float(v) for v in pipeline.calibrate.background(name)]
-    tracks = [_track_entry(log, taker.smoothed.get(log.id), pipeline, truth)
-              for log in taker.logs.values()]
-    disturbances = [asdict(d) for d in taker.disturbances.values()]
+    tracks = [_track_entry(log, collector.smoothed.get(log.id), pipeline, truth)
+              for log in collector.logs.values()]
+    disturbances = [asdict(d) for d in collector.disturbances.values()]
     why = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
-                           pipeline.detect, reader.missing_topics(), rejections)
+                              pipeline.detect, reader.missing_topics(), rejections)
     return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
             'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
             'no_detection_reason': why,
@@ -210,13 +276,13 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
             'clocks_apart': pipeline.track.clocks_apart,
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks,
             'disturbances': disturbances,
-            'unflagged_poses': unflagged_poses(taker.logs.values(), truth.values())
+            'unflagged_poses': unflagged_poses(collector.logs.values(), truth.values())
             if truth and pipeline.settings.track.target == 'vehicle' else None}
 
 
 def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline,
                  truth: Mapping[str, Truth]) -> dict[str, Any]:
-    """One track in the summary; `smoothed` is its `SmoothedLog` or None."""
+    """Entry of a track in the summary."""
     entry: dict[str, Any] = log.summary()
     entry['nis_by_sensor'] = log.nis_of(pipeline.network.names)
     entry['mounting'] = _mounting(log, pipeline)
@@ -235,7 +301,7 @@ def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline
 
 
 def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
-    """Speed and heading by the delays between the sensors, JSON-ready; or why there are none."""
+    """Speed and heading from the delays between the sensors, or the reason for their absence."""
     found = correlated_motion(PassData.of_frames(network, log.stamp_ns, log.measured, log.noise))
     if found.reason:
         return {'reason': found.reason}
@@ -249,8 +315,8 @@ def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
 
 
 def _mounting(log: TrackLog, pipeline: Pipeline) -> dict[str, dict[str, Any]]:
-    """{sensor: how it seems to be turned} of a track; empty where that is not estimated."""
-    allowed = SUSPICIOUS * pipeline.settings.track.mounting_std_deg
+    """Estimated mounting error of each sensor; empty if mounting errors are not estimated."""
+    allowed = SUSPECT_MOUNTING_RATIO * pipeline.settings.track.mounting_std_deg
     return {name: {'angles_deg': angles.tolist(), 'std_deg': std.tolist(),
                    'suspicious': bool(np.abs(angles).max() > allowed)}
             for name, (angles, std) in log.mounting_of(pipeline.network.names).items()}
@@ -258,7 +324,19 @@ def _mounting(log: TrackLog, pipeline: Pipeline) -> dict[str, dict[str, Any]]:
 
 def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
                          truth: Mapping[str, Truth]) -> dict[str, Any] | None:
-    """Errors against the truth that fits best, or None."""
+    """Compute the errors of a track against the ground truth that fits best.
+
+    Parameters
+    ----------
+    log : TrackLog or SmoothedLog
+    pipeline : Configured
+    truth : {target: (timestamps, positions, quaternions)}
+
+    Returns
+    -------
+    dict or None
+        Entry `truth` of a track in `summary.json`; None if no ground truth covers the track.
+    """
     best: tuple[float, dict[str, Any]] | None = None
     for name, arrays in truth.items():
         found = _errors_of(log, pipeline, arrays)
@@ -269,7 +347,7 @@ def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
 
 def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,
                truth: Truth) -> tuple[float, dict[str, Any]] | None:
-    """(error [m] by which truths are compared, all errors) against one truth, or None."""
+    """(error [m] used to compare ground truths, all errors) against one ground truth, or None."""
     if pipeline.settings.track.target == 'magnet':
         magnet = magnet_errors(log, truth, pipeline.settings.track.magnet.axis)
         return (magnet['position_mean'], {**magnet}) if magnet else None
@@ -278,10 +356,10 @@ def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,
 
 
 def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: Truth) -> float | None:
-    """Error over the path bound of a track, over the poses that its errors are of, or None."""
+    """Ratio of the error of a track to its path bound, over the poses of its errors, or None."""
     track = pipeline.settings.track
     if track.target == 'magnet':
-        # Between two poses it may have turned anywhere.
+        # Between two poses, the magnet may have rotated arbitrarily.
         return error_over_bound(pipeline.network, log, truth, acceleration_density(track), 1.0,
                                 track.field_error, track.background_std,
                                 np.arange(MAGNET_SKIP, len(log.stamp_ns)), 3)
@@ -292,9 +370,23 @@ def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: Truth) -> float | Non
 
 
 def write_trajectories(run: Run, out: Path) -> list[Path]:
-    """Write each track, and each that was smoothed, as a TUM trajectory; returns the paths.
+    """Write each track and each smoothed track as a TUM trajectory.
 
-    Raises OutputError.
+    Parameters
+    ----------
+    run : Run
+    out : Path
+        Folder.
+
+    Returns
+    -------
+    list of Path
+        Files written.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
     """
     paths = []
     for logs, suffix in ((run.logs, ''), (run.smoothed, '_smoothed')):
@@ -304,18 +396,32 @@ def write_trajectories(run: Run, out: Path) -> list[Path]:
     return paths
 
 
-def write_figures(run: Run, network: SensorNetwork, out: Path, most: int = 6,
+def write_figures(run: Run, network: SensorNetwork, out: Path, max_tracks: int = 6,
                   stopped: Callable[[], bool] | None = None) -> list[Path]:
-    """Draw the figures of the first `most` tracks into folder `out`; returns their paths.
+    """Draw the figures of the first tracks.
 
-    `stopped` is asked before each track; when it is true no more are drawn.
+    Parameters
+    ----------
+    run : Run
+    network : SensorNetwork
+    out : Path
+        Folder.
+    max_tracks : int
+        Maximum number of tracks.
+    stopped : function, optional
+        Called before each track; drawing ends when it returns true.
+
+    Returns
+    -------
+    list of Path
+        Files written.
     """
-    # Drawing needs matplotlib, which a run without figures should not wait for.
+    # Imported here because it loads matplotlib.
     from mag_tracking.report.figure_file import save_figure
     from mag_tracking.report.figures import field_figure, map_figure, weights_figure
 
     paths = []
-    for log in list(run.logs.values())[:most]:
+    for log in list(run.logs.values())[:max_tracks]:
         if stopped is not None and stopped():
             break
         entry = next(t for t in run.summary['tracks'] if t['id'] == log.id)

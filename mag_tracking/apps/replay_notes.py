@@ -10,12 +10,16 @@ from mag_tracking.units import NS
 
 
 def notes_of(summary: Mapping[str, Any]) -> list[Note]:
-    """Notes on a run.
+    """Create the notes on a replay.
 
     Parameters
     ----------
     summary : dict
         Content of `summary.json`.
+
+    Returns
+    -------
+    list of Note
     """
     return [*_input_notes(summary), *_limit_notes(summary), *_truth_notes(summary),
             *(Note(NOTE, _disturbance_text(d)) for d in summary['disturbances'])]
@@ -25,7 +29,7 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     """Notes on topics, readings and sensors."""
     sensors = summary['sensors']
     for topic in summary['missing_topics']:
-        yield Note(WARNING, f'nothing on {topic}')
+        yield Note(WARNING, f'no messages on {topic}')
     if summary['no_detection_reason']:
         yield Note(NOTE, f'nothing was detected with the settings for a {summary["target"]}: '
                    f'{summary["no_detection_reason"]}')
@@ -33,24 +37,35 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, f'{what}: {n}')
     stuck = [name for name, s in sensors.items() if s['stuck']]
     if stuck:
-        yield Note(WARNING, f'{", ".join(stuck)}: an axis does not vary (see mag-tracking doctor)')
-    waiting = [name for name, s in sensors.items() if not s['ready'] and not s['stuck']]
-    if waiting:
-        yield Note(WARNING, f'no background was learnt for {", ".join(waiting)}: the field was not '
-                   'steady for long enough; give background and noise_std in the network file')
+        yield Note(WARNING, f'{", ".join(stuck)}: an axis is constant (run mag-tracking doctor)')
+    unready = [name for name, s in sensors.items() if not s['ready'] and not s['stuck']]
+    if unready:
+        yield Note(WARNING, f'no background was learnt for {", ".join(unready)}: the quiet '
+                   'intervals are too short; set background and noise_std in the network file')
     for name, s in sensors.items():
         if s['quiet_stretch_s'] is not None:
             begin, end = s['quiet_stretch_s']
-            yield Note(NOTE, f'the recording does not begin quietly: the background of {name} is '
-                       f'its most frequent level, at {begin:.1f} to {end:.1f} s')
+            yield Note(NOTE, f'the recording begins with a target: the most frequent level of '
+                       f'{name}, from {begin:.1f} to {end:.1f} s, is used as its background')
 
 
 def no_track_reason(counts: Mapping[str, int]) -> str | None:
-    """One sentence where one sensor alone measured; `counts` of the tracker."""
+    """Explain why nothing was tracked with a single sensor.
+
+    Parameters
+    ----------
+    counts : dict
+        Counts of the tracker.
+
+    Returns
+    -------
+    str or None
+        None if this is not the case.
+    """
     if counts.get(NO_SCALE, 0) or counts.get(ALONE, 0) and not counts.get('tracks', 0):
-        return ('no track: one sensor does not tell the scale. `mag-tracking events` describes '
-                'what passes without it; where the settings are true of the vehicles here, '
-                'track.single_sensor_prior: true takes the scale from them')
+        return ('no track: the scale is not observable with a single sensor. Use `mag-tracking '
+                'events` to describe the passes without it, or set track.single_sensor_prior: true '
+                'if the vehicles match the settings')
     return None
 
 
@@ -61,45 +76,45 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     if why:
         yield Note(NOTE, why)
     elif len(summary['sensors']) == 1 and summary['tracks']:
-        yield Note(NOTE, 'range and size are those of the settings (track.single_sensor_prior): '
-                   'one sensor does not tell the scale')
+        yield Note(NOTE, 'range and size are based on the settings (track.single_sensor_prior): '
+                   'the scale is not observable with a single sensor')
     if summary['close_network'] and summary['target'] == 'vehicle' and summary['tracks']:
-        yield Note(NOTE, 'all sensors are within two metres: they hardly tell range and size, so '
-                   'the tracks are always ambiguous; speed and direction are those of the delay')
+        yield Note(NOTE, 'all sensors are within two metres: range and size are poorly observable '
+                   'and all tracks are ambiguous; use the speed and direction from the delay')
     if summary['frames_too_long']:
         yield Note(WARNING, summary['frames_too_long'])
     if summary['clocks_apart']:
         yield Note(WARNING, summary['clocks_apart'])
     lost = counts.get(f'tracks ended: {LOST}', 0)
     if lost:
-        yield Note(WARNING, f'{lost} of the tracks lost their target: an orientation in the '
-                   'network file is wrong, there were two targets at once, or it was none of the '
-                   'kinds that the settings know')
-    hardly = counts.get('sensors whose orientation is hardly known', 0)
-    if hardly:
-        yield Note(WARNING, f'{hardly} sensors may be turned by more than 15 degrees, as the '
-                   'network file says: calibrate them')
+        yield Note(WARNING, f'{lost} tracks lost their target: check the orientations in the '
+                   'network file; other causes are several targets at once, or a kind of target '
+                   'that is not in the settings')
+    unknown = counts.get('sensors whose orientation is hardly known', 0)
+    if unknown:
+        yield Note(WARNING, f'{unknown} sensors have an orientation uncertainty of more than 15 '
+                   'degrees in the network file: calibrate them')
     too_long = counts.get('tracks too long to smooth', 0)
     if too_long:
         yield Note(WARNING, f'{too_long} tracks were too long to smooth (track.max_smoothing_s, '
-                   'or too many frames for so many sensors)')
+                   'or too many frames for the number of sensors)')
 
 
 def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """How far poses without a flag can be relied on."""
+    """Note on the reliability of the unambiguous poses."""
     found = summary['unflagged_poses']
     if found and found['n']:
-        yield Note(NOTE, f'poses without a flag: {found["n"]}, of which {found["wrong"]} '
-                   f'({found["wrong"] / found["n"]:.1%}) are wrong: off by more than 2 m and by '
-                   'more than three standard deviations'
-                   + (f'; {found["without_truth"]} more at times without a true pose'
+        yield Note(NOTE, f'unambiguous poses: {found["n"]}, of which {found["wrong"]} '
+                   f'({found["wrong"] / found["n"]:.1%}) are wrong (error above 2 m and above '
+                   'three standard deviations)'
+                   + (f'; {found["without_truth"]} more without ground truth'
                       if found['without_truth'] else ''))
 
 
 def _disturbance_text(d: Mapping[str, Any]) -> str:
-    """A disturbance in a sentence."""
-    lasted = (d['stamp_ns'] - d['begin_ns']) / NS
-    over = 'over the whole network' if d['uniform'] > 0.5 else 'at each sensor on its own'
-    return (f'disturbance {d["id"]}: {lasted:.1f} s, up to {1e9 * d["largest"]:.3g} nT at '
-            f'{", ".join(d["sensors"]) or "no sensor alone"}, {over}; no single target explains it '
-            f'(track {d["track_id"]})')
+    """Describe a disturbance in one sentence."""
+    duration = (d['stamp_ns'] - d['begin_ns']) / NS
+    extent = 'uniform over the network' if d['uniform'] > 0.5 else 'different at each sensor'
+    return (f'disturbance {d["id"]}: {duration:.1f} s, up to {1e9 * d["largest"]:.3g} nT at '
+            f'{", ".join(d["sensors"]) or "no individual sensor"}, {extent}; not explained by a '
+            f'single target (track {d["track_id"]})')

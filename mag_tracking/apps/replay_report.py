@@ -27,14 +27,42 @@ from mag_tracking.report.track_log import TrackLog
 
 
 def write_report(run: Run, network: SensorNetwork, out: Path) -> Path:
-    """Write `report.html` into folder `out`; returns its path. Raises OutputError."""
+    """Write `report.html`.
+
+    Parameters
+    ----------
+    run : Run
+    network : SensorNetwork
+    out : Path
+        Folder.
+
+    Returns
+    -------
+    Path
+        File written.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
     path = out / REPORT
     replace_text(path, report_html(replay_page(run, network)))
     return path
 
 
 def replay_page(run: Run, network: SensorNetwork) -> Page:
-    """Page of a run."""
+    """Create the page of a replay.
+
+    Parameters
+    ----------
+    run : Run
+    network : SensorNetwork
+
+    Returns
+    -------
+    Page
+    """
     summary, logs = run.summary, list(run.logs.values())
     notes, scene = notes_of(summary), None
     if summary['interrupted']:
@@ -51,12 +79,13 @@ def replay_page(run: Run, network: SensorNetwork) -> Page:
 
 def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
            notes: list[Note]) -> dict[str, Any]:
-    """Map of the tracks; what it leaves out is added to the notes."""
+    """Map of the tracks; adds a note for everything that it omits."""
     if len(logs) < len(run.logs):
         notes.append(Note(NOTE, f'the page shows the first {len(logs)} of {len(run.logs)} tracks'))
-    most = max_poses_of(logs)
-    if any(len(log.stamp_ns) > most for log in logs):
-        notes.append(Note(NOTE, f'the page shows {most} poses per track; poses.csv has all'))
+    max_poses = max_poses_of(logs)
+    if any(len(log.stamp_ns) > max_poses for log in logs):
+        notes.append(Note(NOTE, f'the page shows {max_poses} poses per track; poses.csv contains '
+                          'all poses'))
     if len(network) > MAX_SENSORS:
         notes.append(Note(NOTE, f'fields are shown for the {MAX_SENSORS} sensors (of '
                           f'{len(network)}) with the strongest field of each track'))
@@ -64,12 +93,12 @@ def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
     entries = {t['id']: t for t in run.summary['tracks']}
     tracks = []
     for log in logs:
-        rows, facts = thinned(log, most), entries[log.id]
+        rows, facts = thinned(log, max_poses), entries[log.id]
         entry = track_entry(log, begin_ns, strongest_sensors(log), rows)
         entry['facts'] = facts_of(facts)
         if log.id in run.smoothed:
             path = np.array(run.smoothed[log.id].position)
-            entry['smoothed'] = path_entry(log.id, path[::-(-len(path) // most)])
+            entry['smoothed'] = path_entry(log.id, path[::-(-len(path) // max_poses)])
         if 'truth' in facts:
             entry['truth'] = path_entry(log.id, interpolate_truth(
                 run.truth[facts['truth']['name']], [log.stamp_ns[k] for k in rows]))

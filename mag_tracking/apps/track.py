@@ -1,4 +1,4 @@
-"""Targets tracked in a recording or in arrays of readings; results as arrays."""
+"""Tracking of the targets in a recording or in arrays of readings, with results as arrays."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -13,7 +13,7 @@ from mag_tracking.apps.readings import (
     check_order,
     checked_readings,
     network_of,
-    recorded,
+    recorded_readings,
 )
 from mag_tracking.apps.replay import RunCollector, errors_against_truth
 from mag_tracking.arrays import StructArray
@@ -39,49 +39,52 @@ if TYPE_CHECKING:
 
 
 _BATCH = 4096
-"""Readings of arrays that are tracked at once: the outputs of all would not fit into memory."""
+"""Number of readings from arrays processed at once, to bound the memory for outputs."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackingResult:
-    """Tracks, poses and detections. Arrays are structured, in SI units and in order of time; they
-    are empty if there was no target.
+    """Tracks, poses and detections.
+
+    Arrays are structured, in SI units and in chronological order; they are empty without targets.
     """
 
     network: SensorNetwork
+    """Sensors."""
     settings: Settings
+    """Settings of all stages."""
     poses: StructArray
-    """(n,) the published pose of every frame and track: the fields of `Track`."""
+    """(n,) published pose of every frame and track: the fields of `Track`."""
     smoothed: StructArray
-    """(k,) the same by what came before and after: the fields of `SmoothedPose`. Where `complete`
-    is false, by what came within `track.smoothing_lag_s`."""
+    """(k,) smoothed poses: the fields of `SmoothedPose`. If `complete` is false, the pose is
+    smoothed with the fixed lag `track.smoothing_lag_s`, otherwise over the whole track."""
     detections: StructArray
     """(m,) onsets and releases: the fields of `Detection`."""
     tracks: dict[int, TrackLog]
-    """{track id: its history with hypotheses, measured and predicted fields}."""
+    """{track id: history with hypotheses, measured and predicted fields}."""
     truth: dict[str, Truth]
-    """{target: (stamps (n,) [ns], positions (n, 3) [m], quaternions (n, 4) xyzw)}; empty without
+    """{target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}; empty without
     ground truth."""
     rejections: dict[str, int]
-    """{cause: number} of readings that were not used."""
+    """Readings that were not used: {cause: number}."""
     counts: dict[str, dict[str, int]]
     """{stage: {event: number}}."""
     lost: dict[str, int]
-    """{damage: number} of what could not be read from the recording."""
+    """Unreadable parts of the recording: {damage: number}."""
     missing_topics: tuple[str, ...]
     """Topics of the network that are not in the recording."""
     no_detection_reason: str | None
-    """One sentence where nothing was detected; else None."""
+    """One sentence if nothing was detected; otherwise None."""
     sensors_without_background: tuple[str, ...]
-    """Sensors that were not used because their background was never learnt: the readings need a
-    quiet stretch, or the network file a `background` and a `noise_std`."""
+    """Sensors that were not used because their background was not learnt. Their readings need a
+    quiet interval, or the network file a `background` and a `noise_std`."""
     disturbances: tuple[Disturbance, ...]
-    """Fields that something else than a target explains better."""
+    """Fields that a disturbance explains better than a target."""
 
     def __repr__(self) -> str:
         unused = {**self.rejections, **self.lost}
         notes = [*(f'not used: {n} {cause}' for cause, n in unused.items()),
-                 *(f'nothing on {topic}' for topic in self.missing_topics),
+                 *(f'no messages on {topic}' for topic in self.missing_topics),
                  *([f'{len(self.disturbances)} disturbances'] if self.disturbances else []),
                  *(f'no background of {name}' for name in self.sensors_without_background)]
         if self.no_detection_reason:
@@ -91,26 +94,57 @@ class TrackingResult:
                 + (f'; {"; ".join(notes)}' if notes else '') + ')')
 
     def poses_dataframe(self) -> 'pd.DataFrame':
-        """`poses` with the columns of `poses.csv`; raises MissingDependencyError."""
+        """Convert `poses` to a table.
+
+        Returns
+        -------
+        pandas.DataFrame
+            With the columns of `poses.csv`.
+
+        Raises
+        ------
+        MissingDependencyError
+            If pandas is not installed.
+        """
         return poses_dataframe(self.poses)
 
     def smoothed_dataframe(self) -> 'pd.DataFrame':
-        """`smoothed` with the columns of `poses_smoothed.csv` and `complete`; raises
-        MissingDependencyError.
+        """Convert `smoothed` to a table.
+
+        Returns
+        -------
+        pandas.DataFrame
+            With the columns of `poses_smoothed.csv`, and `complete`.
+
+        Raises
+        ------
+        MissingDependencyError
+            If pandas is not installed.
         """
         return smoothed_dataframe(self.smoothed)
 
     def detections_dataframe(self) -> 'pd.DataFrame':
-        """`detections` with the columns of `detections.csv`; raises MissingDependencyError."""
+        """Convert `detections` to a table.
+
+        Returns
+        -------
+        pandas.DataFrame
+            With the columns of `detections.csv`.
+
+        Raises
+        ------
+        MissingDependencyError
+            If pandas is not installed.
+        """
         return detections_dataframe(self.detections)
 
     def errors(self, track_id: int | None = None) -> dict[str, Any] | None:
-        """Errors of a track against the ground truth that fits best.
+        """Compute the errors of a track against the ground truth that fits best.
 
         Parameters
         ----------
         track_id : int, optional
-            The first track if left out.
+            Default: the first track.
 
         Returns
         -------
@@ -120,26 +154,28 @@ class TrackingResult:
         Raises
         ------
         UnknownTrackError
+            If there is no such track.
         """
         return errors_against_truth(self._log(track_id), self, self.truth)
 
     def map_figure(self, track_id: int | None = None) -> 'Figure':
-        """Trajectories of the hypotheses with 90 % ellipses, smoothed track, sensors, truth.
+        """Draw the hypotheses with 90% ellipses, smoothed track, sensors and ground truth.
 
         Parameters
         ----------
         track_id : int, optional
-            The first track if left out.
+            Default: the first track.
 
         Returns
         -------
-        matplotlib Figure
+        matplotlib.figure.Figure
 
         Raises
         ------
         UnknownTrackError
+            If there is no such track.
         """
-        # Tracking alone should not wait for matplotlib; so in the other figures.
+        # Imported here, as in the other figures, because it loads matplotlib.
         from mag_tracking.report.figures import map_figure
 
         log, errors = self._log(track_id), self.errors(track_id)
@@ -149,24 +185,54 @@ class TrackingResult:
         return map_figure(log, self.network, truth, mine['position'] if len(mine) else None)
 
     def weights_figure(self, track_id: int | None = None) -> 'Figure':
-        """Weight of each arrival direction over time; parameters as for `map_figure`."""
+        """Draw the weight of each arrival direction over time.
+
+        Parameters
+        ----------
+        track_id : int, optional
+            Default: the first track.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        UnknownTrackError
+            If there is no such track.
+        """
         from mag_tracking.report.figures import weights_figure
 
         return weights_figure(self._log(track_id))
 
     def field_figure(self, track_id: int | None = None) -> 'Figure':
-        """Measured and predicted field of each sensor; parameters as for `map_figure`."""
+        """Draw the measured and predicted field of each sensor.
+
+        Parameters
+        ----------
+        track_id : int, optional
+            Default: the first track.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        UnknownTrackError
+            If there is no such track.
+        """
         from mag_tracking.report.figures import field_figure
 
         return field_figure(self._log(track_id), self.network)
 
     def _log(self, track_id: int | None) -> TrackLog:
-        """The history of a track, of the first one for None."""
+        """History of a track; None selects the first one."""
         if track_id is None and self.tracks:
             return next(iter(self.tracks.values()))
         if track_id is None or track_id not in self.tracks:
             known = ', '.join(map(str, self.tracks)) or 'none'
-            raise UnknownTrackError(f'track {track_id or ""}: the result has {known}')
+            raise UnknownTrackError(f'track {track_id or ""}: not in the result, which has {known}')
         return self.tracks[track_id]
 
 
@@ -175,17 +241,17 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
           settings: Mapping[str, Any] | None = None) -> TrackingResult:
     """Track the targets in readings or in a recording.
 
-    The stages are those of `mag-tracking replay` and of the ROS nodes; nothing is written.
+    The stages are those of `mag-tracking replay` and of the ROS nodes; no files are written.
 
     Parameters
     ----------
     source : Readings, RecordedReadings, or path of a recording
-        A path is read piece by piece: a long recording need not fit into memory.
+        A recording is read in batches and need not fit into memory.
     network : SensorNetwork or path of a network file
     target : 'vehicle' or 'magnet'
     settings : {name: value}, optional
-        What differs from the defaults of the target, such as {'track.iterations': 5};
-        config/default.yaml lists all names.
+        Settings that differ from the defaults of the target, such as {'track.iterations': 5};
+        config/default.yaml lists all settings.
 
     Returns
     -------
@@ -194,11 +260,11 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
     Raises
     ------
     ReadingsError
-        If the arrays have a wrong shape or type, or are not in order of time.
+        If the arrays have a wrong shape or type, or are not in chronological order.
     RecordingError
         If the recording cannot be read, or has none of the network's topics.
     NetworkError
-        If the network file is not valid.
+        If the network file is invalid.
     SettingsError
         If a setting has an unknown name, a wrong type, or a value out of range.
     """
@@ -211,29 +277,29 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
         source = RecordedReadings(source, {}, {}, {}, ())
     if isinstance(source, RecordedReadings):
         source = replace(source, readings=checked_readings(source.readings, network))
-        prescan(_parts(source.readings), network,
-                   pipeline.settings.calibrate).apply(pipeline.calibrate)
-        for readings in _parts(source.readings):
-            collector.take(pipeline.feed(readings))
+        prescan(_batches(source.readings), network,
+                pipeline.settings.calibrate).apply(pipeline.calibrate)
+        for readings in _batches(source.readings):
+            collector.add(pipeline.feed(readings))
         info = source
     else:
         recording = Recording(source)
         reader = SampleReader(recording, network)
         prescan_of(recording, network, pipeline.settings.calibrate).apply(pipeline.calibrate)
         for readings in reader.readings():
-            collector.take(pipeline.feed(readings))
-        info = recorded(recording, reader, Readings.joined([]))
-    collector.take(pipeline.flush())
+            collector.add(pipeline.feed(readings))
+        info = recorded_readings(recording, reader, Readings.joined([]))
+    collector.add(pipeline.flush())
     return _result(pipeline, results, collector.logs, info)
 
 
-def _parts(readings: Readings) -> Iterator[Readings]:
-    """The readings in batches of at most `_BATCH`."""
+def _batches(readings: Readings) -> Iterator[Readings]:
+    """Readings in batches of at most `_BATCH`."""
     return (readings.part(slice(i, i + _BATCH)) for i in range(0, len(readings), _BATCH))
 
 
 class _Results:
-    """Keeps detections and poses in lists."""
+    """Collects detections and poses in lists."""
 
     def __init__(self) -> None:
         self.poses: list[Track] = []
@@ -242,31 +308,31 @@ class _Results:
         self.disturbances: dict[int, Disturbance] = {}
 
     def add_detection(self, detection: Detection) -> None:
-        """Take an onset or a release."""
+        """Add an onset or a release."""
         self.detections.append(detection)
 
     def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Take a disturbance; its last record takes the place of those before."""
+        """Add a disturbance; its latest record replaces earlier ones."""
         self.disturbances[disturbance.id] = disturbance
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Frames with a target are in the history of its track."""
+        """Do nothing: frames with a target are in the history of its track."""
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Take a smoothed pose."""
+        """Add a smoothed pose."""
         self.smoothed.append(pose)
 
     def add_track(self, track: Track) -> None:
-        """Take a pose; its hypotheses are in the history of the track, and together are large."""
+        """Add a pose without its hypotheses, which are large and in the history of the track."""
         self.poses.append(replace(track, hypotheses=()))
 
 
 def _result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
             recording: RecordedReadings) -> TrackingResult:
-    """The results as arrays; the readings of `recording` are not used."""
+    """Convert the results to arrays; the readings of `recording` are not used."""
     rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
     why = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
-                           pipeline.detect, recording.missing_topics, rejections)
+                              pipeline.detect, recording.missing_topics, rejections)
     return TrackingResult(
         pipeline.network, pipeline.settings, pose_array(results.poses),
         smoothed_array(results.smoothed), detection_array(results.detections), tracks,

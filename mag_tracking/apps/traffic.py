@@ -1,4 +1,4 @@
-"""Vehicles that cross the counting lines of a network: passages and summaries of a recording."""
+"""Traffic in a recording: passages of vehicles across counting lines, and summaries."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -28,21 +28,22 @@ from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.units import NS
 
-FORGOTTEN_S = 300.0
-"""[s] The fields of a track that has ended are kept for its passage for this time."""
+RETENTION_S = 300.0
+"""Time for which the fields of an ended track are kept for its passage [s]."""
 
 
 @dataclass(frozen=True)
 class CountedVehicle:
-    """A passage, and its speed by the delay between sensors."""
+    """Passage of a vehicle, with its velocity from the delay between sensors."""
 
     passage: VehiclePassage
+    """Passage across a line."""
     delay: CorrelatedMotion
-    """Independent of the model of the track; its `reason` says why it is missing."""
+    """Velocity independent of the model of the track; `reason` explains a missing value."""
 
     @property
     def speeds_contradict(self) -> bool:
-        """Whether speed or direction contradict the delays."""
+        """Whether the speed or direction of the track contradicts the delays."""
         p = self.passage
         heading = float(np.arctan2(p.velocity[1], p.velocity[0]))
         return contradicts_delays((p.speed, p.speed_std), (heading, p.heading_std), self.delay)
@@ -50,24 +51,26 @@ class CountedVehicle:
 
 @dataclass(frozen=True)
 class TrafficResult:
-    """The traffic in a recording."""
+    """Traffic in a recording."""
 
     class_names: tuple[str, ...]
-    """In the order of `VehiclePassage.class_probabilities`."""
+    """Classes, in the order of `VehiclePassage.class_probabilities`."""
     vehicles: tuple[CountedVehicle, ...]
-    """In order of time."""
+    """Counted vehicles in chronological order."""
     summaries: tuple[TrafficSummary, ...]
-    """One for each line and interval."""
+    """One summary per line and interval."""
     counts: dict[str, int]
-    """{what: number}: tracks that crossed no line, and others that were not counted."""
+    """Tracks that were not counted, such as tracks that crossed no line: {cause: number}."""
     rejections: dict[str, int]
-    """{cause: number} of readings that were not used."""
+    """Readings that were not used: {cause: number}."""
     missing_topics: tuple[str, ...]
+    """Topics of the network that are not in the recording."""
     sensors_without_background: tuple[str, ...]
+    """Sensors whose background was not learnt."""
     no_detection_reason: str | None
-    """One sentence where nothing was detected; else None."""
+    """One sentence if nothing was detected; otherwise None."""
     no_track_reason: str | None
-    """One sentence where one sensor alone measured, so that nothing was tracked; else None."""
+    """One sentence if nothing was tracked because only one sensor measured; otherwise None."""
 
     def __repr__(self) -> str:
         lines = dict(Counter(v.passage.line for v in self.vehicles))
@@ -83,8 +86,8 @@ def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathL
     recording : path
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
-        What differs from the defaults for a vehicle; `traffic.line_names` and the settings after
-        it are the counting lines.
+        Settings that differ from the defaults for a vehicle; `traffic.line_*` define the counting
+        lines.
 
     Returns
     -------
@@ -95,9 +98,9 @@ def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathL
     RecordingError
         If the recording cannot be read, or has none of the network's topics.
     NetworkError
-        If the network file is not valid.
+        If the network file is invalid.
     SettingsError
-        If a setting is not valid, or the target is not a vehicle.
+        If a setting is invalid, or the target is not a vehicle.
     """
     return count_traffic(Recording(recording), network_of(network),
                          settings_for('vehicle', settings))
@@ -106,25 +109,42 @@ def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathL
 def count_traffic(recording: Recording, network: SensorNetwork, settings: Settings,
                   progress: Callable[[int], object] | None = None,
                   stopped: Callable[[], bool] | None = None) -> TrafficResult:
-    """The traffic in a recording; `progress` and `stopped` are as for `apps.replay.replay`.
+    """Count the traffic in an open recording.
+
+    Parameters
+    ----------
+    recording : Recording
+    network : SensorNetwork
+    settings : Settings
+    progress : function, optional
+        Called with the number of bytes read since the last call.
+    stopped : function, optional
+        Called after every batch of readings; reading ends when it returns true.
+
+    Returns
+    -------
+    TrafficResult
 
     Raises
     ------
     RecordingError
+        If the recording has none of the network's topics.
     SettingsError
+        If the target is not a vehicle.
     """
     if settings.track.target != 'vehicle':
-        raise SettingsError(f'traffic counts vehicles; the target is a {settings.track.target}')
+        raise SettingsError('traffic counts only vehicles; set the target to vehicle instead of '
+                            f'{settings.track.target}')
     pipeline = Pipeline(network, settings)
     reader = SampleReader(recording, network)
     prescan_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
     counter = _Counter(network)
     try:
         for readings in until_stopped(reader.readings, progress, stopped):
-            counter.take(pipeline.feed(readings))
+            counter.add(pipeline.feed(readings))
     except ReadingStopped:
         pass
-    counter.take(pipeline.flush())
+    counter.add(pipeline.flush())
     rejections = dict(reader.rejected + Counter(pipeline.rejections()))
     why = no_detection_reason(network, settings, pipeline.calibrate, pipeline.detect,
                            reader.missing_topics(), rejections)
@@ -135,7 +155,7 @@ def count_traffic(recording: Recording, network: SensorNetwork, settings: Settin
 
 
 class _Counter:
-    """Collects passages and summaries, and the fields of running tracks for the delays."""
+    """Collects passages and summaries, and the fields of active tracks for the delays."""
 
     def __init__(self, network: SensorNetwork) -> None:
         self._network = network
@@ -145,11 +165,11 @@ class _Counter:
         self.vehicles: list[CountedVehicle] = []
         self.summaries: list[TrafficSummary] = []
 
-    def take(self, records: Iterable[Output]) -> None:
-        """Take the outputs of a batch of readings."""
+    def add(self, records: Iterable[Output]) -> None:
+        """Add the outputs of a batch of readings."""
         for record in records:
             if isinstance(record, FieldFrame):
-                self._forget(record.stamp_ns)
+                self._drop_old(record.stamp_ns)
                 self._frame = record
             elif isinstance(record, Track) and not record.ended:
                 assert self._frame is not None, 'a pose without a frame'
@@ -159,21 +179,21 @@ class _Counter:
             elif isinstance(record, TrafficSummary):
                 self.summaries.append(record)
 
-    def _forget(self, now_ns: int) -> None:
-        """Drop the fields of tracks that ended long ago, or before time jumped back."""
+    def _drop_old(self, now_ns: int) -> None:
+        """Drop the fields of tracks that ended long ago, or before the time jumped back."""
         old = self._before_jump or {id for id, frames in self._frames.items()
-                                    if now_ns - frames[-1].stamp_ns > FORGOTTEN_S * NS}
+                                    if now_ns - frames[-1].stamp_ns > RETENTION_S * NS}
         for id in old:
             del self._frames[id]
-        # Their passages come with the frame that jumped back.
+        # Passages of tracks from before the jump arrive with the frame that jumped back.
         jumped = self._frame is not None and now_ns < self._frame.stamp_ns
         self._before_jump = set(self._frames) if jumped else set()
 
     def _delay(self, id: int) -> CorrelatedMotion:
-        """The motion of a track by the delays between the sensors."""
+        """Velocity of a track from the delays between the sensors."""
         frames = self._frames.get(id)
         if not frames:
-            return CorrelatedMotion('its fields were no longer kept')
+            return CorrelatedMotion('the fields of the track are no longer stored')
         begin, end = frames[0].stamp_ns, frames[-1].stamp_ns
         if any(other[0].stamp_ns <= end and begin <= other[-1].stamp_ns
                for name, other in self._frames.items() if name != id):

@@ -1,4 +1,4 @@
-"""Hard and soft iron of tumbled sensors: what `mag-tracking tumble` does."""
+"""Calibration of hard and soft iron by tumbling, as by `mag-tracking tumble`."""
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -18,45 +18,57 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
            field_size: float | None = None, progress: Callable[[int], object] | None = None,
            stopped: Callable[[], bool] | None = None,
            ) -> tuple[SensorNetwork, dict[str, EllipsoidFit], dict[str, FloatArray], bool]:
-    """Hard and soft iron of sensors that were turned about while a recording was made.
+    """Estimate the hard and soft iron of sensors that were rotated during a recording.
 
     Parameters
     ----------
     recording : Recording
     network : SensorNetwork
     sensors : collection of str
-        Names; empty = all.
+        Names of the rotated sensors; empty = all.
     date : str
-        What the calibration is marked with.
-    field_size : float [T], optional
-        Of the field where they were turned; without it the sensors' gain is left as it is.
-    progress, stopped : function, optional
-        As for `calibrate`.
+        Date of the calibration, stored in the network.
+    field_size : float, T, optional
+        Magnitude of the ambient field; without it, the gains of the sensors are kept.
+    progress : function, optional
+        Called with the number of bytes read since the last call.
+    stopped : function, optional
+        Called after every batch of readings; reading ends when it returns true.
 
     Returns
     -------
-    (SensorNetwork with what converged, but without those sensors' backgrounds and noise, which were
-    of uncorrected readings; {sensor: EllipsoidFit}, {sensor: readings (n, 3)},
-    interrupted)
+    network : SensorNetwork
+        Network with the corrections that converged. Background and noise of these sensors are
+        removed because they refer to uncorrected readings.
+    fits : dict of str to EllipsoidFit
+        Result of each sensor.
+    readings : dict of str to (n, 3) array, T, sensor frame
+        Readings of each sensor.
+    interrupted : bool
+        Whether reading was stopped before the end of the recording.
 
-    Raises NetworkError for an unknown sensor, RecordingError where the recording has none
-    of the network's topics.
+    Raises
+    ------
+    NetworkError
+        If a sensor is not in the network.
+    RecordingError
+        If the recording has none of the network's topics.
     """
-    wanted = tuple(sensors) or network.names
-    rows = {name: network.index(name) for name in wanted}
-    taken: dict[str, list[FloatArray]] = {name: [] for name in wanted}
+    selected = tuple(sensors) or network.names
+    rows = {name: network.index(name) for name in selected}
+    collected: dict[str, list[FloatArray]] = {name: [] for name in selected}
     interrupted = False
     reader = SampleReader(recording, network)
     try:
         for batch in until_stopped(reader.readings, progress, stopped):
-            of = batch.rows({name: k for k, name in enumerate(wanted)})
-            of[np.isinf(batch.field).any(axis=1)] = -1
-            for k, name in enumerate(wanted):
-                taken[name].append(batch.field[of == k])
+            sensor = batch.rows({name: k for k, name in enumerate(selected)})
+            sensor[np.isinf(batch.field).any(axis=1)] = -1
+            for k, name in enumerate(selected):
+                collected[name].append(batch.field[sensor == k])
     except ReadingStopped:
         interrupted = True
     readings: dict[str, FloatArray] = {
-        name: np.concatenate([np.empty((0, 3)), *r]) for name, r in taken.items()}
+        name: np.concatenate([np.empty((0, 3)), *r]) for name, r in collected.items()}
     fits = {name: fit_ellipsoid(r, field_size) for name, r in readings.items()}
     columns = {key: list(getattr(network, key)) for key in (
         'offset', 'correction', 'background', 'noise_std', 'calibrated')}
@@ -65,7 +77,7 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
         if not fit.converged:
             continue
         columns['offset'][j], columns['correction'][j] = fit.offset, fit.correction
-        # They were of readings that were not corrected so; both are learnt anew.
+        # Background and noise refer to uncorrected readings; both will be learnt again.
         columns['background'][j] = columns['noise_std'][j] = None
         done = network.calibrated[j]
         columns['calibrated'][j] = network.calibration_record(

@@ -1,4 +1,4 @@
-"""Track a recording at its original speed and show it on a live page."""
+"""Tracking of a recording in real time, shown on a live page."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -16,17 +16,17 @@ from mag_tracking.report.page import NOTE, WARNING, Note, Table
 from mag_tracking.units import NS
 from mag_tracking.web.live_scene import LiveScene
 
-PART_S = 0.05
-"""[s] Duration of a batch of readings."""
+BATCH_S = 0.05
+"""Duration of a batch of readings [s]."""
 MAX_WAIT_S = 5.0
-"""[s] Longer gaps of a recording are shortened."""
-HEALTH_S = 1.0
-"""[s] Interval of health updates."""
+"""Maximum wait during a gap in a recording [s]."""
+HEALTH_INTERVAL_S = 1.0
+"""Interval between updates of the health [s]."""
 
 
 def view(recording: Recording, network: SensorNetwork, settings: Settings, scene: LiveScene,
          rate: float, stopped: Callable[[], bool]) -> None:
-    """Track a recording in real time until it ends or `stopped()` returns True.
+    """Track a recording in real time until it ends or `stopped()` returns true.
 
     Parameters
     ----------
@@ -40,43 +40,46 @@ def view(recording: Recording, network: SensorNetwork, settings: Settings, scene
     stopped : function
         Called several times per second.
 
-    Raises RecordingError.
+    Raises
+    ------
+    RecordingError
+        If the recording has none of the network's topics.
     """
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
     prescan_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
     due, before_ns, health_due = time.monotonic(), None, 0.0
-    for readings, log_ns in _parts(reader.readings_as_received()):
-        # By the time of recording: a single wrong timestamp of a sensor must not stop the page.
+    for readings, log_ns in _batches(reader.readings_as_received()):
+        # Paced by the time of recording, so that one wrong sensor timestamp cannot stop the page.
         step_s = 0.0 if before_ns is None else (log_ns - before_ns) / NS
         due, before_ns = due + min(max(step_s, 0.0), MAX_WAIT_S) / rate, log_ns
         while time.monotonic() < due and not stopped():
             time.sleep(min(0.05, max(0.0, due - time.monotonic())))
         if stopped():
             return
-        _take(scene, pipeline.feed(readings))
+        _add_records(scene, pipeline.feed(readings))
         if time.monotonic() >= health_due:
-            health_due = time.monotonic() + HEALTH_S
-            _tell_health(scene, pipeline, reader, [])
-    _take(scene, pipeline.flush())
-    _tell_health(scene, pipeline, reader, [Note(NOTE, 'end of the recording')])
+            health_due = time.monotonic() + HEALTH_INTERVAL_S
+            _update_health(scene, pipeline, reader, [])
+    _add_records(scene, pipeline.flush())
+    _update_health(scene, pipeline, reader, [Note(NOTE, 'end of the recording')])
 
 
-def _parts(messages: Iterable[tuple[Readings, int]]) -> Iterator[tuple[Readings, int]]:
-    """Readings of about `PART_S` with the time of recording [ns] of the last one."""
-    waiting: list[Readings] = []
+def _batches(messages: Iterable[tuple[Readings, int]]) -> Iterator[tuple[Readings, int]]:
+    """Readings of about `BATCH_S`, with the time of recording of the last one [ns]."""
+    batch: list[Readings] = []
     begin_ns = log_ns = 0
     for readings, log_ns in messages:
-        if not waiting:
+        if not batch:
             begin_ns = log_ns
-        waiting.append(readings)
-        if not 0 <= log_ns - begin_ns < PART_S * NS:
-            yield Readings.joined(waiting), log_ns
-            waiting = []
-    if waiting:
-        yield Readings.joined(waiting), log_ns
+        batch.append(readings)
+        if not 0 <= log_ns - begin_ns < BATCH_S * NS:
+            yield Readings.joined(batch), log_ns
+            batch = []
+    if batch:
+        yield Readings.joined(batch), log_ns
 
 
-def _take(scene: LiveScene, records: Iterable[Output]) -> None:
+def _add_records(scene: LiveScene, records: Iterable[Output]) -> None:
     """Add frames and tracks to the scene."""
     smoothed: dict[int, list[FloatArray]] = {}
     for record in records:
@@ -90,11 +93,12 @@ def _take(scene: LiveScene, records: Iterable[Output]) -> None:
         scene.add_smoothed(track_id, np.array(points))
 
 
-def _tell_health(scene: LiveScene, pipeline: Pipeline, reader: SampleReader,
-                 notes: list[Note]) -> None:
-    """Update rejections and the sensor table."""
+def _update_health(scene: LiveScene, pipeline: Pipeline, reader: SampleReader,
+                   notes: list[Note]) -> None:
+    """Update rejections and the table of sensors."""
     rejected = {**reader.rejected, **pipeline.rejections()}
-    notes = [*notes, *(Note(WARNING, f'nothing on {topic}') for topic in reader.missing_topics()),
+    notes = [*notes,
+             *(Note(WARNING, f'no messages on {topic}') for topic in reader.missing_topics()),
              *(Note(WARNING, f'{cause}: {n}') for cause, n in rejected.items())]
     if pipeline.track.clocks_apart:
         notes.append(Note(WARNING, pipeline.track.clocks_apart))

@@ -1,4 +1,4 @@
-"""The command `mag-tracking`: one module a command."""
+"""The command `mag-tracking`; each module registers one command or a few related ones."""
 
 import argparse
 import io
@@ -13,15 +13,15 @@ from mag_tracking.errors import MagTrackingError
 from mag_tracking.interrupts import exit_on_signals
 from mag_tracking.nodes.start import limit_exit_time
 
-INTERRUPTED = 'mag-tracking: interrupted'
-"""What Ctrl-C has the command say."""
+INTERRUPTED_MESSAGE = 'mag-tracking: interrupted'
+"""Message printed after Ctrl-C."""
 
-UNREAD = 128 + signal.SIGPIPE
-"""Exit status where nobody reads on, as that of other programs."""
+BROKEN_PIPE_STATUS = 128 + signal.SIGPIPE
+"""Exit status after the reader of stdout has closed the pipe, as in other programs."""
 
 
 def command() -> NoReturn:
-    """Run the command as a process; does not return."""
+    """Run the command as the main function of a process and exit with its status."""
     status = 1
     try:
         status = main()
@@ -31,10 +31,22 @@ def command() -> NoReturn:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit status (1 for an error that a message explains)."""
+    """Run the command.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Command-line arguments without the program name; default: `sys.argv[1:]`.
+
+    Returns
+    -------
+    int
+        Exit status: 0 for success, 1 for an error that has been printed, 130 after Ctrl-C;
+        others depend on the command.
+    """
     words = sys.argv[1:] if argv is None else argv
     for word in words:
-        # No path can contain one, and each function that takes a path fails in its own way.
+        # Paths cannot contain NUL, and each function with a path would fail in a different way.
         if '\0' in word:
             print(f'mag-tracking: {word!r} contains a NUL character', file=sys.stderr)
             return 1
@@ -42,48 +54,48 @@ def main(argv: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == 'strict':
         sys.stdout.reconfigure(errors='backslashreplace')
     if words[:1] == ['run']:
-        # To end the nodes is no failure, neither before they are up.
+        # Ending the nodes is not a failure, even before they have started.
         with exit_on_signals(0, signal.SIGINT, signal.SIGTERM):
             return _run(_parse(words))
-    with exit_on_signals(130, signal.SIGINT, message=INTERRUPTED):
+    with exit_on_signals(130, signal.SIGINT, message=INTERRUPTED_MESSAGE):
         args = _parse(words)
     return _run(args)
 
 
 def _parse(words: Sequence[str]) -> argparse.Namespace:
-    """The parsed command line; the imports for it take most of a second."""
+    """Parse the command line. The imports are deferred because they take most of a second."""
     from mag_tracking.cli.commands import parse
 
     return parse(words)
 
 
-def _is_unread() -> bool:
-    """Whether nobody reads what is printed, as behind `| head`; it is then thrown away."""
+def _is_stdout_closed() -> bool:
+    """Whether the reader of stdout has closed the pipe (`| head`); further output is discarded."""
     if sys.stdout is None:
         return False
     poll = select.poll()
     poll.register(sys.stdout.fileno(), 0)
     if not any(event & select.POLLERR for _, event in poll.poll(0)):
         return False
-    # Python would complain once more at its end.
+    # Python would report the error again at exit.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return True
 
 
 def _run(args: argparse.Namespace) -> int:
-    """Run a command; returns its exit status."""
+    """Run a parsed command and return its exit status."""
     try:
         status: int = args.run_command(args)
-        # A process that was started with its output closed has no stdout.
+        # A process that was started with a closed stdout has none.
         if sys.stdout is not None:
             sys.stdout.flush()
         return status
     except (MagTrackingError, OSError) as error:
-        if isinstance(error, BrokenPipeError) and _is_unread():
-            return UNREAD
-        # An OSError here is a full disk or a lost drive; its text names the file.
+        if isinstance(error, BrokenPipeError) and _is_stdout_closed():
+            return BROKEN_PIPE_STATUS
+        # An OSError here is a full disk or a lost drive; its message names the file.
         print(f'mag-tracking: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print(INTERRUPTED, file=sys.stderr)
+        print(INTERRUPTED_MESSAGE, file=sys.stderr)
         return 130

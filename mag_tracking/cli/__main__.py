@@ -1,4 +1,4 @@
-"""`python -m mag_tracking.cli`."""
+"""Entry point of `python -m mag_tracking.cli`."""
 
 from mag_tracking.cli import command
 

@@ -1,4 +1,4 @@
-"""mag-tracking archive."""
+"""Command `mag-tracking archive`."""
 
 import argparse
 import os
@@ -14,16 +14,18 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 
 _ARCHIVE = '''
-Tracks what is in many recordings, or in long ones, on several processors or machines. The
-rows are those of `mag-tracking replay` of each recording by itself: a long one is cut where no
-target is near. Run it again, and it goes on where it stopped; recordings that are done are left
-alone. One that fails is listed with its reason, and the others go on.
+Tracks many or long recordings on several processors or machines. The results equal those of
+`mag-tracking replay` for each recording; long recordings are divided during quiet intervals. An
+interrupted run continues when the same command is run again; completed recordings are skipped. A
+recording that fails is listed with the reason and does not stop the others.
 
-Writes to DIR, as Parquet that pandas, DuckDB and polars read (docs/archive.md has the columns):
-  tracks/      one row a track          passes/      one row a fitted pass
-  poses/       one row a pose           smoothed/    the same, smoothed
-  health/      each sensor every ten minutes
-  recordings.parquet  one row a recording, also of those that failed
+Parquet files written to DIR (columns: docs/archive.md):
+  tracks/             one row per track
+  poses/              one row per pose
+  smoothed/           one row per smoothed pose
+  passes/             one row per fitted pass
+  health/             one row per sensor every ten minutes
+  recordings.parquet  one row per recording, including those that failed
 
 examples:
   mag-tracking archive recordings/ --network site.yaml --out archive
@@ -31,27 +33,33 @@ examples:
   mag-tracking archive /share/month --network site.yaml --out /share/archive \\
       --scheduler tcp://10.0.0.5:8786
 
-The workers of a scheduler need this package, and the same paths to recordings and DIR.
+The workers of a Dask scheduler need this package, and access to the recordings and DIR under the
+same paths.
 '''
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'archive', _archive, _ARCHIVE)
     p.add_argument('recordings', nargs='+', metavar='FOLDER|GLOB|RECORDING',
-                   help='folders are searched with all that is in them')
+                   help='recordings; folders are searched recursively')
     add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder of the dataset')
     add_settings(p)
     where = p.add_mutually_exclusive_group()
     where.add_argument('--workers', type=int, metavar='N', default=os.cpu_count() or 1,
-                       help='processes on this machine (default: as many as it has processors)')
+                       help='number of processes on this machine (default: number of processors)')
     where.add_argument('--scheduler', metavar='ADDRESS',
-                       help='of a Dask scheduler that runs somewhere, such as tcp://10.0.0.5:8786')
+                       help='address of a running Dask scheduler (e.g. tcp://10.0.0.5:8786)')
 
 
 def _archive(args: argparse.Namespace) -> int:
-    """mag-tracking archive."""
+    """Run `mag-tracking archive`."""
     if args.workers < 1:
         raise SettingsError(f'--workers: expected 1 or more, got {args.workers}')
     network, settings = recorded_network(args), settings_of(args)
@@ -62,13 +70,13 @@ def _archive(args: argparse.Namespace) -> int:
         run = archive(recordings, network, settings, args.out, args.workers, args.scheduler,
                       bar.update, lambda: bool(seen), tqdm.write)
     print(f'{len(run.done)} recordings tracked: {run.tracks} tracks, {run.passes} passes'
-          + (f'; {len(run.were_done)} were done before' if run.were_done else ''))
+          + (f'; {len(run.already_done)} skipped (already tracked)' if run.already_done else ''))
     if run.lost_workers:
-        print(f'  a worker was lost {run.lost_workers} times; what it did was done again')
+        print(f'  workers lost: {run.lost_workers}; their tasks were repeated')
     if run.failed:
-        print(f'  {len(run.failed)} failed; recordings.parquet has the reasons')
+        print(f'  recordings failed: {len(run.failed)}; the reasons are in recordings.parquet')
     if run.interrupted:
-        print(f'interrupted; what was done is in {args.out}, and the same command goes on')
+        print(f'interrupted; partial results in {args.out}; run the same command to continue')
         return 130
-    print(f'the dataset is in {args.out}')
+    print(f'dataset in {args.out}')
     return 1 if run.failed else 0

@@ -1,4 +1,4 @@
-"""mag-tracking board-geometry."""
+"""Command `mag-tracking board-geometry`."""
 
 import argparse
 import datetime
@@ -27,17 +27,17 @@ from mag_tracking.network.file import read_network, write_network
 from mag_tracking.settings import flatten, read_parameter_file, replace
 
 _GEOMETRY = '''
-A board of fixed sensors calibrates itself: a magnet of known moment is moved about over
-it, and what all sensors read of every pose tells where each sensor really is, how it is
-turned, its gain and its bias. A tracker gives the poses (the board may be shifted and
-turned against it, the magnet within its tool); without one, --unknown-poses finds them
-too, in the box from --low to --high. Poses should fill the space that will be used, with
-the magnet tilted this way and that: 162 of them were enough for 41 sensors.
+Estimates the position, orientation, gain and bias of each sensor of a board from the readings
+of all sensors while a magnet of known moment is moved over the board. The poses of the magnet
+are measured by a tracker; the offsets between tracker and board, and between tool and magnet,
+are estimated. Without a tracker, --unknown-poses estimates the poses as well, within the box
+from --low to --high. The poses should fill the working volume, with the magnet tilted in
+various directions: 162 poses were sufficient for 41 sensors.
 
-The TABLE is a CSV, a row a pose: x0,y0,z0,x1,... [T, each sensor's own frame; empty =
-not measured], mag_x0,mag_y0,mag_z0 [m], mag_mx0,mag_my0,mag_mz0 (unit vector).
+TABLE is a CSV file with one row per pose: x0,y0,z0,x1,... [T, sensor frame; empty = not
+measured], mag_x0,mag_y0,mag_z0 [m], mag_mx0,mag_my0,mag_mz0 (unit vector).
 
---params takes what is known beforehand, as standard deviations (0 = exactly):
+--params sets the prior knowledge, as standard deviations (0 = exactly known):
 {settings}
 
 examples:
@@ -48,7 +48,12 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     settings = '\n'.join(f'  {p.name}: {p.value}  # {p.doc}{f" [{p.unit}]" if p.unit else ""}'
                          for p in flatten(GeometrySettings()))
     p = add_command(commands, 'board-geometry', _geometry,
@@ -56,77 +61,85 @@ def add(commands: Commands) -> None:
     p.add_argument('table', type=Path, metavar='TABLE', help='readings and poses (.csv)')
     stated = p.add_mutually_exclusive_group(required=True)
     stated.add_argument('--sensors', type=Path, metavar='FILE',
-                        help='x,y,z [m] of every sensor (.csv), turned along the axes')
-    add_network(stated, required=False, text='or the board as stated (network.yaml), its sensors '
-                'in the order of the table')
+                        help='nominal positions x,y,z [m] of all sensors (.csv), which are aligned '
+                        'with the axes')
+    add_network(stated, required=False, text='network file with the nominal geometry, sensors in '
+                'the order of the table')
     p.add_argument('--moment', required=True, type=float, metavar='A_M2',
-                   help='size of the magnet\'s moment')
+                   help='magnitude of the magnet\'s moment [A m^2]')
     p.add_argument('--out', required=True, type=Path, metavar='FILE',
-                   help='the network file to write')
-    p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise of one reading, where '
-                   f'the network file has none (default: {ASSUMED_NOISE:g}, and not written)')
-    p.add_argument('--unknown-poses', action='store_true', help='nothing tracked the magnet')
-    for name, what in (('--low', 'lowest'), ('--high', 'highest')):
+                   help='network file to write')
+    p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise of one reading, for '
+                   'sensors without noise_std in the network file '
+                   f'(default: {ASSUMED_NOISE:g}, not written to the output)')
+    p.add_argument('--unknown-poses', action='store_true',
+                   help='estimate the poses of the magnet (no tracker)')
+    for name, corner in (('--low', 'lower'), ('--high', 'upper')):
         p.add_argument(name, nargs=3, type=float, metavar=('X', 'Y', 'Z'),
-                       help=f'{what} corner of the box where it was [m]')
-    p.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
-    p.add_argument('--figure', type=Path, metavar='FILE', help='draw what was found (.png, .pdf)')
+                       help=f'{corner} corner of the box that contains the magnet [m]')
+    p.add_argument('--params', type=Path, metavar='FILE',
+                   help='YAML file with the settings to override')
+    p.add_argument('--figure', type=Path, metavar='FILE',
+                   help='draw the estimated geometry (.png, .pdf)')
 
 
 def _geometry(args: argparse.Namespace) -> int:
-    """mag-tracking board-geometry."""
+    """Run `mag-tracking board-geometry`."""
     box = _checked(args)
     network = read_network(args.network) if args.sensors is None else board_of(args.sensors)
     settings = replace(GeometrySettings(), read_parameter_file(args.params) if args.params else {})
     date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
-    what = 'poses and geometry' if box else 'geometry'
-    # Ctrl-C ends it at once: nothing has been written yet.
-    with _time_passing(f'finding the {what} of {len(network)} sensors'):
+    unknowns = 'poses and geometry' if box else 'geometry'
+    # Ctrl-C ends the estimation immediately: nothing has been written yet.
+    with _elapsed_time(f'estimating the {unknowns} of {len(network)} sensors'):
         found = survey_geometry(args.table, network, args.moment, settings, date, box,
                                 args.noise_std)
     _print(found, box is not None)
     if not found.geometry.converged:
-        print(f'mag-tracking: refused: {found.geometry.reason}; nothing was written',
+        print(f'mag-tracking: calibration rejected: {found.geometry.reason}; nothing was written',
               file=sys.stderr)
         return 1
-    # From here on, what is begun is ended.
+    # Ctrl-C does not interrupt the writing.
     with recorded_signals(signal.SIGINT):
         write_network(args.out, found.network, 'Geometry from a magnet\'s poses in '
-                      f'{args.table.name}; before that {(args.sensors or args.network).name}.')
+                      f'{args.table.name}; nominal geometry: '
+                      f'{(args.sensors or args.network).name}.')
         if args.figure is not None:
-            # Drawing needs matplotlib, which a run without a figure should not wait for.
+            # Imported here because it loads matplotlib.
             from mag_tracking.report.figure_file import save_figure
             from mag_tracking.report.geometry_figures import geometry_figure
 
             save_figure(geometry_figure(found), args.figure)
-    print(f'the network is in {args.out}')
+    print(f'network written to {args.out}')
     return 0
 
 
 def _checked(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[float]] | None:
-    """The box, or None; raises SettingsError or OutputError for options that make no sense."""
+    """Check the options and return the box; raises SettingsError or OutputError."""
     corners = args.low, args.high
     if args.unknown_poses and None in corners:
-        raise SettingsError('--unknown-poses: --low and --high are needed, the box to look in')
+        raise SettingsError('--unknown-poses: give the box that contains the magnet with --low and '
+                            '--high')
     if not args.unknown_poses and corners != (None, None):
-        raise SettingsError('--low and --high are for --unknown-poses')
+        raise SettingsError('--low and --high require --unknown-poses')
     if not (np.isfinite(args.moment) and args.moment > 0.0):
-        raise SettingsError(f'--moment: expected it above 0 A m^2, got {args.moment:g}')
+        raise SettingsError(f'--moment: expected a value above 0 A m^2, got {args.moment:g}')
     if args.noise_std is not None and not 1e-15 <= args.noise_std < 1e-3:
-        raise SettingsError('--noise-std: expected it above a femtotesla and below a millitesla, '
+        raise SettingsError('--noise-std: expected 1e-15 T or more and less than 1e-3 T, '
                             f'got {args.noise_std:g}')
     if args.unknown_poses and not (np.isfinite(np.subtract(*corners)).all()
                                    and np.less(*corners).all()):
-        raise SettingsError(f'--high: expected it above {args.low} in x, y and z, got {args.high}')
+        raise SettingsError(f'--high: expected values above {args.low} in x, y and z, got '
+                            f'{args.high}')
     for path in (args.out, args.figure):
         if path is not None and not path.absolute().parent.is_dir():
-            raise OutputError(f'cannot write {path}: there is no folder {path.parent}')
+            raise OutputError(f'cannot write {path}: the folder {path.parent} does not exist')
     return corners if args.unknown_poses else None
 
 
 @contextmanager
-def _time_passing(text: str) -> Iterator[None]:
-    """Says what is done, and on a terminal for how long; nobody knows how long it will take."""
+def _elapsed_time(text: str) -> Iterator[None]:
+    """Print the task, and on a terminal the elapsed time; the duration is not predictable."""
     done = threading.Event()
     bar = tqdm(desc=text, bar_format='{desc}: {elapsed}', disable=None)
     if bar.disable:
@@ -147,60 +160,60 @@ def _time_passing(text: str) -> Iterator[None]:
 
 
 def _print(found: GeometrySurvey, blind: bool) -> None:
-    """What was found as a table, and what is wrong."""
+    """Print the calibration as a table, followed by its quality and warnings."""
     g = found.geometry
     if g.converged:
-        print('sensor      moved [mm]    turned [deg]   gain            '
+        print('sensor      shift [mm]    rotation [deg] gain            '
               'bias [uT]                    residual')
         for j, name in enumerate(found.network.names):
             print(f'{name:11s} {_row(found, j)}')
         _print_magnet(g, blind)
-    left_out = found.n_poses - len(found.rows)
-    print(f'{len(found.rows)} of {found.n_poses} poses, normalised cost {g.normalised_cost:.2f} '
-          '(1 = as noise and field error say)')
-    if left_out:
-        print(f'  warning: poses without readings{" or outside the box" * blind}, left out: '
-              f'{left_out}')
+    n_unused = found.n_poses - len(found.rows)
+    print(f'{len(found.rows)} of {found.n_poses} poses used, normalised cost '
+          f'{g.normalised_cost:.2f} (1 = consistent with noise and field error)')
+    if n_unused:
+        print(f'  warning: poses not used (without readings{" or outside the box" * blind}): '
+              f'{n_unused}')
     if g.suspect_sensors:
-        print('  warning: sensors that do not fit with the others, or only far from what was '
-              f'stated (mounting, axes, unit, noise?): {", ".join(g.suspect_sensors)}')
-    guessed = sum(std is None for std in found.network.noise_std)
-    if guessed:
-        print(f'  note: nobody says the noise of {guessed} sensors: counted with '
-              f'{ASSUMED_NOISE:g} T (--noise-std, or noise_std in a network file)')
+        print('  warning: sensors inconsistent with the others or with their nominal geometry '
+              f'(check mounting, axes, unit, noise): {", ".join(g.suspect_sensors)}')
+    n_assumed = sum(std is None for std in found.network.noise_std)
+    if n_assumed:
+        print(f'  note: noise of {n_assumed} sensors assumed to be '
+              f'{ASSUMED_NOISE:g} T (set --noise-std, or noise_std in a network file)')
     for j, name in enumerate(found.network.names):
         if np.isnan(g.bias[j]).all():
-            print(f'  warning: {name} has no reading: it stays as stated')
+            print(f'  warning: {name} has no readings; its nominal geometry is kept')
     for name, axes in found.silent_axes:
-        print(f'  warning: {name} never reported {axes}: its background will have to be learnt')
+        print(f'  warning: {name} never reported {axes}: its background is still unknown')
     if found.suspect_rows:
-        print('  warning: rows of poses that do not fit (the header is row 1): '
+        print('  warning: rows with inconsistent poses (the header is row 1): '
               f'{", ".join(map(str, found.suspect_rows))}')
 
 
 def _print_magnet(g: NetworkGeometry, blind: bool) -> None:
-    """Moment, and how the magnet sits in its tool."""
+    """Print the moment, and the offset and tilt of the magnet in its tool."""
     def listed(values: FloatArray, std: FloatArray, scale: float, digits: int) -> str:
         return ' '.join(f'{scale * v:.{digits}f} ({scale * s:.{digits}f})'
                         for v, s in zip(values, std, strict=True))
 
     moment, std = g.moment
-    print(f'moment {moment:.4f} ({std:.4f}) A m^2' if std else f'moment {moment:g} A m^2, as given')
+    print(f'moment {moment:.4f} ({std:.4f}) A m^2' if std else f'moment {moment:g} A m^2 (given)')
     if not blind:
         offset, offset_std = g.tool_offset
         tilt, tilt_std = g.tool_tilt
-        print(f'magnet from the tracked point, along the tool\'s x y z: '
-              f'{listed(offset, offset_std, 1e3, 2)} mm; tilted by '
+        print(f'magnet relative to the tracked point, tool frame: '
+              f'{listed(offset, offset_std, 1e3, 2)} mm; tilt '
               f'{listed(tilt, tilt_std, 180.0 / np.pi, 2)} deg')
 
 
 def _row(found: GeometrySurvey, j: int) -> str:
-    """One sensor of the table."""
+    """One row of the table of sensors."""
     g = found.geometry
     moved = 1e3 * np.linalg.norm(found.network.positions[j] - found.stated.positions[j])
     moved_std, rotated_std = (np.sqrt(np.square(v[j]).mean())
                              for v in (1e3 * g.position_std, np.rad2deg(g.rotation_std)))
     bias = ' '.join(f'{1e6 * b:+8.2f}' for b in g.bias[j])
-    return (f'{moved:5.2f} ({moved_std:.2f})  {np.rad2deg(found.turned[j]):6.2f} '
+    return (f'{moved:5.2f} ({moved_std:.2f})  {np.rad2deg(found.rotation_angle[j]):6.2f} '
             f'({rotated_std:.2f})  {g.gain[j]:.4f} ({g.gain_std[j]:.4f}) {bias}  '
             f'{g.sensor_residual[j]:8.2f}')

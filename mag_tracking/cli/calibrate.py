@@ -1,4 +1,4 @@
-"""mag-tracking calibrate."""
+"""Command `mag-tracking calibrate`."""
 
 import argparse
 import signal
@@ -24,18 +24,18 @@ from mag_tracking.network.file import write_network
 from mag_tracking.recording.reader import Recording
 
 _CALIBRATE = '''
-From a recording that begins without a target: how each sensor is turned (accelerometer
-and compass), how far its clock is off (knock twice, unevenly, so that all sensors feel
-it), its noise, and whether all sensors measure the same Earth: a flipped axis, a swapped
-pair or another unit is named. What passes tells more of the headings (--no-passes to
-leave that out). An unknown bias of 0.6 uT turns a compass by two degrees: the deviations
-that are written into the network file say what is known, and the tracker counts with them.
-What was stated by hand is kept there, too: calibrating again begins from that. The exit
-status is 2 where a sensor cannot be right.
+Estimates the orientation of each sensor (accelerometer and compass), its clock offset (knock
+twice, at uneven intervals, so that all sensors are shaken) and its noise, from a recording that
+begins without a target. Checks that all sensors measure the same Earth field, and reports flipped
+or swapped axes and wrong units. Passing vehicles improve the headings (disable with --no-passes).
+Headings remain uncertain (a bias of 0.6 uT rotates a compass by two degrees): their standard
+deviations are written to the network file and used by the tracker. Orientations stated by hand are
+kept in the file, and the next calibration starts from them. Exit status 2 if a sensor must be
+wrong.
 
-The network file needs the Earth's field, as earth_field (tesla) or as the site:
+The network file must contain the Earth's field, as earth_field (tesla) or as site:
   site: {latitude: 58.4, longitude: 15.6, height: 60, date: 2026-05-01, x_azimuth_deg: 90}
-x_azimuth_deg is the bearing of the frame's x axis (of the road) from true north.
+x_azimuth_deg is the bearing of the x axis of the frame (the road) from true north.
 
 example:
   mag-tracking calibrate first_day.mcap --network site.yaml --out calibrated.yaml
@@ -43,21 +43,28 @@ example:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'calibrate', _calibrate, _CALIBRATE)
     p.add_argument('recording', type=Path, metavar='RECORDING',
-                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
+                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='FILE',
-                   help='the network file to write')
+                   help='network file to write')
     add_settings(p)
-    p.add_argument('--no-passes', action='store_true', help='do not track what passes')
-    p.add_argument('--figure', type=Path, metavar='FILE', help='draw what was found (.png, .pdf)')
+    p.add_argument('--no-passes', action='store_true',
+                   help='do not estimate headings from passing targets')
+    p.add_argument('--figure', type=Path, metavar='FILE',
+                   help='draw the calibration (.png, .pdf)')
     add_report(p)
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    """mag-tracking calibrate."""
+    """Run `mag-tracking calibrate`."""
     network, settings = recorded_network(args), settings_of(args)
     recording = Recording(args.recording)
     check_outputs(args)
@@ -75,50 +82,50 @@ def _calibrate(args: argparse.Namespace) -> int:
     write_network(args.out, found.network,
                   f'Calibrated from {args.recording.name} and {args.network.name}.')
     if args.report is not None:
-        # It needs matplotlib, which the other commands should not load.
+        # Imported here because it loads matplotlib.
         from mag_tracking.apps.calibrate_report import write_report
 
         write_report(found, network, args.recording.name, args.report)
     if args.figure is not None:
-        # Drawing needs matplotlib, which a run without a figure should not wait for.
+        # Imported here because it loads matplotlib.
         from mag_tracking.report.calibration_figures import calibration_figure
         from mag_tracking.report.figure_file import save_figure
 
         save_figure(calibration_figure(found, network), args.figure)
-    print(f'the network is in {args.out}')
+    print(f'network written to {args.out}')
     return 2 if found.survey.disagreements else 0
 
 
 def _print(found: Calibration, recording: Recording) -> None:
-    """The calibration as a table, and what is wrong."""
+    """Print the calibration as a table, followed by notes and warnings."""
     survey = found.survey
-    print('sensor      tilted   heads [deg]      clock [ms]          noise [nT]           by')
+    print('sensor      tilt     heading [deg]    clock [ms]          noise [nT]           source')
     for j, sensor in enumerate(survey.sensors):
         print(f'{sensor.sensor:11s} {_row(found, j)}')
     if survey.reference:
-        print(f'clocks against that of {survey.reference}')
+        print(f'clock offsets relative to {survey.reference}')
     if found.evidence is not None:
         scatter = found.evidence.scatter[~np.isnan(found.evidence.scatter)]
-        print(f'{found.evidence.n_tracks} passes counted in'
-              + (f'; they differ by {np.sqrt(scatter.max()):.1f} of what they claim at most'
+        print(f'passes used: {found.evidence.n_tracks}'
+              + (f'; largest scatter: {np.sqrt(scatter.max()):.1f} standard deviations'
                  if len(scatter) else ''))
     for text in survey.warnings():
         print(f'  warning: {text}')
     for name in found.without_background:
-        print(f'  warning: {name}: no background was learnt: the recording needs a target-free '
-              'beginning (mag-tracking doctor may say more)')
+        print(f'  warning: {name}: no background was learnt; the recording must begin without a '
+              'target (run mag-tracking doctor for details)')
     if survey.disagreements and found.evidence is None:
-        print('  note: passes were left out, because of sensors that cannot be right')
+        print('  note: passes were not used because some sensors must be wrong')
     for what, n in {**found.rejected, **recording.losses}.items():
         print(f'  warning: {what}: {n}')
 
 
 def _row(found: Calibration, j: int) -> str:
-    """One sensor of the table."""
+    """One row of the table of sensors."""
     network = found.network
     R, std = network.R_ws[j], network.orientation_std[j]
     tilt = np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))
-    # Where the sensor's x axis points, seen from above.
+    # Direction of the sensor's x axis, seen from above.
     heading = np.degrees(np.arctan2(R[1, 0], R[0, 0]))
     sd = '  (?)' if std is None else f'({np.degrees(std[2]):.1f})'
     done, noise = network.calibrated[j], network.noise_std[j]

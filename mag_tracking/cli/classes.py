@@ -1,4 +1,4 @@
-"""mag-tracking classes."""
+"""Command `mag-tracking classes`."""
 
 import argparse
 from collections import Counter
@@ -24,19 +24,20 @@ from mag_tracking.network.file import read_network
 from mag_tracking.recording.signature_tables import read_model, write_model
 
 _CLASSES = '''
-One sensor does not tell size or distance, but the shape of the field as something passes tells
-its class, after training on labelled passes of your own.
+A single sensor determines neither size nor distance of a target, but the shape of the field
+during a pass identifies its class, after training on labelled passes.
 
-LABELLED is a CSV table: a row for each sample (label, signature, time_s, x_nt, y_nt, z_nt), or a
-row for each signature (label, x0, x1, ..., y0, y1, ...). A column pass names signatures of one
-target at several sensors. Or it is a recording with --network FILE
-and --labels FILE, a CSV table of intervals (label, begin_s, end_s, and maybe sensor; seconds since
-the first reading or since 1970, or begin_ns and end_ns). The table of `mag-tracking events`
-(signatures.csv) is one without labels.
+LABELLED is one of:
+  - a CSV table with one row per sample (label, signature, time_s, x_nt, y_nt, z_nt) or one row per
+    signature (label, x0, x1, ..., y0, y1, ...). An optional column pass identifies the signatures
+    of one target at several sensors. signatures.csv of `mag-tracking events` is such a table
+    without labels.
+  - a recording, with --network FILE and --labels FILE, a CSV table of intervals (label, begin_s,
+    end_s, optional sensor; seconds since the first reading or since 1970, or begin_ns and end_ns).
 
-train chooses the method by cross-validation and writes JSON. evaluate trains and tests on
-stratified splits, or tests a model on other examples. predict prints the probability of each class.
-Where a signature is far from all examples the answer is "unknown".
+train selects the method by cross-validation and writes the model as JSON. evaluate trains and
+tests on stratified splits, or tests an existing model. predict prints the probability of each
+class. A signature far from all examples is classified as "unknown".
 
 examples:
   mag-tracking classes evaluate passes.csv
@@ -47,12 +48,17 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'classes', _no_action, _CLASSES)
     actions = p.add_subparsers(dest='action', metavar='ACTION', required=True)
-    for name, run, text in (('train', _train, 'learn classes from labelled passes'),
-                            ('evaluate', _evaluate, 'measure accuracy and reliability'),
-                            ('predict', _predict, 'classes of signatures')):
+    for name, run, text in (('train', _train, 'Train a classifier on labelled passes.'),
+                            ('evaluate', _evaluate, 'Measure accuracy and reliability.'),
+                            ('predict', _predict, 'Classify signatures.')):
         _add_action(actions, name, run, text)
 
 
@@ -61,40 +67,43 @@ def _add_action(actions: Commands, name: str, run: Callable[[argparse.Namespace]
     """Register `train`, `evaluate` or `predict`."""
     p = actions.add_parser(name, help=text, description=text)
     p.set_defaults(run_command=run)
-    p.add_argument('labelled', type=Path, metavar='LABELLED', help='table or recording')
-    p.add_argument('--labels', type=Path, metavar='FILE', help='intervals of a recording')
-    p.add_argument('--network', type=Path, metavar='FILE', help='of a recording')
+    p.add_argument('labelled', type=Path, metavar='LABELLED',
+                   help='table of signatures (.csv) or recording')
+    p.add_argument('--labels', type=Path, metavar='FILE',
+                   help='table of the labelled intervals of a recording (.csv)')
+    p.add_argument('--network', type=Path, metavar='FILE', help='network file of a recording')
     if name == 'train':
-        p.add_argument('--out', type=Path, required=True, metavar='FILE', help='written as JSON')
+        p.add_argument('--out', type=Path, required=True, metavar='FILE',
+                       help='model file to write (.json)')
     else:
         p.add_argument('--model', type=Path, required=name == 'predict', metavar='FILE',
-                       help='of `classes train`')
+                       help='model file written by `classes train`')
     if name == 'evaluate':
         p.add_argument('--splits', type=int, default=20, metavar='N',
-                       help='70/30 splits without a model (default: 20)')
+                       help='number of 70/30 splits without --model (default: 20)')
 
 
 def _no_action(args: argparse.Namespace) -> int:
-    """Argparse asks for an action before this."""
+    """Never called: argparse requires an action."""
     raise SettingsError('classes: expected train, evaluate or predict')
 
 
 def _examples(args: argparse.Namespace) -> Examples:
-    """The signatures of a command line, with a warning for each that cannot be used."""
+    """Read the signatures of the command line and print a warning for each unusable one."""
     network = None if args.network is None else read_network(args.network)
     examples = examples_of(labelled_signatures(args.labelled, args.labels, network,
                                                args.action != 'predict'))
     for reason in examples.left_out:
-        print(f'  warning: left out: {reason}')
+        print(f'  warning: not used: {reason}')
     return examples
 
 
 def _train(args: argparse.Namespace) -> int:
-    """mag-tracking classes train."""
+    """Run `mag-tracking classes train`."""
     check_writable(args.out)
     if any(path is not None and path.resolve() == args.out.resolve()
            for path in (args.labelled, args.labels, args.network)):
-        raise OutputError(f'--out: {args.out} is an input of this command')
+        raise OutputError(f'--out: {args.out} is an input of this command; choose another file')
     model = train_classes(_examples(args))
     write_model(args.out, model)
     print(f'{args.out}: {model.method}; '
@@ -103,33 +112,33 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    """mag-tracking classes evaluate."""
+    """Run `mag-tracking classes evaluate`."""
     if args.splits < 1:
-        raise SettingsError(f'--splits: {args.splits} is not a number of at least 1')
+        raise SettingsError(f'--splits: expected 1 or more, got {args.splits}')
     examples = _examples(args)
     model = None if args.model is None else read_model(args.model)
     found = evaluate_classes(examples, model, args.splits,
                              partial(tqdm, desc='splits', disable=None, leave=False))
     how = f'{args.splits} splits of 70/30' if model is None else f'{args.model}'
-    print(f'{len(examples.labels)} signatures, {how}; tested on {found.n}')
+    print(f'{len(examples.labels)} signatures, {how}; {found.n} tested')
     _print_evaluation(found)
     return 0
 
 
 def _print_evaluation(found: Evaluation) -> None:
-    """The figures of an evaluation."""
-    print(f'  largest class: {found.majority:.1%} (accuracy of a constant answer)')
+    """Print the scores of an evaluation."""
+    print(f'  largest class: {found.majority:.1%} (accuracy of a constant prediction)')
     for name, values in (('accuracy', found.accuracy),
                          ('balanced accuracy', found.balanced_accuracy),
-                         ('answers unknown', found.unknown)):
+                         ('classified as unknown', found.unknown)):
         print(f'  {name}: {_share(values)}')
     for k, name in enumerate(found.classes):
         print(f'  recall of {name}: {_share(found.recall[:, k])}')
-    print(f'  reliability error of the probabilities: {found.reliability:.3f}')
+    print(f'  expected calibration error of the probabilities: {found.reliability:.3f}')
 
 
 def _share(values: 'np.ndarray[tuple[int, ...], np.dtype[np.float64]]') -> str:
-    """A share over all sets, with its standard deviation where there are several."""
+    """Mean of a fraction over all test sets, with its standard deviation if there are several."""
     known = values[np.isfinite(values)]
     if not len(known):
         return 'no examples'
@@ -138,7 +147,7 @@ def _share(values: 'np.ndarray[tuple[int, ...], np.dtype[np.float64]]') -> str:
 
 
 def _predict(args: argparse.Namespace) -> int:
-    """mag-tracking classes predict."""
+    """Run `mag-tracking classes predict`."""
     model, examples = read_model(args.model), _examples(args)
     check_axes(examples, model)
     names, posterior = model.names(examples.x), model.posterior(examples.x)

@@ -1,4 +1,4 @@
-"""The commands of `mag-tracking`; imported is only the one that is asked for."""
+"""The commands of `mag-tracking` and their parser; only the requested command is imported."""
 
 import argparse
 from collections.abc import Sequence
@@ -8,52 +8,67 @@ from typing import NamedTuple
 
 PACKAGE = 'mag_tracking'
 ROS_ARGUMENTS = '--ros-args'
-WITH_ROS = ('run', 'record', 'doctor', 'topics', 'echo', 'param', 'lifecycle', 'watch')
-"""Commands that take arguments of ROS."""
+ROS_COMMANDS = ('run', 'record', 'doctor', 'topics', 'echo', 'param', 'lifecycle', 'watch')
+"""Commands that accept ROS arguments."""
 
 
 class Command(NamedTuple):
-    """What is known of a command before it is imported."""
+    """Description of a command that is available before its module is imported."""
 
     module: str
-    """In this folder; its `add` registers the command, and others of the module."""
+    """Module in this folder; its function `add` registers all commands of the module."""
     short: str
+    """Summary in the list of commands."""
     aliases: tuple[str, ...] = ()
+    """Alternative names."""
 
 
 COMMANDS = {
-    'replay': Command('replay', 'Track what is in recordings, offline.'),
-    'events': Command('events', 'Count and describe passes, sensor by sensor.'),
+    'replay': Command('replay', 'Track the targets in recordings, offline.'),
+    'events': Command('events', 'Count and describe the passes at each sensor.'),
     'traffic': Command('traffic', 'Count vehicles by direction, class and speed.'),
-    'classes': Command('classes', 'Learn and tell classes of passes by one sensor.'),
-    'calibrate': Command('calibrate', 'Find how sensors are turned and their clocks are off.'),
-    'tumble': Command('tumble', 'Find the hard and soft iron of sensors that were turned about.'),
+    'classes': Command('classes', 'Train and apply a classifier of passes at one sensor.'),
+    'calibrate': Command('calibrate', 'Calibrate sensor orientations, clocks and noise.'),
+    'tumble': Command('tumble', 'Calibrate hard and soft iron by rotating the sensors.'),
     'board-geometry': Command(
-        'board_geometry', 'Find where the sensors of a board are, from poses of a magnet.',
+        'board_geometry', 'Calibrate the geometry of a board with a magnet.',
         ('geometry',)),
-    'doctor': Command('doctor', 'Say what is wrong with the sensors.'),
+    'doctor': Command('doctor', 'Diagnose sensor faults.'),
     'fit': Command('fit', 'Fit whole passes at constant velocity, offline.'),
-    'plan': Command('plan', 'What a network of sensors will be able to tell.'),
-    'listen': Command('listen', 'Print what the devices of a drivers file say.'),
+    'plan': Command('plan', 'Predict accuracy and coverage of a sensor network.'),
+    'listen': Command('listen', 'Print the readings of the devices in a drivers file.'),
     'record': Command('record', 'Record the sensors (needs ROS 2).'),
-    'repair': Command('repair', 'Make a recording whole that was cut off.'),
-    'run': Command('run', 'Run the nodes in one process (needs ROS 2).'),
-    'info': Command('info', 'Tell what is in a recording.'),
-    'archive': Command('archive', 'Track many recordings into one dataset, on a cluster.'),
-    'import': Command('import_table', 'Turn a table into a recording.'),
-    'topics': Command('graph', 'List the topics of the graph (needs ROS 2).'),
+    'repair': Command('repair', 'Rebuild the index of an incomplete recording.'),
+    'run': Command('run', 'Run all nodes in one process (needs ROS 2).'),
+    'info': Command('info', 'Summarise the content of a recording.'),
+    'archive': Command('archive', 'Track many recordings into one dataset, in parallel.'),
+    'import': Command('import_table', 'Convert a CSV table to a recording.'),
+    'topics': Command('graph', 'List the topics of the ROS graph (needs ROS 2).'),
     'echo': Command('graph', 'Print the messages of a topic (needs ROS 2).'),
-    'param': Command('graph', 'Show or set parameters of a node (needs ROS 2).'),
-    'lifecycle': Command('graph', 'Show or change the state of a lifecycle node (needs ROS 2).'),
-    'view': Command('live_page', 'Show a recording on a live page.'),
+    'param': Command('graph', 'Show or set the parameters of a node (needs ROS 2).'),
+    'lifecycle': Command('graph', 'Show or change the state of a node (needs ROS 2).'),
+    'view': Command('live_page', 'Track a recording in real time on a live page.'),
     'watch': Command('live_page', 'Show running nodes on a live page (needs ROS 2).'),
 }
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
-    """The parsed command line; its `run_command` takes it and returns the exit status."""
+    """Parse a command line.
+
+    Parameters
+    ----------
+    words : sequence of str
+        Command-line arguments without the program name.
+
+    Returns
+    -------
+    argparse.Namespace
+        Options, and `run_command`: a function that takes the namespace and returns the exit
+        status.
+    """
     parser = argparse.ArgumentParser(
-        prog='mag-tracking', description='Track magnetic targets with stationary magnetometers.')
+        prog='mag-tracking', description='Track magnetic targets with stationary magnetometers. '
+        'For the options of a command, run "mag-tracking COMMAND --help".')
     parser.add_argument('--version', action='version', version=f'mag_tracking {version(PACKAGE)}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     words = list(words)
@@ -66,13 +81,13 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
             commands.add_parser(name, help=command.short, aliases=command.aliases)
     args = parser.parse_args(words[:split])
     args.ros_arguments = words[split:]
-    if args.ros_arguments and args.command not in WITH_ROS:
-        parser.error(f'{ROS_ARGUMENTS}: {args.command} runs without ROS; only '
-                     f'{", ".join(WITH_ROS)} take arguments of ROS')
+    if args.ros_arguments and args.command not in ROS_COMMANDS:
+        parser.error(f'{ROS_ARGUMENTS}: {args.command} runs without ROS; ROS arguments are '
+                     f'accepted by {", ".join(ROS_COMMANDS)}')
     return args
 
 
 def _module_of(word: str) -> str | None:
-    """The module of the command that a word names; None where it names none."""
+    """Module of a command given by name or alias; None for any other word."""
     return next((command.module for name, command in COMMANDS.items()
                  if word in (name, *command.aliases)), None)

@@ -1,4 +1,4 @@
-"""mag-tracking doctor."""
+"""Command `mag-tracking doctor`."""
 
 import argparse
 import signal
@@ -24,11 +24,10 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.stages.health.sensor_health import Finding, SensorHealth
 
 _DOCTOR = '''
-Reads a recording, or listens to what is published now, and says what is wrong with each
-sensor and what to do: no readings, lost ones, duplicates, clocks that step, delays, noise
-beyond what was calibrated, a stuck or saturated sensor, spikes, axes that are flipped or
-swapped, gauss or microtesla published as tesla, backgrounds that are not learnt. The exit
-status is 0 where nothing serious was found, else 2.
+Examines a recording or live topics, and reports the faults of each sensor with a remedy: missing,
+lost or duplicate readings, clock steps, delays, noise above the calibration, stuck or saturated
+sensors, spikes, flipped or swapped axes, wrong units (gauss or microtesla published as tesla),
+backgrounds that are not learnt. Exit status 0 if no serious fault was found, otherwise 2.
 
 examples:
   mag-tracking doctor night.mcap --network site.yaml
@@ -37,34 +36,39 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'doctor', _doctor, _DOCTOR)
     p.add_argument('recording', nargs='?', type=Path, metavar='RECORDING',
-                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
+                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
     p.add_argument('--live', type=float, metavar='SECONDS',
-                   help='listen to the topics for so long instead (needs ROS 2)')
+                   help='examine the live topics for this time instead (needs ROS 2)')
     add_recorded_network(p)
     add_settings(p)
     add_report(p)
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    """mag-tracking doctor."""
+    """Run `mag-tracking doctor`."""
     if (args.recording is None) == (args.live is None):
-        raise SettingsError('doctor: either a RECORDING or --live SECONDS')
+        raise SettingsError('doctor: give either RECORDING or --live SECONDS')
     network, settings = recorded_network(args), settings_of(args)
     check_report(args, args.recording, args.network)
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         if args.live is not None:
             if not 1.0 <= args.live <= 86400.0:
-                raise SettingsError(f'--live: {args.live:g} is not between 1 and 86400 s')
-            # Only this needs ROS.
+                raise SettingsError(f'--live: expected 1 to 86400 s, got {args.live:g}')
+            # Imported here because it needs ROS.
             from mag_tracking.nodes.doctor_node import listening
 
             with listening(network, settings, args.live, lambda: bool(seen),
-                           args.ros_arguments) as heard:
-                heard.status = _report(args, heard.doctor, heard.findings, bool(seen))
-            return heard.status
+                           args.ros_arguments) as live:
+                live.status = _report(args, live.doctor, live.findings, bool(seen))
+            return live.status
         recording = Recording(args.recording)
         with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
                   disable=None) as bar:
@@ -74,29 +78,29 @@ def _doctor(args: argparse.Namespace) -> int:
 
 def _report(args: argparse.Namespace, doctor: Doctor, more: list[Finding],
             is_interrupted: bool) -> int:
-    """Print the findings, `more` included, and write the page; returns the exit status."""
+    """Print all findings, including `more`, write the report, and return the exit status."""
     for name, health in doctor.sensors.items():
         print(f'{name:11s} {_row(health)}')
     findings = sorted(more + doctor.findings(), key=lambda f: not f.serious)
     for finding in findings:
-        print(f'{"WRONG" if finding.serious else "note "} {finding.subject}: {finding.what}\n'
+        print(f'{"ERROR" if finding.serious else "note "} {finding.subject}: {finding.what}\n'
               f'      {finding.advice}')
     if not findings:
-        print('nothing is wrong')
+        print('no faults found')
     if args.report is not None:
         write_report(doctor, findings, 'the running sensors' if args.recording is None
                      else args.recording.name, args.report)
     if is_interrupted:
-        print('interrupted: this is of what was read until then')
+        print('interrupted: the results cover only the part read so far')
         return 130
     return 2 if any(f.serious for f in findings) else 0
 
 
 def _row(health: SensorHealth) -> str:
-    """One sensor in a line."""
+    """One row of the table of sensors."""
     c = health.counts
     if not c['readings']:
-        return 'nothing'
+        return 'no readings'
     delay = health.delay_s[0]
     noise = ' '.join('  -  ' if np.isnan(v) else f'{1e9 * v:5.1f}' for v in health.noise_std)
     return (f'{c["readings"]:8d} readings  {health.rate:7.1f} Hz  {c["lost"]:5d} lost  '

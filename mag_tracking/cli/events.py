@@ -1,4 +1,4 @@
-"""mag-tracking events."""
+"""Command `mag-tracking events`."""
 
 import argparse
 import signal
@@ -19,12 +19,12 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.units import NS
 
 _EVENTS = '''
-Counts what passes each sensor and describes it without tracking: onset and release, peak, energy,
-the time of the closest point, which way it went (with two horizontal axes), and the signature of
-the field. One sensor with one axis is enough. A single sensor does not tell how far or how fast:
-nothing is in metres.
+Detects the passes at each sensor and describes them without tracking: onset and release, peak,
+energy, time of the closest point of approach, direction (needs two horizontal axes), and the
+signature of the field. One sensor with one axis is sufficient. Distance and speed are not
+observable with a single sensor, so that no value is in metres.
 
-With --out DIR: events.csv and signatures.csv.
+With --out, writes events.csv and signatures.csv to DIR.
 
 examples:
   mag-tracking events road.mcap --network network.yaml
@@ -33,21 +33,26 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'events', _events, _EVENTS)
     p.add_argument('recording', type=Path, metavar='RECORDING',
-                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
+                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
-    p.add_argument('--out', type=Path, metavar='DIR', help='folder for tables')
+    p.add_argument('--out', type=Path, metavar='DIR', help='output folder')
     add_settings(p)
 
 
 def _events(args: argparse.Namespace) -> int:
-    """mag-tracking events."""
+    """Run `mag-tracking events`."""
     network, settings = recorded_network(args), settings_of(args)
     recording = Recording(args.recording)
     if args.out is not None and recording.lies_in(args.out):
-        raise OutputError(f'{args.out} is the folder of the recording; the tables would be in it')
+        raise OutputError(f'--out: {args.out} is the folder of the recording; choose another one')
     with recorded_signals(signal.SIGINT) as seen, \
             tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
                  disable=None) as bar:
@@ -59,33 +64,42 @@ def _events(args: argparse.Namespace) -> int:
         write_events(args.out, result.events)
         print(f'tables in {args.out}')
     if seen:
-        print('interrupted: this is of what was read until then')
+        print('interrupted: the results cover only the part read so far')
         return 130
     return 0
 
 
 def _print(result: EventsResult, names: tuple[str, ...]) -> None:
-    """The events, a line each, and their counts."""
+    """Print one line per event, the number of events of each sensor, and warnings."""
     for event in result.events:
         print(line_of(event))
     counts = result.counts()
     print(', '.join(f'{name}: {counts.get(name, 0)} events' for name in names))
     for topic in result.missing_topics:
-        print(f'  warning: nothing on {topic}')
+        print(f'  warning: no messages on {topic}')
     for name in result.sensors_without_background:
-        print(f'  warning: no background was learnt for {name}: it was quiet for too short a time')
+        print(f'  warning: no background was learnt for {name}: its quiet intervals are too short')
 
 
 def line_of(event: PassEvent) -> str:
-    """An event in one line."""
+    """Describe an event in one line.
+
+    Parameters
+    ----------
+    event : PassEvent
+
+    Returns
+    -------
+    str
+    """
     at = datetime.fromtimestamp(event.closest_ns / NS, tz=timezone.utc)
     p = event.left_to_right
     way = f'left to right ({p:.0%})' if p > 0.9 else f'right to left ({1.0 - p:.0%})' \
         if p < 0.1 else 'direction unknown'
     time = f'{at:%H:%M:%S}.{at.microsecond // 10000:02d}'
     closest = f'closest {time} ± {event.closest_std:.2f} s' if np.isfinite(event.closest_std) \
-        else f'loudest {time}, closest point unknown'
-    lasted = (event.release_ns - event.onset_ns) / NS
-    return (f'{event.sensor} {event.number}: {closest}, lasted {lasted:.2f} s, peak '
+        else f'peak at {time}, closest point unknown'
+    duration = (event.release_ns - event.onset_ns) / NS
+    return (f'{event.sensor} {event.number}: {closest}, duration {duration:.2f} s, peak '
             f'{1e9 * np.sqrt(np.nansum(event.peak**2)):.0f} nT on {event.axes}, {way}'
             + ('' if event.ended else ', not ended'))

@@ -1,4 +1,4 @@
-"""mag-tracking fit."""
+"""Command `mag-tracking fit`."""
 
 import argparse
 import signal
@@ -32,26 +32,25 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.settings import read_parameter_file
 
 _FIT = '''
-Cuts the passes out of a recording (from before a detection until its end) and fits
-each as a whole: a row of 1, 2, 3, 4 dipoles at constant velocity (TSP14). For a
-vehicle on a straight road this is the most accurate that there is, and the normalised
-cost says whether to believe it: 1 = the model is right.
+Extracts the passes from a recording (from before each detection until its end) and fits each
+pass as a whole: a row of 1, 2, 3, 4 dipoles at constant velocity (TSP14). For a vehicle on a
+straight road this is the most accurate estimate. The normalised cost is 1 if the model is right
+and larger if it is not.
 
-Two or three vehicles that are seen at once (the tracker, which runs along, says how many) are
-fitted together, on a road at z = 0, and each gets a table of its own.
+The tracker runs in parallel and determines the number of vehicles in a pass. Two or three
+simultaneous vehicles are fitted together, on a road at z = 0, and listed separately.
 
-A pass that this cannot describe (a turn, more vehicles at once, nothing but noise, one
-sensor alone, ...) gets a reason instead of numbers. Speed, direction and time of the closest
-point are judged each for itself, and given where they are determined. Where one sensor is
-behind another on the way, the delay between them gives speed and direction once more,
-without any model.
+If the model does not describe a pass (a turn, too many vehicles, noise, a single sensor, ...),
+a reason is reported instead of an estimate. Speed, direction and time of the closest point of
+approach are assessed separately and reported if they are determined. If the target passes one
+sensor after another, the delay between them yields an independent speed and direction.
 
-Writes to DIR:
-  fits.csv, fits.json   a row a pass, vehicle and order
-  report.html           map, time slider and fields, to look at in a browser
-  *_pass_N.png          measured against fitted field, with 90 % bands; of several
-                        vehicles *_pass_N_vehicle_K.png, without the others' field
-  orders.png            normalised cost over the order
+files written to DIR:
+  fits.csv, fits.json   one row per pass, vehicle and number of dipoles
+  report.html           interactive report: map, time slider, fields
+  *_pass_N.png          measured and fitted field with 90% bands; for several vehicles
+                        *_pass_N_vehicle_K.png, with the field of the others removed
+  orders.png            normalised cost over the number of dipoles
 
 examples:
   mag-tracking fit road.mcap --network network.yaml --out fits
@@ -61,32 +60,38 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'fit', _fit, _FIT)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
-                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
+                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
-    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
+    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
     p.add_argument('--orders', nargs='+', type=int, default=[1, 2, 3, 4], metavar='N',
                    help='numbers of dipoles to try (default: 1 2 3 4)')
     p.add_argument('--cpa-range', nargs=2, type=float, metavar=('RANGE', 'STD'),
-                   help='for one sensor, which cannot tell the scale: the range of the closest '
-                   'point and its deviation [m]')
+                   help='range at the closest point of approach and its standard deviation [m], '
+                   'for a single sensor, which does not determine the scale')
     p.add_argument('--same-vehicle', action='store_true',
-                   help='all passes are of one vehicle: tell its hard and soft iron')
-    p.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
-    p.add_argument('--no-figures', action='store_true', help='leave the pictures out')
+                   help='estimate hard and soft iron, assuming one vehicle in all passes')
+    p.add_argument('--params', type=Path, metavar='FILE',
+                   help='YAML file with the settings to override')
+    p.add_argument('--no-figures', action='store_true', help='do not draw figures')
 
 
 def _fit(args: argparse.Namespace) -> int:
-    """mag-tracking fit."""
+    """Run `mag-tracking fit`."""
     network = recorded_network(args)
     settings = settings_for('vehicle', read_parameter_file(args.params) if args.params else {})
     _check(args, network)
-    # All is opened before anything is written.
+    # All recordings are opened before anything is written.
     recordings = [Recording(path) for path in args.recordings]
     if any(recording.lies_in(args.out) for recording in recordings):
-        raise OutputError(f'{args.out} is the folder of a recording; the results would be in it')
+        raise OutputError(f'--out: {args.out} is the folder of a recording; choose another one')
     jobs = [RecordingFit(r, network, settings, args.orders, args.cpa_range) for r in recordings]
     passes: list[FittedPass] = []
     warnings: list[str] = []
@@ -109,30 +114,30 @@ def _fit(args: argparse.Namespace) -> int:
                 break
         iron = _iron(passes, network) if args.same_vehicle else None
         folder.summary = {'iron': iron, 'interrupted': bool(seen)}
-    # It needs matplotlib, which the other commands should not load.
+    # Imported here because it loads matplotlib.
     from mag_tracking.apps.fit_report import write_report
 
     write_report(passes, network, warnings, args.out)
     if not passes:
-        print('no pass: nothing was detected')
+        print('no passes: nothing was detected')
     elif not args.no_figures:
         _draw_orders(passes, args.out)
-    print(f'{"interrupted; what was done is" if seen else "results"} in {args.out}')
+    print(f'{"interrupted; partial results" if seen else "results"} in {args.out}')
     return 130 if seen else 0
 
 
 def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
-    """Raise SettingsError or OutputError for options that make no sense."""
+    """Check the options; raises SettingsError or OutputError."""
     distinct_names(args.recordings)
     check_orders('--orders', args.orders)
     check_cpa_range('--cpa-range', args.cpa_range, network)
     if args.same_vehicle and not (network.earth_field is not None and network.earth_field.any()):
-        raise SettingsError('--same-vehicle: the network file has no earth_field, without which '
-                            'hard and soft iron cannot be told apart')
+        raise SettingsError('--same-vehicle: add earth_field to the network file; hard and soft '
+                            'iron cannot be separated without it')
 
 
 def _print_pass(one: FittedPass) -> None:
-    """A table of the orders of one pass."""
+    """Print the fits of one pass as a table, one row per number of dipoles."""
     data = one.fits[0].data
     print(f'{one.recording}, {one.label}: {data.n_values} measurements, '
           f'sensors: {", ".join(data.network.names[j] for j in data.sensors)}')
@@ -140,7 +145,7 @@ def _print_pass(one: FittedPass) -> None:
         print(f'  note: {note}')
     if any(not f.reason for f in one.fits):
         print('  dipoles  cost       x        y       z      speed        heading      length   '
-              '   moment')
+              '   moment   (standard deviation)')
     for fit in one.fits:
         mark = '*' if fit is one.chosen else ' '
         cost = f'{fit.normalised_cost:8.2f}' if len(fit.x) else ' ' * 8
@@ -150,59 +155,59 @@ def _print_pass(one: FittedPass) -> None:
         if fit.reason and fit is one.known:
             print(f'        determined: {_known(fit)}')
         if not fit.reason and fit.is_poor_mixture:
-            print('        ambiguous: the vehicles together are described poorly')
+            print('        ambiguous: the joint fit of the vehicles is poor')
         elif not fit.reason and fit.ambiguous:
-            behind, path = min(fit.rivals, key=lambda rival: rival[0])
-            print(f'        ambiguous: {np.exp(-0.5 * behind):.2f} times as likely is '
+            chi_square, path = min(fit.rivals, key=lambda rival: rival[0])
+            print(f'        ambiguous: {np.exp(-0.5 * chi_square):.2f} times as likely at position '
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
-                  + (f' with a length of {abs(path[6]):.1f} m' if len(path) > 6 else ''))
+                  + (f' and length {abs(path[6]):.1f} m' if len(path) > 6 else ''))
     _print_delay(one)
     if one.chosen is not None:
-        least = one.chosen.normalised_cost
-        if least > MAX_NORMALISED_COST:
-            print(f'  a row of dipoles describes it poorly (cost {least:.1f}): '
-                  'speed and position may be off by several of the deviations')
+        chosen_cost = one.chosen.normalised_cost
+        if chosen_cost > MAX_NORMALISED_COST:
+            print(f'  poor fit (cost {chosen_cost:.1f}): errors of speed and position may be '
+                  'several standard deviations')
         centre = one.chosen.data.network.positions[one.chosen.data.sensors].mean(axis=0)
         time, std, distance, distance_std = one.chosen.closest_approach(centre)
-        print(f'  closest to the middle of the sensors {time:+.2f} ({std:.2f}) s after the '
-              f'strongest field, {distance:.2f} ({distance_std:.2f}) m away')
-        far, fast = one.disagreement
-        if np.isfinite(far):
-            print(f'  orders with nearly this cost differ by up to {far:.2f} m and {fast:.2f} m/s, '
-                  'which the deviations (in brackets) do not know of')
+        print(f'  closest to the centre of the sensors {time:+.2f} ({std:.2f}) s after the '
+              f'strongest field, at {distance:.2f} ({distance_std:.2f}) m')
+        dr, dv = one.disagreement
+        if np.isfinite(dr):
+            print(f'  fits with a similar cost differ by up to {dr:.2f} m and {dv:.2f} m/s, '
+                  'which the standard deviations do not include')
 
 
 def _known(fit: PassFit) -> str:
-    """Speed, direction and time, as far as they are trusted, of a fit that is no answer as a
-    whole."""
+    """Trusted values among speed, direction and time of a fit without an estimate."""
     speed, speed_std = fit.speed
     heading, heading_std = np.degrees(fit.heading)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     time, time_std, _, _ = fit.closest_approach(centre)
     texts = {'speed': f'{speed:.2f}({speed_std:.2f}) m/s',
              'direction': f'{heading:.1f}({heading_std:.1f}) deg',
-             'time': f'closest to the middle of the sensors {time:+.2f}({time_std:.2f}) s after '
+             'time': f'closest to the centre of the sensors {time:+.2f}({time_std:.2f}) s after '
                      'the strongest field'}
     return ', '.join(texts[name] for name in fit.trusted)
 
 
 def _print_delay(one: FittedPass) -> None:
-    """The velocity by the delays between sensors, and whether the fit agrees."""
+    """Print the velocity from the delays between sensors, and whether it contradicts the fit."""
     c = one.correlated
     if c.reason:
-        print(f'  no speed by the delay between sensors: {c.reason}')
+        print(f'  no velocity from the delay between sensors: {c.reason}')
         return
-    line = ', along the line of the sensors' if np.isnan(c.heading_std) else ''
-    print(f'  by the delay between sensors: {c.speed:.2f}({c.speed_std:.2f}) m/s, '
-          f'{np.degrees(c.heading):.0f} deg{line}')
+    line = ' (assumed along the line of the sensors)' if np.isnan(c.heading_std) else ''
+    print(f'  velocity from the delay between sensors: {c.speed:.2f}({c.speed_std:.2f}) m/s, '
+          f'heading {np.degrees(c.heading):.0f} deg{line}')
     best = one.chosen
     if best is not None and contradicts_delays(best.speed, best.heading, c):
-        print('  warning: fit and delay contradict each other; believe neither (a clock, a '
-              'position in the network file, a turn)')
+        print('  warning: the velocities of the fit and from the delay contradict each other; rely '
+              'on neither. Check clock offsets, positions in the network file, and whether the '
+              'target turned')
 
 
 def _numbers(fit: PassFit) -> str:
-    """Position, speed, heading, length and moment, with deviations in brackets."""
+    """Position, speed, heading, length and moment, with standard deviations in parentheses."""
     sd = np.sqrt(np.diagonal(fit.robust_covariance))[:3]
     place = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
     moment, P = fit.moment
@@ -215,36 +220,36 @@ def _numbers(fit: PassFit) -> str:
 
 
 def _print_bearing(b: Bearing) -> None:
-    """What one sensor tells."""
+    """Print the directions and times that a single sensor determines."""
     def text(k: int, direction: FloatArray) -> str:
         if not np.isfinite(direction).all():
             return 'unknown'
-        return (f'({" ".join(f"{v:.2f}" for v in direction)}) to '
+        return (f'({" ".join(f"{v:.2f}" for v in direction)}) ± '
                 f'{np.degrees(b.direction_std[k]):.1f} deg')
 
-    print(f'        direction to the closest point {text(0, b.cpa_direction)}, of motion '
-          f'{text(1, b.motion_direction)}, or both reversed; of the moment '
+    print(f'        directions: closest point {text(0, b.cpa_direction)}, motion '
+          f'{text(1, b.motion_direction)} (or both reversed), moment '
           f'{text(2, b.moment_direction)}')
     print(f'        closest {b.cpa_time:+.3f} ({b.cpa_time_std:.3f}) s after the strongest field; '
-          f'speed over range {b.rate:.3f} ({b.rate_std:.3f}) 1/s')
+          f'speed/range {b.rate:.3f} ({b.rate_std:.3f}) 1/s')
 
 
 def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any] | None:
-    """Hard and soft iron from the chosen fits, JSON-ready, or None with a line that says why."""
+    """Hard and soft iron from the chosen fits, JSON-ready; None after printing the reason."""
     together = [one for one in passes if one.n_vehicles > 1]
     if together:
-        print(f'--same-vehicle: {len(together)} vehicles that were seen with others are left out')
+        print(f'--same-vehicle: {len(together)} vehicles that passed with others are not used')
     fits = [one.chosen for one in passes if one.chosen is not None and one.n_vehicles == 1]
     try:
         if not fits:
-            raise ValueError('no pass has an answer')
+            raise ValueError('no pass has an estimate')
         if network.earth_field is None:
             raise ValueError('the network file has no earth_field')
         moments, covariances = zip(*(f.moment for f in fits), strict=True)
         iron = hard_and_soft_iron(moments, [f.heading[0] for f in fits],
                                   network.earth_field / MU0, covariances)
     except ValueError as error:
-        print(f'hard and soft iron: {error}')
+        print(f'hard and soft iron were not estimated: {error}')
         return None
     std = np.sqrt(np.diagonal(iron.covariance)) * np.sqrt(max(1.0, iron.normalised_cost))
     hard = ', '.join(f'{v:.1f} ({s:.1f})' for v, s in zip(iron.hard, std[:3], strict=True))
@@ -255,22 +260,22 @@ def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any
 
 
 def _draw(one: FittedPass, out: Path) -> None:
-    """Draw the order chosen, or the richest that there is."""
+    """Draw the chosen fit, or else the fit with the most dipoles."""
     fit = one.chosen or next((f for f in reversed(one.fits) if len(f.x)), None)
     if fit is None:
         return
-    # Drawing needs matplotlib, which a run without figures should not wait for.
+    # Imported here because it loads matplotlib.
     from mag_tracking.report.figure_file import save_figure
     from mag_tracking.report.fit_figures import pass_figure
 
     title = f'{one.recording}, {one.label}, {fit.n_dipoles} dipole{"s" * (fit.n_dipoles > 1)}'
     title += ' (field of the others removed)' if one.n_vehicles > 1 else ''
-    save_figure(pass_figure(fit, title + (' (no answer)' if fit.reason else '')),
+    save_figure(pass_figure(fit, title + (' (no estimate)' if fit.reason else '')),
                 out / f'{one.recording}_{one.label.replace(", ", "_").replace(" ", "_")}.png')
 
 
 def _draw_orders(passes: Sequence[FittedPass], out: Path) -> None:
-    """The figure of all orders."""
+    """Draw the normalised cost over the number of dipoles for all passes."""
     from mag_tracking.report.figure_file import save_figure
     from mag_tracking.report.fit_figures import order_figure
 

@@ -1,4 +1,4 @@
-"""mag-tracking topics, echo, param and lifecycle."""
+"""Commands `mag-tracking topics`, `echo`, `param` and `lifecycle`."""
 
 import argparse
 import os
@@ -10,29 +10,34 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 
 _NOTE = '''
-A small substitute for those who have ROS from PyPI; with a ROS from apt `ros2` does the same
-and more. Names are relative to the namespace given by --ros-args -r __ns:=/NAMESPACE.
+A substitute for the command `ros2`, which is missing in a ROS from PyPI. Names are relative to
+the namespace set with --ros-args -r __ns:=/NAMESPACE.
 '''
 
 
 def add(commands: Commands) -> None:
-    """Register the commands."""
+    """Register the commands.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     add_command(commands, 'topics', _topics, _NOTE)
     p = add_command(commands, 'echo', _echo, _NOTE)
-    p.add_argument('topic', metavar='TOPIC')
-    p.add_argument('--count', type=int, metavar='N', help='end after so many messages')
+    p.add_argument('topic', metavar='TOPIC', help='name of the topic')
+    p.add_argument('--count', type=int, metavar='N', help='exit after N messages')
     p = add_command(commands, 'param', _param, _NOTE)
-    p.add_argument('node', metavar='NODE')
-    p.add_argument('name', nargs='?', metavar='NAME', help='all of them if left out')
-    p.add_argument('value', nargs='?', metavar='VALUE', help='set it to this (YAML)')
+    p.add_argument('node', metavar='NODE', help='name of the node')
+    p.add_argument('name', nargs='?', metavar='NAME', help='parameter (default: all parameters)')
+    p.add_argument('value', nargs='?', metavar='VALUE', help='new value of the parameter (YAML)')
     p = add_command(commands, 'lifecycle', _lifecycle, _NOTE)
-    p.add_argument('node', metavar='NODE')
-    p.add_argument('transition', nargs='?', metavar='TRANSITION',
-                   help='configure, activate, deactivate, cleanup or shutdown')
+    p.add_argument('node', metavar='NODE', help='name of the node')
+    p.add_argument('transition', nargs='?', metavar='TRANSITION', help='transition to trigger: '
+                   'configure, activate, deactivate, cleanup or shutdown')
 
 
 def _topics(args: argparse.Namespace) -> int:
-    """mag-tracking topics."""
+    """Run `mag-tracking topics`."""
     from mag_tracking.nodes.graph_tools import observer, topics
 
     with observer(args.ros_arguments) as graph:
@@ -42,11 +47,11 @@ def _topics(args: argparse.Namespace) -> int:
 
 
 def _echo(args: argparse.Namespace) -> int:
-    """mag-tracking echo."""
+    """Run `mag-tracking echo`."""
     from mag_tracking.nodes.graph_tools import as_text, observer, receive_messages
 
     if args.count is not None and args.count < 1:
-        raise SettingsError(f'--count: {args.count} is not a number of at least 1')
+        raise SettingsError(f'--count: expected 1 or more, got {args.count}')
     n = 0
 
     def show(message: object) -> bool:
@@ -55,7 +60,7 @@ def _echo(args: argparse.Namespace) -> int:
         try:
             print(f'{as_text(message)}---', flush=True)
         except BrokenPipeError:
-            # Nobody reads on, as behind `| head`; Python would complain once more at its end.
+            # The reader has closed the pipe (`| head`). Python would report it again at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return False
         return not seen and n != args.count
@@ -67,7 +72,7 @@ def _echo(args: argparse.Namespace) -> int:
 
 
 def _param(args: argparse.Namespace) -> int:
-    """mag-tracking param."""
+    """Run `mag-tracking param`."""
     from mag_tracking.nodes.graph_tools import observer, parameter_lines, set_parameter
 
     with observer(args.ros_arguments) as graph:
@@ -79,7 +84,7 @@ def _param(args: argparse.Namespace) -> int:
 
 
 def _lifecycle(args: argparse.Namespace) -> int:
-    """mag-tracking lifecycle."""
+    """Run `mag-tracking lifecycle`."""
     from mag_tracking.nodes.graph_tools import (
         change_lifecycle_state,
         lifecycle_state,
@@ -90,5 +95,5 @@ def _lifecycle(args: argparse.Namespace) -> int:
         if args.transition is not None:
             change_lifecycle_state(graph, args.node, args.transition)
         state, transitions = lifecycle_state(graph, args.node)
-        print(f'{state}; possible: {", ".join(transitions)}')
+        print(f'{state}; available transitions: {", ".join(transitions)}')
     return 0

@@ -1,4 +1,4 @@
-"""mag-tracking import."""
+"""Command `mag-tracking import`."""
 
 import argparse
 from pathlib import Path
@@ -7,59 +7,69 @@ from mag_tracking.cli.options import Commands, add_command
 from mag_tracking.errors import SettingsError
 
 _IMPORT = '''
-Turns a table (CSV with a header) into a recording.
+Converts a table (CSV with a header) to a recording.
 
-Readings: --columns says which column is what, --unit what the field is in. Either a row is one
-reading and a column names the sensor (sensor, x, y, z), or a row has all sensors (NAME.x, NAME.y,
-NAME.z). Axes that are not measured are left out. A sensor of the number 3 becomes mag_3. The
-network.yaml with the sensors' positions is yours to write (config/network.yaml is an example).
+Table of readings: --columns assigns the columns and --unit states the unit of the field. Each row
+contains either one reading, with the sensor in a column (sensor, x, y, z), or one reading of each
+sensor (NAME.x, NAME.y, NAME.z). Omit axes that are not measured. A sensor with the number 3 is
+named mag_3. Write a network file with the positions of the sensors yourself; config/network.yaml
+is an example.
 
   mag-tracking import log.csv --columns time=t sensor=id x=bx y=by z=bz --unit uT --out log
   mag-tracking import log.csv --columns time=ms left.x=x1 left.y=y1 right.x=x2 right.y=y2 \\
       --unit gauss --time-unit ms --out log
 
-Poses of a magnet: with --background, a table with a row a sensor and pose (id, timestamp [s],
-Bx By Bz [uT, sensor frame], sensor_x..z [mm], sensor_ox..oz [rad], m_x..z [mm], m_ox..oz [rad])
-and the background per sensor [uT] become a recording and a network.yaml.
+Table of magnet poses: with --background, a table with one row per sensor and pose (id,
+timestamp [s], Bx By Bz [uT, sensor frame], sensor_x..z [mm], sensor_ox..oz [rad], m_x..z [mm],
+m_ox..oz [rad]) and a table with the background of each sensor [uT] are converted to a recording
+and a network file.
 
   mag-tracking import poses.csv --background background.csv --out magnet
 '''
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'import', _import, _IMPORT)
-    p.add_argument('table', type=Path, metavar='TABLE.csv')
-    p.add_argument('--columns', nargs='+', metavar='WHAT=COLUMN',
-                   help='time=, and sensor= x= y= z=, or NAME.x= NAME.y= NAME.z= of each sensor')
-    p.add_argument('--unit', metavar='UNIT', help='of the field: T, mT, uT, nT, gauss or mgauss')
+    p.add_argument('table', type=Path, metavar='TABLE.csv', help='table of readings or poses')
+    p.add_argument('--columns', nargs='+', metavar='KEY=COLUMN',
+                   help='columns of a table of readings: time=, and sensor= x= y= z= or, for each '
+                   'sensor, NAME.x= NAME.y= NAME.z=')
+    p.add_argument('--unit', metavar='UNIT',
+                   help='unit of the field: T, mT, uT, nT, gauss or mgauss')
     p.add_argument('--time-unit', default='s', metavar='UNIT',
-                   help='of the time: s, ms, us or ns (default: s)')
-    p.add_argument('--background', type=Path, metavar='FILE.csv', help='for poses of a magnet')
-    p.add_argument('--out', required=True, type=Path, metavar='DIR')
+                   help='unit of the time: s, ms, us or ns (default: s)')
+    p.add_argument('--background', type=Path, metavar='FILE.csv',
+                   help='background of each sensor, for a table of magnet poses')
+    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
     p.add_argument('--noise-std', type=float, default=1e-6, metavar='TESLA',
-                   help='noise of one reading of a table of poses (default: 1e-6)')
+                   help='noise of one reading in a table of magnet poses (default: 1e-6)')
 
 
 def _import(args: argparse.Namespace) -> int:
-    """mag-tracking import."""
+    """Run `mag-tracking import`."""
     if (args.columns is None) == (args.background is None):
-        raise SettingsError('import: either --columns (readings) or --background (poses of a '
-                            'magnet)')
-    # Only this command needs them.
+        raise SettingsError('import: give either --columns (table of readings) or --background '
+                            '(table of magnet poses)')
+    # Imported here because other commands do not need them.
     from mag_tracking.recording.field_table import import_field_table
     from mag_tracking.recording.importers import import_pose_table
 
     if args.columns is None:
         recording, network, n = import_pose_table(args.table, args.background, args.out,
                                                   args.noise_std)
-        print(f'{n} readings in {recording}, the network in {network}')
+        print(f'{n} readings written to {recording}, network to {network}')
         return 0
     if args.unit is None:
-        raise SettingsError('import: --unit is needed; a table does not tell tesla from gauss')
+        raise SettingsError('import: --unit is missing; give the unit of the field')
     recording, counts = import_field_table(args.table, args.columns, args.unit, args.out,
                                            args.time_unit)
-    print(f'{sum(counts.values())} readings in {recording}')
+    print(f'{sum(counts.values())} readings written to {recording}')
     for name, n in counts.items():
         print(f'  /{name}/imu/mag  {n}')
     return 0

@@ -1,4 +1,4 @@
-"""mag-tracking info."""
+"""Command `mag-tracking info`."""
 
 import argparse
 from pathlib import Path
@@ -10,14 +10,20 @@ from mag_tracking.recording.reader import Recording
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'info', _info)
-    p.add_argument('recording', type=Path, metavar='RECORDING')
-    add_network(p, False, 'compare with its topics')
+    p.add_argument('recording', type=Path, metavar='RECORDING',
+                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
+    add_network(p, False, 'report which topics of this network are recorded')
 
 
 def _info(args: argparse.Namespace) -> int:
-    """mag-tracking info."""
+    """Run `mag-tracking info`."""
     recording = Recording(args.recording)
     if not recording.message_counts:
         for message in recording.messages():
@@ -27,7 +33,7 @@ def _info(args: argparse.Namespace) -> int:
     if recording.start_ns is not None and recording.end_ns is not None:
         print(f'  {(recording.end_ns - recording.start_ns) / 1e9:.2f} s')
     if not recording.message_counts:
-        print('  warning: there is no message in it')
+        print('  warning: the recording contains no messages')
     for topic in sorted(recording.types):
         print(f'  {topic}  {recording.types[topic]}  {recording.message_counts[topic]}')
     for what, n in recording.losses.items():
@@ -36,9 +42,9 @@ def _info(args: argparse.Namespace) -> int:
         network = read_network(args.network)
         namespaces = namespaces_of(network.topics, recording.types) or ['/']
         if len(namespaces) > 1:
-            print(f'  the topics of the network are in the namespaces {", ".join(namespaces)}')
+            print(f'  namespaces with topics of the network: {", ".join(namespaces)}')
         for name, topic in zip(network.names, network.topics, strict=True):
             topic = absolute(topic, namespaces[0])
-            state = 'there' if topic in recording.types else 'MISSING'
+            state = 'recorded' if topic in recording.types else 'MISSING'
             print(f'  sensor {name}: {topic} is {state}')
     return 0

@@ -1,4 +1,4 @@
-"""mag-tracking view and watch, and the live page of `mag-tracking run`."""
+"""Commands `mag-tracking view` and `watch`, and the live page of `mag-tracking run`."""
 
 import argparse
 import signal
@@ -20,9 +20,9 @@ from mag_tracking.web.live_scene import LiveScene
 from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK, PageServer, check_port
 
 _PAGE = '''
-Open the printed address in a browser. The page shows a map with tracks, 90 % regions and
-hypotheses, the sensors' fields, and the health of the system. It is available on this machine
-only; --host 0.0.0.0 also serves it to other machines, which need the token in the address.
+Open the printed address in a browser. The page shows a map with tracks, 90% regions and
+hypotheses, the fields of the sensors, and the health of the system. It is available on this
+machine only; --host 0.0.0.0 also serves it to other machines, which need the token in the address.
 '''
 _VIEW = f'''
 Tracks a recording in real time and shows it on a live page. Ctrl-C ends it.
@@ -41,10 +41,15 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the commands."""
+    """Register the commands.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'view', _view, _VIEW)
     p.add_argument('recording', type=Path, metavar='RECORDING',
-                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
+                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
     add_settings(p)
     p.add_argument('--rate', type=float, default=1.0, help='playback speed (default: 1)')
@@ -55,7 +60,14 @@ def add(commands: Commands) -> None:
 
 
 def add_page(parser: argparse.ArgumentParser, port: bool = True) -> None:
-    """--host and --port."""
+    """Add --host and --port.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+    port : bool
+        Whether to add --port.
+    """
     if port:
         parser.add_argument('--port', type=int, default=DEFAULT_PORT, metavar='PORT',
                             help=f'port of the page (default: {DEFAULT_PORT}; 0: any free port)')
@@ -63,43 +75,43 @@ def add_page(parser: argparse.ArgumentParser, port: bool = True) -> None:
                         f'the page (default: {LOOPBACK})')
 
 
-def _told(line: str) -> None:
+def _print_flushed(line: str) -> None:
     """Print a line without buffering."""
     print(line, flush=True)
 
 
 def _view(args: argparse.Namespace) -> int:
-    """mag-tracking view."""
+    """Run `mag-tracking view`."""
     if not 0.0 < args.rate < float('inf'):
-        raise SettingsError(f'--rate: {args.rate:g} is not a number above 0')
+        raise SettingsError(f'--rate: expected a number above 0, got {args.rate:g}')
     network, settings = recorded_network(args), settings_of(args)
     recording = Recording(args.recording)
     scene = LiveScene(args.recording.name, network)
     scene.subtitle = f'{len(network)} sensors, frame {network.frame}'
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen, \
             PageServer(scene, args.host, args.port) as server:
-        _told(f'live page: {server.url}')
+        _print_flushed(f'live page: {server.url}')
         view(recording, network, settings, scene, args.rate,
              lambda: bool(seen) or not server.is_serving)
         if not seen:
-            _told('end of the recording; the page is served until Ctrl-C')
+            _print_flushed('end of the recording; the page remains available until Ctrl-C')
         while not seen and server.is_serving:
             time.sleep(0.1)
         return 0 if server.is_serving else 1
 
 
 def _watch(args: argparse.Namespace) -> int:
-    """mag-tracking watch."""
-    # Only this needs ROS.
+    """Run `mag-tracking watch`."""
+    # Imported here because it needs ROS.
     from mag_tracking.nodes.page_node import watch
 
     ended = _ended_input() if args.until_eof else None
-    return watch(args.host, args.port, _told, args.ros_arguments,
+    return watch(args.host, args.port, _print_flushed, args.ros_arguments,
                  ended.is_set if ended is not None else lambda: False)
 
 
 def _ended_input() -> threading.Event:
-    """Event that is set at the end of the standard input: the parent process has ended."""
+    """Event that is set at the end of stdin, which means that the parent process has ended."""
     ended = threading.Event()
 
     def read() -> None:
@@ -114,10 +126,25 @@ def _ended_input() -> threading.Event:
 def page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator[None]:
     """Run the live page in a separate process, so that it cannot delay the nodes.
 
-    Raises DeviceError where the port cannot be opened.
+    Parameters
+    ----------
+    host : str
+        Local address.
+    port : int
+    ros_arguments : sequence of str
+        Arguments for ROS, beginning with --ros-args.
+
+    Yields
+    ------
+    None
+
+    Raises
+    ------
+    DeviceError
+        If the port cannot be opened.
     """
     check_port(host, port)
-    # The page ends with the pipe, also if this process is killed.
+    # The process ends when its stdin is closed, even if this process is killed.
     process = subprocess.Popen([
         sys.executable, '-m', 'mag_tracking.cli', 'watch', '--host', host, '--port', str(port),
         '--until-eof', *ros_arguments], stdin=subprocess.PIPE)

@@ -1,4 +1,4 @@
-"""Options that several commands share; `tracking_options` has those of the tracker."""
+"""Options shared by several commands; those of the tracker are in `tracking_options`."""
 
 import argparse
 import dataclasses
@@ -13,16 +13,32 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.network.topics import checked_namespace
 
-# Quoted: at run time the class takes no type arguments.
+# Quoted because the class is not generic at run time.
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
-"""The parser's commands, to which each module adds its own."""
+"""Subparsers of the main parser, to which each module adds its commands."""
 
 FIGURES = ('.png', '.pdf', '.svg')
+"""File name extensions accepted for figures."""
 
 
 def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
                 text: str = '') -> argparse.ArgumentParser:
-    """A command's parser; `run` takes the parsed arguments and returns the exit status."""
+    """Add the parser of a command.
+
+    Parameters
+    ----------
+    commands : Commands
+    name : str
+        Key in `COMMANDS`.
+    run : function
+        Takes the parsed arguments and returns the exit status.
+    text : str
+        Description and examples, printed after the options.
+
+    Returns
+    -------
+    argparse.ArgumentParser
+    """
     _, short, aliases = COMMANDS[name]
     parser = commands.add_parser(name, aliases=aliases, help=short, description=short, epilog=text,
                                  formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -31,20 +47,48 @@ def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace
 
 
 def add_network(parser: argparse._ActionsContainer, required: bool = True,
-                text: str = 'positions and orientations of the sensors (network.yaml)') -> None:
-    """--network."""
+                text: str = 'network file with the sensors (network.yaml)') -> None:
+    """Add --network.
+
+    Parameters
+    ----------
+    parser : argparse container
+    required : bool
+    text : str
+        Help text.
+    """
     parser.add_argument('--network', required=required, type=Path, metavar='FILE', help=text)
 
 
 def add_recorded_network(parser: argparse._ActionsContainer) -> None:
-    """--network and --namespace."""
+    """Add --network and --namespace.
+
+    Parameters
+    ----------
+    parser : argparse container
+    """
     add_network(parser)
-    parser.add_argument('--namespace', metavar='NAMESPACE', help='of the relative topics of the '
-                        'network file, such as /robot1, where the recording has several')
+    parser.add_argument('--namespace', metavar='NAMESPACE', help='namespace of the relative topics '
+                        'in the network file (e.g. /robot1), if the recording contains several')
 
 
 def recorded_network(args: argparse.Namespace) -> SensorNetwork:
-    """The network of `add_recorded_network`; raises NetworkError."""
+    """Read the network given by --network and --namespace.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        With the options of `add_recorded_network`.
+
+    Returns
+    -------
+    SensorNetwork
+
+    Raises
+    ------
+    NetworkError
+        If the network file or the namespace is invalid.
+    """
     network = read_network(args.network)
     if args.namespace is None:
         return network
@@ -52,49 +96,112 @@ def recorded_network(args: argparse.Namespace) -> SensorNetwork:
 
 
 def distinct_names(paths: Iterable[Path]) -> list[str]:
-    """Stems of recordings; raises OutputError where results would overwrite each other."""
+    """Return the names under which the results of recordings are stored.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+
+    Returns
+    -------
+    list of str
+        File names without extension.
+
+    Raises
+    ------
+    OutputError
+        If two names are equal, so that the results would overwrite each other.
+    """
     names = [path.resolve().stem for path in paths]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise OutputError(f'two recordings are named {twice[0]}: their results would overwrite '
-                          'each other; take them one by one')
+    duplicates = sorted({name for name in names if names.count(name) > 1})
+    if duplicates:
+        raise OutputError(f'several recordings are named {duplicates[0]}: their results would '
+                          'overwrite each other; run the command once for each')
     return names
 
 
 def now() -> str:
-    """The time, as a calibration is marked with it."""
+    """Return the current time as the date of a calibration.
+
+    Returns
+    -------
+    str
+        UTC, ISO 8601.
+    """
     return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
 
 
 def add_report(parser: argparse.ArgumentParser) -> None:
-    """--report."""
+    """Add --report.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+    """
     parser.add_argument('--report', type=Path, metavar='FILE.html',
-                        help='write a report for the browser')
+                        help='write an HTML report to FILE.html')
 
 
 def check_writable(path: Path | None) -> None:
-    """Raise OutputError if a file cannot be written because of its folder."""
+    """Check that the folder of an output file exists.
+
+    Parameters
+    ----------
+    path : Path or None
+        None is accepted.
+
+    Raises
+    ------
+    OutputError
+        If the folder is missing, or `path` is a folder.
+    """
     if path is not None and not path.absolute().parent.is_dir():
-        raise OutputError(f'cannot write {path}: there is no folder {path.parent}')
+        raise OutputError(f'cannot write {path}: the folder {path.parent} does not exist')
     if path is not None and path.is_dir():
         raise OutputError(f'cannot write {path}: it is a folder')
 
 
 def check_report(args: argparse.Namespace, *others: Path | None) -> None:
-    """Raise OutputError if the report cannot be written, or would replace another file."""
+    """Check that the report can be written and does not replace another file.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        With the option of `add_report`.
+    *others : Path or None
+        Other input and output files of the command.
+
+    Raises
+    ------
+    OutputError
+        If the folder is missing, the name does not end in .html, or the file is one of `others`.
+    """
     path = args.report
     if path is None:
         return
     check_writable(path)
     if path.suffix.lower() not in ('.html', '.htm'):
-        raise OutputError(f'--report: {path.name} does not end in .html')
+        raise OutputError(f'--report: expected a file name ending in .html, got {path.name}')
     if any(other is not None and other.resolve() == path.resolve() for other in others):
-        raise OutputError(f'--report: {path} is another file of this command')
+        raise OutputError(f'--report: {path} is also used by another option; choose another file')
 
 
 def check_outputs(args: argparse.Namespace) -> None:
-    """Raise OutputError where what is to be written has no folder to be in."""
+    """Check that the files of --out and --figure can be written.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+
+    Raises
+    ------
+    OutputError
+        If the folder of a file is missing.
+    SettingsError
+        If the file type of the figure is not supported.
+    """
     for path in (args.out, args.figure):
         check_writable(path)
     if args.figure is not None and args.figure.suffix.lower() not in FIGURES:
-        raise SettingsError(f'--figure: {args.figure.name} ends in none of {", ".join(FIGURES)}')
+        raise SettingsError(f'--figure: expected a file name ending in {", ".join(FIGURES)}; got '
+                            f'{args.figure.name}')

@@ -1,4 +1,4 @@
-"""mag-tracking plan."""
+"""Command `mag-tracking plan`."""
 
 import argparse
 import json
@@ -18,19 +18,18 @@ from mag_tracking.report.json_text import without_nan
 from mag_tracking.settings import read_parameter_file
 
 _PLAN = '''
-Before the first hole is drilled: where is a position good to what, where is a target
-detected, and where would one more sensor help most. The bounds are Cramer-Rao bounds of
-a point target at constant speed: no estimator does better, a good one comes near. What
-sensors add beyond their noise (clocks, mountings, a vehicle that is no point) is in the
-relative error of the field (--field-error; the tracker's own setting by default).
+Predicts, before installation, the position accuracy, the detection probability, and the best place
+for an additional sensor. The accuracies are Cramer-Rao bounds for a point target at constant
+speed: a good estimator approaches them, and none exceeds them. Errors beyond the noise (clocks,
+mountings, extended vehicles) are modelled as a relative error of the field (--field-error).
 
-Writes to DIR:
-  plan_position.png    map: standard deviation of the position, by a whole pass
+files written to DIR:
+  plan_position.png    map: standard deviation of the position from a whole pass
   plan_detection.png   map: probability that one frame detects the target
-  plan_sensor.png      map: what one more sensor would bring, and the best place
-  plan_lanes.png       along the lanes: filter and whole pass; passes missed by distance
-  report.html          the maps and curves, to look at in a browser
-  plan.json            all of it in numbers
+  plan_sensor.png      map: gain of an additional sensor, and its best place
+  plan_lanes.png       along the lanes: bounds of filter and whole pass; probability of a miss
+  report.html          interactive report: maps and curves
+  plan.json            all values
 
 examples:
   mag-tracking plan --network network.yaml --target car --out plan
@@ -41,38 +40,47 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'plan', _plan, _PLAN)
     add_network(p)
-    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
-    p.add_argument('--target', metavar='KIND', help='a kind of vehicle of the settings: small, '
-                   'car or truck (default: car), which gives moment and height; or magnet')
-    p.add_argument('--moment', type=float, metavar='A_M2', help='size of the moment instead')
+    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
+    p.add_argument('--target', metavar='KIND', help='small, car or truck: moment and height of '
+                   'this kind of vehicle in the settings (default: car); or magnet')
+    p.add_argument('--moment', type=float, metavar='A_M2',
+                   help='magnitude of the moment [A m^2]; requires --height')
     p.add_argument('--height', type=float, metavar='M', help='height of the '
-                   'magnetic centre, z in the frame of the network')
-    p.add_argument('--speed', type=float, default=10.0, metavar='M_S', help='(default: 10)')
+                   'magnetic centre, z in the frame of the network [m]')
+    p.add_argument('--speed', type=float, default=10.0, metavar='M_S',
+                   help='speed [m/s] (default: 10)')
     p.add_argument('--heading', type=float, nargs='+', metavar='DEG',
-                   help='of the lanes, 0 = along x, anticlockwise (default: the arrivals of the '
-                   'settings)')
-    p.add_argument('--offset', type=float, nargs='+', metavar='M', help='of each lane, to the left '
-                   'of the line through the middle of the sensors (default: 0)')
-    p.add_argument('--noise-std', type=float, metavar='TESLA',
-                   help='noise of one sample, where the network file has none (default: 1.2e-8)')
+                   help='heading of each lane, anticlockwise from x [deg] (default: the arrival '
+                   'directions of the settings)')
+    p.add_argument('--offset', type=float, nargs='+', metavar='M', help='lateral offset of each '
+                   'lane, to the left of the centre of the sensors [m] (default: 0)')
+    p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise of one sample [T] '
+                   '(default: noise_std of the network file, or 1.2e-8)')
     p.add_argument('--rate', type=float, default=100.0, metavar='HZ',
-                   help='samples per second and sensor (default: 100)')
-    p.add_argument('--field-error', type=float, metavar='SHARE',
+                   help='sample rate of each sensor (default: 100)')
+    p.add_argument('--field-error', type=float, metavar='FRACTION',
                    help='relative error of the field (default: track.field_error)')
     p.add_argument('--area', type=float, nargs=4, metavar=('X0', 'Y0', 'X1', 'Y1'),
-                   help='of the maps (default: as far as half of the targets are detected)')
-    p.add_argument('--clearance', type=float, metavar='M', help='no further sensor nearer to the '
-                   'line of a lane (default: 2 for vehicles, 0 with --moment)')
+                   help='area of the maps [m] (default: where at least half of the targets are '
+                   'detected)')
+    p.add_argument('--clearance', type=float, metavar='M', help='minimum distance of an additional '
+                   'sensor from a lane [m] (default: 2 for vehicles, 0 with --moment)')
     p.add_argument('--grid', type=int, default=41, metavar='N',
-                   help='points of the maps on their longer side (default: 41)')
-    p.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
+                   help='number of points along the longer side of the maps (default: 41)')
+    p.add_argument('--params', type=Path, metavar='FILE',
+                   help='YAML file with the settings to override')
 
 
 def _inputs(args: argparse.Namespace, network: SensorNetwork, settings: Settings) -> PlanInputs:
-    """The inputs of the command line; raises SettingsError, which names the option."""
+    """Inputs of the plan from the command line; raises SettingsError, naming the option."""
     try:
         return plan_inputs(
             network, settings, args.target, moment=args.moment, height=args.height,
@@ -85,7 +93,7 @@ def _inputs(args: argparse.Namespace, network: SensorNetwork, settings: Settings
 
 
 def _plan(args: argparse.Namespace) -> int:
-    """mag-tracking plan."""
+    """Run `mag-tracking plan`."""
     network = read_network(args.network)
     kind = 'magnet' if args.target == 'magnet' else 'vehicle'
     settings = settings_for(kind, read_parameter_file(args.params) if args.params else {})
@@ -93,10 +101,10 @@ def _plan(args: argparse.Namespace) -> int:
     output_folder(args.out)
     with tqdm(total=inputs.n_parts, desc='plan', disable=None) as bar:
         result = inputs.run(network, settings, bar.update)
-    # Drawing needs matplotlib, which the other commands should not load.
-    from mag_tracking.apps.plan_report import answers, write_report
+    # Imported here because it loads matplotlib.
+    from mag_tracking.apps.plan_report import summary_lines, write_report
 
-    lines = answers(result)
+    lines = summary_lines(result)
     for line in lines:
         print(line)
     _write(result, args.out)
@@ -106,7 +114,7 @@ def _plan(args: argparse.Namespace) -> int:
 
 
 def _write(p: Plan, out: Path) -> None:
-    """The figures and `plan.json`."""
+    """Write the figures and `plan.json`."""
     content = {
         'x': p.x.tolist(), 'y': p.y.tolist(), 'position_std': p.position_std.tolist(),
         'detection': p.detection.tolist(), 'with_one_more': p.with_one_more.tolist(),
@@ -119,7 +127,7 @@ def _write(p: Plan, out: Path) -> None:
     with new_text_file(out / 'plan.json') as stream:
         json.dump(without_nan(content), stream, indent=1, allow_nan=False)
         stream.write('\n')
-    # Drawing needs matplotlib, which the other commands should not wait for.
+    # Imported here because it loads matplotlib.
     from mag_tracking.report import plan_figures
     from mag_tracking.report.figure_file import save_figure
 

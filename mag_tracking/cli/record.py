@@ -1,4 +1,4 @@
-"""mag-tracking record."""
+"""Command `mag-tracking record`."""
 
 import argparse
 import math
@@ -11,12 +11,12 @@ from mag_tracking.network.file import read_network
 from mag_tracking.network.topics import NAME
 
 _RECORD = '''
-Records the magnetic fields of the network's topics, as they are, until Ctrl-C,
-and where they appear the sensors' sensor_msgs/Imu topics (/mag_1/imu/data_raw
-beside /mag_1/imu/mag). DIR becomes a rosbag2 recording: MCAP files and a
-metadata.yaml. Whatever is lost, before it came or on a full disk, is counted
-and told; after a full disk it goes on in a new file. After a crash less than a
-second is missing; `mag-tracking repair DIR` then gives the file its index.
+Records the magnetic fields on the topics of the network, unchanged, until Ctrl-C. The
+sensor_msgs/Imu topics of the sensors (/mag_1/imu/data_raw next to /mag_1/imu/mag) are
+recorded when they appear. DIR becomes a rosbag2 recording: MCAP files and a metadata.yaml.
+Messages that are lost in transport or dropped on a full disk are counted and reported;
+recording resumes in a new file when the disk has space. After a crash, less than a second
+is missing; `mag-tracking repair DIR` then rebuilds the index.
 
 examples:
   mag-tracking record --network config/network.yaml --out night
@@ -27,32 +27,39 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'record', _record, _RECORD)
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR',
-                   help='folder for the recording')
-    p.add_argument('--topics', nargs='+', default=[], metavar='TOPIC', help='record these, too')
+                   help='output folder')
+    p.add_argument('--topics', nargs='+', default=[], metavar='TOPIC',
+                   help='record these topics as well')
     p.add_argument('--results', action='store_true',
-                   help='what the nodes make of it, too (tracks, detections, calibrated fields)')
-    p.add_argument('--all', action='store_true', help='record every topic')
+                   help='record the results of the nodes as well (tracks, detections, calibrated '
+                   'fields)')
+    p.add_argument('--all', action='store_true', help='record all topics')
     p.add_argument('--split-mb', type=float, default=1000.0, metavar='N',
-                   help='size of a file in MB (default: 1000)')
+                   help='maximum size of a file [MB] (default: 1000)')
     p.add_argument('--split-s', type=float, default=3600.0, metavar='N',
-                   help='time in a file in s (default: 3600)')
+                   help='maximum duration of a file [s] (default: 3600)')
 
 
 def _record(args: argparse.Namespace) -> int:
-    """mag-tracking record."""
-    for option, value, least in (('--split-mb', args.split_mb, 0.1),
-                                 ('--split-s', args.split_s, 1.0)):
-        if not (math.isfinite(value) and value >= least):
-            raise SettingsError(f'{option}: {value:g} is not a number of at least {least:g}')
+    """Run `mag-tracking record`."""
+    for option, value, minimum in (('--split-mb', args.split_mb, 0.1),
+                                   ('--split-s', args.split_s, 1.0)):
+        if not (math.isfinite(value) and value >= minimum):
+            raise SettingsError(f'{option}: expected {minimum:g} or more, got {value:g}')
     for topic in args.topics:
         if not NAME.fullmatch(topic):
-            raise SettingsError(f'--topics: {topic!r} is not the name of a topic')
+            raise SettingsError(f'--topics: {topic!r} is not a valid topic name')
     network = read_network(args.network)
-    # Only this command needs ROS.
+    # Imported here because it needs ROS.
     from mag_tracking.nodes.record_node import run
 
     imus = tuple(filter(None, network.imu_topics))

@@ -1,4 +1,4 @@
-"""mag-tracking repair."""
+"""Command `mag-tracking repair`."""
 
 import argparse
 from pathlib import Path
@@ -7,9 +7,9 @@ from mag_tracking.cli.options import Commands, add_command
 from mag_tracking.recording.repair import repair
 
 _REPAIR = '''
-A recording that was cut off (power, a crash, a full disk) has no index.
-`mag-tracking replay` reads it as it is; rosbag2 and others need the index,
-which this writes, and a new metadata.yaml. The messages stay untouched.
+A recording that was interrupted (power failure, crash, full disk) has no index.
+`mag-tracking replay` can read it nevertheless; rosbag2 and other tools need the index.
+This command writes the index and a new metadata.yaml. The messages are not changed.
 
 example:
   mag-tracking repair night
@@ -17,14 +17,19 @@ example:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'repair', _repair, _REPAIR)
     p.add_argument('recording', type=Path, metavar='RECORDING',
-                   help='an .mcap file or a rosbag2 folder')
+                   help='.mcap file or rosbag2 folder')
 
 
 def _repair(args: argparse.Namespace) -> int:
-    """mag-tracking repair."""
+    """Run `mag-tracking repair`."""
     n = repair(args.recording)
-    print(f'{args.recording}: files that were not whole: {n}')
+    print(f'{args.recording}: files repaired: {n}')
     return 0

@@ -1,7 +1,8 @@
-"""mag-tracking replay."""
+"""Command `mag-tracking replay`."""
 
 import argparse
 import signal
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,30 +29,31 @@ from mag_tracking.report.rerun_file import RERUN_FILE, check_rerun, write_rerun
 from mag_tracking.stages.track.doubts import MEANINGS
 
 _REPLAY = '''
-Reads the magnetic fields of the network's topics, learns each sensor's
-background from the target-free beginning, detects, and tracks with a bank of
-filters. No ROS has to run: the nodes use the very same code.
+Reads the magnetic fields on the topics of the network, learns the background of each sensor
+from a quiet interval, detects targets and tracks them with a bank of filters. ROS does not
+have to run; the ROS nodes use the same code.
 
-Writes to DIR:
-  poses.csv        the published pose, one row a frame
-  poses_smoothed.csv  the same by what came before and after, when a track has ended
-  detections.csv   onsets and releases
-  disturbances.csv fields that no target explains
-  hypotheses.csv   every member of the bank, every frame
-  summary.json     counts, rejected samples by cause, the tracks
-  tracks.mcap      poses and tracks as ROS messages (with metadata.yaml)
-  report.html      all of it to look at in a browser: map, time slider, curves, tables
-  *_track_N.png    the map, the weights, measured against predicted field
-With several recordings, each gets a folder of its own in DIR. Results of an earlier run are
-replaced, its figures removed; other files in the folder stay.
+files written to DIR:
+  poses.csv           published pose of each track, one row per frame
+  poses_smoothed.csv  smoothed pose of each track that has ended
+  detections.csv      onsets and releases
+  disturbances.csv    fields that no target explains
+  hypotheses.csv      every hypothesis of the bank, one row per frame
+  summary.json        counts, rejected samples by cause, tracks
+  tracks.mcap         poses and tracks as ROS messages (with metadata.yaml)
+  report.html         interactive report: map, time slider, curves, tables
+  *_track_N.png       figures: map, weights, measured and predicted field
+
+With several recordings, each has its own folder in DIR. Results of an earlier run are replaced
+and its figures are removed; other files in the folder are kept.
 
 examples:
   mag-tracking replay junction.mcap --network config/network.yaml --out out
   mag-tracking replay magnet/ --network magnet/network.yaml --target magnet --out out
   mag-tracking replay night.mcap --network site.yaml --params mine.yaml --out out
 
-A parameter file holds only what differs from the defaults (config/default.yaml
-has them all, with their meaning):
+The file of --params contains only the settings to override; config/default.yaml describes all
+settings. Example:
   track:
     vehicle:
       arrival_names: ['east', 'west']
@@ -61,37 +63,42 @@ has them all, with their meaning):
 
 TRUTH_METRICS = {
     'rms': ('horizontal RMS error within 5 m', ' m'),
-    'closest': ('horizontal error at the closest point', ' m'),
-    'closest_distance': ('distance there', ' m'),
+    'closest': ('horizontal error at the closest point of approach', ' m'),
+    'closest_distance': ('distance at the closest point of approach', ' m'),
     'position_mean': ('mean position error', ' m'),
-    'position_max': ('largest position error', ' m'),
-    'axis_median_deg': ('median angle of the axis', ' deg'),
-    'anees': ('squared error over what the covariance says, an axis (ANEES)', ''),
-    'error_over_bound': ('error over the path bound', '')}
-"""{key of a track's `truth` in summary.json: (meaning, unit)}."""
+    'position_max': ('maximum position error', ' m'),
+    'axis_median_deg': ('median angular error of the axis', ' deg'),
+    'anees': ('average NEES per axis (1 = consistent)', ''),
+    'error_over_bound': ('ratio of the error to the path bound', '')}
+"""{key of a track's `truth` in summary.json: (description, unit)}."""
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'replay', _replay, _REPLAY)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
-                   help='an .mcap, .db3 or .bag file, or a rosbag2 folder')
+                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
-    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder for the results')
+    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
     add_settings(p)
-    p.add_argument('--truth', metavar='TOPIC|FILE.csv', help='true poses to compare with: a topic '
-                   'with PoseStamped, PoseWithCovarianceStamped or Odometry, or a table with '
-                   'the columns t [s] or stamp_ns, x, y, z [m], qx, qy, qz, qw (default: the '
+    p.add_argument('--truth', metavar='TOPIC|FILE.csv', help='ground truth: a topic '
+                   'with PoseStamped, PoseWithCovarianceStamped or Odometry, or a CSV table with '
+                   'the columns t [s] or stamp_ns, x, y, z [m], qx, qy, qz, qw (default: all '
                    'topics below /ground_truth)')
     p.add_argument('--tum', action='store_true',
-                   help='write each track as track_N.tum, too (time x y z qx qy qz qw)')
+                   help='also write each track as track_N.tum (time x y z qx qy qz qw)')
     p.add_argument('--rerun', action='store_true',
-                   help='write tracks.rrd for the Rerun viewer, too (needs rerun-sdk)')
-    p.add_argument('--no-figures', action='store_true', help='leave the pictures out')
+                   help='also write tracks.rrd for the Rerun viewer (needs rerun-sdk)')
+    p.add_argument('--no-figures', action='store_true', help='do not draw figures')
 
 
 def _replay(args: argparse.Namespace) -> int:
-    """mag-tracking replay."""
+    """Run `mag-tracking replay`."""
     network, settings = recorded_network(args), settings_of(args)
     names = distinct_names(args.recordings)
     if args.rerun:
@@ -101,14 +108,14 @@ def _replay(args: argparse.Namespace) -> int:
             out = args.out / name if len(args.recordings) > 1 else args.out
             _replay_one(path, network, settings, out, seen, args)
             if seen:
-                print(f'interrupted; what was done is in {out}')
+                print(f'interrupted; partial results in {out}')
                 return 130
     return 0
 
 
 def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Path,
                 seen: Sequence[int], args: argparse.Namespace) -> None:
-    """Replay one recording into one folder; what was done stays when it is interrupted."""
+    """Replay one recording into one folder; an interrupted run leaves partial results."""
     recording = Recording(path)
     with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
               disable=None) as bar:
@@ -123,11 +130,11 @@ def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Pat
     if not args.no_figures:
         write_figures(run, network, out, stopped=lambda: bool(seen))
     if not seen:
-        print(f'results in {out}')
+        print(f'{_overview(path, run.summary)}; results in {out}')
 
 
 def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None:
-    """The run in a few lines."""
+    """Print counts, notes and tracks of a run."""
     print(f'{path.name}: {summary["counts"]["align"].get("frames", 0)} frames, '
           f'{summary["counts"]["detect"].get("onsets", 0)} detections, '
           f'{len(summary["tracks"])} tracks')
@@ -136,32 +143,42 @@ def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None
     for t in summary['tracks']:
         _print_track(t)
         if has_truth and 'truth' not in t:
-            print('    no true pose at the time of this track')
+            print('    no ground truth during this track')
+
+
+def _overview(path: Path, summary: dict[str, Any]) -> str:
+    """Name of the recording and number of its tracks, by verdict."""
+    verdicts = Counter(t['verdict'] for t in summary['tracks'])
+    text = ', '.join(f'{n} {verdict}' for verdict, n in verdicts.most_common())
+    return f'{path.name}: {len(summary["tracks"])} tracks' + (f' ({text})' if text else '')
 
 
 def _print_track(t: dict[str, Any]) -> None:
-    """A track in a few lines."""
+    """Print a track: overview, doubts, independent speed, mounting and errors."""
     print(f'  track {t["id"]}: {t["poses"]} poses'
           + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
              if t['arrival'] else '')
-          + (f', a {t["kind"]} ({t["kind_weight"]:.0%})' if t['kind'] else '')
+          + (f', {t["kind"]} ({t["kind_weight"]:.0%})' if t['kind'] else '')
           + f', {t["speed"]:.2f} m/s, {t["moment_size"]:.3g} A m^2, {t["verdict"]}')
     for doubt, n in t['doubts'].items():
         print(f'    ambiguous in {n} of {t["poses"]} poses: {MEANINGS[doubt]} ({doubt})')
     delay = t.get('delay', {})
     if 'speed' in delay:
-        print(f'    by the delay between sensors: {delay["speed"]:.2f} '
-              f'({delay["speed_sd"]:.2f}) m/s, {delay["heading_deg"]:.0f} deg'
-              + (', along the line of the sensors' if delay['heading_sd_deg'] is None else ''))
+        print(f'    velocity from the delay between sensors: {delay["speed"]:.2f} '
+              f'({delay["speed_sd"]:.2f}) m/s, heading {delay["heading_deg"]:.0f} deg'
+              + (' (assumed along the line of the sensors)' if delay['heading_sd_deg'] is None
+                 else ''))
     if delay.get('contradicts'):
-        print('    warning: track and delay contradict each other; believe neither (a clock, '
-              'a position in the network file, a turn, frames that are too long)')
+        print('    warning: the velocities of the track and from the delay contradict each other; '
+              'rely on neither. Check clock offsets, positions in the network file, the frame '
+              'period, and whether the target turned')
     for name, m in t['mounting'].items():
         if m['suspicious']:
-            print(f'    warning: {name} fits best if turned by '
+            print(f'    warning: {name} fits best if rotated by '
                   f'{max(m["angles_deg"], key=abs):+.0f} degrees about one axis: its '
-                  'orientation in the network file is wrong, or the target is not as modelled')
+                  'orientation in the network file is wrong, or the target differs from the '
+                  'model')
     truth = t.get('truth', {})
     for name, (text, unit) in TRUTH_METRICS.items():
         if isinstance(truth.get(name), float):
-            print(f'    against {truth["name"]}: {text} {truth[name]:.4g}{unit}')
+            print(f'    against {truth["name"]}: {text}: {truth[name]:.4g}{unit}')

@@ -1,4 +1,4 @@
-"""mag-tracking run."""
+"""Command `mag-tracking run`."""
 
 import argparse
 from contextlib import nullcontext
@@ -13,12 +13,11 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK
 
 _RUN = '''
-Starts calibration, detection and tracker nodes in one process, and with a
-RECORDING the replay node, with DRIVERS the driver node as well. The nodes call each
-other, without messages between them; what they publish comes after the pose, and what
-is only between them, calibrated fields and frames, where somebody listens. Drivers of your
-own publish sensor_msgs/MagneticField on the topics of the network file. Ctrl-C
-ends it. Arguments of ROS (--ros-args ...) come last.
+Starts the calibration, detection and tracker nodes in one process, the replay node with
+--recording, and the driver node with --drivers. The nodes call each other directly. Messages are
+published after the pose; intermediate results (calibrated fields, frames) are published only if
+they have subscribers. Other drivers publish sensor_msgs/MagneticField on the topics of the
+network file. Ctrl-C ends the nodes. ROS arguments (--ros-args ...) come last.
 
 examples:
   mag-tracking run --network config/network.yaml --drivers config/drivers.yaml
@@ -29,33 +28,39 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'run', _run, _RUN)
     add_network(p)
     add_settings(p)
-    p.add_argument('--recording', type=Path, metavar='RECORDING', help='replay this, too')
+    p.add_argument('--recording', type=Path, metavar='RECORDING', help='replay this recording')
     p.add_argument('--drivers', type=Path, metavar='DRIVERS',
-                   help='run the devices of this drivers file, too')
+                   help='run the devices of this drivers file')
     p.add_argument('--batches', action='store_true',
-                   help='the drivers put readings of many sensors in one message, which dozens of '
-                   'sensors need')
+                   help='publish the readings of many sensors in one message (recommended for '
+                   'dozens of sensors)')
     p.add_argument('--use-sim-time', action='store_true',
-                   help='take the time from /clock, as where a bag is played')
-    p.add_argument('--rate', type=float, default=1.0, help='speed of the replay (default: 1)')
-    p.add_argument('--loop', action='store_true', help='begin again at the end')
+                   help='use the time on /clock, for example while a bag is played')
+    p.add_argument('--rate', type=float, default=1.0,
+                   help='playback speed of the recording (default: 1)')
+    p.add_argument('--loop', action='store_true', help='repeat the recording')
     p.add_argument('--web', type=int, nargs='?', const=DEFAULT_PORT, metavar='PORT',
                    help=f'serve a live page (default port: {DEFAULT_PORT})')
     add_page(p, port=False)
 
 
 def _run(args: argparse.Namespace) -> int:
-    """mag-tracking run."""
-    # Only this command needs ROS.
+    """Run `mag-tracking run`."""
+    # Imported here because it needs ROS.
     from mag_tracking.nodes.runner import run
 
     settings, ros_arguments = settings_of(args), list(args.ros_arguments)
     if args.web is None and args.host != LOOPBACK:
-        raise SettingsError('--host is the address of the live page: add --web')
+        raise SettingsError('--host sets the address of the live page; add --web')
     if args.use_sim_time:
         ros_arguments += ['--ros-args', '-p', 'use_sim_time:=true']
     read_network(args.network)

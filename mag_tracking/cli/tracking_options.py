@@ -1,4 +1,4 @@
-"""The options of commands that track, and the settings that they ask for."""
+"""Options of the commands that track, and the settings that they select."""
 
 import argparse
 from pathlib import Path
@@ -8,13 +8,34 @@ from mag_tracking.settings import read_parameter_file
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
-    """--target and --params."""
-    parser.add_argument('--params', type=Path, metavar='FILE', help='settings that differ')
+    """Add --target and --params.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+    """
+    parser.add_argument('--params', type=Path, metavar='FILE',
+                        help='YAML file with the settings to override')
     parser.add_argument('--target', choices=list(TARGET_DEFAULTS), default='vehicle',
-                        help='what moves (default: vehicle)')
+                        help='type of target (default: vehicle)')
 
 
 def settings_of(args: argparse.Namespace) -> Settings:
-    """Settings of the command line's target and parameter file."""
+    """Return the settings selected by --target and --params.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        With the options of `add_settings`.
+
+    Returns
+    -------
+    Settings
+
+    Raises
+    ------
+    SettingsError
+        If the parameter file is invalid.
+    """
     changes = read_parameter_file(args.params) if args.params else {}
     return settings_for(args.target, changes)

@@ -1,4 +1,4 @@
-"""mag-tracking traffic."""
+"""Command `mag-tracking traffic`."""
 
 import argparse
 import signal
@@ -41,17 +41,17 @@ from mag_tracking.recording.traffic_tables import (
 from mag_tracking.units import NS
 
 _TRAFFIC = '''
-Tracks the vehicles of each recording and counts those that cross a line: time, direction, speed,
-length, class, headway. By default the line is perpendicular to the x axis, through the centre of
-the network; the settings traffic.line_* place others. A vehicle is counted when its track has
-ended. An ambiguous passage is counted, too, and marked with its doubts.
+Tracks the vehicles in each recording and counts those that cross a line: time, direction, speed,
+length, class and headway. The default line is perpendicular to the x axis, through the centre of
+the network; the settings traffic.line_* define other lines. A vehicle is counted when its track
+has ended. Ambiguous passages are counted and marked.
 
-With --out DIR: passages.csv with a row for each vehicle, intervals.csv with counts and mean speeds
-for each interval, direction and class, and the same as Parquet where pyarrow is installed.
+With --out, writes passages.csv (one row per vehicle) and intervals.csv (counts and mean speeds per
+interval, direction and class) to DIR, and the same as Parquet if pyarrow is installed.
 
-With --fleet FILE enrolled vehicles are recognised by the hard and soft iron of their moments.
---enrol NAME adds to that file the one vehicle of each recording; enrolled at headings 45 degrees
-apart it is recognised at any heading, else at that heading only.
+With --fleet, enrolled vehicles are recognised by the hard and soft iron of their moments.
+--enrol NAME adds the only vehicle of each recording to the fleet file. A vehicle enrolled at
+headings 45 degrees apart is recognised at any heading, otherwise only at the enrolled heading.
 
 examples:
   mag-tracking traffic road.mcap --network network.yaml
@@ -61,20 +61,26 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
+    """Register the command.
+
+    Parameters
+    ----------
+    commands : Commands
+    """
     p = add_command(commands, 'traffic', _traffic, _TRAFFIC)
     p.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
-                   help='.mcap, .db3 or .bag files, or rosbag2 folders')
+                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
-    p.add_argument('--out', type=Path, metavar='DIR', help='folder for tables')
-    p.add_argument('--fleet', type=Path, metavar='FILE', help='enrolled vehicles to recognise')
+    p.add_argument('--out', type=Path, metavar='DIR', help='output folder')
+    p.add_argument('--fleet', type=Path, metavar='FILE',
+                   help='fleet file with the enrolled vehicles (.json)')
     p.add_argument('--enrol', metavar='NAME',
-                   help='add the vehicle of each recording to the fleet, as passes of NAME')
+                   help='add the vehicle of each recording to the fleet file under this name')
     add_settings(p)
 
 
 def _traffic(args: argparse.Namespace) -> int:
-    """mag-tracking traffic."""
+    """Run `mag-tracking traffic`."""
     network, settings = recorded_network(args), settings_of(args)
     names = distinct_names(args.recordings)
     recordings = _recordings(args, network)
@@ -99,38 +105,38 @@ def _traffic(args: argparse.Namespace) -> int:
                 for v, who in zip(result.vehicles, found, strict=True)]
             tables['intervals'] += [row for s in result.summaries for row in summary_rows(name, s)]
             if args.out is not None:
-                # After each recording: what is done stays, whatever comes.
+                # Written after each recording, so that an interruption loses nothing.
                 write_traffic(args.out, tables, tables_of(result.class_names, fleet is not None))
     if args.enrol is not None and not seen:
         _enrol(args, network, enrolled)
     if args.out is not None:
         print(f'tables in {args.out}')
     if seen:
-        print('interrupted: this is of what was read until then')
+        print('interrupted: the results cover only the part read so far')
         return 130
     return 0
 
 
 def _recordings(args: argparse.Namespace, network: SensorNetwork) -> list[Recording]:
-    """The recordings, all of which can be read; raises what stops the run before it begins."""
+    """Open all recordings and check the output folder before the run begins."""
     recordings = [Recording(path) for path in args.recordings]
     for recording in recordings:
         SampleReader(recording, network)
         if args.out is not None and recording.lies_in(args.out):
-            raise OutputError(f'{args.out} is the folder of the recording; the tables would be in '
-                              'it')
+            raise OutputError(f'--out: {args.out} is the folder of a recording; choose another '
+                              'one')
     if args.out is not None:
         output_folder(args.out)
     return recordings
 
 
 def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
-    """The enrolled vehicles that are to be recognised."""
+    """Enrolled vehicles to recognise; None without --fleet and while enrolling."""
     if args.enrol is not None:
         if args.fleet is None:
-            raise SettingsError('--enrol: --fleet names the file to add it to')
+            raise SettingsError('--enrol: give the fleet file with --fleet')
         if args.enrol.strip() in ('', UNKNOWN):
-            raise SettingsError(f'--enrol: {args.enrol!r} is not a name of a vehicle')
+            raise SettingsError(f'--enrol: {args.enrol!r} is not a valid name of a vehicle')
         induction_of(network)
         check_writable(args.fleet)
         return None
@@ -138,32 +144,32 @@ def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
 
 
 def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetPass]) -> None:
-    """Add passes to the file of the fleet."""
+    """Add passes to the fleet file."""
     fleet = read_fleet(args.fleet) if args.fleet.exists() else {}
     fleet[args.enrol] = [*fleet.get(args.enrol, []), *passes]
-    # What cannot be enrolled is not written.
+    # Fleet raises an error before a vehicle that cannot be enrolled is written.
     vehicle = next(v for v in Fleet(fleet, network).vehicles if v.name == args.enrol)
     write_fleet(args.fleet, fleet)
     at = 'any heading' if vehicle.iron is not None else \
         f'a heading of {np.degrees(vehicle.heading):.0f} degrees only'
-    print(f'{args.fleet}: {args.enrol} is recognised at {at}; passes: {len(fleet[args.enrol])}')
+    print(f'{args.fleet}: {args.enrol} is recognised at {at} (passes: {len(fleet[args.enrol])})')
 
 
 def _vehicle(found: Identification | None) -> dict[str, Any]:
-    """Columns of the enrolled vehicle; none without a fleet."""
+    """Columns of the enrolled vehicle; empty without a fleet."""
     return {} if found is None else {
         'vehicle': found.name, 'p_vehicle': found.probabilities.get(found.name, np.nan)}
 
 
 def _delay(vehicle: CountedVehicle) -> dict[str, Any]:
-    """Columns of the speed by the delay between sensors."""
+    """Columns of the speed from the delay between sensors."""
     return {'delay_speed': vehicle.delay.speed, 'sd_delay_speed': vehicle.delay.speed_std,
             'speeds_contradict': vehicle.speeds_contradict}
 
 
 def _print(name: str, result: TrafficResult, recording: Recording,
            found: Sequence[Identification | None]) -> None:
-    """The vehicles of a recording, a line each, their counts and the warnings."""
+    """Print one line per vehicle of a recording, the counts, and warnings."""
     for vehicle, who in zip(result.vehicles, found, strict=True):
         known = '' if who is None else f', vehicle {who.name}'
         print(f'{line_of(vehicle)}{known}')
@@ -179,10 +185,10 @@ def _print(name: str, result: TrafficResult, recording: Recording,
     for what, n in warnings.items():
         print(f'  warning: {what}: {n}')
     for topic in result.missing_topics:
-        print(f'  warning: nothing on {topic}')
+        print(f'  warning: no messages on {topic}')
     for sensor in result.sensors_without_background:
-        print(f'  warning: no background was learnt for {sensor}: it was quiet for too short a '
-              'time')
+        print(f'  warning: no background was learnt for {sensor}: its quiet intervals are too '
+              'short')
     if result.no_detection_reason:
         print(f'  nothing was detected: {result.no_detection_reason}')
     if result.no_track_reason:
@@ -190,16 +196,25 @@ def _print(name: str, result: TrafficResult, recording: Recording,
 
 
 def line_of(vehicle: CountedVehicle) -> str:
-    """A passage in one line."""
+    """Describe a passage in one line.
+
+    Parameters
+    ----------
+    vehicle : CountedVehicle
+
+    Returns
+    -------
+    str
+    """
     p = vehicle.passage
     at = datetime.fromtimestamp(p.stamp_ns / NS, tz=timezone.utc)
-    error = '' if np.isnan(p.direction_error) else f' (P_E {p.direction_error:.3f})'
+    error = '' if np.isnan(p.direction_error) else f' (error probability {p.direction_error:.3f})'
     known = f'{p.vehicle_class} ({p.class_probabilities.max():.0%})'
     length = f', {p.length:.1f} m' if p.length else ''
     headway = '' if np.isnan(p.headway) else f', headway {p.headway:.1f} s'
-    delay = '' if vehicle.delay.reason else f', {vehicle.delay.speed:.1f} m/s by delay'
+    delay = '' if vehicle.delay.reason else f', {vehicle.delay.speed:.1f} m/s from the delay'
     contradiction = ', speeds contradict each other' if vehicle.speeds_contradict else ''
-    doubts = f', in doubt: {", ".join(p.doubts)}' if p.doubts else ''
+    doubts = f', doubts: {", ".join(p.doubts)}' if p.doubts else ''
     return (f'{p.number} {at:%H:%M:%S}.{at.microsecond // 10000:02d} {p.line}: '
             f'{DIRECTIONS[p.forward]}{error}, {p.speed:.1f} ± {p.speed_std:.1f} m/s{delay}, '
             f'{known}{length}{headway}{contradiction}{doubts}')

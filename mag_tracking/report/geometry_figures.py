@@ -73,7 +73,7 @@ class _Survey(Protocol):
     def suspect_rows(self) -> tuple[int, ...]: ...
 
     @property
-    def turned(self) -> FloatArray: ...
+    def rotation_angle(self) -> FloatArray: ...
 
 
 def geometry_figure(found: _Survey) -> Figure:
@@ -100,7 +100,7 @@ def geometry_figure(found: _Survey) -> Figure:
     moved = found.network.positions - found.stated.positions
     _spread(rows[0], along, 1e3 * np.linalg.norm(moved, axis=1), 1e3 * g.position_std,
             'displacement [mm]')
-    _spread(rows[1], along, np.rad2deg(found.turned), np.rad2deg(g.rotation_std),
+    _spread(rows[1], along, np.rad2deg(found.rotation_angle), np.rad2deg(g.rotation_std),
             'rotation [deg]')
     rows[2].errorbar(along, g.gain, yerr=SCALE_1D * g.gain_std, fmt='o', ms=4, capsize=2,
                      color='tab:blue')

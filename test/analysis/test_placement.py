@@ -166,13 +166,13 @@ def test_plan_writes_all_that_it_promises(tmp_path, capsys):
     content = json.loads((out / 'plan.json').read_text())
     assert len(content['position_std']) == len(content['y']) and content['lanes'][0]['along']
     text = capsys.readouterr().out
-    assert 'one more sensor helps most at' in text and 'observable, condition number' in text
+    assert 'additional sensor: best at' in text and 'observable, condition number' in text
 
 
 @pytest.mark.parametrize('options, text', [
     (['--target', 'tank'], '--target: expected one of small, car, truck, magnet'),
-    (['--target', 'car', '--moment', '3'], '--target: give one of'),
-    (['--moment', '3'], '--height: needed with a moment'),
+    (['--target', 'car', '--moment', '3'], '--target: give either target or moment'),
+    (['--moment', '3'], '--height: required together with moment'),
     (['--moment', '-3', '--height', '1'], '--moment: expected 1e-06 to 1e+06, got -3'),
     (['--speed', '0'], '--speed: expected 0.0001 to 1000, got 0'),
     (['--rate', 'nan'], '--rate'),
@@ -184,9 +184,9 @@ def test_plan_writes_all_that_it_promises(tmp_path, capsys):
     (['--grid', '2'], '--grid'),
     (['--height', 'nan'], '--height'),
     (['--area', '0', '0', '1e9', '1e9'], '--area: a side'),
-    (['--area', '0', '0', '1', '1000'], '--area: its longer side'),
-    (['--heading', '0', '0'], 'a lane is there twice'),
-    (['--target', 'magnet'], '--moment: needed for a magnet, and height'),
+    (['--area', '0', '0', '1', '1000'], '--area: ratio of its sides'),
+    (['--heading', '0', '0'], 'two lanes are equal'),
+    (['--target', 'magnet'], '--moment: required for a magnet, together with height'),
 ])
 def test_plan_refuses_what_makes_no_sense(tmp_path, capsys, options, text):
     assert main(['plan', '--network', str(NETWORK_FILE), *options,
@@ -209,7 +209,7 @@ def test_plan_bears_what_is_odd(tmp_path, capsys, options):
     assert len(content['lanes']) == (2 if '--rate' in options else 1)
     assert len(list(out.glob('*.png'))) == 4
     if '1e6' in options:
-        assert 'nowhere in the area is it clear' in capsys.readouterr().out
+        assert 'the area has no place clear of the lanes' in capsys.readouterr().out
 
 
 def test_lanes_keep_a_further_sensor_away_from_each_of_them():

@@ -45,7 +45,7 @@ def archived(folder, recording, network, settings, in_order=True):
     work = folder / 'unfinished'
     work.mkdir(parents=True)
     job = Job(recording, work, folder, network, settings)
-    segments = range(cut(job)['stretches'])
+    segments = range(cut(job)['segments'])
     for k in segments if in_order else reversed(segments):
         track_segment(job, k)
     return join(job), len(segments)
@@ -74,8 +74,8 @@ def assert_rows_of_replay(folder, result):
 
 def test_a_recording_that_is_cut_gives_the_rows_of_one_that_is_not(
         tmp_path, monkeypatch, road_network_file):
-    monkeypatch.setattr(archive_segments, 'FEWEST', 60)
-    monkeypatch.setattr(archive_segments, 'PIECE', 50)
+    monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 60)
+    monkeypatch.setattr(archive_segments, 'CHUNK_FRAMES', 50)
     settings, network = settings_for('vehicle', QUICK), read_network(road_network_file)
     known, n = archived(tmp_path, ROAD, network, settings, in_order=False)
     result = mt.track(ROAD, network, settings=QUICK)
@@ -89,7 +89,7 @@ def test_a_recording_that_is_cut_gives_the_rows_of_one_that_is_not(
 def test_clocks_that_are_apart_are_remembered_from_stretch_to_stretch(
         tmp_path, monkeypatch, road_network_file, ahead_s):
     """Tracks are doubted then, by the passes of all stretches before."""
-    monkeypatch.setattr(archive_segments, 'FEWEST', 60)
+    monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 60)
     path = tmp_path / 'network.yaml'
     text = road_network_file.read_text()
     path.write_text(text.replace('mag_2:', f'mag_2:\n    clock_offset: {ahead_s}'))
@@ -127,7 +127,7 @@ def test_an_archive_of_recordings(tmp_path, recordings, capsys):
 
     written = {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')}
     again = archive([recordings / '*.mcap', recordings / 'below'], NETWORK_FILE, settings, out)
-    assert sorted(again.were_done) == sorted(run.done) and not again.done
+    assert sorted(again.already_done) == sorted(run.done) and not again.done
     assert {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')} == written
     assert len(rows(out, 'recordings')) == 4
 
@@ -153,7 +153,7 @@ def test_a_run_that_is_stopped_is_gone_on_with(tmp_path, recordings, whole):
     assert first.interrupted and 1 <= len(first.done) < 3
     second = archive([recordings], NETWORK_FILE, settings, out)
     assert not second.interrupted and len(second.done) + len(first.done) == 3
-    assert sorted(second.were_done) == sorted(first.done)
+    assert sorted(second.already_done) == sorted(first.done)
     assert same_tables(out, whole)
 
 
@@ -168,7 +168,7 @@ def test_a_run_that_is_killed_is_gone_on_with(tmp_path, recordings, whole):
     process.kill()
     process.communicate()
     done = subprocess.run(words, capture_output=True, text=True)
-    assert done.returncode == 1 and '1 failed' in done.stdout, done.stderr
+    assert done.returncode == 1 and 'recordings failed: 1' in done.stdout, done.stderr
     assert same_tables(out, whole)
 
 
@@ -181,7 +181,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path, recordings):
     # As a terminal does it: to all processes.
     os.killpg(process.pid, signal.SIGINT)
     text, errors = process.communicate(timeout=60)
-    assert process.returncode == 130 and 'the same command goes on' in text, errors
+    assert process.returncode == 130 and 'run the same command to continue' in text, errors
     assert 'Traceback' not in errors
 
 
@@ -197,8 +197,8 @@ def frames(*segments):
 
 @pytest.mark.parametrize('quiet_s, n', [(0.5, 1), (2.5, 1), (3.5, 2), (30.0, 2)])
 def test_stretches_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quiet_s, n):
-    monkeypatch.setattr(archive_segments, 'FEWEST', 10)
-    monkeypatch.setattr(archive_segments, 'PIECE', 7)
+    monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 10)
+    monkeypatch.setattr(archive_segments, 'CHUNK_FRAMES', 7)
     given = frames((20.0, False), (2.0, True), (quiet_s, False), (2.0, True), (9.0, False))
     writer = SegmentWriter(tmp_path, 3.0)
     for f in given:
@@ -206,14 +206,14 @@ def test_stretches_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quie
     writer.close()
     assert writer.n_segments == n
     for k in range(n):
-        kept = [f for piece in read_segment(tmp_path / f'stretch-{k}.pickle')
+        kept = [f for piece in read_segment(tmp_path / f'segment-{k}.pickle')
                 for f, _ in piece.frames()]
         first = next(i for i, f in enumerate(kept) if f.target_present)
         # All frames that a track may look back to, and the one that ends it.
         assert kept[first].stamp_ns - kept[0].stamp_ns in (3_000_000_000, 3_100_000_000)
         assert not kept[-1].target_present
     assert max(len(p.stamp_ns) for k in range(n) for p in read_segment(
-        tmp_path / f'stretch-{k}.pickle')) <= 7 + 31
+        tmp_path / f'segment-{k}.pickle')) <= 7 + 31
 
 
 def test_a_time_that_jumps_back_between_stretches_blocks_nothing(tmp_path):
@@ -221,7 +221,7 @@ def test_a_time_that_jumps_back_between_stretches_blocks_nothing(tmp_path):
     for f in frames((60.0, False)) + frames((60.0, False), (2.0, True), (9.0, False)):
         writer.add_frame(f, {})
     writer.close()
-    kept = [f for p in read_segment(tmp_path / 'stretch-0.pickle') for f, _ in p.frames()]
+    kept = [f for p in read_segment(tmp_path / 'segment-0.pickle') for f, _ in p.frames()]
     assert len(kept) == 31 + 20 + 1
     assert not (tmp_path / 'stretch-1.pickle').exists()
 
@@ -233,7 +233,7 @@ def test_doubts_go_with_the_frames_of_a_stretch(tmp_path):
     for k, f in enumerate(frames((5.0, False), (2.0, True), (9.0, False))):
         writer.add_frame(f, first if k < 60 else second)
     writer.close()
-    found = [(f.stamp_ns, doubts) for piece in read_segment(tmp_path / 'stretch-0.pickle')
+    found = [(f.stamp_ns, doubts) for piece in read_segment(tmp_path / 'segment-0.pickle')
              for f, doubts in piece.frames() if doubts is not None]
     assert [doubts for _, doubts in found] == [first, second]
     assert found[0][0] < 5_000_000_000 and found[1][0] == 6_000_000_000

@@ -82,10 +82,10 @@ def test_two_archives_into_one_folder(tmp_path, recordings):
 
 
 def test_a_scheduler_that_does_not_answer(tmp_path, recordings, monkeypatch):
-    monkeypatch.setattr(cluster, 'PATIENCE_S', 1.0)
+    monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT_S', 1.0)
     settings = settings_for('vehicle', QUICK)
-    for address, why in ((f'tcp://127.0.0.1:{free_port()}', 'no Dask scheduler answers'),
-                         ('nonsense://x', 'no Dask scheduler answers')):
+    for address, why in ((f'tcp://127.0.0.1:{free_port()}', 'no response from a Dask scheduler'),
+                         ('nonsense://x', 'no response from a Dask scheduler')):
         with pytest.raises(ClusterError, match=why):
             archive([recordings], NETWORK_FILE, settings, tmp_path / 'out', scheduler=address)
 
@@ -96,8 +96,8 @@ def test_a_scheduler_without_workers_and_with(tmp_path, recordings, monkeypatch)
     settings = settings_for('vehicle', QUICK)
     with LocalCluster(n_workers=0, processes=True, dashboard_address=None,
                       threads_per_worker=1) as there:
-        monkeypatch.setattr(cluster, 'PATIENCE_S', 1.0)
-        with pytest.raises(ClusterError, match='the scheduler has no worker'):
+        monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT_S', 1.0)
+        with pytest.raises(ClusterError, match='the scheduler has no workers'):
             archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
                     scheduler=there.scheduler_address)
         monkeypatch.undo()
@@ -125,7 +125,7 @@ def test_a_client_that_failed_does_not_hold_up_the_next(tmp_path, recordings, mo
                       threads_per_worker=1) as there:
         gc.disable()
         try:
-            with pytest.raises(ClusterError, match='no Dask scheduler answers'):
+            with pytest.raises(ClusterError, match='no response from a Dask scheduler'):
                 archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
                         scheduler='nonsense://x')
             monkeypatch.setattr(IOLoop, 'current', collecting)
@@ -168,7 +168,7 @@ def test_names_of_recordings(tmp_path, recordings):
     (tmp_path / 'bag' / 'metadata.yaml').write_text('')
     assert recordings_of([tmp_path]) == [(tmp_path / 'bag').resolve()]
     for nothing in (tmp_path / 'none', tmp_path / '*.bag', recordings / 'notes.txt'):
-        with pytest.raises(RecordingError, match='there is no recording'):
+        with pytest.raises(RecordingError, match='no recording found'):
             recordings_of([nothing])
 
 
@@ -178,7 +178,7 @@ def test_command_line_errors(tmp_path, recordings, capsys):
     assert main([*words, '--workers', '0']) == 1
     assert '--workers: expected 1 or more' in capsys.readouterr().err
     assert main(['archive', str(tmp_path / 'none'), *words[2:]]) == 1
-    assert 'there is no recording' in capsys.readouterr().err
+    assert 'no recording found' in capsys.readouterr().err
 
 
 def test_a_recording_that_grows_while_it_is_tracked_is_tracked_again(tmp_path):
@@ -194,7 +194,7 @@ def test_a_recording_that_grows_while_it_is_tracked_is_tracked_again(tmp_path):
     archive([path], NETWORK_FILE, settings, out, stopped=grows)
     second = archive([path], NETWORK_FILE, settings, out)
     assert len(second.done) == 1 and second.tracks == 1
-    assert archive([path], NETWORK_FILE, settings, out).were_done == [path]
+    assert archive([path], NETWORK_FILE, settings, out).already_done == [path]
 
 
 def test_nothing_of_another_state_of_a_recording_is_used(tmp_path):

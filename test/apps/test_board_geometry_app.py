@@ -78,9 +78,9 @@ def test_what_is_not_heard_stays_as_stated(tmp_path, capsys):
     assert command(table, '--network', tmp_path / 'stated.yaml', out=tmp_path / 'out.yaml') == 0
     text = capsys.readouterr().out
     assert '39 of 40 poses' in text
-    assert 'warning: poses without readings, left out: 1\n' in text
-    assert 'warning: mag_4 has no reading: it stays as stated' in text
-    assert 'warning: mag_6 never reported z: its background will have to be learnt' in text
+    assert 'warning: poses not used (without readings): 1\n' in text
+    assert 'warning: mag_4 has no readings; its nominal geometry is kept' in text
+    assert 'warning: mag_6 never reported z: its background is still unknown' in text
     was, now = read_network(tmp_path / 'stated.yaml'), read_network(tmp_path / 'out.yaml')
     for name in ('positions', 'R_ws', 'noise_std', 'background', 'correction', 'orientation_std'):
         was_4, now_4 = (getattr(network, name)[4] for network in (was, now))
@@ -101,7 +101,7 @@ def test_rows_of_unknown_poses(tmp_path):
     magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0), MOMENT)
     r = magnet.poses(x[1], x[2])[0][found.rows - 2]
     assert np.median(np.linalg.norm(found.geometry.poses[0] - r, axis=1)) < 3e-3
-    np.testing.assert_allclose(found.turned, np.linalg.norm(
+    np.testing.assert_allclose(found.rotation_angle, np.linalg.norm(
         [rotation_vector(a.T @ b) for a, b in zip(stated.R_ws, found.network.R_ws, strict=True)],
         axis=1), rtol=1e-6)
 

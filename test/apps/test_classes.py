@@ -31,7 +31,8 @@ def test_train_evaluate_and_predict(tables, tmp_path, capsys, name):
     table, model = str(tables / f'{name}.csv'), str(tmp_path / 'classes.json')
     assert main(['classes', 'evaluate', table, '--splits', '3']) == 0
     printed = capsys.readouterr().out
-    for what in ('largest class: 7', 'balanced accuracy: ', 'recall of truck: ', 'reliability'):
+    for what in ('largest class: 7', 'balanced accuracy: ', 'recall of truck: ',
+                 'calibration error'):
         assert what in printed
     assert main(['classes', 'train', table, '--out', model]) == 0
     assert '25 of car, 10 of truck' in capsys.readouterr().out
@@ -77,7 +78,7 @@ def test_intervals_of_a_recording(tmp_path):
 @pytest.mark.parametrize(('rows', 'why'), [
     ([('car', 5, 9), ('truck', 8, 11)], 'rows 2 and 3 overlap'),
     ([('', 5, 9)], 'row 2: the label is empty'), ([('car', 9, 5)], 'ends before it begins'),
-    ([('car', 5000, 5009)], 'no readings in the interval')])
+    ([('car', 5000, 5009)], 'the interval contains no readings')])
 def test_bad_intervals_are_named(tmp_path, rows, why):
     with pytest.raises(LabelsError, match=why):
         labelled_signatures(vehicle_path('straight_car_right'),
@@ -113,7 +114,7 @@ def test_a_model_of_other_axes_is_refused(tables, tmp_path, capsys):
     (tmp_path / 'two.csv').write_text('label,' + ','.join(f'x{k}' for k in range(20)) + '\ncar,'
                                       + ','.join(str(k * (19 - k)) for k in range(20)) + '\n')
     assert main(['classes', 'predict', str(tmp_path / 'two.csv'), '--model', model]) == 1
-    assert 'have the axes x, the model was trained on x y z' in capsys.readouterr().err
+    assert 'have the axes x, but the model was trained on x y z' in capsys.readouterr().err
 
 
 def test_units_are_converted_or_refused(tables, tmp_path, capsys):
@@ -132,7 +133,7 @@ def test_units_are_converted_or_refused(tables, tmp_path, capsys):
         answers.append(capsys.readouterr().out.splitlines()[-1])
     assert len(set(answers)) == 1 and 'car' in answers[0]
     assert main(['classes', 'predict', str(tmp_path / 'none.csv'), '--model', model]) == 1
-    assert 'in an unknown unit, the model was trained on T' in capsys.readouterr().err
+    assert 'in an unknown unit, but the model was trained on T' in capsys.readouterr().err
 
 
 def test_signatures_of_events_can_be_predicted(tmp_path, capsys):

@@ -43,7 +43,7 @@ def test_a_sensor_that_hangs_misses_what_the_others_feel(last_felt, hangs_from, 
         assert found == []
     else:
         assert len(found) == 1 and found[0].startswith('mag_3: its readings did not change while')
-        assert f' felt {missed} targets' in found[0]
+        assert f' sensed {missed} targets' in found[0]
 
 
 def test_quiet_sensors_miss_nothing():

@@ -27,13 +27,13 @@ def test_after_a_detection_nothing_is_to_be_explained():
 
 
 @pytest.mark.parametrize('expected, arguments', [
-    (r'excursion was 0\.\d+ of the threshold \(mag_1 0\.\d+, mag_2 0\.\d+\); nothing louder',
+    (r'excursion was 0\.\d+ of the threshold \(mag_1 0\.\d+, mag_2 0\.\d+\); no target came close',
      {'readings': QUIET}),
     ('noise_std of mag_1 in the network file is',
      {'network': dataclasses.replace(NETWORK, noise_std=(np.full(3, 3e-6),) * 2)}),
     (r'detect.background_std \(1e-05 T\) is larger than the noise',
      {'detect__background_std': 1e-5}),
-    (r'it lasted for \d+ consecutive frames, and detect.onset_frames is 100',
+    (r'it lasted for \d+ consecutive frames, but detect.onset_frames is 100',
      {'detect__onset_frames': 100}),
     ('no background was learnt for mag_1, mag_2: .*calibrate.learn_s',
      {'readings': QUIET.part(slice(0, 200))}),
@@ -54,7 +54,7 @@ def test_covariances_that_are_taken_as_they_are_stand_in_the_way():
 def test_another_unit_is_named():
     readings = recorded('straight_small_left').readings
     said = why(readings=dataclasses.replace(readings, field=1e6 * readings.field))
-    assert 'no reading could be used: 2800 were rejected (above 0.001 T' in said
+    assert 'no reading was usable: 2800 were rejected (above 0.001 T' in said
 
 
 def test_given_backgrounds_that_were_not_compared_with_readings():

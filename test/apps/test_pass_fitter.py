@@ -76,7 +76,7 @@ def in_time(*tracks):
 def test_vehicles_of_a_pass_are_those_that_are_surest_in_it():
     tracks = PassTracks(settings_for('vehicle').track)
     # The third one is of the next pass, which begins while this one is still seen.
-    tracks.take([object(), *in_time(crossing(1, 3.0, -1.7, 10.0), crossing(2, 4.0, 1.7, -12.0),
+    tracks.add([object(), *in_time(crossing(1, 3.0, -1.7, 10.0), crossing(2, 4.0, 1.7, -12.0),
                                     crossing(3, 8.0, -1.7, 14.0, n=20))])
     paths = tracks.paths(pass_of(0.0, 6.0))
     np.testing.assert_allclose(sorted(paths[:, 3]), [-12.0, 10.0])
@@ -90,7 +90,7 @@ def test_vehicles_of_a_pass_are_those_that_are_surest_in_it():
 
 def test_a_vehicle_that_was_lost_and_found_is_one():
     tracks = PassTracks(settings_for('vehicle').track)
-    tracks.take(in_time(crossing(1, 3.0, -1.7, 10.0), [track_pose(4.1, 11.0, id=1, ended=True)],
+    tracks.add(in_time(crossing(1, 3.0, -1.7, 10.0), [track_pose(4.1, 11.0, id=1, ended=True)],
                         crossing(2, 3.2, -1.5, 10.5, std=0.4)))
     np.testing.assert_allclose(tracks.paths(pass_of(0.0, 6.0))[:, 3], [10.0])
 
@@ -98,9 +98,9 @@ def test_a_vehicle_that_was_lost_and_found_is_one():
 def test_a_vehicle_is_one_whose_track_ended_when_it_was_surest():
     tracks = PassTracks(settings_for('vehicle').track)
     coming = crossing(1, 3.0, -1.7, 10.0)[:6]
-    tracks.take(coming)
+    tracks.add(coming)
     assert len(tracks.paths(pass_of(0.0, 3.1))) == 0
-    tracks.take([track_pose(3.2, 2.0, id=1, ended=True)])
+    tracks.add([track_pose(3.2, 2.0, id=1, ended=True)])
     np.testing.assert_allclose(tracks.paths(pass_of(0.0, 3.5))[:, 3], [10.0])
     # It is forgotten then.
     assert len(tracks.paths(pass_of(0.0, 3.5))) == 0
@@ -108,14 +108,14 @@ def test_a_vehicle_is_one_whose_track_ended_when_it_was_surest():
 
 def test_poses_from_before_a_jump_of_the_time_are_of_no_pass():
     tracks = PassTracks(settings_for('vehicle').track)
-    tracks.take(crossing(1, 30.0, -1.7, 10.0))
-    tracks.take(crossing(2, 3.0, 1.7, -12.0))
+    tracks.add(crossing(1, 30.0, -1.7, 10.0))
+    tracks.add(crossing(2, 3.0, 1.7, -12.0))
     np.testing.assert_allclose(tracks.paths(pass_of(0.0, 40.0))[:, 3], [-12.0])
 
 
 def test_magnets_are_no_vehicles():
     tracks = PassTracks(settings_for('magnet').track)
-    tracks.take(in_time(crossing(1, 3.0, -1.7, 10.0), crossing(2, 4.0, 1.7, -12.0)))
+    tracks.add(in_time(crossing(1, 3.0, -1.7, 10.0), crossing(2, 4.0, 1.7, -12.0)))
     assert len(tracks.paths(pass_of(0.0, 6.0))) == 0
 
 

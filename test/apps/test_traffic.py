@@ -102,10 +102,10 @@ def test_what_cannot_be_counted_is_named(tmp_path, capsys):
         mt.traffic(recording, NETWORK_FILE, {'track.target': 'magnet'})
     words = ['traffic', str(recording), '--network', str(NETWORK_FILE)]
     assert main([*words, '--target', 'magnet']) == 1
-    assert 'traffic counts vehicles' in capsys.readouterr().err
+    assert 'traffic counts only vehicles' in capsys.readouterr().err
     assert main(['traffic', str(tmp_path / 'none.mcap'), '--network', str(NETWORK_FILE)]) == 1
     assert main(['traffic', str(recording), *words[1:]]) == 1
-    assert 'two recordings are named' in capsys.readouterr().err
+    assert 'several recordings are named' in capsys.readouterr().err
 
 
 def test_tables_without_rows_have_their_columns(tmp_path, capsys):
@@ -117,7 +117,7 @@ def test_tables_without_rows_have_their_columns(tmp_path, capsys):
         assert main(['traffic', recording, '--network', network, '--out', str(tmp_path)]) == 0
         printed = capsys.readouterr().out
         assert f'{n} vehicles' in printed
-        assert ('one sensor does not tell the scale' in printed) == (n == 0)
+        assert ('the scale is not observable with a single sensor' in printed) == (n == 0)
         csv_rows, rows = (read(tmp_path / f'passages.{kind}') for read, kind in (
             (pd.read_csv, 'csv'), (pd.read_parquet, 'parquet')))
         assert list(csv_rows.columns) == list(rows.columns) and len(rows) == n

@@ -33,7 +33,7 @@ def test_replay_writes_all_that_it_promises(tmp_path, capsys):
     assert track['arrival'] == 'left' and track['verdict'] == 'unique'
     assert {'speed', 'moment', 'poses', 'truth', 'smoothed', 'kind'} <= set(track)
     said = capsys.readouterr().out
-    assert 'from left (100%), a car (100%)' in said and 'replaces' not in said
+    assert 'from left (100%), car (100%)' in said and 'replacing' not in said
     n = track['doubts']['another_arrival']
     assert f'ambiguous in {n} of {track["poses"]} poses' in said
     assert n == sum('another_arrival' in row for row in (out / 'poses.csv').read_text().split())
@@ -49,7 +49,7 @@ def test_a_replay_says_what_it_replaces_and_writes_through_no_link(tmp_path, cap
     (out / 'notes.txt').write_text('mine')
     assert replay_one(out) == 0
     said = capsys.readouterr().out.splitlines()
-    assert said.count(f'replaces the results of an earlier run in {out}') == 1
+    assert said.count(f'replacing the results of an earlier run in {out}') == 1
     assert theirs.read_text() == '- tracks.mcap\n' and (out / 'notes.txt').exists()
     assert not any(path.is_symlink() for path in out.iterdir())
     assert {path.name for path in out.glob('*.png')} == {
@@ -84,7 +84,7 @@ def test_info(capsys):
     assert main(['info', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE)]) == 0
     out = capsys.readouterr().out
     assert '/mag_1/imu/mag  sensor_msgs/msg/MagneticField  2000' in out
-    assert 'sensor mag_2: /mag_2/imu/mag is there' in out
+    assert 'sensor mag_2: /mag_2/imu/mag is recorded' in out
 
 
 def fail(capsys, *arguments):
@@ -168,7 +168,7 @@ def test_a_sensor_on_its_head_is_named(tmp_path, capsys):
     assert 'orientation in the network file is wrong' in capsys.readouterr().out
     # And a network that is right raises no alarm.
     assert replay_one(tmp_path / 'right', '--no-figures') == 0
-    assert 'fits best if turned' not in capsys.readouterr().out
+    assert 'fits best if rotated' not in capsys.readouterr().out
 
 
 def test_a_recording_without_a_target_says_so(tmp_path, capsys):
@@ -212,7 +212,7 @@ def test_fit_writes_all_that_it_promises(tmp_path, capsys):
     assert car['chosen'] == 1 and abs(car['speed'] - 20.0) < 1.6 and not car['reason']
     assert turn['reason'].startswith('not at constant velocity') and turn['speed'] is None
     text = capsys.readouterr().out
-    assert 'a turn, braking' in text and 'closest to the middle of the sensors' in text
+    assert 'a turn, braking' in text and 'closest to the centre of the sensors' in text
 
 
 def test_a_file_name_need_not_be_text(tmp_path):
@@ -244,7 +244,7 @@ def test_fit_of_one_sensor_keeps_what_it_knows(tmp_path, capsys):
     row, = json.loads((tmp_path / 'out' / 'fits.json').read_text())['fits']
     assert row['x'] is None and row['rate'] > 0.0 and row['sd_cpa_time'] > 0.0
     assert len(row['bearing']['motion']) == 3 and 'reversed' in row['bearing']['or_reversed']
-    assert 'or both reversed' in capsys.readouterr().out
+    assert '(or both reversed)' in capsys.readouterr().out
 
 
 def test_fit_opens_everything_before_it_writes(tmp_path, capsys):
@@ -255,13 +255,13 @@ def test_fit_opens_everything_before_it_writes(tmp_path, capsys):
         assert main(['fit', *(str(vehicle_path(n)) for n in names), '--network',
                      str(NETWORK_FILE), '--out', str(out)]) == 1
         assert (out / 'fits.csv').read_text() == 'old'
-    assert f'two recordings are named {NAME}' in capsys.readouterr().err
+    assert f'several recordings are named {NAME}' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('options, text', [
     (['--orders', '0'], '--orders: expected different numbers from 1 to 8'),
     (['--orders', '2', '2'], '--orders'),
-    (['--cpa-range', '4', '1'], 'for one sensor; the network has 2'),
+    (['--cpa-range', '4', '1'], 'only for a single sensor; the 2 sensors'),
 ])
 def test_fit_refuses_options_that_make_no_sense(tmp_path, capsys, options, text):
     assert main(['fit', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), *options,

@@ -66,8 +66,8 @@ def test_what_is_said_and_drawn(calibrated):
     bias = gain[:, None] * network.background
     np.testing.assert_allclose([[float(v) for v in r[7:10]] for r in rows], 1e6 * bias, atol=0.006)
     assert np.ptp(gain) > 0.01 and moved.max() > 0.5 and turned.max() > 1.0
-    assert 'moment 0.264 A m^2, as given' in text and ' mm; tilted by ' in text
-    assert '162 of 162 poses, normalised cost 0.6' in text
+    assert 'moment 0.264 A m^2 (given)' in text and ' mm; tilt ' in text
+    assert '162 of 162 poses used, normalised cost 0.6' in text
     assert 'warning' not in text and 'note' not in text
     assert all(c.by == 'magnet, 162 tracked poses' and c.date.startswith('20')
                and np.isnan(c.clock_offset_std) for c in network.calibrated)
@@ -81,13 +81,13 @@ def test_positions_alone_are_enough(tmp_path, capsys):
     few = write_table(tmp_path / 'poses.csv', *(v[::6] for v in board_of_41()[1:]))
     assert command(few, '--sensors', POSITIONS, out=out) == 0
     text = capsys.readouterr().out
-    assert 'nobody says the noise of 41 sensors: counted with 1e-07 T' in text
+    assert 'note: noise of 41 sensors assumed to be 1e-07 T' in text
     # One noise for two kinds of sensors: the noisier kind stands out.
-    assert 'warning: sensors that do not fit' in text
+    assert 'warning: sensors inconsistent with the others' in text
     network = read_network(out)
     assert network.noise_std == (None,) * 41 and network.imu_topics == (None,) * 41
     assert command(few, '--sensors', POSITIONS, '--noise-std', 3e-7, out=out) == 0
-    assert 'nobody says' not in capsys.readouterr().out
+    assert 'assumed' not in capsys.readouterr().out
     noise = np.array(read_network(out).noise_std) * [[C[0, 0] ** -1] for C in
                                                      read_network(out).correction]
     np.testing.assert_allclose(noise, 3e-7, rtol=1e-9)
@@ -107,8 +107,8 @@ def test_what_does_not_fit_is_named(tmp_path, capsys, monkeypatch):
     assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
                    tmp_path / 'board.png', out=tmp_path / 'out.yaml') == 0
     text = capsys.readouterr().out
-    assert 'noise?): mag_2\n' in text
-    assert 'rows of poses that do not fit (the header is row 1): 9\n' in text
+    assert 'noise): mag_2\n' in text
+    assert 'rows with inconsistent poses (the header is row 1): 9\n' in text
     lines = table.read_text().splitlines()
     assert lines[8].endswith(','.join(map(str, [*positions[7].tolist(), *axes[7].tolist()])))
     labels = [t.get_text() for f in drawn[0].subfigs for a in f.axes for t in
@@ -127,8 +127,8 @@ def test_a_magnet_the_wrong_way_round_is_refused(tmp_path, capsys):
     assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
                    tmp_path / 'board.png', out=tmp_path / 'out.yaml') == 1
     out, err = capsys.readouterr()
-    assert 'refused: the readings do not fit the model: the normalised cost is' in err
-    assert 'the network is in' not in out
+    assert 'calibration rejected: the readings do not fit the model: the normalised cost is' in err
+    assert 'network written to' not in out
     assert {p.name for p in tmp_path.iterdir()} == {'stated.yaml', 'poses.csv'}
 
 
@@ -144,25 +144,27 @@ def test_settings_come_from_a_file(tmp_path, capsys):
     np.testing.assert_allclose(network.R_ws, stated.R_ws, atol=1e-12)
     # What was held fixed has no deviation that a file could hold.
     assert network.orientation_std == (None,) * 9
-    assert 'moment 0.26' in (text := capsys.readouterr().out) and 'as given' not in text
+    assert 'moment 0.26' in (text := capsys.readouterr().out) and '(given)' not in text
     params.write_text('gain_sdt: 0.1')
     assert command(table, *common, out=tmp_path / 'new.yaml') == 1
     assert 'unknown setting gain_sdt; did you mean gain_std?' in capsys.readouterr().err
     params.write_text('iterations: 1')
     assert command(table, *common, out=tmp_path / 'new.yaml') == 1
-    assert 'refused: no minimum within 1 steps' in capsys.readouterr().err
+    assert 'calibration rejected: no minimum within 1 steps' in capsys.readouterr().err
     assert not (tmp_path / 'new.yaml').exists()
 
 
 @pytest.mark.parametrize('options, message', [
-    (['--unknown-poses', '--low', 0, 0, 0], '--low and --high are needed'),
-    (['--low', 0, 0, 0], '--low and --high are for --unknown-poses'),
-    (['--unknown-poses', '--low', 0, 0, 0, '--high', 1, 0, 1], r'--high: expected it above'),
-    (['--unknown-poses', '--low', 0, 0, 0, '--high', 1, 'nan', 1], r'--high: expected it above'),
-    (['--moment', 'nan'], '--moment: expected it above 0 A m^2, got nan'),
-    (['--moment', '-1'], '--moment: expected it above 0'),
-    (['--noise-std', '0.01'], '--noise-std: expected it above a femtotesla'),
-    (['--figure', '/nowhere/board.png'], 'there is no folder /nowhere'),
+    (['--unknown-poses', '--low', 0, 0, 0],
+     '--unknown-poses: give the box that contains the magnet with --low and --high'),
+    (['--low', 0, 0, 0], '--low and --high require --unknown-poses'),
+    (['--unknown-poses', '--low', 0, 0, 0, '--high', 1, 0, 1], r'--high: expected values above'),
+    (['--unknown-poses', '--low', 0, 0, 0, '--high', 1, 'nan', 1],
+     r'--high: expected values above'),
+    (['--moment', 'nan'], '--moment: expected a value above 0 A m^2, got nan'),
+    (['--moment', '-1'], '--moment: expected a value above 0'),
+    (['--noise-std', '0.01'], '--noise-std: expected 1e-15 T or more and less than 1e-3 T'),
+    (['--figure', '/nowhere/board.png'], 'the folder /nowhere does not exist'),
     (['--params', '/nowhere.yaml'], '/nowhere.yaml')])
 def test_bad_options_are_named(tmp_path, capsys, options, message):
     assert command(FOLDER / 'poses.csv', '--sensors', POSITIONS, *options,
@@ -208,7 +210,7 @@ def test_unknown_poses(tmp_path, capsys):
                    out=tmp_path / 'out.yaml') == 0
     text = capsys.readouterr().out
     n = int(text.split(' of 40 poses')[0].split()[-1])
-    assert 36 <= n < 40 and f'left out: {40 - n}' in text and 'tilted' not in text
+    assert 36 <= n < 40 and f'outside the box): {40 - n}' in text and '; tilt ' not in text
     network = read_network(tmp_path / 'out.yaml')
     assert network.calibrated[0].by == f'magnet, {n} unknown poses'
     B = through_calibrate(network, field)
@@ -226,7 +228,7 @@ def test_ctrl_c_ends_it_and_nothing_is_written(tmp_path):
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         # A background job, which these tests may be, passes on that it ignores SIGINT.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
-    assert process.stdout.readline() == 'finding the poses and geometry of 41 sensors\n'
+    assert process.stdout.readline() == 'estimating the poses and geometry of 41 sensors\n'
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 130, err

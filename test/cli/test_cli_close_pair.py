@@ -38,7 +38,7 @@ def test_fit_says_speed_and_direction_twice(pair, tmp_path, capsys):
     assert main(['fit', recording, '--network', network, '--out', str(tmp_path), '--no-figures',
                  '--orders', '2', '3']) == 0
     said = capsys.readouterr().out
-    assert 'by the delay between sensors' in said and 'contradict' not in said
+    assert 'velocity from the delay between sensors' in said and 'contradict' not in said
     with open(tmp_path / 'fits.csv', encoding='utf-8') as stream:
         rows = list(csv.DictReader(stream))
     chosen = next(row for row in rows if row['chosen'] == '1')
@@ -56,7 +56,7 @@ def test_replay_sets_the_delay_beside_the_track(pair, tmp_path, capsys):
     params = parameter_file(tmp_path / 'params.yaml', QUICK)
     assert main(['replay', recording, '--network', network, '--params', str(params), '--out',
                  str(tmp_path), '--no-figures']) == 0
-    assert 'by the delay between sensors' in capsys.readouterr().out
+    assert 'velocity from the delay between sensors' in capsys.readouterr().out
     summary = json.loads((tmp_path / 'summary.json').read_text())
     assert summary['frames_too_long'] is None
     (track,) = [t for t in summary['tracks'] if t['poses'] > 10]

@@ -80,13 +80,13 @@ def test_an_interruption_need_not_wait_for_the_next_batch(tmp_path, monkeypatch)
     assert not waited and summary_of(tmp_path)['interrupted'] is True
 
 
-@pytest.mark.parametrize('step', ['summarise', 'take', 'errors_against_truth', 'write_figures'])
+@pytest.mark.parametrize('step', ['summarise', 'add', 'errors_against_truth', 'write_figures'])
 def test_an_interruption_while_writing_loses_nothing(tmp_path, monkeypatch, capsys, step):
     """First or second, in the middle of an update or of what is written at the end."""
     from mag_tracking.apps import replay as app
     from mag_tracking.cli import replay
 
-    module = {'write_figures': replay, 'take': app.RunCollector}.get(step, app)
+    module = {'write_figures': replay, 'add': app.RunCollector}.get(step, app)
     whole, count = getattr(module, step), []
 
     def impatient(*args, **named):
@@ -97,8 +97,8 @@ def test_an_interruption_while_writing_loses_nothing(tmp_path, monkeypatch, caps
 
     monkeypatch.setattr(module, step, impatient)
     assert replay_one(tmp_path) == 130
-    assert summary_of(tmp_path)['interrupted'] is (step == 'take')
-    assert 'interrupted; what was done is in' in capsys.readouterr().out
+    assert summary_of(tmp_path)['interrupted'] is (step == 'add')
+    assert 'interrupted; partial results in' in capsys.readouterr().out
     assert not list(tmp_path.glob('*.png'))
 
 

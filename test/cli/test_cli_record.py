@@ -80,7 +80,7 @@ def test_the_command_in_this_process(tmp_path, monkeypatch, capsys):
     out, err = capsys.readouterr()
     n = Recording(tmp_path / 'a').message_counts[FIELDS[0]]
     assert len(list((tmp_path / 'a').glob('*.mcap'))) > 1
-    assert n > 50 and f'  {FIELDS[0]}  {n}\n  warning: nothing on {FIELDS[1]}\n' in out
+    assert n > 50 and f'  {FIELDS[0]}  {n}\n  warning: no messages on {FIELDS[1]}\n' in out
     assert decode(list(Recording(tmp_path / 'a').messages())[-1]).header.frame_id == 'last'
     assert err.count(' s: ') >= 3 and ' messages, 0.0 MB' in err
     with Reader(tmp_path / 'a') as reader:
@@ -104,9 +104,11 @@ def test_what_the_options_mean(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(('options', 'message'), [
-    (('--split-mb', '0'), '--split-mb: 0 is not a number of at least 0.1'),
-    (('--split-mb', 'nan'), '--split-mb: nan'), (('--split-s', 'inf'), '--split-s: inf'),
-    (('--split-s', '-5'), '--split-s: -5'), (('--topics', '/a', 'i mu'), "--topics: 'i mu'")])
+    (('--split-mb', '0'), '--split-mb: expected 0.1 or more, got 0'),
+    (('--split-mb', 'nan'), '--split-mb: expected 0.1 or more, got nan'),
+    (('--split-s', 'inf'), '--split-s: expected 1 or more, got inf'),
+    (('--split-s', '-5'), '--split-s: expected 1 or more, got -5'),
+    (('--topics', '/a', 'i mu'), "--topics: 'i mu'")])
 def test_bad_options_are_named(tmp_path, options, message):
     args = arguments_of('record', '--network', NETWORK_FILE, '--out', tmp_path / 'a', *options)
     with pytest.raises(SettingsError, match=message):
@@ -131,5 +133,5 @@ def test_the_command_repair(tmp_path, capsys):
     args = arguments_of('repair', tmp_path / 'a')
     assert args.run_command(args) == 0
     assert capsys.readouterr().out == (f'a_0.mcap: 1 messages, index written\n{tmp_path / "a"}: '
-                                       'files that were not whole: 1\n')
+                                       'files repaired: 1\n')
     assert Recording(tmp_path / 'a').message_counts == {'/x': 1}

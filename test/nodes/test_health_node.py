@@ -103,7 +103,7 @@ def test_a_parked_car_is_not_swallowed_without_a_word(talking, statuses):
 
     try:
         assert talking(lambda: background('mag_1') == background('mag_2') == 'ready')
-        assert talking(lambda: 'taken for its background' in message('mag_1'), step=1e-6)
+        assert talking(lambda: 'became its background' in message('mag_1'), step=1e-6)
         assert 'background' not in message('mag_2')
         state = {v.key: v.value for v in statuses['calibration_node: mag_1'].values}
         assert state['backgrounds relearnt'] == '1' and state['background'] == 'ready'
@@ -274,7 +274,7 @@ def test_what_was_wrong_is_forgotten_after_two_terms(monkeypatch):
             stage.feed(one(sample))
         if k % 100 == 99:
             said.append((now[0], [s.message for s in health.statuses('node', stage)]))
-    told = [t for t, messages in said if 'taken for its background 1 times' in messages[0]]
+    told = [t for t, messages in said if 'became its background 1 times' in messages[0]]
     assert 20.0 < min(told) < 35.0
     assert sensor_health.WINDOW_S < max(told) - min(told) <= 2.0 * sensor_health.WINDOW_S + 5.0
     assert said[-1][1] == ['running', 'running']

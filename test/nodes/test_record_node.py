@@ -127,11 +127,11 @@ def test_what_overflows_the_queue_is_counted(ros, desk, monkeypatch):
     assert d.recorder.counts[FIELDS[0]] > n and d.node.lost == before
     lines = list(summary(d.recorder, Selection(FIELDS, topics=('/gone',)), d.node.lost,
                                      {'/odd': 'odd_msgs/msg/Odd is not installed'}))
-    assert f'  warning: {FIELDS[0]}: lost before they were recorded: ' \
+    assert f'  warning: {FIELDS[0]}: messages lost before recording: ' \
            f'{d.node.lost[FIELDS[0]]}' in lines
-    assert [x for x in lines if 'nothing on' in x] == [
-        f'  warning: nothing on {FIELDS[1]}', '  warning: nothing on /gone']
-    assert '  warning: /odd is not recorded: odd_msgs/msg/Odd is not installed' in lines
+    assert [x for x in lines if 'no messages on' in x] == [
+        f'  warning: no messages on {FIELDS[1]}', '  warning: no messages on /gone']
+    assert '  warning: /odd was not recorded: odd_msgs/msg/Odd is not installed' in lines
 
 
 def test_a_publisher_that_begins_anew_or_a_second_one_is_no_loss(ros, desk):

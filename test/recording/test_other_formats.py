@@ -277,7 +277,7 @@ def test_the_command_asks_for_columns_and_a_unit(tmp_path, capsys):
     table = tmp_path / 'a.csv'
     table.write_text('t,x\n1,2\n')
     assert main(['import', str(table), '--out', str(tmp_path / 'o')]) == 1
-    assert 'either --columns' in capsys.readouterr().err
+    assert 'give either --columns' in capsys.readouterr().err
     assert main(['import', str(table), '--columns', 'time=t', 'a.x=x', '--out',
                  str(tmp_path / 'o')]) == 1
-    assert '--unit is needed' in capsys.readouterr().err
+    assert '--unit is missing' in capsys.readouterr().err

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.readings import recorded
+from mag_tracking.apps.readings import recorded_readings
 from mag_tracking.event_records import VehiclePassage
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.reader import Recording
@@ -53,7 +53,8 @@ def tracked_recording(name, folder=BUSY, changes=None):
     records += pipeline.flush()
     poses = [r for r in records if isinstance(r, Track) and not r.ended]
     vehicles = [(stamps / 1e9, position[:, :2]) for stamps, position, _ in
-                recorded(recording, reader, Readings.joined([])).truth.values()]
+                recorded_readings(recording, reader,
+                                  Readings.joined([])).truth.values()]
     return TrackedRecording(score(poses, vehicles), poses, pipeline,
                             [r for r in records if isinstance(r, SmoothedPose) and r.complete],
                             [r for r in records if isinstance(r, VehiclePassage)])

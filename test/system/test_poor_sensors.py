@@ -56,7 +56,7 @@ def test_the_doctor_names_topic_sizes_and_cause():
     assert '/mag_1/imu/mag state a noise of 1e+08 nT' in said[0] and 'a placeholder' in said[0]
     quiet = recorded(CAR).readings.field[:300:2]
     std = np.std(quiet[:, 0])
-    for variance, cause in (((std * 1e6)**2, 'microtesla^2'), (std, 'in place of the variance')):
+    for variance, cause in (((std * 1e6)**2, 'microtesla^2'), (std, 'instead of the variance')):
         said = [f for f in findings(CAR, spoiler.covariance(variance)) if 'state a noise' in f]
         assert len(said) == 2 and all(cause in f for f in said), said
 

@@ -60,7 +60,7 @@ def test_recordings_of_the_same_name_are_refused(tmp_path, capsys):
     other.write_bytes(vehicle_path(NAME).read_bytes())
     assert main(['replay', str(vehicle_path(NAME)), str(other), '--network', str(NETWORK_FILE),
                  '--out', str(tmp_path / 'out')]) == 1
-    assert 'two recordings are named' in capsys.readouterr().err
+    assert 'several recordings are named' in capsys.readouterr().err
 
 
 def test_a_looped_recording_gives_the_same_track_again(road_network):

@@ -92,9 +92,9 @@ def test_a_calibration_shows_each_sensor(chromium, tmp_path):
 def test_the_doctor_shows_its_findings(chromium, tmp_path, capsys):
     path = tmp_path / 'health.html'
     assert run('doctor', TWO[0], '--report', path) == 0
-    assert 'nothing is wrong' in capsys.readouterr().out
+    assert 'no faults found' in capsys.readouterr().out
     page = opened(chromium, path)
-    assert page.value('document.getElementById("notes").innerText').strip() == 'nothing is wrong'
+    assert page.value('document.getElementById("notes").innerText').strip() == 'no faults found'
     closed(page, path)
 
 
@@ -122,7 +122,7 @@ def test_a_report_replaces_no_other_file(tmp_path, capsys, words):
     theirs.write_bytes(TWO[0].read_bytes())
     report = theirs if words[-1] == 'the recording' else tmp_path / words[-1]
     assert run('doctor', theirs, '--report', report) == 1
-    assert 'does not end in .html' in capsys.readouterr().err
+    assert 'expected a file name ending in .html' in capsys.readouterr().err
     assert theirs.read_bytes() == TWO[0].read_bytes()
 
 
@@ -130,7 +130,7 @@ def test_a_network_named_like_a_page_is_not_replaced(tmp_path, capsys):
     network = tmp_path / 'network.html'
     network.write_text(NETWORK_FILE.read_text())
     assert main(['doctor', str(TWO[0]), '--network', str(network), '--report', str(network)]) == 1
-    assert 'another file of this command' in capsys.readouterr().err
+    assert 'is also used by another option' in capsys.readouterr().err
     assert network.read_text() == NETWORK_FILE.read_text()
 
 

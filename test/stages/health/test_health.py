@@ -245,7 +245,7 @@ def test_a_background_in_the_file_does_not_hide_what_the_sensor_says():
 
 
 def test_without_an_earth_field_sensors_are_compared_with_each_other():
-    for n, said in ((3, 'mag_2: is'), (2, 'network: sensors are not compared')):
+    for n, said in ((3, 'mag_2: is'), (2, 'network: sensors were not compared')):
         network = replace(line_network(n), earth_field=None)
         doctor = Doctor(network, settings_for('vehicle'))
         rng = np.random.default_rng(7)
@@ -272,16 +272,17 @@ def test_clocks_that_are_far_apart_are_named_but_not_those_of_a_replay():
                 doctor.feed(one(MagSample(stamp, name, field)), received)
         found = [str(f) for f in doctor.findings()]
         assert len(found) == n, found
-        assert not n or found[0].startswith('mag_2: its stamps are -120 s off those of other')
+        assert not n or found[0].startswith(
+            'mag_2: its timestamps differ by -120 s from those of other')
 
 
 def test_the_doctor_looks_at_backgrounds():
     # What was seen for a moment only would give way earlier.
     steps = doctored(lambda k, field: field + 1e-6 * (k > 1000), seconds=75.0)
-    assert len(steps) == 2 and 'its background has not been learnt for 5' in steps[1]
+    assert len(steps) == 2 and 'its background has been frozen for 5' in steps[1]
     assert 'its background is doubtful' in steps[0]
     parked = doctored(lambda k, field: field + 1e-6 * (k > 1000), seconds=155.0)
-    assert len(parked) == 1 and 'was taken for its background 1 times' in parked[0]
+    assert len(parked) == 1 and 'became its background 1 times' in parked[0]
     early = doctored(seconds=2.0)
     assert len(early) == 3 and all('no background was learnt' in text for text in early)
 
@@ -310,12 +311,12 @@ def test_the_command(tmp_path, capsys):
     arguments = ['doctor', '--network', str(NETWORK_FILE)]
     assert main([*arguments, str(vehicle_path('straight_car_right'))]) == 0
     said = capsys.readouterr().out
-    assert 'nothing is wrong' in said and '100.0 Hz      0 lost' in said
+    assert 'no faults found' in said and '100.0 Hz      0 lost' in said
     assert main(arguments) == 1
     assert main([*arguments, 'x.mcap', '--live', '3']) == 1
-    assert capsys.readouterr().err.count('either a RECORDING or --live SECONDS') == 2
+    assert capsys.readouterr().err.count('give either RECORDING or --live SECONDS') == 2
     assert main([*arguments, '--live', '0']) == 1
-    assert 'is not between 1 and 86400 s' in capsys.readouterr().err
+    assert '--live: expected 1 to 86400 s, got 0' in capsys.readouterr().err
 
 
 def test_the_command_on_one_silent_sensor(tmp_path, capsys):
@@ -327,7 +328,7 @@ def test_the_command_on_one_silent_sensor(tmp_path, capsys):
                          sample_dict(MagSample(stamp, 'mag_1', field), 'mag_1'), stamp)
     assert main(['doctor', str(tmp_path / 'one.mcap'), '--network', str(NETWORK_FILE)]) == 2
     said = capsys.readouterr().out
-    assert 'WRONG mag_2: no reading' in said and 'mag_1: ' not in said
+    assert 'ERROR mag_2: no reading' in said and 'mag_1: ' not in said
     assert len(network) == 2
 
 
