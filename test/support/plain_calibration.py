@@ -184,9 +184,9 @@ class PlainCalibration:
             if stamp - last > longest:
                 self.unconfirmed[name] = stamp
                 if before is None or not 0 < stamp - before <= longest:
-                    return 'stamp too far ahead'
+                    return 'timestamp too far ahead'
             if stamp <= last and last - stamp <= self.settings.max_backward_jump_s * NS:
-                return 'duplicate stamp' if stamp == last else 'out of order'
+                return 'duplicate timestamp' if stamp == last else 'out of order'
             if stamp <= last:
                 self.backgrounds[name].forget()
                 for _ in self.spikes[name].held:

@@ -38,8 +38,8 @@ CAUSES = {
     core.INFINITE: 'infinite value',
     core.BAD_COVARIANCE: 'covariance is not positive definite',
     core.AXIS_MISSING: 'an axis is missing that the correction needs',
-    core.TOO_FAR_AHEAD: 'stamp too far ahead',
-    core.DUPLICATE: 'duplicate stamp',
+    core.TOO_FAR_AHEAD: 'timestamp too far ahead',
+    core.DUPLICATE: 'duplicate timestamp',
     core.OUT_OF_ORDER: 'out of order',
     core.STUCK: 'the same reading over and over',
 }

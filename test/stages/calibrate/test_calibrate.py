@@ -141,7 +141,7 @@ def test_duplicate_and_late_stamps_are_counted_and_rejected():
     s = stage()
     for t in (1.0, 1.0, 0.5, 1.1):
         fed(s, sample(t))
-    assert rejected(s.counts) == {'duplicate stamp': 1, 'out of order': 1}
+    assert rejected(s.counts) == {'duplicate timestamp': 1, 'out of order': 1}
 
 
 def test_a_restart_is_taken_and_counted():
@@ -200,7 +200,7 @@ def test_a_clock_that_is_ahead_is_put_back():
     assert s.last_stamp_ns('mag_2') == 5_000_000_000
     # Of one sensor the order stays.
     assert fed(s, sample(5.0213, sensor='mag_2')) == []
-    assert rejected(s.counts) == {'duplicate stamp': 1}
+    assert rejected(s.counts) == {'duplicate timestamp': 1}
 
 
 def test_a_sensors_own_iron_is_taken_away():

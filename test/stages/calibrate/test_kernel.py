@@ -218,7 +218,7 @@ def test_corrupt_timestamps_do_not_confirm_each_other():
     at_s = [1, 2, 1000, 3, 1001, 4, 1000.5, 5]
     for k, t in enumerate(at_s):
         stage.feed(one(MagSample(int(t * 1e9), 'mag_1', np.full(3, 1e-8 * (k + 1)))))
-    assert stage.counts['rejected: stamp too far ahead'] == 3
+    assert stage.counts['rejected: timestamp too far ahead'] == 3
     assert stage.counts['calibrated'] == 5
 
 
@@ -232,7 +232,7 @@ def test_a_step_of_the_clock_is_confirmed_once_also_where_a_background_is_offere
         if k == 1:
             stage.resume({'mag_1': stored})
         stage.feed(one(MagSample(int((t + 1.0) * 1e9), 'mag_1', np.full(3, 1e-8 * (k + 1)))))
-    assert stage.counts['rejected: stamp too far ahead'] == 1
+    assert stage.counts['rejected: timestamp too far ahead'] == 1
 
 
 def test_a_flush_forgets_what_all_sensors_were_compared_with():
