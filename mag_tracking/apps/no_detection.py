@@ -66,7 +66,8 @@ def _obstacle(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
             return (f'noise_std of {name} in the network file is '
                     f'{(noise / scatter)[known].max():.2g} times what its readings scatter')
     if detect.largest_excursion > 1.0:
-        return (f'it lasted for {detect.most_above} consecutive frames, and detect.onset_frames is '
+        return (f'it lasted for {detect.max_consecutive_above} consecutive frames, and '
+                'detect.onset_frames is '
                 f'{settings.detect.onset_frames}')
     if settings.calibrate.trust_covariances:
         return ('the covariances of the messages are taken as they are '

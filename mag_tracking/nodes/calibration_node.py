@@ -250,9 +250,9 @@ class CalibrationNode(StageNode):
         if network is None:
             return response
         self.network = network
-        self._stage.renew(network)
+        self._stage.update_network(network)
         self._publish_transforms()
-        self._health.renew(network)
+        self._health.update_network(network)
         self._rounds.begin(network)
         self._rounds.publish()
         self._store.drop(network.names, self._is_live())

@@ -81,7 +81,7 @@ class HealthDiagnostics:
         """{name: SensorHealth} that has seen nothing."""
         return {name: SensorHealth() for name in self._network.names}
 
-    def renew(self, network: SensorNetwork) -> None:
+    def update_network(self, network: SensorNetwork) -> None:
         """Go on with another calibration of the same sensors."""
         self._begin(network)
 

@@ -249,7 +249,7 @@ def test_another_clock_is_no_step_of_it():
                                 EARTH + 1.2e-8 * rng.standard_normal((2, 3)))
             health.add(readings, k * 10_000_000 + 2_000_000)
     feed(0, 90)
-    health.renew(dataclasses.replace(network, clock_offset=np.array([0.5, -0.5])))
+    health.update_network(dataclasses.replace(network, clock_offset=np.array([0.5, -0.5])))
     feed(90, 300)
     for status in health.statuses('node', stage):
         told = [status.message, *(v.value for v in status.values)]

@@ -33,7 +33,7 @@ def passed(n_sensors, seed, fault=None):
 
 NAMED = {
     'dies': ('align', 'frames with a sensor missing'),
-    'freezes': ('mag_2', 'rejected: the same reading over and over'),
+    'freezes': ('mag_2', 'rejected: stuck sensor (repeated reading)'),
     'spikes of 2000 times full scale':
         ('mag_2', 'rejected: above 0.001 T (gauss or microtesla as tesla?)'),
     'spikes within full scale': ('mag_2', 'rejected: spike'),

@@ -32,7 +32,7 @@ def test_covariances_that_drivers_make_up_change_nothing(name):
         said = [f for f in findings(name, spoiler.covariance(variance)) if 'state a noise' in f]
         assert len(said) == 2, said
         overruled = result.counts['calibrate'].get(
-            'covariances of messages overruled by the measured noise', 0)
+            'message covariances overruled by the measured noise', 0)
         assert overruled > 0
 
 
