@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from mag_tracking.nodes.sensor_graph import shortened
-from mag_tracking.stages.health.sensor_health import REPLAYED_S
+from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S
 from mag_tracking.stages.health.window import quantiles
 from mag_tracking.units import NS
 
@@ -61,7 +61,7 @@ class Flow:
     @property
     def is_live(self) -> bool:
         """Whether the latest message was of the present, not of a recording."""
-        return self._age_s is not None and abs(self._age_s) < REPLAYED_S
+        return self._age_s is not None and abs(self._age_s) < MAX_LIVE_DELAY_S
 
     def status(self, node: str, is_there: Callable[[], bool]) -> DiagnosticStatus:
         """The DiagnosticStatus of what came since the last one.
@@ -74,7 +74,7 @@ class Flow:
         news, self._told_lost = self.n_lost - self._told_lost, self.n_lost
         level, message = DiagnosticStatus.OK, 'running'
         busy = self._busy_s / elapsed
-        middle, late = quantiles([a for a in ages if abs(a) < REPLAYED_S], 0.5, 0.99)
+        middle, late = quantiles([a for a in ages if abs(a) < MAX_LIVE_DELAY_S], 0.5, 0.99)
         if self.heard is None:
             message = f'waiting for {shortened(self.topics)}'
             if now - self._began > PATIENCE_S:

@@ -74,8 +74,8 @@ def test_coarse_steps_are_detected_and_not_called_a_fault(name, step, request):
                             'changes, and the other one moves by a step of its noise'))
     assert outcome(name, spoiler.steps(step)).detected >= 1
     said = findings(name, spoiler.steps(step))
-    assert not any(word in f for f in said for word in ('same as all', 'spike', 'does not change',
-                                                        'no background')), said
+    assert not any(word in f for f in said for word in (
+        'identical to all', 'spike', 'does not change', 'no background')), said
 
 
 @pytest.mark.study
