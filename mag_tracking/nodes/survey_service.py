@@ -11,7 +11,7 @@ from mag_tracking.errors import OutputError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.survey.stage import Survey, with_noise
+from mag_tracking.stages.survey.stage import Survey, with_measured_noise
 
 PAUSE_S = 0.5
 """[s] Calls that come sooner after the last one are refused: readings wait while it is solved."""
@@ -50,7 +50,7 @@ class SurveyService:
             return None
         date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
         found = self._survey.solve(fields, date)
-        surveyed = with_noise(found.network, self._stage)
+        surveyed = with_measured_noise(found.network, self._stage)
         if save:
             try:
                 write_network(self._save_as, surveyed, 'Written by calibration_node.')
