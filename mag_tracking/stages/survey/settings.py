@@ -14,7 +14,7 @@ class SurveySettings:
         'to that of the Earth; it limits the accuracy of the compass. A larger bias that the '
         'readings show is taken into account.', 'T', (1e-9, 1e-4))
     accelerometer_bias: float = param(
-        0.05, 'Assumed bias of an accelerometer, per axis. 0.05 corresponds to 0.3 degrees of tilt.',
+        0.05, 'Assumed bias of an accelerometer, per axis. 0.05 is equivalent to 0.3 degrees.',
         'm/s^2', (0.0, 5.0))
     stated_std_deg: float = param(
         5.0, 'Standard deviation, about each axis, of the orientations in the network file, for '
