@@ -67,8 +67,7 @@ def _obstacle(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
                     f'{(noise / scatter)[known].max():.2g} times what its readings scatter')
     if detect.largest_excursion > 1.0:
         return (f'it lasted for {detect.max_consecutive_above} consecutive frames, and '
-                'detect.onset_frames is '
-                f'{settings.detect.onset_frames}')
+                f'detect.onset_frames is {settings.detect.onset_frames}')
     if settings.calibrate.trust_covariances:
         return ('the covariances of the messages are taken as they are '
                 '(calibrate.trust_covariances)')

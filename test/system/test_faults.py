@@ -38,7 +38,7 @@ NAMED = {
         ('mag_2', 'rejected: above 0.001 T (gauss or microtesla as tesla?)'),
     'spikes within full scale': ('mag_2', 'rejected: spike'),
     'small spikes': ('mag_2', 'rejected: spike'),
-    'swaps axes': ('track', 'frames that mag_2 contradicted'),
+    'swaps axes': ('track', 'frames in which mag_2 was rejected'),
     'jumps 1 s ahead': ('align', 'rejected: ahead of all other sensors: mag_2'),
     'jumps 1 s back': ('mag_2', 'rejected: out of order'),
     'sends duplicates': ('mag_2', 'rejected: duplicate timestamp'),

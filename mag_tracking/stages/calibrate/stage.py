@@ -263,7 +263,7 @@ class Calibrate:
         background = self._background[self._network.names[i]]
         background.judge_block()
         while not core.use_reading(self._sensors, self._limits, self._batches, i, stamp,
-                                     plain(field), own, plain(covariance), *out.arrays):
+                                   plain(field), own, plain(covariance), *out.arrays):
             background.judge_block()
 
     def _finished(self, out: OutputBuffer) -> list[Readings]:

@@ -161,7 +161,7 @@ class Detect:
         return (s.background_std + s.background_drift * self._frozen_s) ** 2
 
     def _update_presence(self, stamp_ns: int, statistic: float, n: int,
-               per_axis: FloatArray) -> list[Detection]:
+                         per_axis: FloatArray) -> list[Detection]:
         """Update onset, hold and release, and return the detections that follow."""
         s = self._settings
         if statistic > self.threshold(s.false_alarm_probability, n):

@@ -166,7 +166,7 @@ class _SensorEvents:
         return [self._describe(readings, onset_ns, max(release_ns, onset_ns), ended)]
 
     def _describe(self, readings: Readings, onset_ns: int, release_ns: int,
-                   ended: bool) -> PassEvent:
+                  ended: bool) -> PassEvent:
         """Event record of the readings around a detection."""
         stamp, field = readings.stamp_ns, readings.field
         t = (stamp - onset_ns) / NS

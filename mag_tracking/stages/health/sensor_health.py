@@ -120,7 +120,7 @@ class SensorHealth:
             stamps, fields, received = zip(*self._new, strict=True)
             self._new = []
             self.add_batch(np.array(stamps, dtype=np.int64), np.array(fields, dtype=float),
-                      np.array(received, dtype=np.int64))
+                           np.array(received, dtype=np.int64))
 
     def add_batch(self, stamps: IntArray, fields: FloatArray, received: IntArray) -> None:
         """Add readings to the window directly.

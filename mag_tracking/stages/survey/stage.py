@@ -276,7 +276,7 @@ class Survey:
         return '', first
 
     def _updated_network(self, sensors: Sequence[SensorSurvey], reference: str,
-                  date: str) -> SensorNetwork:
+                         date: str) -> SensorNetwork:
         """Network with the surveyed orientations and clock offsets."""
         network = self._network
         R_ws, clock = network.R_ws.copy(), network.clock_offset.copy()

@@ -13,9 +13,9 @@ from mag_tracking.physics.sources import Magnet, SourceModel
 from mag_tracking.physics.vehicles import FASTEST_TURN, RowVehicle
 from mag_tracking.records import FieldFrame, plain
 from mag_tracking.stages.track import core
-from mag_tracking.stages.track.observation import SAME_TIME_S, Observation
+from mag_tracking.stages.track.observation import TIME_RESOLUTION_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.unobserved_length import CAR_ROW
+from mag_tracking.stages.track.unobserved_length import MAX_CAR_ROW
 
 LINEAR = 0.25
 """A field is about linear in the position over this share of the distance to the nearest sensor:
@@ -76,7 +76,7 @@ class BankFilter:
             settings.vehicle.near_field_lengths if is_vehicle
             else settings.magnet.near_field_length).astype(float)
         self._are_long: BoolArray = np.array(
-            settings.vehicle.lengths if is_vehicle else [0.0]) > CAR_ROW
+            settings.vehicle.lengths if is_vehicle else [0.0]) > MAX_CAR_ROW
 
     def move(self, bank: FilterBank, dt: float) -> None:
         """Time update over `dt` [s]; backwards in time without process noise."""
@@ -177,7 +177,7 @@ class BankFilter:
         offset: FloatArray = frame.time_offset
         if dt <= 0.0 or offset.max() - offset.min() < ONE_TIME * dt:
             return self._no_offset
-        return np.round(offset / SAME_TIME_S) * SAME_TIME_S
+        return np.round(offset / TIME_RESOLUTION_S) * TIME_RESOLUTION_S
 
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
         """(n_sensors,) [T^2] variance of what the model of hypothesis `i` leaves out of a field.
@@ -234,7 +234,7 @@ class BankFilter:
     def nearly_linear(self, x: FloatArray) -> FloatArray:
         """(n_hyp,) [m] how far the position of the states `x` (n_hyp, n_x) may be off for the field
         to be about linear in it."""
-        return LINEAR * self.observation.nearest(x)
+        return LINEAR * self.observation.distance_to_nearest(x)
 
     def is_implausible(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
         """Whether hypothesis `i`, just updated with the `frame`, is contradicted by it."""

@@ -114,14 +114,14 @@ class TrackEvidence:
         self._n_misfits, self._doubts_filter_until_ns = 0, -1
         self._found_ns.clear()
 
-    def doubt_start(self, unseen_coming: bool, network: SensorNetwork, starts_anywhere: bool
+    def doubt_start(self, approach_unobserved: bool, network: SensorNetwork, starts_anywhere: bool
                     ) -> None:
         """Doubt a track whose target was not seen approaching, or whose range nothing tells.
 
         `starts_anywhere` is that of the target.
         """
         # One that was not seen approaching may already have passed.
-        if unseen_coming and not starts_anywhere:
+        if approach_unobserved and not starts_anywhere:
             self.doubt(doubts.NOT_SEEN_APPROACHING)
         # The range of a single sensor's target is what the settings say, and that of a vehicle near
         # a few sensors at one place what the model leaves out of its field.

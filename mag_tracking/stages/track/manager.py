@@ -255,7 +255,7 @@ class TrackManager:
         self._tracks.append(track)
         track.doubt(self._doubtful_sensors(*recent, frame))
         out = track.begin(frame, recent,
-                          unseen_coming=in_tail or bool(recent) and _n_sensors(*recent) < 2)
+                          approach_unobserved=in_tail or bool(recent) and _n_sensors(*recent) < 2)
         return out + self._delete_ended(frame.stamp_ns)
 
     def _sensors_at(self, frame: FieldFrame, n: int) -> SensorSubset:

@@ -196,8 +196,8 @@ class Traffic:
             return
         if track.id not in self._open:
             self._open[track.id] = _TrackHistory(track.stamp_ns, track.stamp_ns,
-                                         [LinePath(line) for line in self._lines],
-                                         [LinePath(line) for line in self._lines])
+                                                 [LinePath(line) for line in self._lines],
+                                                 [LinePath(line) for line in self._lines])
         one = self._open[track.id]
         one.last_ns = track.stamp_ns
         for path in one.published:
@@ -221,7 +221,7 @@ class Traffic:
             before = self._complete_before(now_ns)
             n = sum(f.crossing.stamp_ns < before for f in self._pending)
             self._ended = [one for one in self._ended
-                          if now_ns - one.last_ns < MAX_WAIT_S * NS]
+                           if now_ns - one.last_ns < MAX_WAIT_S * NS]
         due, self._pending = self._pending[:n], self._pending[n:]
         return [p for p in map(self._passage, due) if p is not None]
 
