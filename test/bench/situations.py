@@ -61,8 +61,8 @@ def n_events(found):
 
 def cost():
     """Share of a tracked frame that "something else" and the tests take."""
-    spent = {'_weigh': 0.0, '_doubts': 0.0, 'step': 0.0}
-    owner = {'_weigh': RunningTrack, '_doubts': Member, 'step': RunningTrack}
+    spent = {'_update_evidence': 0.0, '_doubts': 0.0, 'step': 0.0}
+    owner = {'_update_evidence': RunningTrack, '_doubts': Member, 'step': RunningTrack}
 
     def timed(method):
         original = getattr(owner[method], method)
@@ -87,7 +87,7 @@ def cost():
     finally:
         for method, (original, _) in originals.items():
             setattr(owner[method], method, original)
-    return (spent['_weigh'] + spent['_doubts']) / spent['step']
+    return (spent['_update_evidence'] + spent['_doubts']) / spent['step']
 
 
 def main():

@@ -36,8 +36,8 @@ CAUSES = {
 class Align:
     """Combines calibrated readings into frames; memory is bounded by `max_buffered`.
 
-    The cost of a sample between two frames does not depend on the number of sensors: a sample
-    cannot complete a frame while the frame waits for a known sensor. The rules are in
+    The cost of a sample between two frames does not depend on the number of sensors: as long as
+    one sensor is known to be missing, a sample cannot complete a frame. The rules are in
     `alignment.hpp`; this class handles the reasons that it reports.
 
     Parameters

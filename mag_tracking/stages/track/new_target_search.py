@@ -284,7 +284,7 @@ class NewTargetSearch:
         for i in start.new_indices:
             speed = np.hypot(*x[i * n + 3:i * n + 5])
             moment = np.linalg.norm(self._vehicles.hard_moments(x[i * n:]).sum(axis=0))
-            if not self._search.prior.slowest <= speed <= MAX_TIMES * max(settings.speeds) \
+            if not self._search.prior.min_speed <= speed <= MAX_TIMES * max(settings.speeds) \
                     or moment > MAX_TIMES * max(settings.moments):
                 return False
         return True

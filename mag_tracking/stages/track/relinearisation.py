@@ -54,8 +54,8 @@ MAX_FRAMES = 64
 window of several seconds would take more than a core."""
 
 MAX_ELEMENTS = 5_000_000
-"""Maximum of frames times hypotheses times states squared; with many sensors, fewer hypotheses are
-relinearised."""
+"""Maximum product of frames, hypotheses and squared number of states. With many sensors, fewer
+hypotheses are relinearised."""
 
 
 @dataclass(frozen=True)

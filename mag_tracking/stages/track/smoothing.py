@@ -35,7 +35,7 @@ the filter did not know the states to linearise at. One does not reach convergen
 turning cars and trucks, but the car along a corridor is worse."""
 
 MAX_ELEMENTS = 10_000_000
-"""Maximum of frames times states squared that are smoothed: 80 MB, and less than a second."""
+"""Maximum product of frames and squared number of states: 80 MB, and less than a second."""
 
 
 def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],
