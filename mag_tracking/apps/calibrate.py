@@ -16,7 +16,7 @@ from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import AccelerationSample, Track
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import rejected
-from mag_tracking.stages.survey.stage import NetworkSurvey, Survey, with_noise
+from mag_tracking.stages.survey.stage import NetworkSurvey, Survey, with_measured_noise
 
 MIN_POSES = 8
 """Minimum number of unambiguous poses of a track used for the calibration."""
@@ -79,7 +79,7 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
         recording, network, settings, date, progress, stopped)
     if not calibrated.counts.total():
         raise RecordingError(f'{recording.path}: no samples of the sensors of the network')
-    found = with_noise(survey.network, calibrated)
+    found = with_measured_noise(survey.network, calibrated)
     evidence = None
     # A faulty sensor would bias the orientations of the others.
     if passes and not interrupted and settings.track.mounting_std_deg \

@@ -14,7 +14,7 @@ from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
-from mag_tracking.stages.align.frame_period import too_long
+from mag_tracking.stages.align.frame_period import frame_period_warning
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.sensor_health import Finding, SensorHealth
 from mag_tracking.stages.stage import rejected
@@ -270,7 +270,7 @@ class Doctor:
         for cause, n in rejected(self.calibrate.counts).items():
             advice = next((a for key, a in _ADVICE if key in cause), 'check the driver')
             found.append(Finding(n > 100, 'calibrate', f'{n} readings rejected: {cause}', advice))
-        warning = too_long(self._settings.align, self.network)
+        warning = frame_period_warning(self._settings.align, self.network)
         if warning:
             found.append(Finding(True, 'align', warning, 'set align.period_s to 0 (auto)'))
         return sorted(found, key=lambda f: not f.serious)

@@ -73,8 +73,8 @@ def _likely_cause(network: SensorNetwork, settings: Settings, calibrate: Calibra
             return (f'noise_std of {name} in the network file is '
                     f'{(noise / scatter)[known].max():.2g} times the scatter of its readings')
     if detect.largest_excursion > 1.0:
-        return (f'it lasted for {detect.most_above} consecutive frames, but detect.onset_frames is '
-                f'{settings.detect.onset_frames}')
+        return (f'it lasted for {detect.max_consecutive_above} consecutive frames, but '
+                f'detect.onset_frames is {settings.detect.onset_frames}')
     if settings.calibrate.trust_covariances:
         return ('the covariances of the messages are used unchecked '
                 '(calibrate.trust_covariances)')

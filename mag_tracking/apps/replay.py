@@ -36,7 +36,6 @@ from mag_tracking.report.metrics import (
     unflagged_poses,
 )
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
-from mag_tracking.stages.align.frame_period import too_long
 from mag_tracking.stages.track.settings import acceleration_density
 
 SUSPECT_MOUNTING_RATIO = 2.0
@@ -272,7 +271,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
             'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
             'no_detection_reason': why,
             'close_network': len(pipeline.network) > 1 and pipeline.network.is_compact,
-            'frames_too_long': too_long(pipeline.settings.align, pipeline.network),
+            'frames_too_long': frame_period_warning(pipeline.settings.align, pipeline.network),
             'clocks_apart': pipeline.track.clocks_apart,
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks,
             'disturbances': disturbances,

@@ -283,7 +283,7 @@ class CalibrationNode(StageNode):
         if network is None:
             return response
         self.network = network
-        self._stage.renew(network)
+        self._stage.update_network(network)
         self._publish_transforms()
         self._health.use_network(network)
         self._rounds.begin(network)

@@ -24,7 +24,7 @@ from mag_tracking.nodes.stage_node import RESULTS, STREAM, STREAM_OUTPUT, StageN
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.records import Detection, FieldFrame, Readings
-from mag_tracking.stages.align.frame_period import too_long
+from mag_tracking.stages.align.frame_period import frame_period_warning
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.events.stage import Events
@@ -54,7 +54,7 @@ class DetectionNode(StageNode):
         self.settings = declare_settings(self, self.settings, 'detect')
         self.settings = declare_settings(self, self.settings, 'events')
         self._align = Align(self.network, self.settings.align)
-        warning = too_long(self.settings.align, self.network)
+        warning = frame_period_warning(self.settings.align, self.network)
         if warning:
             self.get_logger().warning(warning)
         self._events = Events(self.network, self.settings.align, self.settings.detect) \

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from mag_tracking.nodes.sensor_graph import shortened
-from mag_tracking.stages.health.sensor_health import REPLAYED_S
+from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S
 from mag_tracking.stages.health.window import quantiles
 from mag_tracking.units import NS
 
@@ -84,7 +84,7 @@ class Flow:
     @property
     def is_live(self) -> bool:
         """Whether the latest message was live, not of a recording."""
-        return self._age_s is not None and abs(self._age_s) < REPLAYED_S
+        return self._age_s is not None and abs(self._age_s) < MAX_LIVE_DELAY_S
 
     def status(self, node: str, has_publisher: Callable[[], bool]) -> DiagnosticStatus:
         """Diagnostics of the messages received since the last call.
@@ -106,7 +106,7 @@ class Flow:
         new_losses, self._n_reported_lost = self.n_lost - self._n_reported_lost, self.n_lost
         level, message = DiagnosticStatus.OK, 'running'
         busy = self._busy_s / elapsed
-        median, percentile_99 = quantiles([a for a in ages if abs(a) < REPLAYED_S], 0.5, 0.99)
+        median, percentile_99 = quantiles([a for a in ages if abs(a) < MAX_LIVE_DELAY_S], 0.5, 0.99)
         if self.last_received is None:
             message = f'waiting for {shortened(self.topics)}'
             if now - self._began > FIRST_MESSAGE_TIMEOUT_S:

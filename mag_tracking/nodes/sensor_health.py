@@ -19,7 +19,7 @@ from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 from mag_tracking.stages.health.sensor_health import (
-    REPLAYED_S,
+    MAX_LIVE_DELAY_S,
     WINDOW,
     Finding,
     SensorHealth,
@@ -115,7 +115,7 @@ class HealthDiagnostics:
         j : int
             Index of the sensor.
         """
-        self._present[self._network.names[j]].take(*self._buffer.take(j))
+        self._present[self._network.names[j]].add_batch(*self._buffer.pop(j))
 
     def statuses(self, node: str, calibrate: Calibrate) -> list[DiagnosticStatus]:
         """Diagnostics of all sensors.
@@ -216,7 +216,7 @@ class HealthDiagnostics:
     def _clock_finding(self, name: str) -> list[Finding]:
         """Fault of a sensor whose timestamps are far from the clock of this computer."""
         behind_s = self._latest(name).delay_s[0]
-        if self._is_replayed or not abs(behind_s) > REPLAYED_S:
+        if self._is_replayed or not abs(behind_s) > MAX_LIVE_DELAY_S:
             return []
         days = abs(behind_s) / 86400.0
         far = f'{days / 365.25:.0f} years' if days > 730.0 else f'{days:.0f} days'

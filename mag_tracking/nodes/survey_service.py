@@ -11,7 +11,7 @@ from mag_tracking.errors import OutputError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.survey.stage import Survey, with_noise
+from mag_tracking.stages.survey.stage import Survey, with_measured_noise
 
 MIN_INTERVAL_S = 0.5
 """[s] Minimum interval between calls; readings have to wait while a survey is solved."""
@@ -78,7 +78,7 @@ class SurveyService:
             return None
         date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
         found = self._survey.solve(fields, date)
-        surveyed = with_noise(found.network, self._stage)
+        surveyed = with_measured_noise(found.network, self._stage)
         if save:
             try:
                 write_network(self._save_as, surveyed, 'Written by calibration_node.')

@@ -1,1 +1,1 @@
-"""The steps of the way through: push one record, take what it has to say."""
+"""Stages of the pipeline: each takes one record at a time and returns the resulting records."""

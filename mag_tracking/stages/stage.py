@@ -1,4 +1,4 @@
-"""What every step of the way has in common."""
+"""Protocol of the pipeline stages."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -9,26 +9,55 @@ Out = TypeVar('Out')
 
 
 class Stage(Protocol[In, Out]):
-    """It is fed one item at a time and returns the records that follow.
+    """A step of the pipeline that takes one item at a time.
 
-    It never pulls, never sleeps and never reads a clock: time is what the
-    records carry. `counts` tells what was taken, held back and rejected, by
-    cause, so that nothing is lost without a word.
+    A stage never pulls, never sleeps and never reads a clock. Time is that of the records.
+
+    Attributes
+    ----------
+    counts : Counter of str
+        Number of accepted, held back and rejected items, by cause. Every rejection is counted.
     """
 
     counts: Counter[str]
 
     def feed(self, item: In, /) -> list[Out]:
-        """Take one item, a record or a batch of readings; return the records that follow."""
+        """Process one item.
+
+        Parameters
+        ----------
+        item : In
+            A record or a batch of readings.
+
+        Returns
+        -------
+        list of Out
+            The records that follow from it.
+        """
 
     def idle(self) -> None:
-        """Do work that may wait until the outputs are published; results do not depend on it."""
+        """Do deferred work after the outputs are published; results do not depend on it."""
 
     def flush(self) -> list[Out]:
-        """The input has ended: return what was still held back."""
+        """Return the records that are held back when the input ends.
+
+        Returns
+        -------
+        list of Out
+        """
 
 
 def rejected(counts: Mapping[str, int]) -> dict[str, int]:
-    """The rejections among `counts`: {cause: number}, without their prefix."""
+    """Rejections among the counts of a stage.
+
+    Parameters
+    ----------
+    counts : mapping of str to int
+
+    Returns
+    -------
+    dict of str to int
+        Number by cause, without the prefix ``rejected: ``.
+    """
     return {k.removeprefix('rejected: '): n for k, n in sorted(counts.items())
             if k.startswith('rejected: ')}

@@ -91,7 +91,7 @@ def cost():
     finally:
         for method, (original, _) in originals.items():
             setattr(owner[method], method, original)
-    return (spent['_weigh'] + spent['_doubts']) / spent['step']
+    return (spent['_update_evidence'] + spent['_doubts']) / spent['step']
 
 
 def main():

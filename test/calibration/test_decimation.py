@@ -105,7 +105,7 @@ def test_the_stage_thins_and_tells():
         out += fed(stage, sample)
         if k % 3 == 0:
             out += fed(stage, sample)
-    assert stage.counts['rejected: duplicate stamp'] == 667
+    assert stage.counts['rejected: duplicate timestamp'] == 667
     assert stage.counts_of('mag_1')['accepted'] == 2000
     # Of 200 samples until the background is known none comes out.
     assert len(out) == stage.counts['calibrated'] > 120

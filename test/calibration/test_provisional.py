@@ -184,7 +184,7 @@ def test_the_times_of_doubt_follow_the_clock():
     network = line_network(1)
     stage, *_ = calibrated([readings(traffic(2.0), 14.0)], network)
     (begin, _), = stage.doubtful_intervals()['mag_1']
-    stage.renew(dataclasses.replace(network, clock_offset=np.array([0.5])))
+    stage.update_network(dataclasses.replace(network, clock_offset=np.array([0.5])))
     assert stage.doubtful_intervals()['mag_1'] == ((begin - 500_000_000, None),)
 
 

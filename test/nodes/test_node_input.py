@@ -73,7 +73,7 @@ def test_bad_messages_are_counted_and_survived(ros):
                     if 'calibrate' in s.name}
         assert spin_until(lambda: sum(k.startswith('rejected') for k in values()) >= 5), values()
         causes = ' '.join(values())
-        for cause in ('all NaN', 'infinite', 'gauss', 'duplicate stamp', 'out of order'):
+        for cause in ('all NaN', 'infinite', 'gauss', 'duplicate timestamp', 'out of order'):
             assert cause in causes
         assert calibrated and np.isnan(calibrated[-1].magnetic_field.z)
         assert calibrated[-1].header.frame_id == 'mag_1'

@@ -82,7 +82,7 @@ def test_after_a_restart_the_first_reading_is_calibrated(tmp_path):
     assert len(out) == 8 * RATE and out[0].stamp_ns == 1012 * NS
     fields = np.array([c.field for c in out])
     np.testing.assert_allclose(fields.mean(axis=0), STEP, atol=6e-9)
-    assert stage.backgrounds()['mag_1'].frozen and stage.counts['backgrounds resumed'] == 1
+    assert stage.backgrounds()['mag_1'].frozen and stage.counts['backgrounds restored'] == 1
     # Then it is gone, and what is learnt is as if nothing had been.
     for s in readings(1020.0, 10.0, 2):
         out += fed(stage, s)
@@ -98,7 +98,7 @@ def test_what_is_of_another_time_is_learnt_anew(tmp_path, begin_s, max_resume_ga
     stage = Calibrate(network, CalibrateSettings(max_resume_gap_s=max_resume_gap_s))
     stage.resume(kept)
     assert not [c for s in readings(begin_s, 2.0, 1) for c in fed(stage, s)]
-    assert stage.counts['backgrounds of another time not resumed'] == 1
+    assert stage.counts['outdated backgrounds not restored'] == 1
     assert stage.stored('mag_1') is None
 
 
@@ -121,7 +121,7 @@ def test_another_calibration_that_comes_before_the_readings(tmp_path, change):
     network, kept = kept_in(tmp_path / 'kept.json')
     stage = Calibrate(network, SETTINGS)
     stage.resume(kept)
-    stage.renew(replace(network, **change))
+    stage.update_network(replace(network, **change))
     assert not [c for s in readings(1011.0, 2.0, 1) for c in fed(stage, s)]
 
 

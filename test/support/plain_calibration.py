@@ -111,7 +111,7 @@ class PlainCalibration:
         self.backgrounds = {name: FedBackground(
             s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std, s.relearn_s,
             network.background[i], network.noise_std[i],
-            phase=i / n if n > calibrate.AT_ONCE else None)
+            phase=i / n if n > calibrate.MAX_SYNCHRONOUS else None)
             for i, name in enumerate(network.names)}
 
     def feed(self, sample):
@@ -124,12 +124,12 @@ class PlainCalibration:
             return self.reject(cause)
         raw, sample = sample.field, self.corrected(sample)
         if np.isnan(sample.field).all():
-            return self.reject('an axis is missing that the correction needs')
+            return self.reject('an axis that the correction needs is missing')
         cause = self.misplaced(sample)
         if cause:
             return self.reject(cause)
         if self.settings.reject_stuck and self.repetition[name].is_stuck(sample.field):
-            return self.reject('the same reading over and over')
+            return self.reject('stuck sensor (repeated reading)')
         known = [(sample, False)]
         if self.settings.spike_std:
             background = self.backgrounds[name]
@@ -184,13 +184,13 @@ class PlainCalibration:
             if stamp - last > longest:
                 self.unconfirmed[name] = stamp
                 if before is None or not 0 < stamp - before <= longest:
-                    return 'stamp too far ahead'
+                    return 'timestamp too far ahead'
             if stamp <= last and last - stamp <= self.settings.max_backward_jump_s * NS:
-                return 'duplicate stamp' if stamp == last else 'out of order'
+                return 'duplicate timestamp' if stamp == last else 'out of order'
             if stamp <= last:
                 self.backgrounds[name].forget()
                 for _ in self.spikes[name].held:
-                    self.reject('may have been a spike when time jumped back')
+                    self.reject('possible spike when time jumped back')
                 self.spikes[name].clear()
                 self.counts['time jumped back'] += 1
                 self.first_ns.pop(name)
@@ -208,7 +208,7 @@ class PlainCalibration:
                 found = [MagSample(stamp, s.sensor, field, None if s.covariance is None
                                    else s.covariance * decimator.noise_gain())
                          for stamp, field in decimator.feed(s.stamp_ns, s.field)]
-                self.counts['thinned out'] += 1 - len(found)
+                self.counts['removed by decimation'] += 1 - len(found)
                 self.backgrounds[s.sensor].sensors[0]['n_averaged'] = decimator.factor or 1
             out += [c for f in found for c in self.calibrated(f)]
         return out
@@ -249,7 +249,7 @@ class PlainCalibration:
             return own
         if own is not None:
             if not self.is_credible(own, noise):
-                self.counts['covariances of messages overruled by the measured noise'] += 1
+                self.counts['message covariances overruled by the measured noise'] += 1
                 own = None
         C = noise - np.diag(s['step_variance']) if own is None else own
         return C + np.diag(s['step_variance'] * s['n_rest'] / s['n_averaged'])

@@ -123,7 +123,7 @@ def test_more_vehicles_than_are_tracked_together_are_counted():
         bank = pipeline.track.bank
         most = max(most, 0 if bank is None else bank.label.reshape(len(bank), -1).shape[1])
     assert most == 2
-    assert pipeline.track.counts['new_targets not sought: too many vehicles at once'] > 0
+    assert pipeline.track.counts['new targets not added: too many vehicles at once'] > 0
 
 
 @pytest.mark.study

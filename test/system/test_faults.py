@@ -33,15 +33,15 @@ def passed(n_sensors, seed, fault=None):
 
 NAMED = {
     'dies': ('align', 'frames with a sensor missing'),
-    'freezes': ('mag_2', 'rejected: the same reading over and over'),
+    'freezes': ('mag_2', 'rejected: stuck sensor (repeated reading)'),
     'spikes of 2000 times full scale':
         ('mag_2', 'rejected: above 0.001 T (gauss or microtesla as tesla?)'),
     'spikes within full scale': ('mag_2', 'rejected: spike'),
     'small spikes': ('mag_2', 'rejected: spike'),
-    'swaps axes': ('track', 'frames that mag_2 contradicted'),
-    'jumps 1 s ahead': ('align', 'rejected: ahead of all others: mag_2'),
+    'swaps axes': ('track', 'frames in which mag_2 was rejected'),
+    'jumps 1 s ahead': ('align', 'rejected: ahead of all other sensors: mag_2'),
     'jumps 1 s back': ('mag_2', 'rejected: out of order'),
-    'sends duplicates': ('mag_2', 'rejected: duplicate stamp'),
+    'sends duplicates': ('mag_2', 'rejected: duplicate timestamp'),
     'sends gauss': ('mag_2', 'rejected: above 0.001 T (gauss or microtesla as tesla?)'),
 }
 """Where a fault is counted, and as what."""

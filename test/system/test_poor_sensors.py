@@ -32,7 +32,7 @@ def test_covariances_that_drivers_make_up_change_nothing(name):
         said = [f for f in findings(name, spoiler.covariance(variance)) if 'state a noise' in f]
         assert len(said) == 2, said
         overruled = result.counts['calibrate'].get(
-            'covariances of messages overruled by the measured noise', 0)
+            'message covariances overruled by the measured noise', 0)
         assert overruled > 0
 
 
@@ -74,8 +74,8 @@ def test_coarse_steps_are_detected_and_not_called_a_fault(name, step, request):
                             'changes, and the other one moves by a step of its noise'))
     assert outcome(name, spoiler.steps(step)).detected >= 1
     said = findings(name, spoiler.steps(step))
-    assert not any(word in f for f in said for word in ('same as all', 'spike', 'does not change',
-                                                        'no background')), said
+    assert not any(word in f for f in said for word in (
+        'identical to all', 'spike', 'does not change', 'no background')), said
 
 
 @pytest.mark.study

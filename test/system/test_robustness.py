@@ -113,7 +113,7 @@ def test_an_unknown_covariance_between_the_nodes_is_taken_from_the_network_or_re
     align.feed(one(MagSample(0, 'mag_1', np.zeros(3), None)))
     align.feed(one(MagSample(1, 'mag_1', np.full(3, np.inf), None)))
     assert sorted(rejected(align.counts)) == [
-        'covariance unknown, and no noise_std in the network', 'no finite field']
+        'unknown covariance, and no noise_std in the network', 'no finite field']
 
 
 def test_an_axis_that_is_missing_now_and_then_stays_known():
@@ -150,7 +150,7 @@ def test_one_corrupt_stamp_costs_one_sample():
     s = stage()
     for t in (1.0, 1.1, 3601.0, 1.2, 1.3):
         fed(s, sample(t))
-    assert rejected(s.counts) == {'stamp too far ahead': 1}
+    assert rejected(s.counts) == {'timestamp too far ahead': 1}
     assert s.counts['calibrated'] == 4
     # A real gap is confirmed by the next sample.
     assert fed(s, sample(7200.0)) == [] and len(fed(s, sample(7200.1))) == 1

@@ -1,1 +1,1 @@
-"""Align: calibrated readings to frames of the whole network."""
+"""Align: combine calibrated readings into frames of the whole network."""

@@ -1,7 +1,7 @@
-// The alignment of one sample after the other, and the frames that samples complete.
+// Alignment of samples, one at a time, and the frames that they complete.
 //
-// Every rule for a sample stands here once. What needs Python (a rejection that is counted by name,
-// a clock that stepped, a frame that is complete, ...) is returned as a reason.
+// All rules for a sample are implemented here. An event that needs Python (a rejection that is
+// counted by name, a clock step, a complete frame, ...) is returned as a reason.
 
 #pragma once
 
@@ -15,20 +15,21 @@
 namespace mag_tracking {
 
 enum Reason {
-    // The batch is finished, or the sample is rejected.
+    // The batch is finished, or the sample has been rejected.
     DONE, UNKNOWN_SENSOR, NO_FIELD, NO_COVARIANCE, DUPLICATE, OUT_OF_ORDER, LATE,
-    // To be handled before the same sample is taken again.
+    // To be handled before the same sample is processed again.
     JUMPED_BACK,
-    // The sample may be from a clock that stepped, and nothing was done with it; the sensor has more
-    // samples pending than allowed; the next frame is complete.
+    // The clock of the sample may have stepped, and the sample was not added; the sensor has more
+    // pending samples than allowed; the next frame is complete.
     CLOCK_STEP, TOO_MANY, COMPLETE
 };
 
-// Later than anything.
+// Later than any timestamp.
 constexpr int64_t FAR = std::numeric_limits<int64_t>::max();
 
-// [ns] Length of a frame, how long a sensor may be silent, how far ahead a timestamp may be, how far
-// back is a restart; how many samples of a sensor may be pending; whether sensors are read in turn.
+// [ns] Length of a frame, maximum silence of a sensor, maximum forward jump of a timestamp, and the
+// backward jump that is a restart; maximum number of pending samples per sensor; whether sensors
+// are read in turn.
 struct AlignmentSettings {
     int64_t period, wait, limit, jump_back, most;
     bool is_burst;
@@ -39,7 +40,7 @@ struct Sample {
     double field[3], covariance[9];
 };
 
-// The samples of a sensor that wait for their frame, in the order of their stamps.
+// The pending samples of a sensor, in order of their timestamps.
 class Queue {
   public:
     int64_t size() const { return count_; }
@@ -71,21 +72,21 @@ class Queue {
     int64_t count_ = 0;
 };
 
-// Samples of a batch: their sensors (negative: unknown), timestamps, fields and covariances.
+// Samples of a batch: sensors (negative = unknown), timestamps, fields and covariances.
 struct Samples {
     int64_t n;
     const int64_t *rows, *stamps;
     const double *fields, *covariances;
 };
 
-// Where a frame is written: (n, 3), (n, 3, 3), (n,), (n,); zero at first.
+// Output arrays of a frame: (n, 3), (n, 3, 3), (n,), (n,); initialised to zero.
 struct FrameArrays {
     double *field, *covariance;
     int64_t* n_samples;
     double* time_offset;
 };
 
-// Why a sample, field (3) and covariance (3, 3), cannot be used, or DONE.
+// Reason why a sample, field (3) and covariance (3, 3), cannot be used, or DONE.
 inline Reason fault(const double* field, const double* covariance) {
     int n_missing = 0;
     for (int a = 0; a < 3; ++a) {
@@ -106,8 +107,8 @@ class Alignment {
         look_ahead();
     }
 
-    // The next sample of the batch, and the sensor of the one that a reason is about; the newest
-    // timestamp that was not ahead of all others, and whether no clock has stepped.
+    // Next sample of the batch; sensor of the sample that the latest reason refers to; newest
+    // timestamp that was not ahead of all others; whether no clock step is suspected.
     int64_t next = 0, row = 0, passed = NEVER;
     bool is_calm = true;
 
@@ -119,15 +120,15 @@ class Alignment {
         return n;
     }
 
-    // Without the oldest sample of a sensor, where it has one.
+    // Drop the oldest pending sample of a sensor, if there is one.
     void drop(int64_t i) {
         if (queues_[i].size()) queues_[i].pop();
         look_ahead();
     }
 
-    // Put samples to the pending ones, from `next` on, until Python has to do something. With
-    // `is_checked` it is known that they are not from clocks that stepped; `passed_latest` (n) [ns]
-    // are of each sensor's samples that were not ahead of all others.
+    // Add samples to the pending ones, from `next` on, until Python has to act. With `is_checked`,
+    // the samples have passed the clock step filter. `passed_latest` (n) [ns] is the latest
+    // timestamp of each sensor that was not ahead of all others.
     Reason hold(bool is_checked, int64_t* passed_latest, const Samples& in) {
         while (next < in.n) {
             const int64_t k = next++, i = row = in.rows[k], t = in.stamps[k];
@@ -152,16 +153,17 @@ class Alignment {
         return DONE;
     }
 
-    // Whether there is a sensor that the next frame has to wait for.
+    // Whether the next frame has to wait for a sensor.
     bool waits() {
         const bool is_young = newest_ - first_ < settings_.wait;
-        // Who was never heard counts as heard up to -1: frames that end before are not held up.
+        // A sensor without any sample counts as received up to -1: frames that end before that time
+        // do not wait for it.
         if (due_ < 0 && is_young && std::find(latest_.begin(), latest_.end(), NEVER) != latest_.end())
             return false;
         return is_one_behind() && (!settings_.is_burst || is_one_missing(is_young));
     }
 
-    // Find the end of the next frame; any sensor may be one to wait for. False: nothing is pending.
+    // Find the end of the next frame, and reset the watched sensor. False: no sample is pending.
     bool look_ahead() {
         window_ = settings_.period;
         start_ = due_ = FAR;
@@ -173,13 +175,13 @@ class Alignment {
             if (settings_.is_burst) bring_forward(oldest, taken_[i]);
             earliest = std::min(earliest, oldest);
         }
-        // Where sensors are not read in turn the oldest sample alone decides.
+        // If sensors are not read in turn, the oldest sample alone decides.
         if (!settings_.is_burst && earliest != FAR) bring_forward(earliest, NEVER);
         return due_ != FAR;
     }
 
-    // Average the samples before the end of the next frame (in burst mode one each), which there
-    // are; its timestamp.
+    // Average the samples before the end of the next frame (in burst mode one per sensor) and
+    // return its timestamp. There is at least one sample.
     int64_t frame(const FrameArrays& out) {
         const int64_t end = due_;
         int64_t first = FAR, newest = NEVER, n_all = 0, since_all = 0;
@@ -203,7 +205,7 @@ class Alignment {
         }
         last_taken_ = std::max(last_taken_, newest);
         end_ = settings_.is_burst ? newest + 1 : end;
-        // Rounds of sensors with different rates overlap; the offsets keep their true times.
+        // Rounds of sensors with different rates overlap; the offsets preserve their true times.
         const double mean = double(since_all + n_all * (end - first)) / double(n_all);
         stamp_ = std::max(first + int64_t(std::nearbyint(mean)), stamp_ == NEVER ? NEVER : stamp_ + 1);
         for (std::size_t i = 0; i < queues_.size(); ++i) {
@@ -224,25 +226,25 @@ class Alignment {
         for (int a = 0; a < 9; ++a) covariance[a] += sample.covariance[a];
     }
 
-    // Of the sums over n samples; an axis that none has is NaN.
+    // Mean of the sums over n samples; NaN for an axis that is missing in all of them.
     static void average(int64_t n, const double* n_axis, double* field, double* covariance) {
         double fewest = NAN;
         for (int a = 0; a < 3; ++a) {
             field[a] = n_axis[a] > 0.0 ? field[a] / n_axis[a] : NAN;
             if (n_axis[a] > 0.0) fewest = std::fmin(fewest, n_axis[a]);
         }
-        // The fewest per axis counts for all: never better than it is.
+        // The smallest count of any axis applies to all axes, so the variance is not understated.
         const double divisor = double(std::max<int64_t>(n, 1)) * fewest;
         for (int a = 0; a < 9; ++a) covariance[a] /= divisor;
     }
 
-    // Whether a sensor is alive, and may still give a sample of before the end of the frame.
+    // Whether a sensor is active and may still deliver a sample from before the end of the frame.
     bool is_behind(int64_t latest) const {
         if (latest == NEVER) return newest_ - first_ < settings_.wait;
         return newest_ - settings_.wait <= latest && latest < due_;
     }
 
-    // Whether there is one; it is watched from now on, until it is behind no more.
+    // Whether any sensor is behind. That sensor is watched until it no longer is.
     bool is_one_behind() {
         if (watch_ >= 0 && is_behind(latest_[watch_])) return true;
         for (std::size_t j = 0; j < latest_.size(); ++j)
@@ -253,15 +255,16 @@ class Alignment {
         return false;
     }
 
-    // Whether a sensor may still answer in this round, where its next is not of another.
+    // Whether a sensor may still deliver its sample of this round.
     bool is_one_missing(bool is_young) const {
         for (std::size_t i = 0; i < queues_.size(); ++i) {
             if (queues_[i].size()) {
                 if (queues_[i].oldest().stamp >= due_) return true;
             } else if (latest_[i] == NEVER) {
                 if (is_young) return true;
-            // It was heard and is not pending, so frames were taken. At the head of a new round the
-            // others' latest samples are a round old.
+            // The sensor has no pending sample although it has delivered some, so earlier frames
+            // contain them. At the start of a round, the latest samples of the others are one round
+            // old.
             } else if (last_taken_ == NEVER || latest_[i] >= last_taken_ - settings_.wait) {
                 return true;
             }
@@ -269,11 +272,11 @@ class Alignment {
         return false;
     }
 
-    // Have the next frame end early enough for the oldest pending sample of a sensor; `taken` is its
-    // latest in a frame, or NEVER.
+    // Let the next frame start early enough for the oldest pending sample of a sensor. `taken` is
+    // the timestamp of its latest sample in a frame, or NEVER.
     void bring_forward(int64_t stamp, int64_t taken) {
         if (settings_.is_burst) {
-            // A round spreads over the period, or half of any sensor's sample interval.
+            // A round lasts at most the period, or half the sample interval of any sensor.
             if (taken != NEVER)
                 window_ = std::min(window_, std::max<int64_t>(1, (stamp - taken) / 2));
         } else if (end_ != NEVER && stamp < end_ + settings_.period) {
@@ -283,7 +286,8 @@ class Alignment {
         due_ = start_ + window_;
     }
 
-    // Why the timestamp of a sample cannot be used, or DONE; `latest` is its sensor's.
+    // Reason why the timestamp of a sample cannot be used, or DONE. `latest` is the latest
+    // timestamp of its sensor.
     Reason place(int64_t& latest, int64_t stamp) {
         if (latest != NEVER && stamp <= latest) {
             if (latest - stamp > settings_.jump_back) return JUMPED_BACK;
@@ -298,10 +302,10 @@ class Alignment {
 
     AlignmentSettings settings_;
     std::vector<Queue> queues_;
-    // [ns] Of each sensor the latest timestamp, and that of its samples in frames.
+    // [ns] Per sensor: latest timestamp, and latest timestamp of its samples in frames.
     std::vector<int64_t> latest_, taken_;
-    // Oldest and newest timestamp; end and timestamp of the latest frame, and the newest sample in
-    // any; of the next one the earliest start, the end and the length; a sensor it has to wait for.
+    // Oldest and newest timestamp; end and timestamp of the latest frame, and newest sample in any
+    // frame; earliest start, end and length of the next frame; a sensor that it has to wait for.
     int64_t first_ = NEVER, newest_ = NEVER, end_ = NEVER, stamp_ = NEVER, last_taken_ = NEVER;
     int64_t start_ = FAR, due_ = FAR, window_ = 0, watch_ = -1;
 };

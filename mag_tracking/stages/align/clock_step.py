@@ -1,6 +1,7 @@
-"""Sensors whose clock steps ahead of all the others', told from a gap that all of them had.
+"""Distinction between a clock that steps ahead and a gap that all sensors share.
 
-Where stamps decide what is late, one clock that steps ahead would make all other sensors late.
+Lateness is measured by timestamps. Without this filter, one clock that steps ahead would make the
+samples of all other sensors late.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from mag_tracking.units import NEVER
 
 
 class HeldSample(NamedTuple):
-    """A sample that waits for the clocks of the other sensors."""
+    """A sample that is held until the clocks of the other sensors confirm its timestamp."""
 
     stamp_ns: int
     field: FloatArray
@@ -22,117 +23,145 @@ class HeldSample(NamedTuple):
     """(3, 3) [T^2]"""
 
 
-Passed = list[tuple[int, HeldSample]]
+SensorSamples = list[tuple[int, HeldSample]]
+"""Samples with the row of their sensor, in order of arrival."""
 
 
 class ClockStepFilter:
-    """Holds samples that jump ahead until it is known whether the other sensors jump, too.
+    """Holds samples that jump ahead until it is decided whether the other sensors jump as well.
 
-    All others pass at once.
+    All other samples pass immediately.
+
+    Parameters
+    ----------
+    n_sensors : int
+    max_jump : int, ns
+        Largest forward jump that is not checked. Also the maximum time for which a sample is held,
+        by the timestamps of the other sensors or of its own sensor.
+    max_held : int
+        Maximum number of held samples per sensor.
+
+    Attributes
+    ----------
+    latest : (n_sensors,) int array, ns
+        Timestamp of the latest sample of each sensor that passed.
+    newest : int, ns
+        Newest timestamp that passed.
     """
 
-    def __init__(self, n_sensors: int, limit: int, most: int) -> None:
-        """`limit` [ns]: a longer jump is looked at, and samples are held for so long, by the stamps
-        of the others or its own; `most` of a sensor are held."""
-        self._limit = limit
-        self._most = most
-        # Of those that have passed: of each sensor, and of all.
+    def __init__(self, n_sensors: int, max_jump: int, max_held: int) -> None:
+        self._max_jump = max_jump
+        self._max_held = max_held
         self.latest = np.full(n_sensors, NEVER)
         self.newest = NEVER
-        # (sensor, sample, the newest stamp when it came), in the order in which they came.
+        # (sensor, sample, newest timestamp at its arrival), in order of arrival.
         self._held: list[tuple[int, HeldSample, int]] = []
-        # {sensor that is ahead: (the newest stamp, its own when that was first the newest)}
-        self._quiet_since: dict[int, tuple[int, int]] = {}
+        # {sensor that is ahead: (newest timestamp that passed, its own timestamp at that time)}
+        self._ahead_since: dict[int, tuple[int, int]] = {}
 
     @property
     def n_held(self) -> int:
-        """How many samples are held."""
+        """Number of held samples."""
         return len(self._held)
 
     @property
     def held(self) -> list[tuple[int, HeldSample, int]]:
-        """Sensor, sample and the newest timestamp [ns] when it came, of each that is held."""
+        """Sensor, sample and newest timestamp [ns] at its arrival, of each held sample."""
         return list(self._held)
 
     @property
     def is_calm(self) -> bool:
-        """Whether nobody is ahead: what is no longer a jump than the limit passes."""
-        if not self._held and not self._quiet_since:
+        """Whether no sensor is ahead, so that any jump within the limit passes."""
+        if not self._held and not self._ahead_since:
             return True
-        # What is known of one whose samples are all gone holds for that newest stamp only.
+        # The entry of a sensor without held samples is valid for that newest timestamp only.
         return not self._held and all(
-            newest != self.newest for newest, _ in self._quiet_since.values())
+            newest != self.newest for newest, _ in self._ahead_since.values())
 
-    def feed(self, i: int, sample: HeldSample) -> tuple[Passed, Passed]:
-        """What is known by now of a sample of sensor `i`, and of those that are held.
+    def feed(self, i: int, sample: HeldSample) -> tuple[SensorSamples, SensorSamples]:
+        """Check a sample, and release the held samples that it decides about.
+
+        Parameters
+        ----------
+        i : int
+            Row of the sensor.
+        sample : HeldSample
 
         Returns
         -------
-        passed, refused : lists of (i, sample)
-            In the order in which they came.
+        passed : list of (int, HeldSample)
+            Accepted samples, in order of arrival.
+        rejected : list of (int, HeldSample)
+            Samples with a wrong timestamp, in order of arrival.
         """
         stamp = sample.stamp_ns
         if not self._jumps(i, stamp):
             passed = self._pass([(i, sample)])
         else:
             self._held.append((i, sample, self.newest))
-            if self._quiet_since.get(i, (NEVER,))[0] != self.newest:
-                self._quiet_since[i] = self.newest, stamp
-            if not (self._most_agree(stamp) or self._is_alone(i, stamp)):
-                return [], self._too_old(i, stamp)
-            # Who is ahead of these, too, does not pass with them.
-            passed = self._pass(self._take_out(lambda _, s, __: s.stamp_ns <= stamp + self._limit))
-        # It is back with the others: what it said of a time ahead of them was wrong. And whom they
-        # did not follow for so long they will not follow. The first that is held is the oldest.
-        if i in self._quiet_since or self._held and self.newest - self._held[0][2] > self._limit:
-            self._quiet_since.pop(i, None)
-            return passed, self._take_out(
-                lambda j, _, newest: j == i or self.newest - newest > self._limit)
+            if self._ahead_since.get(i, (NEVER,))[0] != self.newest:
+                self._ahead_since[i] = self.newest, stamp
+            if not (self._majority_follows(stamp) or self._is_alone(i, stamp)):
+                return [], self._expired(i, stamp)
+            # Samples that are ahead of these as well remain held.
+            passed = self._pass(self._release(
+                lambda _, s, __: s.stamp_ns <= stamp + self._max_jump))
+        # The sensor agrees with the others again, so its held samples had wrong timestamps. Samples
+        # that the others did not follow in time are wrong, too. The first held one is the oldest.
+        if i in self._ahead_since or self._held and self.newest - self._held[0][2] > self._max_jump:
+            self._ahead_since.pop(i, None)
+            return passed, self._release(
+                lambda j, _, newest: j == i or self.newest - newest > self._max_jump)
         return passed, []
 
-    def flush(self) -> Passed:
-        """[(i, sample)] of those that are held when nothing comes any more."""
-        return self._pass(self._take_out(lambda *_: True))
+    def flush(self) -> SensorSamples:
+        """Release all held samples at the end of the input.
+
+        Returns
+        -------
+        list of (int, HeldSample)
+        """
+        return self._pass(self._release(lambda *_: True))
 
     def _jumps(self, i: int, stamp: int) -> bool:
-        """Whether a stamp is ahead of all that have passed."""
-        if self.newest == NEVER or stamp <= self.newest + self._limit:
+        """Whether a timestamp is further ahead of all that have passed than the limit."""
+        if self.newest == NEVER or stamp <= self.newest + self._max_jump:
             return False
-        # Of two, who is heard for the first time may as well be right.
-        return self.latest[i] != NEVER or bool(self._held) or len(self._alive()) > 1
+        # With two sensors, the one that reports for the first time is as credible as the other.
+        return self.latest[i] != NEVER or bool(self._held) or len(self._active()) > 1
 
-    def _pass(self, samples: Passed) -> Passed:
-        """Note that `samples` are as they should be."""
+    def _pass(self, samples: SensorSamples) -> SensorSamples:
+        """Record samples as passed."""
         for i, sample in samples:
             self.latest[i] = sample.stamp_ns
             self.newest = max(self.newest, sample.stamp_ns)
         return samples
 
-    def _alive(self) -> set[int]:
-        """The sensors that have passed of late."""
+    def _active(self) -> set[int]:
+        """Sensors whose samples passed recently."""
         return {j for j, latest in enumerate(self.latest.tolist())
-                if latest != NEVER and latest >= self.newest - self._limit}
+                if latest != NEVER and latest >= self.newest - self._max_jump}
 
-    def _most_agree(self, stamp: int) -> bool:
-        """Whether most of the living sensors have jumped to about this stamp."""
-        agree = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._limit}
-        return 2 * len(agree) > len(agree | self._alive())
+    def _majority_follows(self, stamp: int) -> bool:
+        """Whether most active sensors have jumped to about this timestamp."""
+        agree = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._max_jump}
+        return 2 * len(agree) > len(agree | self._active())
 
     def _is_alone(self, i: int, stamp: int) -> bool:
-        """Whether sensor `i` has been ahead for a while and no other has said anything since."""
-        return stamp - self._quiet_since[i][1] >= self._limit
+        """Whether sensor `i` has been ahead beyond the limit while no other sensor reported."""
+        return stamp - self._ahead_since[i][1] >= self._max_jump
 
-    def _too_old(self, i: int, stamp: int) -> Passed:
-        """What of sensor `i` has been held for too long, or is one too many."""
+    def _expired(self, i: int, stamp: int) -> SensorSamples:
+        """Release the samples of sensor `i` that are held too long or exceed the maximum."""
         mine = [s for j, s, _ in self._held if j == i]
-        first = mine[0] if len(mine) > self._most else None
-        return self._take_out(lambda j, s, _: j == i and (
-            s.stamp_ns < stamp - self._limit or s is first))
+        first = mine[0] if len(mine) > self._max_held else None
+        return self._release(lambda j, s, _: j == i and (
+            s.stamp_ns < stamp - self._max_jump or s is first))
 
-    def _take_out(self, is_meant: Callable[[int, HeldSample, int], bool]) -> Passed:
-        """[(i, sample)] of those held that `is_meant`; they are held no more."""
+    def _release(self, is_released: Callable[[int, HeldSample, int], bool]) -> SensorSamples:
+        """Remove held samples for which `is_released` holds, and return them."""
         if not self._held:
             return []
-        out = [h[:2] for h in self._held if is_meant(*h)]
-        self._held = [h for h in self._held if not is_meant(*h)]
+        out = [h[:2] for h in self._held if is_released(*h)]
+        self._held = [h for h in self._held if not is_released(*h)]
         return out

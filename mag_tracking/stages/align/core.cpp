@@ -1,4 +1,4 @@
-// The alignment of samples, as a Python module; core.pyi says what the arguments are.
+// Python module of the sample alignment; core.pyi documents the arguments.
 
 #include "../../python.hpp"
 #include "alignment.hpp"
@@ -15,7 +15,7 @@ int hold(Alignment& alignment, bool is_checked, Integers passed, Integers rows, 
     if (alignment.next < 0) throw py::index_error("next: negative");
     for (Size k = alignment.next; k < n; ++k)
         if (in.rows[k] >= alignment.n_sensors())
-            throw py::index_error("rows: there is no such sensor");
+            throw py::index_error("rows: sensor index out of range");
     return alignment.hold(is_checked, data_of(passed, "passed", {alignment.n_sensors()}), in);
 }
 
@@ -33,7 +33,7 @@ py::object frame(Alignment& alignment, bool is_final) {
 }
 
 void drop(Alignment& alignment, int64_t i) {
-    if (i < 0 || i >= alignment.n_sensors()) throw py::index_error("there is no such sensor");
+    if (i < 0 || i >= alignment.n_sensors()) throw py::index_error("i: sensor index out of range");
     alignment.drop(i);
 }
 
@@ -50,7 +50,7 @@ void add_reasons(py::module_& m) {
 
 PYBIND11_MODULE(core, m) {
     using namespace mag_tracking;
-    m.doc() = "The alignment of one sample after the other, compiled.";
+    m.doc() = "Compiled alignment of individual samples.";
     add_reasons(m);
     py::class_<Alignment>(m, "Alignment")
         .def(py::init([](Size n_sensors, int64_t period, int64_t wait, int64_t limit,

@@ -1,4 +1,4 @@
-"""The alignment of one sample after the other, compiled: `alignment.hpp` has the rules."""
+"""Compiled alignment of individual samples; `alignment.hpp` has the rules."""
 
 from mag_tracking.arrays import FloatArray, IntArray
 
@@ -17,16 +17,34 @@ COMPLETE: int
 class Alignment:
     """The samples of a network that wait for their frame.
 
+    Parameters
+    ----------
+    n_sensors : int
+    period : int, ns
+        Length of a frame.
+    wait : int, ns
+        Maximum silence of a sensor that frames wait for.
+    limit : int, ns
+        Maximum forward jump of a timestamp.
+    jump_back : int, ns
+        A larger backward jump of a timestamp is a restart.
+    most : int
+        Maximum number of pending samples per sensor.
+    is_burst : bool
+        Whether the sensors are read in turn.
+
     Attributes
     ----------
-    next, row : int
-        The next sample of the batch, and the sensor of the one that a reason is about.
+    next : int
+        Next sample of the batch.
+    row : int
+        Sensor of the sample that the latest reason refers to.
     passed : int, ns
-        The newest timestamp that was not ahead of all others, or NEVER.
+        Newest timestamp that was not ahead of all others, or NEVER.
     is_calm : bool
-        Whether no clock has stepped.
+        Whether no clock step is suspected.
     n_pending : int
-        How many samples wait.
+        Number of pending samples.
     """
 
     next: int
@@ -37,39 +55,47 @@ class Alignment:
     @property
     def n_pending(self) -> int: ...
     def __init__(self, n_sensors: int, period: int, wait: int, limit: int, jump_back: int,
-                 most: int, is_burst: bool) -> None:
-        """Length of a frame, how long a sensor may be silent, how far ahead a timestamp may be and
-        how far back is a restart, all [ns]; how many samples of a sensor may wait; whether sensors
-        are read in turn."""
-
+                 most: int, is_burst: bool) -> None: ...
     def hold(self, is_checked: bool, passed: IntArray, rows: IntArray, stamps: IntArray,
              fields: FloatArray, covariances: FloatArray) -> int:
-        """Put samples to the pending ones, from `next` on, until Python has to do something.
+        """Add samples to the pending ones, from `next` on, until the caller has to act.
 
         Parameters
         ----------
         is_checked : bool
-            It is known that the samples are not from clocks that stepped.
-        passed : (n_sensors,) ns
-            The latest of each sensor's samples that were not ahead of all others; changed.
-        rows, stamps, fields, covariances : (n,), (n,) ns, (n, 3) T, (n, 3, 3) T^2
-            The samples; rows: their sensors, negative: unknown.
+            Whether the samples have passed the clock step filter.
+        passed : (n_sensors,) int array, ns
+            Latest timestamp of each sensor that was not ahead of all others; updated in place.
+        rows : (n,) int array
+            Sensors of the samples; negative = unknown.
+        stamps : (n,) int array, ns
+        fields : (n, 3) array, T
+        covariances : (n, 3, 3) array, T^2
 
         Returns
         -------
         int
-            DONE, or the reason of what `row` is about.
+            DONE, or the reason that refers to sensor `row`.
         """
 
     def frame(self, is_final: bool) -> tuple[int, FloatArray, FloatArray, IntArray,
                                              FloatArray] | None:
-        """The next frame if it is complete, or all that is pending is final; else None.
+        """Return the next frame if it is complete, or if all pending samples are final.
 
-        Timestamp [ns], field, covariance, samples and offsets, as of `records.FieldFrame`.
+        Parameters
+        ----------
+        is_final : bool
+            Whether the pending samples are final.
+
+        Returns
+        -------
+        tuple or None
+            Timestamp [ns], field, covariance, number of samples and time offset, as in
+            `records.FieldFrame`.
         """
 
     def drop(self, i: int) -> None:
-        """Without the oldest sample of sensor `i`, where it has one."""
+        """Drop the oldest pending sample of sensor `i`, if there is one."""
 
     def waits(self) -> bool:
-        """Whether there is a sensor that the next frame has to wait for."""
+        """Whether the next frame has to wait for a sensor."""

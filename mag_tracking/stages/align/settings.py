@@ -10,21 +10,22 @@ class AlignSettings:
     """Settings of the alignment."""
 
     period_s: float = param(
-        0.0, 'Length of a frame: the samples of each sensor in it are averaged. 0 = auto: 0.08; '
-        'with sensors that are all within two metres half of what a target of 20 m/s needs between '
-        'the closest, but not below 0.02.', 's', (0.0, 60.0))
+        0.0, 'Length of a frame. The samples of each sensor within a frame are averaged. 0 = '
+        'automatic: 0.08 s; in a network within two metres, half the time that a target at 20 m/s '
+        'takes between the two closest sensors, but not less than 0.02 s.', 's', (0.0, 60.0))
     burst: bool = param(
-        False, 'The sensors are read in turn, one sample each: a frame is closed as soon as '
-        'every sensor has given one, and period_s is the longest that a round may take.')
+        False, 'Sensors are read in turn, one sample each. A frame is complete as soon as every '
+        'sensor has delivered a sample; period_s is then the maximum duration of a round.')
     max_wait_s: float = param(
-        0.5, 'A sensor that is silent for longer is taken for dead and delays nobody.',
-        's', (1e-3, 3600.0))
+        0.5, 'Maximum time that frames wait for a sensor. A sensor that is silent for longer is '
+        'treated as dead and no longer delays frames.', 's', (1e-3, 3600.0))
     max_clock_jump_s: float = param(
-        0.5, 'A sensor whose stamps jump ahead by more than this while those of the others do not '
-        'is held back until they follow: its clock has stepped. 0 = never.', 's', (0.0, 3600.0))
+        0.5, 'Maximum forward jump of the timestamps of one sensor. A larger jump that the other '
+        'sensors do not share is treated as a clock step: the samples are held back until the '
+        'others follow. 0 disables the check.', 's', (0.0, 3600.0))
     max_backward_jump_s: float = param(
-        1.0, 'A stamp that goes back by more than this is a restart (a looped recording).',
-        's', (0.0, 3600.0))
+        1.0, 'Maximum backward jump of a timestamp. A larger jump is treated as a restart (a '
+        'looped recording).', 's', (0.0, 3600.0))
     max_buffered: int = param(
-        10000, 'Samples held per sensor at most; more than that and the oldest are rejected.',
+        10000, 'Maximum number of buffered samples per sensor. Beyond it, the oldest are rejected.',
         '', (2, 10_000_000))

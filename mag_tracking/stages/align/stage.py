@@ -1,8 +1,8 @@
-"""Align: asynchronous samples of many sensors to frames of the whole network.
+"""Align: combine the asynchronous samples of many sensors into frames of the whole network.
 
-Samples are put in order of their timestamps, and a frame is built only from what is final: older
-than the latest sample of every sensor that is alive. So the frames do not depend on the order in
-which the sensors' messages arrive.
+Samples are sorted by timestamp. A frame contains only final samples, which are older than the
+latest sample of every active sensor. Therefore the frames do not depend on the order in which the
+messages of different sensors arrive.
 """
 
 from collections import Counter
@@ -18,28 +18,37 @@ from mag_tracking.stages.align.frame_period import frame_period
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.units import NS
 
-FAR = np.iinfo(np.int64).max
-"""[ns] Later than anything."""
+UNLIMITED = np.iinfo(np.int64).max
+"""[ns] Later than any timestamp."""
 MAX_HELD = 16
-"""Samples of a sensor that are held while it is not known whether its clock has stepped."""
+"""Maximum number of samples per sensor that are held while a possible clock step is undecided."""
 
 CAUSES = {
     core.NO_FIELD: 'no finite field',
-    core.NO_COVARIANCE: 'covariance unknown, and no noise_std in the network',
-    core.DUPLICATE: 'duplicate stamp',
+    core.NO_COVARIANCE: 'unknown covariance, and no noise_std in the network',
+    core.DUPLICATE: 'duplicate timestamp',
     core.OUT_OF_ORDER: 'out of order',
     core.LATE: 'late',
 }
-"""{reason code: why a sample is rejected}, apart from those that name a sensor."""
+"""Cause of rejection for each reason code, except those that name a sensor."""
 
 
 class Align:
-    """Calibrated readings to frames; memory is bounded by `max_buffered`.
+    """Combines calibrated readings into frames; memory is bounded by `max_buffered`.
 
-    Between two frames a sample costs the same with any number of sensors: it cannot complete a
-    frame while one sensor is known that the frame has to wait for.
+    The cost of a sample between two frames does not depend on the number of sensors: as long as
+    one sensor is known to be missing, a sample cannot complete a frame. The rules are in
+    `alignment.hpp`; this class handles the reasons that it reports.
 
-    `alignment.hpp` has the rules; here is what it reports.
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : AlignSettings
+
+    Attributes
+    ----------
+    counts : Counter of str
+        Number of frames and of rejected samples, by cause.
     """
 
     def __init__(self, network: SensorNetwork, settings: AlignSettings) -> None:
@@ -55,9 +64,9 @@ class Align:
         self._reset()
 
     def _reset(self) -> None:
-        """As new."""
+        """Return to the initial state."""
         settings = self._settings
-        longest_jump = int(round(settings.max_clock_jump_s * NS)) or FAR
+        longest_jump = int(round(settings.max_clock_jump_s * NS)) or UNLIMITED
         self._alignment = core.Alignment(
             self._n, self._period, self._wait, longest_jump,
             int(round(settings.max_backward_jump_s * NS)),
@@ -67,16 +76,26 @@ class Align:
 
     @property
     def n_held(self) -> int:
-        """How many samples wait for their frame, or for the other sensors' clocks."""
+        """Number of samples that wait for their frame, or for the clocks of the other sensors."""
         return self._alignment.n_pending + self._clock_steps.n_held
 
     @property
     def n_held_ahead(self) -> int:
-        """How many of them are held because their timestamps jumped ahead."""
+        """Number of samples that are held because their timestamps jumped ahead."""
         return self._clock_steps.n_held
 
     def feed(self, readings: Readings) -> list[FieldFrame]:
-        """Calibrated `Readings` give the `FieldFrame`s that they complete."""
+        """Add calibrated readings.
+
+        Parameters
+        ----------
+        readings : Readings
+
+        Returns
+        -------
+        list of FieldFrame
+            The frames that they complete.
+        """
         rows, C = readings.rows(self._index), readings.covariance
         if C is None:
             C = self._noise[rows]
@@ -89,9 +108,9 @@ class Align:
 
     def _hold(self, rows: IntArray, stamps: IntArray, fields: FloatArray, covariances: FloatArray,
               readings: Readings | None = None) -> list[FieldFrame]:
-        """Put samples to the pending ones; the frames that they complete.
+        """Add samples to the pending ones and return the frames that they complete.
 
-        Without `readings` it is known that they are not from clocks that stepped.
+        Without `readings`, the samples have passed the clock step filter.
         """
         out: list[FieldFrame] = []
         k = 0
@@ -112,53 +131,58 @@ class Align:
                 out += self._after_clock_step(int(rows[k - 1]), HeldSample(
                     int(stamps[k - 1]), fields[k - 1], covariances[k - 1]))
             elif reason == core.JUMPED_BACK:
-                out += self._restarted()
+                out += self._restart()
                 here = slice(k, k + 1)
                 out += self._hold(rows[here], stamps[here], fields[here], covariances[here])
                 k += 1
             elif reason == core.TOO_MANY:
                 alignment.drop(alignment.row)
-                self._reject('too many pending')
+                self._reject('too many pending samples')
                 out += [] if alignment.waits() else self._frames()
             else:
                 self._reject(CAUSES[reason])
 
     def _after_clock_step(self, i: int, sample: HeldSample) -> list[FieldFrame]:
-        """A sample of sensor `i` that may be from a clock that stepped."""
-        passed, refused = self._clock_steps.feed(i, sample)
-        for j, _ in refused:
-            self._reject(f'ahead of all others: {self._names[j]}')
+        """Handle a sample of sensor `i` whose clock may have stepped."""
+        passed, rejected = self._clock_steps.feed(i, sample)
+        for j, _ in rejected:
+            self._reject(f'ahead of all other sensors: {self._names[j]}')
         return self._hold_passed(passed)
 
     def _hold_passed(self, passed: list[tuple[int, HeldSample]]) -> list[FieldFrame]:
-        """Put samples that are not from clocks that stepped to the pending ones."""
+        """Add samples that have passed the clock step filter to the pending ones."""
         out: list[FieldFrame] = []
         for i, s in passed:
             out += self._hold(np.array([i]), np.array([s.stamp_ns]), s.field[None],
                               s.covariance[None])
         return out
 
-    def _restarted(self) -> list[FieldFrame]:
-        """The time jumped back: the frames of what was pending; then as new."""
+    def _restart(self) -> list[FieldFrame]:
+        """Return the frames of the pending samples after a backward jump in time, and reset."""
         out = self.flush()
         self._reset()
         self.counts['time jumped back'] += 1
         return out
 
     def flush(self) -> list[FieldFrame]:
-        """All frames that can be made of what is pending."""
+        """Return all frames of the pending samples.
+
+        Returns
+        -------
+        list of FieldFrame
+        """
         out = self._hold_passed(self._clock_steps.flush())
         return out + self._frames(final=True)
 
     def idle(self) -> None:
-        """Nothing waits."""
+        """Do nothing: no work is deferred."""
 
     def _reject(self, cause: str) -> None:
-        """Count the rejection."""
+        """Count a rejection."""
         self.counts[f'rejected: {cause}'] += 1
 
     def _frames(self, final: bool = False) -> list[FieldFrame]:
-        """Frames that are complete, or all if what is pending is `final`."""
+        """Frames that are complete, or all frames if the pending samples are final."""
         out: list[FieldFrame] = []
         while (arrays := self._alignment.frame(final)) is not None:
             frame = FieldFrame(*arrays)

@@ -1,1 +1,1 @@
-"""Calibrate: raw readings to calibrated ones."""
+"""Calibrate: convert raw readings to calibrated readings."""

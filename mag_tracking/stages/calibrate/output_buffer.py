@@ -1,4 +1,4 @@
-"""Room for the calibrated readings of one batch."""
+"""Output buffer for the calibrated readings of one batch."""
 
 import numpy as np
 
@@ -6,18 +6,39 @@ from mag_tracking.records import Readings
 
 
 class OutputBuffer:
-    """Arrays that compiled code appends calibrated readings to."""
+    """Arrays to which compiled code appends calibrated readings.
 
-    def __init__(self, names: tuple[str, ...], room: int) -> None:
-        """`names` of all sensors; at most `room` readings."""
+    Parameters
+    ----------
+    names : tuple of str
+        Names of all sensors.
+    capacity : int
+        Maximum number of readings.
+
+    Attributes
+    ----------
+    arrays : tuple of arrays
+        Sensors (capacity,), timestamps (capacity,) ns, fields (capacity, 3) T and covariances
+        (capacity, 3, 3) T^2.
+    """
+
+    def __init__(self, names: tuple[str, ...], capacity: int) -> None:
         self._names = names
-        self.arrays = (np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64),
-                       np.empty((room, 3)), np.empty((room, 3, 3)))
-        """Sensors (room,), timestamps (room,) [ns], fields (room, 3) [T], covariances
-        (room, 3, 3) [T^2]."""
+        self.arrays = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64),
+                       np.empty((capacity, 3)), np.empty((capacity, 3, 3)))
 
     def readings(self, n: int) -> list[Readings]:
-        """The first `n` readings, in one batch; none: no batch."""
+        """Return the first `n` readings.
+
+        Parameters
+        ----------
+        n : int
+
+        Returns
+        -------
+        list of Readings
+            One batch, or an empty list if `n` is 0.
+        """
         rows, stamps, fields, covariances = self.arrays
         return [Readings(self._names, rows[:n], stamps[:n], fields[:n], covariances[:n])] \
             if n else []

@@ -1,4 +1,4 @@
-"""Calibrate: check readings, remove the background, attach the noise."""
+"""Calibrate: check readings, subtract the background, and attach the noise covariance."""
 
 from collections import Counter
 from collections.abc import Collection, Mapping
@@ -28,37 +28,50 @@ from mag_tracking.stages.calibrate.restoration import (
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.units import NEVER, NS
 
-AT_ONCE = 16
-"""The blocks of so many sensors may end at once; those of more would hold up the readings."""
+MAX_SYNCHRONOUS = 16
+"""Maximum number of sensors whose blocks may end at the same time. In larger networks the blocks
+are staggered, because evaluating all of them at once would delay the readings."""
 
-OVERRULED = 'covariances of messages overruled by the measured noise'
+OVERRULED = 'message covariances overruled by the measured noise'
+"""Key in the counts for covariances that were replaced."""
 
 CAUSES = {
     core.NO_AXIS: 'no axis reported (all NaN)',
     core.INFINITE: 'infinite value',
     core.BAD_COVARIANCE: 'covariance is not positive definite',
-    core.AXIS_MISSING: 'an axis is missing that the correction needs',
-    core.TOO_FAR_AHEAD: 'stamp too far ahead',
-    core.DUPLICATE: 'duplicate stamp',
+    core.AXIS_MISSING: 'an axis that the correction needs is missing',
+    core.TOO_FAR_AHEAD: 'timestamp too far ahead',
+    core.DUPLICATE: 'duplicate timestamp',
     core.OUT_OF_ORDER: 'out of order',
-    core.STUCK: 'the same reading over and over',
+    core.STUCK: 'stuck sensor (repeated reading)',
 }
-"""{reason code: why a reading is rejected}, apart from those that name a value."""
+"""Cause of rejection for each reason code, except those that name a value."""
 
 
 class Calibrate:
-    """Raw readings to calibrated ones: background removed, covariance known.
+    """Converts raw readings to calibrated ones: background subtracted, covariance known.
 
     The clock offset and the hard and soft iron of the network file are applied first. The field
-    stays in the sensor's frame. The covariance is the reading's own if it has one, else the
+    stays in the frame of the sensor. The covariance is that of the reading if it has one, else the
     configured one, else the estimated one.
 
-    `calibration/readings.hpp` has the rules; here is what it reports.
+    The rules are in `calibration/readings.hpp`; this class handles the reasons that it reports.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : CalibrateSettings
+    background_type : type, optional
+        Class that estimates the background of each sensor.
+
+    Attributes
+    ----------
+    counts : Counter of str
+        Number of readings, by outcome.
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
                  background_type: type[RunningBackground] = RunningBackground) -> None:
-        """`background_type` estimates the background of each sensor."""
         self.counts: Counter[str] = Counter()
         self._per_sensor: dict[str, Counter[str]] = {name: Counter() for name in network.names}
         self._settings, self._sensors = settings, new_sensors(len(network))
@@ -74,35 +87,44 @@ class Calibrate:
         self._background: dict[str, RunningBackground] = {}
         self._changes = SharedChanges()
         self._restoration = BackgroundRestoration(settings.max_resume_gap_s)
-        self.renew(network)
+        self.update_network(network)
 
-    def renew(self, network: SensorNetwork) -> None:
+    def update_network(self, network: SensorNetwork) -> None:
         """Continue with another calibration of the same sensors.
 
-        A background is learnt again where the offset or correction of its sensor has changed; else
-        it stays, also a frozen one. Raises NetworkError where the sensors are others.
+        If the offset or the correction of a sensor has changed, its background is learnt again.
+        Otherwise the background is kept, even while it is frozen.
+
+        Parameters
+        ----------
+        network : SensorNetwork
+
+        Raises
+        ------
+        NetworkError
+            If the names of the sensors differ.
         """
         if network.names != tuple(self._index):
-            raise NetworkError(f'a network of {", ".join(network.names)} in place of one of '
-                               f'{", ".join(self._index)}')
+            raise NetworkError(f'the new network has the sensors {", ".join(network.names)}; '
+                               f'expected {", ".join(self._index)}')
         before, self._network = self._network if self._background else None, network
         self._decimators = {name: Decimator(self._settings.decimate_to_hz)
                             for name in network.names}
         for i, name in enumerate(network.names):
-            same = before is not None and _same(before.offset[i], network.offset[i]) \
-                and _same(before.correction[i], network.correction[i])
+            same = before is not None and _are_equal(before.offset[i], network.offset[i]) \
+                and _are_equal(before.correction[i], network.correction[i])
             shift = int(self._sensors[i]['clock_offset_ns'] - network.clock_offset_ns[i])
             if before is not None and (not same or shift):
                 self._restoration.forget(name)
             if not same or shift:
-                self._give_up(i, 'another calibration came')
+                self._reject_held(i, 'the calibration changed')
             if not same:
                 self._background[name] = self._new_background(i)
             self._configure(i, shift)
         self._note_restorable()
 
     def _configure(self, i: int, shift: int) -> None:
-        """Apply the network file to sensor `i`, and `shift` [ns] to its earlier timestamps."""
+        """Apply the network file to sensor `i`, and add `shift` [ns] to its earlier timestamps."""
         s, network = self._sensors[i], self._network
         for name in ('first_ns', 'last_ns', 'unconfirmed_ns'):
             if s[name] != NEVER:
@@ -116,35 +138,62 @@ class Calibrate:
         s['correction'] = np.eye(3) if correction is None else correction
 
     def _new_background(self, i: int) -> RunningBackground:
-        """Of sensor `i`, from what the network file says of it."""
+        """Background estimator of sensor `i`, with the values of the network file."""
         s, network = self._settings, self._network
         return self._background_type(
             s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std, s.relearn_s,
             network.background[i], network.noise_std[i],
-            phase=i / len(network) if len(network) > AT_ONCE else None,
+            phase=i / len(network) if len(network) > MAX_SYNCHRONOUS else None,
             sensors=self._sensors[i:i + 1],
             evaluate_change=partial(self._changes.evaluate_change, i))
 
     def unready(self) -> list[str]:
-        """Names of the sensors whose background is not known."""
+        """Names of the sensors whose background is not known yet.
+
+        Returns
+        -------
+        list of str
+        """
         return [name for name, b in self._background.items() if not b.ready]
 
     def doubtful_intervals(self) -> dict[str, DoubtfulTimes]:
-        """{sensor: ((begin, end) [ns], ...)} of those whose background was doubtful."""
+        """Intervals in which the background of a sensor was doubtful.
+
+        Returns
+        -------
+        dict of str to DoubtfulTimes
+            ((begin, end) [ns], ...) of each sensor that has such intervals.
+        """
         return {n: b.doubtful_times for n, b in self._background.items() if b.doubtful_times}
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
-        """What was `accepted` and `rejected` of a sensor, and why."""
-        return self._per_sensor[sensor] + Counter(accepted=int(self._of(sensor)['accepted']))
+        """Number of accepted and rejected readings of a sensor, also by cause of rejection.
 
-    def _of(self, sensor: str) -> Record:
-        """The state of a sensor."""
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        Counter of str
+        """
+        return self._per_sensor[sensor] + Counter(accepted=int(self._state_of(sensor)['accepted']))
+
+    def _state_of(self, sensor: str) -> Record:
+        """State of a sensor."""
         return self._sensors[self._index[sensor]]
 
     def feed(self, readings: Readings) -> list[Readings]:
-        """Raw `Readings` give the calibrated ones that are complete by now, in one batch or none.
+        """Calibrate raw readings; the result does not depend on how they are split into batches.
 
-        They do not depend on how the readings are split into batches.
+        Parameters
+        ----------
+        readings : Readings
+
+        Returns
+        -------
+        list of Readings
+            The calibrated readings that are complete, in one batch; empty if there are none.
         """
         rows = readings.rows(self._index)
         own, covariances = _own_covariances(readings)
@@ -162,16 +211,16 @@ class Calibrate:
         return self._finished(out)
 
     def _output(self, n: int) -> OutputBuffer:
-        """Room for what `n` readings may lead to."""
-        room = n + int(self._sensors['n_held'].sum())
+        """Output buffer for the readings that `n` raw readings may complete."""
+        capacity = n + int(self._sensors['n_held'].sum())
         if self._settings.decimate_to_hz:
-            room += sum(d.n_waiting for d in self._decimators.values())
+            capacity += sum(d.n_waiting for d in self._decimators.values())
         for name in ('n_out', 'n_learning', 'n_partly_learning', 'n_overruled'):
             self._batches[0][name] = 0
-        return OutputBuffer(self._network.names, room)
+        return OutputBuffer(self._network.names, capacity)
 
     def _handle(self, reason: int, i: int, out: OutputBuffer) -> None:
-        """Do what compiled code asks for, or count a rejection; it is about sensor `i`."""
+        """Handle a reason that compiled code has returned for sensor `i`."""
         batch, name = self._batches[0], self._network.names[i]
         if batch['n_spikes']:
             self._reject(name, 'spike', int(batch['n_spikes']))
@@ -180,7 +229,7 @@ class Calibrate:
             self._background[name].evaluate_block()
         elif reason == core.JUMPED_BACK:
             self._background[name].forget()
-            self._give_up(i, 'time jumped back')
+            self._reject_held(i, 'time jumped back')
             self.counts['time jumped back'] += 1
             self._sensors[i]['first_ns'] = self._sensors[i]['last_ns'] = NEVER
         elif reason == core.RESTORABLE:
@@ -193,7 +242,7 @@ class Calibrate:
             self._reject(name, self._causes[reason])
 
     def _use_passed(self, i: int, out: OutputBuffer) -> None:
-        """Use the held readings of sensor `i` that have passed."""
+        """Calibrate the held readings of sensor `i` that have passed the spike filter."""
         s, name = self._sensors[i], self._network.names[i]
         for k in range(int(s['n_released'])):
             stamp, own = int(s['held_ns'][k]), int(s['held_own'][k])
@@ -203,7 +252,7 @@ class Calibrate:
                 continue
             decimator = self._decimators[name]
             found = decimator.feed(stamp, field)
-            self.counts['thinned out'] += 1 - len(found)
+            self.counts['removed by decimation'] += 1 - len(found)
             s['n_averaged'] = decimator.factor or 1
             for stamp, field in found:
                 self._use(i, stamp, field, own, covariance * decimator.noise_gain(), out)
@@ -211,15 +260,15 @@ class Calibrate:
 
     def _use(self, i: int, stamp: int, field: FloatArray, own: int, covariance: FloatArray,
              out: OutputBuffer) -> None:
-        """Calibrate a reading of sensor `i` that has passed."""
+        """Calibrate one reading of sensor `i` that has passed the spike filter."""
         background = self._background[self._network.names[i]]
         background.evaluate_block()
         while not core.use_reading(self._sensors, self._limits, self._batches, i, stamp,
-                                     plain(field), own, plain(covariance), *out.arrays):
+                                   plain(field), own, plain(covariance), *out.arrays):
             background.evaluate_block()
 
     def _finished(self, out: OutputBuffer) -> list[Readings]:
-        """The calibrated readings of a batch, counted."""
+        """Count the calibrated readings of a batch and return them."""
         batch = self._batches[0]
         for what, name in (('calibrated', 'n_out'), ('held back while learning', 'n_learning'),
                            ('axes held back while learning', 'n_partly_learning'),
@@ -230,57 +279,78 @@ class Calibrate:
 
     @property
     def n_held(self) -> int:
-        """How many readings wait for the next."""
+        """Number of readings that are held until the next reading of their sensor."""
         return int(self._sensors['n_held'].sum())
 
-    def _give_up(self, i: int, why: str) -> None:
-        """Reject the held readings of sensor `i`: no reading can tell any more what they were."""
-        self._reject(self._network.names[i], f'may have been a spike when {why}',
+    def _reject_held(self, i: int, why: str) -> None:
+        """Reject the held readings of sensor `i`, as no later reading can decide about them."""
+        self._reject(self._network.names[i], f'possible spike when {why}',
                      int(self._sensors[i]['n_held']))
         clear_spikes(self._sensors[i])
 
     def start_from(self, levels: Mapping[str, QuietLevel], steps: Mapping[str, FloatArray]) -> None:
-        """Begin with what a first pass over the readings has found.
+        """Start with the results of a first pass over the readings.
 
         Parameters
         ----------
-        levels : {sensor: QuietLevel}
-            The backgrounds of sensors whose beginning is not quiet.
-        steps : {sensor: (3,) [T]}
-            Smallest changes of their axes.
+        levels : mapping of str to QuietLevel
+            Background of each sensor that is not quiet at the start.
+        steps : mapping of str to (3,) array, T
+            Resolution of the axes of each sensor.
         """
         for name, step in steps.items():
-            self._of(name)['step'] = step
+            self._state_of(name)['step'] = step
         for name, found in levels.items():
             self._background[name].start_from(found.level, found.covariance)
 
     def resume(self, stored: Mapping[str, StoredBackground]) -> None:
-        """Restore {sensor: `StoredBackground`} where its first reading comes soon after."""
+        """Restore backgrounds of sensors whose first reading follows soon enough.
+
+        Parameters
+        ----------
+        stored : mapping of str to StoredBackground
+            Background of each sensor.
+        """
         self._restoration.offer(stored)
         self._note_restorable()
 
     def _note_restorable(self) -> None:
-        """Have compiled code report the first reading of each sensor with a stored background."""
+        """Let compiled code report the first reading of each sensor with a stored background."""
         self._sensors['is_restorable'] = [name in self._restoration for name in self._index]
 
     def stored(self, sensor: str) -> StoredBackground | None:
-        """Background of a sensor for `resume`; None before it is known for certain."""
+        """Background of a sensor that can be passed to `resume`.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        StoredBackground or None
+            None while the background is unknown or doubtful.
+        """
         background, last = self._background[sensor], self.last_stamp_ns(sensor)
         if not background.certain or last is None:
             return None
         return stored_background(background, last, self.background(sensor))
 
     def idle(self) -> None:
-        """Judge complete blocks; without this call the sensor's next reading does it.
+        """Evaluate complete blocks; otherwise the next reading of the sensor triggers that.
 
-        The result is the same: in a large network the reading that completes a block is
-        calibrated with what was known before.
+        The result is the same: in a large network, the reading that completes a block is calibrated
+        with the background before that block.
         """
         for i in np.flatnonzero(self._sensors['is_full']):
             self._background[self._network.names[i]].evaluate_block()
 
     def flush(self) -> list[Readings]:
-        """The readings that waited for the next."""
+        """Return the readings that were held back.
+
+        Returns
+        -------
+        list of Readings
+        """
         out = self._output(0)
         for i in np.flatnonzero(self._sensors['n_held']):
             s = self._sensors[i]
@@ -298,9 +368,17 @@ class Calibrate:
             self._per_sensor[sensor].update({'rejected': n, f'rejected: {cause}': n})
 
     def forget(self, sensors: Collection[str] = ()) -> None:
-        """Learn the backgrounds of `sensors` (all if empty) again.
+        """Learn the backgrounds of sensors again.
 
-        Raises NetworkError for a sensor that is not in the network.
+        Parameters
+        ----------
+        sensors : collection of str, optional
+            All sensors if empty.
+
+        Raises
+        ------
+        NetworkError
+            If a sensor is not in the network.
         """
         for name in sensors:
             self._network.index(name)
@@ -310,35 +388,69 @@ class Calibrate:
         self._note_restorable()
 
     def last_stamp_ns(self, sensor: str) -> int | None:
-        """Timestamp of the latest accepted reading of `sensor`, or None."""
-        last = int(self._of(sensor)['last_ns'])
+        """Timestamp of the latest accepted reading of a sensor.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        int or None, ns
+        """
+        last = int(self._state_of(sensor)['last_ns'])
         return None if last == NEVER else last
 
     def background(self, sensor: str) -> FloatArray:
-        """(3,) [T] background of `sensor` at its latest reading; ValueError before it is ready."""
-        state = self._of(sensor)
+        """Background of a sensor at its latest reading.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        (3,) array, T
+
+        Raises
+        ------
+        ValueError
+            If the background is not known yet.
+        """
+        state = self._state_of(sensor)
         return self._background[sensor].level(int(state['last_ns'] - state['first_ns']) / NS)
 
     def overruled(self, sensor: str) -> tuple[int, FloatArray, FloatArray]:
-        """Covariances of the messages of `sensor` that contradict its noise.
+        """Covariances of the messages of a sensor that contradict its measured noise.
+
+        Parameters
+        ----------
+        sensor : str
 
         Returns
         -------
         n : int
-            How many were overruled.
-        stated, measured : (3,) array, T
-            Standard deviations: of the latest message, and of the sensor; NaN = unknown.
+            Number of overruled covariances.
+        stated : (3,) array, T
+            Standard deviation of the latest message; NaN = unknown.
+        measured : (3,) array, T
+            Standard deviation of the readings; NaN = unknown.
         """
-        s = self._of(sensor)
+        s = self._state_of(sensor)
         return int(s['n_overruled']), s['stated_std'].copy(), s['noise_std'].copy()
 
     def backgrounds(self) -> dict[str, RunningBackground]:
-        """{sensor: RunningBackground}, to look at."""
+        """Background estimators of all sensors, for inspection.
+
+        Returns
+        -------
+        dict of str to RunningBackground
+        """
         return dict(self._background)
 
 
 def _own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
-    """(n,) NONE, VALID or INVALID and (n, 3, 3) [T^2] of readings; as compiled code has them."""
+    """Whether readings have a valid covariance (n,), and the covariances (n, 3, 3) [T^2]."""
     if readings.covariance is None:
         return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
     C = plain(readings.covariance)
@@ -346,6 +458,6 @@ def _own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
     return np.where(readings.has_unknown_covariance(), core.NONE, valid), C
 
 
-def _same(a: FloatArray | None, b: FloatArray | None) -> bool:
-    """Whether two arrays, or None, are the same."""
+def _are_equal(a: FloatArray | None, b: FloatArray | None) -> bool:
+    """Whether two arrays are equal; None equals only None."""
     return a is b if a is None or b is None else np.array_equal(a, b)

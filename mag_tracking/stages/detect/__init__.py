@@ -1,1 +1,1 @@
-"""Detect: the energy test on frames."""
+"""Detect: energy test on frames."""

@@ -1,4 +1,4 @@
-// What every frame without a target asks of resting axes, as a Python module; see resting_axes.py.
+// Python module with the per-frame work on resting axes; see resting_axes.py.
 
 #include <algorithm>
 #include <cmath>
@@ -30,7 +30,7 @@ Array scaled(Array covariance, Array n, Array square, double least, double facto
     for (Size j = 0; j < n_sensors; ++j, C += 9, scaled += 9, count += 3, mean += 3) {
         double std[3];
         for (int a = 0; a < 3; ++a)
-            // A comparison with NaN is false: a missing axis does not rest.
+            // A comparison with NaN is false: a missing axis is not at rest.
             std[a] = count[a] >= least && factor * mean[a] < C[4 * a] ? std::sqrt(1.0 / most) : 1.0;
         for (int a = 0; a < 3; ++a) {
             for (int b = 0; b < 3; ++b) scaled[3 * a + b] = C[3 * a + b] * std[a] * std[b];
@@ -45,7 +45,7 @@ Array scaled(Array covariance, Array n, Array square, double least, double facto
 
 PYBIND11_MODULE(core, m) {
     using namespace mag_tracking;
-    m.doc() = "Axes whose steps are larger than their noise, compiled.";
+    m.doc() = "Compiled functions for axes with coarse resolution.";
     m.def("learn", &learn, IN(field), py::arg("memory"), IN(n), IN(square));
     m.def("scaled", &scaled, IN(covariance), IN(n), IN(square), py::arg("least"), py::arg("factor"),
           py::arg("most"), py::arg("allowance"));

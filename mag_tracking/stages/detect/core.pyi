@@ -1,17 +1,42 @@
-"""Axes whose steps are larger than their noise, compiled."""
+"""Compiled functions for axes with coarse resolution."""
 
 from mag_tracking.arrays import FloatArray
 
 def learn(field: FloatArray, memory: float, n: FloatArray, square: FloatArray) -> None:
-    """Update the mean squares (n_sensors, 3), each of n values, by `field` (n_sensors, 3).
+    """Update the mean squares of the axes with a frame; a missing axis (NaN) changes nothing.
 
-    More than `memory` values are not counted; a missing axis (NaN) changes nothing.
+    Parameters
+    ----------
+    field : (n_sensors, 3) array, T
+    memory : float
+        Maximum number of values that count.
+    n : (n_sensors, 3) array
+        Number of values of each axis; updated in place.
+    square : (n_sensors, 3) array, T^2
+        Mean squares; updated in place.
     """
 
 def scaled(covariance: FloatArray, n: FloatArray, square: FloatArray, least: float, factor: float,
            most: float, allowance: float) -> FloatArray:
-    """`covariance` (n_sensors, 3, 3) with smaller variances where an axis rests.
+    """Covariance with smaller variances for axes at rest.
 
-    It does where `square`, of at least `least` values, is smaller than its variance by `factor`:
-    that is `most` times smaller then. To all variances `allowance` is added.
+    An axis is at rest if `square`, with at least `least` values, is smaller than its variance by
+    `factor`.
+
+    Parameters
+    ----------
+    covariance : (n_sensors, 3, 3) array, T^2
+    n, square : (n_sensors, 3) array
+        As for `learn`.
+    least : float
+        Minimum number of values.
+    factor : float
+    most : float
+        Factor by which the variance of an axis at rest is reduced.
+    allowance : float, T^2
+        Added to all variances.
+
+    Returns
+    -------
+    (n_sensors, 3, 3) array, T^2
     """

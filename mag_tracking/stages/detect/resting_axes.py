@@ -1,7 +1,7 @@
-"""Axes whose steps are larger than their noise: how quiet they are without a target.
+"""Variance of axes with coarse resolution while there is no target.
 
-The covariance of a resting axis says how well it measures a field: within a step. Without a target
-it does not move at all, so that two axes that move by one step each are no noise.
+The covariance of such an axis covers the quantisation error of one step. Without a target the axis
+does not move at all, so simultaneous steps of two axes are not noise.
 """
 
 import numpy as np
@@ -11,40 +11,52 @@ from mag_tracking.records import plain
 from mag_tracking.stages.detect import core
 
 MEMORY_FRAMES = 100
-"""Frames without a target that the usual variance of each axis is of, about."""
+"""Approximate number of frames without a target over which the variance of each axis is
+averaged."""
 
-RESTS = 25.0
-"""An axis rests where its fields vary by less than their covariance states, by this factor."""
+RESTING_RATIO = 25.0
+"""An axis is at rest if its variance is smaller than its stated covariance by this factor."""
 
-MOST = 20.0
-"""The variance of a resting axis is taken to be smaller by this factor. One axis of two sensors
-that moves by one step, as it does while its background drifts, stays below the threshold."""
+VARIANCE_REDUCTION = 20.0
+"""Factor by which the variance of a resting axis is reduced. One step of one axis in a network of
+two sensors, as it occurs while the background drifts, stays below the threshold."""
 
 
 class RestingAxes:
-    """Usual variance of each axis of a network, in frames without a target."""
+    """Variance of each axis of a network, averaged over frames without a target.
+
+    Parameters
+    ----------
+    n_sensors : int
+    """
 
     def __init__(self, n_sensors: int) -> None:
         self._n: FloatArray = np.zeros((n_sensors, 3))
         self._square: FloatArray = np.zeros((n_sensors, 3))
 
     def learn(self, field: FloatArray) -> None:
-        """Take the `field` (n_sensors, 3) [T] of a frame without a target; NaN = missing."""
+        """Add a frame without a target.
+
+        Parameters
+        ----------
+        field : (n_sensors, 3) array, T
+            NaN = missing axis.
+        """
         core.learn(plain(field), MEMORY_FRAMES, self._n, self._square)
 
     def covariance(self, covariance: FloatArray, allowance: float) -> FloatArray:
-        """Covariance of the fields of a frame without a target.
+        """Covariance of a frame, reduced for axes at rest.
 
         Parameters
         ----------
         covariance : (n_sensors, 3, 3) array, T^2
-            Of the frame.
+            Covariance of the frame.
         allowance : float, T^2
-            Variance of what each background may be off by.
+            Variance of the background error.
 
         Returns
         -------
         (n_sensors, 3, 3) array, T^2
         """
-        return core.scaled(plain(covariance), self._n, self._square, MEMORY_FRAMES / 4, RESTS, MOST,
-                           allowance)
+        return core.scaled(plain(covariance), self._n, self._square, MEMORY_FRAMES / 4,
+                           RESTING_RATIO, VARIANCE_REDUCTION, allowance)

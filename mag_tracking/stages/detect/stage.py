@@ -1,6 +1,6 @@
-"""Detect: the chi-square energy test on whitened frames.
+"""Detect: chi-square energy test on whitened frames.
 
-Source: T10 section 5.4, eq. (5.14)-(5.19), over all sensors at once.
+The test is that of T10 section 5.4, eq. (5.14)-(5.19), over all sensors together.
 """
 
 from collections import Counter
@@ -19,50 +19,92 @@ from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.units import NS
 
 RECOVERY_S = 5.0
-"""[s] After a target the calibration needs about this long to learn the background anew."""
+"""[s] Approximate time that the calibration needs to learn the background again after a target."""
 
 
 class Detect:
-    """Frames to frames with a verdict, and a `Detection` at onset and release."""
+    """Decides for each frame whether a target is present, and reports onset and release.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : DetectSettings
+
+    Attributes
+    ----------
+    counts : Counter of str
+        Number of frames, onsets and rejections.
+    max_consecutive_above : int
+        Largest number of consecutive frames above the threshold.
+
+    Raises
+    ------
+    SettingsError
+        If the release probability is below the false alarm probability.
+
+    References
+    ----------
+    [T10]_ eq. (5.14)-(5.19).
+    """
 
     def __init__(self, network: SensorNetwork, settings: DetectSettings) -> None:
         if settings.release_probability < settings.false_alarm_probability:
             raise SettingsError(
                 f'detect.release_probability: {settings.release_probability:g} is below '
-                f'false_alarm_probability ({settings.false_alarm_probability:g}): what is loud '
-                'enough to begin would be quiet enough to end')
+                f'false_alarm_probability ({settings.false_alarm_probability:g}); the release '
+                'threshold must not exceed the detection threshold')
         self.counts: Counter[str] = Counter()
         self._names = network.names
         self._settings = settings
         self._thresholds: dict[tuple[float, int], float] = {}
         self._next_id = 1
-        self._largest_share, self._largest_shares = 0.0, np.zeros(len(network))
-        # Thresholds of one sensor by its number of axes.
+        self._max_ratio, self._max_ratios = 0.0, np.zeros(len(network))
+        # Thresholds for a single sensor, by its number of axes.
         self._single = np.array([np.inf, *(self.threshold(settings.false_alarm_probability, k)
                                            for k in (1, 2, 3))])
-        self.most_above = 0
-        """Consecutive frames above the threshold, at most."""
+        self.max_consecutive_above = 0
         self._resting = RestingAxes(len(network))
         self._reset()
 
     def _reset(self) -> None:
-        """No target."""
+        """Reset to the state without a target."""
         self._present = False
         self._above = 0
         self._last_ns: int | None = None
-        self._loud_ns: int | None = None
+        self._last_active_ns: int | None = None
         self._onset_ns: int | None = None
-        self._unlearnt_s = 0.0
+        self._frozen_s = 0.0
 
     def threshold(self, probability: float, degrees_of_freedom: int) -> float:
-        """Threshold of the energy, remembered."""
+        """Threshold of the energy that noise exceeds with a given probability; cached.
+
+        Parameters
+        ----------
+        probability : float
+        degrees_of_freedom : int
+
+        Returns
+        -------
+        float
+        """
         key = probability, degrees_of_freedom
         if key not in self._thresholds:
             self._thresholds[key] = float(energy_threshold(probability, degrees_of_freedom))
         return self._thresholds[key]
 
     def feed(self, frame: FieldFrame) -> list[FieldFrame | Detection]:
-        """A `FieldFrame` gives itself with the verdict, after any `Detection`."""
+        """Test a frame.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+
+        Returns
+        -------
+        list of FieldFrame or Detection
+            The detection, if there is one, and the frame with its verdict. A frame with an invalid
+            covariance is dropped.
+        """
         out: list[FieldFrame | Detection] = []
         if self._last_ns is not None and frame.stamp_ns <= self._last_ns:
             self.counts['time jumped back'] += 1
@@ -78,8 +120,8 @@ class Detect:
         statistic, n = float(energy.sum()), int(axes.sum())
         self.counts['frames'] += 1
         if n:
-            self._note(energy, axes, statistic, n)
-            out += self._judge(frame.stamp_ns, statistic, n, energy / np.maximum(axes, 1))
+            self._record_excursions(energy, axes, statistic, n)
+            out += self._update_presence(frame.stamp_ns, statistic, n, energy / np.maximum(axes, 1))
         else:
             self.counts['frames without a measurement'] += 1
         if not self._present and not self._above:
@@ -87,56 +129,62 @@ class Detect:
         return [*out, replace(frame, target_present=self._present, statistic=statistic,
                               degrees_of_freedom=n)]
 
-    def _note(self, energy: FloatArray, axes: IntArray, statistic: float, n: int) -> None:
-        """Note the largest excursions in frames without a target."""
+    def _record_excursions(self, energy: FloatArray, axes: IntArray, statistic: float,
+                           n: int) -> None:
+        """Update the largest excursions in frames without a target."""
         if not self._present:
             share = statistic / self.threshold(self._settings.false_alarm_probability, n)
-            self._largest_share = max(self._largest_share, share)
-            np.maximum(self._largest_shares, energy / self._single[axes], out=self._largest_shares)
+            self._max_ratio = max(self._max_ratio, share)
+            np.maximum(self._max_ratios, energy / self._single[axes], out=self._max_ratios)
 
     @property
     def largest_excursion(self) -> float:
-        """Largest excursion of the whole network, in units of the threshold."""
-        return float(np.sqrt(self._largest_share))
+        """Largest excursion of the whole network, relative to the threshold."""
+        return float(np.sqrt(self._max_ratio))
 
     def largest_excursions(self) -> FloatArray:
-        """(n_sensors,) of each sensor, in units of the threshold of that sensor alone."""
-        return np.sqrt(self._largest_shares)
+        """Largest excursion of each sensor, relative to the threshold of that sensor alone.
+
+        Returns
+        -------
+        (n_sensors,) array
+        """
+        return np.sqrt(self._max_ratios)
 
     def _allowance(self, stamp_ns: int) -> float:
-        """[T^2] Variance of what the background may be off by."""
+        """Variance [T^2] of the background error."""
         if self._present and self._onset_ns is not None:
-            self._unlearnt_s = (stamp_ns - self._onset_ns) / NS
-        elif self._loud_ns is not None and stamp_ns - self._loud_ns > RECOVERY_S * NS:
-            self._unlearnt_s = 0.0
+            self._frozen_s = (stamp_ns - self._onset_ns) / NS
+        elif self._last_active_ns is not None and stamp_ns - self._last_active_ns > RECOVERY_S * NS:
+            self._frozen_s = 0.0
         s = self._settings
-        return (s.background_std + s.background_drift * self._unlearnt_s) ** 2
+        return (s.background_std + s.background_drift * self._frozen_s) ** 2
 
-    def _judge(self, stamp_ns: int, statistic: float, n: int,
-               per_axis: FloatArray) -> list[Detection]:
-        """Onset, hold and release; the detections that follow."""
+    def _update_presence(self, stamp_ns: int, statistic: float, n: int,
+                         per_axis: FloatArray) -> list[Detection]:
+        """Update onset, hold and release, and return the detections that follow."""
         s = self._settings
         if statistic > self.threshold(s.false_alarm_probability, n):
             self.counts['frames above the threshold'] += 1
             self._above += 1
-            self.most_above = max(self.most_above, self._above)
+            self.max_consecutive_above = max(self.max_consecutive_above, self._above)
         else:
             self._above = 0
         if statistic > self.threshold(s.release_probability, n):
-            self._loud_ns = stamp_ns
+            self._last_active_ns = stamp_ns
         if not self._present and self._above >= s.onset_frames:
-            self._present, self._loud_ns = True, stamp_ns
-            # What was not learnt for an earlier target is still not learnt.
-            self._onset_ns = stamp_ns - int(self._unlearnt_s * NS)
+            self._present, self._last_active_ns = True, stamp_ns
+            # The background was not learnt since an earlier target, so the uncertainty continues.
+            self._onset_ns = stamp_ns - int(self._frozen_s * NS)
             self.counts['onsets'] += 1
             return [self._detection(stamp_ns, True, statistic, n, self._strongest(per_axis))]
-        if self._present and self._loud_ns is not None \
-                and stamp_ns - self._loud_ns > s.hold_s * NS:
+        if self._present and self._last_active_ns is not None \
+                and stamp_ns - self._last_active_ns > s.hold_s * NS:
             return self._release(stamp_ns, statistic, n, self._strongest(per_axis))
         return []
 
     def _strongest(self, per_axis: FloatArray) -> str:
-        """The sensor with most energy an axis (n_sensors,)."""
+        """Name of the sensor with the largest energy per axis (n_sensors,)."""
         return self._names[int(per_axis.argmax())]
 
     def _release(self, stamp_ns: int, statistic: float, n: int, strongest: str) -> list[Detection]:
@@ -150,14 +198,19 @@ class Detect:
 
     def _detection(self, stamp_ns: int, onset: bool, statistic: float, n: int,
                    strongest: str) -> Detection:
-        """The record."""
+        """Detection record of the current target."""
         p = self._settings.false_alarm_probability
         return Detection(stamp_ns, self._next_id, onset, statistic, n,
                          self.threshold(p, n) if n else float('nan'), p, strongest)
 
     def idle(self) -> None:
-        """Nothing waits."""
+        """Do nothing: no work is deferred."""
 
     def flush(self) -> list[FieldFrame | Detection]:
-        """Nothing is held back: []."""
+        """Return nothing: no frame is held back.
+
+        Returns
+        -------
+        list of FieldFrame or Detection
+        """
         return []

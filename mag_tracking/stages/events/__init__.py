@@ -1,1 +1,1 @@
-"""Events: passes described by each sensor alone."""
+"""Events: passes described by individual sensors."""

@@ -10,5 +10,5 @@ class EventsSettings:
     """Settings of the events."""
 
     max_sensors: int = param(
-        4, 'Nodes: in networks of at most so many sensors detection_node describes what passes '
-        'each sensor on ~/events; 0 = never.', '', (0, 1000))
+        4, 'Maximum number of sensors of a network for which detection_node publishes the passes '
+        'of each sensor on ~/events. 0 disables ~/events.', '', (0, 1000))

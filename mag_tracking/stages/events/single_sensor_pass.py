@@ -1,4 +1,4 @@
-"""Closest point and direction of a pass from one sensor, without any scale."""
+"""Closest point of approach of a pass from one sensor, without any length scale."""
 
 from typing import NamedTuple
 
@@ -10,39 +10,40 @@ from mag_tracking.physics.anderson import anderson_residual
 from mag_tracking.records import plain
 
 MAX_SAMPLES = 200
-"""A pass is averaged to so many samples before the closest point is sought."""
+"""Maximum number of samples to which a pass is averaged before the search."""
 
 MAX_STARTS = 5
-"""The best points of a grid from which the closest point is sought: one axis has several optima."""
+"""Number of grid points from which the search starts; the cost of a single axis has several
+minima."""
 
-CORRELATED = 2.0
-"""[time scales] Correlation time of the residual of a vehicle that is fitted by a dipole."""
+CORRELATION_TIME = 2.0
+"""[time scales] Correlation time of the residual when a dipole is fitted to a vehicle."""
 
-OFF_CENTRE = 0.15
-"""[time scales] The magnetic centre of a vehicle is so far from the middle of its body."""
+CENTRE_OFFSET = 0.15
+"""[time scales] Distance of the magnetic centre of a vehicle from the middle of its body."""
 
 
 class ClosestPoint(NamedTuple):
-    """The closest point of a pass, seen by one sensor."""
+    """Closest point of approach of a pass, from one sensor."""
 
     time: float
-    """[s]; time of the largest field where the closest point is not determined."""
+    """[s] Time of the largest field if the closest point is not observable."""
     time_std: float
-    """[s]; inf where the closest point is not determined."""
+    """[s] Standard deviation; inf if the closest point is not observable."""
     time_scale: float
-    """[s] Range at the closest point over the speed; NaN where it is not determined."""
+    """[s] Distance at the closest point divided by the speed; NaN if it is not observable."""
 
 
 def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> ClosestPoint:
     """Fit the Anderson functions of a dipole on a straight line to the field of one sensor.
 
-    Any axis is enough. The linear part, three coefficients and a constant an axis, is solved for
-    each time and time scale.
+    Any axis is sufficient. The linear part, three coefficients and a constant per axis, is solved
+    for each time and time scale.
 
     Parameters
     ----------
     t : (n,) array, s
-        In order.
+        Ascending.
     field : (n, 3) array, T
         NaN = missing axis.
     noise_std : (3,) array, T
@@ -55,16 +56,16 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
     ----------
     [TSP14]_ eq. (22), (23), with the exponent 5/2.
     """
-    there = ~np.isnan(field).all(axis=0) & ~np.isnan(noise_std)
-    whole = ~np.isnan(field[:, there]).any(axis=1)
-    t, y = t[whole], field[whole][:, there] / noise_std[there]
+    present = ~np.isnan(field).all(axis=0) & ~np.isnan(noise_std)
+    complete = ~np.isnan(field[:, present]).any(axis=1)
+    t, y = t[complete], field[complete][:, present] / noise_std[present]
     if len(t):
         t, y = _averaged(t, y)
     t, y = plain(t), plain(y)
     span = float(t[-1] - t[0]) if len(t) else 0.0
     if len(t) < 8 or not span > 0.0:
         return ClosestPoint(float(t.mean()) if len(t) else np.nan, np.inf, np.nan)
-    loudest = float(t[np.argmax(np.sum(y**2, axis=1))])
+    strongest = float(t[np.argmax(np.sum(y**2, axis=1))])
     interval = span / (len(t) - 1)
 
     def cost(time: float, scale: float) -> float:
@@ -81,19 +82,20 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
         'xatol': 1e-4 * interval, 'fatol': 1e-9 * (1.0 + at_start), 'maxiter': 200})
         for at_start, time, scale in starts[:MAX_STARTS]), key=lambda result: float(result.fun))
     time, scale = float(found.x[0]), float(np.exp(found.x[1]))
-    # Variance of the samples by what is left over; a vehicle leaves more than noise.
-    left = max(found.fun / max(y.size - 4 * y.shape[1] - 2, 1), 0.0)
-    alike = max(1.0, CORRELATED * scale / interval)
+    # The residual of a vehicle is larger than noise, so the variance is estimated from it.
+    residual_variance = max(found.fun / max(y.size - 4 * y.shape[1] - 2, 1), 0.0)
+    n_correlated = max(1.0, CORRELATION_TIME * scale / interval)
     step = 0.05 * scale
     curvature = (cost(time + step, scale) + cost(time - step, scale) - 2.0 * found.fun) / step**2
-    std = np.sqrt(2.0 * left * alike / curvature) if curvature > 0.0 else np.inf
+    std = np.sqrt(2.0 * residual_variance * n_correlated / curvature) \
+        if curvature > 0.0 else np.inf
     if not (t[0] <= time <= t[-1] and scale <= span and np.isfinite(std)):
-        return ClosestPoint(loudest, np.inf, np.nan)
-    return ClosestPoint(time, float(np.hypot(std, OFF_CENTRE * scale)), scale)
+        return ClosestPoint(strongest, np.inf, np.nan)
+    return ClosestPoint(time, float(np.hypot(std, CENTRE_OFFSET * scale)), scale)
 
 
 def _averaged(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means of neighbours, at most `MAX_SAMPLES`, each of the same number of samples."""
+    """Means of blocks of consecutive samples (at most `MAX_SAMPLES` blocks of equal length)."""
     n = -(-len(t) // MAX_SAMPLES) or 1
     k = len(t) // n
     return t[:k * n].reshape(k, n).mean(axis=1), y[:k * n].reshape(k, n, -1).mean(axis=1)

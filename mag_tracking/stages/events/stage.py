@@ -21,20 +21,30 @@ from mag_tracking.stages.events.single_sensor_pass import closest_point
 from mag_tracking.units import NS
 
 PAD_S = 1.0
-"""[s] Before an onset and after the last loud frame, where the sensor is without the target."""
+"""[s] Margin before the onset and after the last frame that is not quiet; without the target."""
 
-MAX_S = 120.0
-"""[s] Of a longer detection, the latest readings are described."""
+MAX_DURATION_S = 120.0
+"""[s] Maximum duration of an event; of a longer detection, only the latest readings are used."""
 
 SIGNATURE_POINTS = 33
-"""Points of a signature."""
+"""Number of points of a signature."""
 
 
 class Events:
-    """Calibrated `Readings` to `PassEvent`s, one for each detection by each sensor.
+    """Converts calibrated readings to events, one for each detection by each sensor.
 
-    Those that one batch completes come sensor by sensor. Nothing is in metres: a single sensor
-    cannot observe the scale.
+    The events that one batch completes are returned sensor by sensor. An event contains no lengths,
+    because a single sensor cannot observe the scale.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    align : AlignSettings
+    detect : DetectSettings
+
+    Attributes
+    ----------
+    counts : Counter of str
     """
 
     def __init__(self, network: SensorNetwork, align: AlignSettings,
@@ -45,7 +55,17 @@ class Events:
         self._sensors = [_SensorEvents(part, align, detect, self.counts) for part in parts]
 
     def feed(self, readings: Readings) -> list[PassEvent]:
-        """Calibrated `Readings` give the events that they complete."""
+        """Add calibrated readings.
+
+        Parameters
+        ----------
+        readings : Readings
+
+        Returns
+        -------
+        list of PassEvent
+            The events that they complete.
+        """
         rows = readings.rows(self._index)
         out: list[PassEvent] = []
         for j in np.unique(rows[rows >= 0]).tolist():
@@ -53,15 +73,20 @@ class Events:
         return out
 
     def idle(self) -> None:
-        """Nothing waits."""
+        """Do nothing: no work is deferred."""
 
     def flush(self) -> list[PassEvent]:
-        """The events that have not ended."""
+        """Return the events that have not ended.
+
+        Returns
+        -------
+        list of PassEvent
+        """
         return [event for s in self._sensors for event in s.flush()]
 
 
 class _SensorEvents:
-    """The events of one sensor."""
+    """Events of one sensor."""
 
     def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
                  counts: 'Counter[str]') -> None:
@@ -69,87 +94,87 @@ class _SensorEvents:
         self._network, self._settings = network, (align, detect)
         self._hold_ns, self._counts = int(detect.hold_s * NS), counts
         self._n = 0
-        self._begin()
+        self._reset()
 
-    def _begin(self) -> None:
-        """Start without any reading."""
+    def _reset(self) -> None:
+        """Drop all readings and restart the detection."""
         self._align = Align(self._network, self._settings[0])
         self._detect = Detect(self._network, self._settings[1])
-        self._kept: deque[Readings] = deque()
+        self._buffer: deque[Readings] = deque()
         self._onset_ns: int | None = None
 
     def feed(self, readings: Readings) -> list[PassEvent]:
-        """Readings of this sensor give the events that they complete."""
-        last = self._kept[-1].stamp_ns[-1:] if self._kept else readings.stamp_ns[:0]
+        """Add readings of this sensor and return the events that they complete."""
+        last = self._buffer[-1].stamp_ns[-1:] if self._buffer else readings.stamp_ns[:0]
         back = np.flatnonzero(np.diff(np.concatenate([last, readings.stamp_ns])) < 0)
         first, out = 0, []
         for k in (back + 1 - len(last)).tolist():
-            # A looped recording: what was kept is of another time.
+            # In a looped recording, the buffered readings belong to another time.
             out += [*self._feed(readings.part(slice(first, k))), *self.flush()]
-            self._begin()
+            self._reset()
             first = k
         return out + self._feed(readings.part(slice(first, None)))
 
     def _feed(self, readings: Readings) -> list[PassEvent]:
-        """`feed` of readings in order of time."""
+        """Add readings that are in order of time."""
         if not len(readings):
             return []
-        self._kept.append(readings)
+        self._buffer.append(readings)
         out: list[PassEvent] = []
         for frame in self._align.feed(readings):
             for record in self._detect.feed(frame):
                 if isinstance(record, Detection):
-                    out += self._at(record)
+                    out += self._on_detection(record)
             begin = frame.stamp_ns if self._onset_ns is None else \
-                max(self._onset_ns, frame.stamp_ns - int(MAX_S * NS))
-            while self._kept[0].stamp_ns[-1] < begin - (2 * PAD_S * NS + self._hold_ns):
-                self._kept.popleft()
+                max(self._onset_ns, frame.stamp_ns - int(MAX_DURATION_S * NS))
+            while self._buffer[0].stamp_ns[-1] < begin - (2 * PAD_S * NS + self._hold_ns):
+                self._buffer.popleft()
         return out
 
     def flush(self) -> list[PassEvent]:
-        """The event that has not ended."""
+        """Return the event that has not ended."""
         out: list[PassEvent] = []
         for frame in self._align.flush():
             for record in self._detect.feed(frame):
                 if isinstance(record, Detection):
-                    out += self._at(record)
-        if self._onset_ns is not None and self._kept:
-            out += self._event(int(self._kept[-1].stamp_ns[-1]), False)
+                    out += self._on_detection(record)
+        if self._onset_ns is not None and self._buffer:
+            out += self._event(int(self._buffer[-1].stamp_ns[-1]), False)
         self._onset_ns = None
         return out
 
-    def _at(self, detection: Detection) -> list[PassEvent]:
-        """An onset, or the event that a release completes."""
+    def _on_detection(self, detection: Detection) -> list[PassEvent]:
+        """Store the time of an onset, or return the event that a release completes."""
         if detection.onset:
             self._onset_ns = detection.stamp_ns
             return []
         return self._event(detection.stamp_ns - self._hold_ns, True)
 
     def _event(self, release_ns: int, ended: bool) -> list[PassEvent]:
-        """The event from the onset until `release_ns`, or none without readings."""
+        """Event from the onset until `release_ns`; empty if there are no readings."""
         onset_ns, self._onset_ns = self._onset_ns, None
         assert onset_ns is not None
-        readings = Readings.joined(self._kept)
+        readings = Readings.joined(self._buffer)
         pad = int(PAD_S * NS)
-        begin_ns = max(onset_ns, release_ns - int(MAX_S * NS)) - pad
+        begin_ns = max(onset_ns, release_ns - int(MAX_DURATION_S * NS)) - pad
         readings = readings.part((begin_ns <= readings.stamp_ns)
                                  & (readings.stamp_ns <= release_ns + pad))
         if not len(readings) or np.isnan(readings.field).all():
             return []
         self._n += 1
         self._counts['events'] += 1
-        return [self._described(readings, onset_ns, max(release_ns, onset_ns), ended)]
+        return [self._describe(readings, onset_ns, max(release_ns, onset_ns), ended)]
 
-    def _described(self, readings: Readings, onset_ns: int, release_ns: int,
-                   ended: bool) -> PassEvent:
-        """The `PassEvent` of the readings around a detection."""
+    def _describe(self, readings: Readings, onset_ns: int, release_ns: int,
+                  ended: bool) -> PassEvent:
+        """Event record of the readings around a detection."""
         stamp, field = readings.stamp_ns, readings.field
         t = (stamp - onset_ns) / NS
-        noise = _noise_of(readings)
+        noise = _median_noise(readings)
         size = np.nansum(field**2, axis=1)
         peak = int(np.argmax(size))
         inside = (onset_ns <= stamp) & (stamp <= release_ns)
-        there = ~np.all(np.isnan(field), axis=0)
+        present = ~np.all(np.isnan(field), axis=0)
         closest = closest_point(t, field, noise)
         horizontal = horizontal_field(field, self._R_ws)
         known = ~np.isnan(horizontal).any(axis=1)
@@ -157,22 +182,22 @@ class _SensorEvents:
                               int(np.count_nonzero(stamp < onset_ns)))
         return PassEvent(
             self._name, self._n, ended, onset_ns, release_ns, int(stamp[peak]), field[peak],
-            float(np.sum(size[inside]) * _interval(stamp)),
-            ''.join(np.array(list('xyz'))[there]), noise,
+            float(np.sum(size[inside]) * _median_interval(stamp)),
+            ''.join(np.array(list('xyz'))[present]), noise,
             onset_ns + int(round(closest.time * NS)), closest.time_std, closest.time_scale, left,
             _signature(t, field, closest.time, closest.time_scale))
 
 
 def _left_to_right(horizontal: FloatArray, noise_std: float, n_quiet: int) -> float:
-    """Probability of a target that moves from left to right; 0.5 where the field does not tell."""
+    """Probability that the target moves from left to right; 0.5 if it is not observable."""
     found = rotation_of_pass(horizontal, noise_std, n_quiet)
     if found is None:
         return 0.5
     return float(np.clip(found.left_to_right, 1.0 - MAX_CONFIDENCE, MAX_CONFIDENCE))
 
 
-def _noise_of(readings: Readings) -> FloatArray:
-    """(3,) [T] median noise of the readings; NaN of an axis that none has."""
+def _median_noise(readings: Readings) -> FloatArray:
+    """Median noise (3,) [T] of the readings; NaN for a missing axis."""
     out: FloatArray = np.full(3, np.nan)
     if readings.covariance is not None:
         variance = np.einsum('kii->ki', readings.covariance)
@@ -181,13 +206,13 @@ def _noise_of(readings: Readings) -> FloatArray:
     return out
 
 
-def _interval(stamp: IntArray) -> float:
-    """[s] Usual time between readings."""
+def _median_interval(stamp: IntArray) -> float:
+    """Median interval [s] between readings."""
     return float(np.median(np.diff(stamp))) / NS if len(stamp) > 1 else 0.0
 
 
 def _signature(t: FloatArray, field: FloatArray, time: float, scale: float) -> FloatArray:
-    """(`SIGNATURE_POINTS`, 3) [T] field over time in units of the time scale; NaN outside."""
+    """Field (`SIGNATURE_POINTS`, 3) [T] over time in units of the time scale; NaN outside."""
     if not np.isfinite(scale):
         return np.full((SIGNATURE_POINTS, 3), np.nan)
     at = time + scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN, SIGNATURE_POINTS)

@@ -1,1 +1,1 @@
-"""Health: what is wrong with the readings of a sensor."""
+"""Health: faults in the readings of a sensor."""

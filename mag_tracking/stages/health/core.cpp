@@ -1,4 +1,4 @@
-// The buffer of raw readings, as a Python module; see reading_buffer.py.
+// Python module of the buffer of raw readings; see reading_buffer.py.
 
 #include "../../python.hpp"
 
@@ -8,21 +8,22 @@ namespace {
 Size add_readings(Integers rows, Integers stamps, Array fields, std::int64_t received_ns, Size first,
                   Integers count, Integers stamp, Integers received, Array field) {
     const Size n = length_of(rows, "rows", 1), n_sensors = length_of(stamp, "stamp", 2);
-    const Size room = stamp.shape(1);
+    const Size capacity = stamp.shape(1);
     const std::int64_t *row = input_of(rows, "rows", {n}), *time = input_of(stamps, "stamps", {n});
     const double* value = input_of(fields, "fields", {n, 3});
     std::int64_t *counts = data_of(count, "count", {n_sensors});
-    std::int64_t *times = data_of(stamp, "stamp", {n_sensors, room});
-    std::int64_t *came = data_of(received, "received", {n_sensors, room});
-    double* values = data_of(field, "field", {n_sensors, room, 3});
+    std::int64_t *times = data_of(stamp, "stamp", {n_sensors, capacity});
+    std::int64_t *came = data_of(received, "received", {n_sensors, capacity});
+    double* values = data_of(field, "field", {n_sensors, capacity, 3});
     if (first < 0) throw py::index_error("first: negative");
     for (Size i = first; i < n; ++i) {
         const std::int64_t j = row[i];
         if (j < 0) continue;
-        if (j >= n_sensors) throw py::index_error("rows: there is no such sensor");
-        if (counts[j] < 0 || counts[j] > room) throw py::index_error("count: there is no such room");
-        if (counts[j] == room) return i;
-        const Size k = j * room + counts[j]++;
+        if (j >= n_sensors) throw py::index_error("rows: sensor index out of range");
+        if (counts[j] < 0 || counts[j] > capacity)
+            throw py::index_error("count: outside the capacity of the buffer");
+        if (counts[j] == capacity) return i;
+        const Size k = j * capacity + counts[j]++;
         times[k] = time[i], came[k] = received_ns;
         for (int a = 0; a < 3; ++a) values[3 * k + a] = value[3 * i + a];
     }
@@ -34,7 +35,7 @@ Size add_readings(Integers rows, Integers stamps, Array fields, std::int64_t rec
 
 PYBIND11_MODULE(core, m) {
     using namespace mag_tracking;
-    m.doc() = "The buffer of raw readings, compiled.";
+    m.doc() = "Compiled buffer of raw readings.";
     m.def("add_readings", &add_readings, IN(rows), IN(stamps), IN(fields), py::arg("received_ns"),
           py::arg("first"), IN(count), IN(stamp), IN(received), IN(field));
 }

@@ -1,8 +1,23 @@
-"""The buffer of raw readings, compiled."""
+"""Compiled buffer of raw readings."""
 
 from mag_tracking.arrays import FloatArray, IntArray
 
 def add_readings(rows: IntArray, stamps: IntArray, fields: FloatArray, received_ns: int, first: int,
                  count: IntArray, stamp: IntArray, received: IntArray, field: FloatArray) -> int:
-    """`ReadingBuffer.add`; `count` (n_sensors,), `stamp` and `received` (n_sensors, room) and
-    `field` (n_sensors, room, 3) are changed."""
+    """As `ReadingBuffer.add`.
+
+    Parameters
+    ----------
+    rows, stamps, fields, received_ns, first
+        As for `ReadingBuffer.add`.
+    count : (n_sensors,) int array
+        Number of buffered readings; updated in place.
+    stamp, received : (n_sensors, capacity) int array, ns
+        Updated in place.
+    field : (n_sensors, capacity, 3) array, T
+        Updated in place.
+
+    Returns
+    -------
+    int
+    """

@@ -1,6 +1,6 @@
-"""Raw readings that wait to be looked at: arrays, filled by compiled code.
+"""Buffer of raw readings, filled by compiled code.
 
-Who looks at ten thousand readings a second one by one does nothing else.
+Processing ten thousand readings per second one by one would occupy a whole core.
 """
 
 import numpy as np
@@ -11,41 +11,59 @@ from mag_tracking.stages.health import core
 
 
 class ReadingBuffer:
-    """Of each of `n` sensors up to `room` readings, in the order in which they came."""
+    """Raw readings of several sensors, each in order of arrival.
 
-    def __init__(self, n: int, room: int) -> None:
+    Parameters
+    ----------
+    n : int
+        Number of sensors.
+    capacity : int
+        Maximum number of readings per sensor.
+    """
+
+    def __init__(self, n: int, capacity: int) -> None:
         self._count = np.zeros(n, dtype=np.int64)
-        self._stamp, self._received = np.zeros((2, n, room), dtype=np.int64)
-        self._field = np.zeros((n, room, 3))
+        self._stamp, self._received = np.zeros((2, n, capacity), dtype=np.int64)
+        self._field = np.zeros((n, capacity, 3))
 
     def add(self, rows: IntArray, stamps: IntArray, fields: FloatArray, received_ns: int,
             first: int) -> int:
-        """Take readings from the one at `first` on, as long as there is room.
+        """Add readings, starting with the one at `first`, until the buffer of a sensor is full.
 
         Parameters
         ----------
-        rows : (n,) int
-            Whose they are; those of negative rows are left out.
-        stamps : (n,) int [ns]
-        fields : (n, 3) [T]
-        received_ns : int
-            When they all came.
+        rows : (n,) int array
+            Sensors of the readings; negative rows are ignored.
+        stamps : (n,) int array, ns
+        fields : (n, 3) array, T
+        received_ns : int, ns
+            Time of receipt of all readings.
         first : int
 
         Returns
         -------
         int
-            The first reading there is no room for, until those of its sensor are taken; n if
-            there is none.
+            Index of the first reading whose sensor has a full buffer; n if all were added.
         """
         return core.add_readings(plain(rows, np.int64), plain(stamps, np.int64), plain(fields),
                                  received_ns, first, self._count, self._stamp, self._received,
                                  self._field)
 
-    def take(self, j: int) -> tuple[IntArray, FloatArray, IntArray]:
-        """(stamps (k,) [ns], fields (k, 3) [T], received (k,) [ns]) of sensor `j`; no copies.
+    def pop(self, j: int) -> tuple[IntArray, FloatArray, IntArray]:
+        """Remove the readings of a sensor from the buffer.
 
-        They wait no more: another reading of the sensor takes their place.
+        The arrays are views: the next readings of the sensor overwrite them.
+
+        Parameters
+        ----------
+        j : int
+            Row of the sensor.
+
+        Returns
+        -------
+        stamps : (k,) int array, ns
+        fields : (k, 3) array, T
+        received : (k,) int array, ns
         """
         k, self._count[j] = int(self._count[j]), 0
         return self._stamp[j, :k], self._field[j, :k], self._received[j, :k]

@@ -1,6 +1,6 @@
-"""Health: what is wrong with the readings of a sensor, and what to do about it.
+"""Health: faults in the readings of a sensor, with advice.
 
-It only looks: nothing is changed or held back. Memory is bounded by a window of readings.
+Readings are only monitored, never changed or held back. Memory is bounded by a window of readings.
 """
 
 from collections import Counter
@@ -13,37 +13,40 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE, MIN_CHANGES
-from mag_tracking.stages.health.window import median_field, noise_of, quantiles
+from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 
 WINDOW = 512
-"""Readings that rates, noise and delays are of; the latest."""
-EVERY = 64
-"""So often they are looked at as a whole."""
-STEP_S = 0.25
-"""[s] A clock has stepped where a stamp is off by more while the reading came in time."""
-REPLAYED_S = 86400.0
-"""[s] Older stamps are of a replay (or of another clock: `apps.doctor` compares sensors)."""
-LOST = 1.5
-"""An interval longer than so many usual ones has lost readings in it."""
-IRREGULAR = 0.3
-"""Where intervals scatter by more than this share, nobody can count what is lost."""
+"""Number of latest readings from which rates, noise and delays are computed."""
+UPDATE_INTERVAL = 64
+"""Number of new readings after which the statistics are updated."""
+CLOCK_STEP_S = 0.25
+"""[s] A clock has stepped if a timestamp is off by more although the reading arrived on time."""
+MAX_LIVE_DELAY_S = 86400.0
+"""[s] Older timestamps belong to a replay, or to another clock; `apps.doctor` compares the
+sensors."""
+GAP_RATIO = 1.5
+"""Readings are lost in an interval that is longer than the median interval by this factor."""
+MAX_JITTER = 0.3
+"""Lost readings are not counted if the intervals scatter by more than this fraction."""
 STUCK_S = 1.0
-"""[s] Readings that stay the same for longer are of a sensor that is stuck."""
-MOVED = 10.0
-"""[steps] A target that moves one axis by so many moves the others by one at least."""
-SPIKE = 30.0
-"""A reading that is off both its neighbours, the same way, by so many noise deviations."""
+"""[s] A sensor is stuck if its readings are identical for longer than this."""
+MIN_MOVED_STEPS = 10.0
+"""A target that moves one axis by this number of quantisation steps moves all others by at least
+one."""
+SPIKE_STD = 30.0
+"""A spike differs from both neighbours, in the same direction, by this number of noise standard
+deviations."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is wrong."""
+    """A fault, and advice on how to fix it."""
 
     serious: bool
-    """What comes of it is wrong, not only worse."""
+    """Whether results are wrong, not only less accurate."""
     subject: str
-    """The sensor, or the stage."""
+    """Sensor or stage."""
     what: str
     advice: str
 
@@ -52,14 +55,18 @@ class Finding:
 
 
 class SensorHealth:
-    """Looks at the readings of one sensor as they come.
+    """Monitors the readings of one sensor.
 
-    That is whenever `every` so many have come, and before each answer; or when many are
-    given at once.
+    Statistics are updated after every `update_interval` readings, before each query, and for each
+    batch.
+
+    Parameters
+    ----------
+    update_interval : int, optional
     """
 
-    def __init__(self, every: int = EVERY) -> None:
-        self._every = every
+    def __init__(self, update_interval: int = UPDATE_INTERVAL) -> None:
+        self._update_interval = update_interval
         self._counts: Counter[str] = Counter()
         self._largest_step_s = 0.0
         self._new: list[tuple[int, FloatArray, int]] = []
@@ -68,74 +75,97 @@ class SensorHealth:
         self._fields: FloatArray = np.zeros((0, 3))
         self._interval_ns, self._spread = float('nan'), float('inf')
         self._noise: FloatArray = np.full(3, np.nan)
-        # What was made of the window, until new readings are taken into it.
-        self._made: dict[str, FloatArray] = {}
+        # Results for the present window; cleared when readings are added.
+        self._cache: dict[str, FloatArray] = {}
         self._delays: list[float] | None = None
-        # Since when the reading has been what it is, and how long ago one was stuck.
-        self._since_ns: int | None = None
-        self._stuck_ago = WINDOW
-        # Length of the present run of equal readings, and how often readings were equal to the one
-        # before, or were not; of each axis whether it has ever changed.
+        # Timestamp of the first of the identical latest readings; number of readings since the last
+        # stuck one.
+        self._unchanged_since_ns: int | None = None
+        self._n_since_stuck = WINDOW
+        # Length of the present run of identical readings; number of readings that repeated the
+        # previous one, and of those that did not; whether each axis has ever changed.
         self._run, self._repeats, self._changes = 0, 0, 0
         self._has_changed = np.zeros(3, dtype=bool)
         self._steps: FloatArray = np.full(3, np.inf)
 
     def add(self, stamp_ns: int, field: FloatArray, received_ns: int | None = None) -> None:
-        """A reading: `field` (3,) [T] as the sensor gave it; `received_ns` by the host's clock."""
+        """Add a reading.
+
+        Parameters
+        ----------
+        stamp_ns : int, ns
+        field : (3,) array, T
+            As measured, without calibration.
+        received_ns : int, ns, optional
+            Time of receipt by the clock of the host.
+        """
         self._new.append((stamp_ns, field, NEVER if received_ns is None else received_ns))
-        if len(self._new) == self._every:
-            self.look()
+        if len(self._new) == self._update_interval:
+            self.update()
 
     @property
     def counts(self) -> 'Counter[str]':
-        """`readings`, `lost`, `duplicates`, `stamps that went back`, `clock steps`, `spikes`,
-        `saturated`, `without any axis`, `stuck readings`; and `x`, `y`, `z` missing."""
-        self.look()
+        """Number of readings and of each kind of fault.
+
+        The keys are `readings`, `lost`, `duplicates`, `backward timestamps`, `clock steps`,
+        `spikes`, `saturated`, `without any axis` and `stuck readings`; `x`, `y` and `z` count
+        missing axes.
+        """
+        self.update()
         return self._counts
 
-    def look(self) -> None:
-        """Take the new readings into the window."""
+    def update(self) -> None:
+        """Include the new readings in the window."""
         if self._new:
             stamps, fields, received = zip(*self._new, strict=True)
             self._new = []
-            self.take(np.array(stamps, dtype=np.int64), np.array(fields, dtype=float),
-                      np.array(received, dtype=np.int64))
+            self.add_batch(np.array(stamps, dtype=np.int64), np.array(fields, dtype=float),
+                           np.array(received, dtype=np.int64))
 
-    def take(self, stamps: IntArray, fields: FloatArray, received: IntArray) -> None:
-        """Take readings into the window: (n,) [ns], (n, 3) [T], and (n,) [ns] or `NEVER`.
+    def add_batch(self, stamps: IntArray, fields: FloatArray, received: IntArray) -> None:
+        """Add readings to the window directly.
 
-        No more than `WINDOW` at once; they may be changed later. Those of `add` are not waited
-        for: it is either the one or the other.
+        The arrays may be modified afterwards. Readings that `add` has buffered are not included
+        first, so use either `add` or `add_batch`.
+
+        Parameters
+        ----------
+        stamps : (n,) int array, ns
+            At most `WINDOW` readings.
+        fields : (n, 3) array, T
+        received : (n,) int array, ns
+            Time of receipt, or `NEVER`.
         """
-        n, self._made, self._delays = len(stamps), {}, None
+        n, self._cache, self._delays = len(stamps), {}, None
         if not n:
             return
         self._stamps = np.append(self._stamps, stamps)[-WINDOW:]
         self._received = np.append(self._received, received)[-WINDOW:]
         self._fields = np.append(self._fields, fields, axis=0)[-WINDOW:]
         self._counts['readings'] += n
-        self._in_time(n)
-        self._values(n)
+        self._check_timestamps(n)
+        self._check_fields(n)
 
-    def _in_time(self, n: int) -> None:
-        """Count what is wrong with the stamps of the `n` latest."""
-        # With the one before them, where there is one.
+    def _check_timestamps(self, n: int) -> None:
+        """Count the faults in the timestamps of the `n` latest readings."""
+        # Including the interval from the reading before, if there is one.
         intervals = np.diff(self._stamps[-n - 1:])
         known = self._received[-n - 1:] != NEVER
         receipts = np.diff(np.where(known, self._received[-n - 1:], 0)) / NS
         steps = receipts - intervals / NS
         usual = 0.0 if np.isnan(self._interval_ns) else self._interval_ns / NS
-        # Of the two the stamp has to be the odd one: a host that stalls, and what it reads in a
-        # burst then, are no step.
-        stepped = known[1:] & known[:-1] & (np.abs(steps) > STEP_S) \
-            & (np.abs(receipts - usual) < STEP_S) & (np.abs(intervals / NS - usual) > STEP_S)
+        # Only a timestamp that is irregular while the receipt is regular is a step. A host that
+        # stalls and then reads a burst is not.
+        stepped = known[1:] & known[:-1] & (np.abs(steps) > CLOCK_STEP_S) \
+            & (np.abs(receipts - usual) < CLOCK_STEP_S) \
+            & (np.abs(intervals / NS - usual) > CLOCK_STEP_S)
         if stepped.any():
             self._counts['clock steps'] += int(stepped.sum())
             self._largest_step_s = max(self._largest_step_s, *steps[stepped].tolist(), key=abs)
         self._counts['duplicates'] += int((intervals == 0).sum())
-        self._counts['stamps that went back'] += int((intervals < 0).sum())
-        if self._spread < IRREGULAR:
-            long = (intervals > LOST * self._interval_ns) & (intervals < 3600 * NS) & ~stepped
+        self._counts['backward timestamps'] += int((intervals < 0).sum())
+        if self._spread < MAX_JITTER:
+            long = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~stepped
             self._counts['lost'] += int(np.sum(np.round(intervals[long] / self._interval_ns) - 1))
         forward = np.diff(self._stamps)
         forward = forward[forward > 0]
@@ -144,53 +174,54 @@ class SensorHealth:
             self._spread = quantiles(np.abs(forward - self._interval_ns), 0.5)[0] \
                 / self._interval_ns
 
-    def _values(self, n: int) -> None:
-        """Count what is wrong with the fields of the `n` latest."""
+    def _check_fields(self, n: int) -> None:
+        """Count the faults in the fields of the `n` latest readings."""
         missing = np.isnan(self._fields[-n:])
         for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
             self._counts[axis] += count
         self._counts['without any axis'] += int(missing.all(axis=1).sum())
-        self._stuck(n)
-        # With the two before them; the last one's neighbour is still to come.
+        self._check_stuck(n)
+        # Including the two readings before, because the last reading has no successor yet.
         fields = self._fields[-n - 2:]
         before, after = np.diff(fields, axis=0)[:-1], -np.diff(fields, axis=0)[1:]
         self._steps = np.minimum(self._steps, smallest_steps(fields))
-        # A comparison with NaN is false: without a known noise there is no spike.
+        # A comparison with NaN is false: as long as the noise is unknown, there are no spikes.
         noise = np.maximum(self._noise, self._steps / np.sqrt(12.0))
-        alone = (np.minimum(np.abs(before), np.abs(after)) > SPIKE * noise) & (before * after > 0.0)
+        alone = (np.minimum(np.abs(before), np.abs(after)) > SPIKE_STD * noise) \
+            & (before * after > 0.0)
         self._counts['spikes'] += int(alone.any(axis=1).sum())
-        if self._stuck_ago >= WINDOW:
-            self._noise = self._made['noise'] = noise_of(self._fields)
+        if self._n_since_stuck >= WINDOW:
+            self._noise = self._cache['noise'] = sample_noise_std(self._fields)
         cut = np.array([saturated_readings(axis) for axis in self._fields.T])[:, -n:]
         self._counts['saturated'] += int(np.count_nonzero(cut.any(axis=0)))
 
-    def _stuck(self, n: int) -> None:
-        """Count those of the `n` latest that have been the same for too long."""
+    def _check_stuck(self, n: int) -> None:
+        """Count those of the `n` latest readings that have been identical for too long."""
         stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
         equal = (fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])
         self._has_changed |= (~equal & ~np.isnan(fields[1:]) & ~np.isnan(fields[:-1])).any(axis=0)
         same = equal.all(axis=1)
         if len(same) < n:
             same = np.append(False, same)
-        # Of each reading the place of the one that it repeats; -1: from before these.
+        # Index of the reading that each one repeats; -1 = a reading before these.
         origin = np.maximum.accumulate(np.where(same, -1, np.arange(n)))
-        since = np.where(origin < 0, self._since_ns or 0, stamps[origin])
+        since = np.where(origin < 0, self._unchanged_since_ns or 0, stamps[origin])
         stuck = np.flatnonzero(stamps - since > STUCK_S * NS)
-        self._since_ns = int(since[-1])
+        self._unchanged_since_ns = int(since[-1])
         self._count_runs(same, since, stamps)
         if not self.is_coarse:
             self._counts['stuck readings'] += len(stuck)
-        self._stuck_ago = n - 1 - int(stuck[-1]) if len(stuck) else self._stuck_ago + n
+        self._n_since_stuck = n - 1 - int(stuck[-1]) if len(stuck) else self._n_since_stuck + n
 
     def _count_runs(self, same: BoolArray, since: IntArray, stamps: IntArray) -> None:
-        """Count repetitions: (n,) whether a reading equals the one before, since when [ns]."""
+        """Count repetitions: `same` (n,) = equal to the previous reading, `since` (n,) [ns]."""
         changed = np.flatnonzero(~same)
         if not len(changed):
             self._run += len(same)
             return
         lengths = np.diff(changed) - 1
         lasting = stamps[changed[1:] - 1] - since[changed[1:] - 1] > STUCK_S * NS
-        # A run that is a fault says little about what is usual.
+        # A faulty run is counted once, because it is not representative.
         self._repeats += int(np.where(lasting, 1, lengths).sum())
         first = self._run + int(changed[0])
         usual = STUCK_S * NS / self._interval_ns if self._interval_ns > 0 else np.inf
@@ -200,60 +231,60 @@ class SensorHealth:
 
     @property
     def is_coarse(self) -> bool:
-        """Whether the sensor repeats itself at rest, or has not changed often enough to tell."""
+        """Whether the sensor repeats readings at rest, or has changed too rarely to decide."""
         return self._changes < MIN_CHANGES \
             or self._repeats >= COARSE * (self._repeats + self._changes)
 
     @property
     def unchanged_since_ns(self) -> int | None:
-        """Timestamp since which the reading has been what it is; None without a reading."""
-        self.look()
-        return self._since_ns
+        """Timestamp [ns] since which the reading has not changed; None before the first reading."""
+        self.update()
+        return self._unchanged_since_ns
 
     @property
     def rate(self) -> float:
-        """[Hz] of the latest readings; NaN before there are enough."""
-        self.look()
+        """Rate of the latest readings [Hz]; NaN until there are enough."""
+        self.update()
         return NS / self._interval_ns
 
     @property
     def noise_std(self) -> FloatArray:
-        """(3,) [T] by differences of neighbours, so that a target that passes is not in it."""
-        return self._once('noise', noise_of)
+        """Noise of the readings without passing targets, (3,) T, from second differences."""
+        return self._cached('noise', sample_noise_std)
 
     @property
     def field(self) -> FloatArray:
-        """(3,) [T] median of the latest readings; NaN of an axis that none has."""
-        return self._once('median', median_field)
+        """Median of the latest readings, (3,) T; NaN for a missing axis."""
+        return self._cached('median', median_field)
 
-    def _once(self, name: str, make: Callable[[FloatArray], FloatArray]) -> FloatArray:
-        """`make` of the fields in the window; once, however often it is asked for."""
-        self.look()
-        if name not in self._made:
-            self._made[name] = make(self._fields)
-        return self._made[name]
+    def _cached(self, name: str, make: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Result of `make` for the fields in the window, computed once."""
+        self.update()
+        if name not in self._cache:
+            self._cache[name] = make(self._fields)
+        return self._cache[name]
 
     @property
     def dead_axes(self) -> str:
-        """Such as 'xz': axes that have not changed in a window in which another one did.
+        """Axes that did not change within a window in which another axis did, such as 'xz'.
 
-        Of a sensor with coarse steps those that have never changed, while another one moved by
-        more than `MOVED` of its steps.
+        For a sensor with coarse resolution: axes that have never changed, while another axis moved
+        by more than `MIN_MOVED_STEPS` of its steps.
         """
-        self.look()
+        self.update()
         if len(self._fields) < WINDOW:
             return ''
         there = ~np.isnan(self._fields).any(axis=0)
         still = there & (self._fields == self._fields[0]).all(axis=0)
         if self.is_coarse:
-            moved = np.ptp(self._fields, axis=0) > MOVED * smallest_steps(self._fields)
+            moved = np.ptp(self._fields, axis=0) > MIN_MOVED_STEPS * smallest_steps(self._fields)
             still &= ~self._has_changed & (moved & there).any()
         return ''.join(np.array(list('xyz'))[still]) if still.sum() < there.sum() else ''
 
     @property
     def delay_s(self) -> list[float]:
-        """(median, 5 %, 95 %) [s] from stamp to receipt; NaN where receipts are not known."""
-        self.look()
+        """Delay [s] from timestamp to receipt: median, 5 % and 95 %; NaN if unknown."""
+        self.update()
         if self._delays is None:
             known = self._received != NEVER
             delays = (self._received - self._stamps)[known] / NS
@@ -262,22 +293,26 @@ class SensorHealth:
 
     def findings(self, name: str, noise_std: FloatArray | None = None,
                  max_field: float = 1e-3, is_live: bool = True) -> list[Finding]:
-        """What is wrong, the worst first: list of `Finding`.
+        """Faults of the sensor, the serious ones first.
 
         Parameters
         ----------
         name : str
-            Of the sensor.
-        noise_std : (3,) [T], optional
-            That it was calibrated to.
-        max_field : float [T]
-            Beyond this it is rejected.
-        is_live : bool
-            False for a recording that is played, perhaps over and over: its clock is no fault.
+            Name of the sensor.
+        noise_std : (3,) array, T, optional
+            Noise at the calibration.
+        max_field : float, T, optional
+            Readings above this value are rejected.
+        is_live : bool, optional
+            False for a replay, whose timestamps may lag or loop.
+
+        Returns
+        -------
+        list of Finding
         """
         n = self.counts['readings']
         if not n:
-            return [Finding(True, name, 'no reading', 'look at its cable, its driver and the topic '
+            return [Finding(True, name, 'no reading', 'check its cable, its driver and the topic '
                             'in the network file')]
         found = [*(self._clock_findings(name) if is_live else ()),
                  *self._time_findings(name, n), *self._value_findings(name, n, max_field)]
@@ -286,65 +321,64 @@ class SensorHealth:
             if np.nanmax(worse, initial=0.0) > 3.0:
                 axis = int(np.nanargmax(worse))
                 found.append(Finding(False, name, f'{"xyz"[axis]} is {worse[axis]:.0f} times as '
-                                     'noisy as it was calibrated', 'look for a new source beside '
-                                     'it (a motor, a cable), or calibrate anew'))
+                                     'noisy as at its calibration', 'remove a new source of '
+                                     'interference nearby (a motor, a cable), or calibrate again'))
         return sorted(found, key=lambda f: not f.serious)
 
     def _clock_findings(self, name: str) -> Iterator[Finding]:
         """Faults of the clock."""
         if n := self.counts['clock steps']:
-            yield Finding(True, name, f'its clock stepped {n} times against the '
-                          f'host\'s, by up to {self._largest_step_s:+.2f} s', 'let the clocks '
-                          'follow one source (chrony, PTP), and stamp by a monotonic one')
-        if n := self.counts['stamps that went back']:
-            yield Finding(True, name, f'stamps went back {n} times',
-                          'two publishers on one topic, a clock that was set, or a looped replay')
+            yield Finding(True, name, f'its clock stepped {n} times relative to the '
+                          f'host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
+                          'clocks (chrony, PTP), and take timestamps from a monotonic clock')
+        if n := self.counts['backward timestamps']:
+            yield Finding(True, name, f'timestamps went back {n} times', 'check for two publishers '
+                          'on one topic, a clock that was set, or a looped replay')
 
     def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
         """Faults of the timestamps."""
         c = self.counts
         middle, low, high = self.delay_s
         if c['duplicates'] > 0.001 * n:
-            yield Finding(False, name, f'{c["duplicates"]} of {n} readings have the stamp of the '
-                          'one before', 'the driver publishes readings twice, or stamps too '
-                          'coarsely')
+            yield Finding(False, name, f'{c["duplicates"]} of {n} readings repeat the previous '
+                          'timestamp', 'check whether the driver publishes readings twice, or '
+                          'whether its timestamps are too coarse')
         if c['lost'] > 0.01 * n:
-            yield Finding(c['lost'] > 0.2 * n, name, f'{c["lost"]} readings are missing between '
-                          f'{n}', 'look at the link, and at the queue of whoever records')
-        if c['clock steps'] or abs(middle) > REPLAYED_S:
+            yield Finding(c['lost'] > 0.2 * n, name, f'{c["lost"]} readings were lost, {n} were '
+                          'received', 'check the link, and the queue size of the recorder')
+        if c['clock steps'] or abs(middle) > MAX_LIVE_DELAY_S:
             return
         if high - low > 0.05:
             yield Finding(False, name, f'readings take {1e3 * low:.0f} to {1e3 * high:.0f} ms to '
-                          'come', 'stamps by the sensor itself would be truer than by receipt')
+                          'arrive', 'use timestamps of the sensor instead of the time of receipt')
         elif abs(middle) > 1.0:
-            yield Finding(False, name, f'stamps are {middle:.1f} s before they are received',
-                          'the clocks of sensor and host disagree; calibrate with knocks')
+            yield Finding(False, name, f'the delay from timestamp to receipt is {middle:.1f} s',
+                          'the clocks of sensor and host disagree: calibrate them with knocks')
 
     def _value_findings(self, name: str, n: int, max_field: float) -> Iterator[Finding]:
-        """What is wrong with fields."""
+        """Faults of the fields."""
         c = self.counts
         size = float(np.sqrt(np.nansum(self.field**2)))
         if size > max_field:
             yield Finding(True, name, f'a field of {size:.3g} T is rejected, the limit is '
-                          f'{max_field:g} T', 'gauss or microtesla published as tesla? Near a '
-                          'magnet raise calibrate.max_field')
+                          f'{max_field:g} T', 'check the unit (gauss or microtesla published as '
+                          'tesla?), or near a magnet raise calibrate.max_field')
         if c['without any axis'] > 0.01 * n:
-            yield Finding(True, name, f'{c["without any axis"]} of {n} readings have no axis at '
-                          'all', 'look at the sensor and its driver')
+            yield Finding(True, name, f'{c["without any axis"]} of {n} readings have no valid '
+                          'axis', 'check the sensor and its driver')
         for axis in self.dead_axes:
-            yield Finding(True, name, f'{axis} does not change', 'the axis is dead: look at the '
+            yield Finding(True, name, f'{axis} does not change', 'the axis is dead: check the '
                           'sensor and its driver')
         for axis in 'xyz':
             if 0.01 * n < c[axis] - c['without any axis'] and c[axis] < 0.99 * n:
                 yield Finding(False, name, f'{axis} is missing in {c[axis]} of {n} readings',
-                              'look at the sensor and its driver')
+                              'check the sensor and its driver')
         if c['stuck readings']:
-            yield Finding(True, name, f'{c["stuck readings"]} readings are the same as all for '
-                          f'more than {STUCK_S:g} s before', 'the sensor or its driver is stuck: '
-                          'switch it off and on')
+            yield Finding(True, name, f'{c["stuck readings"]} readings are identical to all of the '
+                          f'{STUCK_S:g} s before', 'the sensor or its driver is stuck: restart it')
         if c['saturated'] > 0.001 * n:
-            yield Finding(True, name, f'{c["saturated"]} of {n} readings stand at the end of the '
-                          'range', 'set a larger range, or move the sensor away')
+            yield Finding(True, name, f'{c["saturated"]} of {n} readings are at the end of the '
+                          'range', 'set a larger range, or move the sensor further away')
         if c['spikes'] > 0.001 * n:
-            yield Finding(False, name, f'{c["spikes"]} of {n} readings are spikes', 'look at '
-                          'plugs, supply and checksums')
+            yield Finding(False, name, f'{c["spikes"]} of {n} readings are spikes', 'check '
+                          'connectors, power supply and checksums')

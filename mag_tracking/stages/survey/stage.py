@@ -1,6 +1,7 @@
-"""Survey: how each sensor of a network is turned, and how far its clock is off.
+"""Survey: orientation and clock offset of each sensor of a network.
 
-Source: T10 section 6.3: knocks that all sensors feel, accelerometer, compass.
+The methods are those of T10 section 6.3: knocks that all sensors measure, accelerometers, and the
+field of the Earth.
 """
 
 from collections import Counter, deque
@@ -30,45 +31,50 @@ from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NS
 
 MAX_GAP_S = 3600.0
-"""[s] After a longer gap, or a step back, what was collected is of another time."""
+"""[s] After a longer gap or a backward jump, earlier readings belong to another recording."""
 
-SURE_STATED = 1e-3
-"""[rad] Nobody states an orientation better than this."""
+MIN_STATED_STD = 1e-3
+"""[rad] Minimum standard deviation of a stated orientation."""
 
 
 @dataclass(frozen=True)
 class SensorSurvey:
-    """What was found of one sensor."""
+    """Result of the survey for one sensor."""
 
     sensor: str
     orientation: Orientation | None
-    """None: it stays as it was stated."""
+    """None if the stated orientation is kept."""
     by: str
-    """What the orientation comes from."""
+    """Source of the orientation."""
     lag: Lag | None
-    """Of its clock; None for the sensor that the others are compared with."""
+    """Offset of its clock; None for the sensor with the reference clock."""
     warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class NetworkSurvey:
-    """What was found of a network."""
+    """Result of the survey for a network."""
 
     network: SensorNetwork
-    """With orientations and clock offsets as they were found."""
+    """With the surveyed orientations and clock offsets."""
     sensors: tuple[SensorSurvey, ...]
     disagreements: tuple[Disagreement, ...]
-    """Sensors that do not measure the Earth; their headings stay as stated."""
+    """Sensors that do not measure the field of the Earth; they keep their stated headings."""
     bias_std: float
-    """[T] that the compasses were counted with."""
+    """[T] Standard deviation of the compass biases."""
     reference: str
-    """The sensor whose clock is the network's; empty where none felt a knock with another."""
+    """Sensor with the reference clock; empty if no two sensors measured the same knock."""
     shocks: dict[str, tuple[FloatArray, FloatArray]]
-    """{sensor: (t (n,) [s], shock (n,) [m/s^2])} of those with accelerations; each by its own
-    clock, from the first reading of all."""
+    """{sensor: (t (n,) [s], shock (n,) [m/s^2])} for sensors with accelerations; times by the clock
+    of each sensor, from the first reading of all sensors."""
 
     def warnings(self) -> list[str]:
-        """What somebody should know: list of text."""
+        """Warnings for the user.
+
+        Returns
+        -------
+        list of str
+        """
         out = [str(d) for d in self.disagreements]
         reasons = {s.sensor: s.lag.reason for s in self.sensors if s.lag and s.lag.reason}
         out += [f'{s.sensor}: {text}' for s in self.sensors for text in s.warnings]
@@ -76,23 +82,44 @@ class NetworkSurvey:
             out += [f'{name}: clock: {reason}' for name, reason in reasons.items()]
         elif len(self.sensors) > 1:
             because = ', '.join(sorted(set(reasons.values()))) or 'too few accelerometers'
-            out.append(f'clocks stay as they were: {because}')
+            out.append(f'clock offsets are unchanged: {because}')
         return out
 
 
 class Survey:
-    """Collects accelerations; `solve` makes orientations and clock offsets of them."""
+    """Collects accelerations, from which `solve` computes orientations and clock offsets.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : SurveySettings
+
+    Attributes
+    ----------
+    counts : Counter of str
+        Number of accepted and rejected accelerations.
+    """
 
     def __init__(self, network: SensorNetwork, settings: SurveySettings) -> None:
         self.counts: Counter[str] = Counter()
-        # What an earlier survey found is no further evidence.
+        # The result of an earlier survey is not additional evidence.
         self._network, self._settings = network.with_stated_orientations(), settings
-        self._kept: dict[str, deque[tuple[int, FloatArray]]] = {
+        self._accelerations: dict[str, deque[tuple[int, FloatArray]]] = {
             name: deque(maxlen=settings.max_accelerations) for name in network.names}
 
     def feed(self, sample: AccelerationSample) -> list[NetworkSurvey]:
-        """Take an `AccelerationSample`: []."""
-        kept = self._kept.get(sample.sensor)
+        """Add an acceleration.
+
+        Parameters
+        ----------
+        sample : AccelerationSample
+
+        Returns
+        -------
+        list of NetworkSurvey
+            Always empty.
+        """
+        kept = self._accelerations.get(sample.sensor)
         if kept is None:
             self.counts[f'rejected: acceleration of unknown sensor {sample.sensor}'] += 1
         elif not np.isfinite(sample.acceleration).all():
@@ -110,21 +137,26 @@ class Survey:
         return []
 
     def idle(self) -> None:
-        """Nothing waits."""
+        """Do nothing: no work is deferred."""
 
     def flush(self) -> list[NetworkSurvey]:
-        """Nothing is held back: []."""
+        """Return nothing: no record is held back.
+
+        Returns
+        -------
+        list of NetworkSurvey
+        """
         return []
 
     def solve(self, fields: Mapping[str, FloatArray], date: str) -> NetworkSurvey:
-        """What the accelerations so far and the sensors' fields say.
+        """Compute the survey from the accelerations so far and the fields of the sensors.
 
         Parameters
         ----------
-        fields : {sensor: (3,) [T], sensor frame}
-            Without a target; NaN = axis not reported. A sensor may be missing.
+        fields : mapping of str to (3,) array, T, sensor frame
+            Field of each sensor without a target. NaN = axis not reported; a sensor may be missing.
         date : str
-            What the calibration is marked with.
+            Date of the calibration.
 
         Returns
         -------
@@ -133,7 +165,7 @@ class Survey:
         network, names = self._network, self._network.names
         field = np.array([fields.get(name, np.full(3, np.nan)) for name in names])
         stated_std = np.array([np.full(3, np.deg2rad(self._settings.stated_std_deg))
-                               if s is None else np.maximum(s, SURE_STATED)
+                               if s is None else np.maximum(s, MIN_STATED_STD)
                                for s in network.orientation_std])
         warnings: dict[str, list[str]] = {name: [] for name in names}
         ups = [self._up(name, warnings[name]) for name in names]
@@ -142,36 +174,37 @@ class Survey:
         for name, before, now, std in zip(names, network.R_ws, level, stated_std, strict=True):
             if now is not None:
                 warnings[name] += _tilt_warning(before, now.R_ws, std, now.std)
-        odd = self._odd(field, level, stated_std, warnings)
-        bias_std, turned = self._compass(
+        disagreeing = self._disagreements(field, level, stated_std, warnings)
+        bias_std, oriented = self._compass(
             {j: u for j, u in enumerate(ups) if u is not None and names[j] not in
-             {d.sensor for d in odd}}, field, stated_std, warnings)
+             {d.sensor for d in disagreeing}}, field, stated_std, warnings)
         shocks = self._shocks()
         reference, lags = self._lags(shocks)
         sensors = []
         for j, name in enumerate(names):
-            orientation, by = turned.get(j, (level[j], 'accelerometer, heading as stated'))
+            orientation, by = oriented.get(j, (level[j], 'accelerometer, heading as stated'))
             sensors.append(SensorSurvey(
                 name, orientation, 'as stated' if orientation is None else by, lags.get(name),
                 tuple(warnings[name])))
-        return NetworkSurvey(self._surveyed(sensors, reference, date), tuple(sensors), tuple(odd),
-                             bias_std, reference, shocks)
+        return NetworkSurvey(self._updated_network(sensors, reference, date), tuple(sensors),
+                             tuple(disagreeing), bias_std, reference, shocks)
 
     def _up(self, name: str, warnings: list[str]) -> UpDirection | None:
-        """`UpDirection` of a sensor, or None with a warning."""
-        if not self._kept[name]:
-            warnings.append('no accelerations: its orientation is not surveyed')
+        """Vertical direction of a sensor, or None with a warning."""
+        if not self._accelerations[name]:
+            warnings.append('no accelerations; the orientation is not surveyed')
             return None
         try:
-            return up_direction(np.array([a for _, a in self._kept[name]]),
+            return up_direction(np.array([a for _, a in self._accelerations[name]]),
                                 self._settings.accelerometer_bias)
         except ValueError as error:
-            warnings.append(f'{error}: its orientation stays as stated')
+            warnings.append(f'{error}; the stated orientation is kept')
             return None
 
-    def _odd(self, field: FloatArray, level: Sequence[Orientation | None], stated_std: FloatArray,
-             warnings: Mapping[str, list[str]]) -> list[Disagreement]:
-        """The sensors that disagree with the Earth; [] where nothing is there to compare with."""
+    def _disagreements(self, field: FloatArray, level: Sequence[Orientation | None],
+                       stated_std: FloatArray, warnings: Mapping[str, list[str]]
+                       ) -> list[Disagreement]:
+        """Sensors that disagree with the field of the Earth; empty if that field is unknown."""
         network = self._network
         R = np.array([R if o is None else o.R_ws for o, R in zip(level, network.R_ws, strict=True)])
         std = np.array([s if o is None else o.std for o, s in zip(level, stated_std, strict=True)])
@@ -185,14 +218,14 @@ class Survey:
     def _compass(self, ups: Mapping[int, UpDirection], field: FloatArray, stated_std: FloatArray,
                  warnings: Mapping[str, list[str]]
                  ) -> tuple[float, dict[int, tuple[Orientation, str]]]:
-        """(bias_std, {row: (Orientation, by)}) of the sensors that have what it takes."""
+        """Bias [T] and {row: (orientation, source)} of sensors with accelerometer and compass."""
         network, bias_std = self._network, self._settings.compass_bias_std
         usable = {j: up for j, up in ups.items() if not np.isnan(field[j]).all()}
         if network.earth_field is None or not usable:
             return bias_std, {}
         found: dict[int, Orientation] = {}
-        blind: dict[int, str] = {}
-        # Twice: how large biases are is seen when the headings are known.
+        failures: dict[int, str] = {}
+        # Two passes, because the biases can be estimated only when the headings are known.
         for _ in range(2):
             found = {}
             for j, up in usable.items():
@@ -200,29 +233,30 @@ class Survey:
                     found[j] = compass_orientation(up, field[j], network.earth_field, bias_std,
                                                    network.R_ws[j])
                 except ValueError as error:
-                    blind[j] = str(error)
+                    failures[j] = str(error)
             bias_std = pooled_bias_std(list(found.values()), self._settings.compass_bias_std)
-        for j in blind.keys() - found.keys():
-            warnings[network.names[j]].append(blind[j])
+        for j in failures.keys() - found.keys():
+            warnings[network.names[j]].append(failures[j])
         out = {}
         for j, orientation in found.items():
             both = with_stated_heading(orientation, network.R_ws[j], stated_std[j][2])
             name = network.names[j]
             if both is None:
                 away = np.degrees(yaw_between(network.R_ws[j], orientation.R_ws))
-                warnings[name].append(f'heads {away:+.0f} degrees from what the network file says, '
-                                      'by its compass: it stays as stated')
+                warnings[name].append(f'the compass heading differs by {away:+.0f} degrees from '
+                                      'the network file; the stated heading is kept')
             elif not np.isnan(orientation.rival):
-                warnings[name].append('its compass allows another heading, '
+                warnings[name].append('the compass allows another heading, at '
                                       f'{np.degrees(orientation.rival):+.0f} degrees from this one')
             if both is not None:
                 out[j] = both, 'accelerometer, compass and stated heading'
         return bias_std, out
 
     def _shocks(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """How each sensor was shaken."""
-        kept = {name: readings for name, readings in self._kept.items() if readings}
-        # From the first: seconds since 1970 leave a float few digits.
+        """Mechanical shock of each sensor over time."""
+        kept = {name: readings for name, readings in self._accelerations.items() if readings}
+        # Times are relative to the first reading, because seconds since 1970 lose digits in a
+        # float.
         first = min((readings[0][0] for readings in kept.values()), default=0)
         return {name: (np.array([(stamp - first) / NS for stamp, _ in readings]),
                        shock(np.array([a for _, a in readings])))
@@ -230,7 +264,7 @@ class Survey:
 
     def _lags(self, signals: Mapping[str, tuple[FloatArray, FloatArray]]
               ) -> tuple[str, dict[str, Lag]]:
-        """(reference sensor, {sensor: Lag}) by the knocks."""
+        """Reference sensor and {sensor: lag} from the knocks."""
         longest = self._settings.max_clock_offset_s
         first: dict[str, Lag] = {}
         for reference, (t, s) in signals.items():
@@ -241,12 +275,12 @@ class Survey:
             first = first or lags
         return '', first
 
-    def _surveyed(self, sensors: Sequence[SensorSurvey], reference: str,
-                  date: str) -> SensorNetwork:
-        """The network with what was found."""
+    def _updated_network(self, sensors: Sequence[SensorSurvey], reference: str,
+                         date: str) -> SensorNetwork:
+        """Network with the surveyed orientations and clock offsets."""
         network = self._network
         R_ws, clock = network.R_ws.copy(), network.clock_offset.copy()
-        # The reference keeps what was known of its clock: those not compared have the same zero.
+        # The reference clock keeps its offset, so that clocks without a comparison remain valid.
         zero = clock[network.index(reference)] if reference else 0.0
         std, done = list(network.orientation_std), list(network.calibrated)
         for j, s in enumerate(sensors):
@@ -263,18 +297,34 @@ class Survey:
 
 
 class NoiseSource(Protocol):
-    """What `with_noise` asks of a `Calibrate` stage."""
+    """Interface that `with_measured_noise` needs of a `Calibrate` stage."""
 
     def backgrounds(self) -> Mapping[str, RunningBackground]:
-        """The background of each sensor of the network, in its order."""
+        """Background of each sensor of the network, in order.
+
+        Returns
+        -------
+        mapping of str to RunningBackground
+        """
 
 
-def with_noise(network: SensorNetwork, calibrate: NoiseSource) -> SensorNetwork:
-    """The network with the noise that a `Calibrate` stage has found, where it has."""
+def with_measured_noise(network: SensorNetwork, calibrate: NoiseSource) -> SensorNetwork:
+    """Network with the noise that a `Calibrate` stage has measured.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    calibrate : NoiseSource
+
+    Returns
+    -------
+    SensorNetwork
+        Sensors without a complete measurement keep their noise.
+    """
     noise = list(network.noise_std)
     for j, background in enumerate(calibrate.backgrounds().values()):
         std = None if background.covariance is None else np.sqrt(np.diagonal(background.covariance))
-        # The file wants three numbers: an axis that is not reported has none.
+        # The network file needs three numbers, but an axis that is not reported has no noise.
         if std is not None and not np.isnan(std).any():
             noise[j] = std
     return replace(network, noise_std=tuple(noise))
@@ -282,8 +332,8 @@ def with_noise(network: SensorNetwork, calibrate: NoiseSource) -> SensorNetwork:
 
 def _tilt_warning(stated: FloatArray, found: FloatArray, stated_std: FloatArray,
                   found_std: FloatArray) -> list[str]:
-    """[text] where a sensor is tilted more than was stated, or []."""
+    """Warning if the tilt of a sensor differs from the stated one by more than its uncertainty."""
     tilt = np.arccos(np.clip((stated.T @ [0.0, 0.0, 1.0]) @ (found.T @ [0.0, 0.0, 1.0]), -1.0, 1.0))
     allowed = 3.0 * np.hypot(stated_std[:2].max(), found_std[:2].max())
-    return [f'is tilted by {np.degrees(tilt):.0f} degrees from what the network file says'] \
+    return [f'the tilt differs by {np.degrees(tilt):.0f} degrees from the network file'] \
         if tilt > allowed else []

@@ -13,9 +13,9 @@ from mag_tracking.physics.sources import Magnet, SourceModel
 from mag_tracking.physics.vehicles import MAX_TURN_RATE, RowVehicle
 from mag_tracking.records import FieldFrame, plain
 from mag_tracking.stages.track import core
-from mag_tracking.stages.track.observation import SAME_TIME_S, Observation
+from mag_tracking.stages.track.observation import TIME_RESOLUTION_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.unobserved_length import CAR_ROW
+from mag_tracking.stages.track.unobserved_length import MAX_CAR_ROW
 
 LINEAR_SHARE = 0.25
 """The field is approximately linear in the position within this share of the distance to the
@@ -105,7 +105,7 @@ class BankFilter:
             settings.vehicle.near_field_lengths if is_vehicle
             else settings.magnet.near_field_length).astype(float)
         self._are_long: BoolArray = np.array(
-            settings.vehicle.lengths if is_vehicle else [0.0]) > CAR_ROW
+            settings.vehicle.lengths if is_vehicle else [0.0]) > MAX_CAR_ROW
 
     def move(self, bank: FilterBank, dt: float) -> None:
         """Time update of a bank in place, without a measurement.
@@ -242,7 +242,7 @@ class BankFilter:
         offset: FloatArray = frame.time_offset
         if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_SHARE * dt:
             return self._no_offset
-        return np.round(offset / SAME_TIME_S) * SAME_TIME_S
+        return np.round(offset / TIME_RESOLUTION_S) * TIME_RESOLUTION_S
 
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
         """Variance of the model error of the field of a hypothesis.
@@ -369,7 +369,7 @@ class BankFilter:
         -------
         (n_hyp,) array, m
         """
-        return LINEAR_SHARE * self.observation.nearest(x)
+        return LINEAR_SHARE * self.observation.distance_to_nearest(x)
 
     def is_implausible(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
         """Whether the normalised innovation of a hypothesis exceeds `end_nis` per axis.

@@ -14,8 +14,8 @@ from mag_tracking.stages.track.disturbances import field_magnitudes
 from mag_tracking.stages.track.plausibility import moves_too_far
 from mag_tracking.stages.track.rigid_pass import (
     LONG_LENGTH,
+    MAX_MISFIT,
     MIN_DISTANCE,
-    MISFIT,
     RigidPass,
     fit_rigid_pass,
 )
@@ -211,7 +211,7 @@ class CrossCheck:
             return
         self.latest, self._has_whole_pass = found, self._has_risen
         if since <= STEADY_S:
-            self._is_misfit = found.misfit > MISFIT
+            self._is_misfit = found.misfit > MAX_MISFIT
 
     def _pass_doubts(self) -> set[str]:
         """Doubts from the latest fit."""

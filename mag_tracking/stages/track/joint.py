@@ -7,7 +7,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, energies_of
+from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, field_energies
 from mag_tracking.stages.track.relinearisation import Window
 
 CONFIDENT_NATS = 15.0
@@ -110,7 +110,7 @@ def are_sensed_by_two(joint: Joint) -> bool:
     """
     n, best = joint.bank.label.shape[1], joint.bank.best()
     for i in range(n - (1 if joint.replaced is None else 2), n):
-        energy = sum(energies_of(joint.bank_filter, i, path[best], frame) for path, frame in
+        energy = sum(field_energies(joint.bank_filter, i, path[best], frame) for path, frame in
                      zip(joint.window.paths, joint.window.frames, strict=True))
         if np.count_nonzero(energy > DETECTABLE_ENERGY) < 2:
             return False

@@ -102,7 +102,7 @@ class Member:
         self.early: list[TrackState] = []
         self.slot = 0
         self._spread = np.inf
-        self._unseen = target.unseen()
+        self._unobserved_length = target.unobserved_length()
         self._was_unambiguous = False
         # Timestamps and positions of the latest published poses.
         self._recent_positions: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_POSITIONS)
@@ -191,17 +191,18 @@ class Member:
         by = np.flatnonzero(measured.any(axis=1))
         alone = len(sensors.network) > 1 and len(by) == 1
         self.evidence.support(alone, dt)
-        if self._unseen is not None:
-            self._unseen.look(
+        if self._unobserved_length is not None:
+            self._unobserved_length.update(
                 view.bank.x[best], view.bank.P[best], sensors.network.positions[by],
                 self.last is not None and (self.evidence.doubted or not self.last.ambiguous))
         found = self.evidence.note(self._doubts(update, view, alone), frame.stamp_ns)
         excess = 1.0 if self._target.starts_anywhere else self.evidence.innovations.excess
-        return sensors.widened(published_track(
+        return sensors.for_whole_network(published_track(
             view.bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self.evidence.existence, degrees_of_freedom=int(measured.sum()),
-            found=found, excess=excess, unseen=self._unseen, difference=self.cross_check.difference,
+            found=found, excess=excess, unobserved_length=self._unobserved_length,
+            difference=self.cross_check.difference,
             ambiguous_poses=update.settings.ambiguous_poses,
             predicted=update.bank_filter.predicted_field(update.bank, best, frame, dt),
             mounting=view.observation.angles(view.bank.x[best].copy()),
@@ -240,7 +241,7 @@ class Member:
         if self._overfits(update, view):
             found.add(doubts.OVERFIT)
         found |= self.cross_check.doubts(self._clocks.apart_s(update.sensors.rows))
-        found |= self._plausibility.judge(
+        found |= self._plausibility.evaluate(
             view.observation, bank, best, settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), update.dt)
         for reason in found & doubts.PERMANENT:
@@ -268,7 +269,7 @@ class Member:
         str or None
         """
         assert self.last is not None
-        is_coming = not self._target.starts_anywhere and sensors.is_neared_by(self.last)
+        is_coming = not self._target.starts_anywhere and sensors.is_approached_by(self.last)
         return self.evidence.reason_to_end(self.last, self._spread, is_coming, settings)
 
     def unexplained(self, uniform: float) -> UnexplainedField | None:
@@ -337,8 +338,8 @@ class Member:
         ambiguous = doubtful or bool(ambiguities(bank, best, bank.apart(best)))
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
-            kind=int(bank.kind[best]), kinds=self._target.kinds, unseen=self._unseen,
-            complete=complete, difference=difference,
+            kind=int(bank.kind[best]), kinds=self._target.kinds,
+            unobserved_length=self._unobserved_length, complete=complete, difference=difference,
             ambiguous=ambiguous or self.evidence.was_filter_doubted(stamp_ns))
             for (stamp_ns, x, P), difference in zip(states, self.cross_check.differences(states),
                                                     strict=True)]

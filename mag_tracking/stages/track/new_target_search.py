@@ -20,7 +20,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
 from mag_tracking.stages.track.joint import Joint, are_sensed_by_two
 from mag_tracking.stages.track.new_target_evidence import IMPROBABLE
-from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, energy_of
+from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, field_energy
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.stages.track.window_search import WindowSearch
@@ -148,7 +148,7 @@ class NewTargetSearch:
         paths (n, n_frames, n_x).
         """
         window, bank = self._window, self._bank
-        order = np.argsort(-bank.log_w, kind='stable')[:window.most]
+        order = np.argsort(-bank.log_w, kind='stable')[:window.max_hypotheses]
         rows = np.searchsorted(window.anchor.origin, bank.origin[order])
         anchor, paths = window.anchor.rows(rows), np.stack([p[rows] for p in window.paths], axis=1)
         begin = int(window.is_updated)
@@ -189,7 +189,7 @@ class NewTargetSearch:
 
     def _is_sensed(self, known: KnownVehicles, i: int) -> bool:
         """Whether the sensors sense vehicle `i` in the last frame."""
-        return energy_of(
+        return field_energy(
             self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
 
     def _is_elsewhere(self, joint: Joint) -> bool:
@@ -233,7 +233,7 @@ class NewTargetSearch:
                  replaced: int | None) -> list[WindowStart]:
         """Starts of known vehicles and new ones on `paths` (k, 7) with moments (k, 3, 3)."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
-        labels = self._search.prior.nearest(paths)[0].tolist()
+        labels = self._search.prior.nearest_line(paths)[0].tolist()
         starts = []
         for kinds in product(range(len(self._vehicles.settings.kinds)), repeat=len(paths)):
             x, P, path = known.x, known.P, [known.path[:, :n_known]]
@@ -267,7 +267,7 @@ class NewTargetSearch:
         out = []
         for start in starts:
             turning = [P for P in (self._vehicles.turning(start.x, start.P, i)
-                                   for i in start.are_new) if P is not None]
+                                   for i in start.new_indices) if P is not None]
             out.append(replace(start, log_w=start.log_w + float(np.log(1.0 - share))
                                if turning else start.log_w))
             out += [replace(start, P=P, log_w=start.log_w + float(np.log(share / len(turning))))
@@ -301,10 +301,10 @@ class NewTargetSearch:
         A vehicle that stands still is not new.
         """
         settings, n = self._vehicles.settings, self._n_one
-        for i in start.are_new:
+        for i in start.new_indices:
             speed = np.hypot(*x[i * n + 3:i * n + 5])
             moment = np.linalg.norm(self._vehicles.hard_moments(x[i * n:]).sum(axis=0))
-            if not self._search.prior.slowest <= speed <= MAX_RATIO * max(settings.speeds) \
+            if not self._search.prior.min_speed <= speed <= MAX_RATIO * max(settings.speeds) \
                     or moment > MAX_RATIO * max(settings.moments):
                 return False
         return True
@@ -327,7 +327,7 @@ class NewTargetSearch:
                         self._window.intervals,
                         [np.ascontiguousarray(paths[rows, k]) for k in range(n_frames)],
                         [each.copy() for _ in range(n_frames)], float(log_sum_exp(log_w[rows])),
-                        self._window.most)
+                        self._window.max_hypotheses)
         n_targets = len(starts[0].kind)
         return Joint(now, window, self._filter_of(n_targets), log_odds, starts[0].replaced,
                      n_targets > self._n_targets)

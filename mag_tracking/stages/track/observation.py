@@ -1,4 +1,4 @@
-"""What the sensors see of a bank's states: where the target's physics meets the filter's states."""
+"""Measurement model of a bank: the fields at the sensors as a function of the filter states."""
 
 from collections.abc import Iterable
 
@@ -11,117 +11,222 @@ from mag_tracking.physics.mounting import rotated_fields
 from mag_tracking.physics.sources import SourceModel
 
 MAX_ROTATION = np.deg2rad(15.0)
-"""[rad] A sensor whose orientation is less certain is tracked as if it were as certain as this: the
-angles are of first order. `TrackManager` counts such sensors."""
+"""[rad] Maximum standard deviation of a mounting angle; a larger one is limited to this, because
+the angles are of first order. `TrackManager` counts the sensors concerned."""
 
-SAME_TIME_S = 1e-3
-"""[s] Samples closer than this are taken together: at 20 m/s a target moves two centimetres."""
+TIME_RESOLUTION_S = 1e-3
+"""[s] Samples closer than this are treated as simultaneous: at 20 m/s a target moves two
+centimetres."""
 
 
 def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
-    """(n_sensors, 3, 3) [rad^2] of the mounting angles when a track begins.
+    """Covariances of the mounting angles at the start of a track.
 
-    `mounting_std` [rad] is that of a sensor whose `orientation_std` is not known.
+    Parameters
+    ----------
+    network : SensorNetwork
+    mounting_std : float, rad
+        Standard deviation for sensors without `orientation_std`.
+
+    Returns
+    -------
+    (n_sensors, 3, 3) array, rad^2
+        About the axes of the sensor.
     """
     std = [np.full(3, mounting_std) if s is None else np.minimum(s, MAX_ROTATION)
            for s in network.orientation_std]
-    # The angles are about the sensor's axes, what is known of them about the world's.
+    # The angles are about the axes of the sensor, `orientation_std` is about those of the world.
     priors: FloatArray = np.einsum('jik,jk,jlk->jil', network.R_sw, np.square(std), network.R_sw)
-    # Exactly symmetric, and so stays all that comes of it.
+    # Exact symmetry is preserved by all later operations.
     return 0.5 * (priors + np.swapaxes(priors, 1, 2))
 
 
 class Observation:
-    """The field that a network has of hypotheses, and the states that belong to its sensors.
+    """Predicted fields of a network for hypotheses, and the layout of the states of the sensors.
 
-    A state is as on top of `inference/hypothesis.hpp`: the states of `n_targets` targets of one
-    model, whose fields add up, one after the other. Behind the targets' states come each sensor's
-    own: three mounting angles [rad] where they are estimated, and three model errors, in
-    units of their size, where those last. They are what the target model leaves out near a
-    vehicle, and stay alike for `error_time` (first-order Gauss-Markov), so that what is counted
-    of them does not depend on the frame period. Without an `error_time` they are new every frame.
+    The state begins as described in `inference/hypothesis.hpp`: the states of `n_targets` targets
+    of one model, one after the other; their fields are added. The states of each sensor follow:
+    three mounting angles [rad] if they are estimated, and three model errors in units of their size
+    if `error_time` is not 0. The model errors represent the field that the target model leaves out
+    near a vehicle. They are first-order Gauss-Markov processes with the correlation time
+    `error_time`, so that their weight does not depend on the frame period. Without `error_time`,
+    the error is independent noise in every frame.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    model : SourceModel
+    mounting_std : float, rad
+        Standard deviation of the mounting angles for sensors without `orientation_std`; 0 = the
+        angles are not estimated.
+    error_time : float, s
+    n_targets : int, optional
+
+    Attributes
+    ----------
+    positions : (n_sensors, 3) array, m, world frame
+    R_sw : (n_sensors, 3, 3) array
+        World to sensor.
+    n_angles : int
+        Number of mounting angles per sensor.
+    n_targets : int
+    n_one : int
+        Number of states per target.
+    n_target : int
+        Number of states of all targets.
+    own_covariance : (n_sensors, n_own, n_own) array
+        Covariance of the states of each sensor at the start of a track.
+    single_target : Observation
+        Measurement model of one target.
     """
 
     def __init__(self, network: SensorNetwork, model: SourceModel, mounting_std: float,
                  error_time: float, n_targets: int = 1) -> None:
-        """`mounting_std` [rad] is that of a sensor whose `orientation_std` is not known."""
         self.positions: FloatArray = np.ascontiguousarray(network.positions, dtype=float)
-        """(n_sensors, 3) [m]"""
         self.R_sw: FloatArray = np.ascontiguousarray(network.R_sw, dtype=float)
-        """(n_sensors, 3, 3) world to sensor."""
         self._model = model
         self._error_time = error_time
         self.n_angles = 3 if mounting_std else 0
-        """States of each sensor for how it is mounted."""
         self.n_targets = n_targets
         self.n_one = len(model.state_names)
-        """States of each target."""
         self.n_target = n_targets * self.n_one
         n_own = self.n_angles + (3 if error_time else 0)
         self.own_covariance = np.zeros((len(network), n_own, n_own))
-        """(n_sensors, n_own, n_own) of the sensors' own states when a track begins."""
         errors = np.arange(self.n_angles, n_own)
         self.own_covariance[:, errors, errors] = 1.0
         if mounting_std:
             self.own_covariance[:, :3, :3] = angle_priors(network, mounting_std)
-        self.of_one: Observation = self if n_targets == 1 else Observation(
+        self.single_target: Observation = self if n_targets == 1 else Observation(
             network, model, mounting_std, error_time)
-        """The same of a single target."""
-        # Of the states behind the target's: 1 where it is one of these, else 0.
+        # Masks for the states after those of the targets: 1 for model errors or backgrounds, else
+        # 0.
         is_error = np.tile(np.arange(n_own) >= self.n_angles, len(network))
         self._is_error: FloatArray = np.append(is_error, np.zeros(3 * len(network)))
         self._is_background: FloatArray = np.append(0.0 * is_error, np.ones(3 * len(network)))
 
     @property
     def n_own(self) -> int:
-        """States of each sensor between the target's and the backgrounds."""
+        """Number of states per sensor, between those of the targets and the backgrounds."""
         return self.own_covariance.shape[1]
 
     def n_states(self, n_sensors: int) -> int:
-        """States of a target that is seen by so many sensors."""
+        """Number of states of the targets and of a given number of sensors.
+
+        Parameters
+        ----------
+        n_sensors : int
+
+        Returns
+        -------
+        int
+        """
         return self.n_target + (self.n_own + 3) * n_sensors
 
     def own(self, x: FloatArray) -> FloatArray:
-        """(..., n_sensors, n_own): the sensors' own states among those on the last axis of `x`."""
+        """States of the sensors.
+
+        Parameters
+        ----------
+        x : (..., n_x) array
+
+        Returns
+        -------
+        (..., n_sensors, n_own) array
+        """
         n = len(self.positions)
         own = x[..., self.n_target:x.shape[-1] - 3 * n]
         return own.reshape(*own.shape[:-1], n, self.n_own)
 
     def angles(self, x: FloatArray) -> FloatArray:
-        """(..., n_sensors, 3) [rad] mounting angles; (..., 0, 3) where they are not estimated."""
+        """Mounting angles of the sensors.
+
+        Parameters
+        ----------
+        x : (..., n_x) array
+
+        Returns
+        -------
+        (..., n_sensors, 3) array, rad
+            (..., 0, 3) if the angles are not estimated.
+        """
         return self.own(x)[..., :3] if self.n_angles else np.zeros((*x.shape[:-1], 0, 3))
 
     def angle_covariances(self, P: FloatArray) -> FloatArray:
-        """(n_sensors, 3, 3) [rad^2] of the mounting angles, among `P` (n_x, n_x); or (0, 3, 3)."""
+        """Covariances of the mounting angles.
+
+        Parameters
+        ----------
+        P : (n_x, n_x) array
+
+        Returns
+        -------
+        (n_sensors, 3, 3) array, rad^2
+            (0, 3, 3) if the angles are not estimated.
+        """
         first = self.n_target + self.n_own * np.arange(len(self.positions))
         rows = first[:, None] + np.arange(3)
         return P[rows[:, :, None], rows[:, None, :]] if self.n_angles else np.zeros((0, 3, 3))
 
     def without_errors(self, x: FloatArray) -> FloatArray:
-        """The states `x` (n_hyp, n_x), copied, with model errors of zero."""
+        """Copy of states with the model errors set to zero.
+
+        Parameters
+        ----------
+        x : (n_hyp, n_x) array
+
+        Returns
+        -------
+        (n_hyp, n_x) array
+        """
         x = x.copy()
         self.own(x)[..., self.n_angles:] = 0.0
         return x
 
-    def nearest(self, x: FloatArray) -> FloatArray:
-        """(n_hyp,) [m] from the positions of the states `x` (n_hyp, n_x) to the nearest sensor."""
-        away = np.linalg.norm(self.places(x)[:, :, None] - self.positions, axis=3)
+    def distance_to_nearest(self, x: FloatArray) -> FloatArray:
+        """Distance from any target to the nearest sensor.
+
+        Parameters
+        ----------
+        x : (n_hyp, n_x) array
+
+        Returns
+        -------
+        (n_hyp,) array, m
+        """
+        away = np.linalg.norm(self.target_positions(x)[:, :, None] - self.positions, axis=3)
         nearest: FloatArray = away.min(axis=(1, 2))
         return nearest
 
-    def places(self, x: FloatArray) -> FloatArray:
-        """(n_hyp, n_targets, 3) [m] positions of the targets of the states `x` (n_hyp, n_x)."""
+    def target_positions(self, x: FloatArray) -> FloatArray:
+        """Positions of the targets.
+
+        Parameters
+        ----------
+        x : (n_hyp, n_x) array
+
+        Returns
+        -------
+        (n_hyp, n_targets, 3) array, m, world frame
+        """
         places: FloatArray = x[:, :self.n_target].reshape(
             len(x), self.n_targets, self.n_one)[:, :, :3]
         return places
 
     def drift(self, dt: FloatArray, background_density: float) -> tuple[FloatArray, FloatArray]:
-        """What becomes of the sensors' states over the times `dt` (...) [s].
+        """Decay and process noise of the states of the sensors.
+
+        Parameters
+        ----------
+        dt : (...) array, s
+        background_density : float, T/s^0.5
+            Random walk of each background.
 
         Returns
         -------
-        decay, variance : (..., (n_own + 3) n_sensors)
-            They are multiplied by the one, and the other is added.
+        decay : (..., (n_own + 3) n_sensors) array
+            Factor for each state.
+        variance : (..., (n_own + 3) n_sensors) array
+            Added variance of each state.
         """
         fading = np.exp(-np.abs(dt) / self._error_time) if self._error_time else np.ones(dt.shape)
         variance: FloatArray = np.multiply.outer(1.0 - fading**2, self._is_error) \
@@ -130,25 +235,25 @@ class Observation:
 
     def target_fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Field of the targets alone, at each sensor's own time.
+        """Fields of the targets without sensor states, each at the time of the sensor's samples.
 
         Parameters
         ----------
-        x : (n_hyp, n_x)
-        time_offset : (n_sensors,) [s]
-        near_field_length : (n_hyp, n_targets) [m]
+        x : (n_hyp, n_x) array
+        time_offset : (n_sensors,) array, s
+        near_field_length : (n_hyp, n_targets) array, m
 
         Returns
         -------
-        h : (n_hyp, n_sensors, 3) [T], sensor frame
-        H : (n_hyp, n_sensors, 3, n_target)
-        variance : (n_hyp, n_sensors) [T^2]
-            Of what the models leave out near the targets; they do so independently.
+        h : (n_hyp, n_sensors, 3) array, T, sensor frame
+        H : (n_hyp, n_sensors, 3, n_target) array
+        variance : (n_hyp, n_sensors) array, T^2
+            Variance of the errors of the models near the targets, which are independent.
         """
         h, H, gradients = zip(*(
             self._field_of_one(x[:, first:first + self.n_one], time_offset)
             for first in range(0, self.n_target, self.n_one)), strict=True)
-        # NaN where a dipole is on a sensor, as the field there: also where the length is zero.
+        # NaN if a dipole is at a sensor, like the field there, even if the length is zero.
         with np.errstate(invalid='ignore'):
             variance = sum(np.square(length)[:, None] * gradient**2 for length, gradient in zip(
                 near_field_length.T, gradients, strict=True))
@@ -156,16 +261,16 @@ class Observation:
 
     def _field_of_one(self, x: FloatArray, time_offset: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Field of one target with the states `x` (n_hyp, n_one); see `sensor_fields`."""
+        """Field of one target with states (n_hyp, n_one); see `sensor_fields`."""
         n_hyp, n, n_t = len(x), len(self.positions), self.n_one
         if not time_offset.any():
             return sensor_fields(self.positions, self.R_sw, *self._model.dipoles(x))
         h, H = np.empty((n_hyp, n, 3)), np.empty((n_hyp, n, 3, n_t))
         gradient = np.empty((n_hyp, n))
-        steps = np.round(time_offset / SAME_TIME_S)
+        steps = np.round(time_offset / TIME_RESOLUTION_S)
         for step in np.unique(steps):
             j = np.flatnonzero(steps == step)
-            moved, F, _ = self._model.propagate(x, step * SAME_TIME_S)
+            moved, F, _ = self._model.propagate(x, step * TIME_RESOLUTION_S)
             h[:, j], H_moved, gradient[:, j] = sensor_fields(
                 self.positions[j], self.R_sw[j], *self._model.dipoles(moved))
             H[:, j] = H_moved @ (F if F.ndim == 2 else F[:, None])
@@ -173,7 +278,18 @@ class Observation:
 
     def field_of(self, x: FloatArray, targets: Iterable[int], time_offset: FloatArray
                  ) -> FloatArray:
-        """(n_sensors, 3) [T] the field of some targets of a state (n_x,)."""
+        """Field of some of the targets.
+
+        Parameters
+        ----------
+        x : (n_x,) array
+        targets : iterable of int
+        time_offset : (n_sensors,) array, s
+
+        Returns
+        -------
+        (n_sensors, 3) array, T, sensor frame
+        """
         n = self.n_one
         h, H = np.zeros((1, *self.positions.shape)), np.zeros((1, *self.positions.shape, 0))
         for target in targets:
@@ -185,26 +301,30 @@ class Observation:
 
     def fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray,
                field_error: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fields as the sensors see them, without the backgrounds.
+        """Fields at the sensors, without the backgrounds.
+
+        `H` neglects that the size of the model error depends on the state. This is a few per cent
+        of the derivative where the error is large. The size is that of ICASSP11 eq. (9), which
+        models it as noise.
 
         Parameters
         ----------
-        x : (n_hyp, n_x)
-        time_offset : (n_sensors,) [s]
-        near_field_length : (n_hyp, n_targets) [m]
+        x : (n_hyp, n_x) array
+        time_offset : (n_sensors,) array, s
+        near_field_length : (n_hyp, n_targets) array, m
         field_error : float
             Model error relative to the field.
 
         Returns
         -------
-        h : (n_hyp, n_sensors, 3) [T], sensor frame
-        H : (n_hyp, n_sensors, 3, n_target + n_own)
-        inflation : (n_hyp, n_sensors) [T^2]
-            Variance of the model error, where it is new in every frame; else 0.
+        h : (n_hyp, n_sensors, 3) array, T, sensor frame
+        H : (n_hyp, n_sensors, 3, n_target + n_own) array
+        inflation : (n_hyp, n_sensors) array, T^2
+            Variance of a model error that is independent in every frame; else 0.
 
-        H leaves out that the size of the model error depends on the state, too: a few parts in
-        a hundred of the derivative where the error is large. ICASSP11 eq. (9) for that size,
-        there as noise.
+        References
+        ----------
+        [ICASSP11]_ eq. (9).
         """
         h, H, variance = self.target_fields(x, time_offset, near_field_length)
         variance = variance + _share_of_field(h, field_error)
@@ -220,9 +340,19 @@ class Observation:
 
     def model_error(self, x: FloatArray, near_field_length: FloatArray, field_error: float
                     ) -> FloatArray:
-        """(n_sensors,) [T^2] Variance of what the models leave out of the field of a state (n_x,).
+        """Variance of the model error of a state.
 
-        `near_field_length` (n_targets,) [m]. NaN where a dipole is on a sensor.
+        Parameters
+        ----------
+        x : (n_x,) array
+        near_field_length : (n_targets,) array, m
+        field_error : float
+            Model error relative to the field.
+
+        Returns
+        -------
+        (n_sensors,) array, T^2
+            NaN if a dipole is at a sensor.
         """
         h, _, variance = self.target_fields(x[None], np.zeros(len(self.positions)),
                                             near_field_length[None])
@@ -230,6 +360,6 @@ class Observation:
 
 
 def _share_of_field(h: FloatArray, field_error: float) -> FloatArray:
-    """(n_hyp, n_sensors) [T^2] Variance of a model error that is a share of fields `h`."""
+    """Variance (n_hyp, n_sensors) [T^2] of a model error in proportion to the field."""
     variance: FloatArray = field_error**2 * np.einsum('pji,pji->pj', h, h)
     return variance

@@ -1,4 +1,4 @@
-"""The frames of a pass as whitened arrays, and the fit of a row of dipoles on a steady path."""
+"""Frames of a pass as whitened arrays, and the fit of a row of dipoles on a steady path."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,55 +17,75 @@ from mag_tracking.stages.track.bank_filter import known_covariance
 from mag_tracking.units import NS
 
 MODEL_ERROR = 0.04
-"""Error of the field of a row, relative to it; it counts as noise."""
+"""Error of the field of a row of dipoles, relative to the field; treated as noise."""
 
-REACH = 0.2
-"""[m] Near a sensor the error is this length over the distance, if that is more."""
+NEAR_ERROR_LENGTH = 0.2
+"""[m] Near a sensor, the relative error is this length divided by the distance, if that is
+larger."""
 
 MAX_SENSORS = 4
-"""Those with the strongest fields are compared."""
+"""Maximum number of sensors; those with the strongest fields are used."""
 
 N_STEPS, TOLERANCE = 30, 1e-3
-"""The search ends after so many steps, or where one improves the cost by less than this share."""
+"""Maximum number of steps, and the relative improvement of the cost below which the search ends."""
 
 
 @dataclass(frozen=True)
 class PassSamples:
-    """The frames of a pass as whitened arrays, sensor by sensor."""
+    """The frames of a pass as whitened arrays, sorted by frame and sensor."""
 
     compared: IntArray
-    """(k,) rows of the network, that with the strongest field first."""
+    """(k,) Rows of the sensors in the network; the one with the strongest field comes first."""
     t: FloatArray
-    """(n,) [s]"""
+    """(n,) [s] Time of each sample."""
     positions: FloatArray
-    """(n, 3) [m]"""
+    """(n, 3) [m] Sensor positions, world frame."""
     M: FloatArray
-    """(n, 3, 3) world to sensor, and whitening."""
+    """(n, 3, 3) Rotation from world to sensor, and whitening."""
     clock: IntArray
-    """(n,) see `SteadyPass`."""
+    """(n,) Clock of each sample; see `SteadyPass`."""
     y: FloatArray
-    """(3 n,) whitened fields; 0 on missing axes."""
+    """(3 n,) Whitened fields; 0 for missing axes."""
     backgrounds: FloatArray
-    """(3 n, q)"""
+    """(3 n, q) Whitened columns of the backgrounds."""
     n_values: int
-    """How many numbers were measured."""
+    """Number of measured values."""
 
     @property
     def n_clocks(self) -> int:
-        """Number of clocks besides that of the sensor with the strongest field."""
+        """Number of clocks apart from that of the sensor with the strongest field."""
         return len(self.compared) - 1
 
     def n_free(self, n_dipoles: int) -> int:
-        """Degrees of freedom that backgrounds and moments leave to the path."""
+        """Degrees of freedom that backgrounds and moments leave for the path.
+
+        Parameters
+        ----------
+        n_dipoles : int
+
+        Returns
+        -------
+        int
+        """
         return self.n_values - self.backgrounds.shape[1] - 3 * n_dipoles
 
-    def near(self, path: FloatArray) -> 'PassSamples':
-        """The same with the model error of a vehicle near the sensors, on a path (10,)."""
+    def with_near_field_error(self, path: FloatArray) -> 'PassSamples':
+        """Samples whose noise includes the model error near the sensors.
+
+        Parameters
+        ----------
+        path : (10,) array
+            Path of the vehicle, as for `SteadyPass`.
+
+        Returns
+        -------
+        PassSamples
+        """
         c, s = np.cos(path[4]), np.sin(path[4])
         way = self.t[:, None] * np.array([c * path[3], s * path[3], path[5]])
-        share = np.maximum(MODEL_ERROR, REACH / np.linalg.norm(
+        share = np.maximum(MODEL_ERROR, NEAR_ERROR_LENGTH / np.linalg.norm(
             self.positions - path[:3] - way, axis=1))
-        # The whitened signal is in units of a noise that already counts the model error.
+        # The noise that whitens the signal already includes the smaller model error.
         signal = np.square(np.linalg.norm(self.y.reshape(-1, 3), axis=1))
         weight = 1.0 / np.sqrt(1.0 + (share**2 - MODEL_ERROR**2) * signal)
         rows = np.repeat(weight, 3)
@@ -75,12 +95,25 @@ class PassSamples:
     @classmethod
     def of(cls, network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
            max_sensors: int = MAX_SENSORS) -> 'PassSamples':
-        """The samples of the sensors with the strongest fields."""
+        """Samples of the sensors with the strongest fields.
+
+        Parameters
+        ----------
+        network : SensorNetwork
+        frames : sequence of FieldFrame
+        stamp_ns : int, ns
+            Time zero.
+        max_sensors : int, optional
+
+        Returns
+        -------
+        PassSamples
+        """
         field = np.array([f.field for f in frames])
         energy = np.nansum(np.square(field), axis=2)
         measured = np.count_nonzero(~np.isnan(field).all(axis=2), axis=0)
         order = np.argsort(-energy.max(axis=0), kind='stable')
-        # Slow sensors whose clocks are apart may each be in few of the frames.
+        # Slow sensors with clock offsets may each have samples in only a few of the frames.
         compared = order[measured[order] > measured.max(initial=0) // 2][:max_sensors]
         n = len(compared)
         C = np.array([known_covariance(f.covariance)[compared] for f in frames]).reshape(-1, 3, 3)
@@ -101,9 +134,24 @@ class PassSamples:
 
     def fit(self, n_dipoles: int, free: IntArray, starts: FloatArray
             ) -> tuple[FloatArray, float, FloatArray]:
-        """(path and clocks, cost, covariance of those that are free) of the best minimum.
+        """Fit a row of dipoles on a steady path, and return the best minimum.
 
-        `free` as for `SteadyPass`; `starts` (n, n_free).
+        Parameters
+        ----------
+        n_dipoles : int
+        free : (n_free,) int array
+            Free parameters; see `SteadyPass`.
+        starts : (n, n_free) array
+            Start values.
+
+        Returns
+        -------
+        path : (10 + n_clocks,) array
+            Path and clock offsets.
+        cost : float
+            Sum of squared whitened residuals.
+        P : (n_free, n_free) array
+            Covariance of the free parameters.
         """
         model = SteadyPass(self.t, self.positions, self.M, self.clock, free,
                            np.zeros(N_PATH + self.n_clocks), n_dipoles)
@@ -122,7 +170,16 @@ class PassSamples:
         return model.whole(theta[k:k + 1])[0], float(cost[k]), P[k]
 
     def straight_model(self, n_dipoles: int) -> SteadyPass:
-        """A row on a straight path at constant speed, whose clocks are right."""
+        """Row of dipoles on a straight path at constant speed, without clock offsets.
+
+        Parameters
+        ----------
+        n_dipoles : int
+
+        Returns
+        -------
+        SteadyPass
+        """
         return SteadyPass(self.t, self.positions, self.M, np.full(len(self.t), -1),
                           np.arange(N_STRAIGHT), np.zeros(N_PATH), n_dipoles)
 

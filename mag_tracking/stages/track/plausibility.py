@@ -1,4 +1,4 @@
-"""Whether the state of a vehicle is one that a vehicle on this road can have."""
+"""Plausibility of the state of a vehicle: mounting, height, road and speed."""
 
 import numpy as np
 from scipy.special import chdtri, ndtri
@@ -9,89 +9,94 @@ from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 from mag_tracking.stages.track.observation import Observation
 
-MOUNTED = 0.05
-"""Probability that sensors mounted as stated are turned by as much as a track may need."""
+P_MOUNTING = 0.05
+"""Probability that correctly mounted sensors need mounting angles as large as the limit."""
 
-LEVEL = 1e-3
-"""Probability that the iron of a vehicle is as far from its kind's height as it may be."""
+P_HEIGHT = 1e-3
+"""Probability that the iron of a vehicle is as far from the height of its kind as the limit."""
 
-LANE, LANE_LATER = 1.645, 3.0
-"""Deviations by which a vehicle may be beside the outermost lane of the settings: where it is
-nearest to a sensor so far (one in twenty of that lane is farther beside it), and at any later time,
-when it may have turned off."""
+LANE_STDS, LANE_STDS_LATER = 1.645, 3.0
+"""Limits, in standard deviations, of the distance of a vehicle from the outermost lane of the
+settings: at its closest point to any sensor so far (exceeded by one in twenty vehicles of that
+lane), and at any later time, when it may have turned off."""
 
 MIN_SPEED = 1.0
-"""[m/s] A slower vehicle has no direction."""
+"""[m/s] The heading of a slower vehicle is undefined."""
 
-MAX_DISTANCE = 0.75
-"""A target may move so far within a frame, in units of its distance to the second nearest sensor:
-fields are averaged over the frame, with a relative error of about half of the square. One sensor
-that errs more, as it is passed closely, does not mislead a track."""
+MAX_RELATIVE_MOVE = 0.75
+"""Maximum motion of a target within a frame, relative to its distance to the second nearest sensor.
+Fields are averaged over the frame, with a relative error of about half the square of this ratio.
+The error of a single sensor that is passed closely does not mislead a track."""
 
 
 class Plausibility:
-    """Doubts about the states of a vehicle on its way past the sensors."""
+    """Doubts about the states of a vehicle along its track."""
 
     def __init__(self) -> None:
-        # Each hypothesis, by its origin, has been so near to a sensor, and its path was or was not
-        # beside the road there.
+        # Per origin of a hypothesis: smallest distance to a sensor so far, and whether the path was
+        # off the road there.
         self._nearest: FloatArray = np.zeros(0)
         self._was_beside: BoolArray = np.zeros(0, dtype=bool)
 
-    def judge(self, observation: Observation, bank: FilterBank, best: int,
-              settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
-        """Doubts about the state of hypothesis `best`; to be asked once a frame, in order.
+    def evaluate(self, observation: Observation, bank: FilterBank, best: int,
+                 settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
+        """Doubts about the state of a hypothesis; to be called once per frame, in order.
 
         Parameters
         ----------
         observation : Observation
         bank : FilterBank
         best : int
-            Row of the hypothesis that is published.
+            Row of the published hypothesis.
         settings : VehicleSettings
-        mounting_std : float [rad]
-            Standard deviation of the angles by which any sensor may be turned, also one that is
-            known better: what the model leaves out of a field rotates it, too.
-        dt : float [s]
+        mounting_std : float, rad
+            Minimum standard deviation of the mounting angles of each sensor. It applies to
+            accurately mounted sensors as well, because a model error rotates the field, too.
+        dt : float, s
             Length of the frame.
+
+        Returns
+        -------
+        set of str
         """
         x, kind = bank.x[best], int(bank.kind[best])
-        self._look(bank, settings, observation.positions)
+        self._update_road_check(bank, settings, observation.positions)
         found = set()
         if _needs_rotated_sensors(observation, x, mounting_std):
             found.add(doubts.SENSORS_ROTATED)
         off = abs(float(x[2]) - settings.heights[kind])
-        if off > -ndtri(LEVEL / 2.0) * settings.height_stds[kind]:
+        if off > -ndtri(P_HEIGHT / 2.0) * settings.height_stds[kind]:
             found.add(doubts.HEIGHT)
         if self._was_beside[bank.origin[best]] or _passes_beside(
-                x[None], settings, observation.positions, LANE_LATER)[0]:
+                x[None], settings, observation.positions, LANE_STDS_LATER)[0]:
             found.add(doubts.OFF_THE_ROAD)
         if moves_too_far(x[:3], x[3:6], dt, observation.positions):
             found.add(doubts.FRAMES_TOO_LONG)
         return found
 
-    def _look(self, bank: FilterBank, settings: VehicleSettings, positions: FloatArray) -> None:
-        """Remember how near to a sensor each hypothesis has been, and if it was off the road."""
+    def _update_road_check(self, bank: FilterBank, settings: VehicleSettings,
+                           positions: FloatArray) -> None:
+        """Update the closest point of each hypothesis, and whether it was off the road there."""
         more = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
         self._nearest = np.append(self._nearest, np.full(more, np.inf))
         self._was_beside = np.append(self._was_beside, np.zeros(more, dtype=bool))
         distance = np.hypot(*(positions[:, :2, None] - bank.x[:, :2].T).transpose(1, 0, 2))
         nearest = distance.min(axis=0)
         is_nearest = (nearest <= self._nearest[bank.origin]) & _moves(bank.x)
-        beside = _passes_beside(bank.x[is_nearest], settings, positions, LANE)
+        beside = _passes_beside(bank.x[is_nearest], settings, positions, LANE_STDS)
         of_those = bank.origin[is_nearest]
         self._nearest[of_those], self._was_beside[of_those] = nearest[is_nearest], beside
 
 
 def _passes_beside(x: FloatArray, settings: VehicleSettings, positions: FloatArray,
                    deviations: float) -> BoolArray:
-    """Which of the states `x` (n, n_x) pass all sensors on one side, beyond the lanes.
+    """Whether states (n, n_x) pass all sensors (n_sensors, 3) on one side, beyond the lanes.
 
-    There the distance is hardly measured: a train on another line looks like a truck nearby, and a
-    truck beyond a sensor like a car before one that has an axis the wrong way round. Lanes are on
-    both sides of the centre of the network. The wider a network is than the road, the more it
-    covers an area, and a vehicle may be as near to its outermost sensors as a lane to the centre.
-    The sensors are at `positions` (n_sensors, 3).
+    There the distance is hardly observable: a train on another line looks like a truck nearby, and
+    a truck beyond a sensor looks like a car on the near side of a sensor with an inverted axis.
+    Lanes are on both sides of the centre of the network. The more a network extends beyond the
+    road, the more it covers an area, and a vehicle may be as close to its outermost sensors as a
+    lane is to the centre.
     """
     speed = np.maximum(np.hypot(x[:, 3], x[:, 4]), MIN_SPEED)
     away = positions[:, :2, None] - x[:, :2].T
@@ -106,20 +111,31 @@ def _passes_beside(x: FloatArray, settings: VehicleSettings, positions: FloatArr
 
 
 def _moves(x: FloatArray) -> BoolArray:
-    """Which of the states `x` (n, n_x) are fast enough to have a direction."""
+    """Whether states (n, n_x) are fast enough to have a heading."""
     moves: BoolArray = np.hypot(x[:, 3], x[:, 4]) >= MIN_SPEED
     return moves
 
 
 def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray
                   ) -> bool:
-    """Whether a target (3,) moves too far within a frame of `dt` [s].
+    """Whether a target moves too far within a frame.
 
-    `positions` (n, 3) are those of the sensors.
+    Parameters
+    ----------
+    position : (3,) array, m
+    velocity : (3,) array, m/s
+    dt : float, s
+        Length of the frame.
+    positions : (n, 3) array, m
+        Positions of the sensors.
+
+    Returns
+    -------
+    bool
     """
     away = np.sort(np.linalg.norm(position - positions, axis=1))
     way = float(np.hypot(velocity[0], velocity[1])) * dt
-    return len(away) > 1 and bool(way > MAX_DISTANCE * away[1])
+    return len(away) > 1 and bool(way > MAX_RELATIVE_MOVE * away[1])
 
 
 def _needs_rotated_sensors(observation: Observation, x: FloatArray, mounting_std: float) -> bool:
@@ -129,4 +145,4 @@ def _needs_rotated_sensors(observation: Observation, x: FloatArray, mounting_std
         return False
     variance = np.einsum('jii->ji', observation.own_covariance[:, :3, :3])
     square = float((angles**2 / np.maximum(variance, mounting_std**2)).sum())
-    return bool(square > chdtri(angles.size, MOUNTED))
+    return bool(square > chdtri(angles.size, P_MOUNTING))

@@ -1,4 +1,4 @@
-"""From a bank to what is published: the best hypothesis, its pose and its honest doubts."""
+"""Published track of a bank: the best hypothesis, its pose, its covariance and its doubts."""
 
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
@@ -23,34 +23,44 @@ from mag_tracking.stages.track.settings import BEST, MIXTURE
 from mag_tracking.stages.track.unobserved_length import UnobservedLength
 
 UNOBSERVED_VARIANCE = np.pi**2
-"""[rad^2] of an angle that the field does not determine."""
+"""[rad^2] Variance of an angle that is not observable from the field."""
 
-NO_WEIGHT = 1e-6
-"""Hypotheses lighter than the heaviest by this ratio add nothing to a covariance."""
+NEGLIGIBLE_WEIGHT = 1e-6
+"""Hypotheses lighter than the heaviest by this ratio do not contribute to a covariance."""
 
-DOUBT = 0.05
-"""Other places, or other arrivals, with more weight than this make a track ambiguous."""
+AMBIGUOUS_WEIGHT = 0.05
+"""A track is ambiguous if other places, or other arrivals, have more weight than this."""
 
 
 Flags: TypeAlias = tuple[bool, bool, bool]
-"""Which rotations about the body's x, y, z are not observed."""
+"""Whether the rotation about the x, y and z axis of the body is unobservable."""
 
 OrientationEstimate: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, Flags]
-"""Quaternion, derivative, unobserved variance and flags; see `VehicleOrientation`."""
+"""Quaternion, derivative, variance of the unobservable part, and flags; see
+`VehicleOrientation`."""
 
 
 class Orientation(Protocol):
-    """How a target's orientation follows from its state; see `VehicleOrientation`."""
+    """Interface for the orientation of a target from its state; see `VehicleOrientation`."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Quaternion, derivative, unobserved variance and flags."""
+        """Quaternion, derivative, variance of the unobservable part, and flags."""
 
     def quaternions(self, x: FloatArray) -> FloatArray:
-        """Quaternions (n, 4) of states (n, n_t)."""
+        """Quaternions of several states.
+
+        Parameters
+        ----------
+        x : (n, n_t) array
+
+        Returns
+        -------
+        (n, 4) array
+        """
 
 
 class PoseFields(TypedDict):
-    """The fields that a `Track` and a `SmoothedPose` have in common and a state determines."""
+    """Fields of `Track` and `SmoothedPose` that follow from a target state."""
 
     position: FloatArray
     velocity: FloatArray
@@ -65,25 +75,27 @@ class PoseFields(TypedDict):
 
 
 class VehicleOrientation:
-    """Heading of the velocity; roll and pitch are not observed."""
+    """Orientation along the velocity; roll and pitch are unobservable."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Of one state.
+        """Orientation of one state.
 
         Parameters
         ----------
-        x : (n_t,), P : (n_t, n_t)
-            A target state that begins with position and velocity.
+        x : (n_t,) array
+            Target state that begins with position and velocity.
+        P : (n_t, n_t) array
+            Covariance of the state.
 
         Returns
         -------
-        q : (4,) xyzw
-        T : (3, n_t)
-            Derivative of the small rotation about world axes by the state.
-        unobserved : (3, 3)
-            Variance of what is not observed, to be added.
-        flags : (3,) bool
-            Body x, y, z.
+        q : (4,) array, xyzw
+        T : (3, n_t) array
+            Derivative of the small rotation about the world axes with respect to the state.
+        unobserved : (3, 3) array, rad^2
+            Variance of the unobservable part, to be added.
+        flags : (3,) tuple of bool
+            Whether the rotation about the x, y and z axis of the body is unobservable.
         """
         speed2 = x[3] ** 2 + x[4] ** 2
         T = np.zeros((3, len(x)))
@@ -96,24 +108,33 @@ class VehicleOrientation:
         return self.quaternions(x[None])[0], T, unobserved, (True, True, not yaw_known)
 
     def quaternions(self, x: FloatArray) -> FloatArray:
-        """Quaternions (n, 4) of states (n, n_t)."""
+        """Quaternions of several states.
+
+        Parameters
+        ----------
+        x : (n, n_t) array
+
+        Returns
+        -------
+        (n, 4) array
+        """
         return quaternions_from_yaw(np.arctan2(x[:, 4], x[:, 3]))
 
 
 @dataclass(frozen=True)
 class MagnetOrientation:
-    """Direction of the moment; the roll about it is not observed."""
+    """Orientation along the moment; the rotation about the moment is unobservable."""
 
     axis: FloatArray
-    """(3,) direction of the moment in the magnet's own frame. The flag of what is not observed goes
-    to the body axis nearest to it."""
+    """(3,) Direction of the moment in the frame of the magnet. The flag of the unobservable
+    rotation is set for the body axis nearest to it."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Of one state, as that of a vehicle."""
+        """Orientation of one state, as for `VehicleOrientation`."""
         m = x[6:9]
         size2 = m @ m
         T = np.zeros((3, len(x)))
-        # dm = w x m gives the part of w across m: w = m x dm / |m|^2.
+        # dm = w x m determines the part of w perpendicular to m: w = m x dm / |m|^2.
         T[:, 6:9] = cross_matrix(m) / size2
         along = np.outer(m, m) / size2
         nearest = int(np.argmax(np.abs(self.axis)))
@@ -121,54 +142,73 @@ class MagnetOrientation:
                 (nearest == 0, nearest == 1, nearest == 2))
 
     def quaternions(self, x: FloatArray) -> FloatArray:
-        """Quaternions (n, 4) of states (n, n_t)."""
+        """Quaternions of several states.
+
+        Parameters
+        ----------
+        x : (n, n_t) array
+
+        Returns
+        -------
+        (n, 4) array
+        """
         return np.array([quaternion_between(self.axis, m) for m in x[:, 6:9]])
 
 
 def published_track(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
                     names: Sequence[str], kinds: Sequence[str], found: Set[str],
-                    unseen: UnobservedLength | None, *, excess: float = 1.0,
+                    unobserved_length: UnobservedLength | None, *, excess: float = 1.0,
                     ambiguous_poses: str = MIXTURE, difference: FloatArray,
                     stamp_ns: int, id: int, ended: bool, existence: float,
                     degrees_of_freedom: int, predicted: FloatArray, mounting: FloatArray,
                     mounting_covariance: FloatArray) -> Track:
-    """The `Track` of a bank's hypothesis `best`.
+    """Track record of one hypothesis of a bank.
 
     Parameters
     ----------
     bank : FilterBank
     best : int
-        Row of the hypothesis to publish.
+        Row of the hypothesis to be published.
     model : SourceModel
-    orientation : function
-        Takes state and covariance of the target, as `VehicleOrientation`.
+    orientation : Orientation
     names : sequence of str
-        The arrival of each label.
+        Arrival of each label.
     kinds : sequence of str
-        The name of each kind.
+        Name of each kind of target.
     found : set of str
-        What speaks against the pose, of `doubts`; the bank's own ambiguity is added.
-    unseen : UnobservedLength, optional
-        How the length of a vehicle moves its middle; None for a small target.
-    excess : float
-        The innovations are this many times larger than stated: so is the covariance, then.
-    ambiguous_poses : str
-        `track.ambiguous_poses`.
-    difference : (6,) [m], [m/s]
-        The target may as well be so far from the published position and velocity; the covariance
-        covers that.
-    stamp_ns, id, ended, existence, degrees_of_freedom, predicted, mounting, mounting_covariance
-        Fields of `Track` that the bank does not know.
+        Doubts about the pose; the ambiguity of the bank is added.
+    unobserved_length : UnobservedLength or None
+        Effect of the length of a vehicle on its middle; None for a small target.
+    excess : float, optional
+        Ratio of the actual to the expected innovations; it scales the covariance.
+    ambiguous_poses : str, optional
+        Setting `track.ambiguous_poses`.
+    difference : (6,) array, m and m/s
+        Offset of another possible position and velocity, which the covariance has to cover.
+    stamp_ns : int, ns
+        This and the following parameters are fields of `Track`.
+    id : int
+    ended : bool
+    existence : float
+    degrees_of_freedom : int
+    predicted : (n_sensors, 3) array, T, sensor frame
+    mounting : (n_sensors, 3) array, rad
+    mounting_covariance : (n_sensors, 3, 3) array, rad^2
+
+    Returns
+    -------
+    Track
     """
     n_t = len(model.state_names)
     apart = bank.apart(best)
     P = covariance_about(bank, best, model, apart)
-    said, flags = _said_of(model, orientation, bank.x[best, :n_t], excess * P,
-                           int(bank.kind[best]), unseen, difference)
+    fields, flags = _pose_fields(model, orientation, bank.x[best, :n_t], excess * P,
+                                 int(bank.kind[best]), unobserved_length, difference)
     reasons = doubts.ordered({*found, *ambiguities(bank, best, apart)})
-    uncertainty: PoseUncertainty | None = own_uncertainty(said)
+    uncertainty: PoseUncertainty | None = pose_uncertainty(fields)
     if reasons and ambiguous_poses != BEST:
-        uncertainty = mixture_uncertainty(bank, best, apart, model, orientation, said, P, excess) \
+        uncertainty = mixture_uncertainty(
+            bank, best, apart, model, orientation, fields, P, excess) \
             if ambiguous_poses == MIXTURE else None
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
@@ -187,121 +227,179 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         kind_weight=float(weights.sum(where=bank.kind == bank.kind[best])),
         ambiguous=bool(reasons), doubts=reasons,
         unobservable=(False, False, False, *flags), hypotheses=hypotheses,
-        topic_uncertainty=uncertainty, **said)
+        topic_uncertainty=uncertainty, **fields)
 
 
 def covariance_about(bank: FilterBank, best: int, model: SourceModel, apart: BoolArray
                      ) -> FloatArray:
-    """Covariance (n_t, n_t) about the state of hypothesis `best`, of all that are not `apart`.
+    """Covariance about the state of a hypothesis, of all hypotheses that are not apart from it.
 
-    Hypotheses that are not apart differ by where each was linearised, by the kind of target and by
-    its motion; that they do is part of the error. Those that are apart make the track ambiguous.
+    These hypotheses differ in their linearisation, kind of target and motion; the difference is
+    part of the error. Hypotheses that are apart make the track ambiguous instead.
+
+    Parameters
+    ----------
+    bank : FilterBank
+    best : int
+        Row of the hypothesis.
+    model : SourceModel
+    apart : (n_hyp,) bool array
+        `FilterBank.apart` of the hypothesis.
+
+    Returns
+    -------
+    (n_t, n_t) array
     """
     return _second_moment(bank, best, model, np.where(apart, -np.inf, bank.log_w))
 
 
 def _second_moment(bank: FilterBank, best: int, model: SourceModel,
                    log_w: FloatArray) -> FloatArray:
-    """As `covariance_about`, of the hypotheses by their log-weights (n_hyp,)."""
+    """Covariance about hypothesis `best`, of all hypotheses with log-weights (n_hyp,)."""
     n_t = len(model.state_names)
     weight = np.exp(log_w - log_w.max())
-    rows = np.flatnonzero(weight >= NO_WEIGHT)
+    rows = np.flatnonzero(weight >= NEGLIGIBLE_WEIGHT)
     x = bank.x[rows, :n_t]
     difference = x - bank.x[best, :n_t]
     if 'L' in model.state_names:
-        # From its other end it is the same row.
+        # A negative length is the same row, seen from its other end.
         L = model.state_names.index('L')
         difference[:, L] = np.abs(x[:, L]) - abs(bank.x[best, L])
     return second_moment(weight[rows], difference, bank.P[rows, :n_t, :n_t])
 
 
 def mixture_uncertainty(bank: FilterBank, best: int, apart: BoolArray, model: SourceModel,
-                        orientation: Orientation, here: PoseFields, P_here: FloatArray,
+                        orientation: Orientation, published: PoseFields, P_unwidened: FloatArray,
                         excess: float = 1.0) -> PoseUncertainty:
-    """Uncertainty about the pose of hypothesis `best`, where each hypothesis may be right.
+    """Uncertainty about the pose of a hypothesis if any of the hypotheses may be right.
 
     Parameters
     ----------
     bank : FilterBank
     best : int
-    apart : (n_hyp,) bool
-        `FilterBank.apart` of it.
+        Row of the hypothesis.
+    apart : (n_hyp,) bool array
+        `FilterBank.apart` of the hypothesis.
     model : SourceModel
-    orientation : function
-    here : PoseFields
-        As published of the hypotheses at this place.
-    P_here : (n_t, n_t) array
-        `covariance_about` before it was widened to `here`.
-    excess : float
+    orientation : Orientation
+    published : PoseFields
+        Published pose, from the hypotheses that are not apart.
+    P_unwidened : (n_t, n_t) array
+        `covariance_about`, before it was widened to that of `published`.
+    excess : float, optional
         As for `published_track`.
+
+    Returns
+    -------
+    PoseUncertainty
     """
     n_t = len(model.state_names)
-    widening = here['covariance'] - excess * P_here[:6, :6]
+    widening = published['covariance'] - excess * P_unwidened[:6, :6]
     covariance = widening + excess * _second_moment(bank, best, model, bank.log_w)[:6, :6]
-    # Headings may be opposite, and are too far apart for a derivative.
+    # Headings may be opposite, which is too far apart for a derivative.
     log_w = np.where(apart, bank.log_w, -np.inf)
-    rows = np.flatnonzero(log_w >= bank.log_w.max() + np.log(NO_WEIGHT))
+    rows = np.flatnonzero(log_w >= bank.log_w.max() + np.log(NEGLIGIBLE_WEIGHT))
     if not len(rows):
-        return PoseUncertainty(covariance, here['orientation_covariance'],
-                               here['position_orientation_covariance'])
+        return PoseUncertainty(covariance, published['orientation_covariance'],
+                               published['position_orientation_covariance'])
     weight = np.exp(log_w[rows])
-    turned = rotation_vectors_between(here['orientation'],
-                                      orientation.quaternions(bank.x[rows, :n_t]))
+    rotations = rotation_vectors_between(published['orientation'],
+                                         orientation.quaternions(bank.x[rows, :n_t]))
     moved = bank.x[rows, :3] - bank.x[best, :3]
     return PoseUncertainty(
-        covariance, here['orientation_covariance'] + np.einsum('n,ni,nj->ij', weight, turned,
-                                                               turned),
-        (1.0 - weight.sum()) * here['position_orientation_covariance']
-        + np.einsum('n,ni,nj->ij', weight, moved, turned))
+        covariance, published['orientation_covariance']
+        + np.einsum('n,ni,nj->ij', weight, rotations, rotations),
+        (1.0 - weight.sum()) * published['position_orientation_covariance']
+        + np.einsum('n,ni,nj->ij', weight, moved, rotations))
 
 
-def own_uncertainty(said: PoseFields) -> PoseUncertainty:
-    """Uncertainty of the published fields themselves."""
-    return PoseUncertainty(said['covariance'], said['orientation_covariance'],
-                           said['position_orientation_covariance'])
+def pose_uncertainty(fields: PoseFields) -> PoseUncertainty:
+    """Uncertainty of a published pose.
+
+    Parameters
+    ----------
+    fields : PoseFields
+
+    Returns
+    -------
+    PoseUncertainty
+    """
+    return PoseUncertainty(fields['covariance'], fields['orientation_covariance'],
+                           fields['position_orientation_covariance'])
 
 
 def ambiguities(bank: FilterBank, best: int, apart: BoolArray) -> set[str]:
-    """Whether another place, or another arrival, than that of hypothesis `best` is possible.
+    """Doubts because another place or another arrival is possible.
 
-    `apart` (n_hyp,) is `FilterBank.apart` of it.
+    Parameters
+    ----------
+    bank : FilterBank
+    best : int
+        Row of the hypothesis.
+    apart : (n_hyp,) bool array
+        `FilterBank.apart` of the hypothesis.
+
+    Returns
+    -------
+    set of str
     """
     found = set()
-    if bank.weight(apart) > DOUBT:
+    if bank.weight(apart) > AMBIGUOUS_WEIGHT:
         found.add(doubts.ANOTHER_PLACE)
-    if 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > DOUBT:
+    if 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > AMBIGUOUS_WEIGHT:
         found.add(doubts.ANOTHER_ARRIVAL)
     return found
 
 
 def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray, *,
-                  unseen: UnobservedLength | None, difference: FloatArray, stamp_ns: int, id: int,
-                  kind: int, kinds: Sequence[str], ambiguous: bool, complete: bool
-                  ) -> SmoothedPose:
-    """The `SmoothedPose` of a state `x` (n_x,) with covariance `P` (n_x, n_x).
+                  unobserved_length: UnobservedLength | None, difference: FloatArray,
+                  stamp_ns: int, id: int, kind: int, kinds: Sequence[str], ambiguous: bool,
+                  complete: bool) -> SmoothedPose:
+    """Record of a smoothed state.
 
-    The other parameters are as for `published_track`.
+    Parameters
+    ----------
+    model : SourceModel
+    orientation : Orientation
+    x : (n_x,) array
+    P : (n_x, n_x) array
+    unobserved_length : UnobservedLength or None
+    difference : (6,) array, m and m/s
+        As for `published_track`.
+    stamp_ns : int, ns
+    id : int
+    kind : int
+        Kind of target.
+    kinds : sequence of str
+        Name of each kind.
+    ambiguous : bool
+    complete : bool
+        As in `SmoothedPose`.
+
+    Returns
+    -------
+    SmoothedPose
     """
     n_t = len(model.state_names)
     return SmoothedPose(stamp_ns=stamp_ns, id=id, kind=kinds[kind], ambiguous=ambiguous,
                         complete=complete,
-                        **_said_of(model, orientation, x[:n_t], P[:n_t, :n_t], kind, unseen,
-                                   difference)[0])
+                        **_pose_fields(model, orientation, x[:n_t], P[:n_t, :n_t], kind,
+                                       unobserved_length, difference)[0])
 
 
-def _said_of(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray,
-             kind: int, unseen: UnobservedLength | None, difference: FloatArray
-             ) -> tuple[PoseFields, Flags]:
-    """What a target state says, as fields of a record, and which rotations it does not."""
+def _pose_fields(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray,
+                 kind: int, unobserved_length: UnobservedLength | None, difference: FloatArray
+                 ) -> tuple[PoseFields, Flags]:
+    """Fields of a record from a target state, and which rotations are unobservable."""
     dipoles = model.dipoles(x[None])
     dm_dx = dipoles.dm_dx[0].sum(axis=0)
     length, length_std = 0.0, 0.0
     if 'L' in model.state_names:
         L = model.state_names.index('L')
-        # From its other end it is the same row.
+        # A negative length is the same row, seen from its other end.
         length, length_std = abs(float(x[L])), float(np.sqrt(max(P[L, L], 0.0)))
-    if unseen is not None:
-        of_middle = unseen.covariance(x, P, length, kind)
+    if unobserved_length is not None:
+        of_middle = unobserved_length.covariance(x, P, length, kind)
         P = P.copy()
         P[:2, :2] += of_middle
     P = inflated_to_cover(P, difference)

@@ -1,22 +1,22 @@
-"""Relinearise: the leading hypotheses of a running track once more, by what is known by now.
+"""Relinearisation of the leading hypotheses of a running track along their smoothed paths.
 
-An extended Kalman filter linearises each frame where it then believed the target to be. Far ahead
-of the sensors that is metres off, and what it wrongly took for known there it never unlearns. So
-the latest frames are filtered and smoothed again, motion and field linearised along the smoothed
-path of each leading hypothesis: damped Gauss-Newton steps on its path. Where they have settled, the
-state at its end takes the place of the filter's, with the wider of both covariances. Where they
-have not, the state stays, but the filter may be surer than it should be: linearised at one place
-and then at another it learns of directions that no single path learns of (Julier and Uhlmann 2001
-saw it in maps). So a wider covariance of the path is taken there, too.
+An extended Kalman filter linearises each frame at the state predicted at that time. Far ahead of
+the sensors the prediction is metres off, and the filter never loses the certainty that it wrongly
+gained there. Therefore the latest frames are filtered and smoothed again, with motion and field
+linearised along the smoothed path of each leading hypothesis. These are damped Gauss-Newton steps
+on the path. If they converge, the state at the end of the path replaces that of the filter, with
+the larger of both covariances. If they do not converge, the state is kept, but the filter may be
+overconfident: a filter that is linearised at different states gains information about directions
+that no single path can observe (Julier and Uhlmann 2001 found this for maps). Therefore a larger
+covariance of the path is adopted in this case, too.
 
-How probable the frames are along the path is no measure of it: what a model leaves out of the
-field, and how a moment wanders, is in proportion to the moment, so that the steps minimise
-something else. For the same reason a path may run away to moments that explain everything. That of
-a long vehicle, whose model leaves out most, is taken only where it explains the frames no worse
-than the filter did. Weights stay: those of hypotheses that are done again and of others could not
-be compared.
+The likelihood of the frames along the path does not measure convergence. The model error and the
+drift of a moment are proportional to the moment, so the steps minimise a different cost. For the
+same reason a path may diverge to moments that explain everything. The path of a long vehicle, whose
+model error is largest, is adopted only if it explains the frames no worse than the filter did.
+Weights are not changed, because relinearised hypotheses and others could not be compared.
 
-Source: Bell 1994, The iterated Kalman smoother as a Gauss-Newton method.
+The method is the iterated Kalman smoother of Bell 1994.
 """
 
 from collections import Counter
@@ -32,28 +32,30 @@ from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter, PathResult
 from mag_tracking.units import NS
 
-LEADING = np.log(1e3)
-"""A hypothesis leads that is not lighter than the heaviest by more than this."""
+MAX_LOG_RATIO = np.log(1e3)
+"""A hypothesis is leading if its log-weight is below the largest by no more than this."""
 
 PASSES = 3
-"""Gauss-Newton steps each time; the next time goes on from where they led."""
+"""Number of Gauss-Newton steps each time; the next time continues from the result."""
 
-STEP = 0.5
-"""Each goes so far. Whole ones overshoot where the field is far from linear, and run away."""
+STEP_SIZE = 0.5
+"""Damping of each step. Undamped steps overshoot where the field is strongly nonlinear, and
+diverge."""
 
-SETTLED = 0.3
-"""In deviations of the position: a path has settled that the last step moved no more than this
-anywhere."""
+CONVERGED = 0.3
+"""A path has converged if the last step moved it nowhere by more than this, in standard deviations
+of the position."""
 
-TRIED, IN_VAIN = 'paths linearised anew', 'paths linearised anew in vain'
-"""What is counted."""
+ATTEMPTED, FAILED = 'paths relinearised', 'paths relinearised without success'
+"""Keys in the counts."""
 
 MAX_FRAMES = 64
-"""The window is shorter where it would hold more than half of these: at 100 frames a second one of
-seconds would take more than a core."""
+"""Maximum number of frames; a window begins with at most half of them. At 100 frames per second, a
+window of several seconds would take more than a core."""
 
-MAX_NUMBERS = 5_000_000
-"""Frames times hypotheses times states squared: with many sensors it is done for fewer of them."""
+MAX_ELEMENTS = 5_000_000
+"""Maximum product of frames, hypotheses and squared number of states. With many sensors, fewer
+hypotheses are relinearised."""
 
 
 @dataclass(frozen=True)
@@ -61,47 +63,66 @@ class Window:
     """The latest frames of a running track, and the path of each hypothesis through them."""
 
     anchor: FilterBank | InitialBank
-    """At the first of the frames."""
+    """Bank at the first frame."""
     is_updated: bool
-    """The anchor has been updated with the first frame."""
+    """Whether the anchor has been updated with the first frame."""
     frames: list[FieldFrame]
     intervals: list[float]
-    """[s] From the frame before to each."""
+    """[s] Time from the previous frame to each frame."""
     paths: list[FloatArray]
-    """(n_hyp, n_x) at each frame: where the hypotheses of the anchor are linearised."""
+    """(n_hyp, n_x) At each frame: states at which the hypotheses of the anchor are linearised."""
     log_likelihoods: list[FloatArray]
-    """(n_hyp,) of each frame, in the filter; -inf of what was dropped."""
+    """(n_hyp,) Of each frame, in the filter; -inf for dropped hypotheses."""
     evidence: float
-    """Log-evidence of the frames that the anchor was not updated with, in the filter."""
-    most: int
-    """So many hypotheses are linearised at most."""
+    """Log-evidence, in the filter, of the frames with which the anchor has not been updated."""
+    max_hypotheses: int
+    """Maximum number of hypotheses that are relinearised."""
 
 
 class Relinearisation:
-    """The latest frames of a running track, and the path of each hypothesis through them."""
+    """Window of the latest frames of a running track, with the path of each hypothesis.
 
-    def __init__(self, interval_s: float, window_s: float, most: int) -> None:
-        self._interval_ns, self._window_ns, self._most = interval_s * NS, window_s * NS, most
+    Parameters
+    ----------
+    interval_s : float, s
+        Minimum interval between relinearisations.
+    window_s : float, s
+        Duration of the window; 0 disables relinearisation.
+    max_hypotheses : int
+        Maximum number of hypotheses that are relinearised.
+
+    References
+    ----------
+    [Bell94]_; [JulierUhlmann01]_.
+    """
+
+    def __init__(self, interval_s: float, window_s: float, max_hypotheses: int) -> None:
+        self._interval_ns, self._window_ns, self._max_hypotheses = \
+            interval_s * NS, window_s * NS, max_hypotheses
         self.clear()
 
     def clear(self) -> None:
-        """Nothing is kept: no track is running."""
+        """Drop everything; no track is running."""
         self._anchor: FilterBank | InitialBank | None = None
-        # {origin: log-likelihood along the path minus that in the filter}, as of the last time.
+        # {origin: log-likelihood along the path minus that in the filter}, at the last update.
         self._gain: dict[int, float] = {}
 
     def begin(self, anchor: FilterBank | InitialBank) -> None:
-        """A track begins with a bank like the `anchor`, which is not yet updated with its first
-        frame. The passes start from the anchor, and nobody else may write into it. Without a
-        window nothing is done.
+        """Start the window at the first frame of a track.
+
+        Parameters
+        ----------
+        anchor : FilterBank or InitialBank
+            Bank of the track before the update with its first frame. It must not be modified by the
+            caller afterwards.
         """
         if not self._window_ns:
             return
         self._anchor, self._updated = anchor, False
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
-        # At each frame, and of each hypothesis of the anchor: where it is linearised, and the
-        # log-likelihood that the filter gave it.
+        # For each frame and each hypothesis of the anchor: state of the linearisation, and
+        # log-likelihood in the filter.
         self._paths: list[FloatArray] = []
         self._log_likelihoods: list[FloatArray] = []
         self._evidence: list[float] = []
@@ -110,16 +131,26 @@ class Relinearisation:
         self._gain = {}
 
     def restart(self) -> None:
-        """The filter has changed: what it did before the next frame is not to be done again."""
+        """Start a new window at the next frame, because the filter has changed."""
         self._stale = self._anchor is not None
 
     def add(self, bank: FilterBank, predicted: FloatArray, log_likelihood: FloatArray,
             evidence: float, frame: FieldFrame, dt: float) -> None:
-        """The `FilterBank` was updated with a `FieldFrame`, `dt` [s] after the one before.
+        """Add a frame with which the bank has been updated.
 
-        `log_likelihood` (n_hyp,) of it, linearised at the states `predicted` (n_hyp, n_x); where
-        the filter iterates its updates that is not quite where it ended. `evidence` is the
-        log-density of the frame by all hypotheses.
+        Parameters
+        ----------
+        bank : FilterBank
+            Bank after the update.
+        predicted : (n_hyp, n_x) array
+            States at which the frame was linearised. If the filter iterates its updates, the last
+            linearisation is elsewhere.
+        log_likelihood : (n_hyp,) array
+        evidence : float
+            Log-density of the frame over all hypotheses.
+        frame : FieldFrame
+        dt : float, s
+            Time since the previous frame.
         """
         if self._anchor is None:
             return
@@ -140,23 +171,31 @@ class Relinearisation:
             self._last_ns = frame.stamp_ns
 
     def _keep(self, anchor: FilterBank | InitialBank, mask: BoolArray) -> None:
-        """Keep the rows of `mask` of all that is kept for each hypothesis of the `anchor`."""
+        """Keep only the hypotheses of the anchor in `mask`."""
         anchor.keep(mask)
         self._paths = [path[mask] for path in self._paths]
         self._log_likelihoods = [of_frame[mask] for of_frame in self._log_likelihoods]
 
     def improve(self, bank_filter: BankFilter, bank: FilterBank) -> 'Counter[str]':
-        """Linearise the leading hypotheses of the `FilterBank` anew, in place, if it is time to.
+        """Relinearise the leading hypotheses of a bank in place, if the interval has elapsed.
 
-        By the `BankFilter` that it is moved with. Returns a Counter of those it was tried for, and
-        of those for which it was of no use: they keep their states.
+        Parameters
+        ----------
+        bank_filter : BankFilter
+            Filter of the bank.
+        bank : FilterBank
+
+        Returns
+        -------
+        Counter of str
+            Number of relinearised paths, and of those that were rejected.
         """
         anchor = self._anchor
         if anchor is None or self._last_ns is None \
                 or self._frames[-1].stamp_ns - self._last_ns < self._interval_ns:
             return Counter()
         self._last_ns = self._frames[-1].stamp_ns
-        anchor = self._moved_on(bank_filter, anchor, bank)
+        anchor = self._slide(bank_filter, anchor, bank)
         if self._updated and len(self._frames) == 1:
             return Counter()
         leading = self._leading(bank)
@@ -172,26 +211,37 @@ class Relinearisation:
                            out=np.full(len(rows), -np.inf))
         self._gain = dict(zip(anchor.origin[rows[finite]].tolist(), gain[finite].tolist(),
                               strict=True))
-        settled = along.unsettled <= SETTLED
-        taken = finite & settled & ((gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
-        _take(bank, leading[taken], last.x[taken], last.P[taken])
-        rest = finite & ~taken
-        _widen(bank, leading[rest], last.x[rest], last.P[rest], bank_filter.nearly_linear)
-        return Counter({TRIED: len(taken), IN_VAIN: int(np.count_nonzero(~taken))})
+        converged = along.unsettled <= CONVERGED
+        accepted = finite & converged & ((gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
+        _replace_states(bank, leading[accepted], last.x[accepted], last.P[accepted])
+        rest = finite & ~accepted
+        _widen_covariances(bank, leading[rest], last.x[rest], last.P[rest],
+                           bank_filter.nearly_linear)
+        return Counter({ATTEMPTED: len(accepted), FAILED: int(np.count_nonzero(~accepted))})
 
     @property
     def window(self) -> Window | None:
-        """What is kept; None where nothing is."""
+        """Frames and paths of the window; None if there are none."""
         if self._anchor is None or self._stale or not self._frames:
             return None
         begin = int(self._updated)
         return Window(self._anchor, self._updated, self._frames, self._intervals, self._paths,
-                      self._log_likelihoods, float(sum(self._evidence[begin:])), self._most)
+                      self._log_likelihoods, float(sum(self._evidence[begin:])),
+                      self._max_hypotheses)
 
     def without_target(self, bank_filter: BankFilter, bank: FilterBank, i: int, n: int) -> None:
-        """Target `i` of several is no longer followed, and is not felt from the frame `n` on.
+        """Remove one of several targets from the window.
 
-        By the `BankFilter` and the `FilterBank` with that target.
+        Parameters
+        ----------
+        bank_filter : BankFilter
+            Filter that includes the target.
+        bank : FilterBank
+            Bank that includes the target.
+        i : int
+            Target.
+        n : int
+            Frame from which on the target is not detectable; the window begins there.
         """
         if self._anchor is None or self._stale or n >= len(self._frames):
             self.restart()
@@ -204,7 +254,12 @@ class Relinearisation:
         self._gain = {}
 
     def resume(self, window: Window) -> None:
-        """Go on from another window, whose hypotheses are now those of the track."""
+        """Continue from another window, whose hypotheses replace those of the track.
+
+        Parameters
+        ----------
+        window : Window
+        """
         self.begin(window.anchor)
         self._updated = window.is_updated
         self._frames, self._intervals = list(window.frames), list(window.intervals)
@@ -214,22 +269,30 @@ class Relinearisation:
         self._last_ns = window.frames[-1].stamp_ns
 
     def gain(self, origin: int) -> float:
-        """Log-likelihood [nats] of the latest frames along the path of a hypothesis, minus that in
-        its filter; 0 where there is no path, or it was not done last time.
+        """Log-likelihood of the latest frames along a path, minus that in the filter.
+
+        Parameters
+        ----------
+        origin : int
+            Origin of the hypothesis.
+
+        Returns
+        -------
+        float, nats
+            0 if there is no path, or if it was not part of the last update.
         """
         return self._gain.get(origin, 0.0)
 
     def _leading(self, bank: FilterBank) -> IntArray:
-        """Rows of the heaviest hypotheses, as many as it is done for."""
-        affordable = MAX_NUMBERS // (len(self._frames) * bank.x.shape[1]**2)
+        """Rows of the heaviest hypotheses, up to the maximum number."""
+        affordable = MAX_ELEMENTS // (len(self._frames) * bank.x.shape[1]**2)
         order = np.argsort(-bank.log_w, kind='stable')
-        leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - LEADING]
-        return leading[:max(1, min(self._most, affordable))]
+        leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - MAX_LOG_RATIO]
+        return leading[:max(1, min(self._max_hypotheses, affordable))]
 
-    def _moved_on(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
-                  bank: FilterBank) -> FilterBank | InitialBank:
-        """The anchor: once the frames are of twice the window, it moves to where the window begins.
-        """
+    def _slide(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
+               bank: FilterBank) -> FilterBank | InitialBank:
+        """Move the anchor to the start of the window once the frames cover twice the window."""
         now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
         if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MAX_FRAMES:
             return anchor
@@ -239,7 +302,7 @@ class Relinearisation:
 
     def _move_to(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
                  bank: FilterBank, n: int) -> FilterBank:
-        """The anchor, moved to the frame `n`, where the window begins from now on."""
+        """Move the anchor to frame `n`, where the window begins from now on."""
         self._keep(anchor, np.isin(anchor.origin, bank.origin))
         moved = self._anchor = anchor.rows(np.arange(len(anchor)))
         self._run_along(bank_filter, moved, np.stack(self._paths[:n + 1], axis=1), 1)
@@ -251,30 +314,25 @@ class Relinearisation:
 
     def _run_along(self, bank_filter: BankFilter, bank: FilterBank, paths: FloatArray,
                    passes: int) -> PathResult:
-        """Run rows of the anchor, `bank`, along their `paths` (n_rows, n, n_x) through the first n
-        of the frames; both are moved.
-        """
+        """Run hypotheses of the anchor along their paths (n_rows, n, n_x); both are modified."""
         n = paths.shape[1]
         return bank_filter.run_along(
-            bank, self._frames[:n], self._intervals[:n], paths, passes=passes, step=STEP,
+            bank, self._frames[:n], self._intervals[:n], paths, passes=passes, step=STEP_SIZE,
             first_is_updated=self._updated)
 
 
-def _take(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
-    """Take states `x` (n, n_x) for the `rows` (n,) of the bank, and the wider covariances of
-    theirs and of `P` (n, n_x, n_x), in place.
-    """
+def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
+    """Replace states of the bank, in place; each keeps the larger of its covariance and `P`."""
     own, path = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
     bank.x[rows] = x
     bank.P[rows[path > own]] = P[path > own]
 
 
-def _widen(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
-           nearly_linear: Callable[[FloatArray], FloatArray]) -> None:
-    """Take the covariances `P` (n, n_x, n_x) of paths that lead to `x` (n, n_x) where they are
-    wider than those of the `rows` (n,) of the bank, in place, with how far the two are apart.
+def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
+                       nearly_linear: Callable[[FloatArray], FloatArray]) -> None:
+    """Adopt larger covariances of paths, in place, extended by the distance of the states.
 
-    Not where they are so wide that the next update, linearised at one place, would lead astray.
+    Covariances that are too large for the next linear update are not adopted.
     """
     difference = x - bank.x[rows]
     apart = P + difference[:, :, None] * difference[:, None]
@@ -284,5 +342,5 @@ def _widen(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
 
 
 def _rows(anchor: FilterBank | InitialBank, bank: FilterBank) -> IntArray:
-    """Rows of the `anchor` that the hypotheses of `bank` started from."""
+    """Rows of the anchor from which the hypotheses of the bank originate."""
     return np.searchsorted(anchor.origin, bank.origin)

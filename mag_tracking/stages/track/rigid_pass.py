@@ -1,11 +1,11 @@
-"""A vehicle's whole pass at once, along a path that bends only steadily.
+"""Fit of a steady path to the whole pass of a vehicle.
 
-A filter bends the path of its target until it fits whatever the sensors say: clocks that are apart,
-a clipped field, a second vehicle. A path of steady acceleration and turning cannot. If it does not
-explain the frames of a pass, something else than a vehicle past good sensors made them; if a
-straight one does as soon as the clocks are free, these are apart.
+A filter bends the path of its target until it fits any measurement: clock offsets, a clipped field,
+a second vehicle. A path of steady acceleration and turn rate cannot do so. If it does not explain
+the frames of a pass, they are not those of a single vehicle and fault-free sensors. If a straight
+path explains them only with free clocks, the clocks have offsets.
 
-Source: TSP14 sections III.A and V for the fit of a row of dipoles at constant velocity.
+The fit of a row of dipoles at constant velocity is that of TSP14 sections III.A and V.
 """
 
 from collections.abc import Sequence
@@ -23,36 +23,40 @@ from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.pass_samples import PassSamples
 from mag_tracking.units import NS
 
-SHORT, LONG = 3, 5
-"""Dipoles of the rows: a long one explains any vehicle, a short one cannot make up for clocks."""
+N_SHORT, N_LONG = 3, 5
+"""Number of dipoles of the two rows: the long row explains any vehicle; the short one cannot
+compensate for clock offsets."""
 
 LENGTH, LONG_LENGTH = 3.0, 8.0
-"""[m] Between the first and the last of them, where the search starts."""
+"""[m] Start values of the distance from the first to the last dipole, for the short and the long
+row."""
 
-NEAR, FAR = 0.1, 0.3
-"""[s] The search for the clocks starts with these, either way."""
+SMALL_OFFSET, LARGE_OFFSET = 0.1, 0.3
+"""[s] Start values of the clock offsets, used with both signs."""
 
 OFFSET_STD, MAX_OFFSET = 0.15, 0.5
-"""[s] Of clocks that nobody compared. A longer offset is no answer: a turn looks like it."""
+"""[s] Prior standard deviation of clock offsets, and their maximum. A larger offset is not
+accepted, because a turn has the same effect."""
 
 TURN = 0.4
-"""[rad/s] The search for a path that bends starts with this, either way, too."""
+"""[rad/s] Start value of the turn rate of a bent path, used with both signs."""
 
-WELL, MISFIT = 1.3, 1.5
-"""Reduced chi-square: a path explains a pass well up to the first, and cannot beyond the second."""
+GOOD_MISFIT, MAX_MISFIT = 1.3, 1.5
+"""Reduced chi-square up to which a path explains a pass well, and up to which it may explain it."""
 
-CHANCE, BENDS = 1e-5, 1e-3
-"""Probability that clocks which agree make the fit of a straight path better by as much, and that
-of a path that bends."""
+P_CLOCKS, P_BEND = 1e-5, 1e-3
+"""Significance levels for clock offsets, and for a bent path: probability that correct clocks, or a
+straight motion, improve the fit by as much."""
 
 MIN_DISTANCE = 1.0
-"""[m] Clocks that move the target by less do no harm."""
+"""[m] Clock offsets that move the target by less than this are harmless."""
 
 MIDDLE_STD = 0.5
-"""[m] The iron of a vehicle has another middle for each sensor."""
+"""[m] Standard deviation of the magnetic centre of a vehicle between sensors."""
 
-FARTHEST, FASTEST = 30.0, 100.0
-"""[m], [m/s] No vehicle that was tracked is farther from all sensors, or faster."""
+MAX_DISTANCE, MAX_SPEED = 30.0, 100.0
+"""[m], [m/s] Maximum distance of a tracked vehicle from the nearest sensor, and its maximum
+speed."""
 
 _STRAIGHT = np.arange(N_STRAIGHT)
 _BENT = np.arange(N_PATH)
@@ -62,48 +66,60 @@ _BENT = np.arange(N_PATH)
 class RigidPass:
     """Fits of a vehicle on a steady path to the frames of its whole pass.
 
-    The costs are sums of squared whitened residuals.
+    Costs are sums of squared whitened residuals.
     """
 
     stamp_ns: int
-    """When the field was strongest: time zero of the paths."""
+    """Time of the strongest field; time zero of the paths."""
     straight: float
     """Cost of a straight path."""
     bent: float
-    """Cost of a path that bends."""
+    """Cost of a path with acceleration and turn."""
     apart: float
-    """Cost of a straight path at constant speed, the clocks being apart."""
+    """Cost of a straight path at constant speed with free clock offsets."""
     freedom: int
-    """Degrees of freedom of that fit."""
+    """Degrees of freedom of the fit with free clock offsets."""
     misfit: float
-    """Reduced chi-square of a row on a path that bends, a long one if need be; about one where that
+    """Reduced chi-square of a bent path with a short or, if needed, a long row; about 1 if it
     explains the pass."""
     reference: int
-    """Row of the sensor with the strongest field: its clock is what the others are compared to."""
+    """Row of the sensor with the strongest field; its clock is the reference."""
     offset: FloatArray
-    """(n_sensors,) [s] how far each clock is ahead of that; NaN = not compared, or it cannot be."""
+    """(n_sensors,) [s] Time by which each clock is ahead of the reference; NaN = not compared or
+    not observable."""
     offset_std: FloatArray
-    """(n_sensors,) [s] by noise and model error alone; 0 of the reference."""
+    """(n_sensors,) [s] Standard deviation due to noise and model error alone; 0 for the
+    reference."""
     position: FloatArray
-    """(3,) [m] where the field was strongest; of the straight path, the clocks being apart."""
+    """(3,) [m] At the time of the strongest field; of the straight path with free clock offsets."""
     velocity: FloatArray
     """(3,) [m/s]"""
     straight_paths: FloatArray
-    """(k, 6) [m], [m/s] positions and velocities where the field was strongest, on straight paths
-    of a short row and of a long one, if these explain the pass about as well as paths that bend."""
+    """(k, 6) [m], [m/s] Positions and velocities at the time of the strongest field, for straight
+    paths of a short and of a long row that explain the pass about as well as bent paths."""
 
     @property
     def n_clocks(self) -> int:
-        """How many clocks were compared to that of the reference."""
+        """Number of clocks that were compared with the reference."""
         return int(np.count_nonzero(~np.isnan(self.offset))) - 1
 
     @property
     def is_explained(self) -> bool:
-        """Whether a straight path explains the pass, if need be with clocks that are apart."""
-        return self.apart <= WELL * self.freedom
+        """Whether a straight path explains the pass, if necessary with free clock offsets."""
+        return self.apart <= GOOD_MISFIT * self.freedom
 
     def closest(self, positions: FloatArray) -> FloatArray:
-        """(3,) [m] where the path comes nearest to one of the sensors at `positions` (n, 3)."""
+        """Closest point of the path to any sensor.
+
+        Parameters
+        ----------
+        positions : (n, 3) array, m
+            Positions of the sensors.
+
+        Returns
+        -------
+        (3,) array, m
+        """
         away = positions - self.position
         square = max(float(self.velocity @ self.velocity), 1e-12)
         places = self.position + (away @ self.velocity / square)[:, None] * self.velocity
@@ -111,8 +127,19 @@ class RigidPass:
         return nearest
 
     def difference(self, stamp_ns: int, state: FloatArray) -> FloatArray:
-        """(6,) [m], [m/s] from the nearest of the `straight_paths` to a position and velocity,
-        `state` (6,), at the time `stamp_ns`. Horizontal; zero where there are no such paths.
+        """Horizontal difference between a state and the nearest of the `straight_paths`.
+
+        Parameters
+        ----------
+        stamp_ns : int, ns
+            Time of the state.
+        state : (6,) array, m and m/s
+            Position and velocity.
+
+        Returns
+        -------
+        (6,) array, m and m/s
+            Zero if there are no such paths.
         """
         if not len(self.straight_paths):
             return np.zeros(6)
@@ -124,133 +151,145 @@ class RigidPass:
 
     @cached_property
     def speed(self) -> float:
-        """[m/s]"""
+        """Horizontal speed [m/s]."""
         return float(np.hypot(self.velocity[0], self.velocity[1]))
 
     @property
     def widening(self) -> float:
-        """Factor on the variances where the residuals are larger than their law allows."""
+        """Factor on the variances if the residuals are larger than expected."""
         return max(self.apart / self.freedom, 1.0)
 
     def clock_variance(self, sensor: int) -> float:
-        """[s^2] of the offset of a sensor's clock (row), with all that the model leaves out."""
+        """Variance of the clock offset of a sensor, including the model error.
+
+        Parameters
+        ----------
+        sensor : int
+            Row of the sensor.
+
+        Returns
+        -------
+        float, s^2
+        """
         return float(self.widening * self.offset_std[sensor]**2 + (MIDDLE_STD / self.speed)**2)
 
     @property
     def needs_clocks_apart(self) -> bool:
-        """Whether a straight path explains the pass with clocks that are apart, and no path does
-        without."""
+        """Whether only a straight path with clock offsets explains the pass."""
         offset = float(np.nanmax(np.abs(self.offset)))
         if not self.is_explained or offset > MAX_OFFSET or offset * self.speed < MIN_DISTANCE:
             return False
         gains = np.array([self.straight - self.apart, self.bent - self.apart]) / self.widening
         improbable = float(np.nansum(np.square(self.offset / OFFSET_STD)))
-        return bool((gains - improbable > chdtri(self.n_clocks, [CHANCE, BENDS])).all())
+        return bool((gains - improbable > chdtri(self.n_clocks, [P_CLOCKS, P_BEND])).all())
 
     @property
     def is_straight(self) -> bool:
-        """Whether the path need not bend, nor the vehicle accelerate."""
+        """Whether the path needs neither a bend nor acceleration."""
         gain = (min(self.straight, self.apart) - self.bent) / self.widening
-        return bool(gain <= chdtri(N_PATH - N_STRAIGHT, BENDS))
+        return bool(gain <= chdtri(N_PATH - N_STRAIGHT, P_BEND))
 
 
 def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
                    starts: FloatArray) -> RigidPass | None:
-    """Fit straight paths and one that bends to the frames of a pass.
+    """Fit straight paths and bent ones to the frames of a pass.
 
     Parameters
     ----------
     network : SensorNetwork
-    frames : list of FieldFrame
-    stamp_ns : int
-        When the field was strongest.
-    starts : (n, 6) [m], [m/s]
-        Positions and velocities then, to search from.
+    frames : sequence of FieldFrame
+    stamp_ns : int, ns
+        Time of the strongest field.
+    starts : (n, 6) array, m and m/s
+        Positions and velocities at that time, from which the search starts.
 
-    Returns the `RigidPass`, or None where the frames do not determine one.
+    Returns
+    -------
+    RigidPass or None
+        None if the frames do not determine a path.
     """
     data = PassSamples.of(network, frames, stamp_ns)
     n_clocks = data.n_clocks
-    if n_clocks < 1 or data.n_free(LONG) <= N_PATH:
+    if n_clocks < 1 or data.n_free(N_LONG) <= N_PATH:
         return None
     first = np.stack([starts[:, 0], starts[:, 1], starts[:, 2],
                       np.hypot(starts[:, 3], starts[:, 4]),
                       np.arctan2(starts[:, 4], starts[:, 3]), starts[:, 5],
                       np.full(len(starts), LENGTH)], axis=1)
-    straight, cost, _ = data.fit(SHORT, _STRAIGHT, first)
-    bends, apart_from = straight[None, _BENT], [(straight[_STRAIGHT], NEAR)]
-    if cost > WELL * (data.n_free(SHORT) - N_STRAIGHT):
-        # A path that was fitted to a turn, or with clocks that are far apart, leads elsewhere.
+    straight, cost, _ = data.fit(N_SHORT, _STRAIGHT, first)
+    bends, apart_from = straight[None, _BENT], [(straight[_STRAIGHT], SMALL_OFFSET)]
+    if cost > GOOD_MISFIT * (data.n_free(N_SHORT) - N_STRAIGHT):
+        # If the vehicle turned, or if the clock offsets are large, the straight path is misleading.
         bends = np.vstack([bends, [np.append(first[0], [0.0, turn, 0.0])
                                    for turn in (-TURN, TURN)]])
-        apart_from.append((first[0], FAR))
+        apart_from.append((first[0], LARGE_OFFSET))
     clocks = np.array([np.append(p, np.full(n_clocks, sign * offset))
                        for p, offset in apart_from for sign in (-1.0, 1.0)])
-    path, bent, _ = data.fit(SHORT, _BENT, bends)
-    short = _RowFits(_state_at_zero(straight), cost, bent, data.n_free(SHORT) - N_PATH)
-    long = _long_row(data, straight, path, short.misfit > WELL)
-    misfit = short.misfit if short.misfit <= WELL else min(short.misfit, long.misfit)
+    path, bent, _ = data.fit(N_SHORT, _BENT, bends)
+    short = _RowFits(_state_at_zero(straight), cost, bent, data.n_free(N_SHORT) - N_PATH)
+    long = _long_row(data, straight, path, short.misfit > GOOD_MISFIT)
+    misfit = short.misfit if short.misfit <= GOOD_MISFIT else min(short.misfit, long.misfit)
     straight_paths = [f.straight for f in (short, long) if f.needs_no_bend
                       and _is_of_vehicle(f.straight, data.positions)]
     free = np.concatenate([_STRAIGHT, N_PATH + np.arange(n_clocks)])
-    path, apart, P = data.fit(SHORT, free, clocks)
+    path, apart, P = data.fit(N_SHORT, free, clocks)
     if not np.isfinite([cost, bent, apart, misfit]).all():
         return None
     offset, std = np.full(len(network), np.nan), np.full(len(network), np.nan)
-    # What nothing is known of has no variance in a pseudo-inverse.
+    # An unobservable offset has zero variance in a pseudo-inverse.
     variance = np.diagonal(P)[N_STRAIGHT:]
     known = np.append(True, variance > 0.0)
     offset[data.compared[known]] = np.append(0.0, path[N_PATH:])[known]
     std[data.compared[known]] = np.sqrt(np.append(0.0, variance))[known]
     x = _state_at_zero(path)
-    return RigidPass(stamp_ns, cost, bent, apart, data.n_free(SHORT) - len(free), misfit,
+    return RigidPass(stamp_ns, cost, bent, apart, data.n_free(N_SHORT) - len(free), misfit,
                      int(data.compared[0]), offset, std, x[:3], x[3:],
                      np.reshape(straight_paths, (-1, 6)))
 
 
 class _RowFits(NamedTuple):
-    """Fits of a row of dipoles, on a straight path and on one that bends."""
+    """Fits of a row of dipoles, on a straight and on a bent path."""
 
     straight: FloatArray
-    """(6,) position and velocity of the straight path at time zero."""
+    """(6,) Position and velocity of the straight path at time zero."""
     cost: float
     cost_bent: float
     freedom: int
-    """Degrees of freedom of the path that bends."""
+    """Degrees of freedom of the bent path."""
 
     @property
     def misfit(self) -> float:
-        """Reduced chi-square of the path that bends."""
+        """Reduced chi-square of the bent path."""
         return self.cost_bent / self.freedom
 
     @property
     def needs_no_bend(self) -> bool:
-        """Whether the straight path may explain the pass, and one that bends hardly does better."""
+        """Whether the straight path may explain the pass, and the bent one is hardly better."""
         n_more = N_PATH - N_STRAIGHT
         gain = (self.cost - self.cost_bent) / max(self.misfit, 1.0)
-        return bool(self.cost <= MISFIT * (self.freedom + n_more)
-                    and gain <= chdtri(n_more, BENDS))
+        return bool(self.cost <= MAX_MISFIT * (self.freedom + n_more)
+                    and gain <= chdtri(n_more, P_BEND))
 
 
 def _long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, thorough: bool
               ) -> _RowFits:
-    """Fits of a long row, from the paths of a short one; a `thorough` search has more starts."""
-    near = data.near(bent)
+    """Fits of a long row, starting from the paths of a short one; `thorough` adds starts."""
+    near = data.with_near_field_error(bent)
     starts = np.array([straight, bent, straight, bent])
     starts[2:, PATH.index('length')] = LONG_LENGTH
-    path, cost, _ = near.fit(LONG, _STRAIGHT, starts[::2, _STRAIGHT])
+    path, cost, _ = near.fit(N_LONG, _STRAIGHT, starts[::2, _STRAIGHT])
     also = starts[[0, 1, 3]] if thorough else starts[:0]
-    _, cost_bent, _ = near.fit(LONG, _BENT, np.vstack([path[None, _BENT], also[:, _BENT]]))
-    return _RowFits(_state_at_zero(path), cost, cost_bent, data.n_free(LONG) - N_PATH)
+    _, cost_bent, _ = near.fit(N_LONG, _BENT, np.vstack([path[None, _BENT], also[:, _BENT]]))
+    return _RowFits(_state_at_zero(path), cost, cost_bent, data.n_free(N_LONG) - N_PATH)
 
 
 def _state_at_zero(path: FloatArray) -> FloatArray:
-    """(6,) position and velocity of a path at time zero."""
+    """Position and velocity (6,) of a path at time zero."""
     c, s = np.cos(path[4]), np.sin(path[4])
     return np.array([*path[:3], c * path[3], s * path[3], path[5]])
 
 
 def _is_of_vehicle(state: FloatArray, positions: FloatArray) -> bool:
-    """Whether a vehicle past sensors at `positions` (n, 3) can have this `state` (6,)."""
+    """Whether a state (6,) is possible for a vehicle that passes sensors (n, 3)."""
     nearest = np.linalg.norm(state[:3] - positions, axis=1).min()
-    return bool(nearest < FARTHEST and np.linalg.norm(state[3:]) < FASTEST)
+    return bool(nearest < MAX_DISTANCE and np.linalg.norm(state[3:]) < MAX_SPEED)

@@ -1,7 +1,7 @@
-"""One running track: its members, what is published of them, and what speaks for and against them.
+"""A running track: its members, their published poses, and the evidence for and against them.
 
-A track usually has one target. Targets whose fields overlap at the sensors are members of one
-track: they share a state, as what is wrongly taken for the field of one is missing in that of the
+A track usually has one target. Targets whose fields overlap at the sensors are members of one track
+and share a state, because a field that is wrongly attributed to one of them is missing in the
 other.
 
 Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
@@ -27,7 +27,7 @@ from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.member import Member, Update, View, members_in_order
 from mag_tracking.stages.track.new_target_evidence import UNDECIDED_NATS, NewTargetEvidence
 from mag_tracking.stages.track.new_target_search import NewTargetSearch
-from mag_tracking.stages.track.reach import FAINT, UNFELT, energy_of
+from mag_tracking.stages.track.reach import NEGLIGIBLE_ENERGY, WEAK_ENERGY, field_energy
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
@@ -37,64 +37,86 @@ from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.units import NS
 
 UNDECIDED_S = 1.0
-"""[s] Poses are in doubt for so long after another explanation was about as probable."""
+"""[s] Poses are in doubt for this time after another explanation was about as probable."""
 
 DOUBTED_S = 3.0
-"""[s] Vehicles of an explanation that may be others are in doubt for so long."""
+"""[s] Vehicles of an uncertain explanation are in doubt for this time."""
 
 TrackRecord = Track | SmoothedPose | Disturbance
+"""Output of the tracker."""
 
 
 class RunningTrack:
-    """Targets that are being followed, one or several that share a state.
+    """One target that is followed, or several that share a state.
+
+    Parameters
+    ----------
+    id : int
+        Identifier of the first member.
+    target : Target
+    settings : TrackSettings
+    sensors : SensorSubset
+        Sensors at the start of the track.
+    bank_filter : BankFilter
+    bank : FilterBank
+    counts : Counter of str
+        Counts of the stage, which are updated.
+    clocks : ClockComparison
+    later_sensors : SensorSubset
+        Sensors that are used as soon as the bank is small enough.
 
     Attributes
     ----------
+    counts : Counter of str
     members : list of Member
-        Those that are followed, in the order of their states.
+        Members that are followed, in the order of their states.
     ended : str or None
-        Why the last of them is over; None while it runs.
+        Reason why the last member has ended; None while the track runs.
     is_lost : bool
-        The last of them ended while it was still detected.
+        Whether the last member ended while it was still detected.
     """
 
     def __init__(self, id: int, target: Target, settings: TrackSettings, sensors: SensorSubset,
                  bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]',
-                 clocks: ClockComparison, later: SensorSubset) -> None:
-        """It starts with the `sensors`; `later` come in once its bank is small enough."""
+                 clocks: ClockComparison, later_sensors: SensorSubset) -> None:
         self.counts, self._clocks = counts, clocks
         self.ended: str | None = None
         self.is_lost = False
         self._target, self._settings = target, settings
-        self._bank = TrackBank(target, settings, sensors, bank_filter, bank, counts, later)
+        self._bank = TrackBank(target, settings, sensors, bank_filter, bank, counts, later_sensors)
         self.members = [Member(id, target, sensors, counts, clocks, 0)]
         self._newcomers = NewTargetEvidence()
-        # A new target could not be sought: there are too many members.
+        # Whether the last search could not add a member, because there are too many.
         self._is_full = False
         self._handover_due: int | None = None
         self._use(False)
 
     def _use(self, is_handover: bool) -> None:
-        """From now on the track is of the sensors of its bank."""
+        """Switch to the sensors of the bank."""
         sensors = self._bank.sensors
         self._no_target = NoTarget(len(sensors.network), self._settings.background_std)
         self._disturbance_model = DisturbanceModel(sensors.network, self._settings.background_std,
-                                             is_handover)
+                                                   is_handover)
         for member in self.members:
             member.use(sensors)
 
     @property
     def bank(self) -> FilterBank:
-        """The hypotheses of all members."""
+        """Hypotheses of all members."""
         return self._bank.bank
 
     @property
-    def _seeing(self) -> SensorSubset:
-        """The sensors that the track uses, or will use."""
-        return self._bank.later or self._bank.sensors
+    def _final_sensors(self) -> SensorSubset:
+        """Sensors that the track uses, or will use."""
+        return self._bank.later_sensors or self._bank.sensors
 
     def configure(self, settings: TrackSettings) -> None:
-        """Apply new values of the live settings."""
+        """Apply new values of the live settings.
+
+        Parameters
+        ----------
+        settings : TrackSettings
+        """
         self._settings = settings
         self._bank.configure(settings)
         if not settings.cross_check:
@@ -102,32 +124,42 @@ class RunningTrack:
                 member.use(self._bank.sensors)
 
     def doubt(self, sensors: Sequence[int]) -> None:
-        """The backgrounds of the `sensors` (rows) are doubtful, and so is a track that uses one."""
-        if not np.isin(self._seeing.rows, sensors).any():
+        """Doubt the track if it uses a sensor whose background is doubtful.
+
+        Parameters
+        ----------
+        sensors : sequence of int
+            Rows of the sensors whose background is doubtful.
+        """
+        if not np.isin(self._final_sensors.rows, sensors).any():
             return
         for member in self.members:
             if doubts.DOUBTFUL_BACKGROUND not in member.evidence.doubts:
-                self.counts['tracks of a doubtful background'] += 1
+                self.counts['tracks with a doubtful background'] += 1
                 member.evidence.doubt(doubts.DOUBTFUL_BACKGROUND)
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
-        """Run through the `recent` frames before the detection, and publish the first one after.
+        """Process the frames before the detection, and publish the frame of the detection.
 
         Parameters
         ----------
         frame : FieldFrame
-            Of the whole network, with the detection.
+            Frame of the detection, of the whole network.
         recent : list of FieldFrame
-            Those before it, oldest first.
-        approach_unobserved : bool
-            What came before says nothing of how this target came.
+            Frames before it, oldest first.
+        approach_unobserved : bool, optional
+            Whether the recent frames do not show the approach of the target.
+
+        Returns
+        -------
+        list of Track, SmoothedPose or Disturbance
         """
         watched_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
         first = self.members[0]
         first.evidence.doubt_start(
             approach_unobserved or watched_ns < MIN_OBSERVED_SHARE * self._settings.lookback_s * NS,
-            self._seeing.whole, self._target.starts_anywhere)
+            self._final_sensors.whole, self._target.starts_anywhere)
         first.begin_ns = frame.stamp_ns
         self._bank.begin(recent[0] if recent else frame, frame)
         dt = 0.0
@@ -142,20 +174,30 @@ class RunningTrack:
         return self.step(frame, dt)
 
     def step(self, frame: FieldFrame, dt: float, publish: bool = True) -> list[TrackRecord]:
-        """Predict, update, weigh; the records of a frame, if it is to be published.
+        """Predict, update and weight the bank, and publish the frame if requested.
 
-        The `frame` is of the whole network, `dt` [s] after the one before.
+        Parameters
+        ----------
+        frame : FieldFrame
+            Frame of the whole network.
+        dt : float, s
+            Time since the previous frame.
+        publish : bool, optional
+
+        Returns
+        -------
+        list of Track, SmoothedPose or Disturbance
         """
         if self.ended is not None:
             return []
         for member in () if self._target.starts_anywhere else self.members:
-            member.evidence.check_approach(self._seeing.part_of(frame))
+            member.evidence.check_approach(self._final_sensors.part_of(frame))
         advance = self._bank.advance(self._bank.sensors.part_of(frame), dt)
-        if not self._weigh(advance):
+        if not self._update_evidence(advance):
             return self.end('no hypothesis explains the field')
         self._bank.keep(advance, publish)
         best = self.bank.best()
-        self._note(advance, best)
+        self._update_newcomers(advance, best)
         if not publish and not self._bank.is_lagged:
             return []
         views = [self._view(i, best) for i in range(len(self.members))]
@@ -172,17 +214,16 @@ class RunningTrack:
         return [*out, *late, *self._end_if_over(advance.frame)]
 
     def _view(self, i: int, best: int) -> View:
-        """The bank of member `i` alone; `best` is the row of all members."""
-        bank = self.bank.extract_target(i, self._bank.one.n_target)
+        """Bank of member `i` alone; `best` is the row of the joint hypothesis."""
+        bank = self.bank.extract_target(i, self._bank.single_target.n_target)
         row = best if bank is self.bank else bank.best()
-        return View(bank, row, self._bank.one, self._bank.gain(row))
+        return View(bank, row, self._bank.single_target, self._bank.gain(row))
 
-    def _weigh(self, advance: Advance) -> bool:
-        """Count what a frame says for the members, for something else, and for no target; whether
-        a hypothesis explains it."""
+    def _update_evidence(self, advance: Advance) -> bool:
+        """Update the evidence of the members with a frame; False if no hypothesis explains it."""
         frame, dt = advance.frame, advance.dt
         if advance.n_rejected and np.count_nonzero(frame.n_samples) <= advance.n_rejected:
-            # Where no majority is left the track may as well be wrong.
+            # Without a majority of sensors, the track itself may be wrong.
             for member in self.members:
                 member.evidence.doubt(doubts.SENSORS_CONTRADICT)
         if not np.isfinite(advance.evidence):
@@ -198,38 +239,39 @@ class RunningTrack:
                 member.evidence.bayes_factor.add(
                     advance.evidence - disturbance_model, frame.stamp_ns,
                     self._settings.min_bayes_factor)
-            mine, first = self._frame_of(i, best, frame, dt), i * self._bank.one.n_target
+            mine, first = self._member_frame(i, best, frame, dt), \
+                i * self._bank.single_target.n_target
             member.evidence.add_frame(mine, self._bank.sensors.rows, self.bank.nis[best])
             if self._settings.cross_check and not self._target.starts_anywhere:
                 member.cross_check.add(
-                    mine, self.bank.x[best, first:first + self._bank.one.n_target])
+                    mine, self.bank.x[best, first:first + self._bank.single_target.n_target])
         return True
 
-    def _note(self, advance: Advance, best: int) -> None:
-        """Count how a frame fits hypothesis `best`, for the question of new targets."""
+    def _update_newcomers(self, advance: Advance, best: int) -> None:
+        """Update the evidence for new targets with the fit of hypothesis `best`."""
         bank, frame = self.bank, advance.frame
         self._newcomers.add(
             float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
             frame.stamp_ns, advance.n_rejected > 0 and len(frame.field) == 2,
             bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
 
-    def _frame_of(self, i: int, best: int, frame: FieldFrame, dt: float) -> FieldFrame:
-        """A frame as member `i` alone would have made it, by hypothesis `best`."""
+    def _member_frame(self, i: int, best: int, frame: FieldFrame, dt: float) -> FieldFrame:
+        """Frame with the field of member `i` only, according to hypothesis `best`."""
         if len(self.members) == 1:
             return frame
         others = self._bank.filter.field_of_others(self.bank, best, i, frame, dt)
         return replace(frame, field=frame.field - others)
 
     def _is_out_of_reach(self, i: int, frame: FieldFrame) -> bool:
-        """Whether member `i` of several goes away, and is no longer felt."""
+        """Whether member `i` of several moves away and is no longer detectable."""
         last = self.members[i].last
         assert last is not None
-        energy = energy_of(self._bank.filter, i, self.bank.x[self.bank.best()], frame)
-        return energy < (FAINT if self._is_full else UNFELT) \
-            and not self._bank.sensors.is_neared_by(last)
+        energy = field_energy(self._bank.filter, i, self.bank.x[self.bank.best()], frame)
+        return energy < (WEAK_ENERGY if self._is_full else NEGLIGIBLE_ENERGY) \
+            and not self._bank.sensors.is_approached_by(last)
 
     def _end_if_over(self, frame: FieldFrame) -> list[TrackRecord]:
-        """The closing records of those members that are over by their latest poses."""
+        """Closing records of the members that end with their latest poses."""
         out: list[TrackRecord] = []
         for member in list(self.members):
             reason = member.reason_to_end(self._bank.sensors, self._settings)
@@ -242,7 +284,7 @@ class RunningTrack:
         return out
 
     def _end_member(self, member: Member, reason: str) -> list[TrackRecord]:
-        """End one member; the others go on without its states."""
+        """End one member; the others continue without its states."""
         if len(self.members) == 1:
             self.is_lost = member.is_lost
             return self.end(reason)
@@ -253,12 +295,22 @@ class RunningTrack:
         return out
 
     def end(self, reason: str) -> list[TrackRecord]:
-        """End all members: the last record of each again, marked as ended, and smoothed poses."""
+        """End all members.
+
+        Parameters
+        ----------
+        reason : str
+
+        Returns
+        -------
+        list of Track, SmoothedPose or Disturbance
+            For each member its last record, marked as ended, and its smoothed poses.
+        """
         self.ended = reason
         return [record for i in range(len(self.members)) for record in self._closing(i, reason)]
 
     def _closing(self, i: int, reason: str) -> list[TrackRecord]:
-        """The closing records of member `i`."""
+        """Closing records of member `i`."""
         member = self.members[i]
         member.ended = reason
         if len(self.members) == 1:
@@ -270,26 +322,31 @@ class RunningTrack:
         view = self._view(i, best)
         doubtful = member.evidence.ends_in_misfit or member.is_doubted(self._settings)
         return [replace(member.last, ended=True),
-                *self._smoothed(i, view, False, self._bank.rest_of_lag(best), doubtful),
+                *self._smoothed(i, view, False, self._bank.remaining_lagged(best), doubtful),
                 *self._smoothed(i, view, True, self._bank.smoothed(best), doubtful)]
 
     def _smoothed(self, i: int, view: View, complete: bool, states: list[TrackState],
                   doubtful: bool) -> list[SmoothedPose]:
-        """The `SmoothedPose`s of member `i` of the states of all; of a complete track, with those
-        before it shared its state."""
-        member, n = self.members[i], self._bank.one.n_target
+        """Smoothed poses of member `i`; if complete, also those before it shared its state."""
+        member, n = self.members[i], self._bank.single_target.n_target
         mine = member.states_of(member.slot if complete else i, n, states)
         return member.smoothed(view.bank, view.best, complete,
                                [*member.early, *mine] if complete else mine, doubtful)
 
     @property
     def unexplained(self) -> list[UnexplainedField]:
-        """The fields during tracks that have ended, where a target never explained them."""
+        """Fields during ended members that a target never explained."""
         found = [m.unexplained(self._disturbance_model.uniform) for m in self.members if m.ended]
         return [u for u in found if u is not None]
 
     def new_target(self) -> Joint | None:
-        """Another explanation of the latest frames, where they ask for one and it is believed."""
+        """Search for another explanation of the latest frames, if they require one.
+
+        Returns
+        -------
+        Joint or None
+            None if no other explanation is sufficiently probable.
+        """
         window, n = self._bank.window, len(self.members)
         if self.ended is not None or self._target.starts_anywhere or window is None \
                 or self.members[0].last is None:
@@ -297,17 +354,17 @@ class RunningTrack:
         if (reason := self._newcomers.due(window.frames[-1].stamp_ns)) is None:
             return None
         self._is_full = n >= self._settings.max_joint_targets
-        self.counts['new_targets sought'] += 1
+        self.counts['searches for new targets'] += 1
         if self._is_full:
-            self.counts['new_targets not sought: too many vehicles at once'] += 1
+            self.counts['new targets not added: too many vehicles at once'] += 1
         found = NewTargetSearch(
             self.bank, window, self._bank.filter_of, n, VehicleState(
                 self._settings.vehicle, self._bank.sensors.network,
                 self._settings.background_std), reason, not self._is_full).find()
-        # A field of something else is no vehicle more.
+        # A field that a disturbance explains is not evidence for another vehicle.
         if self._newcomers.accepts(found.log_odds if found and all(
                 m.evidence.bayes_factor.would_be_favoured(
-                found.log_odds, self._settings.min_bayes_factor)
+                    found.log_odds, self._settings.min_bayes_factor)
                 for m in self.members) else -np.inf):
             return found
         if found is not None and found.log_odds > UNDECIDED_NATS:
@@ -318,9 +375,16 @@ class RunningTrack:
         return None
 
     def admit(self, joint: Joint, id: int) -> None:
-        """Go on with another explanation; a new target becomes the member `id`."""
+        """Continue with another explanation of the latest frames.
+
+        Parameters
+        ----------
+        joint : Joint
+        id : int
+            Identifier of the new member, if there is one.
+        """
         begin_ns, now_ns = (joint.window.frames[k].stamp_ns for k in (0, -1))
-        n, sensors = self._bank.one.n_target, self._bank.sensors
+        n, sensors = self._bank.single_target.n_target, self._bank.sensors
         ratio = self._settings.min_bayes_factor
         states = self._bank.smoothed(self.bank.best(), False)
         for member in self.members:
@@ -342,7 +406,7 @@ class RunningTrack:
                 member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, now_ns, DOUBTED_S, begin_ns)
 
     def hand_over(self) -> None:
-        """Switch to the sensors near where the target is going, if those used are others."""
+        """Switch to the sensors near the predicted position, if they are others."""
         best, self._handover_due = self._handover_due, None
         if best is None or self.ended is not None or len(self.members) > 1:
             return

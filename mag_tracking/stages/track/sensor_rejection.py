@@ -1,8 +1,8 @@
-"""Sensors that contradict the others: found while a target is tracked, and left out of a frame.
+"""Rejection of sensors that contradict the others, frame by frame.
 
-A sensor whose axes were swapped, that was knocked over, or that another vehicle stands at, pulls
-a track away from what all others say. Where a frame does not fit the leading hypothesis, and fits
-it once one sensor, or a few, are taken for missing, it is they that are wrong.
+A sensor with swapped axes, a sensor that was knocked over, or one beside another vehicle pulls a
+track away from the measurements of all others. If a frame does not fit the leading hypothesis, but
+does so without one or a few sensors, these are rejected.
 """
 
 from collections import Counter
@@ -20,74 +20,81 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 _States: TypeAlias = tuple[FloatArray, FloatArray]
 """States and covariances of a bank."""
 
-ONE_IN = 8
-"""No more than one sensor in so many can be wrong, but always one: else it is the track. Those that
-are far from the target agree with everything."""
+SENSORS_PER_REJECTION = 8
+"""Number of sensors for each one that may be rejected; one is always allowed. If more would be
+needed, the track itself is wrong. Sensors far from the target agree with everything."""
 
 
 class SensorRejection:
-    """Updates a bank with what of a frame can be believed."""
+    """Updates a bank with the credible part of each frame.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of the sensors.
+    """
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
         self.clear()
 
     def clear(self) -> None:
-        """No track is running."""
-        self._left_out: tuple[int, ...] = ()
+        """Reset; no track is running."""
+        self._rejected: tuple[int, ...] = ()
 
     def advance(self, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame, dt: float
                 ) -> 'tuple[FloatArray, FloatArray, FieldFrame, Counter[str]]':
-        """Move the `FilterBank` through a frame, without sensors that contradict.
+        """Move a bank through a frame, without sensors that contradict the others.
 
         Parameters
         ----------
         bank_filter : BankFilter
         bank : FilterBank
         frame : FieldFrame
-        dt : float [s]
+        dt : float, s
+            Time since the previous frame.
 
         Returns
         -------
-        predicted : (n_hyp, n_x)
-            The states before the update.
-        log_likelihood : (n_hyp,)
+        predicted : (n_hyp, n_x) array
+            States before the update.
+        log_likelihood : (n_hyp,) array
         frame : FieldFrame
-            What was used: sensors that were left out are missing.
-        counts : Counter
-            {what: number}, of the sensors that were left out.
+            The frame that was used, in which rejected sensors are missing.
+        counts : Counter of str
+            Number of rejections of each rejected sensor.
         """
-        # To keep all states takes as long as the update. Where the leader fits before it, one that
-        # does not will hardly lead after it.
+        # Keeping a copy of all states takes as long as the update. If the leading hypothesis fits
+        # before the update, one that does not fit is unlikely to lead after it.
         may_contradict = not self._fits_leader(bank_filter, bank, frame, dt)
         before = bank.x, bank.P
         predicted, log_likelihood = bank_filter.advance(bank, frame, dt, keeps_prior=may_contradict)
         if not may_contradict or self._fits(bank_filter, bank, frame, log_likelihood):
-            self._left_out = ()
+            self._rejected = ()
             return predicted, log_likelihood, frame, Counter()
         whole = bank.x, bank.P, bank.nis, log_likelihood
-        for left_out in self._suspicions(bank_filter, bank, before, frame, dt):
-            log_likelihood, less = self._without(bank_filter, bank, before, frame, dt, left_out)
+        for rejected in self._candidates(bank_filter, bank, before, frame, dt):
+            log_likelihood, less = self._without(bank_filter, bank, before, frame, dt, rejected)
             if self._fits(bank_filter, bank, less, log_likelihood):
-                self._left_out = left_out
+                self._rejected = rejected
                 return predicted, log_likelihood, less, Counter(
-                    {f'frames that {self._names[j]} contradicted': 1 for j in left_out})
-        self._left_out = ()
+                    {f'frames in which {self._names[j]} was rejected': 1 for j in rejected})
+        self._rejected = ()
         bank.x, bank.P, bank.nis, log_likelihood = whole
         return predicted, log_likelihood, frame, Counter()
 
-    def _suspicions(self, bank_filter: BankFilter, bank: FilterBank, before: _States,
+    def _candidates(self, bank_filter: BankFilter, bank: FilterBank, before: _States,
                     frame: FieldFrame, dt: float) -> Iterator[tuple[int, ...]]:
-        """Sets of sensors, as tuples of rows, to be left out, one after the other."""
+        """Sets of sensor rows to be rejected, in order of suspicion."""
         present = np.flatnonzero(~np.isnan(frame.field).all(axis=1)).tolist()
-        most = max(1, len(present) // ONE_IN) if len(present) > 1 else 0
-        # Those of the frame before are the first that are suspected.
-        again = tuple(j for j in self._left_out if j in present)
-        if again and len(again) <= most:
+        max_rejected = max(1, len(present) // SENSORS_PER_REJECTION) if len(present) > 1 else 0
+        # The sensors rejected in the previous frame are tried first.
+        again = tuple(j for j in self._rejected if j in present)
+        if again and len(again) <= max_rejected:
             yield again
         found: tuple[int, ...] = ()
-        while len(found) < most:
-            # The one without which the others fit best is the next.
+        while len(found) < max_rejected:
+            # The next one is the sensor without which the others fit best.
             misfit: dict[tuple[int, ...], float] = {}
             for j in present:
                 if j not in found:
@@ -100,9 +107,9 @@ class SensorRejection:
 
     @staticmethod
     def _without(bank_filter: BankFilter, bank: FilterBank, before: _States, frame: FieldFrame,
-                 dt: float, left_out: tuple[int, ...]) -> tuple[FloatArray, FieldFrame]:
-        """The frame once more, as if some sensors were missing: (log-likelihood, frame)."""
-        missing = np.isin(np.arange(len(frame.field)), left_out)
+                 dt: float, rejected: tuple[int, ...]) -> tuple[FloatArray, FieldFrame]:
+        """Update with the frame again, as if some sensors were missing: (log-likelihood, frame)."""
+        missing = np.isin(np.arange(len(frame.field)), rejected)
         less = replace(frame, field=np.where(missing[:, None], np.nan, frame.field),
                        covariance=np.where(missing[:, None, None], np.nan, frame.covariance),
                        n_samples=np.where(missing, 0, frame.n_samples),
@@ -113,20 +120,20 @@ class SensorRejection:
     @classmethod
     def _fits_leader(cls, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,
                      dt: float) -> bool:
-        """Whether the frame will fit the hypothesis that leads before it."""
+        """Whether the frame will fit the hypothesis that leads before the update."""
         leader = bank.alone(int(np.argmax(bank.log_w)))
         return cls._fits(bank_filter, leader, frame, bank_filter.advance(leader, frame, dt)[1])
 
     @staticmethod
     def _fits(bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,
               log_likelihood: FloatArray) -> bool:
-        """Whether the frame fits the hypothesis that leads after it."""
+        """Whether the frame fits the hypothesis that leads after the update."""
         leader = _leader(bank, log_likelihood)
         return leader is not None and not bank_filter.is_implausible(bank, leader, frame)
 
 
 def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:
-    """Row of the hypothesis that weighs most after the frame; None where none explains it."""
+    """Row of the heaviest hypothesis after the frame; None if no hypothesis explains it."""
     log_w = bank.log_w + log_likelihood
     leader = int(np.argmax(log_w))
     return leader if np.isfinite(log_w[leader]) else None

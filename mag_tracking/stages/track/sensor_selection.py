@@ -1,7 +1,8 @@
-"""Neighbourhood: of a large network the sensors that a track needs, which change as it moves on.
+"""Selection of the sensors of a large network that a track uses; it changes as the target moves.
 
-A state has up to nine numbers of each sensor, and an update takes time with the cube of
-the sensors. Far ones see nothing of the target; what they could still tell of it is given away.
+A state has up to nine elements per sensor, and the cost of an update is cubic in the number of
+sensors. Distant sensors do not measure the target; the little information that they would add is
+given up.
 """
 
 from dataclasses import replace
@@ -15,33 +16,81 @@ from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track.observation import angle_priors
 from mag_tracking.stages.track.settings import TrackSettings
 
-AHEAD_S = 0.5
-"""[s] The sensors are chosen for where the target will be then."""
+PREDICTION_S = 0.5
+"""[s] Sensors are selected for the position predicted over this time."""
 
 
-def nearest(positions: FloatArray, place: FloatArray, n: int) -> IntArray:
-    """Rows (n,), ascending, of the sensors at `positions` (n_sensors, 3) nearest to a `place`."""
+def nearest_sensors(positions: FloatArray, place: FloatArray, n: int) -> IntArray:
+    """Sensors nearest to a place.
+
+    Parameters
+    ----------
+    positions : (n_sensors, 3) array, m
+    place : (2,) array, m
+    n : int
+        Number of sensors.
+
+    Returns
+    -------
+    (n,) int array
+        Rows in ascending order.
+    """
     distance = np.hypot(*(positions[:, :2] - place).T)
     return np.sort(np.argsort(distance, kind='stable')[:n])
 
 
-def from_nearest(place: FloatArray, positions: FloatArray) -> FloatArray:
-    """(2,) [m] to a `place` (2,) from the nearest sensor of `positions` (n_sensors, 3)."""
-    away: FloatArray = place - positions[nearest(positions, place, 1)[0], :2]
+def offset_from_nearest(place: FloatArray, positions: FloatArray) -> FloatArray:
+    """Vector from the nearest sensor to a place.
+
+    Parameters
+    ----------
+    place : (2,) array, m
+    positions : (n_sensors, 3) array, m
+
+    Returns
+    -------
+    (2,) array, m
+    """
+    away: FloatArray = place - positions[nearest_sensors(positions, place, 1)[0], :2]
     return away
 
 
 def part_of_frame(frame: FieldFrame, rows: IntArray) -> FieldFrame:
-    """The `FieldFrame` of some sensors alone."""
+    """Frame of some sensors only.
+
+    Parameters
+    ----------
+    frame : FieldFrame
+    rows : (n,) int array
+
+    Returns
+    -------
+    FieldFrame
+    """
     return replace(frame, field=frame.field[rows], covariance=frame.covariance[rows],
                    n_samples=frame.n_samples[rows], time_offset=frame.time_offset[rows])
 
 
 class SensorSubset:
-    """The sensors that a track uses: all of a network, or some rows of a large one."""
+    """The sensors that a track uses: all sensors of a network, or some of a large one.
+
+    Parameters
+    ----------
+    whole : SensorNetwork
+    rows : (n,) int array, optional
+        Rows in ascending order; all sensors by default.
+
+    Attributes
+    ----------
+    whole : SensorNetwork
+    is_part : bool
+        Whether the sensors are a selection.
+    rows : (n,) int array
+    network : SensorNetwork
+        Network of the selected sensors.
+    """
 
     def __init__(self, whole: SensorNetwork, rows: IntArray | None = None) -> None:
-        """`rows` ascending; None = all."""
         self.whole = whole
         self.is_part = rows is not None
         self.rows: IntArray = np.arange(len(whole)) if rows is None else rows
@@ -49,48 +98,103 @@ class SensorSubset:
 
     @classmethod
     def near(cls, whole: SensorNetwork, place: FloatArray, n: int) -> 'SensorSubset':
-        """The `n` sensors nearest to a `place` (2,) [m]."""
-        return cls(whole, nearest(whole.positions, place, n))
+        """The sensors nearest to a place.
+
+        Parameters
+        ----------
+        whole : SensorNetwork
+        place : (2,) array, m
+        n : int
+            Number of sensors.
+
+        Returns
+        -------
+        SensorSubset
+        """
+        return cls(whole, nearest_sensors(whole.positions, place, n))
 
     def part_of(self, frame: FieldFrame) -> FieldFrame:
-        """What of a frame of the whole network these sensors measured."""
+        """Part of a frame of the whole network that these sensors measured.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+
+        Returns
+        -------
+        FieldFrame
+        """
         return part_of_frame(frame, self.rows) if self.is_part else frame
 
     def ahead_of(self, state: FloatArray, n: int) -> 'SensorSubset':
-        """The `n` sensors nearest to where a target of this state (n_x,) will be soon; these, if
-        the nearer half of them is among these."""
-        place = state[:2] + AHEAD_S * state[3:5]
-        serve = np.isin(nearest(self.whole.positions, place, n // 2), self.rows).all()
+        """The sensors nearest to the predicted position of a target.
+
+        Parameters
+        ----------
+        state : (n_x,) array
+        n : int
+            Number of sensors.
+
+        Returns
+        -------
+        SensorSubset
+            The same object if it contains the nearer half of those sensors.
+        """
+        place = state[:2] + PREDICTION_S * state[3:5]
+        serve = np.isin(nearest_sensors(self.whole.positions, place, n // 2), self.rows).all()
         return self if serve else SensorSubset.near(self.whole, place, n)
 
-    def is_neared_by(self, track: Track) -> bool:
-        """Whether a `Track` moves towards the sensor that it is nearest to."""
-        away = from_nearest(track.position[:2], self.network.positions)
+    def is_approached_by(self, track: Track) -> bool:
+        """Whether a track moves towards its nearest sensor.
+
+        Parameters
+        ----------
+        track : Track
+
+        Returns
+        -------
+        bool
+        """
+        away = offset_from_nearest(track.position[:2], self.network.positions)
         return bool(away @ track.velocity[:2] < 0.0)
 
-    def widened(self, track: Track, settings: TrackSettings) -> Track:
-        """A `Track` of these sensors as one of the whole network."""
-        return widened(track, self.rows, self.whole, settings) if self.is_part else track
+    def for_whole_network(self, track: Track, settings: TrackSettings) -> Track:
+        """Extend a track of these sensors to the whole network.
+
+        Parameters
+        ----------
+        track : Track
+        settings : TrackSettings
+
+        Returns
+        -------
+        Track
+        """
+        return for_whole_network(track, self.rows, self.whole, settings) if self.is_part else track
 
 
-def hand_on(bank: FilterBank, before: IntArray, after: IntArray, own_covariance: FloatArray,
-            background_std: float) -> None:
-    """Give the hypotheses of a `FilterBank`, in place, the states of other sensors.
+def exchange_sensor_states(bank: FilterBank, before: IntArray, after: IntArray,
+                           own_covariance: FloatArray, background_std: float) -> None:
+    """Replace the sensor states of a bank, in place, by those of other sensors.
+
+    Sensors that are in both sets keep their states and correlations.
 
     Parameters
     ----------
     bank : FilterBank
-    before, after : (n_before,), (n_after,) int
-        Rows in the network of the sensors whose states they have and shall have; those of both
-        keep what is known of them, and how it hangs together.
-    own_covariance : (n_after, n_own, n_own)
-        Of a new sensor's own states, which come between the target's and the backgrounds.
-    background_std : float [T]
-        Of a new sensor's background.
+    before : (n_before,) int array
+        Rows of the present sensors in the network.
+    after : (n_after,) int array
+        Rows of the new sensors in the network.
+    own_covariance : (n_after, n_own, n_own) array
+        Covariance of the states of each new sensor, which are between those of the target and the
+        backgrounds.
+    background_std : float, T
+        Standard deviation of the background of a new sensor.
     """
     n_own = own_covariance.shape[1]
     n_t = bank.x.shape[1] - (n_own + 3) * len(before)
-    old, new = [_places(n_t, n_own, len(rows)) for rows in (before, after)]
+    old, new = [_state_columns(n_t, n_own, len(rows)) for rows in (before, after)]
     kept = [(list(before).index(row), k) for k, row in enumerate(after) if row in before]
     source = np.concatenate([np.arange(n_t), *(old[j] for j, _ in kept)])
     target = np.concatenate([np.arange(n_t), *(new[k] for _, k in kept)])
@@ -106,17 +210,29 @@ def hand_on(bank: FilterBank, before: IntArray, after: IntArray, own_covariance:
     bank.nis = np.full((len(bank), len(after)), np.nan)
 
 
-def _places(n_t: int, n_own: int, n_sensors: int) -> IntArray:
-    """Of each sensor the places of its states: (n_sensors, n_own + 3)."""
+def _state_columns(n_t: int, n_own: int, n_sensors: int) -> IntArray:
+    """Columns (n_sensors, n_own + 3) of the states of each sensor."""
     j = np.arange(n_sensors)[:, None]
     return np.hstack([n_t + n_own * j + np.arange(n_own),
                       n_t + n_own * n_sensors + 3 * j + np.arange(3)])
 
 
-def widened(track: Track, rows: IntArray, network: SensorNetwork, settings: TrackSettings) -> Track:
-    """A `Track` of the sensors `rows` as one of the whole `network`.
+def for_whole_network(track: Track, rows: IntArray, network: SensorNetwork,
+                      settings: TrackSettings) -> Track:
+    """Extend a track of some sensors to the whole network.
 
-    What it says nothing of is NaN, and a mounting is what was known of it before.
+    Parameters
+    ----------
+    track : Track
+    rows : (n,) int array
+        Rows of its sensors.
+    network : SensorNetwork
+    settings : TrackSettings
+
+    Returns
+    -------
+    Track
+        Values of the other sensors are NaN; their mounting angles are those of the prior.
     """
     n_sensors = len(network)
     predicted, nis = np.full((n_sensors, 3), np.nan), np.full(n_sensors, np.nan)

@@ -1,9 +1,10 @@
-"""Smooth: a track once more, by what came before and after each of its poses.
+"""Smoothing of a track with the frames before and after each of its poses.
 
-One hypothesis of the bank, the one that stands at the end, is run through the frames again and
-then back, and is relinearised once. Hypotheses do not touch each other, so one can be run alone.
-Frames that contradict it are left out: one of them would bend the whole track. What was published
-last need not be where the smoothed track ends: each was linearised elsewhere.
+The hypothesis of the bank that is the best at the end is run forward through the frames again and
+then backward, and relinearised once. Hypotheses are independent, so that one can be run alone.
+Frames that contradict it are left out, because a single one would bend the whole track. The
+smoothed track need not end at the last published pose, since the two are linearised at different
+states.
 """
 
 from collections import deque
@@ -29,39 +30,40 @@ TrackState: TypeAlias = tuple[int, FloatArray, FloatArray]
 """Timestamp [ns], state (n_x,) and covariance (n_x, n_x)."""
 
 RELINEARISATIONS = 1
-"""How often the whole is linearised anew, at what came of it before: far ahead of the sensors the
-filter did not yet know where to linearise. It has not settled then: four times bring turning cars
-and trucks nearer, but the car along a corridor further off."""
+"""Number of relinearisations of the whole track at the previous result: far ahead of the sensors,
+the filter did not know the states to linearise at. One does not reach convergence. Four improve
+turning cars and trucks, but the car along a corridor is worse."""
 
-MAX_NUMBERS = 10_000_000
-"""Frames times states squared that are smoothed at most: 80 MB, and less than a second."""
+MAX_ELEMENTS = 10_000_000
+"""Maximum product of frames and squared number of states: 80 MB, and less than a second."""
 
 
 def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],
                    intervals: Sequence[float], updated: bool = False,
                    relinearisations: int = RELINEARISATIONS, path: Sequence[FloatArray] = ()
                    ) -> tuple[list[State], int]:
-    """States of a hypothesis at each frame, given all of them.
+    """States of a hypothesis at each frame, given all frames.
 
     Parameters
     ----------
     bank_filter : BankFilter
     bank : FilterBank
         The hypothesis alone, at the first frame.
-    frames : list of n FieldFrame
-    intervals : list of n float [s]
-        Time from the frame before.
-    updated : bool
-        The bank has been updated with the first frame.
-    relinearisations : int
-    path : list of FloatArray (n_x,)
-        States at the first frames, as far as they are known; the first pass is linearised there.
+    frames : sequence of FieldFrame
+    intervals : sequence of float, s
+        Time from the previous frame to each frame.
+    updated : bool, optional
+        Whether the bank has been updated with the first frame.
+    relinearisations : int, optional
+    path : sequence of (n_x,) array, optional
+        Known states at the first frames, at which the first pass is linearised.
 
     Returns
     -------
-    states : list of n (x (n_x,), P (n_x, n_x))
+    states : list of (x (n_x,), P (n_x, n_x))
+        One for each frame.
     left_out : int
-        Frames that the hypothesis contradicted; it coasted through them.
+        Number of frames that contradicted the hypothesis and were left out.
     """
     paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
     for at, known in zip(paths[0], path, strict=False):
@@ -75,70 +77,101 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
 
 @dataclass
 class _Start:
-    """Where a track began, and the filter that it was moved with."""
+    """Start of a track, and the filter that moved it."""
 
     bank_filter: BankFilter
     bank: FilterBank | InitialBank
     paths: tuple[FloatArray, ...] = ()
-    """(n_hyp, n_x) states of all hypotheses at the first frames, as far as they are known."""
+    """(n_hyp, n_x) Known states of all hypotheses at the first frames."""
     origin: IntArray | None = None
-    """(n_hyp,) of the `paths`."""
+    """(n_hyp,) Origins of the hypotheses of `paths`."""
 
     def path_of(self, origin: int) -> list[FloatArray]:
-        """The path of a hypothesis through the first frames, as far as it is known."""
+        """Known path of a hypothesis through the first frames."""
         return [path[self.origin == origin][0] for path in self.paths]
 
 
 class WholeTrack:
-    """The frames of a running track, to smooth it when it ends."""
+    """Frames of a running track, with which it is smoothed when it ends.
 
-    def __init__(self, longest_s: float) -> None:
-        self._longest_s = longest_s
+    Parameters
+    ----------
+    max_duration_s : float, s
+        Maximum duration of a track that is smoothed; 0 disables smoothing.
+
+    Attributes
+    ----------
+    is_too_long : bool
+        Whether the track exceeded a limit and cannot be smoothed.
+    """
+
+    def __init__(self, max_duration_s: float) -> None:
+        self._max_duration_s = max_duration_s
         self.clear()
 
     def clear(self) -> None:
-        """Nothing is kept."""
+        """Drop everything."""
         self._start: _Start | None = None
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
         self._published: list[bool] = []
-        self._length_s, self.too_long = 0.0, False
+        self._length_s, self.is_too_long = 0.0, False
         self._updated = False
 
     def begin(self, bank: FilterBank | InitialBank, bank_filter: BankFilter) -> None:
-        """A track begins with a bank like `bank`, before its first frame, with the settings of now.
+        """Start with a bank before its first frame, and with the present settings.
 
-        Nobody else may write into `bank`.
+        Parameters
+        ----------
+        bank : FilterBank or StartingBank
+            It must not be modified by the caller afterwards.
+        bank_filter : BankFilter
         """
         self.clear()
-        if self._longest_s:
+        if self._max_duration_s:
             self._start = _Start(copy(bank_filter), bank)
 
     def resume(self, window: Window, bank_filter: BankFilter) -> None:
-        """Go on from a window of another filter, of which all frames count as published."""
+        """Continue from a window of another filter; all of its frames count as published.
+
+        Parameters
+        ----------
+        window : Window
+        bank_filter : BankFilter
+        """
         anchor = window.anchor.rows(np.arange(len(window.anchor)))
         self.begin(anchor, bank_filter)
         if self._start is not None:
-            # The window moves its paths on.
+            # The paths are copied, because the window modifies them.
             self._start = replace(self._start, origin=anchor.origin.copy(),
                                   paths=tuple(path.copy() for path in window.paths))
         self._updated = window.is_updated
         for frame, dt in zip(window.frames, window.intervals, strict=True):
             self.add(anchor, frame, dt, True)
 
-    def give_up(self) -> None:
-        """It cannot be smoothed as a whole."""
+    def abandon(self) -> None:
+        """Drop everything; the track cannot be smoothed as a whole."""
         self.clear()
-        self.too_long = True
+        self.is_too_long = True
 
     def add(self, bank: FilterBank, frame: FieldFrame, dt: float, published: bool) -> None:
-        """A frame was used, `dt` [s] after the one before."""
+        """Add a frame with which the bank has been updated.
+
+        Parameters
+        ----------
+        bank : FilterBank
+        frame : FieldFrame
+        dt : float, s
+            Time since the previous frame.
+        published : bool
+            Whether a pose was published for the frame.
+        """
         if self._start is None:
             return
         self._length_s += dt
         n_numbers = (len(self._frames) + 1) * bank.x.shape[1]**2
-        if self._length_s > self._longest_s or n_numbers > MAX_NUMBERS:
-            self.give_up()
+        if self._length_s > self._max_duration_s or n_numbers > MAX_ELEMENTS:
+            self.abandon()
             return
         self._frames.append(frame)
         self._intervals.append(dt)
@@ -147,9 +180,19 @@ class WholeTrack:
             self._start.bank.keep(np.isin(self._start.bank.origin, bank.origin))
 
     def smoothed(self, bank: FilterBank, best: int) -> tuple[list[TrackState], int]:
-        """[(stamp_ns, x, P)] of the published frames, and how many frames did not fit.
+        """Smoothed states of the published frames.
 
-        By the hypothesis `best` of the `bank`.
+        Parameters
+        ----------
+        bank : FilterBank
+        best : int
+            Row of the hypothesis to be smoothed.
+
+        Returns
+        -------
+        states : list of TrackState
+        left_out : int
+            Number of frames that did not fit.
         """
         start = self._start
         if start is None or not self._frames:
@@ -162,8 +205,8 @@ class WholeTrack:
             self._frames, states, self._published, strict=True) if published], left_out
 
 
-class _Kept(NamedTuple):
-    """A frame of a running track, and its bank after the update with it."""
+class _LaggedFrame(NamedTuple):
+    """A frame of a running track, and its bank after the update."""
 
     frame: FieldFrame
     dt: float
@@ -172,50 +215,84 @@ class _Kept(NamedTuple):
     x: FloatArray
     P: FloatArray
 
-    def rows(self, mask: BoolArray) -> '_Kept':
-        """The hypotheses of the `mask` (n_hyp,) alone."""
+    def rows(self, mask: BoolArray) -> '_LaggedFrame':
+        """The hypotheses of `mask` (n_hyp,) only."""
         return self._replace(origin=self.origin[mask], x=self.x[mask], P=self.P[mask])
 
 
 class FixedLag:
-    """The latest frames of a running track and the bank at each, to smooth the oldest."""
+    """Smoothing with a fixed lag: the latest frames of a running track, and the bank at each.
+
+    Parameters
+    ----------
+    lag_s : float, s
+    """
 
     def __init__(self, lag_s: float) -> None:
         self._lag_s = lag_s
-        self._kept: deque[_Kept] = deque()
+        self._lagged: deque[_LaggedFrame] = deque()
 
     def clear(self) -> None:
-        """Nothing is kept: a track has ended."""
-        self._kept.clear()
+        """Drop all frames."""
+        self._lagged.clear()
 
     def smoothed(self, bank_filter: BankFilter, bank: FilterBank, best: int, frame: FieldFrame,
                  dt: float, published: bool) -> list[TrackState]:
-        """[(stamp_ns, x, P)] of the frames that now lie `lag_s` back: none or one, rarely more.
+        """Add a frame, and return the smoothed states of the frames that are older than the lag.
 
-        `bank` after the update with `frame`, which came `dt` [s] after the one before.
+        Parameters
+        ----------
+        bank_filter : BankFilter
+        bank : FilterBank
+            Bank after the update with the frame.
+        best : int
+            Row of the hypothesis to be smoothed.
+        frame : FieldFrame
+        dt : float, s
+            Time since the previous frame.
+        published : bool
+            Whether a pose is published for the frame.
+
+        Returns
+        -------
+        list of TrackState
+            Usually none or one.
         """
-        self._kept.append(_Kept(frame, dt, published, bank.origin, bank.x.copy(), bank.P.copy()))
-        if len(bank) < len(self._kept[0].origin) // 2:
-            self._kept = deque(k.rows(np.isin(k.origin, bank.origin)) for k in self._kept)
+        self._lagged.append(_LaggedFrame(
+            frame, dt, published, bank.origin, bank.x.copy(), bank.P.copy()))
+        if len(bank) < len(self._lagged[0].origin) // 2:
+            self._lagged = deque(k.rows(np.isin(k.origin, bank.origin)) for k in self._lagged)
         out: list[TrackState] = []
-        while (frame.stamp_ns - self._kept[0].frame.stamp_ns) / NS >= self._lag_s:
-            if self._kept[0].published:
-                out.append((self._kept[0].frame.stamp_ns,
+        while (frame.stamp_ns - self._lagged[0].frame.stamp_ns) / NS >= self._lag_s:
+            if self._lagged[0].published:
+                out.append((self._lagged[0].frame.stamp_ns,
                             *self._states(bank_filter, bank, best)[0]))
-            self._kept.popleft()
+            self._lagged.popleft()
         return out
 
-    def rest(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[TrackState]:
-        """[(stamp_ns, x, P)] of all frames that are left: the track ends."""
-        if not self._kept:
+    def remaining(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[TrackState]:
+        """Smoothed states of all remaining frames at the end of a track.
+
+        Parameters
+        ----------
+        bank_filter : BankFilter
+        bank : FilterBank
+        best : int
+            Row of the hypothesis to be smoothed.
+
+        Returns
+        -------
+        list of TrackState
+        """
+        if not self._lagged:
             return []
         return [(kept.frame.stamp_ns, *state) for kept, state in zip(
-            self._kept, self._states(bank_filter, bank, best), strict=True) if kept.published]
+            self._lagged, self._states(bank_filter, bank, best), strict=True) if kept.published]
 
     def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
-        """Smoothed states of the frames that are kept, linearised once: it is done every frame."""
-        oldest = self._kept[0]
+        """Smoothed states of the stored frames; linearised once, because it is done every frame."""
+        oldest = self._lagged[0]
         one, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
         one.x, one.P = oldest.x[row].copy(), oldest.P[row].copy()
-        return smoothed_track(bank_filter, one, [k.frame for k in self._kept],
-                              [k.dt for k in self._kept], updated=True, relinearisations=0)[0]
+        return smoothed_track(bank_filter, one, [k.frame for k in self._lagged],
+                              [k.dt for k in self._lagged], updated=True, relinearisations=0)[0]

@@ -1,4 +1,4 @@
-"""What is tracked: the source model of a target, how it is published and how its track begins."""
+"""Kinds of target: source model, published orientation, and start of a track."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from mag_tracking.stages.track.unobserved_length import UnobservedLength
 
 @dataclass(frozen=True)
 class Target:
-    """A kind of target that the tracker can follow."""
+    """Kind of target that the tracker can follow."""
 
     model: SourceModel
     orientation: Orientation
@@ -34,23 +34,33 @@ class Target:
     """Name of each arrival direction."""
     kinds: Sequence[str]
     """Name of each kind of target."""
-    unseen: Callable[[], UnobservedLength | None]
-    """For each track: how its length moves its middle; None for a small target."""
+    unobserved_length: Callable[[], UnobservedLength | None]
+    """Factory for each track: effect of the length on the middle; None for a small target."""
     starts_anywhere: bool
-    """A magnet that was lost is found anywhere; a vehicle starts on an arrival line."""
+    """Whether a track may start anywhere: a lost magnet may be found at any place, but a vehicle
+    starts on an arrival line."""
     start: Callable[[TrackSettings, SensorNetwork, FieldFrame, FloatArray], FilterBank | None]
-    """First hypotheses from the settings, a network, a frame, and the covariances
-    (n_sensors, n_own, n_own) of the sensors' own states; None where the frame allows no start."""
+    """First hypotheses from the settings, a network, a frame and the covariances (n_sensors, n_own,
+    n_own) of the sensor states; None if the frame does not allow a start."""
 
 
 def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
-    """The target that the settings ask for.
+    """Target that the settings select.
+
+    Parameters
+    ----------
+    settings : TrackSettings
+    network : SensorNetwork
+
+    Returns
+    -------
+    Target
 
     Raises
     ------
     SettingsError
-        If the target is unknown, its settings contradict each other, or the start of a track
-        would take too much memory.
+        If the target is unknown, if its settings contradict each other, or if the start of a track
+        would need too much memory.
     """
     if settings.target == 'vehicle':
         vehicle = settings.vehicle

@@ -1,4 +1,4 @@
-"""The bank of a running track, with the frames that are kept to relinearise and to smooth it."""
+"""Bank of a running track, with the frames that are stored for relinearisation and smoothing."""
 
 from collections import Counter
 from copy import copy
@@ -14,10 +14,10 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.bank_size import WEIGHT_KEPT, max_hypotheses, max_sensors
 from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.observation import Observation
-from mag_tracking.stages.track.reach import weak_from
+from mag_tracking.stages.track.reach import first_weak_frame
 from mag_tracking.stages.track.relinearisation import Relinearisation, Window
 from mag_tracking.stages.track.sensor_rejection import SensorRejection
-from mag_tracking.stages.track.sensor_selection import SensorSubset, hand_on
+from mag_tracking.stages.track.sensor_selection import SensorSubset, exchange_sensor_states
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import FixedLag, TrackState, WholeTrack
 from mag_tracking.stages.track.target import Target
@@ -26,42 +26,54 @@ from mag_tracking.units import NS
 
 @dataclass(frozen=True)
 class Advance:
-    """A bank was moved through a frame."""
+    """Result of moving a bank through a frame."""
 
     frame: FieldFrame
-    """What was used of it."""
+    """The part of the frame that was used."""
     dt: float
-    """[s] Since the frame before."""
+    """[s] Time since the previous frame."""
     predicted: FloatArray
-    """(n_hyp, n_x) before the update."""
+    """(n_hyp, n_x) States before the update."""
     log_likelihood: FloatArray
     """(n_hyp,)"""
     evidence: float
-    """Log-density of the frame by all hypotheses; -inf where none explains it."""
+    """Log-density of the frame over all hypotheses; -inf if none explains it."""
     n_rejected: int
-    """Sensors that were left out."""
+    """Number of rejected sensors."""
 
 
 class TrackBank:
-    """Hypotheses of the targets of a track, and the filter, sensors and frames that they are of.
+    """Hypotheses of the targets of a track, with their filter, sensors and frames.
+
+    Parameters
+    ----------
+    target : Target
+    settings : TrackSettings
+    sensors : SensorSubset
+        Sensors at the start of the track.
+    bank_filter : BankFilter
+    bank : FilterBank
+    counts : Counter of str
+        Counts of the stage, which are updated.
+    later_sensors : SensorSubset
+        Sensors that are used as soon as the bank is small enough.
 
     Attributes
     ----------
     bank : FilterBank
     filter : BankFilter
     sensors : SensorSubset
-        Those that it uses.
-    later : SensorSubset or None
-        Those that it will use once the bank is small enough.
+        Sensors in use.
+    later_sensors : SensorSubset or None
+        Sensors that will be used; None after the switch.
     """
 
     def __init__(self, target: Target, settings: TrackSettings, sensors: SensorSubset,
                  bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]',
-                 later: SensorSubset) -> None:
-        """Parameters as for `RunningTrack`."""
+                 later_sensors: SensorSubset) -> None:
         self._target, self._settings, self._counts = target, settings, counts
         self.bank, self.filter, self.sensors = bank, bank_filter, sensors
-        self.later: SensorSubset | None = later
+        self.later_sensors: SensorSubset | None = later_sensors
         self._rejection = SensorRejection(sensors.network.names)
         self._relinearisation = Relinearisation(
             settings.relinearise_interval_s, settings.relinearise_window_s,
@@ -70,13 +82,13 @@ class TrackBank:
         self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
 
     @property
-    def one(self) -> Observation:
-        """How the sensors see a single target."""
-        return self.filter.observation.of_one
+    def single_target(self) -> Observation:
+        """Measurement model of a single target."""
+        return self.filter.observation.single_target
 
     @property
     def window(self) -> Window | None:
-        """The latest frames, with the paths of the hypotheses."""
+        """The latest frames, with the paths of the hypotheses; None if there are none."""
         return self._relinearisation.window
 
     @property
@@ -85,21 +97,53 @@ class TrackBank:
         return self._lag is not None
 
     def gain(self, row: int) -> float:
-        """[nats] Of the latest frames along the path of a hypothesis, less than in its filter."""
+        """Log-likelihood of the latest frames along a path, minus that in the filter.
+
+        Parameters
+        ----------
+        row : int
+            Row of the hypothesis.
+
+        Returns
+        -------
+        float, nats
+        """
         return self._relinearisation.gain(int(self.bank.origin[row]))
 
     def filter_of(self, n_targets: int) -> BankFilter:
-        """The filter of so many targets."""
+        """Filter for a given number of targets.
+
+        Parameters
+        ----------
+        n_targets : int
+
+        Returns
+        -------
+        BankFilter
+        """
         return BankFilter(self.sensors.network, self._target.model, self._settings, n_targets)
 
     def configure(self, settings: TrackSettings) -> None:
-        """Apply new values of the live settings."""
+        """Apply new values of the live settings.
+
+        Parameters
+        ----------
+        settings : TrackSettings
+        """
         self._settings = settings
         self.filter.configure(settings)
         self._relinearisation.restart()
 
     def begin(self, first: FieldFrame, now: FieldFrame) -> None:
-        """The bank, which is of the time of the frame `now`, begins with an earlier one."""
+        """Move the bank back to the first frame of the track.
+
+        Parameters
+        ----------
+        first : FieldFrame
+            First frame of the track.
+        now : FieldFrame
+            Frame at which the bank was created.
+        """
         if first is not now:
             self.filter.move(self.bank, (first.stamp_ns - now.stamp_ns) / NS)
         start = InitialBank.of(self.bank, self.filter.observation.n_target)
@@ -107,7 +151,19 @@ class TrackBank:
         self._relinearisation.begin(start)
 
     def advance(self, frame: FieldFrame, dt: float) -> Advance:
-        """Move the bank through a frame of the sensors that it uses, and weigh it."""
+        """Move the bank through a frame, and weight the hypotheses.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+            Frame of the sensors in use.
+        dt : float, s
+            Time since the previous frame.
+
+        Returns
+        -------
+        Advance
+        """
         predicted, log_likelihood, used, rejected = self._rejection.advance(
             self.filter, self.bank, frame, dt)
         self._counts.update(rejected)
@@ -115,7 +171,14 @@ class TrackBank:
                        len(rejected))
 
     def keep(self, advance: Advance, publish: bool) -> None:
-        """Keep the frame of an `Advance`; drop what is improbable, and relinearise the rest."""
+        """Store a frame, drop improbable hypotheses, and relinearise the others.
+
+        Parameters
+        ----------
+        advance : Advance
+        publish : bool
+            Whether a pose is published for the frame.
+        """
         s, bank = self._settings, self.bank
         self._relinearisation.add(bank, advance.predicted, advance.log_likelihood,
                                   advance.evidence, advance.frame, advance.dt)
@@ -126,78 +189,148 @@ class TrackBank:
         self._whole.add(bank, advance.frame, advance.dt, publish)
 
     def lagged(self, best: int, frame: FieldFrame, dt: float, publish: bool) -> list[TrackState]:
-        """States that now lie the fixed lag back, by hypothesis `best`."""
+        """States of the frames that are now older than the fixed lag.
+
+        Parameters
+        ----------
+        best : int
+            Row of the hypothesis to be smoothed.
+        frame : FieldFrame
+        dt : float, s
+            Time since the previous frame.
+        publish : bool
+            Whether a pose is published for the frame.
+
+        Returns
+        -------
+        list of TrackState
+        """
         return [] if self._lag is None else self._lag.smoothed(self.filter, self.bank, best, frame,
                                                                dt, publish)
 
-    def rest_of_lag(self, best: int) -> list[TrackState]:
-        """States that are left of the fixed lag: the track ends."""
-        return [] if self._lag is None else self._lag.rest(self.filter, self.bank, best)
+    def remaining_lagged(self, best: int) -> list[TrackState]:
+        """States of the remaining frames of the fixed lag at the end of the track.
+
+        Parameters
+        ----------
+        best : int
+            Row of the hypothesis to be smoothed.
+
+        Returns
+        -------
+        list of TrackState
+        """
+        return [] if self._lag is None else self._lag.remaining(self.filter, self.bank, best)
 
     def smoothed(self, best: int, counts: bool = True) -> list[TrackState]:
-        """States of the frames that are kept, by all of them and hypothesis `best`."""
+        """Smoothed states of all stored frames.
+
+        Parameters
+        ----------
+        best : int
+            Row of the hypothesis to be smoothed.
+        counts : bool, optional
+            Whether frames that were left out are counted.
+
+        Returns
+        -------
+        list of TrackState
+        """
         states, left_out = self._whole.smoothed(self.bank, best)
         if counts:
             self._counts['frames left out of smoothing'] += left_out
-            self._counts['tracks too long to smooth'] += self._whole.too_long
+            self._counts['tracks too long to smooth'] += self._whole.is_too_long
         return states
 
     def without_target(self, i: int) -> None:
-        """Target `i` of several is over."""
+        """Remove one of several targets.
+
+        Parameters
+        ----------
+        i : int
+        """
         best, n_targets = self.bank.best(), self.filter.observation.n_targets
-        n = weak_from(self.filter, i, self.window, int(self.bank.origin[best]))
+        n = first_weak_frame(self.filter, i, self.window, int(self.bank.origin[best]))
         self._relinearisation.without_target(self.filter, self.bank, i, n)
-        self.bank = self.bank.without_target(i, self.one.n_target)
+        self.bank = self.bank.without_target(i, self.single_target.n_target)
         self.filter = self.filter_of(n_targets - 1)
         self._rejection.clear()
-        self._forget_lag()
+        self._clear_lag()
 
     def resume(self, joint: Joint) -> None:
-        """Go on with another explanation of the latest frames."""
+        """Continue with another explanation of the latest frames.
+
+        Parameters
+        ----------
+        joint : Joint
+        """
         self.bank, self.filter = joint.bank, joint.bank_filter
         self._relinearisation.resume(joint.window)
         self._whole.resume(joint.window, self.filter)
         self._rejection.clear()
-        self._forget_lag()
+        self._clear_lag()
 
-    def _forget_lag(self) -> None:
-        """The states have changed: what is kept of the fixed lag is of others."""
+    def _clear_lag(self) -> None:
+        """Drop the frames of the fixed lag, because the layout of the states has changed."""
         if self._lag is not None:
             self._lag.clear()
 
     def hand_over(self, best: int) -> bool:
-        """Switch to the sensors near where hypothesis `best` is going; whether they are others."""
+        """Switch to the sensors near the predicted position of a hypothesis.
+
+        Parameters
+        ----------
+        best : int
+            Row of the hypothesis.
+
+        Returns
+        -------
+        bool
+            Whether the sensors have changed.
+        """
         sensors = self.sensors.ahead_of(self.bank.x[best], min(
             self._settings.max_sensors, max_sensors(self.filter.observation, len(self.bank))))
         if sensors is self.sensors:
             return False
-        self._hand_on_to(sensors)
-        self._whole.give_up()
+        self._switch_sensors(sensors)
+        self._whole.abandon()
         self._relinearisation.restart()
-        self._counts['tracks handed on to other sensors'] += 1
+        self._counts['tracks handed over to other sensors'] += 1
         return True
 
     def widen(self, dt: float) -> bool:
-        """Use all sensors from the next frame on, which comes in `dt` [s], if the frames until now
-        have made enough hypotheses improbable; else they come in with a handover. Whether it did.
+        """Use all later sensors from the next frame on, if few hypotheses are probable by now.
+
+        Otherwise they are added with a handover.
+
+        Parameters
+        ----------
+        dt : float, s
+            Time until the next frame.
+
+        Returns
+        -------
+        bool
+            Whether the sensors have changed.
         """
-        sensors, self.later = self.later or self.sensors, None
+        sensors, self.later_sensors = self.later_sensors or self.sensors, None
         n, most = len(sensors.rows), max_hypotheses(self.filter.observation, len(sensors.rows))
         if n == len(self.sensors.rows) or not self.bank.is_concentrated_in(most, WEIGHT_KEPT):
             return False
         self._counts['hypotheses dropped'] += self.bank.prune(np.inf, most)
-        self._hand_on_to(sensors)
+        self._switch_sensors(sensors)
         anchor = self.bank.copy()
         self.filter.move(anchor, dt)
         self._whole.begin(anchor, self.filter)
         self._relinearisation.begin(anchor.copy())
         return True
 
-    def _hand_on_to(self, sensors: SensorSubset) -> None:
-        """Give the hypotheses the states of other sensors."""
+    def _switch_sensors(self, sensors: SensorSubset) -> None:
+        """Replace the sensor states of the hypotheses by those of other sensors."""
         before, self.sensors = self.sensors.rows, sensors
         self.filter = self.filter_of(1)
         self._rejection = SensorRejection(sensors.network.names)
-        hand_on(self.bank, before, sensors.rows, self.filter.observation.own_covariance,
-                self._settings.background_std)
-        self._forget_lag()
+        exchange_sensor_states(
+            self.bank, before, sensors.rows, self.filter.observation.own_covariance,
+            self._settings.background_std)
+        self._clear_lag()

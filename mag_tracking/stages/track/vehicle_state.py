@@ -18,54 +18,57 @@ from mag_tracking.stages.track.initiation_vehicle import (
 )
 
 MIN_MOMENT = 1e-6
-"""[A m^2] A smaller moment has no direction."""
+"""[A m^2] The direction of a smaller moment is undefined."""
 
 
 @dataclass(frozen=True)
 class VehicleState:
-    """States of `RowVehicle` of the settings, from straight paths (`PATH` of `steady_pass`)."""
+    """Converts straight paths (`PATH` of `steady_pass`) to states of `RowVehicle`."""
 
     settings: VehicleSettings
     network: SensorNetwork
     background_std: float
-    """[T] Of each background."""
+    """[T] Standard deviation of each background."""
 
     @cached_property
     def _model(self) -> RowVehicle:
-        """The model of the settings."""
+        """Vehicle model of the settings."""
         return vehicle_model(self.settings, self.network)
 
     @property
-    def _d(self) -> int:
-        """Dipoles of a vehicle."""
+    def _n_dipoles(self) -> int:
+        """Number of dipoles of a vehicle."""
         return self._model.n_dipoles
 
     @property
     def length_column(self) -> int | None:
-        """Of the length among the states of a vehicle; None where all are points."""
-        return 9 + 3 * self._d if self._d > 1 else None
+        """Column of the length in the state of a vehicle; None if all vehicles are points."""
+        return 9 + 3 * self._n_dipoles if self._n_dipoles > 1 else None
 
     def prior(self, theta: FloatArray, moments: FloatArray, t: float, kind: int, label: int
               ) -> tuple[FloatArray, FloatArray]:
-        """What is known of a vehicle that comes about here, before anything is measured.
+        """Prior of a vehicle that arrives on a given path.
 
-        As where a track starts, but that the direction of its moment is about the one found.
+        It is that at the start of a track, except that the direction of the moment is the one that
+        was found.
 
         Parameters
         ----------
-        theta : (7,)
-            A straight path.
-        moments : (k, 3) [A m^2], world
-            Those that were found.
-        t : float [s]
-            The time on that path.
-        kind, label : int
-            Kind of vehicle, and arrival.
+        theta : (7,) array
+            Straight path.
+        moments : (k, 3) array, A m^2, world frame
+            Moments that were found.
+        t : float, s
+            Time on the path.
+        kind : int
+            Kind of vehicle.
+        label : int
+            Arrival.
 
         Returns
         -------
-        x : (n_t,)
-        P : (n_t, n_t)
+        x : (n_t,) array
+        P : (n_t, n_t) array
         """
         s = self.settings
         R = rotation_about_z(float(np.deg2rad(s.arrival_headings_deg[label])))
@@ -73,17 +76,29 @@ class VehicleState:
         mean = s.moments[kind] * found / max(float(np.linalg.norm(found)), MIN_MOMENT)
         x = self.along(theta, mean[None], np.array([t]), kind)[0]
         x[2], x[5] = s.heights[kind], 0.0
-        if self._d > 1:
-            x[9 + 3 * self._d] = s.lengths[kind]
+        if self._n_dipoles > 1:
+            x[9 + 3 * self._n_dipoles] = s.lengths[kind]
         return x, starting_covariance(s, kind, R, float(theta[3]), s.moment_stds[kind])
 
     def along(self, theta: FloatArray, moments: FloatArray, times: FloatArray, kind: int
               ) -> FloatArray:
-        """States (n, n_t) on a straight path theta (7,) at the `times` (n,) [s].
+        """States on a straight path.
 
-        `moments` (k, 3) [A m^2, world] of a row of k dipoles, from the tail to the head.
+        Parameters
+        ----------
+        theta : (7,) array
+            Straight path.
+        moments : (k, 3) array, A m^2, world frame
+            Moments of a row of k dipoles, from the tail to the head.
+        times : (n,) array, s
+        kind : int
+            Kind of vehicle.
+
+        Returns
+        -------
+        (n, n_t) array
         """
-        d, s, length = self._d, self.settings, float(theta[6])
+        d, s, length = self._n_dipoles, self.settings, float(theta[6])
         heading = float(theta[4])
         R = rotation_about_z(heading)
         soft = soft_iron(s, kind)
@@ -92,7 +107,7 @@ class VehicleState:
         x[:, :3], x[:, 3:6] = theta[:3] + times[:, None] * velocity, velocity
         ordered = moments[::-1] if length < 0.0 else moments
         is_point = s.length_stds[kind] == 0.0
-        each = np.tile(moments.sum(axis=0) / d, (d, 1)) if is_point else _spread(ordered, d)
+        each = np.tile(moments.sum(axis=0) / d, (d, 1)) if is_point else _resampled(ordered, d)
         x[:, 6:6 + 3 * d] = (each @ R - soft * self._model.induction @ R / d).ravel()
         x[:, 6 + 3 * d:9 + 3 * d] = soft
         if d > 1:
@@ -100,14 +115,33 @@ class VehicleState:
         return x
 
     def hard_moments(self, x: FloatArray) -> FloatArray:
-        """(d, 3) [A m^2] of a state (n_t,), in the vehicle's frame."""
-        hard: FloatArray = x[6:6 + 3 * self._d].reshape(-1, 3)
+        """Permanent moments of a state.
+
+        Parameters
+        ----------
+        x : (n_t,) array
+
+        Returns
+        -------
+        (d, 3) array, A m^2, vehicle frame
+        """
+        hard: FloatArray = x[6:6 + 3 * self._n_dipoles].reshape(-1, 3)
         return hard
 
     def turning(self, x: FloatArray, P: FloatArray, target: int) -> FloatArray | None:
-        """The covariance (n_x, n_x) with one target turning; None where none can turn.
+        """Covariance in which one target turns.
 
-        `x` (n_x,) are states of several targets.
+        Parameters
+        ----------
+        x : (n_x,) array
+            State of several targets.
+        P : (n_x, n_x) array
+        target : int
+
+        Returns
+        -------
+        (n_x, n_x) array or None
+            None if vehicles do not turn according to the settings.
         """
         if not self._model.turn_acceleration:
             return None
@@ -119,8 +153,8 @@ class VehicleState:
         return out
 
 
-def _spread(moments: FloatArray, d: int) -> FloatArray:
-    """Moments (d, 3) of a row of `d` dipoles with the same total and middle as `moments` (k, 3)."""
+def _resampled(moments: FloatArray, d: int) -> FloatArray:
+    """Moments (d, 3) of a row of `d` dipoles with the same total and middle as those of (k, 3)."""
     if len(moments) == 1 or d == 1:
         return np.tile(moments.sum(axis=0) / d, (d, 1))
     places = np.linspace(0.0, d - 1.0, len(moments))

@@ -1,4 +1,4 @@
-"""The frames of a window as the search for a vehicle takes them, without those that are known."""
+"""Samples of a window for the search for vehicles, without the fields of known vehicles."""
 
 from functools import cached_property
 
@@ -12,31 +12,38 @@ from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.stages.track.window_start import KnownVehicles
 from mag_tracking.units import NS
 
-MAX_ROWS = 320
-"""Samples that a search is of: of more frames than that only every other one, or fewer."""
+MAX_SAMPLES = 320
+"""Maximum number of samples of a search; of more frames, only every second one, or fewer, are
+used."""
 
 KNOWN_STD, KNOWN_SHARE = 0.7, 0.3
-"""[m], [m/s] By so much may vehicles that are tracked be off while another is sought; and by this
-share their moments."""
+"""[m], [m/s] Uncertainty of tracked vehicles while another one is searched; and relative
+uncertainty of their moments."""
 
 
 class WindowSearch:
-    """Samples of a window, in which vehicles are sought.
+    """Samples of a window in which vehicles are searched.
+
+    Parameters
+    ----------
+    window : Window
+    vehicles : VehicleState
+        Converts the results to states.
 
     Attributes
     ----------
     times : (n,) array, s
-        Of the frames, before the last one.
+        Times of the frames, relative to the last one.
     prior : PathPrior
+    samples : PassSamples
     """
 
     def __init__(self, window: Window, vehicles: VehicleState) -> None:
-        """`vehicles` makes states of what is found."""
         network, frames = vehicles.network, window.frames
         self._window, self._vehicles = window, vehicles
         self.times: FloatArray = np.array([(f.stamp_ns - frames[-1].stamp_ns) / NS
                                            for f in frames])
-        step = -(-len(frames) * len(network) // MAX_ROWS)
+        step = -(-len(frames) * len(network) // MAX_SAMPLES)
         self._thinned = np.arange(len(frames))[::-1][::step][::-1]
         self.prior = PathPrior.of(vehicles.settings, network)
         self.samples = PassSamples.of(network, [frames[k] for k in self._thinned],
@@ -44,12 +51,21 @@ class WindowSearch:
 
     @cached_property
     def grid(self) -> StartGrid:
-        """Where a vehicle is sought."""
+        """Start paths of the search."""
         return StartGrid(self.samples, self.prior,
                          self.prior.starts(self._vehicles.settings, self._vehicles.network))
 
     def beside(self, known: KnownVehicles) -> SteadySearch:
-        """The search for a vehicle beside those that are known."""
+        """Search for a vehicle beside known ones.
+
+        Parameters
+        ----------
+        known : KnownVehicles
+
+        Returns
+        -------
+        SteadySearch
+        """
         samples = self.samples
         if known.filter is None:
             return SteadySearch(samples, self.prior, np.zeros(len(samples.y)), self._backgrounds())
@@ -68,14 +84,14 @@ class WindowSearch:
                             np.hstack([self._backgrounds(), (W @ columns).reshape(3 * len(W), -1)]))
 
     def _backgrounds(self) -> FloatArray:
-        """(3 n, q) whitened columns of the backgrounds, each times its standard deviation."""
+        """Whitened fields (3 n, q) of one standard deviation of each background."""
         return self._vehicles.background_std * self.samples.backgrounds
 
     def _columns(self, H: FloatArray, x: FloatArray, t: FloatArray, n_one: int) -> FloatArray:
-        """(n, n_sensors, 3, q) fields of one deviation of what is not known of the vehicles.
+        """Fields (n, n_sensors, 3, q) of one standard deviation of the errors of known vehicles.
 
-        By the derivatives `H` (n, n_sensors, 3, n_t) along a path that ends with `x` (n_x,), at the
-        times `t` (n,) [s] before that. Each vehicle has `n_one` states.
+        `H` (n, n_sensors, 3, n_t) are the derivatives along a path that ends with the state `x`
+        (n_x,), at times `t` (n,) [s] before its end.
         """
         out = []
         for first in range(0, H.shape[-1], n_one):

@@ -1,4 +1,4 @@
-"""Hypotheses at the beginning of a window: vehicles that are known there, and others that come."""
+"""Hypotheses at the start of a window: known vehicles and new ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,51 +10,63 @@ from mag_tracking.geometry import overlap
 from mag_tracking.stages.track.bank_filter import BankFilter
 
 WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 1.0
-"""[m] Two bodies are in each other's way that are less than so much apart across their heading; by
-so much they are longer than their rows together; and by so much their paths may be off."""
+"""[m] Two vehicles overlap if their lateral distance is less than the first value; the sum of their
+lengths exceeds that of their rows by the second; the third is the uncertainty of their paths."""
 
 
 @dataclass(frozen=True)
 class PathHypothesis:
-    """A hypothesis of some vehicles, with the path to linearise it along."""
+    """A hypothesis of several vehicles, with the path at which it is linearised."""
 
     x: FloatArray
-    """(n_x,) at the beginning of the window."""
+    """(n_x,) State at the start of the window."""
     P: FloatArray
     """(n_x, n_x)"""
     path: FloatArray
-    """(n, n_x)"""
+    """(n, n_x) States at the frames of the window."""
     label: tuple[int, ...]
-    """The arrival of each vehicle."""
+    """Arrival of each vehicle."""
     kind: tuple[int, ...]
     log_w: float
 
 
 @dataclass(frozen=True)
 class WindowStart(PathHypothesis):
-    """Known vehicles, and others that were sought."""
+    """Known vehicles and new ones."""
 
     n_new: int
-    """So many vehicles were sought: the last ones."""
+    """Number of new vehicles, which are the last ones."""
     replaced: int | None
-    """As of `Joint`."""
+    """As in `Joint`."""
 
     @property
-    def are_new(self) -> range:
-        """Places of the vehicles that were sought."""
+    def new_indices(self) -> range:
+        """Indices of the new vehicles."""
         return range(len(self.kind) - self.n_new, len(self.kind))
 
 
 @dataclass(frozen=True)
 class KnownVehicles(PathHypothesis):
-    """Vehicles beside which others are sought."""
+    """Known vehicles beside which others are searched."""
 
     filter: BankFilter | None
-    """The filter of so many vehicles; None where there are none."""
+    """Filter for this number of vehicles; None if there are none."""
 
 
 def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
-    """The covariance `P` (n, n) with an independent `block` (k, k) from row `at` on."""
+    """Covariance with an inserted independent block.
+
+    Parameters
+    ----------
+    P : (n, n) array
+    block : (k, k) array
+    at : int
+        Row at which the block is inserted.
+
+    Returns
+    -------
+    (n + k, n + k) array
+    """
     n, k = len(P), len(block)
     rows = np.append(np.arange(at), np.arange(at + k, n + k))
     out = np.zeros((n + k, n + k))
@@ -64,21 +76,53 @@ def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
 
 
 def in_order_of(first: FloatArray, pair: FloatArray) -> FloatArray:
-    """A pair of paths (2, 7), the nearer one of the `first` pair's first coming first."""
+    """Pair of paths in the order of another pair, by distance.
+
+    Parameters
+    ----------
+    first : (2, 7) array
+        Pair with the required order.
+    pair : (2, 7) array
+
+    Returns
+    -------
+    (2, 7) array
+    """
     away = np.linalg.norm(pair[:, None, :2] - first[:, :2], axis=2)
     return pair if away[0, 0] + away[1, 1] <= away[0, 1] + away[1, 0] else pair[::-1].copy()
 
 
 def labels_of(labels: Sequence[tuple[int, ...]]) -> IntArray:
-    """(n,) or (n, n_targets) as of a `FilterBank`."""
+    """Labels in the form that a `FilterBank` needs.
+
+    Parameters
+    ----------
+    labels : sequence of tuple of int
+        Label of each vehicle, for each hypothesis.
+
+    Returns
+    -------
+    (n,) or (n, n_targets) int array
+    """
     out = np.array(labels)
     return out[:, 0].copy() if out.shape[1] == 1 else out
 
 
 def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length: int | None) -> float:
-    """[m] by how much two vehicles of a `path` (n, n_x) are in each other at most.
+    """Maximum depth by which two vehicles overlap along a path.
 
-    Each has `n_one` states, of which `length` is the column of its length; None: all are points.
+    Parameters
+    ----------
+    path : (n, n_x) array
+    n_one : int
+        Number of states per vehicle.
+    n_targets : int
+    length : int or None
+        Column of the length among the states of a vehicle; None = all are points.
+
+    Returns
+    -------
+    float, m
     """
     x = path[:, :n_one * n_targets].reshape(len(path), n_targets, n_one)
     depth = 0.0

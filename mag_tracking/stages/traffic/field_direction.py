@@ -1,4 +1,4 @@
-"""Check of a track's direction by the rotation of the field at each sensor."""
+"""Check of the direction of a track by the rotation of the field at each sensor."""
 
 from collections import deque
 
@@ -15,46 +15,69 @@ from mag_tracking.network.counting_line import Crossing
 from mag_tracking.records import FieldFrame
 from mag_tracking.units import NS
 
-KEPT_S = 70.0
-"""[s] Frames are kept for this time at most: the longest track that is smoothed, and more."""
+MAX_AGE_S = 70.0
+"""[s] Maximum age of stored frames; more than the longest track that is smoothed."""
 
-IN_LANE = 1.5
-"""[m] A sensor closer to the path than this observes no direction."""
+MIN_LATERAL = 1.5
+"""[m] A sensor closer to the path than this does not observe the direction."""
 
-REACH = 12.0
-"""[m] A sensor whose closest approach is further than this from the crossing is not used."""
+MAX_ALONG = 12.0
+"""[m] A sensor is not used if its closest point of approach is further than this from the
+crossing."""
 
-WIDTHS = 3.0
-"""The window reaches this many distances from the path to both sides."""
+WINDOW_RATIO = 3.0
+"""Half the window is the time in which the vehicle travels this multiple of the distance between
+sensor and path."""
 
-MIN_S, MAX_S = 0.5, 4.0
+MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S = 0.5, 4.0
 """[s] Bounds of half the window."""
 
 MAX_LOG_ODDS = float(np.log(MAX_CONFIDENCE / (1.0 - MAX_CONFIDENCE)))
+"""Largest log odds from one sensor."""
 
 
 class FieldDirection:
-    """Probability of a direction by the latest frames."""
+    """Error probability of a direction, from the latest frames.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    """
 
     def __init__(self, network: SensorNetwork) -> None:
         self._network = network
         self._frames: deque[FieldFrame] = deque()
 
-    def remember(self, frame: FieldFrame, since_ns: int) -> None:
-        """Keep a frame, and forget those of another time and those that no crossing needs.
+    def add(self, frame: FieldFrame, since_ns: int) -> None:
+        """Store a frame, and drop frames that no crossing needs any more.
 
-        Crossings since `since_ns` may still be found.
+        All frames are dropped if the time jumps back.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+        since_ns : int, ns
+            Crossings since this time may still be found.
         """
         if self._frames and frame.stamp_ns <= self._frames[-1].stamp_ns:
             self._frames.clear()
         self._frames.append(frame)
-        oldest = max(since_ns - round(MAX_S * NS), frame.stamp_ns - round(KEPT_S * NS))
+        oldest = max(since_ns - round(MAX_HALF_WINDOW_S * NS),
+                     frame.stamp_ns - round(MAX_AGE_S * NS))
         while self._frames[0].stamp_ns < oldest:
             self._frames.popleft()
 
     def error_probability(self, crossing: Crossing) -> float:
-        """Probability that the direction of a crossing is wrong; NaN where it is not observable, or
-        sensors contradict each other.
+        """Probability that the direction of a crossing is wrong.
+
+        Parameters
+        ----------
+        crossing : Crossing
+
+        Returns
+        -------
+        float
+            NaN if the direction is not observable, or if the sensors contradict each other.
         """
         velocity = crossing.pose.velocity[:2]
         speed = float(np.hypot(*velocity))
@@ -64,13 +87,15 @@ class FieldDirection:
         r = self._network.positions[:, :2] - crossing.position[:2]
         along, left = r @ u, u[0] * r[:, 1] - u[1] * r[:, 0]
         odds, same_side = [], []
-        for j in np.flatnonzero((np.abs(left) >= IN_LANE) & (np.abs(along) <= REACH)).tolist():
-            half = np.clip(WIDTHS * abs(left[j]) / speed, MIN_S, MAX_S)
+        for j in np.flatnonzero(
+                (np.abs(left) >= MIN_LATERAL) & (np.abs(along) <= MAX_ALONG)).tolist():
+            half = np.clip(WINDOW_RATIO * abs(left[j]) / speed,
+                           MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S)
             found = self._log_odds(j, crossing.stamp_ns + round(along[j] / speed * NS),
                                    round(half * NS))
             if found is not None:
                 odds.append(float(np.clip(found, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
-                # To a sensor on its left, which looks to the right, it moves from right to left.
+                # A sensor to the left of the path sees the vehicle move from right to left.
                 same_side.append(bool(left[j] < 0.0))
         fused = fused_log_odds(odds, same_side)
         if not odds or len(odds) > 1 and abs(fused) < 0.5 * max(map(abs, odds)):

@@ -113,7 +113,7 @@ def test_late_duplicate_and_unordered_samples_are_counted():
     for ms in (490, 485):
         align.feed(one(sample(ms, 0)))
     align.feed(one(MagSample(0, 'mag_7', np.zeros(3), C)))
-    assert rejected(align.counts) == {'duplicate stamp': 1, 'out of order': 1,
+    assert rejected(align.counts) == {'duplicate timestamp': 1, 'out of order': 1,
                                       'unknown sensor mag_7': 1}
     slow = stage(2, max_wait_s=0.2)
     feed(slow, [s for s in stream(2, 2000) if s.sensor == 'mag_1'], flush=False)
@@ -127,7 +127,7 @@ def test_an_unknown_covariance_is_that_of_the_network_or_the_sample_is_rejected(
     align = Align(dataclasses.replace(network, noise_std=stds), AlignSettings())
     frames = feed(align, [MagSample(0, f'mag_{j}', np.ones(3)) for j in (1, 2)] + [sample(1, 0)])
     np.testing.assert_array_equal(frames[0].covariance, [C, np.diag(stds[1] ** 2)])
-    assert rejected(align.counts) == {'covariance unknown, and no noise_std in the network': 1}
+    assert rejected(align.counts) == {'unknown covariance, and no noise_std in the network': 1}
 
 
 def test_a_looped_recording_starts_anew_and_loses_nothing_before():
@@ -144,7 +144,7 @@ def test_memory_is_bounded():
     for k in range(1000):
         align.feed(one(sample(10.0 * k, 0)))
     assert align.n_held == 50
-    assert rejected(align.counts) == {'too many pending': 950}
+    assert rejected(align.counts) == {'too many pending samples': 950}
 
 
 def test_burst_mode_closes_a_round_at_its_last_sensor():
@@ -223,7 +223,8 @@ class Plain:
         if t <= self.latest.get(j, -1):
             back = self.latest[j] - t
             if back <= self.jump:
-                self.counts['rejected: out of order' if back else 'rejected: duplicate stamp'] += 1
+                self.counts['rejected: out of order' if back
+                            else 'rejected: duplicate timestamp'] += 1
                 return []
             out = self.flush()
             self.begin()
@@ -236,7 +237,7 @@ class Plain:
         self.held = sorted([*self.held, (t, j, x)], key=lambda h: h[:2])
         if len([h for h in self.held if h[1] == j]) > self.most:
             self.held.remove(next(h for h in self.held if h[1] == j))
-            self.counts['rejected: too many pending'] += 1
+            self.counts['rejected: too many pending samples'] += 1
         return out + self.flush(False)
 
     def flush(self, final=True):

@@ -71,7 +71,7 @@ def test_the_others_go_on_as_if_the_one_ahead_were_not_there():
     frames = frames_of(stage, stepped(arrivals, {2}, 2000, 4000, by=1000)) + stage.flush()
     silent = [a for a in arrivals if a[0] != 2 or not 2000 <= a[1] < 4000]
     expected = frames_of(without, silent) + without.flush()
-    assert rejected(stage.counts) == {'ahead of all others: mag_3': 200}
+    assert rejected(stage.counts) == {'ahead of all other sensors: mag_3': 200}
     assert [(f.stamp_ns, f.n_samples.tolist()) for f in frames] == [
         (f.stamp_ns, f.n_samples.tolist()) for f in expected]
 
@@ -89,13 +89,13 @@ def test_after_a_restart_it_goes_by_the_new_time():
     stage = align(3)
     frames_of(stage, stream(3, 100_000, 102_000))
     frames_of(stage, stepped(stream(3, 0, 4000), {1}, 2000, 3000, by=1000))
-    assert rejected(stage.counts) == {'ahead of all others: mag_2': 100}
+    assert rejected(stage.counts) == {'ahead of all other sensors: mag_2': 100}
 
 
 def test_who_fell_silent_ahead_is_named_by_its_own_name():
     stage = align(3)
     frames_of(stage, stream(3, 0, 1000) + [(1, 5000)] + stream(3, 1000, 3000, skip=(1,)))
-    assert rejected(stage.counts) == {'ahead of all others: mag_2': 1}
+    assert rejected(stage.counts) == {'ahead of all other sensors: mag_2': 1}
 
 
 def test_few_samples_of_a_sensor_wait_also_where_its_stamps_stand_still():
@@ -104,14 +104,14 @@ def test_few_samples_of_a_sensor_wait_also_where_its_stamps_stand_still():
         frames_of(stage, stream(3, 0, 1000))
         frames_of(stage, [(1, 9000)] * 100)
         assert stage.n_held_ahead == expected
-        assert rejected(stage.counts)['ahead of all others: mag_2'] == 100 - expected
+        assert rejected(stage.counts)['ahead of all other sensors: mag_2'] == 100 - expected
 
 
 def test_counts_name_each_sensor():
     stage = align(6)
     frames_of(stage, stepped(stream(6, 0, 4000), {0, 5}, 1000, 2000, by=5000))
     assert Counter(rejected(stage.counts)) == {
-        'ahead of all others: mag_1': 100, 'ahead of all others: mag_6': 100}
+        'ahead of all other sensors: mag_1': 100, 'ahead of all other sensors: mag_6': 100}
 
 
 def test_what_is_ahead_is_so_of_the_newest_not_of_the_latest():

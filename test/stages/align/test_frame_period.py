@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.stages.align.frame_period import frame_period, shortest_delay, too_long
+from mag_tracking.stages.align.frame_period import (
+    frame_period,
+    frame_period_warning,
+    shortest_delay,
+)
 from mag_tracking.stages.align.settings import AlignSettings
 from support.passes import ROAD, network_of
 
@@ -31,20 +35,20 @@ def test_height_is_no_delay():
 def test_one_sensor_has_no_delay():
     one = network_of([[0.0, 0.0, 0.0]])
     assert shortest_delay(one) is None and frame_period(AUTO, one) == 0.08
-    assert too_long(AUTO, one) is None
+    assert frame_period_warning(AUTO, one) is None
 
 
 def test_a_setting_is_taken_as_it_is_and_warned_of():
     close = network_of([[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]])
     long = dataclasses.replace(AUTO, period_s=0.08)
     assert frame_period(long, close) == 0.08
-    said = too_long(long, close)
+    said = frame_period_warning(long, close)
     assert '80 ms' in said and '25 ms' in said and 'mag_1 to mag_2' in said
-    assert too_long(dataclasses.replace(long, burst=True), close) is None
-    assert too_long(long, ROAD) is None
+    assert frame_period_warning(dataclasses.replace(long, burst=True), close) is None
+    assert frame_period_warning(long, ROAD) is None
     # Nobody is warned of what was chosen for him.
     nearer = network_of([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0]])
-    assert too_long(AUTO, close) is None and too_long(AUTO, nearer) is None
+    assert frame_period_warning(AUTO, close) is None and frame_period_warning(AUTO, nearer) is None
 
 
 def test_a_frame_shorter_than_any_reading_is_refused():

@@ -141,7 +141,7 @@ def test_duplicate_and_late_stamps_are_counted_and_rejected():
     s = stage()
     for t in (1.0, 1.0, 0.5, 1.1):
         fed(s, sample(t))
-    assert rejected(s.counts) == {'duplicate stamp': 1, 'out of order': 1}
+    assert rejected(s.counts) == {'duplicate timestamp': 1, 'out of order': 1}
 
 
 def test_a_restart_is_taken_and_counted():
@@ -200,7 +200,7 @@ def test_a_clock_that_is_ahead_is_put_back():
     assert s.last_stamp_ns('mag_2') == 5_000_000_000
     # Of one sensor the order stays.
     assert fed(s, sample(5.0213, sensor='mag_2')) == []
-    assert rejected(s.counts) == {'duplicate stamp': 1}
+    assert rejected(s.counts) == {'duplicate timestamp': 1}
 
 
 def test_a_sensors_own_iron_is_taken_away():
@@ -228,7 +228,7 @@ def test_an_axis_that_a_correction_needs_is_missed():
     field = [EARTH[0], EARTH[1], np.nan]
     s = corrected(correction=SOFT + 0.01)
     assert fed(s, sample(1.0, field, 'mag_2')) == []
-    assert rejected(s.counts) == {'an axis is missing that the correction needs': 1}
+    assert rejected(s.counts) == {'an axis that the correction needs is missing': 1}
     # An offset needs no other axis.
     (out,) = fed(corrected(offset=HARD), sample(1.0, field, 'mag_2'))
     np.testing.assert_allclose(out.field[:2], -HARD[:2], atol=1e-18)
@@ -262,7 +262,7 @@ def test_another_calibration_keeps_a_background_that_a_target_stands_on():
     car = np.array([5.8e-7, 0.0, 0.0])
     feed(800, 1000, car)
     assert stage.backgrounds()['mag_1'].frozen
-    stage.renew(dataclasses.replace(network, clock_offset=np.array([0.25])))
+    stage.update_network(dataclasses.replace(network, clock_offset=np.array([0.25])))
     out = feed(1000, 2000, car)
     assert stage.backgrounds()['mag_1'].frozen and stage.backgrounds()['mag_1'].n_relearnt == 0
     assert len(out) == 1000
@@ -278,10 +278,10 @@ def test_another_correction_is_learnt_anew():
     for k in range(500):
         fed(stage, MagSample(k * 10**7, 'mag_1', EARTH + SIGMA * np.sin([k, 2 * k, 3 * k])))
     assert stage.backgrounds()['mag_1'].ready
-    stage.renew(dataclasses.replace(network, offset=(np.full(3, 1e-6),)))
+    stage.update_network(dataclasses.replace(network, offset=(np.full(3, 1e-6),)))
     assert not stage.backgrounds()['mag_1'].measured
-    with pytest.raises(NetworkError, match='in place of one of mag_1'):
-        stage.renew(line_network(2))
+    with pytest.raises(NetworkError, match='expected mag_1'):
+        stage.update_network(line_network(2))
 
 
 def ends_of_blocks(phase, times):

@@ -63,7 +63,7 @@ def calibrated_alike(network, samples, size=20, **settings):
 def test_a_pass_with_a_fault(monkeypatch, fault, is_large_and_corrected):
     network, samples, *_ = stream(2, 3, fault)
     if is_large_and_corrected:
-        monkeypatch.setattr(calibrate, 'AT_ONCE', 1)
+        monkeypatch.setattr(calibrate, 'MAX_SYNCHRONOUS', 1)
         network = corrected(network)
     assert calibrated_alike(network, samples).counts['calibrated'] > 1000
 
@@ -110,7 +110,7 @@ def test_another_calibration_and_learning_again_in_the_middle():
         stage, out = Calibrate(network, CalibrateSettings()), []
         for k, part in enumerate((samples[:800], samples[800:1600], samples[1600:])):
             if k == 1:
-                stage.renew(corrected(network))
+                stage.update_network(corrected(network))
             if k == 2:
                 stage.forget(['mag_1'])
             for i in range(0, len(part), size):
@@ -154,7 +154,7 @@ def test_a_corrected_sensor_that_is_stuck(seed):
     fields[400:] = fields[400]
     samples = [MagSample(10**18 + k * 25_000_000, 'mag_2', f) for k, f in enumerate(fields)]
     stage = calibrated_alike(network, samples)
-    assert stage.counts['rejected: the same reading over and over'] > 1100
+    assert stage.counts['rejected: stuck sensor (repeated reading)'] > 1100
 
 
 def test_a_background_without_an_axis():
@@ -204,7 +204,7 @@ def test_many_thinned_samples_come_at_once(is_renewed):
         stage, out = Calibrate(network, CalibrateSettings(decimate_to_hz=20.0)), []
         for i in range(0, 400, size):
             if is_renewed and i <= 40 < i + size:
-                stage.renew(dataclasses.replace(network, clock_offset=np.zeros(2)))
+                stage.update_network(dataclasses.replace(network, clock_offset=np.zeros(2)))
             out.append(sum(map(len, stage.feed(batch(samples[i:i + size])))))
         found.append((sum(out), stage.counts['calibrated']))
         assert size > 1 or max(out) == 32
@@ -218,7 +218,7 @@ def test_corrupt_timestamps_do_not_confirm_each_other():
     at_s = [1, 2, 1000, 3, 1001, 4, 1000.5, 5]
     for k, t in enumerate(at_s):
         stage.feed(one(MagSample(int(t * 1e9), 'mag_1', np.full(3, 1e-8 * (k + 1)))))
-    assert stage.counts['rejected: stamp too far ahead'] == 3
+    assert stage.counts['rejected: timestamp too far ahead'] == 3
     assert stage.counts['calibrated'] == 5
 
 
@@ -232,7 +232,7 @@ def test_a_step_of_the_clock_is_confirmed_once_also_where_a_background_is_offere
         if k == 1:
             stage.resume({'mag_1': stored})
         stage.feed(one(MagSample(int((t + 1.0) * 1e9), 'mag_1', np.full(3, 1e-8 * (k + 1)))))
-    assert stage.counts['rejected: stamp too far ahead'] == 1
+    assert stage.counts['rejected: timestamp too far ahead'] == 1
 
 
 def test_a_flush_forgets_what_all_sensors_were_compared_with():

@@ -24,7 +24,7 @@ def test_nothing_is_found_in_the_recordings(name, road_network):
         fed(stage, s)
     flushed(stage)
     assert sum(stage.counts_of(name)['accepted'] for name in road_network.names) > 1000
-    assert not {'spike', 'the same reading over and over'} & set(rejected(stage.counts))
+    assert not {'spike', 'stuck sensor (repeated reading)'} & set(rejected(stage.counts))
 
 
 def calibrate(**changes):
@@ -48,8 +48,8 @@ def test_spikes_and_repetitions_are_counted_where_they_are():
     y[[100, 150, 151]] += 5e-6
     y[300:330] = y[299]
     out = feed(stage, y)
-    stuck_ones = stage.counts_of('mag_1')['rejected: the same reading over and over']
-    assert rejected(stage.counts) == {'spike': 3, 'the same reading over and over': stuck_ones}
+    stuck_ones = stage.counts_of('mag_1')['rejected: stuck sensor (repeated reading)']
+    assert rejected(stage.counts) == {'spike': 3, 'stuck sensor (repeated reading)': stuck_ones}
     assert 24 <= stuck_ones <= 27 and len(out) == 400 - 3 - stuck_ones
     assert np.abs([c.field for c in out]).max() < 6 * SIGMA
     assert (np.diff([c.stamp_ns for c in out]) > 0).all()
@@ -81,7 +81,7 @@ def test_what_is_held_when_time_jumps_back_is_counted():
     stage, _ = calibrate()
     held_spike(stage)
     assert len(feed(stage, noise(50), first=-1000)) == 50
-    assert rejected(stage.counts) == {'may have been a spike when time jumped back': 2}
+    assert rejected(stage.counts) == {'possible spike when time jumped back': 2}
     assert total(stage) == 102
 
 
@@ -92,8 +92,8 @@ def test_what_is_held_when_another_calibration_comes_is_counted(what):
     held_spike(stage)
     new = {'offset': (np.full(3, 1e-6),), 'correction': (1.01 * np.eye(3),),
            'clock_offset': (0.003,)}[what]
-    stage.renew(dataclasses.replace(network, **{what: new}))
-    assert rejected(stage.counts) == {'may have been a spike when another calibration came': 2}
+    stage.update_network(dataclasses.replace(network, **{what: new}))
+    assert rejected(stage.counts) == {'possible spike when the calibration changed': 2}
     out = feed(stage, noise(50), first=100)
     assert len(out) == 50 and total(stage) == 102
 
@@ -101,7 +101,7 @@ def test_what_is_held_when_another_calibration_comes_is_counted(what):
 def test_the_same_calibration_once_more_changes_nothing():
     stage, network = calibrate()
     held_spike(stage)
-    stage.renew(dataclasses.replace(network))
+    stage.update_network(dataclasses.replace(network))
     assert len(feed(stage, noise(1), first=52)) == 1
     assert rejected(stage.counts) == {'spike': 2} and total(stage) == 53
 

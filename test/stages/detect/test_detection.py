@@ -61,7 +61,8 @@ def test_measured_false_alarm_rate_is_the_stated_one(p):
 
 
 @pytest.mark.parametrize('per_frame, said, counted', [
-    (1, '3.5e-4 a frame of one sample (12.5 Hz)', 1e-3), (8, '1.5e-7 of eight (100 Hz)', 0.05)])
+    (1, '3.5e-4 per frame of one sample (12.5 Hz)', 1e-3),
+    (8, '1.5e-7 per frame of eight (100 Hz)', 0.05)])
 def test_false_alarm_probability_at_the_defaults_is_the_one_said(per_frame, said, counted):
     """Noise of 12 nT a sample, `per_frame` samples a frame, and the allowance for backgrounds."""
     settings, variance = DetectSettings(), SIGMA**2 / per_frame

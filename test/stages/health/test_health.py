@@ -101,20 +101,20 @@ def broken(what):
 
 
 @pytest.mark.parametrize('what, serious, said', [
-    ('lost', False, 'readings are missing between'),
-    ('twice', False, '3000 of 6000 readings have the stamp of the one before'),
-    ('back', True, 'stamps went back 1 times'),
-    ('step', True, "its clock stepped 1 times against the host's, by up to -1.00 s"),
-    ('late', False, 'ms to come'),
-    ('ahead', False, 'stamps are -3.0 s before they are received'),
-    ('stuck', True, 'readings are the same as all for more than 1 s before'),
-    ('saturated', True, 'stand at the end of the range'),
+    ('lost', False, 'readings were lost, '),
+    ('twice', False, '3000 of 6000 readings repeat the previous timestamp'),
+    ('back', True, 'timestamps went back 1 times'),
+    ('step', True, 'its clock stepped 1 times relative to the host, by up to -1.00 s'),
+    ('late', False, 'ms to arrive'),
+    ('ahead', False, 'the delay from timestamp to receipt is -3.0 s'),
+    ('stuck', True, 'readings are identical to all of the 1 s before'),
+    ('saturated', True, 'are at the end of the range'),
     ('spikes', False, '14 of 3000 readings are spikes'),
     ('dead', True, 'x does not change'),
     ('axis', False, 'z is missing in 300 of 3000 readings'),
-    ('nothing', True, '300 of 3000 readings have no axis at all'),
+    ('nothing', True, '300 of 3000 readings have no valid axis'),
     ('gauss', True, 'a field of 0.514 T is rejected, the limit is 0.001 T'),
-    ('noisy', False, 'y is 10 times as noisy as it was calibrated'),
+    ('noisy', False, 'y is 10 times as noisy as at its calibration'),
 ])
 def test_each_fault_is_named(what, serious, said):
     health = examined(*broken(what))
@@ -293,7 +293,7 @@ def test_the_doctor_finds_nothing_in_good_recordings(name, road_network):
     found = [str(f) for f in doctor.findings()]
     if name == 'straight_truck_right':
         # Its sensors end at 100 uT, and it was that near.
-        assert found.pop().startswith('mag_2: 9 of 1400 readings stand at the end of the range')
+        assert found.pop().startswith('mag_2: 9 of 1400 readings are at the end of the range')
     assert not lost and not found
 
 
@@ -347,12 +347,12 @@ def test_many_at_once_are_the_same_as_one_by_one():
     rng = np.random.default_rng(3)
     stamps = np.arange(700) * NS // 100
     fields = 1e-6 + 1e-8 * rng.standard_normal((700, 3))
-    single, many = SensorHealth(every=256), SensorHealth()
+    single, many = SensorHealth(update_interval=256), SensorHealth()
     for t, f in zip(stamps.tolist(), fields, strict=True):
         single.add(t, f, t + 10**6)
     for begin, end in ((0, 0), (0, 300), (300, 301), (301, 700)):
         given = stamps[begin:end].copy(), fields[begin:end].copy(), stamps[begin:end] + 10**6
-        many.take(*given)
+        many.add_batch(*given)
         for array in given:
             array[:] = 0
     assert many.counts == single.counts and many.counts['readings'] == 700
@@ -370,7 +370,7 @@ def test_what_waits_comes_out_as_it_came():
     fields[7, 1] = np.nan
 
     def take(j):
-        found[j] += [(int(t), f.tolist(), int(r)) for t, f, r in zip(*waiting.take(j), strict=True)]
+        found[j] += [(int(t), f.tolist(), int(r)) for t, f, r in zip(*waiting.pop(j), strict=True)]
 
     while (i := waiting.add(rows, stamps, fields, 1000, i)) < len(rows):
         take(rows[i])

@@ -129,7 +129,7 @@ def test_without_the_earths_field_tilt_and_clock_are_found():
 def test_sensors_without_accelerations_stay_as_stated():
     found, _ = surveyed(change=lambda readings: readings.pop('mag_2'))
     assert warnings(found) == {
-        'mag_2': ('no accelerations: its orientation is not surveyed',)}
+        'mag_2': ('no accelerations; the orientation is not surveyed',)}
     s = found.sensors[1]
     assert (s.orientation, s.by, s.lag) == (None, 'as stated', None)
     np.testing.assert_array_equal(found.network.R_ws[1], np.eye(3))
@@ -164,7 +164,7 @@ def test_without_a_knock_clocks_stay():
     network = stated(clock_offset=np.array([0.0, 0.5, -0.5]))
     found, _ = surveyed(network, knocks=())
     assert found.reference == ''
-    assert found.warnings() == ['clocks stay as they were: the reference measured no knock']
+    assert found.warnings() == ['clock offsets are unchanged: the reference felt no knock']
     np.testing.assert_array_equal(found.network.clock_offset, [0.0, 0.5, -0.5])
     assert np.isnan(found.network.calibrated[1].clock_offset_std)
 
@@ -193,7 +193,7 @@ def test_a_tilted_sensor_is_named_and_levelled():
     turned = (TURNED[0], Rotation.from_euler('x', 30.0, True), TURNED[2])
     found, _ = surveyed(turned=turned)
     assert warnings(found) == {
-        'mag_2': ('is tilted by 30 degrees from what the network file says',)}
+        'mag_2': ('the tilt differs by 30 degrees from the network file',)}
     np.testing.assert_allclose(found.network.R_ws[1], turned[1].as_matrix(), atol=0.04)
     # Compared with the Earth it is as it stands, not as it was stated.
     assert found.disagreements == ()
@@ -204,7 +204,8 @@ def test_a_compass_far_from_what_was_stated_is_named():
     turned = (TURNED[0], Rotation.from_euler('z', 25.0, True), TURNED[2])
     found, _ = surveyed(turned=turned)
     assert warnings(found) == {'mag_2': (
-        'heads +25 degrees from what the network file says, by its compass: it stays as stated',)}
+        'the compass heading differs by +25 degrees from the network file; the stated heading is '
+        'kept',)}
     np.testing.assert_allclose(found.network.R_ws[1], np.eye(3), atol=2e-3)
     assert np.degrees(found.network.orientation_std[1][2]) == pytest.approx(5.0)
     assert found.sensors[1].by == 'accelerometer, heading as stated'

@@ -15,7 +15,7 @@ from support.networks import line_network
 from support.samples import one, simulate
 
 SURE_WITHOUT = ('junction_left_to_right', 'junction_left_turns_to_rear')
-DOUBTED = 'tracks of a doubtful background'
+DOUBTED = 'tracks with a doubtful background'
 SETTINGS = settings_for('vehicle', QUICK)
 """A fast tracker: the doubt does not depend on the model of the target."""
 

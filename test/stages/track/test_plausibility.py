@@ -27,7 +27,7 @@ def state(observation, z=0.5, speed=10.0, at=(0.0, 0.0), angles_deg=0.0):
 
 def judged(plausibility, observation, x, dt=0.08, mounting=MOUNTING, origin=0):
     bank = SimpleNamespace(x=x[None], kind=np.array([1]), origin=np.array([origin]))
-    return plausibility.judge(observation, bank, 0, SETTINGS.vehicle, mounting, dt)
+    return plausibility.evaluate(observation, bank, 0, SETTINGS.vehicle, mounting, dt)
 
 
 def found(mounting=MOUNTING, dt=0.08, **of_state):
@@ -78,7 +78,7 @@ def test_each_hypothesis_has_a_path_of_its_own():
     for k in range(2):
         bank = SimpleNamespace(x=np.array([state(observation, at=at[k]) for at in paths.values()]),
                                kind=np.array([1, 1]), origin=np.array(list(paths)))
-        said = [plausibility.judge(observation, bank, best, SETTINGS.vehicle, MOUNTING, 0.08)
+        said = [plausibility.evaluate(observation, bank, best, SETTINGS.vehicle, MOUNTING, 0.08)
                 for best in range(2)]
         assert said == [{doubts.OFF_THE_ROAD}, set()]
 

@@ -115,7 +115,7 @@ def test_where_all_is_linear_nothing_changes(monkeypatch, window_s, interval_s, 
     _, _, counts = followed_beside_plain(
         filter_, Relinearisation(interval_s, window_s, 5), anew_at=anew_at)
     if window_s > 0.1 and passes == 8:
-        assert counts[relinearise.TRIED] > counts[relinearise.IN_VAIN] == 0
+        assert counts[relinearise.ATTEMPTED] > counts[relinearise.FAILED] == 0
 
 
 @pytest.mark.parametrize('long, better, is_taken', [
@@ -126,8 +126,8 @@ def test_a_long_vehicle_is_taken_only_where_it_explains_the_frames_no_worse(
     filter_ = LinearFilter()
     filter_.long, filter_.better = long, better
     _, _, counts = followed_beside_plain(filter_, Relinearisation(0.0, 0.5, 5))
-    assert counts[relinearise.TRIED] > 50
-    assert counts[relinearise.IN_VAIN] == (0 if is_taken else counts[relinearise.TRIED])
+    assert counts[relinearise.ATTEMPTED] > 50
+    assert counts[relinearise.FAILED] == (0 if is_taken else counts[relinearise.ATTEMPTED])
 
 
 class LessSure(LinearFilter):
@@ -163,7 +163,7 @@ def less_sure(more, linear):
 def test_of_a_settled_path_the_state_and_the_wider_covariance_are_taken(more, is_wider):
     filter_, bank, relinearisation = less_sure(more, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
-    assert relinearisation.improve(filter_, bank)[relinearise.IN_VAIN] == 0
+    assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 0
     np.testing.assert_allclose(bank.x[0], x[0] + 0.1 * np.eye(6)[1], atol=1e-9)
     np.testing.assert_allclose(
         bank.P[0], P[0] + is_wider * more * np.eye(6)[0] * np.eye(6)[0][:, None], atol=1e-9)
@@ -173,10 +173,10 @@ def test_of_a_settled_path_the_state_and_the_wider_covariance_are_taken(more, is
     (0.5, np.inf, True), (0.5, 2.0, True), (0.5, 0.5, False), (-1e-3, np.inf, False)])
 def test_of_a_path_that_is_less_sure_the_covariance_is_taken(monkeypatch, more, linear, is_wider):
     """Where it has not settled, as far as here anything ever does."""
-    monkeypatch.setattr(relinearise, 'SETTLED', -1.0)
+    monkeypatch.setattr(relinearise, 'CONVERGED', -1.0)
     filter_, bank, relinearisation = less_sure(more, linear)
     x, P = bank.x.copy(), bank.P.copy()
-    assert relinearisation.improve(filter_, bank)[relinearise.IN_VAIN] == 1
+    assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 1
     np.testing.assert_array_equal(bank.x, x)
     # With how far apart the two are: that, too, nobody knows.
     expected = P[0] + is_wider * (more * np.eye(6)[0] * np.eye(6)[0][:, None]
@@ -202,7 +202,7 @@ def test_a_path_whose_covariance_is_none_is_of_no_use():
     """Rounding errors over a sensor: its state and its path stay where they were."""
     filter_, bank, relinearisation = less_sure(-3.0, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
-    assert relinearisation.improve(filter_, bank)[relinearise.IN_VAIN] == 1
+    assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 1
     np.testing.assert_array_equal(bank.x, x)
     np.testing.assert_array_equal(bank.P, P)
 
@@ -220,7 +220,7 @@ def test_it_is_done_over_twice_the_window_at_most(monkeypatch, window_s, max_fra
 @pytest.mark.parametrize('most, affordable', [(1, 10**9), (5, 6**2 * 40)])
 def test_it_is_done_for_the_heaviest(monkeypatch, most, affordable):
     """And for fewer where many states make it expensive: here for one over forty frames."""
-    monkeypatch.setattr(relinearise, 'MAX_NUMBERS', affordable)
+    monkeypatch.setattr(relinearise, 'MAX_ELEMENTS', affordable)
     filter_ = LinearFilter()
     bank, *_ = followed_beside_plain(filter_, Relinearisation(60.0, 60.0, most), prune=False)
     anew = Relinearisation(0.0, 60.0, most)
@@ -229,7 +229,7 @@ def test_it_is_done_for_the_heaviest(monkeypatch, most, affordable):
     frame = FieldFrame(10**12, np.zeros((1, 3)), np.eye(3)[None], np.full(1, 8), np.zeros(1), True)
     for _ in range(40):
         anew.add(bank, bank.x.copy(), np.zeros(len(bank)), 0.0, frame, 0.1)
-    assert anew.improve(filter_, bank)[relinearise.TRIED] == 1
+    assert anew.improve(filter_, bank)[relinearise.ATTEMPTED] == 1
     assert filter_.origins == {bank.origin[np.argmax(bank.log_w)]}
 
 
@@ -264,7 +264,7 @@ def followed(filter_, bank, y, anew):
         dt = PERIOD if k else 0.0
         anew.add(bank, *filter_.advance(bank, frame, dt), 0.0, frame, dt)
         counts = anew.improve(filter_, bank)
-    return counts[relinearise.TRIED], counts[relinearise.IN_VAIN]
+    return counts[relinearise.ATTEMPTED], counts[relinearise.FAILED]
 
 
 TURNS = {**STILL, 'track.vehicle.turn_acceleration': 1e-4, 'track.vehicle.turn_time': 1e3}
@@ -372,8 +372,8 @@ def test_settings_changed_in_mid_track_begin_it_anew():
                 errors.append(np.hypot(*(r.position[:2] - true)))
                 if len(errors) == 15:
                     stage.configure(settings.track)
-                    before = stage.counts[relinearise.TRIED] - stage.counts[relinearise.IN_VAIN]
-    assert stage.counts[relinearise.TRIED] - stage.counts[relinearise.IN_VAIN] > before > 0
+                    before = stage.counts[relinearise.ATTEMPTED] - stage.counts[relinearise.FAILED]
+    assert stage.counts[relinearise.ATTEMPTED] - stage.counts[relinearise.FAILED] > before > 0
     assert max(errors[15:]) < 1.5
 
 

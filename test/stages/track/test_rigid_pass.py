@@ -121,7 +121,7 @@ def test_paths_that_may_explain_a_pass_are_where_the_vehicle_was():
                          path=TURNS).straight_paths)
 
 
-@pytest.mark.parametrize('limit, most', [('FARTHEST', 3.0), ('FASTEST', 15.0)])
+@pytest.mark.parametrize('limit, most', [('MAX_DISTANCE', 3.0), ('MAX_SPEED', 15.0)])
 def test_paths_that_are_too_far_or_too_fast_explain_nothing(monkeypatch, limit, most):
     """This vehicle passes one sensor at 3.5 m, the other at 5.5 m, at 20 m/s."""
     monkeypatch.setattr(rigid_pass, limit, most)
@@ -130,5 +130,5 @@ def test_paths_that_are_too_far_or_too_fast_explain_nothing(monkeypatch, limit, 
 
 
 def test_a_path_that_is_near_to_one_sensor_is_near(monkeypatch):
-    monkeypatch.setattr(rigid_pass, 'FARTHEST', 4.5)
+    monkeypatch.setattr(rigid_pass, 'MAX_DISTANCE', 4.5)
     assert len(found(steady_frames(np.random.default_rng(9))).straight_paths) == 2

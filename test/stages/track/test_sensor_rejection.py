@@ -15,7 +15,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.evidence import MAX_SINGLE_SENSOR_S
 from mag_tracking.stages.track.initiation_vehicle import vehicle_model
 from mag_tracking.stages.track.manager import TrackManager
-from mag_tracking.stages.track.sensor_rejection import ONE_IN, SensorRejection
+from mag_tracking.stages.track.sensor_rejection import SENSORS_PER_REJECTION, SensorRejection
 from support.bundled import POINT
 from support.faulty_streams import NS, stream
 from support.networks import line_network
@@ -115,7 +115,7 @@ def test_one_that_is_wrong_is_left_out_as_if_it_were_missing(n, seed):
         expected, after = plain(bank_filter, bank, without(frame, j))
         _, got, used, counts = SensorRejection(names).advance(
             bank_filter, mine, spoilt(frame, j), DT)
-        assert counts == {f'frames that {names[j]} contradicted': 1}
+        assert counts == {f'frames in which {names[j]} was rejected': 1}
         assert got.tobytes() == expected.tobytes() and state(mine) == after
         assert same_frame(used, without(frame, j))
     if n == 2:
@@ -136,7 +136,7 @@ def test_the_frame_and_the_prior_are_not_written_into():
 
 @pytest.mark.parametrize('n, most', [(2, 1), (6, 1), (15, 1), (16, 2), (24, 3)])
 def test_never_more_than_one_in_eight_but_always_one(n, most):
-    assert most == max(1, n // ONE_IN)
+    assert most == max(1, n // SENSORS_PER_REJECTION)
     for wrong in (most, most + 1):
         bank_filter, bank, frame, names = situation(n, n_hyp=2)
         # Those that are near: what is far away agrees with everything.
@@ -145,7 +145,7 @@ def test_never_more_than_one_in_eight_but_always_one(n, most):
         whole, after = plain(bank_filter, bank, bad)
         _, got, used, counts = SensorRejection(names).advance(bank_filter, bank, bad, DT)
         if wrong == most and n > 2:
-            assert set(counts) == {f'frames that {names[j]} contradicted' for j in near}
+            assert set(counts) == {f'frames in which {names[j]} was rejected' for j in near}
             assert same_frame(used, without(frame, *near))
         elif wrong > most:
             # The frame as a whole, bit for bit: it is the track that is lost.
@@ -187,7 +187,7 @@ def test_an_axis_that_is_missing_leaves_a_sensor_there():
     field[:, 2] = np.nan
     bad = spoilt(dataclasses.replace(frame, field=field), 3)
     *_, used, counts = SensorRejection(names).advance(bank_filter, bank, bad, DT)
-    assert counts == {f'frames that {names[3]} contradicted': 1}
+    assert counts == {f'frames in which {names[3]} was rejected': 1}
     assert np.isnan(used.field[3]).all() and not np.isnan(used.field[2, :2]).any()
 
 
@@ -262,7 +262,7 @@ def test_a_sensor_that_rules_out_every_hypothesis_is_left_out():
     ruled = Ruled(3, network, vehicle_model(SETTINGS.vehicle, network), SETTINGS)
     _, after = plain(plain_filter, bank, without(frame, 3))
     _, got, _, counts = SensorRejection(names).advance(ruled, bank, frame, DT)
-    assert counts == {f'frames that {names[3]} contradicted': 1}
+    assert counts == {f'frames in which {names[3]} was rejected': 1}
     assert np.isfinite(got).all() and state(bank) == after
 
 
@@ -289,7 +289,7 @@ def test_of_two_sensors_the_track_is_flagged_from_then_on():
         pipeline, tracks, (begin, _) = passing(
             2, fault, seed=1, lasting_s=MAX_SINGLE_SENSOR_S - 0.2)
         flags[fault] = [t.ambiguous for t in tracks if t.stamp_ns / NS > begin + 0.5]
-        contradicted = [what for what in pipeline.track.counts if 'contradicted' in what]
+        contradicted = [what for what in pipeline.track.counts if 'was rejected' in what]
         assert bool(contradicted) == bool(fault)
     assert len(flags['swaps axes']) > 10 and all(flags['swaps axes'])
     assert not any(flags[None])
@@ -303,9 +303,9 @@ MISTAKEN = pytest.param(3, 0, marks=pytest.mark.xfail(strict=True, reason=(
 @pytest.mark.parametrize('n_sensors, seed', [MISTAKEN, (3, 1), (3, 2), (3, 3), (6, 0)])
 def test_of_more_the_others_are_believed(n_sensors, seed):
     pipeline, tracks, (begin, end) = passing(n_sensors, 'swaps axes', seed)
-    assert pipeline.track.counts['frames that mag_2 contradicted'] > 3
-    assert [what for what in pipeline.track.counts if 'contradicted' in what] == [
-        'frames that mag_2 contradicted']
+    assert pipeline.track.counts['frames in which mag_2 was rejected'] > 3
+    assert [what for what in pipeline.track.counts if 'was rejected' in what] == [
+        'frames in which mag_2 was rejected']
     assert not any(t.ambiguous for t in tracks if t.stamp_ns / NS > end + 0.3)
     # The poses say themselves who was used.
     used = [np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in tracks
@@ -317,7 +317,7 @@ def test_of_more_the_others_are_believed(n_sensors, seed):
 
 def test_a_track_that_was_bent_to_the_wrong_two_is_flagged():
     pipeline, tracks, (_, end) = passing(3, 'swaps axes', 0)
-    assert [what for what in pipeline.track.counts if 'contradicted' in what]
+    assert [what for what in pipeline.track.counts if 'was rejected' in what]
     after = [t.ambiguous for t in tracks if t.stamp_ns / NS > end + 0.3]
     assert len(after) > 10 and all(after)
 
@@ -325,7 +325,7 @@ def test_a_track_that_was_bent_to_the_wrong_two_is_flagged():
 def test_without_a_fault_nobody_is_suspected():
     pipeline, tracks, _ = passing(3, None)
     assert len(tracks) > 20
-    assert not [what for what in pipeline.track.counts if 'contradicted' in what]
+    assert not [what for what in pipeline.track.counts if 'was rejected' in what]
 
 
 def test_a_calibration_that_comes_while_one_is_left_out_waits_for_the_end_of_the_track():

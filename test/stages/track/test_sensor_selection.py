@@ -12,7 +12,11 @@ from mag_tracking.simulation.scenario import Path, point_body
 from mag_tracking.stages.track import bank_size, manager
 from mag_tracking.stages.track.approach import Approach
 from mag_tracking.stages.track.doubts import DOUBTFUL_BACKGROUND
-from mag_tracking.stages.track.sensor_selection import hand_on, nearest, part_of_frame
+from mag_tracking.stages.track.sensor_selection import (
+    exchange_sensor_states,
+    nearest_sensors,
+    part_of_frame,
+)
 from support.bundled import POINT
 from support.networks import line_network
 from support.samples import one, simulate
@@ -36,7 +40,7 @@ def test_what_is_known_of_sensors_that_stay_is_kept(n_own):
     bank = bank_of(rng, 4, 8, n_own, 3)
     x, P = bank.x.copy(), bank.P.copy()
     prior = np.array([np.diag(np.arange(1.0, n_own + 1.0)) * (j + 1) for j in range(4)])
-    hand_on(bank, before, after, prior.reshape(4, n_own, n_own), 0.25)
+    exchange_sensor_states(bank, before, after, prior.reshape(4, n_own, n_own), 0.25)
     n_x = 8 + (n_own + 3) * 4
     assert bank.x.shape == (4, n_x) and bank.P.shape == (4, n_x, n_x)
     assert np.isnan(bank.nis).all() and bank.nis.shape == (4, 4)
@@ -60,8 +64,8 @@ def test_what_is_known_of_sensors_that_stay_is_kept(n_own):
 
 def test_the_nearest_in_the_plane_in_the_networks_order():
     positions = np.array([[0.0, 0.0, 9.0], [5.0, 0.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 0.5, 0.0]])
-    assert nearest(positions, np.array([0.2, 0.0]), 2).tolist() == [0, 2]
-    assert nearest(positions, np.array([9.0, 0.0]), 3).tolist() == [0, 1, 2]
+    assert nearest_sensors(positions, np.array([0.2, 0.0]), 2).tolist() == [0, 2]
+    assert nearest_sensors(positions, np.array([9.0, 0.0]), 3).tolist() == [0, 1, 2]
 
 
 def test_a_part_of_a_network():
@@ -98,7 +102,7 @@ def test_a_target_is_followed_along_forty_sensors():
     print(f'rms {np.sqrt((e**2).sum(axis=1).mean()):.2f} m, mean NEES {np.mean(nees):.2f} of 2')
     assert np.sqrt((e**2).sum(axis=1).mean()) < 0.5
     assert np.mean(nees) < 4.0
-    assert pipeline.counts()['track']['tracks handed on to other sensors'] >= 10
+    assert pipeline.counts()['track']['tracks handed over to other sensors'] >= 10
     frames = {r.stamp_ns: r for r in records if isinstance(r, FieldFrame)}
     for t in inside:
         assert t.predicted.shape == (40, 3) and t.mounting.shape == (40, 3)
@@ -128,7 +132,7 @@ def test_many_sensors_come_in_when_the_frames_before_the_detection_are_through(m
         assert max(np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in live) == min(most, 12)
         smoothed = [r for r in records if isinstance(r, SmoothedPose) and r.complete]
         if most == 16:
-            assert pipeline.track.counts['tracks handed on to other sensors'] == 0
+            assert pipeline.track.counts['tracks handed over to other sensors'] == 0
             assert [p.stamp_ns for p in smoothed] == [t.stamp_ns for t in live]
             errors = [np.linalg.norm(p.position[:2] - truth(p.stamp_ns / 1e9)) for p in smoothed
                       if 0.0 < truth(p.stamp_ns / 1e9)[0] < 45.0]
@@ -163,7 +167,7 @@ def test_sensors_that_come_in_and_say_nothing_change_nothing(monkeypatch, frames
     """The time of the first frame with all of them is gone through once."""
     network, every = frames
     first = next(f for f in every if f.target_present)
-    near = nearest(network.positions, network.positions[
+    near = nearest_sensors(network.positions, network.positions[
         np.argmax(np.linalg.norm(np.nan_to_num(first.field), axis=1)), :2], 4)
     far = np.setdiff1d(np.arange(12), near)
     silent = [dataclasses.replace(
@@ -210,7 +214,7 @@ def test_the_first_pose_is_doubted_for_a_sensor_that_comes_in_with_it(monkeypatc
         monkeypatch.setattr(manager, 'sensors_at_start', lambda *_, n=n: n)
         tracker, tracks = managed(frames, POINT, {far: ((0, 2**62),)})
         assert DOUBTFUL_BACKGROUND in tracks[0].doubts
-        assert tracker.counts['tracks of a doubtful background'] == 1
+        assert tracker.counts['tracks with a doubtful background'] == 1
 
 
 def test_a_network_that_is_not_larger_is_used_whole():

@@ -375,7 +375,7 @@ def test_a_track_that_was_lost_is_smoothed_with_a_doubt():
 
 
 def test_long_tracks_of_many_states_are_bounded(monkeypatch):
-    monkeypatch.setattr(smooth_module, 'MAX_NUMBERS', 20 * 35**2)
+    monkeypatch.setattr(smooth_module, 'MAX_ELEMENTS', 20 * 35**2)
     records, _ = run(point_body([250.0, -150.0, 80.0], 4.0, 0.5), {})
     assert [r for r in records if isinstance(r, Track)]
     assert not [r for r in records if isinstance(r, SmoothedPose)]

@@ -37,7 +37,7 @@ def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(comp
     x[18] = length
     for kind, usual, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
         said[kind] = smoothed_pose(
-            model, VehicleOrientation(), x, P, unseen=UnobservedLength([usual], [std]),
+            model, VehicleOrientation(), x, P, unobserved_length=UnobservedLength([usual], [std]),
             difference=np.zeros(6), stamp_ns=0, id=1, kind=0, kinds=(kind,), ambiguous=False,
             complete=complete).covariance - P[:6, :6]
     assert not said['car'].any()
@@ -49,17 +49,18 @@ def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(comp
 
 @pytest.mark.parametrize('length', [4.0, 8.9])
 def test_a_truck_that_was_felt_has_its_iron_at_either_end(length):
-    unseen = of_vehicles()
+    unobserved_length = of_vehicles()
     for beyond in (-9.0, 8.0):
-        unseen.look(at([beyond, 0.0]), P, np.zeros((1, 3)), True)
+        unobserved_length.update(at([beyond, 0.0]), P, np.zeros((1, 3)), True)
         expected = np.square(off_middle(length, 1.5, beyond > 0.0)).mean()
-        said = unseen.covariance(at([beyond, 0.0]), P, length, TRUCK)
+        said = unobserved_length.covariance(at([beyond, 0.0]), P, length, TRUCK)
         assert said[0, 0] == pytest.approx(expected, rel=0.02)
 
 
 def test_a_row_that_is_longer_than_its_kind_hides_no_more_than_the_spread_of_it():
-    unseen = of_vehicles()
-    said = [unseen.covariance(at([-9.0, 0.0]), P, length, TRUCK)[0, 0] for length in (9.0, 15.0)]
+    unobserved_length = of_vehicles()
+    said = [unobserved_length.covariance(at([-9.0, 0.0]), P, length, TRUCK)[0, 0]
+            for length in (9.0, 15.0)]
     np.testing.assert_allclose(said, 1.5**2)
 
 
@@ -75,40 +76,40 @@ def test_a_car_that_comes_may_be_the_head_of_a_truck():
 
 @pytest.mark.parametrize('heading', [0.0, 2.0, np.pi])
 def test_once_a_truck_would_have_been_felt_a_car_is_one(heading):
-    unseen, forward = of_vehicles(), np.array([np.cos(heading), np.sin(heading)])
+    unobserved_length, forward = of_vehicles(), np.array([np.cos(heading), np.sin(heading)])
     for beyond, is_open in ((-9.0, True), (2.9, True), (3.1, False), (8.0, False)):
         x = at(beyond * forward, heading)
-        unseen.look(x, P, np.zeros((1, 3)), True)
-        assert unseen.covariance(x, P, 3.0, CAR).any() == is_open
+        unobserved_length.update(x, P, np.zeros((1, 3)), True)
+        assert unobserved_length.covariance(x, P, 3.0, CAR).any() == is_open
 
 
 def test_round_a_corner_the_way_counts():
-    unseen = of_vehicles()
+    unobserved_length = of_vehicles()
     for place, heading, is_open in (([-4.0, 1.0], 0.0, True), ([1.0, 1.0], 0.0, True),
                                     ([2.0, 0.0], -1.5, True), ([2.0, -2.0], -1.5, False)):
         x = at(place, heading)
-        unseen.look(x, P, np.zeros((1, 3)), True)
-        assert unseen.covariance(x, P, 3.0, CAR).any() == is_open
+        unobserved_length.update(x, P, np.zeros((1, 3)), True)
+        assert unobserved_length.covariance(x, P, 3.0, CAR).any() == is_open
 
 
 def test_only_a_sensor_that_it_came_near_to_has_felt_it():
-    unseen, far = of_vehicles(), np.array([[-100.0, 500.0, 0.0], [0.0, 3.0, 0.0]])
-    unseen.look(at([-20.0, 0.0]), P, far, True)
-    assert unseen.covariance(at([-20.0, 0.0]), P, 3.0, CAR).any()
-    for places, is_sure in ((np.zeros((0, 3)), True), (far, False)):
+    unobserved_length, far = of_vehicles(), np.array([[-100.0, 500.0, 0.0], [0.0, 3.0, 0.0]])
+    unobserved_length.update(at([-20.0, 0.0]), P, far, True)
+    assert unobserved_length.covariance(at([-20.0, 0.0]), P, 3.0, CAR).any()
+    for places, is_certain in ((np.zeros((0, 3)), True), (far, False)):
         # None measured; or it may as well be elsewhere.
-        unseen.look(at([20.0, 0.0]), P, places, is_sure)
-        assert unseen.covariance(at([20.0, 0.0]), P, 3.0, CAR).any()
+        unobserved_length.update(at([20.0, 0.0]), P, places, is_certain)
+        assert unobserved_length.covariance(at([20.0, 0.0]), P, 3.0, CAR).any()
 
 
 def test_one_that_stops_keeps_its_heading():
-    unseen = of_vehicles()
-    unseen.look(at([-5.0, 0.0]), P, SENSORS, True)
-    moving = unseen.covariance(at([-4.0, 0.0]), P, 3.0, CAR)
+    unobserved_length = of_vehicles()
+    unobserved_length.update(at([-5.0, 0.0]), P, SENSORS, True)
+    moving = unobserved_length.covariance(at([-4.0, 0.0]), P, 3.0, CAR)
     for heading in (0.0, 2.0, 4.0):
         standing = at([-4.0, 0.0], heading, 0.1)
-        unseen.look(standing, P, SENSORS, True)
-        np.testing.assert_allclose(unseen.covariance(standing, P, 3.0, CAR), moving)
+        unobserved_length.update(standing, P, SENSORS, True)
+        np.testing.assert_allclose(unobserved_length.covariance(standing, P, 3.0, CAR), moving)
 
 
 def test_nothing_is_longer_than_the_longest_kind():
@@ -127,8 +128,8 @@ def test_what_is_not_seen_and_where_else_it_may_be_are_covered_together():
     said = {}
     for name, difference in (('here', np.zeros(6)), ('apart', np.array([6.0, 0, 0, 2.0, 0, 0]))):
         said[name] = smoothed_pose(
-            model, VehicleOrientation(), x, P, unseen=None, difference=difference, stamp_ns=0, id=1,
-            kind=0, kinds=('car',), ambiguous=False, complete=True)
+            model, VehicleOrientation(), x, P, unobserved_length=None, difference=difference,
+            stamp_ns=0, id=1, kind=0, kinds=('car',), ambiguous=False, complete=True)
     here, apart = said['here'], said['apart']
     assert apart.covariance[0, 0] == pytest.approx(36.0)
     assert here.covariance[0, 0] < 36.0

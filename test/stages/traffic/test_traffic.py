@@ -81,13 +81,13 @@ def test_a_crossing_is_extrapolated_only_a_little():
 def test_a_track_that_is_lost_and_begun_again_is_counted_once():
     records, stage = counted(drive(2.0, 4.3, 4.0), drive(4.6, 6.0, 4.1, id=2))
     assert len(passages(records)) == 1
-    assert stage.counts['crossings of lost tracks, counted once'] == 1
+    assert stage.counts['repeated crossings after a lost track'] == 1
 
 
 def test_that_holds_where_the_extrapolated_crossing_comes_first():
     records, stage = counted(drive(2.0, 3.9, 4.1), drive(4.0, 6.0, 4.15, id=2))
     assert len(passages(records)) == 1
-    assert stage.counts['crossings of lost tracks, counted once'] == 1
+    assert stage.counts['repeated crossings after a lost track'] == 1
 
 
 def test_vehicles_in_two_lanes_are_not_one():
@@ -278,7 +278,7 @@ def test_a_gap_in_the_frames_has_no_intervals():
 
 
 def test_magnets_are_not_counted():
-    stage = Traffic(NETWORK, TrafficSettings(), is_of_vehicles=False)
+    stage = Traffic(NETWORK, TrafficSettings(), counts_vehicles=False)
     assert stage.feed(TrackedFrame(frame(0.0), [])) == stage.flush() == []
 
 
@@ -286,8 +286,8 @@ def test_magnets_are_not_counted():
     ({'line_offsets': (0.0, 1.0)}, r'traffic.line_offsets: expected 1 values'),
     ({'class_lengths': (3.0,)}, r'traffic.class_lengths: expected 3 values'),
     ({'class_names': ('car', 'car', 'truck')}, 'duplicate names'),
-    ({'class_names': ('car', 'unknown', 'truck')}, "'unknown' is not a usable name"),
-    ({'line_names': ('',)}, 'is not a usable name')])
+    ({'class_names': ('car', 'unknown', 'truck')}, "'unknown' is not a valid name"),
+    ({'line_names': ('',)}, 'is not a valid name')])
 def test_lists_that_do_not_belong_together_are_refused(changes, why):
     with pytest.raises(SettingsError, match=why):
         Traffic(NETWORK, TrafficSettings(**changes))
