@@ -36,6 +36,7 @@ from mag_tracking.report.metrics import (
     unflagged_poses,
 )
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.stages.align.frame_period import frame_period_warning
 from mag_tracking.stages.track.settings import acceleration_density
 
 SUSPECT_MOUNTING_RATIO = 2.0
