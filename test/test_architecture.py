@@ -25,8 +25,8 @@ def layers():
 
 
 def table():
-    """[{room}], highest floor first, as docs/architecture.md has them."""
-    text = (ROOT / 'docs' / 'architecture.md').read_text()
+    """[{room}], highest floor first, as docs/contributing/architecture.md has them."""
+    text = (ROOT / 'docs' / 'contributing' / 'architecture.md').read_text()
     rows = re.findall(r'^\| (\d) \| ([^|]+)\|', text, re.M)
     assert [int(n) for n, _ in rows] == list(range(len(rows), 0, -1))
     return [{room.removesuffix('.py').rstrip('/') for room in re.findall(r'`([^`]+)`', rooms)}
@@ -158,7 +158,9 @@ def test_the_tests_mirror_the_package():
 
 def paths_in_documents():
     """(document, path of a file or folder that it names in backticks)."""
-    for document in [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]:
+    docs = ROOT / 'docs'
+    folders = [docs, docs / 'concepts', docs / 'contributing', docs / 'guides']
+    for document in [*ROOT.glob('*.md'), *(p for folder in folders for p in folder.glob('*.md'))]:
         for name in re.findall(r'`([\w./-]+(?:/|\.py|\.md|/[\w.-]+\.(?:yaml|xml|toml)))`',
                                document.read_text()):
             yield document.name, name
