@@ -160,7 +160,7 @@ def paths_in_documents():
     """(document, path of a file or folder that it names in backticks)."""
     pages = [p for p in sorted((ROOT / 'docs').rglob('*.md'))
              if not {'reference', 'gallery'} & set(p.parts)]
-    for document in [ROOT / 'README.md', *pages]:
+    for document in [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *pages]:
         for name in re.findall(r'`([\w./-]+(?:/|\.py|\.md|/[\w.-]+\.(?:yaml|xml|toml)))`',
                                document.read_text()):
             yield document.name, name
