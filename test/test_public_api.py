@@ -8,7 +8,6 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -371,28 +370,3 @@ def test_a_plan_is_that_of_the_command(tmp_path):
     assert list(found.best_place) == written['best_place']
     with pytest.raises(mt.SettingsError, match='^moment: required for a magnet'):
         mt.plan(NETWORK_FILE, 'magnet')
-
-
-def test_the_documentation_names_what_is_there():
-    text = (ROOT / 'docs' / 'api.md').read_text()
-    for name in ('track', 'fit', 'plan', 'read_network', 'read_recording', 'readings_from_arrays',
-                 'read_parameter_file'):
-        assert f'`{name}(' in text
-    attributes = {*mt.TrackingResult.__dataclass_fields__, *dir(mt.TrackingResult)}
-    for word in ('poses_dataframe', 'map_figure', 'errors', 'rejections', 'lost',
-                 'missing_topics', 'sensors_without_background'):
-        assert word in text and word in attributes
-
-
-def test_the_code_of_the_documentation_runs(tmp_path, monkeypatch):
-    """With the names of its files replaced by those of files that exist."""
-    text = (ROOT / 'docs' / 'api.md').read_text()
-    code = '\n'.join(line.strip() for line in text.splitlines() if line.startswith('    '))
-    code = code.replace("'recording.mcap'", repr(str(vehicle_path(NAME))))
-    code = code.replace("'network.yaml'", repr(str(NETWORK_FILE)))
-    # Drawing by pandas takes a display's backend.
-    code = code.replace(".plot(x='x', y='y')", "[['x', 'y']]")
-    monkeypatch.chdir(tmp_path)
-    names = {}
-    exec(code, names)
-    assert Path('map.png').stat().st_size > 1000 and len(names['readings']) == 2

@@ -3,6 +3,7 @@
 from mag_tracking.drivers.configuration import settings_by_kind
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.recording.archive_tables import TABLES
+from mag_tracking.recording.traffic_tables import tables_of
 from mag_tracking.settings import flatten
 from mag_tracking.stages.track.doubts import MEANINGS
 
@@ -10,7 +11,7 @@ from mag_tracking.stages.track.doubts import MEANINGS
 def settings_pages():
     """{file name: Markdown}."""
     return {'parameters.md': parameters(), 'drivers.md': drivers(), 'doubts.md': doubts(),
-            'archive_tables.md': archive_tables()}
+            'archive_tables.md': archive_tables(), 'traffic_tables.md': traffic_tables()}
 
 
 def parameters():
@@ -74,6 +75,20 @@ def archive_tables():
              'of each '
              'column are also stored in the metadata of the files.', '']
     for table, columns in TABLES.items():
-        lines += [f'## {table}', '', '| column | unit | meaning |', '|---|---|---|',
-                  *(f'| `{c.name}` | {c.unit} | {c.meaning} |' for c in columns), '']
+        lines += [f'## {table}', '', *column_rows(columns), '']
     return '\n'.join(lines)
+
+
+def traffic_tables():
+    """The columns of the results of `mag-tracking traffic`."""
+    lines = ['# Tables of traffic', '', 'Columns of the CSV and Parquet files that `mag-tracking '
+             'traffic` writes ({doc}`/guides/traffic`).', '']
+    for table, columns in tables_of(('<class>',), True).items():
+        lines += [f'## {table}', '', *column_rows(columns), '']
+    return '\n'.join(lines)
+
+
+def column_rows(columns):
+    """Markdown table of columns."""
+    return ['| column | unit | meaning |', '|---|---|---|',
+            *(f'| `{c.name}` | {c.unit} | {c.meaning} |' for c in columns)]
