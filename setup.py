@@ -6,20 +6,20 @@ from pybind11.setup_helpers import Pybind11Extension
 from setuptools import Distribution, find_packages, setup
 
 NAME = 'mag_tracking'
-# Version, description and licence stand in package.xml, where ROS tools expect them.
+# package.xml is the only source of version, description and licence: ROS tools read it there.
 PACKAGE = ElementTree.parse('package.xml').getroot()
 NODES = ('driver_node', 'replay_node', 'calibration_node', 'detection_node', 'tracker_node')
 
 class DataFilesDistribution(Distribution):
-    """Workaround: `pip install -e` leaves data_files out, as setuptools asks for `has_data`, which
-    nobody defines. It can go when an editable install has share/mag_tracking/package.xml without.
+    """Workaround: `pip install -e` omits data_files, because setuptools queries `has_data`, which is
+    undefined. Remove it once an editable install contains share/mag_tracking/package.xml without it.
     """
 
     def has_data(self):
         return self.has_data_files()
 
-# What is computed for every reading and every frame. It may be copied to another machine, so it is
-# not made for this processor alone: where that matters the module chooses by itself.
+# Code that runs for every reading and every frame. A wheel may run on other machines, so it is not
+# compiled for this processor; modules select faster versions at run time where that matters.
 CORES = [
     Pybind11Extension(
         source.removesuffix('.cpp').replace('/', '.'), [source], cxx_std=17,
@@ -48,8 +48,8 @@ setup(
         (f'share/{NAME}/config/security', sorted(glob('config/security/*.xml'))),
         (f'share/{NAME}/config/viewers', sorted(glob('config/viewers/*'))),
     ],
-    # ROS itself and mag_tracking_msgs stay out: people with a ROS from apt have them from there,
-    # and pip would look for mag-tracking-msgs on the index, where it is not.
+    # ROS and mag_tracking_msgs are not listed: users of ROS from apt have them already, and pip
+    # would search mag-tracking-msgs on PyPI, where it does not exist.
     install_requires=[
         'matplotlib',
         'mcap',
@@ -69,11 +69,11 @@ setup(
         'zstandard',
     ],
     extras_require={
-        # ros-jazzy-*: the names without "jazzy" are another release of ROS.
+        # The packages without "jazzy" in their names belong to another ROS release.
         'ros': [
             'ros-jazzy-common-interfaces',
             'ros-jazzy-rclpy',
-            # rclpy's wheel does not ask for a middleware and cannot be imported without one.
+            # The wheel of rclpy does not depend on a middleware, but cannot be imported without one.
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
         'archive': ['dask', 'distributed', 'pyarrow'],
@@ -90,12 +90,12 @@ setup(
             'sphinx-design',
             'sphinx-gallery',
         ],
-        # `colcon test` runs pytest only where the extra "test" names it.
+        # `colcon test` runs pytest only if the extra "test" lists it.
         'test': [
-            # Drivers for CircuitPython, as users have them.
+            # CircuitPython drivers as users install them.
             'adafruit-circuitpython-lis3mdl',
             'adafruit-circuitpython-mmc56x3',
-            # What reads archives.
+            # Readers of archives.
             'duckdb',
             'filterpy',
             'hypothesis',

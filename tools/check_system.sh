@@ -28,7 +28,7 @@ sys.exit(not os.path.exists(os.path.join(sysconfig.get_path("include"), "Python.
 # The ROS wheels of PyPI are built for x86_64 Linux with glibc only.
 if [ "$(uname -s)" != Linux ] || [ "$(uname -m)" != x86_64 ]; then
     fail "This is $(uname -s) on $(uname -m); the ROS packages on PyPI exist for Linux on x86_64 only." \
-         'Install ROS 2 Jazzy from apt and build with colcon: see README.md.'
+         'Install ROS 2 Jazzy from apt and build with colcon: see docs/guides/deploy.md.'
 fi
 
 if command -v "$python" >/dev/null; then

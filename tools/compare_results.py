@@ -37,10 +37,11 @@ def recordings(tree, out):
     """Bundled recordings: [(name, recording, network, target)]; imports the magnet tables."""
     road = ROOT / 'config' / 'network.yaml'
     found = [(p.stem, p, road, 'vehicle') for p in sorted((DATA / 'vehicles').glob('*.mcap'))]
-    found.append(('two_way_road_start', DATA / 'two_way_road' / 'two_way_road_start.mcap', road,
-                  'vehicle'))
-    found.append(('corridor_8_sensors', DATA / 'corridor' / 'corridor_8_sensors.mcap',
-                  DATA / 'corridor' / 'network.yaml', 'vehicle'))
+    for folder in ('two_way_road', 'corridor'):
+        found += [(p.stem, p, DATA / folder / 'network.yaml', 'vehicle')
+                  for p in sorted((DATA / folder).glob('*.mcap'))]
+    found += [(p.stem, p, DATA / 'busy' / f'network_{p.stem.split("_", 1)[1]}.yaml', 'vehicle')
+              for p in sorted((DATA / 'busy').glob('*.mcap'))]
     for n in (1, 2):
         source, folder = DATA / 'magnet_16_sensors', out / f'lisa{n}'
         mag_tracking(tree, 'import', source / f'lisa_data{n}.csv', '--background',
@@ -76,7 +77,7 @@ def difference(one, other):
     return abs(a - b) / max(abs(a), abs(b)) if math.isfinite(a) and math.isfinite(b) else math.inf
 
 
-def compare(one, other):
+def compare(one, other, renamed):
     """Compare two CSV files: (rows, values, largest difference, its location)."""
     with open(one, newline='') as a, open(other, newline='') as b:
         rows, others = list(csv.reader(a)), list(csv.reader(b))
@@ -86,6 +87,8 @@ def compare(one, other):
     for i, (row, other_row) in enumerate(zip(rows, others, strict=True)):
         for column, x, y in zip(rows[0], row, other_row, strict=True):
             n += 1
+            for old, new in renamed:
+                x = x.replace(old, new)
             d = difference(x, y)
             if d > worst:
                 worst, where = d, f'row {i}, {column}: {x} against {y}'
@@ -100,6 +103,8 @@ def main():
                         help='relative tolerance (default: 1e-12)')
     parser.add_argument('--workers', type=int, default=2,
                         help='number of concurrent replays (default: 2)')
+    parser.add_argument('--renamed', nargs=2, action='append', default=[], metavar=('OLD', 'NEW'),
+                        help='text of the base that has been renamed since')
     args = parser.parse_args()
     build = ROOT / 'build' / 'compare'
     commit = subprocess.run(['git', 'rev-parse', '--short', args.base], cwd=ROOT, check=True,
@@ -108,6 +113,8 @@ def main():
     if not tree.exists():
         subprocess.run(['git', 'worktree', 'add', '--detach', tree, commit], cwd=ROOT, check=True,
                        capture_output=True)
+        subprocess.run([sys.executable, 'setup.py', '-q', 'build_ext', '--inplace'], cwd=tree,
+                       check=True, capture_output=True)
     if not (kept / 'complete').exists():
         replay_all(tree, kept, args.workers)
         (kept / 'complete').touch()
@@ -115,7 +122,8 @@ def main():
     failed = False
     for name in names:
         for table in TABLES:
-            n_rows, n, worst, where = compare(kept / name / table, build / 'results' / name / table)
+            n_rows, n, worst, where = compare(kept / name / table, build / 'results' / name / table,
+                                             args.renamed)
             bad = worst > args.tolerance
             failed |= bad
             print(f'{name} {table}: {n_rows} rows, {n} values, largest difference {worst:.2g}'
