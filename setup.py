@@ -11,8 +11,8 @@ PACKAGE = ElementTree.parse('package.xml').getroot()
 NODES = ('driver_node', 'replay_node', 'calibration_node', 'detection_node', 'tracker_node')
 
 class DataFilesDistribution(Distribution):
-    """Workaround: `pip install -e` omits data_files, because setuptools queries `has_data`, which is
-    undefined. Remove it once an editable install contains share/mag_tracking/package.xml without it.
+    """Workaround: `pip install -e` omits data_files, because setuptools queries the undefined
+    `has_data`. Remove it once an editable install contains share/mag_tracking/package.xml without.
     """
 
     def has_data(self):
@@ -73,7 +73,7 @@ setup(
         'ros': [
             'ros-jazzy-common-interfaces',
             'ros-jazzy-rclpy',
-            # The wheel of rclpy does not depend on a middleware, but cannot be imported without one.
+            # The wheel of rclpy does not require a middleware, but fails to import without one.
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
         'archive': ['dask', 'distributed', 'pyarrow'],
