@@ -113,7 +113,7 @@ def test_an_unknown_covariance_between_the_nodes_is_taken_from_the_network_or_re
     align.feed(one(MagSample(0, 'mag_1', np.zeros(3), None)))
     align.feed(one(MagSample(1, 'mag_1', np.full(3, np.inf), None)))
     assert sorted(rejected(align.counts)) == [
-        'unknown covariance, and no noise_std in the network', 'no finite field']
+        'no finite field', 'unknown covariance, and no noise_std in the network']
 
 
 def test_an_axis_that_is_missing_now_and_then_stays_known():
