@@ -411,8 +411,8 @@ class ScriptedTransport:
 
 
 def test_frames_are_assembled_from_a_stream():
-    device = FramedDevice(ScriptedTransport([Chunk(1, b'1\n2'), Chunk(2, b'\n3'), Chunk(3, b'4\n')]),
-                          DigitFraming())
+    device = FramedDevice(ScriptedTransport([
+        Chunk(1, b'1\n2'), Chunk(2, b'\n3'), Chunk(3, b'4\n')]), DigitFraming())
     device.open()
     assert [(a.arrival_ns, a.reading.field[0]) for a in device.read(0.0)] == [(1, 1.0)]
     assert [(a.arrival_ns, a.reading.field[0]) for a in device.read(0.0)] == [(2, 2.0)]
