@@ -1,4 +1,4 @@
-"""The structure: floors, sizes, and what tests may reach."""
+"""Architecture: floors of the rooms, sizes of files and functions, and imports of the tests."""
 
 import ast
 import re
@@ -13,19 +13,19 @@ from support.bundled import ROOT
 
 PACKAGE = ROOT / 'mag_tracking'
 FILES = sorted(PACKAGE.rglob('*.py'))
-MAX_FILE, MAX_FUNCTION, MAX_SHARE = 350, 40, 0.2
-"""Lines of a file and of a function, both without docstrings; share of all lines in one room."""
+MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_ROOM_SHARE = 350, 40, 0.2
+"""Lines of a file and of a function without docstrings; share of all lines in one room."""
 
 
-def layers():
-    """[{room}], highest floor first, as `lint-imports` checks them."""
+def checked_floors():
+    """Sets of rooms, highest floor first, as `lint-imports` checks them."""
     contracts = api.read_configuration(str(ROOT / 'pyproject.toml'))['contracts_options']
     rows = next(c['layers'] for c in contracts if c['type'] == 'layers')
     return [set(re.split(r'\s*[|:]\s*', row)) for row in rows]
 
 
-def table():
-    """[{room}], highest floor first, as docs/contributing/architecture.md has them."""
+def documented_floors():
+    """Sets of rooms, highest floor first, as in docs/contributing/architecture.md."""
     text = (ROOT / 'docs' / 'contributing' / 'architecture.md').read_text()
     rows = re.findall(r'^\| (\d) \| ([^|]+)\|', text, re.M)
     assert [int(n) for n, _ in rows] == list(range(len(rows), 0, -1))
@@ -33,40 +33,40 @@ def table():
             for _, rooms in rows]
 
 
-def test_the_contracts_and_the_page_say_the_same_floors():
-    assert layers() == table()
+def test_import_contracts_match_the_documented_floors():
+    assert checked_floors() == documented_floors()
 
 
 def test_every_module_has_a_floor():
     rooms = {p.stem if p.is_file() else p.name for p in PACKAGE.iterdir()
              if p.name != '__pycache__' and (p.suffix == '.py' or p.is_dir())}
-    assert rooms - {'__init__'} == set.union(*layers())
+    assert rooms - {'__init__'} == set.union(*checked_floors())
 
 
-def test_compiled_sources_include_only_what_is_below_their_floor():
-    floor = {room: -k for k, rooms in enumerate(layers()) for room in rooms}
+def test_compiled_sources_include_only_headers_of_lower_floors():
+    floor = {room: -k for k, rooms in enumerate(checked_floors()) for room in rooms}
     sources = [*PACKAGE.rglob('*.hpp'), *PACKAGE.rglob('*.cpp')]
     assert sources
     for source in sources:
         text = source.read_text()
-        assert text.count('\n') <= MAX_FILE, source
+        assert text.count('\n') <= MAX_FILE_LINES, source
         for name in re.findall(r'^#include "(.+)"$', text, re.M):
             included = (source.parent / name).resolve()
             own, other = (p.relative_to(PACKAGE).parts[0].removesuffix('.hpp')
                           for p in (source, included))
             assert included.is_file(), (source, name)
-            # A header beside all rooms is of the lowest floor.
-            assert own == other or floor.get(other, -len(layers())) < floor.get(
-                own, -len(layers()) + 1), (source, name)
+            # A header outside the rooms belongs to the lowest floor.
+            assert own == other or floor.get(other, -len(checked_floors())) < floor.get(
+                own, -len(checked_floors()) + 1), (source, name)
 
 
-def test_no_two_modules_import_each_other():
+def test_the_import_graph_has_no_cycle():
     graph = grimp.build_graph('mag_tracking')
     imports = {m: graph.find_modules_directly_imported_by(m) for m in graph.modules}
     done, on_path = set(), []
 
     def visit(module):
-        assert module not in on_path, f'circle: {on_path[on_path.index(module):]}'
+        assert module not in on_path, f'import cycle: {on_path[on_path.index(module):]}'
         if module not in done:
             on_path.append(module)
             for imported in imports[module]:
@@ -80,7 +80,7 @@ def test_no_two_modules_import_each_other():
 
 
 def n_lines(path):
-    """Lines of a module without its docstrings: these are for a reader of the reference."""
+    """Lines of a module without its docstrings."""
     text = path.read_text()
     docstrings = (ast.get_docstring(node, clean=False) for node in ast.walk(ast.parse(text))
                   if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef,
@@ -88,32 +88,32 @@ def n_lines(path):
     return len(text.splitlines()) - sum(d.count('\n') + 1 for d in docstrings if d is not None)
 
 
-def test_no_file_is_too_long():
+def test_no_file_exceeds_the_maximum_length():
     assert {str(p.relative_to(ROOT)): n_lines(p) for p in FILES
-            if n_lines(p) > MAX_FILE} == {}
+            if n_lines(p) > MAX_FILE_LINES} == {}
 
 
-def test_no_room_holds_too_much():
+def test_no_room_exceeds_its_share_of_all_lines():
     rooms = Counter()
     for path in FILES:
         rooms[path.relative_to(PACKAGE).parts[0]] += n_lines(path)
     largest, n = rooms.most_common(1)[0]
-    assert n <= MAX_SHARE * rooms.total(), f'{largest}: {n} of {rooms.total()} lines'
+    assert n <= MAX_ROOM_SHARE * rooms.total(), f'{largest}: {n} of {rooms.total()} lines'
 
 
 def definitions(path):
-    """(node, whether it is public) of every function and class of a module, methods included."""
+    """(node, whether it is public) of every class, function and method of a module."""
     def walk(body, public):
         for node in body:
             if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
-                shown = public and not node.name.startswith('_')
-                yield node, shown
-                yield from walk(node.body, shown and isinstance(node, ast.ClassDef))
+                is_public = public and not node.name.startswith('_')
+                yield node, is_public
+                yield from walk(node.body, is_public and isinstance(node, ast.ClassDef))
 
     return walk(ast.parse(path.read_text()).body, True)
 
 
-def length(node):
+def n_function_lines(node):
     """Lines of a function without its docstring."""
     text = ast.get_docstring(node, clean=False)
     return node.end_lineno - node.lineno + 1 - (text.count('\n') + 1 if text is not None else 0)
@@ -122,16 +122,16 @@ def length(node):
 @pytest.mark.parametrize('path', FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_functions_are_short_and_public_names_have_docstrings(path):
     assert ast.get_docstring(ast.parse(path.read_text()))
-    long = {node.name: length(node) for node, _ in definitions(path)
-            if not isinstance(node, ast.ClassDef) and length(node) > MAX_FUNCTION}
+    long = {node.name: n_function_lines(node) for node, _ in definitions(path)
+            if not isinstance(node, ast.ClassDef) and n_function_lines(node) > MAX_FUNCTION_LINES}
     assert long == {}
-    silent = [node.name for node, public in definitions(path)
-              if public and ast.get_docstring(node) is None]
-    assert silent == []
+    undocumented = [node.name for node, public in definitions(path)
+                    if public and ast.get_docstring(node) is None]
+    assert undocumented == []
 
 
 def private_uses(tree):
-    """Private names of the package that a test imports, or reads from anything but `self`."""
+    """Private names that a test imports from the package or reads from anything but `self`."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('mag_tracking'):
             yield from (a.name for a in node.names if a.name.startswith('_'))
@@ -143,21 +143,21 @@ def private_uses(tree):
 
 @pytest.mark.parametrize('path', sorted((ROOT / 'test').rglob('*.py')),
                          ids=lambda p: str(p.relative_to(ROOT / 'test')))
-def test_tests_reach_no_private_name(path):
+def test_tests_use_no_private_names(path):
     assert sorted(private_uses(ast.parse(path.read_text()))) == []
 
 
 def test_the_tests_mirror_the_package():
-    """Every folder of tests below the system tests is a room of the package."""
-    apart = {'data', 'support', 'system', 'bench', '__pycache__'}
+    """Every folder of tests, except those listed, is a room of the package."""
+    exceptions = {'data', 'support', 'system', 'bench', '__pycache__'}
     folders = [p.relative_to(ROOT / 'test') for p in (ROOT / 'test').rglob('*')
-               if p.is_dir() and not set(p.relative_to(ROOT / 'test').parts) & apart]
+               if p.is_dir() and not set(p.relative_to(ROOT / 'test').parts) & exceptions]
     assert [str(f) for f in folders if not (PACKAGE / f).is_dir()] == []
     assert Path('stages/track') in folders
 
 
 def paths_in_documents():
-    """(document, path of a file or folder that it names in backticks)."""
+    """(document, path) of every file or folder that a document names in backticks."""
     pages = [p for p in sorted((ROOT / 'docs').rglob('*.md'))
              if not {'reference', 'gallery'} & set(p.parts)]
     for document in [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *pages]:
@@ -166,8 +166,8 @@ def paths_in_documents():
             yield document.name, name
 
 
-def test_documents_name_files_that_exist():
-    """Below the project, the package, a room of it, or the results of a command."""
+def test_files_named_in_documents_exist():
+    """Paths are relative to the project, the package, a room of it, or the tests."""
     rooms = [ROOT, PACKAGE, *(p for p in PACKAGE.rglob('*') if p.is_dir()), ROOT / 'test']
     assert [(d, name) for d, name in paths_in_documents()
             if not any((room / name).exists() for room in rooms)] == []

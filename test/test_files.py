@@ -1,4 +1,4 @@
-"""Files of results: made new under their own name, whatever had it."""
+"""Output files: each is created from scratch and replaces a link or pipe of its name."""
 
 import os
 
@@ -52,51 +52,51 @@ def write_figures(out):
     (lambda out: write_events(out, []), ()),
     (lambda out: write_network(out / 'n.yaml', line_network(2)), ()),
     (lambda out: write_backgrounds(out / 'b.json', {}), ())])
-def test_no_result_is_written_through_a_link(tmp_path, write, more):
+def test_results_are_not_written_through_a_symbolic_link(tmp_path, write, more):
     (tmp_path / 'new').mkdir()
     write(tmp_path / 'new')
     names = sorted(path.name for path in (tmp_path / 'new').iterdir())
-    out, theirs = tmp_path / 'out', tmp_path / 'theirs'
+    out, targets = tmp_path / 'out', tmp_path / 'theirs'
     out.mkdir()
-    theirs.mkdir()
+    targets.mkdir()
     for name in (*names, *more):
-        # A recording may only take the place of one of the same name.
-        (theirs / name).write_text('- a.mcap\n- tracks.mcap\n')
-        (out / name).symlink_to(theirs / name)
+        # A recording is only replaced if `metadata.yaml` lists its name.
+        (targets / name).write_text('- a.mcap\n- tracks.mcap\n')
+        (out / name).symlink_to(targets / name)
     write(out)
     assert sorted(path.name for path in out.iterdir()) == names
     assert not any(path.is_symlink() for path in out.iterdir())
-    assert {path.read_text() for path in theirs.iterdir()} == {'- a.mcap\n- tracks.mcap\n'}
+    assert {path.read_text() for path in targets.iterdir()} == {'- a.mcap\n- tracks.mcap\n'}
 
 
 @pytest.mark.parametrize('make', [new_text_file, new_binary_file])
-def test_a_new_file_takes_the_place_of_what_had_its_name(tmp_path, make):
+def test_a_new_file_replaces_a_link_or_pipe_of_its_name(tmp_path, make):
     path, other = tmp_path / 'a', tmp_path / 'other'
     other.write_text('theirs')
-    for before in (lambda: path.symlink_to(other), lambda: path.symlink_to(tmp_path / 'nowhere'),
+    for occupy in (lambda: path.symlink_to(other), lambda: path.symlink_to(tmp_path / 'nowhere'),
                    lambda: path.hardlink_to(other), lambda: os.mkfifo(path), lambda: None):
         path.unlink(missing_ok=True)
-        before()
+        occupy()
         with make(path) as stream:
             stream.write('' if make is new_text_file else b'')
         assert path.is_file() and not path.is_symlink() and path.stat().st_size == 0
         assert other.read_text() == 'theirs' and sorted(tmp_path.iterdir()) == [path, other]
 
 
-def test_a_row_is_there_as_soon_as_it_is_written(tmp_path):
+def test_a_row_is_readable_as_soon_as_it_is_flushed(tmp_path):
     with new_text_file(tmp_path / 'a') as stream:
         stream.write('row\n')
         stream.flush()
         assert (tmp_path / 'a').read_text() == 'row\n'
 
 
-def test_what_is_no_text_is_escaped(tmp_path):
+def test_lone_surrogates_are_escaped(tmp_path):
     with new_text_file(tmp_path / 'a') as stream:
         stream.write('\udcff\u00e4')
     assert (tmp_path / 'a').read_text(encoding='utf-8') == '\\udcff\u00e4'
 
 
-def test_a_folder_of_that_name_is_no_file(tmp_path):
+def test_a_folder_of_the_same_name_is_refused(tmp_path):
     (tmp_path / 'a').mkdir()
     with pytest.raises(OSError, match='directory'):
         new_text_file(tmp_path / 'a')
@@ -106,19 +106,19 @@ def test_a_folder_of_that_name_is_no_file(tmp_path):
             ResultFolder(tmp_path / name, line_network(2))
 
 
-def test_a_path_with_a_nul_is_named(tmp_path):
-    told = r"'a\\x00b.* is not a valid path: it contains a NUL character"
-    with pytest.raises(RecordingError, match=told):
+def test_a_path_with_a_nul_character_is_refused(tmp_path):
+    message = r"'a\\x00b.* is not a valid path: it contains a NUL character"
+    with pytest.raises(RecordingError, match=message):
         checked_path('a\0b', RecordingError)
     for write in (output_folder, new_text_file, lambda path: write_events(path, []),
                   RecordingWriter, FitFolder, Recorder,
                   lambda path: write_network(path, line_network(2)),
                   lambda path: replay(Recording(vehicle_path('straight_car_right')),
                                       line_network(2), settings_for('vehicle'), path)):
-        with pytest.raises(OutputError, match=told):
+        with pytest.raises(OutputError, match=message):
             write('a\0b')
     for read in (read_network, read_parameter_file, Recording, repair, read_readings,
                  lambda path: mt.track(path, line_network(2)),
                  lambda path: import_field_table(path, ['time=t', 'm.x=x'], 'T', 'out')):
-        with pytest.raises(mt.MagTrackingError, match=told):
+        with pytest.raises(mt.MagTrackingError, match=message):
             read('a\0b')

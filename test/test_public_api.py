@@ -1,4 +1,4 @@
-"""The public interface of the package: what `import mag_tracking` offers to a notebook."""
+"""Public Python interface: the names that `import mag_tracking` provides."""
 
 import ast
 import importlib
@@ -20,7 +20,7 @@ from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS
 from support.bundled import NETWORK_FILE, QUICK, ROOT, vehicle_path
 
 NAME = 'straight_car_fast_left'
-HEAVY = {'matplotlib', 'dask', 'mcap', 'numpy', 'pandas', 'rclpy', 'scipy', 'yaml'}
+HEAVY_MODULES = {'matplotlib', 'dask', 'mcap', 'numpy', 'pandas', 'rclpy', 'scipy', 'yaml'}
 
 
 @pytest.fixture(scope='module')
@@ -40,14 +40,14 @@ def readings():
                                    np.full((6, 3), 1e-6))
 
 
-def python(code):
-    """What another interpreter prints."""
+def run_python(code):
+    """Output of `code` in another interpreter."""
     return subprocess.run([sys.executable, '-c', code], check=True, capture_output=True, text=True,
                           cwd=ROOT).stdout.strip()
 
 
-def same(a, b):
-    """Whether two results have the same arrays, to the last bit."""
+def are_identical(a, b):
+    """Whether the arrays of two results are equal to the last bit."""
     return all(getattr(a, name).dtype == getattr(b, name).dtype
                and getattr(a, name).tobytes() == getattr(b, name).tobytes()
                for name in ('poses', 'smoothed', 'detections'))
@@ -63,7 +63,7 @@ def test_a_public_name_resolves_and_is_documented(name):
 
 
 def test_type_checkers_see_the_public_names():
-    """The imports for type checkers are those that are done on first use."""
+    """The imports under TYPE_CHECKING match the imports on first use."""
     tree = ast.parse((ROOT / 'mag_tracking' / '__init__.py').read_text())
     block = next(n for n in tree.body if isinstance(n, ast.If) and n.test.id == 'TYPE_CHECKING')
     seen = {alias.asname or alias.name: (node.module, alias.name)
@@ -73,35 +73,35 @@ def test_type_checkers_see_the_public_names():
         assert getattr(mt, name) is getattr(importlib.import_module(module), there)
 
 
-def test_a_public_name_is_not_that_of_a_module():
-    """Importing the module would replace it."""
+def test_no_public_name_is_that_of_a_module():
+    """Importing the module would replace the name."""
     assert not set(mt.__all__) & {p.stem for p in (ROOT / 'mag_tracking').iterdir()}
 
 
-def test_an_unknown_name_is_an_attribute_error():
+def test_an_unknown_name_raises_an_attribute_error():
     with pytest.raises(AttributeError, match="module 'mag_tracking' has no attribute 'trakc'"):
         mt.trakc  # noqa: B018
 
 
 def test_importing_the_package_imports_nothing_else():
-    loaded = python('import sys, mag_tracking; dir(mag_tracking); print(*sys.modules)').split()
+    loaded = run_python('import sys, mag_tracking; dir(mag_tracking); print(*sys.modules)').split()
     assert 'mag_tracking' in loaded
-    assert not HEAVY & {name.partition('.')[0] for name in loaded}
+    assert not HEAVY_MODULES & {name.partition('.')[0] for name in loaded}
     assert not [name for name in loaded if name.startswith('mag_tracking.')]
 
 
-def test_tracking_does_not_import_figures_and_pandas():
-    loaded = python('import sys, mag_tracking; mag_tracking.track; print(*sys.modules)').split()
+def test_tracking_imports_neither_matplotlib_nor_pandas_nor_ros():
+    loaded = run_python('import sys, mag_tracking; mag_tracking.track; print(*sys.modules)').split()
     assert 'mag_tracking.apps.track' in loaded
     assert not {'matplotlib', 'pandas', 'rclpy'} & {n.partition('.')[0] for n in loaded}
 
 
-def test_figures_leave_the_backend_alone():
+def test_figure_modules_do_not_change_the_matplotlib_backend():
     modules = [f'mag_tracking.report.{p.stem}'
                for p in (ROOT / 'mag_tracking' / 'report').glob('*figures.py')]
     assert len(modules) == 5
-    assert python('import matplotlib; matplotlib.use("svg"); import '
-                  f'{", ".join(modules)}; print(matplotlib.get_backend())') == 'svg'
+    assert run_python('import matplotlib; matplotlib.use("svg"); import '
+                      f'{", ".join(modules)}; print(matplotlib.get_backend())') == 'svg'
 
 
 def test_a_recording_is_read_into_arrays(recorded):
@@ -110,7 +110,7 @@ def test_a_recording_is_read_into_arrays(recorded):
     assert readings.names == mt.read_network(NETWORK_FILE).names == ('mag_1', 'mag_2')
     assert readings.stamp_ns.shape == readings.sensor.shape == (n,) and n == 2800
     assert readings.stamp_ns.dtype == np.int64 and readings.field.shape == (n, 3)
-    # Of the order of the Earth's field, in tesla.
+    # Order of magnitude of the Earth's field [T].
     assert 1e-6 < np.median(np.linalg.norm(readings.field, axis=1)) < 1e-4
     (name, (stamps, positions, quaternions)), = recorded.truth.items()
     assert name == 'vehicle_00' and (np.diff(stamps) > 0).all()
@@ -138,16 +138,16 @@ def test_tracking_a_recording_equals_a_replay(result, vehicle_replays):
     assert errors and errors == {k: entry['truth'][k] for k in errors}
 
 
-def test_arrays_give_the_same_as_the_recording(result, recorded):
-    assert same(mt.track(recorded, mt.read_network(NETWORK_FILE)), result)
+def test_arrays_give_the_same_result_as_the_recording(result, recorded):
+    assert are_identical(mt.track(recorded, mt.read_network(NETWORK_FILE)), result)
     r = recorded.readings
-    mine = mt.readings_from_arrays(np.array(r.names)[r.sensor], r.stamp_ns, r.field, r.covariance)
-    from_arrays = mt.track(mine, NETWORK_FILE)
-    assert same(from_arrays, result)
+    arrays = mt.readings_from_arrays(np.array(r.names)[r.sensor], r.stamp_ns, r.field, r.covariance)
+    from_arrays = mt.track(arrays, NETWORK_FILE)
+    assert are_identical(from_arrays, result)
     assert from_arrays.truth == {} and from_arrays.errors() is None
 
 
-def test_a_magnet_in_arrays_equals_a_replay(magnet_runs, magnet_replays):
+def test_tracking_arrays_of_a_magnet_equals_a_replay(magnet_runs, magnet_replays):
     recording, network = magnet_runs[1]
     run, folder = magnet_replays[1]
     found = mt.track(mt.read_recording(recording, network).readings, network, 'magnet')
@@ -157,7 +157,7 @@ def test_a_magnet_in_arrays_equals_a_replay(magnet_runs, magnet_replays):
     assert len(found.poses) > 10 and found.counts == run.summary['counts']
 
 
-def test_settings_differ_from_the_defaults(recorded, result):
+def test_settings_override_the_defaults(recorded, result):
     found = mt.track(recorded, NETWORK_FILE, settings={'align.period_s': 0.2})
     assert found.settings.align.period_s == 0.2 and 0 < len(found.poses) < len(result.poses)
     with pytest.raises(mt.SettingsError, match='did you mean track.iterations'):
@@ -176,11 +176,11 @@ def test_dataframes_have_units(result):
     units = result.poses_dataframe().attrs['units']
     assert units['stamp_ns'] == 'ns' and units['sd_y'] == 'm' and units['vx'] == 'm/s'
     assert units['mz'] == 'A m^2'
-    without = {'track_id', 'weight', 'ambiguous', 'kind', 'kind_weight', 'doubts'}
-    assert set(units) == set(POSE_COLUMNS) - without
+    dimensionless = {'track_id', 'weight', 'ambiguous', 'kind', 'kind_weight', 'doubts'}
+    assert set(units) == set(POSE_COLUMNS) - dimensionless
 
 
-def test_arrays_have_the_fields_of_the_records(result):
+def test_result_arrays_have_the_fields_of_the_records(result):
     n = len(result.poses)
     assert result.poses['covariance'].shape == (n, 6, 6)
     assert set(result.poses['kind']) <= {'small', 'car', 'truck'}
@@ -192,7 +192,7 @@ def test_arrays_have_the_fields_of_the_records(result):
     np.testing.assert_allclose(seconds, 0.08, atol=1e-6)
 
 
-def test_a_long_name_is_not_cut(recorded):
+def test_a_long_arrival_name_is_not_truncated(recorded):
     long = 'from the right, where the road comes over the bridge'
     found = mt.track(recorded, NETWORK_FILE, settings=QUICK | {
         'track.vehicle.arrival_names': ['left', long, 'rear']})
@@ -202,7 +202,7 @@ def test_a_long_name_is_not_cut(recorded):
 @pytest.mark.parametrize('source', ['nothing', 'noise'])
 def test_no_target_gives_empty_arrays(recorded, result, source):
     r = recorded.readings
-    # The car comes after four seconds.
+    # The car arrives after 4 s.
     quiet = r.part(r.stamp_ns < r.stamp_ns[0] + (0 if source == 'nothing' else 4_000_000_000))
     found = mt.track(quiet, NETWORK_FILE)
     for name in ('poses', 'smoothed', 'detections'):
@@ -229,7 +229,7 @@ def test_rejected_readings_are_counted(recorded):
     assert '20 unknown sensor' in repr(found) and 'not used' in repr(found)
 
 
-def test_what_a_damaged_recording_lost_is_told(tmp_path):
+def test_losses_of_a_damaged_recording_are_reported(tmp_path):
     cut = tmp_path / 'cut.mcap'
     content = vehicle_path(NAME).read_bytes()
     cut.write_bytes(content[:len(content) // 2])
@@ -252,13 +252,13 @@ FIELD, STAMPS = np.zeros((3, 3)), np.arange(3)
     (['a'] * 3, np.arange(3, dtype=np.uint64) + 2**63, FIELD, None, 'nanoseconds since 1970'),
     (['a'] * 3, np.full(3, -2**63), FIELD, None, 'nanoseconds since 1970'),
 ])
-def test_bad_arrays_are_refused(sensor, stamp_ns, field, covariance, text):
+def test_invalid_arrays_are_refused(sensor, stamp_ns, field, covariance, text):
     with pytest.raises(mt.ReadingsError, match=text) as caught:
         mt.readings_from_arrays(sensor, stamp_ns, field, covariance)
     assert isinstance(caught.value, ValueError) and isinstance(caught.value, mt.MagTrackingError)
 
 
-def test_what_is_masked_is_missing():
+def test_masked_axes_become_nan():
     field = np.ma.masked_greater(np.arange(9.0).reshape(3, 3), 6.0)
     found = mt.readings_from_arrays(['a'] * 3, STAMPS, field).field
     np.testing.assert_array_equal(np.isnan(found), np.arange(9.0).reshape(3, 3) > 6.0)
@@ -266,7 +266,7 @@ def test_what_is_masked_is_missing():
 
 
 @pytest.mark.parametrize('of_recording', [False, True])
-def test_masked_stamps_are_refused_also_where_the_order_is_that_of_a_recording(
+def test_masked_timestamps_are_refused(
         recorded, of_recording):
     r = recorded.readings
     broken = replace(r, stamp_ns=np.ma.masked_equal(r.stamp_ns, r.stamp_ns[5]))
@@ -283,20 +283,20 @@ def test_masked_stamps_are_refused_also_where_the_order_is_that_of_a_recording(
     ({'stamp_ns': np.array([0, 60, 120, 1, 61, 121]) * 1_000_000_000},
      r'reading 3 \(mag_2\) is 119 s older'),
 ])
-def test_bad_readings_are_refused(readings, changes, text):
+def test_invalid_readings_are_refused(readings, changes, text):
     with pytest.raises(mt.ReadingsError, match=text):
         mt.track(replace(readings, **changes), NETWORK_FILE)
 
 
-def test_readings_that_are_late_by_little_are_tracked(recorded):
-    """A recording holds its readings as they arrived: they need not be sorted."""
+def test_slightly_late_readings_are_tracked(recorded):
+    """A recording stores readings in order of arrival, which need not be the order of time."""
     r = recorded.readings
     later = replace(r, stamp_ns=r.stamp_ns + np.where(r.sensor == 1, -30_000_000, 0))
     assert (np.diff(later.stamp_ns) < 0).any()
     assert len(mt.track(later, NETWORK_FILE).tracks) == 1
 
 
-def test_bad_files_are_refused(tmp_path):
+def test_missing_files_are_refused(tmp_path):
     with pytest.raises(mt.RecordingError, match='does not exist'):
         mt.track(tmp_path / 'none.mcap', NETWORK_FILE)
     with pytest.raises(mt.NetworkError):
@@ -304,14 +304,14 @@ def test_bad_files_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['poses', 'smoothed', 'detections'])
-def test_without_pandas_the_extra_is_named(monkeypatch, result, name):
+def test_the_error_without_pandas_names_the_extra(monkeypatch, result, name):
     monkeypatch.setitem(sys.modules, 'pandas', None)
     with pytest.raises(mt.MissingDependencyError, match=r'pip install mag_tracking\[pandas\]'):
         getattr(result, f'{name}_dataframe')()
     assert len(getattr(result, name))
 
 
-def test_figures_of_a_track(result):
+def test_a_track_has_a_map_a_weights_and_a_field_figure(result):
     from matplotlib.figure import Figure
     titles = set()
     for name in ('map', 'weights', 'field'):
@@ -328,15 +328,15 @@ def test_figures_of_a_track(result):
         result.map_figure(7)
 
 
-def test_fits_as_a_dataframe_are_those_of_the_command(tmp_path):
+def test_the_fit_dataframe_equals_the_table_of_the_command(tmp_path):
     found = mt.fit(vehicle_path(NAME), NETWORK_FILE, orders=[1, 3])
-    one, = found.passes
-    assert found.warnings == () and one.chosen.n_dipoles == 3
+    fitted_pass, = found.passes
+    assert found.warnings == () and fitted_pass.chosen.n_dipoles == 3
     frame = found.to_dataframe()
     assert tuple(frame.columns) == FIT_COLUMNS and len(frame) == 2
     assert frame.attrs['units']['sd_mx'] == 'A m^2' and frame.attrs['units']['cpa_time'] == 's'
     with FitFolder(tmp_path) as folder:
-        folder.add(one)
+        folder.add(fitted_pass)
     written = pd.read_csv(tmp_path / 'fits.csv', float_precision='round_trip',
                           keep_default_na=False, na_values=['nan'])
     pd.testing.assert_frame_equal(frame, written, check_exact=True, check_dtype=False)
@@ -351,17 +351,17 @@ def test_a_recording_without_a_pass_gives_an_empty_fit(tmp_path):
     assert tuple(found.to_dataframe().columns) == FIT_COLUMNS and len(found.to_dataframe()) == 0
 
 
-@pytest.mark.parametrize('named, text', [
+@pytest.mark.parametrize('arguments, text', [
     ({'orders': [0]}, r'orders: expected different numbers from 1 to 8, got \[0\]'),
     ({'orders': []}, 'orders'),
     ({'cpa_range': (4.0, 0.3)}, 'cpa_range: only for a single sensor'),
 ])
-def test_fit_refuses_bad_arguments(named, text):
+def test_fit_refuses_invalid_arguments(arguments, text):
     with pytest.raises(mt.SettingsError, match=text):
-        mt.fit(vehicle_path(NAME), NETWORK_FILE, **named)
+        mt.fit(vehicle_path(NAME), NETWORK_FILE, **arguments)
 
 
-def test_a_plan_is_that_of_the_command(tmp_path):
+def test_the_plan_equals_that_of_the_command(tmp_path):
     assert main(['plan', '--network', str(NETWORK_FILE), '--target', 'truck', '--heading', '0',
                  '--grid', '9', '--out', str(tmp_path)]) == 0
     written = json.loads((tmp_path / 'plan.json').read_text())

@@ -1,4 +1,4 @@
-"""Settings: declared once, checked everywhere, and what is generated from them is up to date."""
+"""Settings: generated files, validation of values, and parameter files."""
 
 import importlib.util
 
@@ -21,7 +21,7 @@ def test_generated_files_are_up_to_date():
 
 
 @pytest.mark.parametrize('target', ['vehicle', 'magnet'])
-def test_yaml_of_the_defaults_reads_back_as_the_defaults(target, tmp_path):
+def test_default_settings_survive_a_yaml_round_trip(target, tmp_path):
     path = tmp_path / 'p.yaml'
     path.write_text(to_yaml(settings_for(target)))
     changes = read_parameter_file(path)
@@ -52,26 +52,26 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
      r"track.vehicle.kinds: 'c\\ud800r' is not text: it contains a lone surrogate"),
     ({'track.vehicle.arrival_names': ['left', 'right', '\udcff']}, 'arrival_names: .* surrogate'),
 ])
-def test_faults_name_the_setting(changes, message):
+def test_errors_name_the_invalid_setting(changes, message):
     with pytest.raises(SettingsError, match=message):
         replace(Settings(), changes)
 
 
-def test_arrivals_need_a_heading_each(road_network):
+def test_each_arrival_needs_a_heading(road_network):
     from mag_tracking.pipeline import Pipeline
     settings = settings_for('vehicle', {'track.vehicle.arrival_headings_deg': [0.0, 90.0]})
     with pytest.raises(SettingsError, match='arrival_headings_deg: expected 3 values'):
         Pipeline(road_network, settings)
 
 
-def test_target_of_the_file_and_of_the_caller_have_to_agree():
+def test_the_targets_of_file_and_caller_must_agree():
     with pytest.raises(SettingsError, match='magnet'):
         settings_for('vehicle', {'track.target': 'magnet'})
     with pytest.raises(SettingsError, match='expected vehicle or magnet'):
         settings_for('submarine')
 
 
-def test_parameter_files(tmp_path):
+def test_parameter_files_are_read_and_checked(tmp_path):
     path = tmp_path / 'p.yaml'
     path.write_text('tracker_node:\n  ros__parameters:\n    track:\n      iterations: 2\n'
                     'detection_node:\n  ros__parameters:\n    align.period_s: 0.1\n')
@@ -112,6 +112,6 @@ def test_the_default_file_is_plain_yaml_with_floats():
     ({'track.vehicle.kinds': ['car', 'car', 'truck']}, 'kinds: a name is duplicated'),
     ({'track.vehicle.length_stds': [1.0, 1.0, 3.0]}, 'length_stds: 1 for small, which is a point'),
     ({'track.vehicle.difference_stds': [9.0, 30.0, 120.0]}, 'difference_stds: 9 for small')])
-def test_lists_that_belong_together_are_checked(road_network, changes, message):
+def test_related_lists_are_checked_against_each_other(road_network, changes, message):
     with pytest.raises(SettingsError, match=message):
         TrackManager(road_network, settings_for('vehicle', changes).track)

@@ -1,4 +1,4 @@
-"""The package as a wheel: complete, without junk, and at work without ROS and without this tree."""
+"""The wheel: complete, without junk, and usable without ROS and the source tree."""
 
 import csv
 import json
@@ -16,21 +16,21 @@ import pytest
 from support.bundled import NETWORK_FILE, ROOT, vehicle_path
 
 NAME = 'straight_car_fast_left'
-RUNNING = f'{sys.version_info.major}.{sys.version_info.minor}'
-VERSIONS = sorted({'3.10', '3.13', RUNNING}, key=lambda v: int(v.partition('.')[2]))
+RUNNING_VERSION = f'{sys.version_info.major}.{sys.version_info.minor}'
+VERSIONS = sorted({'3.10', '3.13', RUNNING_VERSION}, key=lambda v: int(v.partition('.')[2]))
 SHARE = 'mag_tracking-0.1.0.data/data/share'
 METADATA = {f'mag_tracking-0.1.0.dist-info/{name}' for name in (
     'METADATA', 'WHEEL', 'RECORD', 'entry_points.txt', 'top_level.txt', 'licenses/LICENSE')}
-CORES = sorted(str(p.relative_to(ROOT)) for p in (ROOT / 'mag_tracking').rglob('core.cpp'))
+CORE_SOURCES = sorted(str(p.relative_to(ROOT)) for p in (ROOT / 'mag_tracking').rglob('core.cpp'))
 JUNK = ('mag_tracking/notes.txt',
         'mag_tracking/physics/__pycache__/dipole.cpython-310.pyc', 'test/test_new.py',
         'mag_tracking.egg-info/PKG-INFO', 'out/summary.json', 'config/backup.yaml~')
-SITE = '''
+SITE_NETWORK = '''
 site: {latitude: 58.4, longitude: 15.6, height: 60, date: 2026-05-01, x_azimuth_deg: 90}
 sensors:
   mag_1: {position: [0, 0, 0]}
 '''
-IN_ONE_LINE = '''
+TRACK_SCRIPT = '''
 import json, sys, mag_tracking as mt
 result = mt.track(sys.argv[1], sys.argv[2])
 try:
@@ -41,7 +41,7 @@ print(json.dumps({'file': mt.__file__, 'positions': result.poses['position'].tol
                   'message': message, 'prefix': sys.prefix,
                   'earth': mt.read_network(sys.argv[3]).earth_field.tolist()}))
 '''
-TYPED = '''
+TYPED_SCRIPT = '''
 import mag_tracking as mt
 
 result: mt.TrackingResult = mt.track('recording.mcap', 'network.yaml')
@@ -51,18 +51,18 @@ mt.trakc  # type: ignore[attr-defined]
 '''
 
 
-def tracked():
+def tracked_files():
     """Names of the files that git tracks."""
     if not (ROOT / '.git').exists() or shutil.which('git') is None:
-        pytest.skip('the tree is no git checkout, which would say what belongs to it')
+        pytest.skip('not a git checkout: the tracked files are unknown')
     return subprocess.run(['git', 'ls-files', '-z'], cwd=ROOT, check=True, capture_output=True,
                           text=True).stdout.rstrip('\0').split('\0')
 
 
-def expected():
-    """Names of the files that a wheel has to contain."""
+def expected_files():
+    """Names of the files that a wheel must contain."""
     names = set(METADATA)
-    for name in tracked():
+    for name in tracked_files():
         folder = name.partition('/')[0]
         if folder == 'mag_tracking' and not name.endswith(('.hpp', '.cpp')):
             names.add(name)
@@ -73,22 +73,22 @@ def expected():
     return names
 
 
-def contained(wheel):
-    """Names of the files in a wheel, each once, but those of the compiled modules."""
+def contained_files(wheel):
+    """Names of the files in a wheel without the compiled modules; fails if a name is duplicated."""
     with zipfile.ZipFile(wheel) as archive:
         names = [i.filename for i in archive.infolist() if not i.is_dir()]
     compiled = [name for name in names if name.endswith('.so')]
     assert len(set(names)) == len(names)
-    assert sorted(name.partition('.')[0] + '.cpp' for name in compiled) == CORES
+    assert sorted(name.partition('.')[0] + '.cpp' for name in compiled) == CORE_SOURCES
     return {*names} - {*compiled}
 
 
 @pytest.fixture
 def copy(tmp_path):
-    """A copy of what git tracks, as it is in the working tree."""
+    """A copy of the tracked files, as they are in the working tree."""
     folder = tmp_path / 'tree'
-    for name in tracked():
-        # A test is not needed to build; a deleted file is still tracked.
+    for name in tracked_files():
+        # The build needs no tests. Git still lists deleted files.
         if (ROOT / name).is_file() and not name.startswith('test/'):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)
@@ -96,13 +96,13 @@ def copy(tmp_path):
 
 
 def bare_environment():
-    """The environment without what points to ROS, to this tree or to another interpreter."""
+    """The environment without variables of ROS, this tree or another interpreter."""
     own = ('PYTHON', 'ROS_', '_ROS', 'AMENT_', 'COLCON_', 'VIRTUAL_ENV', 'LD_LIBRARY_PATH')
     return {k: v for k, v in os.environ.items() if not k.startswith(own)}
 
 
 def run(*command, cwd, **variables):
-    """The output of a command, which has to succeed."""
+    """Run a command, which must succeed; return its output."""
     done = subprocess.run([str(c) for c in command], cwd=cwd,
                           env=bare_environment() | variables, capture_output=True, text=True)
     assert done.returncode == 0, f'{command}\n{done.stdout}\n{done.stderr}'
@@ -110,27 +110,27 @@ def run(*command, cwd, **variables):
 
 
 def interpreter(version):
-    """A Python of this version that can make virtual environments; skips where there is none."""
-    if version == RUNNING:
+    """Path of a Python of this version with venv; skips the test if there is none."""
+    if version == RUNNING_VERSION:
         return sys.executable
     check = 'import sys, venv, ensurepip; print("%d.%d" % sys.version_info[:2])'
-    places = [shutil.which(f'python{version}'), *sorted(
+    candidates = [shutil.which(f'python{version}'), *sorted(
         Path.home().glob(f'.pyenv/versions/{version}.*/bin/python'))]
-    for path in filter(None, places):
+    for path in filter(None, candidates):
         found = subprocess.run([str(path), '-c', check], env=bare_environment(),
                                capture_output=True, text=True)
         if found.returncode == 0 and found.stdout.strip() == version:
             return path
-    pytest.skip(f'there is no python{version} with venv, neither on PATH nor from pyenv')
+    pytest.skip(f'python{version} with venv is neither on PATH nor installed by pyenv')
 
 
-def test_the_wheel_holds_every_file_and_no_junk(tmp_path, copy):
-    """Built without isolation: that needs no network."""
+def test_the_wheel_contains_every_file_and_no_junk(tmp_path, copy):
+    """Build isolation would need a network."""
     pytest.importorskip('setuptools', minversion='70.1', reason='builds wheels from 70.1 on')
     for name in JUNK:
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
         (copy / name).write_text('')
-    # The compiled modules are not run here: they are built faster without optimisation.
+    # The compiled modules are not run, and building without optimisation is faster.
     compiler = tmp_path / 'compiler'
     compiler.write_text('#!/bin/sh\nexec c++ "$@" -O0\n')
     compiler.chmod(0o755)
@@ -138,10 +138,10 @@ def test_the_wheel_holds_every_file_and_no_junk(tmp_path, copy):
         tmp_path, cwd=copy, CC=str(compiler), CXX=str(compiler))
     wheel, = tmp_path.glob('*.whl')
     assert re.fullmatch(r'mag_tracking-0\.1\.0-cp3\d+-cp3\d+-linux_\w+\.whl', wheel.name)
-    assert contained(wheel) == expected()
+    assert contained_files(wheel) == expected_files()
     assert {'mag_tracking/py.typed', 'mag_tracking/nodes/fastdds.xml',
             f'{SHARE}/mag_tracking/config/network.yaml',
-            f'{SHARE}/mag_tracking/launch/tracking.launch.py'} <= expected()
+            f'{SHARE}/mag_tracking/launch/tracking.launch.py'} <= expected_files()
 
 
 def rows(path):
@@ -149,21 +149,23 @@ def rows(path):
         return list(csv.DictReader(stream))
 
 
-def assert_same_track(ours, theirs):
-    """Poses and summary agree: numbers to 1e-9 of the size of their column, words exactly."""
+def assert_same_track(actual, expected):
+    """Check that poses and summary agree: numbers to 1e-9 of the column maximum, text exactly."""
     for name in ('poses.csv', 'poses_smoothed.csv', 'detections.csv'):
-        a, b = rows(ours / name), rows(theirs / name)
+        a, b = rows(actual / name), rows(expected / name)
         assert len(a) == len(b) > 0 and a[0].keys() == b[0].keys()
         for column in a[0]:
-            mine, other = ([row[column] for row in table] for table in (a, b))
+            found, wanted = ([row[column] for row in table] for table in (a, b))
             try:
-                mine, other = np.array(mine, dtype=float), np.array(other, dtype=float)
+                found, wanted = np.array(found, dtype=float), np.array(wanted, dtype=float)
             except ValueError:
-                assert mine == other, column
+                assert found == wanted, column
             else:
-                np.testing.assert_allclose(mine, other, rtol=1e-9, atol=1e-9 * np.abs(other).max(),
-                                           err_msg=f'{name}: {column}')
-    summaries = [json.loads((folder / 'summary.json').read_text()) for folder in (ours, theirs)]
+                np.testing.assert_allclose(
+                    found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max(),
+                    err_msg=f'{name}: {column}')
+    summaries = [json.loads((folder / 'summary.json').read_text())
+                 for folder in (actual, expected)]
     assert summaries[0]['counts'] == summaries[1]['counts']
     (a,), (b,) = (summary['tracks'] for summary in summaries)
     assert a.keys() == b.keys()
@@ -174,61 +176,61 @@ def assert_same_track(ours, theirs):
             assert a[key] == value, key
 
 
-def installed(version, tmp_path, copy):
-    """A fresh virtual environment with the wheel built from the copy: (its bin, the wheel)."""
+def install_wheel(version, tmp_path, copy):
+    """Install the wheel in a new virtual environment; return (bin folder, wheel)."""
     pins = ROOT / 'constraints.txt'
     run(interpreter(version), '-m', 'venv', tmp_path / 'venv', cwd=tmp_path)
-    there = tmp_path / 'venv' / 'bin'
-    pip = there / 'python', '-m', 'pip', '--quiet', '--disable-pip-version-check', '--no-input'
+    bin_folder = tmp_path / 'venv' / 'bin'
+    pip = bin_folder / 'python', '-m', 'pip', '--quiet', '--disable-pip-version-check', '--no-input'
     run(*pip, 'install', '-c', pins, '--upgrade', 'pip', 'setuptools', 'pybind11', cwd=tmp_path)
-    # As `python -m build` does: what is in no source distribution cannot be in its wheel.
-    run(there / 'python', '-c', 'import sys, setuptools.build_meta as b; b.build_sdist('
+    # As `python -m build` does: a wheel contains only files of the source distribution.
+    run(bin_folder / 'python', '-c', 'import sys, setuptools.build_meta as b; b.build_sdist('
         'sys.argv[1])', tmp_path / 'sdist', cwd=copy)
     source, = (tmp_path / 'sdist').glob('*.tar.gz')
     for name, what in (('wheel', copy), ('wheel_of_sdist', source)):
         run(*pip, 'wheel', '--no-deps', '--build-constraint', pins, '-w', tmp_path / name, what,
             cwd=tmp_path)
     wheel, = (tmp_path / 'wheel').glob('*.whl')
-    again, = (tmp_path / 'wheel_of_sdist').glob('*.whl')
-    assert contained(wheel) == contained(again) == expected()
+    wheel_of_sdist, = (tmp_path / 'wheel_of_sdist').glob('*.whl')
+    assert contained_files(wheel) == contained_files(wheel_of_sdist) == expected_files()
     run(*pip, 'install', '-c', pins, wheel, cwd=tmp_path)
     run(*pip, 'check', cwd=tmp_path)
-    return there, wheel
+    return bin_folder, wheel
 
 
 @pytest.mark.study
 @pytest.mark.alone
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize('version', VERSIONS)
-def test_the_wheel_works_without_ros_and_without_the_tree(version, tmp_path, copy,
-                                                          vehicle_replays):
-    there, wheel = installed(version, tmp_path, copy)
+def test_the_wheel_works_without_ros_and_the_source_tree(version, tmp_path, copy,
+                                                         vehicle_replays):
+    bin_folder, wheel = install_wheel(version, tmp_path, copy)
     shutil.rmtree(copy)
-    venv, home = there.parent, tmp_path / 'elsewhere'
+    venv, home = bin_folder.parent, tmp_path / 'elsewhere'
     home.mkdir()
-    assert run(there / 'python', '-c', 'from importlib.util import find_spec as f; '
+    assert run(bin_folder / 'python', '-c', 'from importlib.util import find_spec as f; '
                'print(f("rclpy"), f("pandas"))', cwd=home).strip() == 'None None'
     package = next((venv / 'lib').glob('python*')) / 'site-packages' / 'mag_tracking'
     assert (package / 'py.typed').is_file() and (package / 'nodes' / 'fastdds.xml').is_file()
     assert (venv / 'share' / 'mag_tracking' / 'config' / 'network.yaml').read_text() == \
         NETWORK_FILE.read_text()
 
-    text = run(there / 'mag-tracking', 'replay', vehicle_path(NAME), '--network',
+    text = run(bin_folder / 'mag-tracking', 'replay', vehicle_path(NAME), '--network',
                venv / 'share' / 'mag_tracking' / 'config' / 'network.yaml', '--out', home / 'out',
                cwd=home)
     assert '1 tracks' in text and len(list((home / 'out').glob('*.png'))) == 3
     assert_same_track(home / 'out', vehicle_replays[NAME][1])
 
-    (home / 'site.yaml').write_text(SITE)
-    found = json.loads(run(there / 'python', '-c', IN_ONE_LINE, vehicle_path(NAME), NETWORK_FILE,
-                           home / 'site.yaml', cwd=home))
+    (home / 'site.yaml').write_text(SITE_NETWORK)
+    found = json.loads(run(bin_folder / 'python', '-c', TRACK_SCRIPT, vehicle_path(NAME),
+                           NETWORK_FILE, home / 'site.yaml', cwd=home))
     assert Path(found['file']).parent == package and Path(found['prefix']) == venv
     poses = rows(home / 'out' / 'poses.csv')
     assert found['positions'] == [[float(row[axis]) for axis in 'xyz'] for row in poses]
     assert 'pip install mag_tracking[pandas]' in found['message']
     assert 4.5e-5 < np.linalg.norm(found['earth']) < 5.5e-5
 
-    (home / 'typed.py').write_text(TYPED)
+    (home / 'typed.py').write_text(TYPED_SCRIPT)
     run(sys.executable, '-m', 'mypy', '--strict', '--config-file=', '--python-executable',
-        there / 'python', 'typed.py', cwd=home)
-    print(f'Python {version}: {wheel.name}, {len(poses)} poses as here')
+        bin_folder / 'python', 'typed.py', cwd=home)
+    print(f'Python {version}: {wheel.name}, the same {len(poses)} poses as in the source tree')

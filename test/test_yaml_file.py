@@ -1,4 +1,4 @@
-"""YAML files that are small on disk and large in memory are refused, wherever they are read."""
+"""YAML files that are small on disk and large in memory are refused by every reader."""
 
 import pytest
 
@@ -12,14 +12,14 @@ from mag_tracking.yaml_file import MAX_DEPTH, MAX_NODES, read_yaml
 
 
 def nested_aliases(n, form='[{}]', width=9):
-    """Anchors a0 .. an: each `form` around `width` aliases of the one before."""
+    """Anchors a0 .. an: each inserts `width` aliases of the previous anchor into `form`."""
     lines = ['a0: &a0 {x: 1}']
     lines += [f'a{k}: &a{k} ' + form.format(', '.join([f'*a{k - 1}'] * width))
               for k in range(1, n + 1)]
     return '\n'.join(lines) + '\n'
 
 
-def message_of(read, path):
+def error_message(read, path):
     with pytest.raises(MagTrackingError) as error:
         read(path)
     return str(error.value)
@@ -33,10 +33,10 @@ def test_aliases_that_expand_to_gigabytes_are_refused(tmp_path, read, key):
     for n in (6, 40):
         path.write_text(f'{nested_aliases(n)}{key}: *a{n}\n')
         assert f'{path} is not valid YAML: aliases expand to more than {MAX_NODES} ' \
-               'values (line 7)' in message_of(read, path)
+               'values (line 7)' in error_message(read, path)
 
 
-@pytest.mark.parametrize('text, told', [
+@pytest.mark.parametrize('text, message', [
     (nested_aliases(40, '{{<<: [{}]}}', 2), 'aliases expand to more than'),
     (nested_aliases(40, '{{a: [{}]}}', 2), 'aliases expand to more than'),
     (nested_aliases(100, width=1), f'more than {MAX_DEPTH} levels (line 64)'),
@@ -46,13 +46,13 @@ def test_aliases_that_expand_to_gigabytes_are_refused(tmp_path, read, key):
     ('&a [[*a]]', 'an alias contains itself (line 1)'),
     ('a: &a {<<: *a}', 'an alias contains itself (line 1)'),
     ('a: 0x' + 'f' * 9000, 'an integer of 36000 bits exceeds the maximum of')])
-def test_what_has_no_bound_is_named_with_its_line(tmp_path, text, told):
+def test_excessive_content_is_refused_with_its_line(tmp_path, text, message):
     path = tmp_path / 'a.yaml'
     path.write_text(text)
-    assert told in message_of(lambda path: read_yaml(path, SettingsError), path)
+    assert message in error_message(lambda path: read_yaml(path, SettingsError), path)
 
 
-def test_aliases_may_be_used(tmp_path):
+def test_repeated_aliases_are_accepted(tmp_path):
     path = tmp_path / 'a.yaml'
     path.write_text('a: &a [1, 2]\nb: &b {c: *a, d: *a}\ne: {<<: *b, f: *b}\n' + 'g: ['
                     + ', '.join(['*a'] * 20_000) + ']\n')
@@ -64,13 +64,13 @@ def test_aliases_may_be_used(tmp_path):
 @pytest.mark.parametrize('read, key', [
     (read_network, 'frame'), (read_drivers, 'board'),
     (lambda path: replace(Settings(), read_parameter_file(path)), 'align.period_s')])
-def test_a_message_does_not_repeat_the_whole_file(tmp_path, read, key):
+def test_an_error_message_does_not_repeat_the_whole_file(tmp_path, read, key):
     path = tmp_path / 'a.yaml'
     path.write_text(f'{key}: [{", ".join(["[1, 2, 3]"] * 1000)}]')
-    assert len(message_of(read, path)) < 1000
+    assert len(error_message(read, path)) < 1000
 
 
-def test_an_integer_beyond_all_bounds_is_told_by_its_size():
+def test_a_huge_integer_is_reported_by_its_size():
     for name in ('align.period_s', 'detect.onset_frames'):
         with pytest.raises(SettingsError, match=f'{name}: an integer of 20001 bits is too large'):
             replace(Settings(), {name: 1 << 20_000})

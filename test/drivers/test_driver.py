@@ -1,4 +1,4 @@
-"""A driver keeps its device open, names, scales and stamps what it says, and counts the rest."""
+"""Driver: reopening, sensor names, units, timestamps, sequence numbers and counts."""
 
 import gc
 from collections import Counter
@@ -20,8 +20,8 @@ DAY_NS = 1_700_000_000_000_000_000
 CLOCK = ClockSettings(tick_s=1e-6, min_delay_s=0.0)
 
 
-class Machine:
-    """The clocks of a machine whose time the test makes."""
+class SimulatedHost:
+    """Clocks of a host whose time the test sets."""
 
     def __init__(self):
         self.now_ns, self.step_ns = 5_000_000_000, 0
@@ -39,7 +39,7 @@ class Machine:
 
 
 class ScriptedDevice:
-    """Does what stands in `script` one after the other: errors are raised, lists are given."""
+    """Device that follows `script`: errors are raised, lists are returned as arrivals."""
 
     def __init__(self, machine, script):
         self.counts = Counter()
@@ -64,25 +64,25 @@ class ScriptedDevice:
         self.calls.append('close')
 
 
-def said(driver, timeout_s):
-    """What `driver` has, as samples."""
+def poll_samples(driver, timeout_s):
+    """Samples from one poll of `driver`."""
     readings, accelerations = driver.poll(timeout_s)
     return [*samples_of(readings), *accelerations]
 
 
 def driver_of(script, settings=None, sensors=None, clock=CLOCK):
-    machine = Machine()
+    machine = SimulatedHost()
     device = ScriptedDevice(machine, script)
     driver = Driver('board', device, DriverSettings(**(settings or {})), clock,
                     sensors or {'': 'mag_1'}, machine.monotonic_ns, machine.wall_ns, machine.sleep)
     return driver, device, machine
 
 
-def test_a_reading_is_a_sample_in_si_and_in_time_of_day():
+def test_a_reading_becomes_a_sample_in_si_units_and_wall_time():
     reading = Reading('A', (10.0, -20.0, float('nan')), (0.0, 0.0, 1.0), ticks=7)
     driver, _, machine = driver_of([[reading]], {'unit': 'mG', 'acceleration_unit': 'g'},
                                    {'A': 'mag_7'})
-    field, acceleration = said(driver, 0.2)
+    field, acceleration = poll_samples(driver, 0.2)
     assert isinstance(field, MagSample) and isinstance(acceleration, AccelerationSample)
     assert field.sensor == acceleration.sensor == 'mag_7'
     np.testing.assert_allclose(field.field, [1e-6, -2e-6, np.nan])
@@ -93,28 +93,28 @@ def test_a_reading_is_a_sample_in_si_and_in_time_of_day():
 
 @pytest.mark.parametrize('unit, tesla', [('T', 1.0), ('mT', 1e-3), ('uT', 1e-6), ('nT', 1e-9),
                                          ('G', 1e-4), ('mG', 1e-7), ('1.5e-8', 1.5e-8)])
-def test_units(unit, tesla):
+def test_units_are_converted_to_tesla(unit, tesla):
     driver, *_ = driver_of([[Reading('', (2.0, 3.0, 4.0))]], {'unit': unit})
-    np.testing.assert_allclose(said(driver, 0.1)[0].field, np.array([2.0, 3.0, 4.0]) * tesla,
-                               rtol=1e-12)
+    np.testing.assert_allclose(poll_samples(driver, 0.1)[0].field,
+                               np.array([2.0, 3.0, 4.0]) * tesla, rtol=1e-12)
 
 
-@pytest.mark.parametrize('settings, told', [
+@pytest.mark.parametrize('settings, message', [
     ({'unit': 'gauss'}, "board: unit: 'gauss' is neither"), ({'unit': '0'}, 'unit'),
     ({'unit': 'nan'}, 'unit'), ({'acceleration_unit': 'G'}, 'board: acceleration_unit'),
     ({'stamp_by': 'sundial'}, 'board: stamp_by: expected auto, ticks')])
-def test_settings_that_are_none(settings, told):
-    with pytest.raises(SettingsError, match=told):
+def test_invalid_settings_are_refused(settings, message):
+    with pytest.raises(SettingsError, match=message):
         driver_of([], settings)
 
 
-def test_a_lost_device_is_opened_again_with_back_off():
+def test_a_lost_device_is_reopened_with_back_off():
     driver, device, machine = driver_of(
         ['no port'] * 6 + [[Reading('', (1.0, 2.0, 3.0))], DeviceError('pulled out'), 'no port',
                            [Reading('', (1.0, 2.0, 3.0))]])
     opened, times, samples = 0, [], []
     while len(samples) < 2:
-        samples += said(driver, 0.01)
+        samples += poll_samples(driver, 0.01)
         if device.calls.count('open') > opened:
             opened = device.calls.count('open')
             times.append(machine.now_ns / 1e9)
@@ -122,18 +122,18 @@ def test_a_lost_device_is_opened_again_with_back_off():
         if opened == 3:
             assert driver.fault == 'no port'
     waits = np.diff(times)
-    # Twice as long each time, up to a second; from the beginning once something has come.
+    # The interval doubles up to 1 s, and restarts after a reading.
     np.testing.assert_allclose(waits[:6], [0.1, 0.2, 0.4, 0.8, 1.0, 1.0], atol=0.011)
     np.testing.assert_allclose(waits[6:], [0.1, 0.2], atol=0.011)
     assert driver.fault == ''
     assert driver.counts()['failed attempts to open'] == 7
     assert driver.counts()['connections lost'] == 1
-    # What failed to open has been closed, too: it may hold half of what it needs.
+    # A device that failed to open is closed, too, because it may hold resources.
     assert device.calls.count('close') == 8
     assert max(machine.slept) <= 0.01 + 1e-9
 
 
-def test_a_port_that_opens_but_says_nothing_backs_off_too():
+def test_a_device_that_opens_but_fails_to_read_backs_off():
     driver, device, machine = driver_of([DeviceError('gone')] * 5)
     while machine.now_ns < 9e9:
         driver.poll(0.01)
@@ -141,7 +141,7 @@ def test_a_port_that_opens_but_says_nothing_backs_off_too():
     assert device.calls.count('open') == 6
 
 
-def test_a_silent_device_is_opened_again():
+def test_a_silent_device_is_reopened():
     driver, device, machine = driver_of([[Reading('', (1.0, 2.0, 3.0))]],
                                         {'silence_timeout_s': 3.0})
     begin = machine.now_ns
@@ -149,36 +149,36 @@ def test_a_silent_device_is_opened_again():
         driver.poll(0.2)
     assert 3.0 <= (machine.now_ns - begin) / 1e9 <= 3.6
     assert driver.counts()['reopened after silence'] == 1
-    never, device, machine = driver_of([], {'silence_timeout_s': 0.0})
+    patient, device, machine = driver_of([], {'silence_timeout_s': 0.0})
     for _ in range(1000):
-        never.poll(0.2)
+        patient.poll(0.2)
     assert device.calls == ['open']
 
 
-def test_steps_of_the_machines_clock_move_stamps_at_once_and_are_counted():
+def test_steps_of_the_host_clock_shift_timestamps_and_are_counted():
     script = [[Reading('', (1.0, 2.0, 3.0), ticks=1000 * k)] for k in range(3)]
     driver, _, machine = driver_of(script)
     stamps = []
     for k in range(3):
         machine.now_ns = 5_000_000_000 + 1_000_000 * k
         machine.step_ns = 0 if k < 2 else 3_600_000_000_000
-        stamps.append(said(driver, 0.1)[0].stamp_ns)
+        stamps.append(poll_samples(driver, 0.1)[0].stamp_ns)
     assert stamps[1] - stamps[0] == pytest.approx(1_000_000, abs=2)
     assert stamps[2] - stamps[1] == pytest.approx(3_600_001_000_000, abs=2)
     assert driver.counts()['steps of the host clock'] == 1
 
 
-def test_what_stamps():
+def test_stamp_by_selects_the_source_of_timestamps():
     def stamps(settings, readings, clock=CLOCK):
         driver, _, machine = driver_of([[r] for r in readings], settings, clock=clock)
         out = []
         for k in range(len(readings)):
             machine.now_ns = 5_000_000_000 + 10_000_000 * k + (3_000_000 if k == 1 else 0)
-            out += [s.stamp_ns - DAY_NS - 5_000_000_000 for s in said(driver, 0.1)]
+            out += [s.stamp_ns - DAY_NS - 5_000_000_000 for s in poll_samples(driver, 0.1)]
         return driver, out
     field = (1.0, 2.0, 3.0)
     ticked = [Reading('', field, ticks=10_000 * k, sequence=k) for k in range(3)]
-    # The second came 3 ms late: a clock of the device's own knows better.
+    # The second reading arrives 3 ms late, which the clock of the device corrects.
     _, by_ticks = stamps({}, ticked)
     np.testing.assert_allclose(by_ticks, [0, 1e7, 2e7], atol=1e4)
     _, by_sequence = stamps({'stamp_by': 'sequence'}, ticked, ClockSettings(tick_s=0.01))
@@ -192,27 +192,27 @@ def test_what_stamps():
     assert driver.counts()['readings without a device time'] == 1
 
 
-def test_each_source_has_its_own_clock_and_its_name():
+def test_each_source_has_its_own_clock_and_name():
     here, there = Reading('', (1.0, 0.0, 0.0), ticks=0), Reading('', (2.0, 0.0, 0.0), ticks=10**9)
     driver, _, _ = driver_of([[(here, 'road/a'), (there, 'road/b'), (here, 'road/c')]],
                              sensors={'road/a': 'mag_1', 'road/b': 'mag_2'})
-    samples = said(driver, 0.1)
+    samples = poll_samples(driver, 0.1)
     assert [(s.sensor, s.field[0]) for s in samples] == [('mag_1', 1.0), ('mag_2', 2.0)]
     assert samples[0].stamp_ns == samples[1].stamp_ns
     assert set(driver.clocks()) == {'road/a', 'road/b'}
     assert driver.counts()['readings of unknown sensors: road/c'] == 1
-    # The device's own name counts before the place that it sends from.
+    # A sensor name in the reading has precedence over the source.
     driver, _, _ = driver_of([[(Reading('A', (1.0, 0.0, 0.0)), 'road/b')]],
                              sensors={'A': 'mag_1', 'road/b': 'mag_2'})
-    assert said(driver, 0.1)[0].sensor == 'mag_1'
+    assert poll_samples(driver, 0.1)[0].sensor == 'mag_1'
 
 
-def test_an_acceleration_alone_is_no_field():
+def test_an_acceleration_alone_gives_no_field_sample():
     driver, *_ = driver_of([[Reading('', None, (0.0, 0.0, 9.8))]])
-    assert [type(s) for s in said(driver, 0.1)] == [AccelerationSample]
+    assert [type(s) for s in poll_samples(driver, 0.1)] == [AccelerationSample]
 
 
-def test_errors_of_other_peoples_devices_are_trouble_like_any_other():
+def test_an_unexpected_error_of_a_device_is_a_fault():
     driver, device, machine = driver_of([])
     driver.poll(0.01)
     driver.fail(ZeroDivisionError('division by zero'))
@@ -223,82 +223,82 @@ def test_errors_of_other_peoples_devices_are_trouble_like_any_other():
     assert driver.is_open and device.calls == ['open', 'close', 'open']
 
 
-def test_readings_are_gathered():
+def test_readings_are_batched():
     script = [[Reading('', (float(k), 0.0, 0.0))] for k in range(3)]
     driver, _, machine = driver_of([*script, []], {'batch_s': 0.004})
-    assert [s.field[0] for s in said(driver, 0.2)] == [0.0, 1.0, 2.0]
+    assert [s.field[0] for s in poll_samples(driver, 0.2)] == [0.0, 1.0, 2.0]
     assert machine.slept == [pytest.approx(0.004)]
-    # A loss on the way takes nothing of what has come.
+    # A lost connection does not discard the readings before it.
     driver, *_ = driver_of([script[0], DeviceError('gone'), DeviceError('gone')],
                            {'batch_s': 0.004})
-    assert len(said(driver, 0.2)) == 1 and driver.is_open
-    assert said(driver, 0.2) == [] and driver.fault == 'gone'
+    assert len(poll_samples(driver, 0.2)) == 1 and driver.is_open
+    assert poll_samples(driver, 0.2) == [] and driver.fault == 'gone'
 
 
-def checked(numbers, wrap=0, values=None):
+def check_sequence(numbers, wrap=0, values=None):
     check = SequenceCheck(wrap)
     new = [check.is_new(n, b'%d' % (k if values is None else values[k]))
            for k, n in enumerate(numbers)]
     return new, +check.counts
 
 
-def test_losses_by_sequence_number():
-    assert checked(range(5, 50)) == ([True] * 45, {})
-    assert checked([0, 1, 5, 6, 16]) == ([True] * 5, {'lost': 3 + 9})
-    # A late one was not lost, and is handed on.
-    assert checked([0, 1, 4, 2, 5]) == ([True] * 5, {'lost': 1, 'late arrivals': 1})
-    assert checked([254, 255, 0, 1], wrap=256) == ([True] * 4, {})
-    assert checked([250, 3, 255], wrap=256) == ([True] * 3, {'lost': 7, 'late arrivals': 1})
-    assert checked([0, 300, -1], wrap=256)[1] == {'sequence numbers out of range': 2}
-    assert checked([0, 1000, 1001])[1] == {'lost': 999}
-    # One corrupt number is not a billion that were lost.
-    assert checked([0, 1, 2**64 - 1, 2, 3]) == (
+def test_losses_are_counted_by_sequence_number():
+    assert check_sequence(range(5, 50)) == ([True] * 45, {})
+    assert check_sequence([0, 1, 5, 6, 16]) == ([True] * 5, {'lost': 3 + 9})
+    # A late reading was not lost, and is passed on.
+    assert check_sequence([0, 1, 4, 2, 5]) == ([True] * 5, {'lost': 1, 'late arrivals': 1})
+    assert check_sequence([254, 255, 0, 1], wrap=256) == ([True] * 4, {})
+    assert check_sequence([250, 3, 255], wrap=256) == ([True] * 3, {'lost': 7, 'late arrivals': 1})
+    assert check_sequence([0, 300, -1], wrap=256)[1] == {'sequence numbers out of range': 2}
+    assert check_sequence([0, 1000, 1001])[1] == {'lost': 999}
+    # A corrupt number is not counted as a loss.
+    assert check_sequence([0, 1, 2**64 - 1, 2, 3]) == (
         [True] * 5, {'sequence jumps': 1, 'sequence restarts': 1})
 
 
-def test_duplicates_are_not_restarts():
+def test_duplicates_are_distinguished_from_restarts():
     # The same number with the same values is the same reading, NaN or not.
-    assert checked([0, 1, 1, 2, 0], values=[5, 6, 6, 7, 5]) == (
+    assert check_sequence([0, 1, 1, 2, 0], values=[5, 6, 6, 7, 5]) == (
         [True, True, False, True, False], {'duplicates': 2})
-    # With other values the device has begun anew, near its beginning or far from it.
+    # With other values, the device has restarted, near its first number or far from it.
     for begin in (3, 500, 100_000):
-        assert checked([begin, begin + 1, 0, 1, 2]) == (
+        assert check_sequence([begin, begin + 1, 0, 1, 2]) == (
             [True] * 5, {'sequence restarts': 1})
 
 
-def test_the_memory_of_a_sequence_is_bounded():
+def test_the_memory_of_a_sequence_check_is_bounded():
     even = range(0, 100 * MAX_REMEMBERED, 2)
 
-    def told_of(number):
-        return checked([*even, number], values=[0] * (len(even) + 1))[1].keys() - {'lost'}
+    def causes_of(number):
+        return check_sequence([*even, number], values=[0] * (len(even) + 1))[1].keys() - {'lost'}
 
-    # Of those that came and of those that did not.
+    # The bound applies to received and to missing numbers.
     last = even[-1]
-    assert told_of(last - 2 * (MAX_REMEMBERED - 1)) == {'duplicates'}
-    assert told_of(last - 2 * MAX_REMEMBERED) == {'sequence restarts'}
-    assert told_of(last - 1 - 2 * (MAX_REMEMBERED - 1)) == {'late arrivals'}
-    assert told_of(last - 1 - 2 * MAX_REMEMBERED) == {'sequence restarts'}
+    assert causes_of(last - 2 * (MAX_REMEMBERED - 1)) == {'duplicates'}
+    assert causes_of(last - 2 * MAX_REMEMBERED) == {'sequence restarts'}
+    assert causes_of(last - 1 - 2 * (MAX_REMEMBERED - 1)) == {'late arrivals'}
+    assert causes_of(last - 1 - 2 * MAX_REMEMBERED) == {'sequence restarts'}
 
 
-def test_a_reading_that_comes_twice_is_one():
-    """Also with an axis that is missing; the same count with other numbers is another reading."""
+def test_duplicate_readings_are_dropped():
+    """A missing axis makes no difference. The same number with other values is a new reading."""
     def reading(x, sequence, acceleration=None):
         return Reading('', (x, float('nan'), 3.0), acceleration, sequence=sequence)
     driver, *_ = driver_of([
         [reading(1.0, 1), reading(1.0, 1), reading(2.0, 2), reading(2.0, 2, (0.0, 0.0, 9.8))]])
-    assert [type(s) for s in said(driver, 0.1)] == [MagSample] * 3 + [AccelerationSample]
+    assert [type(s) for s in poll_samples(driver, 0.1)] == [MagSample] * 3 + [AccelerationSample]
     counts = driver.counts()
     assert (counts['duplicates: mag_1'], counts['sequence restarts: mag_1']) == (1, 1)
 
 
-def test_what_is_kept_by_the_thousand_is_not_looked_through_for_garbage():
+def test_remembered_readings_do_not_burden_the_garbage_collector():
     gc.collect()
     gc.disable()
     try:
         before = len(gc.get_objects())
         driver, *_ = driver_of([[Reading('', (float(k), 2.0, 3.0), (0.0, float(k), 9.8), sequence=k)
                                  for k in range(MAX_REMEMBERED)]])
-        assert len(said(driver, 0.1)) == 2 * MAX_REMEMBERED
+        assert len(poll_samples(driver, 0.1)) == 2 * MAX_REMEMBERED
         assert len(gc.get_objects()) - before < MAX_REMEMBERED // 4
     finally:
         gc.enable()
@@ -306,55 +306,55 @@ def test_what_is_kept_by_the_thousand_is_not_looked_through_for_garbage():
 
 @pytest.mark.parametrize('sequence', [None, 1])
 @pytest.mark.parametrize('field', [(1.0, 2.0), (1.0, 2.0, 3.0) * 2, (10**400, 0.0, 0.0)])
-def test_other_than_three_axes_is_an_error_of_the_device(field, sequence):
-    """Also where it says so three times: their axes are not mixed."""
+def test_a_field_that_is_not_three_floats_is_an_error_of_the_device(field, sequence):
+    """Three such readings are not combined either."""
     driver, *_ = driver_of([[Reading('', field, sequence=sequence)] * 3])
     with pytest.raises((ValueError, OverflowError)):
         driver.poll(0.1)
 
 
-def test_an_infinite_field_is_none_but_its_acceleration_is_one():
+def test_an_infinite_field_is_dropped_but_its_acceleration_is_kept():
     driver, *_ = driver_of([[Reading('', (float('inf'), 0.0, 0.0), (0.0, 0.0, 9.8)),
                              Reading('', (1.0, 2.0, 3.0))]])
-    field, acceleration = said(driver, 0.1)
+    field, acceleration = poll_samples(driver, 0.1)
     assert field.field.tolist() == [1.0, 2.0, 3.0] and isinstance(acceleration, AccelerationSample)
     assert driver.counts()['readings that overflow in tesla'] == 1
 
 
-def test_one_topic_is_of_one_sensor():
+def test_a_single_sensor_accepts_only_its_first_name():
     driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0)), Reading('B', (2.0, 0.0, 0.0)),
                              Reading('A', (3.0, 0.0, 0.0))]])
-    assert [s.field[0] for s in said(driver, 0.1)] == [1.0, 3.0]
+    assert [s.field[0] for s in poll_samples(driver, 0.1)] == [1.0, 3.0]
     assert driver.counts()['readings of unknown sensors: B'] == 1
 
 
-def test_a_sensor_that_is_not_used_is_no_news():
+def test_an_unused_sensor_is_ignored_without_a_count():
     driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0), sequence=1),
                              Reading('B', (2.0, 0.0, 0.0), sequence=1)]],
                            sensors={'A': 'mag_1', 'B': '-'})
-    assert [s.sensor for s in said(driver, 0.1)] == ['mag_1']
+    assert [s.sensor for s in poll_samples(driver, 0.1)] == ['mag_1']
     assert driver.counts() == {'samples: mag_1': 1}
 
 
-def test_unknown_names_do_not_pile_up():
+def test_the_number_of_counted_unknown_names_is_bounded():
     readings = [Reading(f'x{k}', (1.0, 0.0, 0.0)) for k in range(1000)]
     driver, *_ = driver_of([readings, [readings[0], readings[-1]]], sensors={'A': 'mag_1'})
-    assert said(driver, 0.1) == []
+    assert poll_samples(driver, 0.1) == []
     assert len(driver.counts()) == 21
     assert driver.counts()['readings of unknown sensors (and others)'] == 980
-    assert said(driver, 0.1) == []
+    assert poll_samples(driver, 0.1) == []
     assert len(driver.counts()) == 21 and driver.counts()['readings of unknown sensors: x0'] == 2
     assert driver.counts()['readings of unknown sensors (and others)'] == 981
 
 
-def test_a_reading_beyond_all_numbers_is_none():
+def test_a_reading_that_overflows_in_tesla_is_dropped():
     driver, *_ = driver_of([[Reading('', (1e308, 0.0, 0.0)), Reading('', (1.0, 0.0, 0.0))]],
                            {'unit': '1e10'})
-    assert len(said(driver, 0.1)) == 1
+    assert len(poll_samples(driver, 0.1)) == 1
     assert driver.counts()['readings that overflow in tesla'] == 1
 
 
-def test_a_device_that_does_not_even_close_is_opened_again():
+def test_a_device_that_fails_to_close_is_reopened():
     driver, device, machine = driver_of([DeviceError('gone')])
 
     def close():
@@ -365,26 +365,26 @@ def test_a_device_that_does_not_even_close_is_opened_again():
     machine.now_ns += 10**9
     driver.poll(0.1)
     assert driver.is_open and driver.counts()['failed attempts to close'] == 1
-    # What was wrong stays said until something has come.
+    # The fault remains until a reading arrives.
     assert driver.fault
 
 
-def test_errors_behind_a_driver_are_not_the_devices():
+def test_errors_in_processing_do_not_close_the_device():
     driver, device, _ = driver_of([[Reading('', (1.0, 2.0, 3.0))]] * 3)
-    taken = []
+    processed = []
 
-    def take(readings, accelerations):
+    def process(readings, accelerations):
         assert not accelerations
-        taken.append(readings)
-        if len(taken) == 1:
-            raise ValueError('nobody expected it')
-    serve(driver, take, lambda: len(taken) == 3)
+        processed.append(readings)
+        if len(processed) == 1:
+            raise ValueError('unexpected value')
+    serve(driver, process, lambda: len(processed) == 3)
     assert device.calls == ['open', 'close']
-    assert driver.counts()['errors while processing readings: ValueError: nobody expected it'] == 1
+    assert driver.counts()['errors while processing readings: ValueError: unexpected value'] == 1
 
 
-class Lines:
-    """Frames of two bytes: a digit and a new line."""
+class DigitFraming:
+    """Framing of two bytes: a digit and a newline."""
 
     def parse(self, data, final=False):
         n = len(data) // 2 * 2
@@ -394,8 +394,8 @@ class Lines:
                       {'bytes between frames': rest} if final and rest else {})
 
 
-class Bytes:
-    """A transport of given chunks."""
+class ScriptedTransport:
+    """Transport that returns given chunks."""
 
     def __init__(self, chunks, whole=False):
         self.whole, self.counts, self._chunks = whole, Counter(dropped=2), list(chunks)
@@ -410,34 +410,36 @@ class Bytes:
         pass
 
 
-def test_frames_are_put_together_from_a_stream():
-    device = FramedDevice(Bytes([Chunk(1, b'1\n2'), Chunk(2, b'\n3'), Chunk(3, b'4\n')]), Lines())
+def test_frames_are_assembled_from_a_stream():
+    device = FramedDevice(ScriptedTransport([
+        Chunk(1, b'1\n2'), Chunk(2, b'\n3'), Chunk(3, b'4\n')]), DigitFraming())
     device.open()
     assert [(a.arrival_ns, a.reading.field[0]) for a in device.read(0.0)] == [(1, 1.0)]
     assert [(a.arrival_ns, a.reading.field[0]) for a in device.read(0.0)] == [(2, 2.0)]
-    # The connection is lost in the middle of a frame: its beginning fits no other end.
+    # The connection is lost within a frame, whose start is not joined with later bytes.
     device.open()
     assert [a.reading.field[0] for a in device.read(0.0)] == [4.0]
     assert device.counts == {'dropped': 2, 'bytes of truncated frames': 1}
 
 
-def test_messages_are_whole():
-    device = FramedDevice(Bytes([Chunk(1, b'1\n2', 'a'), Chunk(2, b'3\n', 'b')], True), Lines())
+def test_messages_are_not_joined():
+    device = FramedDevice(ScriptedTransport([Chunk(1, b'1\n2', 'a'), Chunk(2, b'3\n', 'b')], True),
+                          DigitFraming())
     arrivals = device.read(0.0) + device.read(0.0)
     assert [(a.source, a.reading.field[0]) for a in arrivals] == [('a', 1.0), ('b', 3.0)]
     assert device.counts == {'dropped': 2, 'bytes between frames': 1}
 
 
-def test_what_is_measured_while_nobody_listens_is_not_lost():
-    """A deliberate pause is not one of the link: that is counted."""
+def test_numbers_skipped_while_closed_are_not_lost():
+    """A gap while the driver is closed is not counted; a gap while it is open is."""
     def at(*numbers):
         return [Reading('', (float(n), 0.0, 0.0), sequence=n) for n in numbers]
     driver, *_ = driver_of([at(1, 2), at(50, 51, 53)])
-    said(driver, 0.1)
+    poll_samples(driver, 0.1)
     driver.close()
-    assert len(said(driver, 0.1)) == 3
+    assert len(poll_samples(driver, 0.1)) == 3
     assert driver.counts()['lost: mag_1'] == 1
     driver, *_ = driver_of([at(1, 2), at(50, 51, 53)])
-    said(driver, 0.1)
-    said(driver, 0.1)
+    poll_samples(driver, 0.1)
+    poll_samples(driver, 0.1)
     assert driver.counts()['lost: mag_1'] == 48

@@ -1,4 +1,4 @@
-"""The drivers file: what it describes, and what it is told where it describes nothing."""
+"""Drivers file: valid entries, defaults, custom classes and errors."""
 
 from types import SimpleNamespace
 
@@ -24,16 +24,16 @@ def read(tmp_path, content, network=None):
 
 
 def without(*keys, **more):
-    """The board without some keys, and with others."""
+    """The board with some keys removed and others added."""
     return {'board': {**{k: v for k, v in BOARD.items() if k not in keys}, **more}}
 
 
-def test_the_example_as_it_is():
+def test_the_example_file_is_valid():
     path = ROOT / 'config' / 'drivers.yaml'
     assert [d.name for d in read_drivers(path, read_network(NETWORK_FILE))] == ['roadside']
 
 
-def test_every_entry_of_the_example_is_one(tmp_path):
+def test_every_entry_of_the_example_file_is_valid(tmp_path):
     text = (ROOT / 'config' / 'drivers.yaml').read_text()
     blocks = [b for b in text.split('\n\n') if 'sensor' in b and ('transport:' in b
                                                                  or 'device:' in b)]
@@ -48,7 +48,7 @@ def test_every_entry_of_the_example_is_one(tmp_path):
         assert driver.sensors and not driver.is_open
 
 
-def test_what_is_known_of_a_kind_need_not_be_said(tmp_path):
+def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
     [driver] = read(tmp_path, {'mti': {
         'transport': 'serial', 'serial': {'port': '/dev/x'}, 'framing': 'xsens', 'sensor': 'a'}})
     assert driver.clock_settings.tick_s == 1e-4
@@ -60,7 +60,7 @@ def test_what_is_known_of_a_kind_need_not_be_said(tmp_path):
     assert driver.settings.sequence_wrap == 0 and driver.settings.stamp_by == 'sequence'
 
 
-@pytest.mark.parametrize('content, told', [
+@pytest.mark.parametrize('content, message', [
     (without('framing'), 'board: framing is missing (one of text, json, binary, xsens)'),
     (without('transport'), 'board: transport is missing (one of serial, udp, mqtt)'),
     (without(device='i2c'), 'device excludes transport and framing'),
@@ -92,13 +92,13 @@ def test_what_is_known_of_a_kind_need_not_be_said(tmp_path):
     ({'board': 7}, 'board: expected a mapping of settings, got 7'),
     ('[1, 2]', 'expected a mapping of devices'), ('', 'expected a mapping of devices'),
     ('a: [', 'is not valid YAML'), ('a: 1\na: 2', 'duplicate key a')])
-def test_files_that_are_none(tmp_path, content, told):
+def test_invalid_files_are_refused(tmp_path, content, message):
     with pytest.raises(SettingsError) as error:
         read(tmp_path, content)
-    assert told in str(error.value) and 'drivers.yaml' in str(error.value)
+    assert message in str(error.value) and 'drivers.yaml' in str(error.value)
 
 
-def test_a_sensor_of_unknown_geometry(tmp_path):
+def test_a_sensor_that_is_not_in_the_network_is_refused(tmp_path):
     network = read_network(NETWORK_FILE)
     assert read(tmp_path, BOARD and {'board': BOARD}, network)
     with pytest.raises(SettingsError, match='sensor mag_7 is not in the network, whose sensors '
@@ -106,19 +106,17 @@ def test_a_sensor_of_unknown_geometry(tmp_path):
         read(tmp_path, {'board': {**BOARD, 'sensor': 'mag_7'}}, network)
 
 
-def test_a_file_that_is_not_there(tmp_path):
+def test_a_missing_file_is_reported(tmp_path):
     with pytest.raises(SettingsError, match='cannot read .*: No such file'):
         read_drivers(tmp_path / 'nowhere.yaml')
 
 
 @pytest.mark.parametrize('role, name', [(r, n) for r, kinds in KINDS.items() for n in kinds])
-def test_every_kind_is_there_and_says_its_settings(role, name):
+def test_every_kind_can_be_loaded_and_has_settings(role, name):
     assert load_class(role, name).SETTINGS()
 
 
-class Counting:
-    """Somebody's own framing: a byte is a reading."""
-
+class CustomFraming:
     SETTINGS = SimpleNamespace
 
     def __init__(self, settings):
@@ -128,11 +126,11 @@ class Counting:
         pass
 
 
-def test_kinds_of_ones_own(tmp_path, monkeypatch):
+def test_custom_framings_and_devices_are_loaded(tmp_path, monkeypatch):
     from mag_tracking.drivers.framings.text import TextSettings
-    monkeypatch.setattr(Counting, 'SETTINGS', TextSettings)
+    monkeypatch.setattr(CustomFraming, 'SETTINGS', TextSettings)
     [driver] = read(tmp_path, {'mine': {
-        **{k: v for k, v in BOARD.items() if k != 'text'}, 'framing': f'{__name__}:Counting',
+        **{k: v for k, v in BOARD.items() if k != 'text'}, 'framing': f'{__name__}:CustomFraming',
         'framing_settings': {'max_length': 7}}})
     assert isinstance(driver.device, FramedDevice)
     [driver] = read(tmp_path, {'mine': {

@@ -1,4 +1,4 @@
-"""The simulated roadside: right fields at the right times, and the command that listens to it."""
+"""Simulated roadside device: fields, times, and the command `listen`."""
 
 import dataclasses
 import math
@@ -23,7 +23,7 @@ QUIET = SimulatorSettings(network=str(NETWORK_FILE), rate_hz=50.0, noise=0.0, pe
 
 
 class Clock:
-    """A clock that goes on when somebody sleeps: never for less than was asked."""
+    """Clock that advances only in `sleep`, rounded up to whole nanoseconds."""
 
     def __init__(self):
         self.ns = 10**15
@@ -38,7 +38,7 @@ def device_of(settings=QUIET):
     return SimulatedDevice(settings, lambda: clock.ns, clock.sleep), clock
 
 
-def gathered(device, n, timeout_s=1.0):
+def first_arrivals(device, n, timeout_s=1.0):
     """The first `n` arrivals."""
     out = []
     while len(out) < n:
@@ -47,9 +47,9 @@ def gathered(device, n, timeout_s=1.0):
 
 
 def true_field(network, t):
-    """(n_sensors, 3) [T], world, at `t` [s] after the beginning of a pass by the settings `QUIET`.
+    """Field at `t` [s] after the start of a pass with `QUIET`, (n_sensors, 3) T, world frame.
 
-    Both sensors stand at x = 0; the way begins 30 m before and takes 6 s at 10 m/s.
+    Both sensors are at x = 0. The path starts 30 m before them and takes 6 s at 10 m/s.
     """
     path = Path(np.array([-30.0, network.positions[:, 1].mean() - 1.0]), 0.0, 10.0)
     body = random_vehicle(np.random.default_rng(QUIET.seed), length=QUIET.length,
@@ -59,27 +59,27 @@ def true_field(network, t):
                                             network.positions)[0]
 
 
-def test_the_fields_are_those_of_a_vehicle_that_passes():
+def test_the_fields_are_those_of_a_passing_vehicle():
     device, _ = device_of()
     device.open()
     network = read_network(NETWORK_FILE)
-    arrivals = gathered(device, 2 * 350)
+    arrivals = first_arrivals(device, 2 * 350)
     for k in (0, 100, 150, 220, 299):
         B = true_field(network, k / 50.0)
         for j, name in enumerate(network.names):
             reading = arrivals[2 * k + j].reading
             assert (reading.sensor, reading.sequence, reading.ticks) == (name, k, 20_000 * k)
             np.testing.assert_allclose(reading.field, network.R_ws[j].T @ B[j], rtol=1e-9)
-    # Then the road is free, until the next comes after 12 s.
+    # Then the road is empty until the next vehicle starts after 12 s.
     for j in range(2):
         np.testing.assert_allclose(arrivals[2 * 330 + j].reading.field,
                                    network.R_ws[j].T @ network.earth_field, rtol=1e-12)
-    again = gathered(device, 2 * 400)
-    assert again[2 * 250].reading.sequence == 600
-    np.testing.assert_array_equal(again[2 * 250].reading.field, arrivals[0].reading.field)
+    next_arrivals = first_arrivals(device, 2 * 400)
+    assert next_arrivals[2 * 250].reading.sequence == 600
+    np.testing.assert_array_equal(next_arrivals[2 * 250].reading.field, arrivals[0].reading.field)
 
 
-def test_readings_come_in_time_and_noise_is_as_stated():
+def test_readings_arrive_in_time_with_the_specified_noise():
     device, clock = device_of(SimulatorSettings(network=str(NETWORK_FILE), noise=2e-8, lead=150.0,
                                                 moment=0.0))
     device.open()
@@ -90,16 +90,16 @@ def test_readings_come_in_time_and_noise_is_as_stated():
             fields.append(arrival.reading.field)
     assert len(fields) == pytest.approx(2 * 2000, abs=4)
     std = np.std(np.array(fields)[::2], axis=0)
-    # Of 2000 readings the deviation is known to 1.6 %.
+    # The standard deviation of 2000 readings has a relative error of 1.6 %.
     np.testing.assert_allclose(std, 2e-8, rtol=0.08)
 
 
-def test_sensors_in_turn_measure_at_their_own_times():
-    """Each is a share of the interval behind the one before, and so is its field."""
+def test_sequential_sensors_measure_at_their_own_times():
+    """Each sensor measures a fraction of the interval after the previous one."""
     device, _ = device_of(dataclasses.replace(QUIET, sequential=True))
     device.open()
     network = read_network(NETWORK_FILE)
-    arrivals = gathered(device, 2 * 250)
+    arrivals = first_arrivals(device, 2 * 250)
     for i in (0, 1, 300, 301, 499):
         k, j = divmod(i, 2)
         reading, t = arrivals[i].reading, k / 50.0 + j / 100.0
@@ -109,29 +109,29 @@ def test_sensors_in_turn_measure_at_their_own_times():
         np.testing.assert_allclose(reading.field, network.R_ws[j].T @ B[j], rtol=1e-9)
 
 
-def test_what_nobody_took_in_time_is_lost_and_counted():
+def test_readings_not_read_in_time_are_dropped_and_counted():
     device, clock = device_of()
     device.open()
-    gathered(device, 2)
+    first_arrivals(device, 2)
     clock.sleep(MAX_BACKLOG_S + 10.0)
     first = device.read(0.1)[0].reading
     lost = device.counts['readings dropped, not read in time']
     assert lost == 2 * (first.sequence - 1) == pytest.approx(2 * 500, abs=4)
 
 
-def test_a_device_that_is_opened_again_goes_on_with_its_clock():
+def test_the_device_clock_continues_after_reopening():
     device, clock = device_of()
     with pytest.raises(DeviceError, match='not open'):
         device.read(0.1)
     device.open()
-    gathered(device, 2)
+    first_arrivals(device, 2)
     device.close()
     clock.sleep(3.0)
     device.open()
-    assert gathered(device, 1)[0].reading.ticks >= 3_000_000
+    assert first_arrivals(device, 1)[0].reading.ticks >= 3_000_000
 
 
-def test_networks_that_cannot_be_simulated(tmp_path):
+def test_unsuitable_settings_and_networks_are_refused(tmp_path):
     with pytest.raises(SettingsError, match='network: the path'):
         SimulatedDevice(SimulatorSettings())
     with pytest.raises(NetworkError):
@@ -145,14 +145,14 @@ def test_networks_that_cannot_be_simulated(tmp_path):
 
 
 def drivers_file(tmp_path, sensors):
-    """The simulator as a drivers file."""
+    """Drivers file of the simulator."""
     path = tmp_path / 'drivers.yaml'
     path.write_text(f'road:\n  device: simulator\n  simulator: {{network: {NETWORK_FILE}, '
                     f'moment: 0.0}}\n  sensors: {sensors}\n')
     return path
 
 
-def test_listening(tmp_path, capsys):
+def test_listen_prints_rate_and_field_of_each_sensor(tmp_path, capsys):
     path = drivers_file(tmp_path, '{mag_1: mag_1, mag_2: mag_2}')
     assert cli.main(['listen', str(path), '--network', str(NETWORK_FILE), '--seconds', '2']) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -161,12 +161,12 @@ def test_listening(tmp_path, capsys):
     assert 80.0 < float(rate) < 120.0
 
 
-def test_listening_to_nothing_is_told(tmp_path, capsys):
+def test_listen_reports_silent_sensors_and_invalid_arguments(tmp_path, capsys):
     path = drivers_file(tmp_path, '{mag_1: mag_1, north: mag_2}')
     assert cli.main(['listen', str(path), '--seconds', '1']) == 1
-    said = capsys.readouterr().out
-    assert 'readings of unknown sensors: mag_2' in said
-    assert re.search(r'^  mag_2 +nothing$', said, re.M)
+    output = capsys.readouterr().out
+    assert 'readings of unknown sensors: mag_2' in output
+    assert re.search(r'^  mag_2 +nothing$', output, re.M)
     assert cli.main(['listen', str(path), '--network', str(NETWORK_FILE), '--seconds', '0']) == 1
     assert '--seconds: 0 is not a number above 0' in capsys.readouterr().err
     assert cli.main(['listen', str(tmp_path / 'none.yaml')]) == 1

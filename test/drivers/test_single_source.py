@@ -1,4 +1,4 @@
-"""Which source is taken for a device's only sensor."""
+"""Selection of the source of a device's only sensor."""
 
 from mag_tracking.drivers.single_source import RELEASE_TIMEOUT_S, SingleSource
 
@@ -6,7 +6,7 @@ DEVICE, STRAY = ('', '10.0.0.5'), ('', '10.0.0.66')
 S = 1_000_000_000
 
 
-def test_a_stray_message_before_the_device_does_not_keep_its_place():
+def test_a_stray_first_message_does_not_block_the_device():
     source = SingleSource()
     assert source.accepts(STRAY, 0)
     times = [round((0.1 + 0.1 * k) * S) for k in range(100)]
@@ -14,10 +14,10 @@ def test_a_stray_message_before_the_device_does_not_keep_its_place():
     first = accepted.index(True)
     assert (all(accepted[first:]) and times[first] / S <= RELEASE_TIMEOUT_S + 0.2
             and source.changes == 1)
-    # Nor does one that comes while it sends.
+    # A stray message while the device sends is refused.
     assert not source.accepts(STRAY, times[-1] + 1) and source.accepts(DEVICE, times[-1] + 2)
 
 
-def test_a_slow_device_keeps_its_place_where_nobody_else_sends():
+def test_a_slow_source_is_kept_while_no_other_sends():
     source = SingleSource()
     assert all(source.accepts(DEVICE, k * 60 * S) for k in range(5)) and source.changes == 0

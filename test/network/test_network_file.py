@@ -1,4 +1,4 @@
-"""network.yaml: what it means, and what becomes of a faulty one."""
+"""network.yaml: values, round trips and errors."""
 
 from dataclasses import replace
 
@@ -38,10 +38,10 @@ def read(tmp_path, text):
     return read_network(path)
 
 
-def test_a_good_file(tmp_path):
+def test_a_network_file_is_read(tmp_path):
     n = read(tmp_path, GOOD)
     assert n.names == ('a', 'b') and n.topics == ('a/imu/mag', '/other/mag')
-    # A quarter turn about z takes the sensor's x to the world's y.
+    # A quarter turn about z rotates the sensor's x axis to the world's y axis.
     np.testing.assert_allclose(n.R_ws[0] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
     np.testing.assert_array_equal(n.R_ws[1], np.eye(3))
     np.testing.assert_allclose(n.R_sw[0], n.R_ws[0].T)
@@ -70,31 +70,31 @@ sensors:
 """
 
 
-def test_what_is_known_of_a_calibrated_sensor(tmp_path):
+def test_the_calibration_of_a_sensor_is_read(tmp_path):
     n = read(tmp_path, CALIBRATED)
     np.testing.assert_allclose(np.degrees(n.orientation_std[0]), [0.3, 0.4, 2.3])
     np.testing.assert_allclose(np.degrees(n.orientation_std[1]), 5.0)
     assert n.orientation_std[2] is None
     np.testing.assert_array_equal(n.clock_offset, [-0.0223, 0.0, 0.0])
     np.testing.assert_array_equal(n.offset[0], [1e-6, -2e-6, 3e-6])
-    # Nine numbers are its rows.
+    # The nine numbers are the rows of the matrix.
     np.testing.assert_array_equal(n.correction[0],
                                   [[1.01, 0.02, 0.0], [0.02, 0.98, 0.0], [0.0, -0.01, 1.0]])
     assert n.offset[1] is n.correction[1] is n.calibrated[1] is None
     assert n.calibrated[0] == CalibrationRecord('2026-05-01', 'accelerometer and compass', 2e-5)
     assert n.calibrated[2].by == 'as stated' and np.isnan(n.calibrated[2].clock_offset_std)
-    # Beside a topic that ends as REP-145 has it, else nobody knows.
+    # The IMU topic follows from a topic that ends as in REP-145; otherwise it is unknown.
     assert n.imu_topics == ('a/imu/data_raw', None, '/imu_of_c')
 
 
-def test_the_site_tells_the_field(tmp_path):
+def test_the_site_determines_the_earth_field(tmp_path):
     n = read(tmp_path, CALIBRATED)
     np.testing.assert_array_equal(
         n.earth_field, earth_field(Site(58.4, 15.6, 60.0, 2026.0 + 120 / 365, 90.0)))
 
 
-def assert_agree(a, b):
-    """Fail unless two networks say the same."""
+def assert_equal_networks(a, b):
+    """Check that two networks are equal."""
     assert (a.names, a.topics, a.frame, a.imu_topics) == (b.names, b.topics, b.frame, b.imu_topics)
     for name in ('positions', 'earth_field', 'clock_offset'):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
@@ -112,38 +112,38 @@ def assert_agree(a, b):
 
 
 @pytest.mark.parametrize('text', [GOOD, CALIBRATED])
-def test_what_is_written_reads_back(tmp_path, text):
+def test_a_written_network_is_read_back(tmp_path, text):
     n = read(tmp_path, text)
     n = replace(n, R_ws=n.R_ws @ Rotation.random(len(n), random_state=1).as_matrix())
     write_network(tmp_path / 'copy.yaml', n, 'A copy.\nOf two lines.')
     assert (tmp_path / 'copy.yaml').read_text().startswith('# A copy.\n# Of two lines.\n')
-    assert_agree(read_network(tmp_path / 'copy.yaml'), n)
+    assert_equal_networks(read_network(tmp_path / 'copy.yaml'), n)
     with pytest.raises(OutputError, match='cannot write'):
         write_network(tmp_path / 'no' / 'such' / 'folder.yaml', n)
 
 
 @pytest.mark.parametrize('deg', [1e-5, 0.06, 30.0, 45.0, 180.0])
-def test_any_deviation_that_a_survey_may_find_reads_back(tmp_path, deg):
-    """A heading that nobody stated is known to 180 degrees: survey.stated_std_deg allows it."""
+def test_any_orientation_std_of_a_survey_is_read_back(tmp_path, deg):
+    """An unknown heading has 180 degrees, the maximum of survey.stated_std_deg."""
     n = read(tmp_path, GOOD)
     n = replace(n, orientation_std=(np.deg2rad([0.3, 0.3, deg]), None))
     write_network(tmp_path / 'copy.yaml', n)
-    assert_agree(read_network(tmp_path / 'copy.yaml'), n)
+    assert_equal_networks(read_network(tmp_path / 'copy.yaml'), n)
 
 
-def test_a_sensor_without_an_accelerometer_stays_so(tmp_path):
+def test_a_sensor_without_an_accelerometer_is_read_back(tmp_path):
     n = read(tmp_path, GOOD.replace('topic: /other', 'imu_topic: null\n    topic: /other'))
     assert n.imu_topics == ('a/imu/data_raw', None)
     write_network(tmp_path / 'copy.yaml', n)
-    assert_agree(read_network(tmp_path / 'copy.yaml'), n)
+    assert_equal_networks(read_network(tmp_path / 'copy.yaml'), n)
 
 
-def test_any_words_read_back(tmp_path):
+def test_text_with_special_characters_is_read_back(tmp_path):
     n = read(tmp_path, GOOD)
     n = replace(n, calibrated=(
         CalibrationRecord('2026-05-01', "the installer's eye: # 1", np.nan), None))
     write_network(tmp_path / 'copy.yaml', n)
-    assert_agree(read_network(tmp_path / 'copy.yaml'), n)
+    assert_equal_networks(read_network(tmp_path / 'copy.yaml'), n)
 
 
 @pytest.mark.parametrize('old, new, message', [
@@ -172,7 +172,7 @@ def test_any_words_read_back(tmp_path):
     ('x_azimuth_deg: 90', 'x_azimuth: 90', "site: unknown key 'x_azimuth'"),
     ('site:', 'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]\nsite:', 'both define the field'),
 ])
-def test_faults_of_a_calibration_are_named(tmp_path, old, new, message):
+def test_invalid_calibrations_are_refused(tmp_path, old, new, message):
     assert old in CALIBRATED
     with pytest.raises(NetworkError, match=message):
         read(tmp_path, CALIBRATED.replace(old, new))
@@ -203,13 +203,13 @@ def test_faults_of_a_calibration_are_named(tmp_path, old, new, message):
     ('[2.0e-6, 1.55e-5, -4.9e-5]', '[2.0e-3, 0.0, 0.0]', 'more than a millitesla'),
     ('position: [0, -4.5, 0]', 'position: [0, 2.0e+8, 0]', 'too far from the origin'),
 ])
-def test_faults_are_named(tmp_path, old, new, message):
+def test_invalid_networks_are_refused(tmp_path, old, new, message):
     assert old in GOOD
     with pytest.raises(NetworkError, match=message.replace('[', r'\[')):
         read(tmp_path, GOOD.replace(old, new))
 
 
-def test_missing_and_empty_files(tmp_path):
+def test_missing_and_empty_files_are_refused(tmp_path):
     with pytest.raises(NetworkError, match='cannot read'):
         read_network(tmp_path / 'nowhere.yaml')
     for text in ('', 'sensors: {}', 'sensors: [a]'):
@@ -217,7 +217,7 @@ def test_missing_and_empty_files(tmp_path):
             read(tmp_path, text)
 
 
-def test_an_unknown_sensor_is_named(tmp_path):
+def test_an_unknown_sensor_is_refused(tmp_path):
     with pytest.raises(NetworkError, match='unknown sensor c; the network has a, b'):
         read(tmp_path, GOOD).index('c')
 

@@ -1,4 +1,4 @@
-"""Names of topics in namespaces, and recordings that were made in one."""
+"""Topic names in namespaces, and recordings made in a namespace."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ RELATIVE = ('mag_1/imu/mag', 'mag_2/imu/mag')
 
 
 def recording_of(path, *namespaces):
-    """A recording with one reading of mag_1 in each namespace, 1, 2, ... tesla."""
+    """Recording with one reading of mag_1 in each namespace, of 1, 2, ... T."""
     path.parent.mkdir(exist_ok=True)
     with RecordingWriter(path) as writer:
         for k, namespace in enumerate(namespaces):
@@ -27,8 +27,8 @@ def recording_of(path, *namespaces):
     return Recording(path)
 
 
-def fields(recording, namespace=None):
-    """The x axes that a reader of a network with relative topics finds."""
+def read_fields(recording, namespace=None):
+    """(x components, missing topics) that a reader finds with relative topics."""
     network = dataclasses.replace(line_network(2), topics=RELATIVE, namespace=namespace)
     reader = SampleReader(recording, network)
     return [s.field[0] for s in recorded(reader)], reader.missing_topics()
@@ -37,24 +37,24 @@ def fields(recording, namespace=None):
 @pytest.mark.parametrize('namespaces, expected', [
     (('',), (1.0, '/mag_2/imu/mag')), (('/robot1',), (1.0, '/robot1/mag_2/imu/mag')),
     (('/a/b',), (1.0, '/a/b/mag_2/imu/mag')), (('/sim', ''), (2.0, '/mag_2/imu/mag'))])
-def test_relative_topics_are_found_where_they_are(tmp_path, namespaces, expected):
-    assert fields(recording_of(tmp_path / 'a.mcap', *namespaces)) == (
+def test_relative_topics_are_found_in_their_namespace(tmp_path, namespaces, expected):
+    assert read_fields(recording_of(tmp_path / 'a.mcap', *namespaces)) == (
         [expected[0]], [expected[1]])
 
 
-def test_of_several_namespaces_one_has_to_be_chosen(tmp_path):
+def test_several_namespaces_require_a_choice(tmp_path):
     recording = recording_of(tmp_path / 'a.mcap', '/north', '/south')
     with pytest.raises(RecordingError, match='the namespaces /north, /south: choose .*--namespace'):
-        fields(recording)
-    assert fields(recording, '/south') == ([2.0], ['/south/mag_2/imu/mag'])
+        read_fields(recording)
+    assert read_fields(recording, '/south') == ([2.0], ['/south/mag_2/imu/mag'])
     with pytest.raises(RecordingError, match="none of the network's topics .*/west/mag_1/imu/mag"):
-        fields(recording, '/west')
+        read_fields(recording, '/west')
 
 
-def test_names():
+def test_names_are_resolved_and_namespaces_are_checked():
     assert absolute('a/b') == '/a/b' and absolute('a', '/n/m') == '/n/m/a'
     assert absolute('/a', '/n') == '/a'
-    # The end of a longer name is another name.
+    # The end of a longer name does not match.
     assert namespaces_of(['mag'], ['/imag', '/x/mag']) == ['/x']
     assert namespaces_of(['/mag'], ['/x/mag']) == []
     assert checked_namespace('/') == '/' and checked_namespace('/a/b_1') == '/a/b_1'

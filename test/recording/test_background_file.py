@@ -1,4 +1,4 @@
-"""A calibration that is started again goes on with what it had learnt a moment before."""
+"""Stored backgrounds: resumption after a restart of the calibration, and their file."""
 
 import json
 import os
@@ -28,22 +28,22 @@ STEP = np.array([0.0, 4e-7, 0.0])
 
 
 def readings(begin_s, seconds, seed, step=0.0):
-    """[MagSample] of sensor 0."""
+    """Samples of mag_1."""
     rng = np.random.default_rng(seed)
     return [MagSample(int((begin_s + k / RATE) * NS), 'mag_1',
                       EARTH + step + STD * rng.standard_normal(3))
             for k in range(int(seconds * RATE))]
 
 
-def network_of(n=2):
+def network_without_backgrounds(n=2):
     """A network without backgrounds."""
     network = line_network(n, tilt=0.0)
     return replace(network, background=(None,) * n, noise_std=(None,) * n)
 
 
-def learnt():
-    """(network, a `Calibrate` that has learnt mag_1 until 10 s)."""
-    network = network_of()
+def learnt_stage():
+    """(network, `Calibrate` stage that has learnt the background of mag_1 for 10 s)."""
+    network = network_without_backgrounds()
     assert network.names[0] == 'mag_1'
     stage = Calibrate(network, CalibrateSettings())
     for s in readings(1000.0, 10.0, 0):
@@ -51,62 +51,62 @@ def learnt():
     return network, stage
 
 
-def kept_in(path):
-    """(network, `read_backgrounds` of what was written to `path`)."""
-    network, stage = learnt()
+def write_and_read_back(path):
+    """Write the background of mag_1 to `path`; return (network, backgrounds read back)."""
+    network, stage = learnt_stage()
     write_backgrounds(path, {'mag_1': background_text(
         stage.stored('mag_1'), network, 0, SETTINGS)})
-    kept, refused = read_backgrounds(path, network, SETTINGS)
+    stored, refused = read_backgrounds(path, network, SETTINGS)
     assert not refused
-    return network, kept
+    return network, stored
 
 
-def test_what_is_kept_comes_back_as_it_was(tmp_path):
+def test_a_stored_background_is_read_back_unchanged(tmp_path):
     path = tmp_path / 'a' / 'b.json'
-    network, kept = kept_in(path)
-    _, stage = learnt()
-    assert list(kept) == ['mag_1'] and stage.stored('mag_2') is None
-    np.testing.assert_array_equal(kept['mag_1'].background, stage.background('mag_1'))
-    np.testing.assert_array_equal(kept['mag_1'].covariance,
+    network, stored = write_and_read_back(path)
+    _, stage = learnt_stage()
+    assert list(stored) == ['mag_1'] and stage.stored('mag_2') is None
+    np.testing.assert_array_equal(stored['mag_1'].background, stage.background('mag_1'))
+    np.testing.assert_array_equal(stored['mag_1'].covariance,
                                   stage.backgrounds()['mag_1'].covariance)
-    assert kept['mag_1'].stamp_ns == stage.last_stamp_ns('mag_1')
+    assert stored['mag_1'].stamp_ns == stage.last_stamp_ns('mag_1')
     assert [p.name for p in path.parent.iterdir()] == ['b.json']
 
 
-def test_after_a_restart_the_first_reading_is_calibrated(tmp_path):
-    """Also where a target stands there by then: it must not become the background."""
-    network, kept = kept_in(tmp_path / 'kept.json')
+def test_the_first_reading_after_a_restart_is_calibrated(tmp_path):
+    """A target that is present by then must not become the background."""
+    network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings())
-    stage.resume(kept)
+    stage.resume(stored)
     out = [c for s in readings(1012.0, 8.0, 1, STEP) for c in fed(stage, s)]
     assert len(out) == 8 * RATE and out[0].stamp_ns == 1012 * NS
     fields = np.array([c.field for c in out])
     np.testing.assert_allclose(fields.mean(axis=0), STEP, atol=6e-9)
     assert stage.backgrounds()['mag_1'].frozen and stage.counts['backgrounds restored'] == 1
-    # Then it is gone, and what is learnt is as if nothing had been.
+    # The target leaves, and the background is learnt as usual.
     for s in readings(1020.0, 10.0, 2):
         out += fed(stage, s)
     assert not stage.backgrounds()['mag_1'].frozen
-    # The end of a line through ten seconds is known to 2 nT.
+    # The end of a line through 10 s is known to 2 nT.
     np.testing.assert_allclose(stage.background('mag_1'), EARTH, atol=6e-9)
 
 
 @pytest.mark.parametrize('begin_s, max_resume_gap_s', [
     (1009.0, 60.0), (1009.98, 60.0), (1080.0, 60.0), (1020.0, 5.0)])
-def test_what_is_of_another_time_is_learnt_anew(tmp_path, begin_s, max_resume_gap_s):
-    network, kept = kept_in(tmp_path / 'kept.json')
+def test_a_background_of_another_time_is_not_resumed(tmp_path, begin_s, max_resume_gap_s):
+    network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(max_resume_gap_s=max_resume_gap_s))
-    stage.resume(kept)
+    stage.resume(stored)
     assert not [c for s in readings(begin_s, 2.0, 1) for c in fed(stage, s)]
     assert stage.counts['outdated backgrounds not restored'] == 1
     assert stage.stored('mag_1') is None
 
 
 @pytest.mark.parametrize('has_begun', [False, True])
-def test_forgetting_forgets_also_what_was_kept(tmp_path, has_begun):
-    network, kept = kept_in(tmp_path / 'kept.json')
+def test_forget_discards_stored_backgrounds(tmp_path, has_begun):
+    network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, SETTINGS)
-    stage.resume(kept)
+    stage.resume(stored)
     if has_begun:
         fed(stage, readings(1011.0, 1.0, 1)[0])
     stage.forget()
@@ -117,33 +117,33 @@ def test_forgetting_forgets_also_what_was_kept(tmp_path, has_begun):
 
 @pytest.mark.parametrize('change', [
     {'offset': (np.array([1e-6, 0.0, 0.0]), None)}, {'clock_offset': (0.1, 0.0)}])
-def test_another_calibration_that_comes_before_the_readings(tmp_path, change):
-    network, kept = kept_in(tmp_path / 'kept.json')
+def test_a_changed_calibration_discards_stored_backgrounds(tmp_path, change):
+    network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, SETTINGS)
-    stage.resume(kept)
+    stage.resume(stored)
     stage.update_network(replace(network, **change))
     assert not [c for s in readings(1011.0, 2.0, 1) for c in fed(stage, s)]
 
 
-def test_a_sensor_that_was_moved_meanwhile_is_learnt_anew_soon(tmp_path):
-    """Also where a steady change is never taken for the background otherwise."""
-    network, kept = kept_in(tmp_path / 'kept.json')
+def test_a_sensor_moved_before_the_restart_is_relearnt_soon(tmp_path):
+    """This applies even if steady changes are otherwise never relearnt."""
+    network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
-    stage.resume(kept)
+    stage.resume(stored)
     out = [c for s in readings(1040.0, 20.0, 1, 25.0 * STEP) for c in fed(stage, s)]
     late = np.array([c.field for c in out if c.stamp_ns > 1052 * NS])
     assert np.abs(late.mean(axis=0)).max() < 6e-9
     assert stage.backgrounds()['mag_1'].n_relearnt == 1
-    # What comes from then on is a target, for ever if it stays.
+    # A later steady change is a target, without a time limit.
     out = [c for s in readings(1060.0, 60.0, 2, 26.0 * STEP) for c in fed(stage, s)]
     np.testing.assert_allclose(np.mean([c.field for c in out], axis=0), STEP, atol=1e-8)
 
 
-def test_what_has_been_learnt_again_is_as_any_other(tmp_path):
-    """A target that comes later and stays is none the sooner the background."""
-    network, kept = kept_in(tmp_path / 'kept.json')
+def test_a_confirmed_background_is_not_relearnt_sooner(tmp_path):
+    """A target that arrives later and stays does not become the background sooner."""
+    network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
-    stage.resume(kept)
+    stage.resume(stored)
     for s in readings(1012.0, 10.0, 1):
         fed(stage, s)
     out = [c for s in readings(1022.0, 40.0, 2, STEP) for c in fed(stage, s)]
@@ -155,40 +155,40 @@ def test_what_has_been_learnt_again_is_as_any_other(tmp_path):
     {'offset': (np.array([1e-6, 0.0, 0.0]), None)}, {'clock_offset': (0.1, 0.0)},
     {'background': (EARTH + 5e-6, None)},
     {'positions': np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])}])
-def test_a_sensor_that_is_another_is_learnt_anew(tmp_path, change):
-    network, _ = kept_in(tmp_path / 'kept.json')
-    kept, refused = read_backgrounds(tmp_path / 'kept.json', replace(network, **change), SETTINGS)
-    assert kept == {} and 'another network file' in refused['mag_1']
+def test_a_background_of_another_network_file_is_refused(tmp_path, change):
+    network, _ = write_and_read_back(tmp_path / 'kept.json')
+    stored, refused = read_backgrounds(tmp_path / 'kept.json', replace(network, **change), SETTINGS)
+    assert stored == {} and 'another network file' in refused['mag_1']
 
 
-def test_other_settings_are_another_noise(tmp_path):
-    network, _ = kept_in(tmp_path / 'kept.json')
-    kept, refused = read_backgrounds(
+def test_a_background_of_other_settings_is_refused(tmp_path):
+    network, _ = write_and_read_back(tmp_path / 'kept.json')
+    stored, refused = read_backgrounds(
         tmp_path / 'kept.json', network, CalibrateSettings(decimate_to_hz=10.0))
-    assert kept == {} and 'other settings' in refused['mag_1']
+    assert stored == {} and 'other settings' in refused['mag_1']
     assert read_backgrounds(tmp_path / 'none.json', network, SETTINGS) == ({}, {})
 
 
-@pytest.mark.parametrize('change, told', [
+@pytest.mark.parametrize('change, message', [
     (lambda c: 'not json', 'Expecting value'), (lambda c: '[' * 100_000, 'recursion'),
     (lambda c: json.dumps([1]), 'is not a background file of version'),
     (lambda c: json.dumps({**c, 'version': 2}), 'background file of version 1'),
     (lambda c: json.dumps({'version': 1}), 'is not a background file of version')])
-def test_a_file_that_is_none_is_told(tmp_path, change, told):
+def test_an_invalid_file_is_refused(tmp_path, change, message):
     path = tmp_path / 'kept.json'
-    network, _ = kept_in(path)
+    network, _ = write_and_read_back(path)
     path.write_text(change(json.loads(path.read_text())))
-    with pytest.raises(RecordingError, match=told):
+    with pytest.raises(RecordingError, match=message):
         read_backgrounds(path, network, SETTINGS)
 
 
-@pytest.mark.parametrize('key, value, told', [
+@pytest.mark.parametrize('key, value, reason', [
     ('background', [1.0, 2.0], 'ValueError: invalid background'),
     ('covariance', [[0.0] * 3] * 3, 'not positive definite'), ('stamp_ns', None, 'at None'),
     ('made_of', None, 'another network file')])
-def test_one_bad_entry_costs_no_other(tmp_path, key, value, told):
+def test_an_invalid_entry_affects_no_other(tmp_path, key, value, reason):
     path = tmp_path / 'kept.json'
-    network, stage = learnt()
+    network, stage = learnt_stage()
     for s in readings(1000.0, 10.0, 1):
         fed(stage, replace(s, sensor='mag_2'))
     write_backgrounds(path, {name: background_text(stage.stored(name), network, j, SETTINGS)
@@ -196,26 +196,26 @@ def test_one_bad_entry_costs_no_other(tmp_path, key, value, told):
     content = json.loads(path.read_text())
     content['sensors']['mag_1'][key] = value
     path.write_text(json.dumps(content))
-    kept, refused = read_backgrounds(path, network, SETTINGS)
-    assert list(kept) == ['mag_2'] and list(refused) == ['mag_1'] and told in refused['mag_1']
+    stored, refused = read_backgrounds(path, network, SETTINGS)
+    assert list(stored) == ['mag_2'] and list(refused) == ['mag_1'] and reason in refused['mag_1']
 
 
-def test_an_axis_that_has_only_just_begun_is_not_kept(tmp_path):
-    network = network_of()
+def test_an_axis_without_enough_readings_is_not_stored(tmp_path):
+    network = network_without_backgrounds()
     stage = Calibrate(network, SETTINGS)
     for k, s in enumerate(readings(1000.0, 10.0, 0)):
         field = s.field.copy()
         field[2] = field[2] if k in (400, 401) else np.nan
         fed(stage, replace(s, field=field))
-    kept = stage.stored('mag_1')
-    assert np.isnan(kept.background).tolist() == [False, False, True]
-    write_backgrounds(tmp_path / 'k', {'mag_1': background_text(kept, network, 0, SETTINGS)})
-    again, refused = read_backgrounds(tmp_path / 'k', network, SETTINGS)
+    stored = stage.stored('mag_1')
+    assert np.isnan(stored.background).tolist() == [False, False, True]
+    write_backgrounds(tmp_path / 'k', {'mag_1': background_text(stored, network, 0, SETTINGS)})
+    restored, refused = read_backgrounds(tmp_path / 'k', network, SETTINGS)
     assert not refused
-    np.testing.assert_array_equal(again['mag_1'].background, kept.background)
+    np.testing.assert_array_equal(restored['mag_1'].background, stored.background)
 
 
-def test_a_place_that_cannot_be_written_is_told(tmp_path):
+def test_an_unwritable_path_is_reported(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(OutputError, match='Not a directory|File exists'):
         write_backgrounds(tmp_path / 'file' / 'kept.json', {})
@@ -223,14 +223,14 @@ def test_a_place_that_cannot_be_written_is_told(tmp_path):
         write_backgrounds('/', {})
 
 
-def test_every_network_file_has_a_place_of_its_own(monkeypatch, tmp_path):
+def test_each_network_file_and_node_has_its_own_default_path(monkeypatch, tmp_path):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
-    one = default_path('/a/network.yaml', '/calibration_node')
+    path = default_path('/a/network.yaml', '/calibration_node')
     others = {default_path('/b/network.yaml', '/calibration_node'),
               default_path('/a/network.yaml', '/north/calibration_node')}
-    assert len(others | {one}) == 3
-    assert {p.parent for p in others | {one}} == {tmp_path / 'mag_tracking'}
-    assert one.name.startswith('network_')
+    assert len(others | {path}) == 3
+    assert {p.parent for p in others | {path}} == {tmp_path / 'mag_tracking'}
+    assert path.name.startswith('network_')
     monkeypatch.delenv('ROS_HOME')
     assert default_path('network.yaml', '/n').parent == Path(
         os.path.expanduser('~/.ros/mag_tracking'))

@@ -1,4 +1,4 @@
-"""SQLite and ROS 1 bags, JSON and protobuf messages, and tables: read as the MCAP recording is."""
+"""SQLite and ROS 1 bags, JSON and protobuf messages, and tables: same results as with MCAP."""
 
 import json
 
@@ -36,8 +36,8 @@ def expected():
     return mt.track(vehicle_path(NAME), NETWORK_FILE, settings=QUICK)
 
 
-def written_db3(source, folder):
-    """An SQLite bag of a recording, by `rosbags`."""
+def write_sqlite_bag(source, folder):
+    """Write a recording as an SQLite bag with `rosbags`."""
     types = get_typestore(Stores.ROS2_JAZZY)
     with Ros2Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connections = {topic: writer.add_connection(topic, kind, typestore=types)
@@ -47,8 +47,8 @@ def written_db3(source, folder):
     return folder
 
 
-def written_ros1(source, path):
-    """A ROS 1 bag of a recording, by `rosbags`."""
+def write_ros1_bag(source, path):
+    """Write a recording as a ROS 1 bag with `rosbags`."""
     ros2, ros1 = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
     with Ros1Writer(path) as writer:
         connections = {topic: writer.add_connection(topic, kind, typestore=ros1)
@@ -64,18 +64,18 @@ def written_ros1(source, path):
     return path
 
 
-def compare(result, expected):
+def assert_equal_results(result, expected):
     for table in ('poses', 'smoothed', 'detections'):
         np.testing.assert_array_equal(getattr(result, table), getattr(expected, table), table)
     assert result.errors() == expected.errors() and result.rejections == expected.rejections
 
 
 @pytest.mark.parametrize('kind', ['folder', 'db3', 'bag'])
-def test_a_bag_gives_what_the_mcap_gives(kind, source, expected, tmp_path):
+def test_a_bag_gives_the_same_result_as_the_mcap_file(kind, source, expected, tmp_path):
     if kind == 'bag':
-        path = written_ros1(source, tmp_path / 'one.bag')
+        path = write_ros1_bag(source, tmp_path / 'one.bag')
     else:
-        path = written_db3(source, tmp_path / 'two')
+        path = write_sqlite_bag(source, tmp_path / 'two')
         path = path if kind == 'folder' else path / 'two.db3'
     found = Recording(path)
     assert found.types == source.types and found.message_counts == source.message_counts
@@ -83,14 +83,14 @@ def test_a_bag_gives_what_the_mcap_gives(kind, source, expected, tmp_path):
     done = []
     n = sum(1 for _ in found.messages(progress=done.append))
     assert n == source.message_counts.total() and sum(done) == found.size
-    compare(mt.track(path, NETWORK_FILE, settings=QUICK), expected)
+    assert_equal_results(mt.track(path, NETWORK_FILE, settings=QUICK), expected)
 
 
 @pytest.mark.parametrize('kind', ['db3', 'bag'])
 @pytest.mark.parametrize('share', [0.0, 0.1, 0.5, 0.9])
-def test_a_damaged_bag_is_named_or_read_as_far_as_it_goes(kind, share, source, tmp_path):
-    path = written_ros1(source, tmp_path / 'one.bag') if kind == 'bag' \
-        else written_db3(source, tmp_path / 'two') / 'two.db3'
+def test_a_truncated_bag_is_refused_or_read_up_to_its_end(kind, share, source, tmp_path):
+    path = write_ros1_bag(source, tmp_path / 'one.bag') if kind == 'bag' \
+        else write_sqlite_bag(source, tmp_path / 'two') / 'two.db3'
     data = bytearray(path.read_bytes())
     path.write_bytes(data[:int(share * len(data))])
     try:
@@ -103,9 +103,9 @@ def test_a_damaged_bag_is_named_or_read_as_far_as_it_goes(kind, share, source, t
 
 
 @pytest.mark.parametrize('kind, seed', [('db3', 0), *(('bag', seed) for seed in range(6))])
-def test_bytes_that_were_changed_end_nothing(kind, seed, source, tmp_path):
-    path = written_ros1(source, tmp_path / 'one.bag') if kind == 'bag' \
-        else written_db3(source, tmp_path / 'two') / 'two.db3'
+def test_flipped_bytes_in_a_bag_do_not_crash_the_reader(kind, seed, source, tmp_path):
+    path = write_ros1_bag(source, tmp_path / 'one.bag') if kind == 'bag' \
+        else write_sqlite_bag(source, tmp_path / 'two') / 'two.db3'
     data, rng = bytearray(path.read_bytes()), np.random.default_rng(seed)
     for k in rng.integers(4096, len(data), 300 if kind == 'db3' else 20):
         data[k] ^= 0xFF
@@ -118,8 +118,8 @@ def test_bytes_that_were_changed_end_nothing(kind, seed, source, tmp_path):
         assert len(read.readings) <= 2800
 
 
-def mcap_of(path, encoding, schema, messages):
-    """An MCAP file of (topic, time, bytes)."""
+def write_mcap(path, encoding, schema, messages):
+    """Write an MCAP file with messages (topic, time, bytes)."""
     with open(path, 'wb') as stream:
         writer = Writer(stream)
         writer.start()
@@ -152,7 +152,7 @@ def test_json_messages_of_a_magnetic_field_are_read(seconds, nanoseconds, source
         'header': {'stamp': {seconds: t // 10**9, nanoseconds: t % 10**9}, 'frame_id': ''},
         'magnetic_field': dict(zip('xyz', b.tolist(), strict=True))}).encode())
         for topic, t, b in fields_of(source)]
-    path = mcap_of(tmp_path / 'json.mcap', 'json', ('Magnetic', 'jsonschema', SCHEMA), messages)
+    path = write_mcap(tmp_path / 'json.mcap', 'json', ('Magnetic', 'jsonschema', SCHEMA), messages)
     assert set(Recording(path).types.values()) == {MAGNETIC_FIELD}
     found = mt.track(path, NETWORK_FILE, settings=QUICK)
     np.testing.assert_array_equal(found.poses, expected.poses)
@@ -169,7 +169,7 @@ def test_json_messages_of_a_magnetic_field_are_read(seconds, nanoseconds, source
     (lambda m: m['magnetic_field'].update(z='1'), "is not a number: '1'"),
     (lambda m: m.update(magnetic_field_covariance=[1.0]), 'covariance'),
     (lambda m: m.update(magnetic_field=3.0), r'magnetic_field\.x is missing')])
-def test_other_json_messages_are_rejected(change, cause, tmp_path):
+def test_invalid_json_messages_are_rejected(change, cause, tmp_path):
     message = {'header': {'stamp': {'sec': 1, 'nanosec': 2}},
                'magnetic_field': {'x': 1e-5, 'y': None, 'z': 2}}
     read = field_decoder('jsonschema', 'M', SCHEMA)
@@ -179,7 +179,7 @@ def test_other_json_messages_are_rejected(change, cause, tmp_path):
     bad = json.dumps(message).encode()
     with pytest.raises(ValueError, match=cause):
         read(bad)
-    path = mcap_of(tmp_path / 'a.mcap', 'json', ('M', 'jsonschema', SCHEMA), [
+    path = write_mcap(tmp_path / 'a.mcap', 'json', ('M', 'jsonschema', SCHEMA), [
         ('/mag_1/imu/mag', k, data) for k, data in enumerate((bad, b'\xff{', b'[' * 100_000, b''))])
     found = mt.read_recording(path, NETWORK_FILE)
     assert len(found.readings) == 0
@@ -215,8 +215,8 @@ def test_protobuf_messages_of_a_magnetic_field_are_read(source, expected, tmp_pa
         m.timestamp.seconds, m.timestamp.nanos = divmod(t, 10**9)
         m.magnetic_field.x, m.magnetic_field.y, m.magnetic_field.z = b.tolist()
         messages.append((topic, t, m.SerializeToString()))
-    path = mcap_of(tmp_path / 'p.mcap', 'protobuf', ('lab.Magnetic', 'protobuf', descriptors),
-                   messages)
+    path = write_mcap(tmp_path / 'p.mcap', 'protobuf', ('lab.Magnetic', 'protobuf', descriptors),
+                      messages)
     found = mt.track(path, NETWORK_FILE, settings=QUICK)
     np.testing.assert_array_equal(found.poses, expected.poses)
 
@@ -234,7 +234,7 @@ def test_a_table_of_readings_becomes_a_recording(source, expected, tmp_path, cap
     np.testing.assert_allclose(result.poses['position'], expected.poses['position'], rtol=1e-6)
 
 
-def test_a_row_may_have_all_sensors(tmp_path):
+def test_a_row_may_hold_several_sensors(tmp_path):
     table = tmp_path / 'wide.csv'
     table.write_text('ms,a,b,c\n1,0.5,,2\n2,,,\n3,1.5,0.25,-2\n')
     recording, counts = import_field_table(
@@ -266,14 +266,14 @@ def test_a_row_may_have_all_sensors(tmp_path):
     (['a.x=x'], 'T', 't,x\n1,2\n', 'time and at least one axis'),
     (['time=t', 'time=u', 'a.x=x'], 'T', 't,x\n1,2\n', 'is given twice'),
     (['time'], 'T', 't,x\n1,2\n', 'expected KEY=COLUMN such as time=t')])
-def test_a_table_that_does_not_fit_is_named(columns, unit, text, message, tmp_path):
+def test_an_invalid_table_is_refused(columns, unit, text, message, tmp_path):
     table = tmp_path / 'a.csv'
     table.write_text(text)
     with pytest.raises(RecordingError, match=message):
         import_field_table(table, columns, unit, tmp_path / 'o')
 
 
-def test_the_command_asks_for_columns_and_a_unit(tmp_path, capsys):
+def test_the_command_requires_columns_and_a_unit(tmp_path, capsys):
     table = tmp_path / 'a.csv'
     table.write_text('t,x\n1,2\n')
     assert main(['import', str(table), '--out', str(tmp_path / 'o')]) == 1

@@ -1,4 +1,4 @@
-"""Tables of a magnet's poses: what is read, and what is refused."""
+"""Tables of magnet poses: reading and validation."""
 
 import numpy as np
 import pytest
@@ -10,11 +10,11 @@ from support.real_board import board_of_41
 
 @pytest.fixture(scope='module')
 def recorded():
-    """(network, field, positions, axes)."""
+    """(network, field, positions, axes) of the board with 41 sensors."""
     return board_of_41()
 
 
-def test_the_table_is_read(recorded):
+def test_the_table_of_the_real_board_is_read(recorded):
     network, field, positions, axes = recorded
     assert network.positions.shape == (41, 3) and field.shape == (324, 41, 3)
     assert positions.shape == axes.shape == (324, 3)
@@ -26,7 +26,7 @@ def test_the_table_is_read(recorded):
 HEADER = 'mag_mz0,x0,y0,z0,mag_x0,mag_y0,mag_z0,mag_mx0,mag_my0\n'
 
 
-def test_columns_are_found_by_name_and_readings_may_be_missing(tmp_path):
+def test_columns_are_found_by_name_and_axes_may_be_missing(tmp_path):
     path = tmp_path / 'poses.csv'
     path.write_text(HEADER + '0.8,1e-6,,nan,1,2,3,0.6,0\n')
     field, positions, axes = read_pose_table(path)
@@ -45,7 +45,7 @@ def test_columns_are_found_by_name_and_readings_may_be_missing(tmp_path):
     (HEADER + '1,0,0,0,,0,0,0,0\n', 'row 2: mag_x0 is not a finite number'),
     (HEADER + '1,inf,0,0,0,0,0,0,0\n', 'row 2: x0 is not a finite number'),
     (HEADER + '0.9,0,0,0,0,0,0,0,0\n', 'row 2: mag_mx0..mag_mz0 has length 0.9')])
-def test_a_bad_table_is_named(tmp_path, content, message):
+def test_an_invalid_table_is_refused(tmp_path, content, message):
     path = tmp_path / 'poses.csv'
     path.write_text(content)
     with pytest.raises(RecordingError, match=message) as caught:
@@ -56,7 +56,7 @@ def test_a_bad_table_is_named(tmp_path, content, message):
 @pytest.mark.parametrize('content, message', [
     ('# x,y,z\n', 'has no rows'), ('# x,y,z\n1,2\n', 'row 2: expected 3 columns, got 2'),
     ('1,2,a\n', "row 1: z is 'a'"), ('1,nan,2\n', 'row 1: y is not a finite number')])
-def test_bad_positions_are_named(tmp_path, content, message):
+def test_invalid_sensor_positions_are_refused(tmp_path, content, message):
     path = tmp_path / 'sensors.csv'
     path.write_text(content)
     with pytest.raises(RecordingError, match=message):

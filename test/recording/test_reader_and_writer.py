@@ -1,4 +1,4 @@
-"""Recordings: written so that others read them, read so that damage is survived and told."""
+"""Recordings: readable by other software, and read in spite of damage."""
 
 import io
 import tracemalloc
@@ -25,7 +25,7 @@ JUNCTION = 'junction_left_to_right'
 
 
 def write(path, n, topics=2, step_ms=10):
-    """A recording of `n` samples a topic; returns them."""
+    """Write a recording with `n` samples per topic; return the samples."""
     rng = np.random.default_rng(0)
     samples = []
     with RecordingWriter(path) as writer:
@@ -45,7 +45,7 @@ def read(path, network=None):
     return list(recording.messages()), recording
 
 
-def test_what_is_written_reads_back(tmp_path):
+def test_written_samples_are_read_back(tmp_path):
     samples = write(tmp_path / 'a.mcap', 200)
     for path in (tmp_path, tmp_path / 'a.mcap'):
         messages, recording = read(path)
@@ -57,7 +57,7 @@ def test_what_is_written_reads_back(tmp_path):
             np.testing.assert_array_equal(back.covariance, s.covariance)
 
 
-def test_rosbags_reads_what_is_written(tmp_path):
+def test_rosbags_reads_written_samples(tmp_path):
     samples = write(tmp_path / 'a.mcap', 50)
     with AnyReader([tmp_path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         rows = [(t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
@@ -68,7 +68,7 @@ def test_rosbags_reads_what_is_written(tmp_path):
         np.testing.assert_array_equal(m.magnetic_field_covariance, s.covariance.ravel())
 
 
-def test_rosbags_reads_the_tracks(vehicle_replays):
+def test_rosbags_reads_poses_and_tracks(vehicle_replays):
     run, folder = vehicle_replays['straight_car_right']
     with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         poses = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()
@@ -81,41 +81,41 @@ def test_rosbags_reads_the_tracks(vehicle_replays):
                                          strict=True):
         p = m.pose.pose.position
         np.testing.assert_array_equal([p.x, p.y, p.z], position)
-        said = m.pose.covariance.reshape(6, 6)[:3, :3]
+        covariance = m.pose.covariance.reshape(6, 6)[:3, :3]
         if ambiguous:
-            # It has no flag: its covariance is that of all that is possible.
-            assert np.linalg.eigvalsh(said - C[:3, :3]).min() > -1e-9
+            # A pose message has no flag: its covariance covers all hypotheses.
+            assert np.linalg.eigvalsh(covariance - C[:3, :3]).min() > -1e-9
         else:
-            np.testing.assert_array_equal(said, C[:3, :3])
+            np.testing.assert_array_equal(covariance, C[:3, :3])
     assert [t.tracks[0].status for t in tracks] == [0] * len(poses) + [1]
 
 
-def fields(text):
-    """The declarations of a definition, without comments and spacing."""
+def declarations(text):
+    """Declarations of a definition without comments and spacing."""
     lines = (line.split('#')[0].split() for line in text.splitlines())
     return [' '.join(line) for line in lines if line]
 
 
-def test_definitions_are_those_of_the_message_package():
+def test_definitions_match_the_message_package():
     for name, text in DEFINITIONS.items():
         if name.startswith('mag_tracking_msgs/'):
             source = ROOT / 'msg_defs' / 'msg' / f'{name.split("/")[-1]}.msg'
-            assert fields(source.read_text()) == fields(text), name
+            assert declarations(source.read_text()) == declarations(text), name
 
 
-def test_definitions_are_those_of_jazzy():
+def test_definitions_match_ros_jazzy():
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in DEFINITIONS.items():
         if not name.startswith('mag_tracking_msgs/'):
             ours = get_types_from_msg(text, name)[name]
-            # The generated text has them in the same order with the same types.
+            # The names of the fields and their order are compared.
             theirs = store.fielddefs[name]
             assert [f[0] for f in ours[1]] == [f[0] for f in theirs[1]], name
 
 
 def test_every_field_of_a_track_is_written(vehicle_replays):
-    """The encoder fills a missing field with zero without a word: none may be missing."""
-    names = {line.split()[1] for line in fields(DEFINITIONS['mag_tracking_msgs/msg/Track'])
+    """The encoder silently writes zero for a missing field."""
+    names = {line.split()[1] for line in declarations(DEFINITIONS['mag_tracking_msgs/msg/Track'])
              if '=' not in line}
     _, folder = vehicle_replays['straight_car_right']
     message = next(m for m in Recording(folder / 'tracks.mcap').messages()
@@ -126,7 +126,7 @@ def test_every_field_of_a_track_is_written(vehicle_replays):
     assert all(f"'{name}'" in source for name in names)
 
 
-def test_a_cut_file_is_read_up_to_the_cut(tmp_path):
+def test_a_truncated_file_is_read_up_to_its_end(tmp_path):
     path = tmp_path / 'cut.mcap'
     write(tmp_path / 'a.mcap', 15_000)
     whole = (tmp_path / 'a.mcap').read_bytes()
@@ -138,7 +138,7 @@ def test_a_cut_file_is_read_up_to_the_cut(tmp_path):
     assert [m.log_time_ns for m in messages] == sorted(m.log_time_ns for m in messages)
 
 
-def test_flipped_bytes_cost_their_chunk_and_are_told(tmp_path):
+def test_flipped_bytes_cost_only_their_chunk_and_are_reported(tmp_path):
     path = tmp_path / 'a.mcap'
     write(path, 15_000)
     data = bytearray(path.read_bytes())
@@ -153,7 +153,7 @@ def test_flipped_bytes_cost_their_chunk_and_are_told(tmp_path):
 
 
 @pytest.mark.parametrize('seed', range(12))
-def test_random_damage_never_crashes(tmp_path, seed):
+def test_random_damage_does_not_crash_the_reader(tmp_path, seed):
     rng = np.random.default_rng(seed)
     data = bytearray(vehicle_path(JUNCTION).read_bytes())
     for i in rng.integers(0, len(data), 30):
@@ -170,7 +170,7 @@ def test_random_damage_never_crashes(tmp_path, seed):
 
 
 @pytest.mark.study
-def test_memory_is_flat(tmp_path):
+def test_reader_memory_does_not_grow_with_the_recording(tmp_path):
     peaks = []
     for n in (10_000, 40_000):
         path = tmp_path / str(n) / 'a.mcap'
@@ -184,8 +184,8 @@ def test_memory_is_flat(tmp_path):
     assert peaks[1] < 1.2 * peaks[0] < 9e6, peaks
 
 
-def test_chunks_that_overlap_come_out_in_order(tmp_path):
-    """A file written topic by topic: every chunk of the second lies in the past."""
+def test_overlapping_chunks_are_read_in_order(tmp_path):
+    """The file is written topic by topic, so all chunks of the second topic lie in the past."""
     path = tmp_path / 'a.mcap'
     with RecordingWriter(path) as writer:
         for j in range(2):
@@ -196,7 +196,7 @@ def test_chunks_that_overlap_come_out_in_order(tmp_path):
     assert len(times) == 40_000 and times == sorted(times)
 
 
-def test_start_offset_and_topics():
+def test_messages_are_selected_by_topic_and_start_time():
     recording = Recording(vehicle_path(JUNCTION))
     start = recording.start_ns + 5_000_000_000
     messages = list(recording.messages({'/mag_1/imu/mag'}, start))
@@ -205,7 +205,7 @@ def test_start_offset_and_topics():
     assert len(messages) == 1500
 
 
-def test_unusable_recordings_are_named(tmp_path, road_network):
+def test_unusable_recordings_are_refused(tmp_path, road_network):
     empty = tmp_path / 'empty.mcap'
     empty.write_bytes(b'')
     text = tmp_path / 'text.mcap'
@@ -224,7 +224,7 @@ def test_unusable_recordings_are_named(tmp_path, road_network):
         Recording(folder)
 
 
-def test_a_recording_without_the_topics_says_what_it_has(tmp_path, road_network):
+def test_the_error_for_missing_topics_lists_the_recorded_ones(tmp_path, road_network):
     path = tmp_path / 'a.mcap'
     with RecordingWriter(path) as writer:
         s = MagSample(0, 'x', np.zeros(3))
@@ -233,7 +233,7 @@ def test_a_recording_without_the_topics_says_what_it_has(tmp_path, road_network)
         SampleReader(Recording(path), road_network)
 
 
-def test_a_topic_of_another_type_is_named(tmp_path, road_network):
+def test_a_topic_of_another_type_is_refused(tmp_path, road_network):
     path = tmp_path / 'a.mcap'
     with RecordingWriter(path) as writer:
         writer.write('/mag_1/imu/mag', 'std_msgs/msg/Header', header_dict(0, 'x'), 0)
@@ -241,21 +241,21 @@ def test_a_topic_of_another_type_is_named(tmp_path, road_network):
         SampleReader(Recording(path), road_network)
 
 
-def test_a_recording_without_messages_gives_none(tmp_path, road_network):
+def test_a_recording_without_messages_gives_no_samples(tmp_path, road_network):
     path = tmp_path / 'a.mcap'
     with RecordingWriter(path):
         pass
     assert recorded(SampleReader(Recording(path), road_network)) == []
 
 
-def test_an_unwritable_place_is_named(tmp_path):
+def test_an_unwritable_path_is_reported(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(OutputError, match='cannot write'):
         RecordingWriter(tmp_path / 'file' / 'a.mcap')
 
 
 def write_raw(path, log_times, use_chunking=True):
-    """A recording of one topic whose messages have these log times, which may be any."""
+    """Write a recording of one topic with arbitrary log times."""
     with open(path, 'wb') as stream:
         writer = Writer(stream, use_chunking=use_chunking)
         writer.start('ros2', 'test')
@@ -267,16 +267,16 @@ def write_raw(path, log_times, use_chunking=True):
 
 
 @pytest.mark.parametrize('use_chunking', [True, False])
-def test_a_log_time_that_no_clock_shows_costs_nothing(tmp_path, use_chunking):
-    """MCAP has 64 bits without a sign for it."""
+def test_log_times_beyond_63_bits_are_limited_without_loss(tmp_path, use_chunking):
+    """MCAP stores log times as unsigned 64-bit integers."""
     write_raw(tmp_path / 'a.mcap', [1, 2, 2**63, 2**64 - 1], use_chunking)
     messages, recording = read(tmp_path / 'a.mcap')
     assert [m.data for m in messages] == [b'message %d' % k for k in range(4)]
     assert messages[-1].log_time_ns == LATEST_NS and not recording.losses
 
 
-def test_messages_without_chunks_are_read_together(tmp_path):
-    """And those before the place where a file is cut are kept."""
+def test_messages_without_chunks_are_read_in_blocks(tmp_path):
+    """The messages before the end of a truncated file are read."""
     write_raw(tmp_path / 'a.mcap', range(1000), use_chunking=False)
     blocks = list(Recording(tmp_path / 'a.mcap').blocks())
     assert sum(map(len, blocks)) == 1000 and len(blocks) <= 5

@@ -1,4 +1,4 @@
-"""The recorder: what it writes others read; files, splits and latched messages."""
+"""Recorder: readability by other software, splits and latched messages."""
 
 import errno
 
@@ -14,12 +14,12 @@ from mag_tracking.recording.recorder import FLUSH_INTERVAL_NS, Recorder
 from mag_tracking.recording.writer import offered_qos
 from support.recorded_numbers import TOPIC, S, by_rosbags, field, numbers, started
 
-# A kill in time, or a full disk, is not tested beside what computes.
+# Not run in parallel with tests that load the machine.
 pytestmark = pytest.mark.alone
 
 
-def test_what_is_recorded_is_read_by_others(tmp_path):
-    recorder, told = started(tmp_path / 'a')
+def test_a_recording_is_read_by_rosbags_and_mcap(tmp_path):
+    recorder, reports = started(tmp_path / 'a')
     pose = 'geometry_msgs/msg/PoseStamped'
     recorder.add_topic('/pose', pose, definition(pose), offered_qos(False, True))
     content = {'header': {'stamp': {'sec': 3, 'nanosec': 4}, 'frame_id': 'map'}}
@@ -28,7 +28,7 @@ def test_what_is_recorded_is_read_by_others(tmp_path):
         if k % 100 == 0:
             recorder.write('/pose', encoder(pose)(content), 7 * S + k * 1000 + 1)
     recorder.close()
-    assert numbers(tmp_path / 'a')[0] == list(range(300)) and told == []
+    assert numbers(tmp_path / 'a')[0] == list(range(300)) and reports == []
     assert by_rosbags(tmp_path / 'a') == [(7 * S + k * 1000, k) for k in range(300)]
     with Reader(tmp_path / 'a') as reader:
         assert {t: (i.msgtype, i.msgcount) for t, i in reader.topics.items()} == {
@@ -46,7 +46,7 @@ def test_what_is_recorded_is_read_by_others(tmp_path):
     assert rows == [('ros2msg', 'cdr', k, 300) for k in range(300)]
 
 
-def test_what_waits_is_written_though_nothing_more_comes(tmp_path):
+def test_buffered_messages_are_written_without_further_input(tmp_path):
     recorder, _ = started(tmp_path / 'a')
     recorder.write(TOPIC, field(0), 5)
     recorder.tick(S + FLUSH_INTERVAL_NS - 1)
@@ -57,7 +57,7 @@ def test_what_waits_is_written_though_nothing_more_comes(tmp_path):
     assert numbers(tmp_path / 'a')[0] == [0]
 
 
-def test_a_recording_without_messages_is_one(tmp_path):
+def test_a_recording_without_messages_is_valid(tmp_path):
     recorder, _ = started(tmp_path / 'a')
     recorder.tick(9000 * S)
     recorder.close()
@@ -66,9 +66,9 @@ def test_a_recording_without_messages_is_one(tmp_path):
     assert [p.name for p in (tmp_path / 'a').glob('*.mcap')] == ['a_0.mcap']
 
 
-@pytest.mark.parametrize('how', ['size', 'time'])
-def test_each_file_of_a_split_recording_stands_alone(tmp_path, how):
-    limits = {'size': {'split_bytes': 20_000}, 'time': {'split_ns': 2 * S}}[how]
+@pytest.mark.parametrize('split_by', ['size', 'time'])
+def test_each_file_of_a_split_recording_is_complete(tmp_path, split_by):
+    limits = {'size': {'split_bytes': 20_000}, 'time': {'split_ns': 2 * S}}[split_by]
     recorder, _ = started(tmp_path / 'a', **limits)
     recorder.add_topic('/map', MAGNETIC_FIELD, definition(MAGNETIC_FIELD),
                        offered_qos(True, True), latched=1)
@@ -81,20 +81,20 @@ def test_each_file_of_a_split_recording_stands_alone(tmp_path, how):
             metadata = yaml.safe_load((tmp_path / 'a' / 'metadata.yaml').read_text())
     recorder.close()
     files = sorted((tmp_path / 'a').glob('*.mcap'), key=lambda p: int(p.stem.split('_')[1]))
-    assert len(files) == 5 if how == 'time' else max(p.stat().st_size for p in files) < 23_000
+    assert len(files) == 5 if split_by == 'time' else max(p.stat().st_size for p in files) < 23_000
     assert len(files) >= 4
-    # In the middle of it, the list names the finished files and the open one.
+    # During the recording, metadata.yaml lists the finished files and the open one.
     listed = metadata['rosbag2_bagfile_information']['relative_file_paths']
     assert listed == [p.name for p in files[:len(listed)]] and 1 < len(listed) < len(files)
-    got = []
+    all_rows = []
     for n, file in enumerate(files):
-        mine = by_rosbags(file)
-        assert mine and mine == by_rosbags(file) and numbers(file)[0] == [k for _, k in mine]
-        # The latest of the latched ones, at the time of the first of the others.
+        rows = by_rosbags(file)
+        assert rows and rows == by_rosbags(file) and numbers(file)[0] == [k for _, k in rows]
+        # Later files begin with the latest latched message, at the time of the first other one.
         assert by_rosbags(file, '/map') == ([(107, 7), (108, 8), (109, 9)] if n == 0
-                                            else [(mine[0][0], 9)])
-        got += mine
-    assert got == [(1000 + k, k) for k in range(1000)] == by_rosbags(tmp_path / 'a')
+                                            else [(rows[0][0], 9)])
+        all_rows += rows
+    assert all_rows == [(1000 + k, k) for k in range(1000)] == by_rosbags(tmp_path / 'a')
     assert recorder.repeated == len(files) - 1
     assert recorder.counts == {TOPIC: 1000, '/map': 3}
     with Reader(tmp_path / 'a') as reader:
@@ -102,7 +102,7 @@ def test_each_file_of_a_split_recording_stands_alone(tmp_path, how):
         assert (reader.start_time, reader.end_time) == (107, 2000)
 
 
-def test_more_publishers_more_latched_messages(tmp_path):
+def test_each_publisher_adds_a_latched_message(tmp_path):
     recorder, _ = started(tmp_path / 'a', split_ns=S)
     recorder.add_topic(TOPIC, MAGNETIC_FIELD, latched=1)
     recorder.write(TOPIC, field(1), 1)
@@ -123,20 +123,20 @@ def test_a_folder_with_another_recording_is_refused(tmp_path, name):
     assert (tmp_path / name).read_text() == 'kept' and len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_place_where_nothing_can_be_written_is_named(tmp_path):
+def test_an_unwritable_folder_is_reported(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(OutputError, match='file is not a folder'):
         Recorder(tmp_path / 'file')
     with pytest.raises(OutputError, match='cannot record in .*Not a directory'):
         Recorder(tmp_path / 'file' / 'a')
 
-    def forbidden(path):
+    def refuse(path):
         raise PermissionError(errno.EACCES, 'Permission denied')
     with pytest.raises(OutputError, match='cannot record in .*Permission denied'):
-        Recorder(tmp_path / 'a', opener=forbidden)
+        Recorder(tmp_path / 'a', opener=refuse)
 
 
-def test_a_type_without_definition_is_recorded_all_the_same(tmp_path):
+def test_a_type_without_a_definition_is_recorded(tmp_path):
     recorder, _ = started(tmp_path / 'a')
     recorder.add_topic('/odd', 'odd_msgs/msg/Odd')
     recorder.write('/odd', b'\0\1\0\0abcd', 1)

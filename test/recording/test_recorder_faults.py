@@ -1,4 +1,4 @@
-"""The recorder where it is killed or the disk fails: what is lost is little, and told."""
+"""Recorder during kills and disk failures: losses are small and reported."""
 
 import errno
 import io
@@ -20,13 +20,13 @@ from support.bundled import ROOT
 from support.marks import studied
 from support.recorded_numbers import TOPIC, S, by_rosbags, field, numbers, started
 
-# A kill in time, or a full disk, is not tested beside what computes.
+# Not run in parallel with tests that load the machine.
 pytestmark = pytest.mark.alone
 TEST_FOLDER = str(ROOT / 'test')
 
 
-class Disk:
-    """An opener of files on a disk of a few bytes."""
+class SmallDisk:
+    """Opener of files on a disk with `room` free bytes."""
 
     def __init__(self, room):
         self.room = room
@@ -67,8 +67,8 @@ for k, d in enumerate(data):
 '''
 
 
-def killed(folder, after_s):
-    """(numbers, times [ns]) that a recorder process had taken when it was killed."""
+def record_until_killed(folder, after_s):
+    """(numbers, times [ns]) of the messages that a process had recorded when it was killed."""
     process = subprocess.Popen([sys.executable, '-c', RECORD_UNTIL_KILLED, folder,
                                 TEST_FOLDER], stdout=subprocess.PIPE)
     with process:
@@ -86,17 +86,17 @@ def test_kills_lose_less_than_a_second(tmp_path, n_kills):
     worst_n = worst_s = n_cut = 0
     for n in range(0, 20, 20 // n_kills):
         folder = tmp_path / f'r{n}'
-        taken, times = killed(folder, 0.1 + 0.05 * n)
+        recorded, times = record_until_killed(folder, 0.1 + 0.05 * n)
         found, recording = numbers(folder)
-        assert found == list(range(len(found))) and len(found) <= len(taken) + 1
-        assert all(re.search('no valid index|unreadable after byte', what)
-                   for what in recording.losses), recording.losses
-        lost = len(taken) - len(found)
+        assert found == list(range(len(found))) and len(found) <= len(recorded) + 1
+        assert all(re.search('no valid index|unreadable after byte', loss)
+                   for loss in recording.losses), recording.losses
+        lost = len(recorded) - len(found)
         if lost > 0:
             worst_n, worst_s = max(worst_n, lost), max(
                 worst_s, (times[-1] - times[len(found)]) / S)
-        # Another reader wants the index, which the last file has only after a repair,
-        # or if it was killed in the moment between two files.
+        # Other readers need the index. The last file has none before the repair, unless the
+        # process was killed between two files.
         if recording.losses:
             n_cut += 1
             with pytest.raises(AnyReaderError, match='end magic'):
@@ -108,9 +108,9 @@ def test_kills_lose_less_than_a_second(tmp_path, n_kills):
     assert worst_s < 1.0 and n_cut > n_kills / 2
 
 
-def test_a_full_disk_is_told_and_it_goes_on(tmp_path):
-    disk = Disk(40_000)
-    recorder, told = started(tmp_path / 'a', opener=disk, retry_ns=S)
+def test_a_full_disk_is_reported_and_the_recording_continues(tmp_path):
+    disk = SmallDisk(40_000)
+    recorder, reports = started(tmp_path / 'a', opener=disk, retry_ns=S)
     for k in range(2000):
         if k == 1000:
             before = recorder.dropped[TOPIC]
@@ -122,18 +122,18 @@ def test_a_full_disk_is_told_and_it_goes_on(tmp_path):
     dropped = recorder.dropped[TOPIC]
     assert recorder.counts[TOPIC] == len(found) == 2000 - dropped
     assert 100 < before < dropped <= before + 100
-    # One gap: from the chunk that found no room to the first try after there was some.
+    # One gap: from the first chunk without space to the first retry with space.
     first = found.index(next(b for a, b in zip(found, found[1:], strict=False) if b != a + 1))
     assert found[:first] == list(range(first)) and found[first:] == list(range(first + dropped,
                                                                               2000))
-    assert len(told) == 2 and 'No space left' in told[0] and f': {dropped}' in told[1]
+    assert len(reports) == 2 and 'No space left' in reports[0] and f': {dropped}' in reports[1]
     assert not recorder.unfinished and not recording.losses
     assert [k for _, k in by_rosbags(tmp_path / 'a')] == found
 
 
-def test_a_disk_that_stays_full_leaves_what_can_be_repaired(tmp_path):
-    disk = Disk(40_000)
-    recorder, told = started(tmp_path / 'a', opener=disk, split_bytes=15_000)
+def test_a_recording_on_a_full_disk_can_be_repaired(tmp_path):
+    disk = SmallDisk(40_000)
+    recorder, reports = started(tmp_path / 'a', opener=disk, split_bytes=15_000)
     for k in range(2000):
         recorder.write(TOPIC, field(k), k)
         recorder.tick(S + k * S // 100)
@@ -142,40 +142,40 @@ def test_a_disk_that_stays_full_leaves_what_can_be_repaired(tmp_path):
     assert found == list(range(len(found)))
     recorder.close()
     assert numbers(tmp_path / 'a')[0] == found
-    assert any(f'mag-tracking repair {tmp_path / "a"}' in text for text in told)
+    assert any(f'mag-tracking repair {tmp_path / "a"}' in text for text in reports)
     repair(tmp_path / 'a')
     assert [k for _, k in by_rosbags(tmp_path / 'a')] == found
     assert sorted(p.suffix for p in (tmp_path / 'a').iterdir() if p.suffix != '.mcap') == ['.yaml']
 
 
-LIMITED = '''
+RECORD_WITH_FILE_LIMIT = '''
 import resource, sys
 sys.path.insert(0, sys.argv[2])
 from support.recorded_numbers import S, TOPIC, field, started
 resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000))
-recorder, told = started(sys.argv[1], retry_ns=S // 2)
+recorder, reports = started(sys.argv[1], retry_ns=S // 2)
 for k in range(1500):
     recorder.write(TOPIC, field(k), k)
     recorder.tick(S + k * S // 100)
 recorder.close()
-print(recorder.counts[TOPIC], recorder.dropped[TOPIC], len(told), len(recorder.unfinished))
+print(recorder.counts[TOPIC], recorder.dropped[TOPIC], len(reports), len(recorder.unfinished))
 '''
 
 
-def test_a_limit_of_the_system_on_the_size_of_files(tmp_path):
-    """Real short writes; what is unfinished at the end has no room for its index even then."""
-    done = subprocess.run([sys.executable, '-c', LIMITED, tmp_path / 'a',
+def test_recording_survives_a_file_size_limit_of_the_system(tmp_path):
+    """The short writes are real. An unfinished file has no room for its index until the end."""
+    done = subprocess.run([sys.executable, '-c', RECORD_WITH_FILE_LIMIT, tmp_path / 'a',
                            TEST_FOLDER], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    counted, dropped, told, _ = map(int, done.stdout.split())
+    n_recorded, dropped, n_reports, _ = map(int, done.stdout.split())
     found, _ = numbers(tmp_path / 'a')
-    assert counted == len(found) == 1500 - dropped and dropped > 0 and told >= 4
+    assert n_recorded == len(found) == 1500 - dropped and dropped > 0 and n_reports >= 4
     repair(tmp_path / 'a', report=lambda _: None)
     assert [k for _, k in by_rosbags(tmp_path / 'a')] == found
 
 
-def test_a_folder_that_is_removed_is_told_and_made_again(tmp_path):
-    recorder, told = started(tmp_path / 'a', retry_ns=S)
+def test_a_removed_folder_is_reported_and_created_again(tmp_path):
+    recorder, reports = started(tmp_path / 'a', retry_ns=S)
     for k in range(500):
         if k == 100:
             for p in (tmp_path / 'a').iterdir():
@@ -186,4 +186,4 @@ def test_a_folder_that_is_removed_is_told_and_made_again(tmp_path):
     recorder.close()
     found, _ = numbers(tmp_path / 'a')
     assert found == list(range(recorder.dropped[TOPIC], 500)) and 100 < len(found) < 400
-    assert recorder.counts[TOPIC] == len(found) and 'was removed' in told[0]
+    assert recorder.counts[TOPIC] == len(found) and 'was removed' in reports[0]

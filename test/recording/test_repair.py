@@ -1,4 +1,4 @@
-"""Repair of recordings that were cut or damaged, and of nothing else."""
+"""Repair of truncated and damaged recordings."""
 
 import io
 import struct
@@ -16,25 +16,25 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.repair import finish_file, repair
 from support.recorded_numbers import TOPIC, S, by_rosbags, field, numbers, started
 
-# A kill in time, or a full disk, is not tested beside what computes.
+# Not run in parallel with tests that load the machine.
 pytestmark = pytest.mark.alone
 
 
-def torn_recording(tmp_path, tick=True):
-    """The bytes of a recording file of two topics, as it is before it is finished."""
+def unfinished_recording(tmp_path, tick=True):
+    """(bytes of an unfinished recording file with two topics, bytes of the finished file)."""
     recorder, _ = started(tmp_path / 'source')
     recorder.add_topic('/other', MAGNETIC_FIELD, definition(MAGNETIC_FIELD))
     for k in range(200):
         recorder.write(TOPIC, field(k), k)
         recorder.write('/other', field(k), k)
         recorder.tick(S + k * S // 100)
-    whole = (tmp_path / 'source' / 'source_0.mcap').read_bytes()
+    unfinished = (tmp_path / 'source' / 'source_0.mcap').read_bytes()
     recorder.close()
-    return whole, (tmp_path / 'source' / 'source_0.mcap').read_bytes()
+    return unfinished, (tmp_path / 'source' / 'source_0.mcap').read_bytes()
 
 
-def test_repair_at_whatever_byte_it_was_cut(tmp_path):
-    unfinished, finished = torn_recording(tmp_path)
+def test_repair_recovers_a_file_truncated_at_any_byte(tmp_path):
+    unfinished, finished = unfinished_recording(tmp_path)
     assert finished.startswith(unfinished)
     data = finished[:-8]
     last = [c for c in make_reader(io.BytesIO(finished)).get_summary().chunk_indexes
@@ -46,8 +46,8 @@ def test_repair_at_whatever_byte_it_was_cut(tmp_path):
                        last_chunk_end + 9, len(unfinished), len(data)}):
         file.write_bytes(data[:cut])
         before = {t: numbers(file, t)[0] for t in (TOPIC, '/other')}
-        told = []
-        assert repair(file.parent, told.append) == 1
+        reports = []
+        assert repair(file.parent, reports.append) == 1
         with open(file, 'rb') as stream:
             reader = make_reader(stream, validate_crcs=True)
             for topic, found in before.items():
@@ -56,7 +56,7 @@ def test_repair_at_whatever_byte_it_was_cut(tmp_path):
             assert [k for _, k in by_rosbags(file.parent, topic)] == found
         torn = file.with_name('x_0.mcap.cut')
         kept = torn.read_bytes() if torn.exists() else b''
-        assert any(f'last {len(kept)} bytes' in line for line in told) == bool(kept)
+        assert any(f'last {len(kept)} bytes' in line for line in reports) == bool(kept)
         if cut <= len(unfinished):
             head = file.read_bytes()
             assert head.startswith(data[:cut - len(kept)]) and data[:cut].endswith(kept)
@@ -65,13 +65,13 @@ def test_repair_at_whatever_byte_it_was_cut(tmp_path):
         start, _, crc = struct.unpack('<QQI', repaired[-28:-8])
         assert crc == zlib.crc32(repaired[start:-12])
         if last_chunk_end <= cut <= len(unfinished):
-            # The indexes of the last chunk are made as they would have been.
+            # The rebuilt indexes of the last chunk equal the original ones.
             assert repaired.startswith(unfinished)
         assert repair(file.parent) == 0 and file.read_bytes() == repaired
 
 
 def stamp_ns_of(message):
-    """The number in the bytes of a magnetic field: its stamp comes first."""
+    """Timestamp of a serialised magnetic field, which comes first in its bytes."""
     sec, nanosec = struct.unpack_from('<iI', message.data, 4)
     return sec * S + nanosec
 
@@ -91,8 +91,8 @@ def test_repair_keeps_the_order_of_many_files(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['a_0.mcap', 'a_12.mcap'])
-def test_an_empty_file_of_a_crash_costs_nothing_else(tmp_path, name):
-    """A split had begun, or the first file."""
+def test_an_empty_file_after_a_crash_costs_no_other_file(tmp_path, name):
+    """The empty file is the first one, or that of a split that had just begun."""
     recorder, _ = started(tmp_path / 'a', split_ns=S)
     for k in range(24):
         recorder.write(TOPIC, field(k), k)
@@ -102,30 +102,30 @@ def test_an_empty_file_of_a_crash_costs_nothing_else(tmp_path, name):
     assert len(kept) < 24
     (tmp_path / 'a' / name).write_bytes(b'')
     (tmp_path / 'a' / 'metadata.yaml').unlink()
-    whole = Recording(tmp_path / 'a')
-    assert len(list(whole.messages())) == len(kept)
-    assert whole.losses[f'{name} is empty (0 bytes)'] == 1
-    said = []
-    repair(tmp_path / 'a', said.append)
-    assert said == [f'{tmp_path / "a" / name} is empty and was skipped']
+    recording = Recording(tmp_path / 'a')
+    assert len(list(recording.messages())) == len(kept)
+    assert recording.losses[f'{name} is empty (0 bytes)'] == 1
+    reports = []
+    repair(tmp_path / 'a', reports.append)
+    assert reports == [f'{tmp_path / "a" / name} is empty and was skipped']
     assert numbers(tmp_path / 'a')[0] == kept
 
 
-def test_repair_leaves_out_and_tells_a_damaged_chunk(tmp_path):
-    unfinished, finished = torn_recording(tmp_path)
+def test_repair_skips_and_reports_a_damaged_chunk(tmp_path):
+    unfinished, finished = unfinished_recording(tmp_path)
     file = tmp_path / 'x.mcap'
     broken = bytearray(unfinished)
     middle = make_reader(io.BytesIO(finished)).get_summary().chunk_indexes[2]
     broken[middle.chunk_start_offset + middle.chunk_length // 2] ^= 0xFF
     file.write_bytes(broken)
-    before, told = numbers(file)[0], []
+    before, reports = numbers(file)[0], []
     assert 0 < len(before) < 200
-    assert repair(file, told.append) == 1
-    assert any('damaged chunks skipped: 1' in line for line in told), told
+    assert repair(file, reports.append) == 1
+    assert any('damaged chunks skipped: 1' in line for line in reports), reports
     assert [k for _, k in by_rosbags(file)] == before
 
 
-def test_what_is_being_recorded_is_not_repaired(tmp_path):
+def test_a_recording_in_progress_is_not_repaired(tmp_path):
     recorder, _ = started(tmp_path / 'a')
     recorder.write(TOPIC, field(0), 1)
     with pytest.raises(OutputError, match='a_0.mcap is being recorded'):
@@ -134,7 +134,7 @@ def test_what_is_being_recorded_is_not_repaired(tmp_path):
     assert numbers(tmp_path / 'a')[0] == [0] and repair(tmp_path / 'a') == 0
 
 
-def test_repair_names_what_is_no_recording(tmp_path):
+def test_repair_refuses_files_that_are_no_recording(tmp_path):
     with pytest.raises(RecordingError, match='contains no .mcap file'):
         repair(tmp_path / 'nothing')
     (tmp_path / 'x.mcap').write_text('nonsense of some length')
@@ -146,7 +146,7 @@ def test_repair_names_what_is_no_recording(tmp_path):
 @pytest.mark.parametrize('qos', ['a: [', '[' * 80 + ']' * 80, '\n'.join(
     ['a0: &a0 [1, 1, 1, 1]'] + [f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]'
                                 for k in range(1, 30)])])
-def test_repair_names_a_topic_whose_qos_is_not_yaml(tmp_path, qos):
+def test_repair_refuses_a_topic_whose_qos_is_not_yaml(tmp_path, qos):
     with open(tmp_path / 'x_0.mcap', 'wb') as stream:
         writer = Writer(stream)
         writer.start()

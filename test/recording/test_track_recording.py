@@ -1,4 +1,4 @@
-"""`tracks.mcap` holds what viewers of ROS need: read back by an independent library."""
+"""`tracks.mcap` contains what ROS viewers need; it is read by an independent library."""
 
 import numpy as np
 import pytest
@@ -26,12 +26,12 @@ def read(vehicle_replays):
     return run, messages, durability
 
 
-def test_every_topic_is_there(read):
+def test_every_topic_is_recorded(read):
     _, messages, durability = read
     assert messages.keys() == TOPICS
     latched = {topic for topic, name in durability.items() if name == 'TRANSIENT_LOCAL'}
     assert latched == {'/tf_static', '/tracker_node/sensor_markers'}
-    # Where the sensors are is known from the first message on.
+    # The positions of the sensors come with the first message.
     first = min(time_ns for rows in messages.values() for time_ns, _ in rows)
     assert all(messages[topic][0][0] == first and len(messages[topic]) == 1 for topic in latched)
 
@@ -40,15 +40,15 @@ def test_each_pose_has_its_odometry_transform_and_markers(read):
     run, messages, _ = read
     log = run.logs[1]
     n = len(log.stamp_ns)
-    sure = [k for k in range(n) if not log.ambiguous[k]]
+    unambiguous = [k for k in range(n) if not log.ambiguous[k]]
     assert [len(messages[t]) for t in ('/tracker_node/pose', '/tracker_node/odometry', '/tf')] == [
-        n, n, len(sure)]
+        n, n, len(unambiguous)]
     for position, (_, odometry) in zip(log.position, messages['/tracker_node/odometry'],
                                        strict=True):
         p = odometry.pose.pose.position
         assert [p.x, p.y, p.z] == position.tolist() and odometry.child_frame_id == 'track_1'
-    # A transform has no covariance: ambiguous poses have none.
-    for k, (_, tf) in zip(sure, messages['/tf'], strict=True):
+    # A transform has no covariance, so ambiguous poses have no transform.
+    for k, (_, tf) in zip(unambiguous, messages['/tf'], strict=True):
         (transform,) = tf.transforms
         t = transform.transform.translation
         assert [t.x, t.y, t.z] == log.position[k].tolist()
@@ -61,7 +61,7 @@ def test_each_pose_has_its_odometry_transform_and_markers(read):
     assert {m.ns for m in sensors} == set(SENSOR_KINDS)
 
 
-def test_paths_are_the_whole_track(read):
+def test_paths_contain_the_whole_track(read):
     run, messages, _ = read
     for topic, log in (('path', run.logs[1]), ('path_smoothed', run.smoothed[1])):
         ((_, path),) = messages[f'/tracker_node/{topic}']
@@ -71,7 +71,7 @@ def test_paths_are_the_whole_track(read):
     assert len(smoothed.poses) == len(run.smoothed[1].position)
 
 
-def test_fields_are_those_that_were_tracked(read):
+def test_recorded_fields_are_those_that_were_tracked(read):
     run, messages, _ = read
     log = run.logs[1]
     for j in (0, 1):
@@ -80,5 +80,5 @@ def test_fields_are_those_that_were_tracked(read):
         compared = [(found[stamp], field[j]) for stamp, field in zip(
             log.stamp_ns, log.measured, strict=True) if stamp in found]
         assert len(compared) > 0.5 * len(log.stamp_ns)
-        for ours, theirs in compared:
-            np.testing.assert_array_equal([ours.x, ours.y, ours.z], theirs)
+        for recorded, tracked in compared:
+            np.testing.assert_array_equal([recorded.x, recorded.y, recorded.z], tracked)

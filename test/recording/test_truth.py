@@ -1,4 +1,4 @@
-"""Truth from topics of several types and from tables; trajectories for others."""
+"""Truth from topics of two types and from tables, and trajectory files."""
 
 import csv
 import dataclasses
@@ -32,12 +32,12 @@ NAME = 'straight_car_fast_left'
 
 
 def pose(x):
-    """geometry_msgs/Pose."""
+    """geometry_msgs/Pose at (x, 2, 3)."""
     return {'position': {'x': x, 'y': 2.0, 'z': 3.0}, 'orientation': {'w': 1.0}}
 
 
 def recording_of(path, frame):
-    """A recording with a field, and poses of two types on topics of their own."""
+    """Recording with a field, and with poses of two types on two topics."""
     sample = MagSample(10**9, 'mag_1', [0.0, 0.0, 0.0])
     with RecordingWriter(path) as writer:
         writer.write('/mag_1/imu/mag', MAGNETIC_FIELD, sample_dict(sample, 'mag_1'), 10**9)
@@ -51,13 +51,13 @@ def recording_of(path, frame):
 
 
 def truth_of(recording, topic, network=None):
-    """What a reader finds: (arrays, rejected)."""
+    """(truth arrays, rejected messages) of a reader."""
     reader = SampleReader(recording, network or line_network(2), topic)
     list(reader.readings())
     return reader.truth_arrays(), dict(reader.rejected)
 
 
-def test_a_topic_of_either_type_is_truth_in_order_of_time(tmp_path):
+def test_poses_of_either_type_are_truth_in_order_of_time(tmp_path):
     recording = recording_of(tmp_path / 'a.mcap', 'map')
     assert truth_of(recording, None) == ({}, {})
     for topic, name, first in (('/gnss/pose', '/gnss', 1.0), ('/slam', '/slam', 10.0)):
@@ -69,9 +69,8 @@ def test_a_topic_of_either_type_is_truth_in_order_of_time(tmp_path):
         assert quaternion.tolist() == [[0.0, 0.0, 0.0, 1.0]] * 2
 
 
-def test_poses_are_taken_in_blocks_and_put_in_order_of_their_stamps():
-    """Those of two channels of one topic, in the order of the log; other frames and types are left
-    to the decoder."""
+def test_poses_are_read_in_blocks_and_sorted_by_timestamp():
+    """Other frames and encodings are left to the decoder."""
     def message(topic, stamp_ns, frame='map', kind=POSE):
         return RawMessage(topic, kind, 0, encoder(POSE)({
             'header': header_dict(stamp_ns, frame), 'pose': pose(float(stamp_ns))}),
@@ -94,24 +93,24 @@ def test_poses_are_taken_in_blocks_and_put_in_order_of_their_stamps():
     assert stamps.tolist() == [20, 30] and position[:, 0].tolist() == [20.0, 30.0]
 
 
-def test_truth_in_another_frame_is_not_compared_and_said(tmp_path):
+def test_truth_in_another_frame_is_rejected_with_a_reason(tmp_path):
     recording = recording_of(tmp_path / 'a.mcap', 'odom')
     assert truth_of(recording, '/slam') == ({}, {'truth on /slam is in frame odom, not map': 2})
     network = dataclasses.replace(line_network(2), frame='odom')
     assert list(truth_of(recording, '/slam', network)[0]) == ['/slam']
 
 
-@pytest.mark.parametrize('topic, told', [
+@pytest.mark.parametrize('topic, message', [
     ('/nowhere', 'the truth topic /nowhere is not in the recording; topics with poses: /gnss/pose'),
     ('nowhere', 'the truth topic /nowhere is not in the recording'),
     ('/mag_1/imu/mag', 'the truth topic /mag_1/imu/mag is sensor_msgs/msg/MagneticField')])
-def test_a_topic_that_cannot_be_truth_is_named(tmp_path, topic, told):
-    with pytest.raises(RecordingError, match=told):
+def test_a_topic_without_poses_is_refused_as_truth(tmp_path, topic, message):
+    with pytest.raises(RecordingError, match=message):
         truth_of(recording_of(tmp_path / 'a.mcap', 'map'), topic)
 
 
-def test_a_table_is_the_same_truth_as_the_topic(tmp_path, road_network):
-    """In either unit of time; the errors of the track are those against the topic."""
+def test_a_table_gives_the_same_errors_as_the_topic(tmp_path, road_network):
+    """The time is in ns or in s; the errors of the track equal those with the topic."""
     settings = settings_for('vehicle', QUICK)
     run = replay(Recording(vehicle_path(NAME)), road_network, settings, tmp_path / 'a')
     ((stamps, position, _),) = run.truth.values()
@@ -131,20 +130,20 @@ def test_a_table_is_the_same_truth_as_the_topic(tmp_path, road_network):
             assert found[key] == pytest.approx(expected[key], rel=1e-3)
 
 
-@pytest.mark.parametrize('text, told', [
+@pytest.mark.parametrize('text, message', [
     ('t,y\n1,2\n', 'column x is missing'), ('x,y\n1,2\n', 'column stamp_ns, t or time is missing'),
     ('t,x,y\n1,2\n', 'row 2: expected 3 columns'), ('t,x,y\n1,2,north\n', "row 2: y is 'north'"),
     ('t,x,y\n,1,2\n', 'row 2: t is not a finite number'), ('t,x,y\n', 'has no rows'),
     ('t,x,y\n1,2,inf\n', 'row 2: y is not a finite number'),
     ('stamp_ns,x,y\n\u00b2,1,2\n', 'row 2: stamp_ns'), ('t,x,y\n1e300,1,2\n', 'not a valid time'),
     ('stamp_ns,x,y\n99999999999999999999999,1,2\n', 'not a valid time')])
-def test_faults_of_a_table_are_named(tmp_path, text, told):
+def test_an_invalid_truth_table_is_refused(tmp_path, text, message):
     (tmp_path / 'truth.csv').write_text(text)
-    with pytest.raises(RecordingError, match=told):
+    with pytest.raises(RecordingError, match=message):
         read_truth_table(tmp_path / 'truth.csv')
 
 
-def test_a_table_of_a_spreadsheet_with_a_mark_at_its_begin(tmp_path):
+def test_a_table_with_a_byte_order_mark_is_read(tmp_path):
     (tmp_path / 'truth.csv').write_text('t,x,y\n2,3,4\n1,1,2\n', encoding='utf-8-sig')
     stamps, position, quaternion = read_truth_table(tmp_path / 'truth.csv')['truth']
     assert stamps.tolist() == [10**9, 2 * 10**9]
@@ -152,13 +151,13 @@ def test_a_table_of_a_spreadsheet_with_a_mark_at_its_begin(tmp_path):
     assert quaternion.tolist() == [[0.0, 0.0, 0.0, 1.0]] * 2
 
 
-def test_a_table_that_does_not_exist_is_no_topic(tmp_path, road_network):
+def test_a_missing_table_is_reported(tmp_path, road_network):
     with pytest.raises(RecordingError, match='cannot read .*missing.csv'):
         replay(Recording(vehicle_path(NAME)), road_network, settings_for('vehicle'), tmp_path,
                truth=str(tmp_path / 'missing.csv'))
 
 
-def test_trajectories_read_back(tmp_path, vehicle_replays):
+def test_trajectory_files_hold_the_track(tmp_path, vehicle_replays):
     run, _ = vehicle_replays[NAME]
     paths = write_trajectories(run, tmp_path)
     assert [p.name for p in paths] == ['track_1.tum', 'track_1_smoothed.tum']

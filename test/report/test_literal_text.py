@@ -1,4 +1,4 @@
-"""Names of the user in figures: drawn as they are, whatever matplotlib reads in them."""
+"""Names chosen by the user are drawn literally in figures, never as mathematics."""
 
 import io
 from types import SimpleNamespace
@@ -20,14 +20,14 @@ NAMES = ('$\\foo$', '_hidden $^{$', '\\$5$')
 
 
 def texts_of(figure):
-    """All texts of a figure that has been drawn: a name that is read as mathematics fails."""
+    """All texts of a figure after drawing, which fails for a name parsed as mathematics."""
     figure.savefig(io.BytesIO(), dpi=40)
     return {t.get_text().replace('\\$', '$').replace('\u200b', '') for t in figure.findobj(
         lambda artist: hasattr(artist, 'get_text'))}
 
 
 @pytest.mark.parametrize('text', [*NAMES, '$', '$a\n$', '__', 'left', ''])
-def test_a_text_is_drawn_as_it_is(text):
+def test_a_text_is_drawn_literally(text):
     figure = Figure()
     axes = figure.add_subplot()
     axes.plot([0, 1], label=literal(text) or 'none')
@@ -42,10 +42,10 @@ FIELD = 1e-8 * np.ones((4, 3, 3))
 
 
 def log_of_track():
-    place = np.zeros(3), np.eye(2)
+    estimate = np.zeros(3), np.eye(2)
     return TrackLog(1, stamp_ns=[0, 1, 2, 3], position=[np.ones(3) * k for k in range(4)],
                     covariance=[np.eye(6)] * 4, ambiguous=[True, False, False, False],
-                    arrivals=[{name: (0.5, *place) for name in NAMES}] * 4,
+                    arrivals=[{name: (0.5, *estimate) for name in NAMES}] * 4,
                     measured=list(FIELD), predicted=list(FIELD))
 
 
@@ -82,7 +82,7 @@ def geometry():
 ELLIPSOID = SimpleNamespace(coverage=1.0, correct=lambda readings: readings)
 
 
-@pytest.mark.parametrize('drawn, what', [
+@pytest.mark.parametrize('draw, label', [
     (lambda: map_figure(log_of_track(), NETWORK), 'from {} (50% at the end)'),
     (lambda: weights_figure(log_of_track()), '{}'),
     (lambda: field_figure(log_of_track(), NETWORK), '{}'),
@@ -93,12 +93,12 @@ ELLIPSOID = SimpleNamespace(coverage=1.0, correct=lambda readings: readings)
     (lambda: calibration_figure(calibration(), NETWORK), '{}'),
     (lambda: tumble_figure(dict.fromkeys(NAMES, ELLIPSOID), dict.fromkeys(NAMES, FIELD[0])), '{}'),
     (lambda: geometry_figure(geometry()), '{}')])
-def test_every_figure_draws_names_as_they_are(drawn, what):
-    assert {what.format(name) for name in NAMES} <= texts_of(drawn())
+def test_every_figure_draws_names_literally(draw, label):
+    assert {label.format(name) for name in NAMES} <= texts_of(draw())
 
 
-def test_lanes_that_are_equal_share_a_curve_and_a_label():
-    """Of two equal curves one would hide the other."""
+def test_equal_lanes_share_a_curve_and_a_label():
+    """One of two equal curves would hide the other."""
     lanes = plan()
     lanes.lanes[2].filter_std = lanes.lanes[0].filter_std
     texts = texts_of(lane_figure(lanes))
@@ -106,23 +106,23 @@ def test_lanes_that_are_equal_share_a_curve_and_a_label():
 
 
 def test_the_first_pose_is_on_the_line_of_the_track():
-    """Also where the best hypothesis of its arrival is elsewhere."""
+    """This applies even if the best hypothesis of its arrival is elsewhere."""
     log = log_of_track()
     (axes,) = map_figure(log, NETWORK).axes
     lines = {line.get_label(): line.get_xydata() for line in axes.get_lines()}
     assert lines['first pose'].tolist() == [lines['track'][0].tolist()]
-    # Only what weighs something is drawn.
+    # Only hypotheses with a significant weight are drawn.
     log.arrivals = [{name: (0.001, np.zeros(3), np.eye(2)) for name in NAMES}] * 4
     labels = [line.get_label() for line in map_figure(log, NETWORK).axes[0].get_lines()]
     assert not any(label.startswith('from ') for label in labels)
 
 
-def test_bytes_of_a_file_name_that_are_no_text_are_escaped():
+def test_lone_surrogates_in_a_file_name_are_escaped():
     assert 'a\\udcff: measured (dots), fitted (lines), 90 % bands' in texts_of(
         pass_figure(fitted_pass(), 'a\udcff'))
 
 
-def test_a_title_of_a_pass_is_drawn_as_it_is():
+def test_the_title_of_a_pass_is_drawn_literally():
     title = '$\\foo$, pass 1, 1 dipole'
     assert f'{title}: measured (dots), fitted (lines), 90 % bands' in texts_of(
         pass_figure(fitted_pass(), title))

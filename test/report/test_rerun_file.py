@@ -1,4 +1,4 @@
-"""Tracks for the Rerun viewer."""
+"""Files for the Rerun viewer."""
 
 import importlib.util
 
@@ -12,7 +12,7 @@ from support.bundled import NETWORK_FILE, vehicle_path
 NAME = 'straight_small_left'
 
 
-def test_without_the_sdk_it_is_said_before_the_work(tmp_path, capsys, monkeypatch):
+def test_a_missing_rerun_sdk_is_reported_before_the_replay(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr('mag_tracking.report.rerun_file.find_spec', lambda _: None)
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--rerun',
                  '--out', str(tmp_path / 'out')]) == 1
@@ -20,8 +20,8 @@ def test_without_the_sdk_it_is_said_before_the_work(tmp_path, capsys, monkeypatc
     assert not (tmp_path / 'out').exists()
 
 
-@pytest.mark.skipif(importlib.util.find_spec('rerun') is None, reason='there is no rerun-sdk here')
-def test_the_poses_are_those_of_the_track(tmp_path, vehicle_replays, road_network):
+@pytest.mark.skipif(importlib.util.find_spec('rerun') is None, reason='rerun-sdk is not installed')
+def test_the_poses_in_the_file_are_those_of_the_track(tmp_path, vehicle_replays, road_network):
     from rerun.chunk import RrdReader
 
     run, _ = vehicle_replays[NAME]

@@ -1,4 +1,4 @@
-"""Poses without a flag against truth: what counts as wrong."""
+"""Wrong poses without the ambiguous flag, counted against truth."""
 
 import numpy as np
 
@@ -16,12 +16,12 @@ def truth(y=0.0, shift_s=0.0):
             np.stack([10.0 * T, y + 0.0 * T, 0.0 * T], axis=1), QUATERNIONS)
 
 
-def counted(n, wrong=0, without_truth=0):
+def counts(n, wrong=0, without_truth=0):
     return {'n': n, 'wrong': wrong, 'without_truth': without_truth}
 
 
 def log(off_m=0.0, std_m=0.1, ambiguous=False):
-    """A track beside the first vehicle."""
+    """A track at the lateral distance `off_m` from the first vehicle."""
     out = TrackLog(1)
     for t in T:
         out.add(track_pose(t, 10.0 * t, off_m, ambiguous=ambiguous,
@@ -29,27 +29,27 @@ def log(off_m=0.0, std_m=0.1, ambiguous=False):
     return out
 
 
-def test_a_pose_is_wrong_by_metres_and_by_standard_deviations():
+def test_a_wrong_pose_is_off_in_metres_and_in_standard_deviations():
     n = len(T)
-    assert unflagged_poses([log(0.5)], [truth()]) == counted(n)
-    assert unflagged_poses([log(2.1)], [truth()]) == counted(n, n)
-    assert unflagged_poses([log(2.1, std_m=1.0)], [truth()]) == counted(n)
-    assert unflagged_poses([log(9.0, ambiguous=True)], [truth()]) == counted(0)
+    assert unflagged_poses([log(0.5)], [truth()]) == counts(n)
+    assert unflagged_poses([log(2.1)], [truth()]) == counts(n, n)
+    assert unflagged_poses([log(2.1, std_m=1.0)], [truth()]) == counts(n)
+    assert unflagged_poses([log(9.0, ambiguous=True)], [truth()]) == counts(0)
 
 
-def test_a_pose_is_right_that_is_right_about_any_vehicle_there():
+def test_a_pose_near_any_present_vehicle_is_not_wrong():
     assert unflagged_poses([log(5.0)], [truth(), truth(5.0)])['wrong'] == 0
     assert unflagged_poses([log(5.0)], [truth(), truth(-5.0)])['wrong'] == len(T)
-    # A vehicle that comes later excuses nothing, and without any truth nothing is known.
+    # A vehicle at another time does not count. Without truth, a pose is not judged.
     assert unflagged_poses([log(5.0)], [truth(), truth(5.0, 100.0)])['wrong'] == len(T)
-    assert unflagged_poses([log(5.0)], [truth(shift_s=100.0)]) == counted(0, 0, len(T))
+    assert unflagged_poses([log(5.0)], [truth(shift_s=100.0)]) == counts(0, 0, len(T))
 
 
-def test_the_share_is_reported():
+def test_the_fraction_of_wrong_poses_is_reported():
     summary = {'missing_topics': [], 'no_detection_reason': None, 'rejected': {}, 'lost': {},
                'sensors': {}, 'counts': {'track': {}}, 'close_network': False, 'tracks': [],
                'frames_too_long': None, 'clocks_apart': '', 'disturbances': [],
-               'target': 'vehicle', 'unflagged_poses': counted(200, 3)}
+               'target': 'vehicle', 'unflagged_poses': counts(200, 3)}
     assert [n.text.partition(':')[2][:27] for n in notes_of(summary)] == [
         ' 200, of which 3 (1.5%) are']
     assert notes_of({**summary, 'unflagged_poses': None}) == []

@@ -1,4 +1,4 @@
-"""Fixtures of the tests of pages."""
+"""Fixtures for the tests of pages."""
 
 import pytest
 
@@ -10,13 +10,13 @@ from support.live_records import records_of
 
 @pytest.fixture(scope='module')
 def chromium():
-    with browser() as found:
-        yield found
+    with browser() as opened:
+        yield opened
 
 
 @pytest.fixture(scope='module')
 def records(road_network):
-    """Frames and tracks of a recording, in their order."""
+    """Frames and tracks of a recording, in order."""
     return records_of('straight_car_right', road_network)
 
 
@@ -27,5 +27,5 @@ def scene(road_network):
 
 @pytest.fixture
 def server(scene):
-    with PageServer(scene, port=0) as found:
-        yield found
+    with PageServer(scene, port=0) as running:
+        yield running

@@ -1,4 +1,4 @@
-"""Lines and regions on the pages against independently computed numbers."""
+"""Curves and regions on the pages against independently computed values."""
 
 import numpy as np
 import pytest
@@ -28,13 +28,13 @@ def page(vehicle_replays, road_network, tmp_path_factory):
         yield found
 
 
-def at(page, log, k):
-    """Show pose number `k`."""
+def show_pose(page, log, k):
+    """Move the slider to pose `k`."""
     page.move_slider((log.stamp_ns[k] - log.stamp_ns[0]) / 1e9)
 
 
 def trace(page, plot, name):
-    """(x, y) of a trace of a plot, by the beginning of its name."""
+    """(x, y) of the trace in `plot` whose name starts with `name`."""
     found = page.value(f'''(() => {{
         const found = document.getElementById('{plot}').data.find(
           d => (d.name || '').startsWith('{name}'));
@@ -43,35 +43,36 @@ def trace(page, plot, name):
     return np.array(found, dtype=float)
 
 
-def squared(points, middle, C):
-    """Squared deviations of points (2, n) from a middle, in its covariance."""
-    d = points - np.asarray(middle)[:2, None]
+def squared_mahalanobis(points, centre, C):
+    """Squared Mahalanobis distances of points (2, n) from `centre` with the covariance `C`."""
+    d = points - np.asarray(centre)[:2, None]
     return np.einsum('an,ab,bn->n', d, np.linalg.inv(C[:2, :2]), d)
 
 
 @pytest.mark.parametrize('share', [0.0, 0.05, 0.3, 0.6, 1.0])
-def test_the_region_holds_90_percent_of_the_covariance(page, log, share):
+def test_the_region_is_the_90_percent_ellipse_of_the_covariance(page, log, share):
     k = round(share * (len(log.stamp_ns) - 1))
-    at(page, log, k)
+    show_pose(page, log, k)
     points = trace(page, 'map', '90 % region')
-    np.testing.assert_allclose(squared(points, log.position[k], log.covariance[k]),
+    np.testing.assert_allclose(squared_mahalanobis(points, log.position[k], log.covariance[k]),
                                chi2.ppf(0.9, 2), rtol=1e-3)
 
 
 def test_hypotheses_are_drawn_with_their_weight_and_region(page, log):
     k = next(k for k, row in enumerate(log.arrivals)
              if sum(weight > 0.01 for weight, *_ in row.values()) > 1)
-    at(page, log, k)
+    show_pose(page, log, k)
     n = 0
     for name, (weight, position, C) in log.arrivals[k].items():
         if weight > 0.01:
             points = trace(page, 'map', f'from {name}, {round(100 * weight)} %')
-            np.testing.assert_allclose(squared(points, position, C), chi2.ppf(0.9, 2), rtol=1e-3)
+            np.testing.assert_allclose(squared_mahalanobis(points, position, C),
+                                       chi2.ppf(0.9, 2), rtol=1e-3)
             n += 1
     assert n > 1
 
 
-def test_curves_are_those_of_the_log(page, log):
+def test_curves_match_the_track_log(page, log):
     t = (np.array(log.stamp_ns) - log.stamp_ns[0]) / 1e9
     speed = np.hypot(*np.array(log.velocity)[:, :2].T)
     x, y = trace(page, 'speed', 'speed')
@@ -90,18 +91,18 @@ def test_curves_are_those_of_the_log(page, log):
         assert max(weights) > 0.1
 
 
-def test_fields_are_drawn_as_measured_and_as_predicted(page, log):
+def test_measured_and_predicted_fields_match_the_track_log(page, log):
     panels = page.value('''[...document.querySelectorAll('#field .plot')].map(
         plot => plot.data.map(d => [d.name, Array.from(d.y)]))''')
     assert len(panels) == 2
     for j, panel in enumerate(panels):
         for name, values in panel:
-            axis, what = 'xyz'.index(name[0]), name[2:]
+            axis, kind = 'xyz'.index(name[0]), name[2:]
             np.testing.assert_allclose(np.array(values, dtype=float),
-                                       1e9 * np.array(getattr(log, what))[:, j, axis], rtol=1e-5)
+                                       1e9 * np.array(getattr(log, kind))[:, j, axis], rtol=1e-5)
 
 
-def test_weights_of_an_arrival_are_those_of_all_its_hypotheses(page, log):
-    """In the log they come from the published record; the sum over arrivals is one."""
+def test_weights_of_all_arrivals_sum_to_one(page, log):
+    """The weights in the log are those of the published records."""
     total = [sum(weight for weight, *_ in row.values()) for row in log.arrivals]
     np.testing.assert_allclose(total, 1.0, atol=1e-9)

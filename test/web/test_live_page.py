@@ -1,4 +1,4 @@
-"""The live page, fed without ROS: values and delay in Chromium, reconnection, many viewers."""
+"""Live page in Chromium, fed without ROS: values, delay, reconnection and memory."""
 
 import threading
 import time
@@ -16,29 +16,29 @@ from support.browser import needs_browser
 from support.live_records import feed, poses
 
 MAX_DELAY_MS = 200.0
-"""From the stamp of a pose until it is drawn, in the middle of all."""
+"""Maximum median delay from the timestamp of a pose to its drawing."""
 SECOND_NS = 1_000_000_000
 
 
 @needs_browser
-def test_the_page_has_the_poses_that_were_tracked(chromium, scene, server, records):
-    """Half of them came before it was opened."""
+def test_the_page_shows_all_tracked_poses(chromium, scene, server, records):
+    """Half of the poses come before the page is opened."""
     half = len(records) // 2
     feed(scene, records[:half])
     page = Opened(chromium, server.url)
     page.wait('magTracking.connected && magTracking.scene?.tracks.length')
     feed(scene, records[half:])
-    wanted = poses(records)
-    page.wait(f'magTracking.scene?.tracks[0]?.columns.t.length >= {len(wanted)}')
+    expected = poses(records)
+    page.wait(f'magTracking.scene?.tracks[0]?.columns.t.length >= {len(expected)}')
     page.wait('magTracking.scene?.tracks[0]?.ended')
     for name, axis in (('x', 0), ('y', 1), ('z', 2)):
         np.testing.assert_array_equal(
             page.value(f'Array.from(magTracking.scene.tracks[0].columns.{name})'),
-            [p.position[axis] for p in wanted])
+            [p.position[axis] for p in expected])
     begin_ns = int(page.value('magTracking.scene.begin_ns'))
-    t = (wanted[20].stamp_ns - begin_ns) / 1e9
+    t = (expected[20].stamp_ns - begin_ns) / 1e9
     page.move_slider(t)
-    np.testing.assert_allclose(page.pose_on_map(), wanted[20].position[:2])
+    np.testing.assert_allclose(page.pose_on_map(), expected[20].position[:2])
     assert not page.value('magTracking.follows')
     page.page.click('#latest')
     page.wait('magTracking.follows')
@@ -48,7 +48,7 @@ def test_the_page_has_the_poses_that_were_tracked(chromium, scene, server, recor
 
 @needs_browser
 @pytest.mark.alone
-def test_a_pose_is_on_the_page_within_200_ms(chromium, scene, server, records):
+def test_the_median_delay_of_a_pose_is_below_200_ms(chromium, scene, server, records):
     page = Opened(chromium, server.url)
     page.wait('magTracking.connected')
     page.value('''() => { window.delays = []; let before = 0; const look = () => {
@@ -72,16 +72,16 @@ def test_a_pose_is_on_the_page_within_200_ms(chromium, scene, server, records):
     finally:
         stop.set()
         thread.join()
-    # The first are those of the drawing of everything.
+    # The first delays include the drawing of the whole scene.
     delays = np.array(page.value('window.delays'))[20:]
-    print(f'from stamp to drawing: median {np.median(delays):.0f} ms, '
+    print(f'from timestamp to drawing: median {np.median(delays):.0f} ms, '
           f'90 % {np.quantile(delays, 0.9):.0f} ms')
     assert np.median(delays) < MAX_DELAY_MS
     page.page.close()
 
 
 @needs_browser
-def test_it_reconnects_after_a_restart(chromium, road_network, records):
+def test_the_page_reconnects_after_a_restart_of_the_server(chromium, road_network, records):
     first = LiveScene('before', road_network)
     with PageServer(first, port=0) as server:
         port = server.port
@@ -101,7 +101,7 @@ def test_it_reconnects_after_a_restart(chromium, road_network, records):
 
 
 @needs_browser
-def test_markup_in_health_is_shown_as_it_is(chromium, scene, server):
+def test_markup_in_health_notes_is_shown_literally(chromium, scene, server):
     evil = '<img src=x onerror="window.broken = true">'
     scene.set_health([Note(ERROR, evil)], [])
     page = Opened(chromium, server.url)
@@ -112,8 +112,8 @@ def test_markup_in_health_is_shown_as_it_is(chromium, scene, server):
 
 
 @needs_browser
-def test_a_target_that_stays_for_hours_fills_no_memory(chromium, scene, server, records):
-    """Neither that of the server, with and without viewers, nor that of the browser."""
+def test_a_target_that_stays_for_hours_needs_bounded_memory(chromium, scene, server, records):
+    """This applies to the server, with and without viewers, and to the browser."""
     template = [r for r in records if isinstance(r, FieldFrame)][-1]
     pose, stamp = poses(records)[30], template.stamp_ns
 

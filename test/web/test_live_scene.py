@@ -1,4 +1,4 @@
-"""Messages of a live scene: restarts, late records, bounded memory, and invalid numbers."""
+"""Messages of a live scene: restarts, late records, bounded memory and invalid numbers."""
 
 import base64
 import json
@@ -13,12 +13,12 @@ from support.live_records import NS, feed, later, poses
 
 
 class Viewer:
-    """Keeps what a page would keep: {key: times of the poses}, by the messages alone."""
+    """State of a page built from the messages: `tracks` is {key: times of the poses}."""
 
     def __init__(self):
         self.tracks, self.ended, self.scenes = {}, set(), 0
 
-    def take(self, messages):
+    def receive(self, messages):
         for message in map(json.loads, messages):
             if message['type'] == 'scene':
                 self.tracks, self.ended, self.scenes = {}, set(), self.scenes + 1
@@ -31,68 +31,68 @@ class Viewer:
 
 
 def follow(scene, records):
-    """A viewer from the beginning on, which is told often."""
-    viewer = Viewer().take(scene.news())
+    """A viewer that receives frequent updates from the start."""
+    viewer = Viewer().receive(scene.news())
     for k in range(0, len(records), 7):
         feed(scene, records[k:k + 7])
-        viewer.take(scene.news())
+        viewer.receive(scene.news())
     # The first message after the first record is the scene; rows follow it.
-    return viewer.take(scene.news())
+    return viewer.receive(scene.news())
 
 
-def test_who_follows_and_who_comes_late_have_the_same(scene, records):
+def test_early_and_late_viewers_have_the_same_tracks(scene, records):
     viewer = follow(scene, records)
-    late = Viewer().take(scene.whole())
+    late = Viewer().receive(scene.whole())
     assert late.tracks == viewer.tracks and late.ended == viewer.ended == {1}
     assert len(viewer.tracks[1]) == len(poses(records))
     assert all(np.diff(viewer.tracks[1]) > 0.0)
 
 
 @pytest.mark.parametrize('seconds', [40.0, 4000.0])
-def test_the_track_1_of_a_restarted_tracker_is_another(scene, records, seconds):
+def test_track_1_of_a_restarted_tracker_is_a_new_track(scene, records, seconds):
     viewer = follow(scene, records)
-    viewer.take(scene.news())
+    viewer.receive(scene.news())
     for part in (later(records, seconds),):
         feed(scene, part)
-        viewer.take(scene.news())
+        viewer.receive(scene.news())
     assert len(viewer.tracks) == 2
     assert [len(times) for times in viewer.tracks.values()] == [len(poses(records))] * 2
     assert viewer.scenes <= 2
 
 
-def test_a_tracker_that_was_killed_has_not_ended_its_track(scene, records):
-    """The first track has no closing record; the next one begins minutes later."""
+def test_a_track_after_a_killed_tracker_is_a_new_track(scene, records):
+    """The first track has no closing record; the next track begins minutes later."""
     viewer = follow(scene, records[:-1])
     feed(scene, later(records, 300.0))
-    viewer.take(scene.news())
+    viewer.receive(scene.news())
     assert len(viewer.tracks) == 2
 
 
 def test_a_late_record_of_a_track_does_not_clear_the_page(scene, records):
-    """A closing record has the time of the last pose, which may be seconds ago."""
+    """A closing record has the timestamp of the last pose, which may be seconds old."""
     viewer = follow(scene, [r for r in records if isinstance(r, FieldFrame) or not r.ended])
     last = [r for r in records if isinstance(r, FieldFrame)][-1]
     scene.add_frame(replace(last, stamp_ns=last.stamp_ns + 8 * NS))
     scenes = viewer.scenes
     scene.add_track(replace(poses(records)[-1], ended=True))
-    viewer.take(scene.news())
+    viewer.receive(scene.news())
     assert viewer.scenes == scenes and viewer.ended == {1}
 
 
 def test_a_looped_bag_clears_the_page(scene, records):
     viewer = follow(scene, records)
     scenes = viewer.scenes
-    viewer.take(follow_on(scene, records[:60]))
+    viewer.receive(feed_and_get_news(scene, records[:60]))
     assert viewer.scenes == scenes + 1
     assert sum(map(len, viewer.tracks.values())) == len(poses(records[:60]))
 
 
-def follow_on(scene, records):
+def feed_and_get_news(scene, records):
     feed(scene, records)
     return [*scene.news(), *scene.news()]
 
 
-def test_old_tracks_are_forgotten_and_their_number_is_bounded(scene, records):
+def test_old_tracks_and_excess_poses_are_removed(scene, records):
     template, pose = [r for r in records if isinstance(r, FieldFrame)][-1], poses(records)[30]
     stamp = template.stamp_ns
     for track_id in range(1, 120):
@@ -105,30 +105,30 @@ def test_old_tracks_are_forgotten_and_their_number_is_bounded(scene, records):
     late = Viewer()
     scene.news()
     rows = scene.news()
-    late.take([*scene.whole()])
+    late.receive([*scene.whole()])
     kept = sum(map(len, late.tracks.values()))
     assert kept <= MAX_POSES
     first = min(times[-1] for times in late.tracks.values())
     last = max(times[-1] for times in late.tracks.values())
     assert last - first <= HISTORY_S
-    # Nobody looked: what was smoothed of forgotten tracks is forgotten, too.
+    # Without a viewer, the smoothed poses of removed tracks are removed, too.
     assert sum(len(json.loads(m).get('smoothed', ())) for m in rows) == len(late.tracks)
 
 
-def test_numbers_that_are_none_leave_valid_json(scene, records):
+def test_nan_values_give_valid_json(scene, records):
     feed(scene, [replace(r, moment=np.full(3, np.nan), nis=np.nan)
                  if not isinstance(r, FieldFrame) else r for r in records])
     scene.news()
 
     def refuse(text):
-        raise AssertionError(f'{text} is no JSON')
+        raise AssertionError(f'{text} is not JSON')
 
     for message in [*scene.news(), *scene.whole()]:
         json.loads(message, parse_constant=refuse)
 
 
-def test_fields_are_those_of_the_sensors_that_the_target_passes(records, road_network):
-    """A target moves from the first sensors of a long road to the last ones."""
+def test_fields_are_those_of_the_sensors_near_the_target(records, road_network):
+    """A target moves along a road from the first sensors to the last."""
     n = 20
 
     class Road:

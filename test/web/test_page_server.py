@@ -1,4 +1,4 @@
-"""Server of the live page: slow and vanishing viewers, access, faults."""
+"""Server of the live page: slow and lost viewers, access control and errors."""
 
 import json
 import socket
@@ -18,8 +18,8 @@ from mag_tracking.web.page_server import PageServer
 from support.live_records import feed, poses
 
 
-def received(url, until, seconds=60.0):
-    """Messages of a viewer until `until(message)`."""
+def messages_until(url, until, seconds=60.0):
+    """Messages that a viewer receives until `until(message)`."""
     out = []
     with connect(url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
         end = time.monotonic() + seconds
@@ -28,42 +28,42 @@ def received(url, until, seconds=60.0):
     return out
 
 
-def test_ten_viewers_hear_the_same_and_one_that_goes_away_disturbs_none(scene, server, records):
+def test_ten_viewers_get_all_poses_although_another_disconnects(scene, server, records):
     urls = [server.url.replace('http', 'ws') + 'stream'] * 10
     viewers = [connect(url, max_size=None) for url in urls]
     quitter = connect(urls[0], max_size=None)
     feed(scene, records[:len(records) // 2])
     quitter.socket.close()
     feed(scene, records[len(records) // 2:])
-    wanted = [p.stamp_ns for p in poses(records)]
+    expected = [p.stamp_ns for p in poses(records)]
     for viewer in viewers:
         n = 0
-        while n < len(wanted):
+        while n < len(expected):
             message = json.loads(viewer.recv(60.0))
             for track in message.get('tracks', message.get('scene', {}).get('tracks', ())):
                 n += len(track['doubts'])
-        assert n == len(wanted)
+        assert n == len(expected)
         viewer.close()
 
 
-def test_a_viewer_that_cannot_follow_gets_the_whole_later(scene, server, records, monkeypatch):
-    """Its buffer is bounded, the others are served, and finally it has all poses."""
-    # On a busy machine it takes longer until this test reads.
+def test_a_slow_viewer_gets_the_whole_scene_later(scene, server, records, monkeypatch):
+    """Its buffer is bounded, other viewers are served, and it finally has all poses."""
+    # On a busy machine, this test may read late.
     monkeypatch.setattr('mag_tracking.web.page_server.LAG_TIMEOUT_S', 600.0)
-    with viewer_of(server) as quick, unread(server) as slow:
+    with reading_viewer(server) as quick, unreading_viewer(server) as slow:
         stamp = publish_until(scene, records, lambda: server.n_lagged, quick)
         assert read_until(slow, b'"type": "scene"', 2) == 2
-        # The scene with all poses is followed by what is new.
-        assert read_until(slow, f'"latest_ns": "{more(scene, records, stamp)}"'.encode()) == 1
+        # The scene with all poses is followed by new rows.
+        assert read_until(slow, f'"latest_ns": "{publish(scene, records, stamp)}"'.encode()) == 1
 
 
-def viewer_of(server):
-    """A viewer that reads."""
+def reading_viewer(server):
+    """A viewer that reads its messages."""
     return connect(server.url.replace('http', 'ws') + 'stream', max_size=None)
 
 
 def read_until(raw, pattern, n=1, seconds=120.0):
-    """Read until a pattern has come `n` times; how often it came."""
+    """Read until a pattern has occurred `n` times; return how often it occurred."""
     found, rest = 0, b''
     raw.settimeout(seconds)
     while found < n:
@@ -75,8 +75,8 @@ def read_until(raw, pattern, n=1, seconds=120.0):
     return found
 
 
-def more(scene, records, stamp, n=1):
-    """Publish `n` more poses; the time of the last."""
+def publish(scene, records, stamp, n=1):
+    """Publish `n` more poses; return the timestamp of the last."""
     template = [r for r in records if isinstance(r, FieldFrame)][-1]
     for _ in range(n):
         stamp += 10_000_000
@@ -86,19 +86,19 @@ def more(scene, records, stamp, n=1):
 
 
 def publish_until(scene, records, condition, quick, seconds=60.0):
-    """Publish many poses until the condition holds; the time of the last."""
+    """Publish poses until the condition holds; return the timestamp of the last."""
     stamp, end = records[-1].stamp_ns, time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
-        stamp = more(scene, records, stamp, 400)
-        # This one is served all the while.
+        stamp = publish(scene, records, stamp, 400)
+        # The fast viewer is served meanwhile.
         quick.recv(60.0)
     return stamp
 
 
 @contextmanager
-def unread(server):
-    """A viewer that shakes hands and does not read by itself."""
+def unreading_viewer(server):
+    """A viewer that completes the handshake and does not read by itself."""
     with socket.socket() as raw:
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
         raw.connect(('127.0.0.1', server.port))
@@ -110,32 +110,33 @@ def unread(server):
 
 def test_a_viewer_that_never_reads_is_disconnected(scene, records, monkeypatch):
     monkeypatch.setattr('mag_tracking.web.page_server.LAG_TIMEOUT_S', 0.5)
-    with PageServer(scene, port=0) as server, viewer_of(server) as quick, unread(server):
+    with PageServer(scene, port=0) as server, reading_viewer(server) as quick, \
+            unreading_viewer(server):
         stamp = publish_until(scene, records, lambda: server.n_lagged, quick)
         end = time.monotonic() + 60.0
         while server.n_viewers > 1:
-            stamp = more(scene, records, stamp)
+            stamp = publish(scene, records, stamp)
             quick.recv(60.0)
             assert time.monotonic() < end
 
 
 def test_a_scene_larger_than_the_buffer_is_followed_by_rows(scene, server, records):
-    """A new viewer of a long session reads megabytes first; it must not be sent them again."""
-    with viewer_of(server) as quick:
-        stamp = more(scene, records, records[-1].stamp_ns, 7_900)
+    """A new viewer of a long session first reads megabytes, which must not be sent twice."""
+    with reading_viewer(server) as quick:
+        stamp = publish(scene, records, records[-1].stamp_ns, 7_900)
         while f'"latest_ns": "{stamp}"' not in quick.recv(60.0):
             pass
-    with unread(server) as slow:
+    with unreading_viewer(server) as slow:
         received, due = b'', time.monotonic()
         slow.settimeout(60.0)
         while b'"type": "rows"' not in received[-300_000:]:
-            # So many ticks pass meanwhile that the server sees the full buffer.
+            # The viewer reads so slowly that the server sees a full buffer.
             due += 0.02
             time.sleep(max(0.0, due - time.monotonic()))
             part = slow.recv(100_000)
             assert part
             received += part
-            stamp = more(scene, records, stamp)
+            stamp = publish(scene, records, stamp)
         assert received.count(b'"type": "scene"') == 1
         assert server.n_lagged == 0 and len(received) > 1_500_000
 
@@ -155,7 +156,7 @@ def test_the_number_of_viewers_is_limited(scene, monkeypatch):
             viewer.close()
 
 
-def test_a_fault_of_the_source_is_said_and_ends_nothing(caplog):
+def test_an_error_of_the_scene_is_reported_and_does_not_stop_the_server(caplog):
     class Broken:
         def whole(self):
             return ['{"type": "health", "notes": [], "tables": []}']
@@ -164,17 +165,17 @@ def test_a_fault_of_the_source_is_said_and_ends_nothing(caplog):
             raise ValueError('broken')
 
     with PageServer(Broken(), port=0) as server:
-        messages = received(server.url, lambda m: m['type'] == 'fault')
+        messages = messages_until(server.url, lambda m: m['type'] == 'fault')
         assert messages[-1]['text'] == 'ValueError: broken'
-        received(server.url, lambda m: m['type'] == 'fault')
+        messages_until(server.url, lambda m: m['type'] == 'fault')
         assert server.is_serving
     assert len([r for r in caplog.records if 'error in the live page' in r.message]) == 1
     assert not server.is_serving
 
 
-def test_a_looped_bag_begins_anew(scene, server, records):
+def test_a_looped_bag_starts_a_new_scene(scene, server, records):
     feed(scene, records)
-    messages = received(server.url, lambda m: m['type'] == 'scene')
+    messages = messages_until(server.url, lambda m: m['type'] == 'scene')
     assert messages[-1]['type'] == 'scene'
     with connect(server.url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
         feed(scene, records[:50])
@@ -186,7 +187,7 @@ def test_a_looped_bag_begins_anew(scene, server, records):
         assert int(message['scene']['begin_ns']) == begin
 
 
-def test_a_port_in_use_is_said(scene, server):
+def test_an_unusable_address_is_reported(scene, server):
     with pytest.raises(DeviceError, match=f'port {server.port}: Address already in use'):
         PageServer(scene, port=server.port)
     for port in (-1, 70000):
@@ -205,8 +206,8 @@ def status_of(url, **headers):
         return error.code
 
 
-def test_without_a_token_only_this_machine_sees_it(server):
-    """A page of elsewhere may have its own name point here, or open the socket from its script."""
+def test_without_a_token_only_local_requests_are_served(server):
+    """A foreign page may point its host name here, or open the socket from a script."""
     assert 'token' not in server.url
     assert status_of(server.url) == 200
     assert status_of(server.url + 'etc/passwd') == 404
@@ -219,7 +220,7 @@ def test_without_a_token_only_this_machine_sees_it(server):
     connect(stream, origin=server.url.rstrip('/')).close()
 
 
-def test_from_elsewhere_the_token_is_needed(scene):
+def test_remote_requests_require_the_token(scene):
     with PageServer(scene, host='0.0.0.0', port=0) as server:
         address, token = server.url.split('?token=')
         assert socket.gethostname() in address
@@ -233,7 +234,7 @@ def test_from_elsewhere_the_token_is_needed(scene):
         connect(f'{address.replace("http", "ws")}stream?token={token}').close()
 
 
-def test_nonsense_does_not_end_the_server(server):
+def test_invalid_requests_do_not_stop_the_server(server):
     for text in (b'\x16\x03\x01garbage\r\n\r\n', b'POST / HTTP/1.1\r\n\r\n', b'', b'A' * 100_000):
         with socket.create_connection(('127.0.0.1', server.port)) as raw:
             try:

@@ -1,4 +1,4 @@
-"""The report of a replay in headless Chromium: its numbers are those of the tables."""
+"""Report page of a replay in headless Chromium: values, controls and robustness."""
 
 import csv
 import json
@@ -24,7 +24,7 @@ EVIL = '</script><script>window.broken = true</script><b>left</b>'
 
 @pytest.fixture(scope='module')
 def report(vehicle_replays, road_network):
-    """(path, rows of poses.csv) of a report."""
+    """(path of the page, rows of poses.csv)."""
     run, folder = vehicle_replays[RECORDING]
     path = write_report(run, road_network, folder)
     with open(folder / 'poses.csv', newline='') as stream:
@@ -32,8 +32,8 @@ def report(vehicle_replays, road_network):
 
 
 @pytest.fixture(scope='module')
-def opened(chromium, report):
-    """A page that several tests use; each moves the slider to where it needs it."""
+def shared_page(chromium, report):
+    """Page shared by several tests, each of which moves the slider as it needs."""
     page = Opened(chromium, report[0].as_uri())
     page.wait('magTracking.drawn > 0')
     yield page
@@ -48,69 +48,70 @@ def columns(page, name):
     return np.array(page.value(f'Array.from(magTracking.scene.tracks[0].columns.{name})'))
 
 
-def test_numbers_of_the_page_are_those_of_the_table(opened, report):
+def test_poses_on_the_page_match_the_table(shared_page, report):
     rows = report[1]
-    begin_ns = int(opened.value('magTracking.scene.begin_ns'))
+    begin_ns = int(shared_page.value('magTracking.scene.begin_ns'))
     stamps = np.array([int(row['stamp_ns']) for row in rows])
-    np.testing.assert_allclose(columns(opened, 't'), (stamps - begin_ns) / 1e9, atol=1e-9)
-    for mine, theirs in (('x', 'x'), ('y', 'y'), ('z', 'z'), ('vx', 'vx'), ('vy', 'vy')):
-        np.testing.assert_array_equal(columns(opened, mine), column(rows, theirs))
-    for mine, theirs in (('xx', 'sd_x'), ('yy', 'sd_y')):
-        np.testing.assert_allclose(np.sqrt(columns(opened, mine)), column(rows, theirs), rtol=1e-6)
-    np.testing.assert_array_equal(columns(opened, 'ambiguous'), column(rows, 'ambiguous'))
+    np.testing.assert_allclose(columns(shared_page, 't'), (stamps - begin_ns) / 1e9, atol=1e-9)
+    for key, name in (('x', 'x'), ('y', 'y'), ('z', 'z'), ('vx', 'vx'), ('vy', 'vy')):
+        np.testing.assert_array_equal(columns(shared_page, key), column(rows, name))
+    for key, name in (('xx', 'sd_x'), ('yy', 'sd_y')):
+        np.testing.assert_allclose(np.sqrt(columns(shared_page, key)), column(rows, name),
+                                   rtol=1e-6)
+    np.testing.assert_array_equal(columns(shared_page, 'ambiguous'), column(rows, 'ambiguous'))
 
 
-def test_fields_weights_and_innovations_are_those_of_the_run(opened, vehicle_replays):
+def test_fields_weights_and_innovations_match_the_run(shared_page, vehicle_replays):
     log = vehicle_replays[RECORDING][0].logs[1]
     for j in range(2):
         for name in ('measured', 'predicted'):
-            found = opened.value('magTracking.scene.tracks[0].fields'
-                                 f'[{j}].{name}.map(axis => Array.from(axis))')
+            found = shared_page.value('magTracking.scene.tracks[0].fields'
+                                      f'[{j}].{name}.map(axis => Array.from(axis))')
             np.testing.assert_allclose(np.array(found, dtype=float).T,
                                        np.array(getattr(log, name))[:, j], rtol=1e-6)
     for name in {name for row in log.arrivals for name in row}:
-        found = opened.value(f'Array.from(magTracking.scene.tracks[0].arrivals.{name}.weight)')
+        found = shared_page.value(f'Array.from(magTracking.scene.tracks[0].arrivals.{name}.weight)')
         np.testing.assert_allclose(found, [row[name][0] if name in row else 0.0
                                            for row in log.arrivals], rtol=1e-6)
     per_axis = np.array(log.nis) / np.maximum(1, log.degrees_of_freedom)
-    np.testing.assert_allclose(columns(opened, 'nis').astype(float), per_axis, rtol=1e-6)
+    np.testing.assert_allclose(columns(shared_page, 'nis').astype(float), per_axis, rtol=1e-6)
 
 
-def test_the_slider_moves_map_curves_and_text_together(opened, report):
-    t = columns(opened, 't')
+def test_the_slider_moves_map_curves_and_text_together(shared_page, report):
+    t = columns(shared_page, 't')
     for k in (0, len(t) // 2, len(t) - 1):
-        opened.move_slider(t[k])
+        shared_page.move_slider(t[k])
         row = report[1][k]
-        np.testing.assert_allclose(opened.pose_on_map(), [float(row['x']), float(row['y'])])
-        opened.wait(f'Math.abs(document.getElementById("speed").layout.shapes[0].x0 - {t[k]})'
-                    ' < 1e-9')
-        np.testing.assert_allclose(opened.lines(), t[k])
-        text = opened.value('document.getElementById("readout").textContent')
+        np.testing.assert_allclose(shared_page.pose_on_map(), [float(row['x']), float(row['y'])])
+        shared_page.wait(f'Math.abs(document.getElementById("speed").layout.shapes[0].x0 - {t[k]})'
+                         ' < 1e-9')
+        np.testing.assert_allclose(shared_page.lines(), t[k])
+        text = shared_page.value('document.getElementById("readout").textContent')
         assert f'x {float(row["x"]):.2f}, y {float(row["y"]):.2f}' in text
         assert ('ambiguous' in text) == (row['ambiguous'] == '1')
 
 
-def test_it_needs_nothing_from_outside_and_nothing_is_wrong(opened, report):
-    t = columns(opened, 't')
+def test_the_page_loads_no_other_file_and_logs_no_error(shared_page, report):
+    t = columns(shared_page, 't')
     for share in np.linspace(0.0, 1.0, 7):
-        opened.move_slider(t[0] + share * (t[-1] - t[0]))
-    opened.page.select_option('#sensors', 'mag_2')
-    opened.page.set_viewport_size({'width': 390, 'height': 800})
+        shared_page.move_slider(t[0] + share * (t[-1] - t[0]))
+    shared_page.page.select_option('#sensors', 'mag_2')
+    shared_page.page.set_viewport_size({'width': 390, 'height': 800})
     # Playback from the end restarts at the beginning.
-    opened.page.click('#play')
-    opened.wait(f'magTracking.plays && magTracking.t < {t.mean()}')
-    opened.page.click('#play')
-    opened.wait('!magTracking.plays')
-    opened.move_slider(t[0] + 0.8 * (t[-1] - t[0]))
-    opened.page.click('#play')
-    opened.wait('magTracking.plays')
-    opened.wait(f'!magTracking.plays && magTracking.t >= {t[-1]}')
-    assert opened.complaints == []
-    assert opened.requests == [report[0].as_uri()]
+    shared_page.page.click('#play')
+    shared_page.wait(f'magTracking.plays && magTracking.t < {t.mean()}')
+    shared_page.page.click('#play')
+    shared_page.wait('!magTracking.plays')
+    shared_page.move_slider(t[0] + 0.8 * (t[-1] - t[0]))
+    shared_page.page.click('#play')
+    shared_page.wait('magTracking.plays')
+    shared_page.wait(f'!magTracking.plays && magTracking.t >= {t[-1]}')
+    assert shared_page.complaints == []
+    assert shared_page.requests == [report[0].as_uri()]
     assert report[0].stat().st_size < MAX_MB * 1e6
 
 
-def test_a_telephone_shows_it_in_its_width(chromium, report):
+def test_the_page_fits_the_width_of_a_telephone(chromium, report):
     page = Opened(chromium, report[0].as_uri(), viewport={'width': 360, 'height': 740},
                   is_mobile=True, has_touch=True)
     page.wait('magTracking.drawn > 0')
@@ -122,8 +123,8 @@ def test_a_telephone_shows_it_in_its_width(chromium, report):
     page.page.close()
 
 
-def test_the_table_jumps_to_each_track(chromium, vehicle_replays, road_network, tmp_path):
-    """Two tracks of one run: that of the recording, and the same, later and elsewhere."""
+def test_the_table_selects_each_track(chromium, vehicle_replays, road_network, tmp_path):
+    """The second track is a copy of the first, later and at another position."""
     run, _ = vehicle_replays[RECORDING]
     later = second_track(run.logs[1])
     both = type(run)({**run.summary, 'tracks': [*run.summary['tracks'], {
@@ -143,7 +144,7 @@ def test_the_table_jumps_to_each_track(chromium, vehicle_replays, road_network, 
 
 
 def second_track(log):
-    """A copy of a log, a minute later."""
+    """A copy of a log, one minute later and displaced."""
     from copy import deepcopy
 
     later = deepcopy(log)
@@ -153,8 +154,8 @@ def second_track(log):
     return later
 
 
-def test_markup_in_names_is_shown_as_it_is(chromium, road_network, tmp_path):
-    """Names of arrivals and of files come from users."""
+def test_markup_in_names_is_shown_literally(chromium, road_network, tmp_path):
+    """The user chooses the names of arrivals and files."""
     settings = settings_for('vehicle', QUICK | {
         'track.vehicle.arrival_names': [EVIL, 'right', 'rear']})
     recording = Recording(vehicle_path('straight_small_left'))
@@ -187,9 +188,9 @@ def test_notes_tables_and_missing_values_are_shown(chromium, tmp_path):
     page.page.close()
 
 
-def test_a_report_of_very_many_poses_is_thinned_and_says_so(vehicle_replays, road_network,
+def test_a_report_of_very_many_poses_is_thinned_with_a_note(vehicle_replays, road_network,
                                                             tmp_path):
-    """A day of traffic has thousands of tracks; the page has to open all the same."""
+    """A day of traffic has thousands of tracks, and the page must still open."""
     run, _ = vehicle_replays[RECORDING]
     n = 600
     logs = {}

@@ -1,3 +1,5 @@
+"""Binary framing, checksums and field layouts; properties of every framing."""
+
 import math
 import random
 import struct
@@ -21,7 +23,7 @@ from support.framing_fuzz import CASES, fuzz, some_garbage
 
 XYZ = ('x', 'y', 'z')
 XYZ_I16 = ('x:i16', 'y:i16', 'z:i16')
-ONE = Reading('', (1.0, 2.0, 3.0))
+READING = Reading('', (1.0, 2.0, 3.0))
 
 
 def binary(**changes):
@@ -34,7 +36,7 @@ def binary(**changes):
 @pytest.mark.parametrize('name, value', [
     ('sum8', 0xDD), ('xor8', 0x31), ('crc8', 0xF4), ('crc16_ccitt', 0x29B1),
     ('crc16_modbus', 0x4B37), ('crc32', 0xCBF43926)])
-def test_check_values(name, value):
+def test_checksums_have_their_check_values(name, value):
     size, function = CHECKSUMS[name]
     assert function(b'123456789') == value
     assert function(bytes(range(256)) * 3) < 256**size
@@ -43,7 +45,7 @@ def test_check_values(name, value):
 # Fields.
 
 @pytest.mark.parametrize('fields, each, count, values, expected', [
-    (XYZ, (), 0, [1.0, 2.0, 3.0], [ONE]),
+    (XYZ, (), 0, [1.0, 2.0, 3.0], [READING]),
     (('z', '-', 'x', '-'), (), 0, [3.0, None, 1.0, None], [Reading('', (1.0, math.nan, 3.0))]),
     (('ticks', 'ay'), (), 0, [9.0, 2.0],
      [Reading('', None, (math.nan, 2.0, math.nan), 9.0)]),
@@ -57,7 +59,7 @@ def test_check_values(name, value):
     (('sensor', 'x.A'), ('z', '-', 'y'), 2, ['board', 1.0, 2.0, None, 3.0, 4.0, None, 5.0],
      [Reading('board.A', (1.0, math.nan, math.nan)), Reading('board.0', (math.nan, 3.0, 2.0)),
       Reading('board.1', (math.nan, 5.0, 4.0))])])
-def test_what_the_values_of_a_frame_mean(fields, each, count, values, expected):
+def test_field_layouts_map_values_to_readings(fields, each, count, values, expected):
     layout = FieldLayout(fields, each, count)
     assert len(layout.quantities) == len(values)
     assert repr(layout.readings(values)) == repr(expected)
@@ -82,16 +84,16 @@ def test_what_the_values_of_a_frame_mean(fields, each, count, values, expected):
     ((), ('x.A',), 2, "each: expected x y z ax ay az or -, got 'x.A'"),
     ((), ('x',), 0, 'must be set together'),
     (XYZ, (), 3, 'must be set together')])
-def test_fields_that_mean_nothing_are_refused(fields, each, count, message):
+def test_invalid_field_layouts_are_refused(fields, each, count, message):
     with pytest.raises(SettingsError, match=message):
         FieldLayout(fields, each, count)
 
 
-def test_the_longest_name_of_a_sensor():
+def test_a_sensor_name_may_have_64_characters():
     assert FieldLayout(('x.' + 64 * 'a',)).readings([1.0])[0].sensor == 64 * 'a'
 
 
-def test_escapes_mean_the_same_in_both_quotes_of_yaml():
+def test_escapes_are_equal_in_single_and_double_quotes_of_yaml():
     assert unescaped('end', '\\r\\n') == unescaped('end', '\r\n') == b'\r\n'
     assert unescaped('end', '\\t\\0\\x1e\\\\n') == b'\t\x00\x1e\\n'
     for bad in ('\\q', '\\', '\\x80', '\\x1', '\ud800'):
@@ -108,7 +110,7 @@ LIMITS = {'u8': (0, 255), 'i8': (-128, 127), 'u16': (0, 65535), 'i16': (-32768, 
 
 @pytest.mark.parametrize('order', ['little', 'big'])
 @pytest.mark.parametrize('kind', LIMITS)
-def test_every_integer_type(kind, order):
+def test_every_integer_type_is_decoded(kind, order):
     low, high = LIMITS[kind]
     values = (low, high, 1)
     payload = b''.join(v.to_bytes(int(kind[1:]) // 8, order, signed=low < 0)
@@ -124,7 +126,7 @@ def test_every_integer_type(kind, order):
 
 
 @pytest.mark.parametrize('kind, code', [('f32', 'f'), ('f64', 'd')])
-def test_floats_that_are_not_finite(kind, code):
+def test_infinite_floats_are_rejected_and_nan_axes_are_kept(kind, code):
     framing = binary(fields=[f'{name}:{kind}' for name in ('x', 'y', 'z', 'ticks', '-')],
                      byte_order='big')
 
@@ -144,16 +146,16 @@ def test_floats_that_are_not_finite(kind, code):
 
 @pytest.mark.parametrize('name', ['none', *CHECKSUMS])
 @pytest.mark.parametrize('order', ['little', 'big'])
-@pytest.mark.parametrize('since', ['sync', 'payload'])
-def test_where_checksum_and_tail_stand(name, order, since):
-    framing = binary(checksum=name, byte_order=order, checksum_from=since, tail='0D 0A')
+@pytest.mark.parametrize('start', ['sync', 'payload'])
+def test_checksum_and_tail_are_checked(name, order, start):
+    framing = binary(checksum=name, byte_order=order, checksum_from=start, tail='0D 0A')
     sync, payload = b'\xA5\x5A', b''.join(v.to_bytes(2, order) for v in (1, 2, 3))
     checksum = b''
     if name != 'none':
         size, function = CHECKSUMS[name]
-        checksum = function((sync if since == 'sync' else b'') + payload).to_bytes(size, order)
+        checksum = function((sync if start == 'sync' else b'') + payload).to_bytes(size, order)
     frame = sync + payload + checksum + b'\r\n'
-    assert framing.parse(frame).readings == (ONE,) and framing.size == len(frame)
+    assert framing.parse(frame).readings == (READING,) and framing.size == len(frame)
     for at in range(2, len(frame)):
         bad = framing.parse(frame[:at] + bytes([frame[at] ^ 1]) + frame[at + 1:])
         if at >= len(frame) - 2:
@@ -161,10 +163,10 @@ def test_where_checksum_and_tail_stand(name, order, since):
         elif name != 'none':
             assert bad.rejected['frames with a wrong checksum'] == 1 and not bad.readings
         else:
-            assert bad.readings != (ONE,)
+            assert bad.readings != (READING,)
 
 
-def test_a_sync_that_is_no_beginning_hides_no_frame():
+def test_a_false_sync_hides_no_frame():
     framing = binary(checksum='crc32', sync='A5 A5', each=['x:i16', 'y:i16'], count=2,
                      fields=['sequence:u16', '-:u24'])
     payload = b'\xA5' * 13
@@ -175,13 +177,13 @@ def test_a_sync_that_is_no_beginning_hides_no_frame():
         assert parsed.rejected['bytes between frames'] == len(before) + 1
 
 
-def test_what_follows_from_the_types():
-    known = {}
+def test_wraps_follow_from_the_field_types():
+    wraps = {}
     for kind in ('u8', 'u24', 'u32', 'u64', 'f64'):
         framing = binary(fields=[f'ticks:{kind}', 'x:i16'])
-        known[kind] = framing.CLOCK['wrap']
+        wraps[kind] = framing.CLOCK['wrap']
         assert framing.DRIVER == {}
-    assert known == {'u8': 256, 'u24': 2**24, 'u32': 2**32, 'u64': 0, 'f64': 0}
+    assert wraps == {'u8': 256, 'u24': 2**24, 'u32': 2**32, 'u64': 0, 'f64': 0}
     framing = binary(fields=['sequence:u16', 'x:i16'])
     assert framing.DRIVER == {'sequence_wrap': 65536} and framing.CLOCK == {}
 
@@ -197,12 +199,12 @@ def test_what_follows_from_the_types():
     ({'fields': ['sensor:f64', 'x:u8']}, 'sensor must be an integer'),
     ({'byte_order': 'middle'}, 'byte_order'), ({'checksum': 'md5'}, 'checksum'),
     ({'checksum_from': 'tail'}, 'checksum_from'), ({'count': -1}, 'count')])
-def test_binary_settings_that_mean_nothing_are_refused(changes, message):
+def test_invalid_binary_settings_are_refused(changes, message):
     with pytest.raises(SettingsError, match=message):
         binary(**changes)
 
 
-# Laws of every framing.
+# Properties of every framing.
 
 FRAMINGS = {
     **{name: (case.make_framing(), None) for name, case in CASES.items()},
@@ -218,12 +220,12 @@ FRAMINGS = {
     'tail': (BinaryFraming(BinarySettings(sync='01', fields=('x:f32',), tail='02')), (
         b'\x01', b'\x02', b'\x01\x00\x00\x80\x7f\x02', b'\x01\x00\x00\x80\x3f\x02')),
 }
-LONGEST = {'text': 121, 'json': 257, 'binary': 24, 'binary of a board': 41, 'short lines': 13,
-           'lines with a long end': 11, 'objects': 25, 'no checksum': 6, 'tail': 6}
+MAX_REST = {'text': 121, 'json': 257, 'binary': 24, 'binary of a board': 41, 'short lines': 13,
+            'lines with a long end': 11, 'objects': 25, 'no checksum': 6, 'tail': 6}
 
 
-def some_stream(name, seed):
-    """A stream made of what is hard for this framing."""
+def random_stream(name, seed):
+    """A random stream of pieces that are difficult for this framing."""
     rng, atoms = random.Random(seed), FRAMINGS[name][1]
     if atoms:
         return b''.join(rng.choices(atoms, k=rng.randint(0, 40)))
@@ -234,8 +236,8 @@ def some_stream(name, seed):
     return out[rng.randint(0, 20):-rng.randint(1, 20)]
 
 
-def fed(name, pieces, final):
-    """(readings, counts, rest) of what comes in pieces."""
+def parse_pieces(name, pieces, final):
+    """(readings, counts, rest) of a stream parsed in pieces."""
     framing = FRAMINGS[name][0]
     readings, counts, rest = [], Counter(), b''
     for i, piece in enumerate(pieces):
@@ -247,7 +249,7 @@ def fed(name, pieces, final):
         readings += map(repr, parsed.readings)
         counts.update(parsed.rejected)
         rest = data[parsed.consumed:]
-        assert len(rest) <= (0 if last else LONGEST[name])
+        assert len(rest) <= (0 if last else MAX_REST[name])
     return readings, counts, rest
 
 
@@ -255,23 +257,23 @@ def fed(name, pieces, final):
 @settings(derandomize=True, deadline=None, max_examples=120)
 @given(seed=st.integers(0, 2**32), places=st.lists(st.integers(0, 2**16), max_size=12),
        final=st.booleans(), single=st.booleans())
-def test_any_pieces_give_the_same(name, seed, places, final, single):
-    stream = some_stream(name, seed)
+def test_chunk_boundaries_do_not_change_the_result(name, seed, places, final, single):
+    stream = random_stream(name, seed)
     if single:
         pieces = [stream[i:i + 1] for i in range(len(stream))] or [b'']
     else:
         cuts = sorted({p % (len(stream) + 1) for p in places})
         pieces = [stream[a:b] for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True)]
-    assert fed(name, pieces, final) == fed(name, [stream], final)
+    assert parse_pieces(name, pieces, final) == parse_pieces(name, [stream], final)
 
 
 @pytest.mark.parametrize('name', FRAMINGS)
-def test_nothing_is_lost_without_a_count(name):
+def test_every_lost_frame_is_counted(name):
     framing = FRAMINGS[name][0]
     n_found = n_rejected = 0
     for seed in range(300):
-        stream = some_stream(name, seed)
-        readings, counts, rest = fed(name, [stream], bool(seed % 2))
+        stream = random_stream(name, seed)
+        readings, counts, rest = parse_pieces(name, [stream], bool(seed % 2))
         n_found, n_rejected = n_found + len(readings), n_rejected + sum(counts.values())
         if isinstance(framing, BinaryFraming):
             n_sensors = 4 if name == 'binary of a board' else 1
@@ -287,25 +289,25 @@ def test_nothing_is_lost_without_a_count(name):
 @pytest.mark.parametrize('name', CASES)
 def test_every_frame_between_garbage_is_found_and_none_invented(name):
     result = fuzz(CASES[name], 20_000)
-    # Of the frames whose 16 bits decide, a false one passes in 65536; here none does.
+    # A 16-bit checksum accepts one false frame in 65536; with this seed it accepts none.
     assert result.lost == result.invented == 0
     assert result.found == result.readings >= result.sent == 20_000
-    assert result.garbage > 200_000 and result.worst_rest <= LONGEST[name]
+    assert result.garbage > 200_000 and result.worst_rest <= MAX_REST[name]
 
 
-def test_the_fuzzer_sees_a_framing_that_loses_or_invents():
+def test_the_fuzzer_detects_lost_and_invented_readings():
     case = CASES['binary']
 
-    class Deaf(BinaryFraming):
+    class LossyFraming(BinaryFraming):
         def parse(self, data, final=False):
             parsed = super().parse(data, final)
             return parsed if len(data) % 5 else type(parsed)((), parsed.consumed)
 
-    deaf = BinarySettings(sync='A5 5A', checksum='crc32', fields=(
+    lossy = BinarySettings(sync='A5 5A', checksum='crc32', fields=(
         'sequence:u16', 'ticks:u32', 'x:f32', 'y:f32', 'z:f32'))
-    assert fuzz(case._replace(make_framing=lambda: Deaf(deaf)), 500).lost > 0
-    blind = BinarySettings(sync='A5 5A', fields=(*deaf.fields, '-:u32'))
-    result = fuzz(case._replace(make_framing=lambda: BinaryFraming(blind)), 500)
+    assert fuzz(case._replace(make_framing=lambda: LossyFraming(lossy)), 500).lost > 0
+    unchecked = BinarySettings(sync='A5 5A', fields=(*lossy.fields, '-:u32'))
+    result = fuzz(case._replace(make_framing=lambda: BinaryFraming(unchecked)), 500)
     assert result.invented > 0 and result.lost > 0 and result.failed(0.0)
     assert not fuzz(case, 500).failed(0.0)
 
@@ -314,21 +316,21 @@ def test_the_fuzzer_sees_a_framing_that_loses_or_invents():
     ('text', b'9', 2**20), ('text', b'\n', 2**18), ('text', b'$MAG,', 2**20), ('json', b'{', 2**20),
     ('json', b'[\n', 2**16), ('binary', b'\xa5\x5a', 2**20), ('binary', b'\xa5', 2**20),
     ('binary of a board', b'\xff', 2**19)])
-def test_a_megabyte_of_nothing_takes_linear_time(name, piece, size):
+def test_a_megabyte_without_frames_takes_linear_time(name, piece, size):
     framing = FRAMINGS[name][0]
     stream = piece * (size // len(piece))
     start = time.process_time()
     parsed = framing.parse(stream)
-    # About a second; quadratic time would be hours.
+    # It takes about a second; quadratic time would be hours.
     assert time.process_time() - start < 20.0
-    assert not parsed.readings and len(stream) - parsed.consumed <= LONGEST[name]
+    assert not parsed.readings and len(stream) - parsed.consumed <= MAX_REST[name]
     pieces = [stream[i:i + 1000] for i in range(0, 2**16, 1000)]
-    assert fed(name, pieces, True) == fed(name, [b''.join(pieces)], True)
+    assert parse_pieces(name, pieces, True) == parse_pieces(name, [b''.join(pieces)], True)
 
 
 @pytest.mark.parametrize('value', [b'1' * 60_000 + b'x', b' ' * 60_000 + b'x', b'1.' + b'1' * 60_000
                                    + b'e', b'nan' * 20_000, b'+' * 60_000, b'.' * 60_000])
-def test_a_long_value_takes_no_time(value):
+def test_a_long_invalid_value_takes_linear_time(value):
     framing = TextFraming(TextSettings(fields=('x',), max_length=65536))
     start = time.process_time()
     assert framing.parse(value, final=True).rejected == {

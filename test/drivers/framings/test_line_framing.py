@@ -1,3 +1,5 @@
+"""Framing of lines of text and of JSON objects."""
+
 import math
 
 import pytest
@@ -9,20 +11,20 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.settings import replace
 
 XYZ = ('x', 'y', 'z')
-ONE = Reading('', (1.0, 2.0, 3.0))
+READING = Reading('', (1.0, 2.0, 3.0))
 
 
-def text(**changes):
+def text_framing(**changes):
     return TextFraming(replace(TextSettings(), {'fields': XYZ, **changes}))
 
 
-def objects(**changes):
+def json_framing(**changes):
     return JsonFraming(replace(JsonSettings(), {'field': ['m'], **changes}))
 
 
 # Text.
 
-ALL = ('sensor', 'ticks', 'sequence', '-', 'x', 'y', 'z')
+ALL_FIELDS = ('sensor', 'ticks', 'sequence', '-', 'x', 'y', 'z')
 
 
 @pytest.mark.parametrize('line, expected', [
@@ -31,9 +33,9 @@ ALL = ('sensor', 'ticks', 'sequence', '-', 'x', 'y', 'z')
     ('ß,1,-7,１,,nan,-NaN'.encode(), Reading('ß', (math.nan,) * 3, None, 1.0, -7)),
     (b'a,1,18446744073709551615,,1,2,' + b'0' * 400, Reading(
         'a', (1.0, 2.0, 0.0), None, 1.0, 2**64 - 1))])
-def test_a_line_of_text(line, expected):
+def test_a_line_of_text_is_parsed(line, expected):
     for data, final in ((line + b'\n', False), (line, True)):
-        parsed = text(fields=ALL).parse(data, final)
+        parsed = text_framing(fields=ALL_FIELDS).parse(data, final)
         assert repr(parsed.readings) == repr((expected,))
         assert parsed.consumed == len(data) and not parsed.rejected
 
@@ -56,10 +58,10 @@ def test_a_line_of_text(line, expected):
     (b'1,2,' + b'0' * 509, 'longer than max_length'),
     (b'', 'that are empty'),
     (b' \t\r', 'that are empty')])
-def test_a_line_that_is_rejected(line, cause):
-    parsed = text().parse(line + b'\n1,2,3\n')
+def test_an_invalid_line_is_rejected_with_its_cause(line, cause):
+    parsed = text_framing().parse(line + b'\n1,2,3\n')
     assert parsed.rejected == {f'lines {cause}': 1}
-    assert parsed.readings == (ONE,)
+    assert parsed.readings == (READING,)
 
 
 @pytest.mark.parametrize('line, cause', [
@@ -75,22 +77,23 @@ def test_a_line_that_is_rejected(line, cause):
     (b'A,1,' + b'1' * 5000 + b',?,1,2,3', 'with a sequence that is not an integer'),
     (b'A,1,18446744073709551616,?,1,2,3', 'with a sequence of more than 64 bits'),
     (b'A,1,-9223372036854775809,?,1,2,3', 'with a sequence of more than 64 bits')])
-def test_a_value_that_must_be_there(line, cause):
-    parsed = text(fields=ALL, max_length=6000).parse(line, final=True)
+def test_a_missing_or_invalid_value_rejects_the_line(line, cause):
+    parsed = text_framing(fields=ALL_FIELDS, max_length=6000).parse(line, final=True)
     assert parsed.rejected == {f'lines {cause}': 1} and not parsed.readings
 
 
-def test_separators_ends_prefixes_and_comments():
-    assert text(separator=' ').parse(b' 1 \t2   3\n').readings == (ONE,)
-    assert text(separator='; ').parse(b'1; 2; 3\n').readings == (ONE,)
-    assert text(separator='\\t').parse(b'1\t2\t3\n').readings == (ONE,)
-    assert text(end=';').parse(b'1,2,3\r;').readings == (ONE,)
-    assert text(end='\r\n').parse(b'1,2,3\r\n1,2').consumed == 7
-    parsed = text(prefix='$MAG,', comment='#').parse(
+def test_separators_ends_prefixes_and_comments_are_configurable():
+    assert text_framing(separator=' ').parse(b' 1 \t2   3\n').readings == (READING,)
+    assert text_framing(separator='; ').parse(b'1; 2; 3\n').readings == (READING,)
+    assert text_framing(separator='\\t').parse(b'1\t2\t3\n').readings == (READING,)
+    assert text_framing(end=';').parse(b'1,2,3\r;').readings == (READING,)
+    assert text_framing(end='\r\n').parse(b'1,2,3\r\n1,2').consumed == 7
+    parsed = text_framing(prefix='$MAG,', comment='#').parse(
         b'$MAG,1,2,3\n# $MAG,1,2,3\n1,2,3\n $MAG,1,2,3\n')
-    assert parsed.readings == (ONE,)
+    assert parsed.readings == (READING,)
     assert parsed.rejected == {'lines without the prefix': 2, 'lines that are comments': 1}
-    assert text().parse(b'#1,2,3\n').rejected == {'lines with a value that is not a number': 1}
+    assert text_framing().parse(b'#1,2,3\n').rejected == {
+        'lines with a value that is not a number': 1}
 
 
 @pytest.mark.parametrize('line, cause', [
@@ -103,8 +106,8 @@ def test_separators_ends_prefixes_and_comments():
     (b'$MAG,1,-,2,-,5.5,*6', 'without a checksum'),
     (b'$MAG,1,-,2,-,5.5,*066', 'without a checksum'),
     (b'$MAG,1,-,2,-,5.5,', 'without a checksum')])
-def test_the_checksum_of_nmea(line, cause):
-    framing = text(fields=('-', 'x', '-', 'y', '-', 'z', '-'), checksum='nmea')
+def test_nmea_checksums_are_checked(line, cause):
+    framing = text_framing(fields=('-', 'x', '-', 'y', '-', 'z', '-'), checksum='nmea')
     parsed = framing.parse(line + b'\n')
     assert parsed.rejected == ({f'lines {cause}': 1} if cause else {})
     assert len(parsed.readings) == (cause is None)
@@ -118,9 +121,9 @@ def test_the_checksum_of_nmea(line, cause):
     ({'prefix': '$M', 'comment': '$'}, 'would be ignored'),
     ({'checksum': 'crc8'}, "checksum: expected one of none, nmea, got 'crc8'"),
     ({'max_length': 0}, 'max_length'), ({'fields': ['B']}, "fields: 'B': expected one of")])
-def test_text_settings_that_mean_nothing_are_refused(changes, message):
+def test_invalid_text_settings_are_refused(changes, message):
     with pytest.raises(SettingsError, match=message):
-        text(**changes)
+        text_framing(**changes)
 
 
 # JSON.
@@ -129,16 +132,16 @@ PATHS = {'sensor': 'id', 'ticks': 'clock.t', 'sequence': 'n', 'field': ['m.x', '
          'acceleration': ['a']}
 
 
-def test_an_object_with_everything():
+def test_an_object_with_every_quantity_is_parsed():
     line = (b'{"id": "A", "clock": {"t": 1e3}, "n": 7, "m": {"x": 1, "y": [0, 2.5]}, '
             b'"a": [null, NaN, -3], "else": {"huge": Infinity}}\r\n')
     expected = Reading('A', (1.0, math.nan, 2.5), (math.nan, math.nan, -3.0), 1000.0, 7)
     for data in (line, line.replace(b'"A"', b'"\\u0041"'), line.replace(b'7', b'7.0')):
-        parsed = objects(**PATHS).parse(data)
+        parsed = json_framing(**PATHS).parse(data)
         assert repr(parsed.readings) == repr((expected,)) and not parsed.rejected
     assert [type(v) for v in parsed.readings[0].field] == [float] * 3
     assert isinstance(parsed.readings[0].sequence, int)
-    assert objects(**PATHS).parse(line.replace(b'"A"', b'12')).readings[0].sensor == '12'
+    assert json_framing(**PATHS).parse(line.replace(b'"A"', b'12')).readings[0].sensor == '12'
 
 
 @pytest.mark.parametrize('line, cause', [
@@ -168,10 +171,10 @@ def test_an_object_with_everything():
     ('{"m": [1, 2, 3]}'.encode('utf-16'), 'that are not UTF-8'),
     (b' ', 'that are empty'),
     (b'{"m": [1, 2, 3]' + b' ' * 200_000 + b'}', 'longer than max_length')])
-def test_an_object_that_is_rejected(line, cause):
-    framing = objects(max_length=200_000)
+def test_an_invalid_object_is_rejected_with_its_cause(line, cause):
+    framing = json_framing(max_length=200_000)
     parsed = framing.parse(line + b'\n{"m":[1,2,3]}\n')
-    assert parsed.rejected == {f'lines {cause}': 1} and parsed.readings == (ONE,)
+    assert parsed.rejected == {f'lines {cause}': 1} and parsed.readings == (READING,)
     assert framing.parse(line, final=True).rejected == {f'lines {cause}': 1}
 
 
@@ -190,27 +193,27 @@ def test_an_object_that_is_rejected(line, cause):
     (b'[1, 2]', b'[1]', 'without m.y.1'), (b'[1, 2]', b'{"0": 1}', 'without m.y.1'),
     (b'{"x"', b'{"q"', 'without m.x'), (b'{"x": 1, "y": [1, 2]}', b'"xy"', 'without m.x'),
     (b'{"x": 1, "y": [1, 2]}', b'[1]', 'without m.x')])
-def test_a_path_that_must_lead_somewhere(old, new, cause):
+def test_a_path_without_a_valid_value_rejects_the_object(old, new, cause):
     line = (b'{"id": "A", "clock": {"t": 5}, "n": 7, "m": {"x": 1, "y": [1, 2]}, '
             b'"a": [1, 2, 3]}\n')
-    framing = objects(**PATHS, max_length=5000)
+    framing = json_framing(**PATHS, max_length=5000)
     assert len(framing.parse(line).readings) == 1 and line.count(old) == 1
     parsed = framing.parse(line.replace(old, new))
     assert parsed.rejected == {f'lines {cause}': 1} and not parsed.readings
 
 
-def test_an_object_of_several_lines_is_only_read_from_a_whole_message():
+def test_an_object_of_several_lines_requires_a_whole_message():
     pretty = b'{\n "m": [1,\n 2, 3]\n}\n'
-    assert objects().parse(pretty).rejected == {'lines that are not JSON': 4}
-    parsed = objects().parse(pretty, final=True)
-    assert parsed.readings == (ONE,) and parsed.consumed == len(pretty) and not parsed.rejected
-    assert objects(max_length=len(pretty) - 1).parse(pretty, final=True).rejected == {
+    assert json_framing().parse(pretty).rejected == {'lines that are not JSON': 4}
+    parsed = json_framing().parse(pretty, final=True)
+    assert parsed.readings == (READING,) and parsed.consumed == len(pretty) and not parsed.rejected
+    assert json_framing(max_length=len(pretty) - 1).parse(pretty, final=True).rejected == {
         'lines that are not JSON': 4}
-    # Several objects in a message are lines, whatever one of them is like.
+    # Several objects in a message are read as lines, even if one of them is invalid.
     for bad in (b'{"m": 1, "m": 1}', b'\xff', b'['):
-        parsed = objects().parse(bad + b'\n{"m":[1,2,3]}\n{"m":[1,2,3]}', final=True)
-        assert parsed.readings == (ONE, ONE) and sum(parsed.rejected.values()) == 1
-    assert objects().parse(b'[1,\n2]', final=True).rejected == {
+        parsed = json_framing().parse(bad + b'\n{"m":[1,2,3]}\n{"m":[1,2,3]}', final=True)
+        assert parsed.readings == (READING, READING) and sum(parsed.rejected.values()) == 1
+    assert json_framing().parse(b'[1,\n2]', final=True).rejected == {
         'lines that are not a JSON object': 1}
 
 
@@ -222,6 +225,6 @@ def test_an_object_of_several_lines_is_only_read_from_a_whole_message():
     ({'acceleration': ['a', 'b', 'c', 'd']}, 'acceleration: expected'),
     ({'ticks': 'a..b'}, "ticks: 'a..b' has an empty key"), ({'field': ['.a']}, 'empty key'),
     ({'end': ''}, 'end')])
-def test_json_settings_that_mean_nothing_are_refused(changes, message):
+def test_invalid_json_settings_are_refused(changes, message):
     with pytest.raises(SettingsError, match=message):
-        objects(**changes)
+        json_framing(**changes)

@@ -1,4 +1,4 @@
-"""What Xsens' messages say: recorded ones, the formats of numbers, and the layouts of MTData."""
+"""Contents of Xsens messages: recorded messages, number formats and layouts of MTData."""
 
 import random
 
@@ -26,13 +26,13 @@ from support.xsens_messages import (
 )
 
 BETWEEN = 'bytes between frames'
-UNFIT = 'MTData2 messages with invalid packet lengths'
-NOTHING = 'messages without field or acceleration'
+INVALID_LENGTHS = 'MTData2 messages with invalid packet lengths'
+NO_VALUES = 'messages without field or acceleration'
 LEGACY = XsensFraming(XsensSettings(mtdata=LAYOUT))
 FRAMING = XsensFraming(XsensSettings())
 
 
-# What devices sent.
+# Recorded messages.
 
 MTI_G_710 = bytes.fromhex(
     'faff3662102002a9861060040314ed5310100c07440be007e301140d2f1837e0200401800007'
@@ -47,8 +47,8 @@ CONFIGURATION = bytes.fromhex(
     'faff0d76037003f80480' + '00' * 90 + '0001037003f800000000000000010027010802490501' + '9b')
 
 
-def test_a_recorded_message_of_an_mti_g_710_with_its_checksum():
-    """The values are those that another decoder found."""
+def test_a_recorded_message_of_an_mti_g_710_is_decoded():
+    """The reference values are those of another decoder."""
     parsed = FRAMING.parse(MTI_G_710)
     reading, = parsed.readings
     assert reading.field is None
@@ -57,8 +57,8 @@ def test_a_recorded_message_of_an_mti_g_710_with_its_checksum():
     assert parsed.consumed == len(MTI_G_710) and parsed.rejected == {}
 
 
-def test_the_clock_and_the_count_are_as_the_driver_is_told():
-    """The next of these messages came 10 ms after it, with 51703223."""
+def test_the_clock_and_sequence_defaults_match_the_messages():
+    """The next message of the recording came 10 ms later, with 51703223 ticks."""
     reading, = FRAMING.parse(MTI_G_710).readings
     assert (51703223 - reading.ticks) * FRAMING.CLOCK['tick_s'] == pytest.approx(0.01)
     last = READING._replace(ticks=float(0xFFFFFFFF), sequence=0xFFFF)
@@ -67,8 +67,8 @@ def test_the_clock_and_the_count_are_as_the_driver_is_told():
     assert FRAMING.DRIVER['sequence_wrap'] == last.sequence + 1
 
 
-def test_a_recorded_message_of_an_mti_300():
-    """The values are those that Xsens' MT Manager showed."""
+def test_a_recorded_message_of_an_mti_300_is_decoded():
+    """The reference values are those of Xsens' MT Manager."""
     parsed = FRAMING.parse(message(0x36, MTI_300))
     reading, = parsed.readings
     assert reading.field == pytest.approx((-0.30001938, 1.42270923, 0.58756894), abs=5e-9)
@@ -78,14 +78,14 @@ def test_a_recorded_message_of_an_mti_300():
 
 
 def test_recorded_answers_are_consumed_and_counted():
-    said = bytes.fromhex('faff3100d0') + CONFIGURATION + bytes.fromhex('faff0304037003f88c')
-    parsed = FRAMING.parse(said + FRAME)
-    assert parsed.readings == (READING,) and parsed.consumed == len(said + FRAME)
+    answers = bytes.fromhex('faff3100d0') + CONFIGURATION + bytes.fromhex('faff0304037003f88c')
+    parsed = FRAMING.parse(answers + FRAME)
+    assert parsed.readings == (READING,) and parsed.consumed == len(answers + FRAME)
     assert parsed.rejected == {
         'other messages: 0x31': 1, 'other messages: 0x0D': 1, 'other messages: 0x03': 1}
 
 
-# The contents of a message.
+# Contents of a message.
 
 @pytest.mark.parametrize('precision, coded, values', [
     (FLOAT, '3f800000 c0200000 00000000', (1.0, -2.5, 0.0)),
@@ -93,7 +93,7 @@ def test_recorded_answers_are_consumed_and_counted():
     (FP1632, '000000000001 80000000fffd 00000001ffff', (1.0, -2.5, -1.0 + 2.0**-32)),
     (DOUBLE, '3ff0000000000000 c004000000000000 0000000000000000', (1.0, -2.5, 0.0))])
 @pytest.mark.parametrize('coordinates', [0x0, 0x4, 0x8])
-def test_the_four_formats_of_numbers(precision, coded, values, coordinates):
+def test_the_four_number_formats_are_decoded(precision, coded, values, coordinates):
     data = bytes.fromhex(coded)
     for kind, name in ((0xC020, 'field'), (0x4020, 'acceleration')):
         parsed = FRAMING.parse(message(0x36, packet(kind + coordinates + precision, data)))
@@ -103,7 +103,7 @@ def test_the_four_formats_of_numbers(precision, coded, values, coordinates):
 
 @settings(derandomize=True, deadline=None)
 @given(st.integers(0, 2**32), st.sampled_from([FLOAT, FP1220, FP1632, DOUBLE]), st.booleans())
-def test_what_was_sent_is_read(seed, precision, extended):
+def test_encoded_readings_are_decoded(seed, precision, extended):
     rng = random.Random(seed)
     reading = random_reading(rng, precision)
     data = mtdata2(reading, precision)
@@ -112,7 +112,7 @@ def test_what_was_sent_is_read(seed, precision, extended):
     assert parsed.readings == (reading,) and parsed.rejected == {}
 
 
-def test_packets_come_in_any_order_and_unknown_ones_are_skipped():
+def test_packets_may_have_any_order_and_unknown_ones_are_skipped():
     data = (packet(0xC020, reals(READING.field, FLOAT)) + packet(0x5A5F, b'\xfa\xff\x36')
             + packet(0x1070, b'\x00\x00\x00\x07') + packet(0x1020, b'\xa6\x55')
             + packet(0x2030, b'') + packet(0x1021, b'\x01\x02')
@@ -122,10 +122,10 @@ def test_packets_come_in_any_order_and_unknown_ones_are_skipped():
     assert parsed.rejected == {}
 
 
-def test_packets_that_might_have_been_used_are_counted():
-    behind = (packet(0xA010, bytes(20)) + packet(0xC010, bytes(6)) + packet(0xC034, bytes(12))
-              + packet(0xC020, bytes(12)) + packet(0x1020, bytes(2)))
-    parsed = FRAMING.parse(mtdata2(READING, behind=behind))
+def test_unused_and_duplicate_packets_are_counted():
+    packets = (packet(0xA010, bytes(20)) + packet(0xC010, bytes(6)) + packet(0xC034, bytes(12))
+               + packet(0xC020, bytes(12)) + packet(0x1020, bytes(2)))
+    parsed = FRAMING.parse(mtdata2(READING, behind=packets))
     assert parsed.readings == (READING,)
     assert parsed.rejected == {
         'packets not used: 0xA010': 1, 'packets not used: 0xC010': 1, 'packets not used: 0xC034': 1,
@@ -134,9 +134,9 @@ def test_packets_that_might_have_been_used_are_counted():
 
 
 @pytest.mark.parametrize('data', [b'', packet(0x2010, bytes(16)), packet(0x1020, b'\x00\x01')])
-def test_a_message_that_says_nothing_of_the_field_is_counted(data):
+def test_a_message_without_field_or_acceleration_is_counted(data):
     parsed = FRAMING.parse(message(0x36, data) + FRAME)
-    assert parsed.readings == (READING,) and parsed.rejected == {NOTHING: 1}
+    assert parsed.readings == (READING,) and parsed.rejected == {NO_VALUES: 1}
 
 
 @pytest.mark.parametrize('data', [
@@ -145,14 +145,14 @@ def test_a_message_that_says_nothing_of_the_field_is_counted(data):
     packet(0xC021, bytes(18)), packet(0xC022, bytes(24)), packet(0xC023, bytes(12)),
     packet(0x4020, bytes(8)), packet(0x1020, bytes(4)), packet(0x1060, bytes(2)),
     packet(0x1020, b''), packet(0xC020, bytes(12)) + packet(0x1060, bytes(8))])
-def test_packets_that_do_not_fit_refuse_the_message(data):
+def test_packets_of_invalid_length_reject_the_message(data):
     false = message(0x36, data)
     parsed = FRAMING.parse(false + FRAME)
     assert parsed.readings == (READING,)
-    assert parsed.rejected == {UNFIT: 1, BETWEEN: len(false)}
+    assert parsed.rejected == {INVALID_LENGTHS: 1, BETWEEN: len(false)}
 
 
-def test_a_field_that_is_not_a_number_is_given_as_it_is():
+def test_a_nan_in_the_field_is_returned_unchanged():
     parsed = FRAMING.parse(mtdata2(Reading(field=(1.0, float('nan'), 2.0))))
     assert str(parsed.readings[0].field) == '(1.0, nan, 2.0)'
 
@@ -165,16 +165,16 @@ def test_a_field_that_is_not_a_number_is_given_as_it_is():
     ('acc', 'gyr', 'mag', 'euler', 'analog_1', 'analog_2', 'status'),
     ('temp', 'gyr', 'mag', 'matrix', 'analog_2', 'status', 'counter')])
 @pytest.mark.parametrize('number_format, precision', [('float', FLOAT), ('fp12.20', FP1220)])
-def test_mtdata_is_laid_out_as_the_settings_say(blocks, number_format, precision):
-    said = {'temp': reals([21.5], precision), 'acc': reals(READING.acceleration, precision),
-            'gyr': reals((0.1, 0.2, 0.3), precision), 'mag': reals(READING.field, precision),
-            'quaternion': reals((1.0, 0.5, 0.25, 0.0), precision),
-            'euler': reals((-1.0, 2.0, -3.0), precision), 'matrix': reals([0.5] * 9, precision),
-            'analog_1': b'\x01\x02', 'analog_2': b'\x03\x04', 'status': b'\x07',
-            'counter': b'\xa6\x55'}
+def test_mtdata_is_decoded_with_the_layout_of_the_settings(blocks, number_format, precision):
+    encoded = {'temp': reals([21.5], precision), 'acc': reals(READING.acceleration, precision),
+               'gyr': reals((0.1, 0.2, 0.3), precision), 'mag': reals(READING.field, precision),
+               'quaternion': reals((1.0, 0.5, 0.25, 0.0), precision),
+               'euler': reals((-1.0, 2.0, -3.0), precision), 'matrix': reals([0.5] * 9, precision),
+               'analog_1': b'\x01\x02', 'analog_2': b'\x03\x04', 'status': b'\x07',
+               'counter': b'\xa6\x55'}
     framing = XsensFraming(replace(XsensSettings(), {
         'mtdata': list(blocks), 'mtdata_format': number_format}))
-    parsed = framing.parse(message(0x32, b''.join(said[block] for block in blocks)))
+    parsed = framing.parse(message(0x32, b''.join(encoded[block] for block in blocks)))
     assert parsed.rejected == {}
     assert parsed.readings == (Reading(
         field=READING.field if 'mag' in blocks else None,
@@ -182,7 +182,7 @@ def test_mtdata_is_laid_out_as_the_settings_say(blocks, number_format, precision
         sequence=42581 if 'counter' in blocks else None),)
 
 
-def test_mtdata_that_the_settings_do_not_describe_is_counted():
+def test_mtdata_that_does_not_match_the_settings_is_counted():
     sent = message(0x32, bytes(41)) + message(0x32, bytes(43)) + message(0x32, b'') + FRAME
     parsed = LEGACY.parse(sent)
     assert parsed.readings == (READING,)
@@ -205,6 +205,6 @@ def test_mtdata_that_the_settings_do_not_describe_is_counted():
     ({'mtdata_format': 'fp12.20'}, "mtdata_format is 'fp12.20', but mtdata is none"),
     ({'max_message': 253}, 'max_message: 253 is outside'),
     ({'max_message': 4097}, 'max_message: 4097 is outside')])
-def test_settings_that_describe_no_message_are_refused(changes, text):
+def test_invalid_settings_are_refused(changes, text):
     with pytest.raises(SettingsError, match=text):
         XsensFraming(replace(XsensFraming.SETTINGS(), changes))

@@ -1,4 +1,4 @@
-"""The Xsens protocol: the laws of a framing, and what false messages cannot do."""
+"""Framing of the Xsens protocol: properties of every framing, and false messages."""
 
 import random
 import time
@@ -23,15 +23,15 @@ from support.xsens_messages import (
 )
 
 BETWEEN = 'bytes between frames'
-WRONG_SUM = 'frames with a wrong checksum'
+WRONG_CHECKSUM = 'frames with a wrong checksum'
 SPLICED = 'messages that contain the start of another'
 LEGACY = XsensFraming(XsensSettings(mtdata=LAYOUT))
 FRAMING = XsensFraming(XsensSettings())
-LONGEST = 512 + 7
+MAX_MESSAGE = 512 + 7
 
 
-def pieces(framing, data, sizes):
-    """(readings, counts) of `data` in pieces of these sizes, the last of all that is left."""
+def parse_in_pieces(framing, data, sizes):
+    """(readings, counts) of `data` parsed in pieces of these sizes; the last piece is the rest."""
     readings, counts, rest, position = [], {}, b'', 0
     sizes = [*sizes, len(data)]
     while position < len(data):
@@ -39,7 +39,7 @@ def pieces(framing, data, sizes):
         piece, position = rest + data[position:position + size], position + size
         parsed = framing.parse(piece, final=position >= len(data))
         rest = piece[parsed.consumed:]
-        assert len(rest) < LONGEST
+        assert len(rest) < MAX_MESSAGE
         readings += parsed.readings
         for cause, n in parsed.rejected.items():
             counts[cause] = counts.get(cause, 0) + n
@@ -49,7 +49,7 @@ def pieces(framing, data, sizes):
 
 # Other messages.
 
-def test_other_messages_are_counted_by_their_kind_and_errors_by_their_code():
+def test_other_messages_are_counted_by_kind_and_errors_by_code():
     sent = (message(0x3E, b'') + message(0x42, b'\x04') + message(0x42, b'\x1e\x01')
             + message(0x42, b'\x04') + message(0x42, b'') + message(0xC1, bytes(32)))
     parsed = FRAMING.parse(sent)
@@ -61,15 +61,15 @@ def test_other_messages_are_counted_by_their_kind_and_errors_by_their_code():
 
 
 @pytest.mark.parametrize('mid', [0x00, 0x30, 0x34, 0x3C, 0x40])
-def test_what_no_device_sends_is_no_message(mid):
+def test_messages_with_invalid_identifiers_are_garbage(mid):
     false = message(mid, bytes(8))
     parsed = FRAMING.parse(false + FRAME)
     assert parsed.readings == (READING,) and parsed.rejected == {BETWEEN: len(false)}
     assert FRAMING.parse(false[:3]).consumed == 3
 
 
-def filled_up_to(size):
-    """A message with `READING` and packets of no interest, of so many bytes of data."""
+def padded_message(size):
+    """A message with `READING` and padding packets; its data have `size` bytes."""
     fill = size - (len(FRAME) - 5) - 9
     sent = mtdata2(READING, behind=b''.join(
         packet(0x5010, bytes(n)) for n in (fill // 3, fill // 3, fill - 2 * (fill // 3))))
@@ -78,70 +78,71 @@ def filled_up_to(size):
 
 
 @pytest.mark.parametrize('size', [255, 511, 512])
-def test_messages_with_extended_length_are_read_up_to_the_longest(size):
-    sent = filled_up_to(size)
+def test_messages_with_extended_length_are_read_up_to_the_maximum(size):
+    sent = padded_message(size)
     for n in range(1, len(sent)):
         assert FRAMING.parse(sent[:n]).consumed == 0
     parsed = FRAMING.parse(sent + FRAME)
     assert parsed.readings == (READING, READING) and parsed.rejected == {}
 
 
-def test_a_longer_message_is_garbage():
-    false = filled_up_to(513)
+def test_a_message_beyond_the_maximum_length_is_garbage():
+    false = padded_message(513)
     parsed = FRAMING.parse(false + FRAME)
     assert parsed.readings == (READING,) and parsed.rejected == {BETWEEN: len(false)}
     framing = XsensFraming(XsensSettings(max_message=513))
     assert framing.parse(false + FRAME).readings == (READING, READING)
 
 
-# The laws of a framing.
+# Properties of every framing.
 
-def test_every_byte_is_in_a_frame_or_between_frames_or_left():
+def test_every_byte_is_parsed_counted_or_left():
     rng = random.Random(5)
     for _ in range(200):
         frames = [encode_random_frame(rng)[0] for _ in range(10)]
-        # Without preambles, so that it holds no false frames.
-        others = [bytes(rng.randrange(0xFA) for _ in range(rng.randrange(20))) for _ in frames]
+        # Without preambles, so that there are no false frames.
+        gaps = [bytes(rng.randrange(0xFA) for _ in range(rng.randrange(20))) for _ in frames]
         last = FRAME[:rng.randrange(len(FRAME))]
-        data = b''.join(a + b for a, b in zip(others, frames, strict=True)) + last
+        data = b''.join(a + b for a, b in zip(gaps, frames, strict=True)) + last
         parsed = LEGACY.parse(data)
-        assert parsed.rejected.get(BETWEEN, 0) == sum(map(len, others))
+        assert parsed.rejected.get(BETWEEN, 0) == sum(map(len, gaps))
         assert data[parsed.consumed:] == last
         parsed = LEGACY.parse(data, final=True)
-        assert parsed.rejected.get(BETWEEN, 0) == sum(map(len, others)) + len(last)
+        assert parsed.rejected.get(BETWEEN, 0) == sum(map(len, gaps)) + len(last)
         assert parsed.consumed == len(data)
 
 
 @settings(derandomize=True, deadline=None, max_examples=60)
 @given(st.integers(0, 2**32), st.lists(st.integers(0, 90), max_size=60))
-def test_other_pieces_give_the_same(seed, sizes):
+def test_chunk_boundaries_do_not_change_the_result(seed, sizes):
     data, sent, _ = stream(random.Random(seed), 25)
     whole = LEGACY.parse(data, final=True)
     assert whole.consumed == len(data) and lost_and_false(sent, whole.readings) == (0, 0)
-    assert pieces(LEGACY, data, sizes) == (list(whole.readings), dict(whole.rejected))
-    assert pieces(LEGACY, data, [1] * len(data)) == (list(whole.readings), dict(whole.rejected))
+    assert parse_in_pieces(LEGACY, data, sizes) == (list(whole.readings), dict(whole.rejected))
+    assert parse_in_pieces(LEGACY, data, [1] * len(data)) == (
+        list(whole.readings), dict(whole.rejected))
 
 
 @settings(derandomize=True, deadline=None, max_examples=60)
 @given(st.integers(0, 2**32), st.integers(1, 400))
-def test_other_pieces_of_pure_garbage_give_the_same(seed, size):
+def test_chunk_boundaries_in_garbage_do_not_change_the_result(seed, size):
     rng = random.Random(seed)
     data = b''.join(rng.choice((garbage(rng, 40), message(0x0D, garbage(rng, rng.randrange(99))),
                                 message(0x36, packet(0x5010, garbage(rng, 80)))))
                     for _ in range(30))
     whole = LEGACY.parse(data, final=True)
-    assert pieces(LEGACY, data, [size] * len(data)) == (
+    assert parse_in_pieces(LEGACY, data, [size] * len(data)) == (
         list(whole.readings), dict(whole.rejected))
 
 
-def test_all_of_20_000_frames_are_found_between_garbage():
+def test_all_frames_between_garbage_are_found():
     data, sent, _ = stream(random.Random(1), 20_000)
-    found, _ = pieces(LEGACY, data, [500] * (len(data) // 500))
+    found, _ = parse_in_pieces(LEGACY, data, [500] * (len(data) // 500))
     assert len(sent) > 17_000
     assert lost_and_false(sent, found) == (0, 0)
 
 
-def test_a_lost_and_a_false_reading_are_told():
+def test_the_helper_counts_lost_and_false_readings():
     a, b, c = (Reading(sequence=n) for n in range(3))
     assert lost_and_false([a, b, c], [a, b, c]) == (0, 0)
     assert lost_and_false([a, b, c], [a, c]) == (1, 0)
@@ -150,7 +151,7 @@ def test_a_lost_and_a_false_reading_are_told():
     assert lost_and_false([a, a], [a]) == (1, 0)
 
 
-def test_the_end_of_a_datagram_leaves_nothing():
+def test_the_end_of_a_datagram_leaves_no_rest():
     for n in range(len(FRAME)):
         parsed = FRAMING.parse(FRAME + FRAME[:n], final=True)
         assert parsed.readings == (READING,) and parsed.consumed == len(FRAME) + n
@@ -163,22 +164,24 @@ def test_the_end_of_a_datagram_leaves_nothing():
 @pytest.mark.parametrize('unit', [b'\xfa', b'\xfa\xff', b'\xfa\xff\x36\xfe',
                                   b'\xfa\xff\x36\xff\x02\x00', b'\xfa\xff\x0d\xff\x02\x00',
                                   b'\xfa\xff\x36\x00\xcb', b'\xfa\xff\x01\x04\xfa\xff\x01\x04'])
-def test_nothing_but_beginnings_takes_no_longer_than_its_length_says(unit):
+def test_message_starts_without_an_end_take_linear_time(unit):
     def seconds(n):
         data = unit * (n // len(unit))
         begin = time.process_time()
         assert FRAMING.parse(data, final=True).consumed == len(data)
         return time.process_time() - begin
 
-    # It is less than a second for a megabyte; the machine may be slow, and busy.
+    # A megabyte takes less than a second; the margin allows for a slow or busy machine.
     assert seconds(400_000) < 4.0
 
 
-# What false messages cannot do.
+# False messages.
 
 def forged(mid, size, inside, at, adjust):
-    """A message of `size` bytes of data in whose data, from `at` on, stands what begins
-    `inside`; one byte before that makes the sum right."""
+    """A message with `size` bytes of data that contain the start of `inside` at the offset `at`.
+
+    The byte `adjust` makes the checksum valid.
+    """
     head = bytearray(b'\xfa\xff' + bytes([mid, size]) + bytes(at))
     rest = inside[:size + 5 - len(head)]
     head[adjust] = -(sum(head[1:]) + sum(rest)) & 0xFF
@@ -189,17 +192,18 @@ def forged(mid, size, inside, at, adjust):
 
 @pytest.mark.parametrize('inside', [FRAME * 6, message(0x32, bytes(42)) + FRAME * 6])
 @pytest.mark.parametrize('size', range(9, 200, 7))
-def test_a_message_that_swallows_another_is_not_believed(inside, size):
-    """It ends in the other one, with it, or behind it."""
+def test_a_message_that_contains_another_is_rejected(inside, size):
+    """The forged message ends within the contained one, with it, or after it."""
     data = forged(0x0D, size, inside, 6, 5)
     whole = LEGACY.parse(data, final=True)
     assert whole.readings == LEGACY.parse(inside).readings
     assert whole.rejected[SPLICED] == 1
     assert whole.rejected[BETWEEN] == len(data) - len(inside)
-    assert pieces(LEGACY, data, [1] * len(data)) == (list(whole.readings), dict(whole.rejected))
+    assert parse_in_pieces(LEGACY, data, [1] * len(data)) == (
+        list(whole.readings), dict(whole.rejected))
 
 
-def test_a_message_that_takes_but_the_preamble_of_the_next_is_not_believed():
+def test_a_message_that_ends_with_the_next_preamble_is_rejected():
     head = bytearray(b'\xfa\xff\x0d\x04\x00\x00\x00\x00')
     head[4] = -(sum(head[1:]) + 0xFA) & 0xFF
     data = bytes(head) + FRAME
@@ -210,34 +214,34 @@ def test_a_message_that_takes_but_the_preamble_of_the_next_is_not_believed():
         assert FRAMING.parse(data[:n]).consumed == 0
 
 
-def test_an_answer_whose_checksum_is_a_preamble_waits_for_one_byte_and_a_reading_for_none():
+def test_an_answer_that_ends_with_a_preamble_waits_but_a_reading_does_not():
     answer = message(0x01, b'\x00\x00\x00\x01')
     answer = message(0x01, bytes([0, 0, 0, (answer[-1] + 1 - 0xFA) & 0xFF]))
     assert answer[-1] == 0xFA
     assert FRAMING.parse(answer).consumed == 0
-    counted = {'other messages: 0x01': 1}
-    assert FRAMING.parse(answer, final=True).rejected == counted
+    rejected = {'other messages: 0x01': 1}
+    assert FRAMING.parse(answer, final=True).rejected == rejected
     parsed = FRAMING.parse(answer + FRAME)
-    assert parsed.readings == (READING,) and parsed.rejected == counted
+    assert parsed.readings == (READING,) and parsed.rejected == rejected
     for count in range(256):
         sent = mtdata2(READING._replace(sequence=count))
-        for behind in (b'', b'\xff', b'\xff\x36\x20'):
-            assert len(FRAMING.parse(sent + behind).readings) == 1
+        for following in (b'', b'\xff', b'\xff\x36\x20'):
+            assert len(FRAMING.parse(sent + following).readings) == 1
 
 
-def test_bytes_that_were_lost_cost_no_other_message():
-    """Two or more bytes of every other message; what is left takes in some of its successor."""
+def test_lost_bytes_cost_no_other_message():
+    """Every other message loses two or more bytes and so runs into its successor."""
     rng = random.Random(3)
     data, sent = [], []
     while len(data) < 8000:
-        frame, said = encode_random_frame(rng)
-        if not said:
+        frame, readings = encode_random_frame(rng)
+        if not readings:
             continue
         if len(data) % 2:
             begin = rng.randrange(1, len(frame) - 2)
             frame = frame[:begin] + frame[begin + rng.randrange(2, len(frame) - begin + 1):]
         else:
-            sent += said
+            sent += readings
         data.append(frame)
     parsed = LEGACY.parse(b''.join(data), final=True)
     assert lost_and_false(sent, parsed.readings) == (0, 0)
@@ -245,26 +249,26 @@ def test_bytes_that_were_lost_cost_no_other_message():
 
 
 def test_one_wrong_byte_costs_one_message():
-    before, behind = READING._replace(sequence=1), READING._replace(sequence=3)
+    before, after = READING._replace(sequence=1), READING._replace(sequence=3)
     for at in range(len(FRAME)):
         for change in (1, 0x80, 0xFF):
             wrong = bytearray(FRAME)
             wrong[at] ^= change
-            data = mtdata2(before) + bytes(wrong) + mtdata2(behind) * 6
+            data = mtdata2(before) + bytes(wrong) + mtdata2(after) * 6
             parsed = FRAMING.parse(data, final=True)
-            assert parsed.readings == (before, *[behind] * 6), (at, change)
+            assert parsed.readings == (before, *[after] * 6), (at, change)
             assert parsed.rejected[BETWEEN] == len(FRAME)
 
 
-def test_a_wrong_checksum_is_counted_and_searched_again():
+def test_a_frame_with_a_wrong_checksum_is_counted_and_searched():
     wrong = FRAME[:-1] + bytes([FRAME[-1] ^ 1])
     parsed = FRAMING.parse(wrong + FRAME)
     assert parsed.readings == (READING,)
-    assert parsed.rejected == {WRONG_SUM: 1, BETWEEN: len(wrong)}
+    assert parsed.rejected == {WRONG_CHECKSUM: 1, BETWEEN: len(wrong)}
 
 
-def test_a_beginning_in_the_values_delays_the_message_until_it_is_clear():
-    """Its data hold what may be the beginning of another, which ends behind it."""
+def test_a_possible_start_in_the_data_delays_the_message():
+    """The data contain a possible start of another message that would end later."""
     for inside, ends in ((b'\xfa\xff\x36\x20', 0x20 + 5), (b'\xfa\xff\x32\x2a', 0x2A + 5)):
         sent = mtdata2(READING, behind=packet(0x5010, bytes(3) + inside + bytes(5)))
         begins = sent.index(inside)
@@ -276,14 +280,14 @@ def test_a_beginning_in_the_values_delays_the_message_until_it_is_clear():
         assert LEGACY.parse(sent, final=True).readings == (READING,)
         parsed = LEGACY.parse(data)
         assert parsed.readings == (READING,) * 4 and parsed.rejected == {}
-    # What cannot become a data message delays nothing.
+    # A start that cannot become a data message causes no delay.
     for inside in (b'\xfa\xff\x0d\x20', b'\xfa\xff\x34\x20', b'\xfa\xff\x36\xff\x02\x01'):
         sent = mtdata2(READING, behind=packet(0x5010, bytes(3) + inside + bytes(5)))
         assert FRAMING.parse(sent).readings == (READING,)
 
 
-def test_a_right_sum_in_the_values_is_not_enough_to_refuse_a_message():
-    """The packets of what seems to begin there do not fit, or it has not the length of MTData."""
+def test_a_valid_checksum_in_the_data_does_not_reject_the_message():
+    """The contained message has invalid packets, or not the length of MTData."""
     for inside in (message(0x36, b'\x10\x20\x03\x00\x00'), message(0x32, bytes(41)),
                    message(0x31, b'')):
         sent = mtdata2(READING, behind=packet(0x5010, inside))
@@ -291,37 +295,37 @@ def test_a_right_sum_in_the_values_is_not_enough_to_refuse_a_message():
         assert parsed.readings == (READING,) and parsed.rejected == {}
 
 
-def test_a_reading_does_not_wait_for_more_than_the_longest_message():
-    """It holds what may be the beginning of a message that ends too far behind."""
+def test_a_reading_waits_for_at_most_the_longest_message():
+    """The data contain a possible start of a message of the maximum length."""
     inside = b'\xfa\xff\x36\xff\x02\x00'
     sent = mtdata2(READING, behind=packet(0x5010, bytes(3) + inside + bytes(5)))
     data = sent + FRAME * 20
-    assert FRAMING.parse(data[:LONGEST - 1]).readings == ()
-    assert FRAMING.parse(data[:LONGEST]).readings[0] == READING
+    assert FRAMING.parse(data[:MAX_MESSAGE - 1]).readings == ()
+    assert FRAMING.parse(data[:MAX_MESSAGE]).readings[0] == READING
     assert FRAMING.parse(data).readings == (READING,) * 21
 
 
-def test_an_answer_that_may_hide_a_far_end_is_not_believed():
+def test_an_answer_that_may_contain_the_longest_message_is_rejected():
     answer = message(0x0D, bytes(3) + b'\xfa\xff\x36\xff\x02\x00' + bytes(5))
     data = answer + FRAME * 20
-    assert FRAMING.parse(data[:LONGEST - 1]).consumed == 0
+    assert FRAMING.parse(data[:MAX_MESSAGE - 1]).consumed == 0
     parsed = FRAMING.parse(data)
     assert parsed.readings == (READING,) * 20
     assert parsed.rejected[SPLICED] == 1 and parsed.rejected[BETWEEN] == len(answer)
-    # In a datagram that ends before, nothing can be hidden.
+    # A datagram that ends earlier cannot contain that message.
     assert FRAMING.parse(answer + FRAME, final=True).rejected == {'other messages: 0x0D': 1}
 
 
 @pytest.mark.parametrize('false', [b'\xfa', b'\xfa\xff', b'\xfa\xff\x36', b'\xfa\xff\x36\xfe',
                                    b'\xfa\xff\x36\xff\x02\x00', b'\xfa\xff\x0d\xff\x02\x00'])
-def test_a_false_beginning_delays_readings_by_no_more_than_the_longest_message(false):
+def test_a_false_start_delays_readings_by_at_most_the_longest_message(false):
     data = false + FRAME * 12
-    rest, came = b'', []
+    rest, returned_at = b'', []
     for at in range(len(data)):
         rest += data[at:at + 1]
         parsed = FRAMING.parse(rest)
         rest = rest[parsed.consumed:]
-        came += [at + 1] * len(parsed.readings)
-    whole = [len(false) + len(FRAME) * n for n in range(1, 13)]
-    assert came == [max(at, came[0]) for at in whole]
-    assert came[0] <= max(whole[0], LONGEST)
+        returned_at += [at + 1] * len(parsed.readings)
+    complete_at = [len(false) + len(FRAME) * n for n in range(1, 13)]
+    assert returned_at == [max(at, returned_at[0]) for at in complete_at]
+    assert returned_at[0] <= max(complete_at[0], MAX_MESSAGE)

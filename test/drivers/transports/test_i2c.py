@@ -1,4 +1,4 @@
-"""I2C magnetometers over a simulated bus: scales, axes, times, faults."""
+"""I2C magnetometers over a simulated bus: scales, axes, times and failures."""
 
 import itertools
 import math
@@ -23,17 +23,17 @@ SCALES = [
     *(('lis3mdl', {'range_ut': r}, r * 1e-6, 1e-4 / gain) for r, gain in
       [(400.0, 6842), (800.0, 3421), (1200.0, 2281), (1600.0, 1711)]),
 ]
-"""(chip, settings, largest field [T], one count [T])."""
+"""(chip, settings, maximum field [T], one count [T])."""
 
 
-def test_a_range_is_a_range_of_the_table():
+def test_scales_are_tested_for_every_chip():
     assert {chip for chip, *_ in SCALES} == set(FAKES)
 
 
 @hypothesis_settings(derandomize=True, deadline=None, max_examples=150)
 @given(st.sampled_from(SCALES), st.tuples(*[st.floats(-1.0, 1.0)] * 3),
        st.tuples(*[st.integers(-3000, 3000)] * 3))
-def test_the_field_comes_out_to_half_a_count(scale, part, bridge_offset):
+def test_the_field_is_accurate_to_half_a_count(scale, part, bridge_offset):
     chip, changes, largest, count = scale
     _, bus, device, fake = one(chip, **{chip: changes})
     largest -= 3000.0 * count if hasattr(fake, 'bridge_offset') else count
@@ -47,12 +47,12 @@ def test_the_field_comes_out_to_half_a_count(scale, part, bridge_offset):
 
 @pytest.mark.parametrize('chip, changes, largest, count', SCALES)
 @pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_full_scale_is_reached_and_beyond_is_nan(chip, changes, largest, count, sign):
+def test_full_scale_is_measured_and_values_beyond_are_nan(chip, changes, largest, count, sign):
     _, _, device, fake = one(chip, **{chip: changes})
     fake.field = lambda ns: (B[0], sign * (largest - 2 * count), B[2])
     field = device.read(1.0)[0].reading.field
     assert field[1] == pytest.approx(sign * largest, abs=3 * count)
-    # The HMC's counts end at 2047, well above the range that is recommended.
+    # The HMC's counts end at 2047, well above the recommended range.
     beyond = 2049 * count if chip.startswith('hmc') else 1.05 * largest
     fake.field = lambda ns: (B[0], B[1], sign * beyond)
     field = device.read(1.0)[0].reading.field
@@ -61,8 +61,8 @@ def test_full_scale_is_reached_and_beyond_is_nan(chip, changes, largest, count, 
 
 
 @pytest.mark.parametrize('chip', FAKES)
-def test_a_reading_has_the_time_of_its_conversion(chip):
-    """The field changes by 1 mT/s, so it tells the time."""
+def test_the_arrival_time_is_that_of_the_conversion(chip):
+    """The field changes by 1 mT/s and so encodes the time."""
     clock, _, device, fake = one(chip, rate_hz=23.0)
     errors = []
     for _ in range(40):
@@ -71,7 +71,7 @@ def test_a_reading_has_the_time_of_its_conversion(chip):
         (arrival,) = device.read(1.0)
         errors.append((arrival.arrival_ns - start - 50e6) * 1e-9
                       - arrival.reading.field[0] * 1e3)
-    # What starts its conversions itself is late by what a command takes, and half a count.
+    # A continuously converting chip is off by up to half a period plus the time of a command.
     bound = {'rm3100': 0.5 / 147.0 + 3e-4, 'lis3mdl': 0.5 / 155.0 + 3e-4}.get(chip, 1.5e-4)
     assert np.abs(errors).max() < bound
     if chip in ('rm3100', 'lis3mdl'):
@@ -79,7 +79,7 @@ def test_a_reading_has_the_time_of_its_conversion(chip):
 
 
 def read_for(device, clock, seconds):
-    """All arrivals of some time."""
+    """All arrivals within `seconds`."""
     end_ns, out = clock.ns + round(seconds * 1e9), []
     while clock.ns < end_ns:
         out += device.read((end_ns - clock.ns) * 1e-9)
@@ -87,7 +87,7 @@ def read_for(device, clock, seconds):
 
 
 @pytest.mark.parametrize('rate', [0.5, 7.0, 50.0, 80.0])
-def test_turns_keep_their_rate_whatever_they_take(rate):
+def test_polling_cycles_keep_their_rate(rate):
     clock, _, device, _ = one('mmc5983ma', rate_hz=rate)
     device.read(3.0)
     arrivals = read_for(device, clock, 200.0 / rate)
@@ -97,13 +97,13 @@ def test_turns_keep_their_rate_whatever_they_take(rate):
     assert not device.counts
 
 
-def test_turns_that_were_missed_are_counted_and_the_grid_stays():
+def test_missed_polling_cycles_are_counted_and_the_grid_is_kept():
     clock, _, device, _ = one('hmc5883l', rate_hz=50.0)
     before = device.read(1.0)[0].arrival_ns
     clock.sleep(0.110)
     after = device.read(1.0)[0].arrival_ns
     again = device.read(1.0)[0].arrival_ns
-    # 20, 40, 60, 80 ms are gone; 100 ms is late, and the next one is not.
+    # The cycles at 20, 40, 60 and 80 ms are missed. That at 100 ms is late, the next is not.
     assert device.counts == {'polling cycles missed': 4}
     assert (again - before) * 1e-9 == pytest.approx(0.120, abs=5e-3)
     assert (after - before) * 1e-9 == pytest.approx(0.110, abs=1e-2)
@@ -112,14 +112,14 @@ def test_turns_that_were_missed_are_counted_and_the_grid_stays():
     assert device.counts == {'polling cycles missed': 5}
 
 
-def test_a_turn_that_takes_longer_than_the_period_misses_others():
+def test_a_polling_cycle_longer_than_the_period_misses_others():
     clock, _, device, _ = one('mmc5983ma', rate_hz=100.0, mmc5983ma={'conversion_ms': 8.0})
     arrivals = read_for(device, clock, 2.0)
     assert len(arrivals) + device.counts['polling cycles missed'] == pytest.approx(200, abs=3)
     assert 60 < len(arrivals) < 105
 
 
-def test_nothing_due_is_nothing_read_after_the_timeout():
+def test_read_without_a_due_cycle_returns_nothing_at_its_timeout():
     clock, _, device, _ = one('hmc5883l', rate_hz=2.0)
     device.read(1.0)
     start = clock.ns
@@ -129,7 +129,7 @@ def test_nothing_due_is_nothing_read_after_the_timeout():
     assert len(device.read(1.0)) == 1
 
 
-def test_the_chips_of_a_bus_measure_at_the_same_time():
+def test_the_chips_on_a_bus_measure_simultaneously():
     entries = ['A:mmc5603:0x30', 'B:hmc5883l:0x1e', 'E:lis3mdl:0x1c', 'C:rm3100:0x20',
                'D:rm3100:0x21']
     clock, bus, device = rig(entries)
@@ -138,7 +138,7 @@ def test_the_chips_of_a_bus_measure_at_the_same_time():
     arrivals = device.read(1.0)
     assert sorted(a.reading.sensor for a in arrivals) == list('ABCDE')
     assert [a.arrival_ns for a in arrivals] == sorted(a.arrival_ns for a in arrivals)
-    # One after the other they would take twice as long.
+    # Sequential conversions would take twice as long.
     assert (clock.ns - start) * 1e-9 < 0.0135
     assert max(a.arrival_ns for a in arrivals) - min(a.arrival_ns for a in arrivals) < 15e6
 
@@ -156,18 +156,18 @@ def test_no_conversion_is_read_twice(chip):
         'polling cycles without a new conversion: A': pytest.approx(400 - rate, abs=3)}
 
 
-def test_conversions_that_nobody_read_are_counted():
+def test_overwritten_conversions_are_counted():
     clock, _, device = rig(['A:lis3mdl:0x1c', 'B:lis3mdl:0x1e'], rate_hz=50.0)
     device.open()
     assert len(read_for(device, clock, 0.985)) == 100
-    # B was set up first: the second is there already when it is first read.
+    # A is set up first: its first conversion is overwritten before the first reading.
     assert device.counts == {'conversions overwritten before they were read: A': 50,
                              'conversions overwritten before they were read: B': 49}
 
 
 @pytest.mark.parametrize('chip, changes', [
     ('mmc5983ma', {}), ('mmc5603', {}), ('mmc5603', {'set_reset_s': 10.0}), ('hmc5883l', {})])
-def test_a_conversion_that_is_not_done_is_no_reading(chip, changes):
+def test_an_unfinished_conversion_gives_no_reading(chip, changes):
     _, _, device, fake = one(chip, **{chip: changes})
     slow = fake.CONVERSION_MS if hasattr(fake, 'CONVERSION_MS') else None
     device.read(1.0)
@@ -186,7 +186,7 @@ def test_a_conversion_that_is_not_done_is_no_reading(chip, changes):
 
 
 @pytest.mark.parametrize('chip', ['mmc5983ma', 'mmc5603'])
-def test_the_offset_of_the_bridge_is_measured_anew(chip):
+def test_the_bridge_offset_is_measured_periodically(chip):
     clock, _, device, fake = one(chip, rate_hz=50.0, **{chip: {'set_reset_s': 1.0}})
     fake.bridge_offset = (20000.0, -7000.0, 300.0)
     arrivals = read_for(device, clock, 0.97)
@@ -197,11 +197,11 @@ def test_the_offset_of_the_bridge_is_measured_anew(chip):
     assert len(fake.pulses) == 4
     for arrival in arrivals + after[1:]:
         np.testing.assert_allclose(arrival.reading.field, B, atol=0.76 / 16384e4)
-    # What drifts meanwhile is in the field until then.
+    # Until then, the drift of the offset remains in the field.
     assert between[0].reading.field[0] == pytest.approx(B[0] + 100 / 16384e4, abs=1e-8)
 
 
-def test_an_axis_over_its_range_does_not_spoil_the_readings_after_it():
+def test_an_overrange_axis_does_not_affect_later_readings():
     clock, _, device, fake = one('mmc5983ma', mmc5983ma={'set_reset_s': 3600.0})
     fake.field = lambda ns: (9e-4, 0.0, 0.0)
     assert math.isnan(device.read(1.0)[0].reading.field[0])
@@ -212,7 +212,7 @@ def test_an_axis_over_its_range_does_not_spoil_the_readings_after_it():
 
 
 @pytest.mark.parametrize('chip', FAKES)
-def test_a_failure_is_counted_and_tried_again(chip):
+def test_a_failed_reading_is_counted_and_retried(chip):
     clock, bus, device, fake = one(chip)
     device.read(1.0)
     for n in range(1, 13):
@@ -224,7 +224,7 @@ def test_a_failure_is_counted_and_tried_again(chip):
 
 
 @pytest.mark.parametrize('chip', FAKES)
-def test_a_chip_that_goes_on_failing_is_lost_and_set_up_again(chip):
+def test_a_chip_that_keeps_failing_is_lost_and_can_be_reopened(chip):
     clock, bus, device, fake = one(chip, max_failures=5)
     device.read(1.0)
     fake.answers = False
@@ -242,13 +242,13 @@ def test_a_chip_that_goes_on_failing_is_lost_and_set_up_again(chip):
     fake.power_up()
     device.open()
     fake.answers = False
-    # It begins to count anew.
+    # The count of failures restarts.
     assert device.read(0.001) == device.read(0.001) == []
     fake.answers = True
     np.testing.assert_allclose(device.read(1.0)[0].reading.field, B, atol=1e-7)
 
 
-def test_what_the_others_said_is_not_lost_with_a_chip():
+def test_readings_of_other_chips_are_returned_when_one_is_lost():
     clock, bus, device = rig(['A:lis3mdl:0x1c', 'B:hmc5883l:0x1e'], max_failures=1)
     device.open()
     bus.chips[0x1C].answers = False
@@ -258,7 +258,7 @@ def test_what_the_others_said_is_not_lost_with_a_chip():
 
 
 @pytest.mark.parametrize('chip', ['rm3100', 'lis3mdl'])
-def test_a_chip_whose_supply_was_cut_is_lost(chip):
+def test_a_power_cut_is_detected_by_missing_conversions(chip):
     clock, _, device, fake = one(chip, silence_timeout_s=0.5)
     device.read(1.0)
     fake.power_up()
@@ -273,7 +273,7 @@ def test_a_chip_whose_supply_was_cut_is_lost(chip):
     np.testing.assert_allclose(device.read(1.0)[0].reading.field, B, atol=1e-7)
 
 
-def test_two_silent_turns_in_a_row_are_nothing():
+def test_two_silent_polling_cycles_are_tolerated():
     clock, _, device, fake = one('rm3100', rate_hz=10.0, silence_timeout_s=0.0)
     for silent in (2, 2):
         fake.stop()
@@ -283,13 +283,13 @@ def test_two_silent_turns_in_a_row_are_nothing():
 
 
 @pytest.mark.parametrize('chip', ['hmc5883l', 'hmc5983'])
-def test_a_scale_that_went_with_the_supply_is_no_reading(chip):
+def test_a_chip_that_lost_its_settings_gives_no_reading(chip):
     clock, _, device, fake = one(chip, **{chip: {'range_ut': 810.0}})
     device.read(1.0)
     fake.power_up()
     with pytest.raises(DeviceError, match='the chip lost its settings'):
         device.read(10.0)
-    # The same gain, and yet not as it was set up.
+    # The gain is unchanged, but another register is not.
     fake.memory[:] = bytes([0x70, 7 << 5]) + fake.memory[2:]
     device.open()
     fake.memory[0] = 0x70
@@ -297,7 +297,7 @@ def test_a_scale_that_went_with_the_supply_is_no_reading(chip):
         device.read(10.0)
 
 
-def test_a_bus_that_hangs_costs_one_wait_a_turn():
+def test_a_hanging_bus_costs_one_timeout_per_polling_cycle():
     clock, bus, device = rig(['A:lis3mdl:0x1c', 'B:hmc5883l:0x1e', 'C:rm3100:0x20'],
                              max_failures=2)
     device.open()

@@ -1,4 +1,4 @@
-"""I2C magnetometers: settings, opening and closing, multiplexers."""
+"""I2C magnetometers: settings, opening, closing and multiplexers."""
 
 import errno
 import re
@@ -35,7 +35,7 @@ from support.i2c_chips import Clock, FakeHmc5883l, FakeLis3mdl, FakeMmc5603
     (['A:lis3mdl:0x1c@0x70.1', 'B:lis3mdl:0x1c@0x70.1'], 'A and B both answer'),
     (['A:lis3mdl:0x70', 'B:lis3mdl:0x1c@0x70.1'], 'A: address 0x70 is used by a multiplexer'),
 ])
-def test_entries_that_cannot_be(entries, message):
+def test_invalid_sensor_entries_are_refused(entries, message):
     with pytest.raises(SettingsError, match=message):
         I2cDevice(replace(I2cSettings(), {'sensors': entries}))
 
@@ -49,14 +49,14 @@ def test_entries_that_cannot_be(entries, message):
     ({'rm3100': {'cycle_count': 150}}, r'rm3100\.cycle_count: expected one of 50, 100, 200'),
     ({'lis3mdl': {'range_ut': 500.0}}, r'lis3mdl\.range_ut'),
 ])
-def test_settings_of_a_chip_are_looked_at_before_it_is_opened(changes, message):
+def test_chip_settings_are_checked_before_opening(changes, message):
     (chip,) = changes
     with pytest.raises(SettingsError, match=message):
         rig([f'A:{chip}:{FAKES[chip][1]:#04x}'], **changes)
 
 
 @pytest.mark.parametrize('chip', FAKES)
-def test_the_usual_settings_are_usable(chip):
+def test_the_default_settings_of_each_chip_work(chip):
     _, _, device, _ = one(chip)
     assert len(device.read(0.0)) == 1 and not device.counts
 
@@ -66,7 +66,7 @@ def test_the_usual_settings_are_usable(chip):
     (errno.EACCES, '/dev/i2c-7: no permission; .*usermod -aG i2c'),
     (errno.EIO, '/dev/i2c-7: cannot be opened: Input/output error'),
 ])
-def test_a_bus_that_cannot_be_opened(code, message):
+def test_a_bus_that_cannot_be_opened_is_reported(code, message):
     def open_bus(number):
         assert number == 7
         raise OSError(code, {errno.EIO: 'Input/output error'}.get(code, ''))
@@ -76,25 +76,25 @@ def test_a_bus_that_cannot_be_opened(code, message):
         I2cDevice(settings, open_bus).open()
 
 
-def test_the_real_smbus_says_that_there_is_no_bus():
+def test_a_missing_bus_is_reported_by_the_real_smbus():
     settings = replace(I2cSettings(), {'sensors': ['A:lis3mdl:0x1c'], 'bus': 254})
     with pytest.raises(DeviceError, match='/dev/i2c-254: not found'):
         I2cDevice(settings).open()
 
 
-LEFT = {'mmc5983ma': {0x0A: 0x1C, 0x0B: 0x0D}, 'mmc5603': {0x1C: 0x1C, 0x1D: 0x10},
-        'hmc5883l': {0: 0x71, 1: 0xE0}, 'hmc5983': {0: 0x72},
-        'rm3100': {5: 50, 7: 50, 9: 50, 11: 0x9F},
-        'lis3mdl': {0x20: 0x60, 0x21: 0x60, 0x23: 0x02, 0x05: 7}}
-"""{chip: {register: what another program left in it}}."""
+LEFTOVERS = {'mmc5983ma': {0x0A: 0x1C, 0x0B: 0x0D}, 'mmc5603': {0x1C: 0x1C, 0x1D: 0x10},
+             'hmc5883l': {0: 0x71, 1: 0xE0}, 'hmc5983': {0: 0x72},
+             'rm3100': {5: 50, 7: 50, 9: 50, 11: 0x9F},
+             'lis3mdl': {0x20: 0x60, 0x21: 0x60, 0x23: 0x02, 0x05: 7}}
+"""{chip: {register: value left by another program}}."""
 
 
 @pytest.mark.parametrize('chip', FAKES)
-def test_a_chip_is_set_up_whatever_state_it_was_left_in(chip):
+def test_a_chip_is_set_up_from_any_state(chip):
     address = FAKES[chip][1]
     _, bus, device = rig([f'A:{chip}:{address:#04x}'])
     fake = bus.chips[address]
-    for register, value in LEFT[chip].items():
+    for register, value in LEFTOVERS[chip].items():
         fake.memory[register] = value
     if chip == 'rm3100':
         fake.begin(1_900_000)
@@ -102,11 +102,11 @@ def test_a_chip_is_set_up_whatever_state_it_was_left_in(chip):
     np.testing.assert_allclose(device.read(0.0)[0].reading.field, B, atol=1e-7)
     assert fake.memory[0x05] != 7
     if chip.startswith('hmc'):
-        # The compensation of the temperature, which the HMC5883L does not have.
+        # Bit 7 enables the temperature compensation, which the HMC5883L lacks.
         assert fake.memory[0] >> 7 == (chip == 'hmc5983')
 
 
-def test_nothing_at_the_address():
+def test_a_missing_chip_is_reported():
     _, bus, device = rig(['A:lis3mdl:0x1e'], {})
     with pytest.raises(DeviceError, match=re.escape(
             '/dev/i2c-1: A (lis3mdl, address 0x1e): no answer; check wiring and supply, and the '
@@ -115,7 +115,7 @@ def test_nothing_at_the_address():
     assert bus.opened == 1 and not bus.open
 
 
-def test_another_chip_at_the_address():
+def test_another_chip_at_the_address_is_identified():
     clock = Clock()
     _, bus, device = rig(['A:lis3mdl:0x1e'], {0x1E: FakeHmc5883l(clock)}, clock)
     with pytest.raises(DeviceError, match=re.escape(
@@ -129,11 +129,11 @@ def test_another_chip_at_the_address():
 @pytest.mark.parametrize('chip, register', [
     ('mmc5983ma', 0x2F), ('mmc5603', 0x39), ('hmc5883l', 0x0A), ('hmc5883l', 0x0B),
     ('hmc5983', 0x0C), ('rm3100', 0x36), ('lis3mdl', 0x0F)])
-def test_every_register_of_the_identity_counts(chip, register):
+def test_every_identity_register_is_checked(chip, register):
     address = FAKES[chip][1]
     _, bus, device = rig([f'A:{chip}:{address:#04x}'])
     fake = bus.chips[address]
-    # A soft reset would bring it back.
+    # A soft reset would restore the memory, so the read access is replaced.
     fake.fetch = lambda r: 0x5A if r == register else fake.memory[r]
     with pytest.raises(DeviceError, match=f'identity register {register:#04x} reads 0x5a instead '
                                           r'of 0x..$'):
@@ -147,7 +147,7 @@ def test_every_register_of_the_identity_counts(chip, register):
     (OSError(errno.EIO, 'Input/output error'), 'cannot be read: Input/output error'),
 ])
 @pytest.mark.parametrize('when', range(6))
-def test_a_failure_while_a_chip_is_set_up(error, message, when):
+def test_a_failure_during_set_up_is_reported_and_closes_the_bus(error, message, when):
     _, bus, device = rig(['A:lis3mdl:0x1c'])
     bus.next_errors = [None] * when + [error]
     with pytest.raises(DeviceError, match=message):
@@ -157,7 +157,7 @@ def test_a_failure_while_a_chip_is_set_up(error, message, when):
     assert bus.open and bus.number == 1
 
 
-def test_a_block_that_is_cut_off_is_a_failure():
+def test_a_truncated_block_is_a_failed_reading():
     clock, bus, device, fake = one('lis3mdl')
     device.read(1.0)
     whole = bus.read_i2c_block_data
@@ -166,7 +166,7 @@ def test_a_block_that_is_cut_off_is_a_failure():
     assert device.counts['failed readings: A'] == 1
 
 
-def test_closing():
+def test_close_and_open_may_be_repeated():
     _, bus, device, _ = one('lis3mdl')
     device.close()
     device.close()
@@ -190,18 +190,18 @@ def test_close_ends_a_read_in_another_thread():
     device = I2cDevice(settings, bus.open_bus)
     device.open()
     assert len(device.read(1.0)) == 1
-    got = []
-    thread = threading.Thread(target=lambda: got.append(device.read(30.0)))
+    results = []
+    thread = threading.Thread(target=lambda: results.append(device.read(30.0)))
     thread.start()
     time.sleep(0.15)
     start = time.monotonic()
     device.close()
     thread.join()
-    assert got == [[]] and time.monotonic() - start < 1.0 and not bus.open
+    assert results == [[]] and time.monotonic() - start < 1.0 and not bus.open
 
 
-def behind_multiplexers():
-    """(clock, bus, device): chips of one address on three channels, and one without."""
+def multiplexed_rig():
+    """(clock, bus, device): three chips of one address on channels, and two without a channel."""
     clock = Clock()
     at = {name: FakeLis3mdl(clock, (i * 1e-5, 0.0, 0.0))
           for i, name in enumerate('ABC', start=1)}
@@ -212,9 +212,9 @@ def behind_multiplexers():
                 'C:lis3mdl:0x1c@0x71.0', 'E:mmc5603:0x30'], chips, clock)
 
 
-def test_each_channel_is_opened_alone():
-    """The simulated bus also fails where two chips answer."""
-    clock, bus, device = behind_multiplexers()
+def test_only_one_channel_is_open_at_a_time():
+    """The simulated bus also fails if two chips answer."""
+    clock, bus, device = multiplexed_rig()
     device.open()
     for _ in range(5):
         fields = {a.reading.sensor: a.reading.field for a in device.read(1.0)}
@@ -224,7 +224,7 @@ def test_each_channel_is_opened_alone():
     assert not [cause for cause in device.counts if 'failed' in cause]
 
 
-def test_chips_behind_different_channels_measure_at_the_same_time():
+def test_chips_on_different_channels_measure_simultaneously():
     clock = Clock()
     fields = {n: (n * 1e-5, 0.0, -1e-5) for n in range(4)}
     chips = {0x70: FakeMultiplexer(clock, {
@@ -240,16 +240,16 @@ def test_chips_behind_different_channels_measure_at_the_same_time():
     assert len(arrivals) == 4
 
 
-def test_channels_are_shut_for_what_is_on_the_bus_itself():
-    _, bus, device = behind_multiplexers()
+def test_channels_are_closed_for_chips_on_the_bus_itself():
+    _, bus, device = multiplexed_rig()
     device.open()
-    # The last that was spoken to is E.
+    # The last chip addressed is E, which is on the bus itself.
     assert bus.chips[0x70].mask == bus.chips[0x71].mask == 0
     assert set(bus.chips[0x70].written) == {0, 1, 1 << 5}
     assert set(bus.chips[0x71].written) == {0, 1}
 
 
-def test_a_channel_stays_open_while_its_chip_is_spoken_to():
+def test_a_channel_stays_open_while_its_chip_is_addressed():
     clock = Clock()
     chips = {0x70: FakeMultiplexer(clock, {3: {0x1C: FakeLis3mdl(clock)}})}
     _, bus, device = rig(['A:lis3mdl:0x1c@0x70.3'], chips, clock)
@@ -259,19 +259,19 @@ def test_a_channel_stays_open_while_its_chip_is_spoken_to():
     assert bus.chips[0x70].written == [1 << 3]
 
 
-def test_a_multiplexer_that_was_reset_is_set_again():
-    clock, bus, device = behind_multiplexers()
+def test_channels_are_selected_again_after_a_multiplexer_reset():
+    clock, bus, device = multiplexed_rig()
     device.open()
     device.read(1.0)
     for name in (0x70, 0x71):
         bus.chips[name].mask = 0
-    # A failure of anything tells it.
+    # Any failure makes the driver select the channels again.
     bus.next_errors = [OSError(errno.EREMOTEIO, 'Remote I/O error')]
     device.read(1.0)
     assert len(device.read(1.0)) == 5
 
 
-def test_a_channel_that_was_shut_behind_our_back_is_opened_again():
+def test_a_channel_closed_by_another_program_is_opened_again():
     clock = Clock()
     chips = {0x70: FakeMultiplexer(clock, {3: {0x1C: FakeLis3mdl(clock)}})}
     _, bus, device = rig(['A:lis3mdl:0x1c@0x70.3'], chips, clock)
@@ -283,7 +283,7 @@ def test_a_channel_that_was_shut_behind_our_back_is_opened_again():
     assert device.counts['failed readings: A'] == 1
 
 
-def test_a_missing_multiplexer_is_named():
+def test_a_missing_multiplexer_is_reported():
     clock, bus, device = rig(['A:lis3mdl:0x1c@0x72.4'], {})
     with pytest.raises(DeviceError, match='on channel 4 of the multiplexer at 0x72.*no answer'):
         device.open()

@@ -1,4 +1,4 @@
-"""MQTT at a real broker: whole, in order, counted; every way to fail names the broker."""
+"""MQTT with a real broker: delivery, counted losses, failures, TLS and closing."""
 
 import os
 import threading
@@ -35,7 +35,7 @@ def broker(tmp_path_factory):
 
 @pytest.fixture
 def topics(monkeypatch):
-    """Makes transports that are closed at the end."""
+    """Factory of transports, which are closed at the end."""
     monkeypatch.setattr(mqtt_topics, 'CLOSE_WAIT_S', 0.01)
     made = []
 
@@ -46,11 +46,11 @@ def topics(monkeypatch):
     yield make
     for transport in made:
         transport.close()
-    assert not loops()
+    assert not connection_threads()
 
 
-def loops():
-    """The threads of all connections."""
+def connection_threads():
+    """Threads of all connections."""
     return {t for t in threading.enumerate() if t.name.startswith('mqtt ')}
 
 
@@ -59,8 +59,8 @@ def send(port, messages, **kwargs):
                       for topic, payload in messages], '127.0.0.1', port)
 
 
-def gather(transport, n, seconds=5.0):
-    """Chunks until there are `n`, or nothing comes for a while."""
+def read_chunks(transport, n, seconds=5.0):
+    """Read chunks until there are `n`, or the time is over."""
     chunks, end = [], time.monotonic() + seconds
     while len(chunks) < n and time.monotonic() < end:
         chunks += transport.read(0.2)
@@ -75,17 +75,17 @@ def wait_until(condition, seconds=5.0):
 
 
 def wait_for_messages(broker, client_id, n):
-    """Until a reader with `qos` 1 has taken `n` messages, which nobody has read yet."""
+    """Wait until a client with `qos` 1 has acknowledged `n` messages, which are still unread."""
     wait_until(lambda: broker.log().count(f'Received PUBACK from {client_id} ') == n)
 
 
-def failure(transport):
-    """What `open` says; it is done in time, and leaves no thread."""
-    before, start = loops(), time.monotonic()
+def open_error(transport):
+    """Error message of `open`, which must fail in time and leave no thread."""
+    before, start = connection_threads(), time.monotonic()
     with pytest.raises(DeviceError) as caught:
         transport.open()
     assert time.monotonic() - start < 2.0 * transport.settings.connect_timeout_s + 1.0
-    assert loops() <= before
+    assert connection_threads() <= before
     with pytest.raises(DeviceError, match='not open'):
         transport.read(0.0)
     assert str(caught.value).startswith(
@@ -94,13 +94,13 @@ def failure(transport):
 
 
 @pytest.mark.parametrize('qos', [0, 1, 2])
-def test_messages_are_whole_in_order_and_have_their_topic(broker, topics, qos):
+def test_messages_arrive_complete_and_in_order_with_their_topic(broker, topics, qos):
     mqtt = topics(broker.port, qos=qos)
     mqtt.open()
     sent = [(f'mag/{i % 7}', bytes([i % 256]) * (1 + i % 90)) for i in range(1000)]
     before = time.monotonic_ns()
     send(broker.port, sent, qos=qos)
-    chunks = gather(mqtt, len(sent))
+    chunks = read_chunks(mqtt, len(sent))
     assert [(c.source, c.data) for c in chunks] == sent
     arrivals = [c.arrival_ns for c in chunks]
     assert arrivals == sorted(arrivals)
@@ -109,34 +109,35 @@ def test_messages_are_whole_in_order_and_have_their_topic(broker, topics, qos):
     assert mqtt.whole
 
 
-def test_only_the_topics_that_were_asked_for_come(broker, topics):
+def test_only_subscribed_topics_are_received(broker, topics):
     mqtt = topics(broker.port, topics=('mag/a', 'mag/+/b'))
     mqtt.open()
     send(broker.port, [('mag/c', b'1'), ('mag/a', b'2'), ('other', b'3'), ('mag/x/b', b'4')])
-    assert [(c.source, c.data) for c in gather(mqtt, 2)] == [('mag/a', b'2'), ('mag/x/b', b'4')]
+    assert [(c.source, c.data) for c in read_chunks(mqtt, 2)] == [
+        ('mag/a', b'2'), ('mag/x/b', b'4')]
     assert mqtt.read(0.1) == []
 
 
-def test_read_waits_no_longer_than_it_is_told_and_no_longer_than_needed(broker, topics):
+def test_read_returns_at_a_message_or_at_its_timeout(broker, topics):
     mqtt = topics(broker.port)
     mqtt.open()
     start = time.monotonic()
     assert mqtt.read(0.2) == []
     assert 0.2 <= time.monotonic() - start < 0.8
-    late = threading.Timer(0.2, send, (broker.port, [('mag/a', b'x')]))
-    late.start()
+    timer = threading.Timer(0.2, send, (broker.port, [('mag/a', b'x')]))
+    timer.start()
     start = time.monotonic()
     chunk, = mqtt.read(5.0)
     assert 0.15 < time.monotonic() - start < 2.0
-    late.join()
-    # The time is of the coming, not of the reading.
+    timer.join()
+    # The arrival time is that of reception, not of reading.
     send(broker.port, [('mag/a', b'y')])
     time.sleep(0.2)
     chunk, = mqtt.read(0.0)
     assert time.monotonic_ns() - chunk.arrival_ns > 150e6
 
 
-def test_the_oldest_are_dropped_for_a_slow_reader_and_counted(broker, topics):
+def test_a_slow_reader_loses_the_oldest_messages_which_are_counted(broker, topics):
     mqtt = topics(broker.port, client_id='slow', queue=50, qos=1)
     mqtt.open()
     send(broker.port, [('mag/a', str(i).encode()) for i in range(300)] + [('mag/end', b'end')],
@@ -150,7 +151,7 @@ def test_the_oldest_are_dropped_for_a_slow_reader_and_counted(broker, topics):
     assert mqtt.counts == {'messages dropped (queue full)': 251}
 
 
-def test_a_queue_that_is_just_full_loses_nothing(broker, topics):
+def test_a_queue_that_is_exactly_full_loses_nothing(broker, topics):
     mqtt = topics(broker.port, client_id='full', queue=50, qos=1)
     mqtt.open()
     send(broker.port, [('mag/a', str(i).encode()) for i in range(50)], qos=1)
@@ -159,48 +160,48 @@ def test_a_queue_that_is_just_full_loses_nothing(broker, topics):
     assert not mqtt.counts
 
 
-def test_a_message_that_is_too_long_is_counted(broker, topics):
+def test_long_and_empty_messages_are_counted(broker, topics):
     mqtt = topics(broker.port, max_length=1000)
     mqtt.open()
     send(broker.port, [('mag/a', b'x' * 1000), ('mag/a', b'x' * 1001), ('mag/a', b'x' * 500_000),
                        ('mag/a', b''), ('mag/a', b'z')])
-    assert [len(c.data) for c in gather(mqtt, 2)] == [1000, 1]
+    assert [len(c.data) for c in read_chunks(mqtt, 2)] == [1000, 1]
     assert mqtt.counts == {'messages longer than max_length': 2, 'empty messages': 1}
 
 
-def test_half_a_million_bytes_come_whole_where_they_are_allowed(broker, topics):
+def test_a_message_of_500_000_bytes_is_received_if_allowed(broker, topics):
     mqtt = topics(broker.port, max_length=1_000_000)
     mqtt.open()
     payload = os.urandom(500_000)
     send(broker.port, [('mag/a', payload)])
-    assert [c.data for c in gather(mqtt, 1)] == [payload]
+    assert [c.data for c in read_chunks(mqtt, 1)] == [payload]
 
 
-@pytest.mark.parametrize('wanted', [False, True])
-def test_retained_messages_are_old_news(broker, topics, wanted):
+@pytest.mark.parametrize('enabled', [False, True])
+def test_retained_messages_are_skipped_unless_enabled(broker, topics, enabled):
     send(broker.port, [('mag/kept', b'old')], retain=True)
     try:
-        mqtt = topics(broker.port, retained=wanted)
+        mqtt = topics(broker.port, retained=enabled)
         mqtt.open()
         send(broker.port, [('mag/kept', b'new')], retain=True)
-        sent = [b'old', b'new'] if wanted else [b'new']
-        assert [c.data for c in gather(mqtt, len(sent))] == sent
-        assert mqtt.counts == ({} if wanted else {'retained messages skipped': 1})
+        sent = [b'old', b'new'] if enabled else [b'new']
+        assert [c.data for c in read_chunks(mqtt, len(sent))] == sent
+        assert mqtt.counts == ({} if enabled else {'retained messages skipped': 1})
     finally:
         send(broker.port, [('mag/kept', b'')], retain=True)
 
 
-def test_what_was_sent_while_nobody_listened_does_not_come_later(broker, topics):
+def test_messages_sent_while_closed_are_not_received_later(broker, topics):
     mqtt = topics(broker.port, client_id='reader', qos=1)
     mqtt.open()
     mqtt.close()
     send(broker.port, [('mag/a', b'meanwhile')], qos=1)
     mqtt.open()
     send(broker.port, [('mag/a', b'now')], qos=1)
-    assert [c.data for c in gather(mqtt, 1)] == [b'now']
+    assert [c.data for c in read_chunks(mqtt, 1)] == [b'now']
 
 
-def test_what_was_not_read_before_closing_does_not_come_later(broker, topics):
+def test_messages_unread_at_closing_are_not_received_later(broker, topics):
     mqtt = topics(broker.port, client_id='leaving', qos=1)
     mqtt.open()
     send(broker.port, [('mag/a', b'meanwhile')], qos=1)
@@ -212,15 +213,15 @@ def test_what_was_not_read_before_closing_does_not_come_later(broker, topics):
     assert mqtt.read(0.1) == []
 
 
-def test_two_without_an_identifier_do_not_throw_each_other_out(broker, topics):
+def test_two_clients_without_identifier_coexist(broker, topics):
     both = [topics(broker.port), topics(broker.port)]
     for mqtt in both:
         mqtt.open()
     send(broker.port, [('mag/a', b'x')])
-    assert [[c.data for c in gather(mqtt, 1)] for mqtt in both] == [[b'x'], [b'x']]
+    assert [[c.data for c in read_chunks(mqtt, 1)] for mqtt in both] == [[b'x'], [b'x']]
 
 
-def test_an_identifier_belongs_to_one_connection(broker, topics):
+def test_a_second_client_with_the_same_identifier_replaces_the_first(broker, topics):
     first, second = topics(broker.port, client_id='same'), topics(broker.port, client_id='same')
     first.open()
     second.open()
@@ -229,7 +230,7 @@ def test_an_identifier_belongs_to_one_connection(broker, topics):
     assert second.read(0.1) == []
 
 
-def test_a_broker_that_is_killed_is_told_after_what_came_before(tmp_path, topics):
+def test_a_killed_broker_is_reported_after_its_last_messages(tmp_path, topics):
     with Broker(tmp_path, 'log_type all') as broker:
         mqtt = topics(broker.port, client_id='reader', qos=1)
         mqtt.open()
@@ -237,20 +238,20 @@ def test_a_broker_that_is_killed_is_told_after_what_came_before(tmp_path, topics
         wait_for_messages(broker, 'reader', 2)
         broker.kill()
         killed = time.monotonic()
-        wait_until(lambda: not loops())
+        wait_until(lambda: not connection_threads())
         assert [c.data for c in mqtt.read(5.0)] == [b'1', b'2']
         for _ in range(2):
             with pytest.raises(DeviceError, match=f'127.0.0.1:{broker.port}: .*lost'):
                 mqtt.read(5.0)
         assert time.monotonic() - killed < 2.0
-        assert 'connection refused; check that the broker is running' in failure(mqtt)
+        assert 'connection refused; check that the broker is running' in open_error(mqtt)
         broker.start()
         mqtt.open()
         send(broker.port, [('mag/a', b'3')])
-        assert [c.data for c in gather(mqtt, 1)] == [b'3']
+        assert [c.data for c in read_chunks(mqtt, 1)] == [b'3']
 
 
-def test_a_read_that_waits_is_told_of_the_end_at_once(tmp_path, topics):
+def test_a_killed_broker_ends_a_waiting_read_at_once(tmp_path, topics):
     with Broker(tmp_path) as broker:
         mqtt = topics(broker.port)
         mqtt.open()
@@ -263,11 +264,11 @@ def test_a_read_that_waits_is_told_of_the_end_at_once(tmp_path, topics):
         assert time.monotonic() - start < 2.0
 
 
-def test_a_broker_that_is_silent_is_given_up(tmp_path, topics):
+def test_a_silent_broker_is_reported_after_the_keepalive_time(tmp_path, topics):
     with Broker(tmp_path) as broker:
         mqtt = topics(broker.port, keepalive_s=1)
         mqtt.open()
-        # A healthy connection on which nothing is published lasts.
+        # A healthy connection lasts even if nothing is published.
         assert mqtt.read(1.5) == []
         broker.freeze()
         start = time.monotonic()
@@ -276,7 +277,7 @@ def test_a_broker_that_is_silent_is_given_up(tmp_path, topics):
         assert time.monotonic() - start < 4.0
 
 
-def test_password(tmp_path, topics):
+def test_the_password_file_authenticates_the_client(tmp_path, topics):
     file = tmp_path / 'secret'
     with Broker(tmp_path, *password_lines(tmp_path, 'reader', 'pass word ')) as broker:
         for content, username in (('pass word \nsecond line\n', 'reader'),
@@ -288,82 +289,83 @@ def test_password(tmp_path, topics):
         file.write_text('wrong\n')
         for changes in ({}, {'username': 'reader'},
                         {'username': 'reader', 'password_file': str(file)}):
-            assert 'connection refused: Not authorized' in failure(
+            assert 'connection refused: Not authorized' in open_error(
                 topics(broker.port, **changes))
 
 
-def test_a_password_file_that_cannot_be_used(tmp_path, topics):
+def test_an_unusable_password_file_is_reported(tmp_path, topics):
     file = tmp_path / 'secret'
     mqtt = topics(free_port(), username='reader', password_file=str(file))
-    assert f'password_file {file} cannot be read: No such file' in failure(mqtt)
+    assert f'password_file {file} cannot be read: No such file' in open_error(mqtt)
     file.write_text('\nsecond line\n')
-    assert f'the first line of password_file {file} is empty' in failure(mqtt)
+    assert f'the first line of password_file {file} is empty' in open_error(mqtt)
     file.write_bytes(b'\xff\xfe')
-    assert f'password_file {file} cannot be read: \'utf-8\'' in failure(mqtt)
+    assert f'password_file {file} cannot be read: \'utf-8\'' in open_error(mqtt)
 
 
-def test_subscription_that_is_not_granted(tmp_path, topics):
+def test_a_refused_subscription_is_reported(tmp_path, topics):
     lines = subscription_lines(tmp_path, 'reader', 'x', 'mag/open/#')
     (tmp_path / 'secret').write_text('x')
     user = {'username': 'reader', 'password_file': str(tmp_path / 'secret')}
     with Broker(tmp_path, *lines) as broker:
         topics(broker.port, topics=('mag/open/1',), **user).open()
         mqtt = topics(broker.port, topics=('mag/open/1', 'mag/closed', 'all'), **user)
-        assert failure(mqtt).endswith('subscription refused: mag/closed, all')
+        assert open_error(mqtt).endswith('subscription refused: mag/closed, all')
 
 
-def test_topic_filter_that_is_none(broker, topics):
-    assert "('mag/a', 'mag/#/b'): Invalid" in failure(
+def test_an_invalid_topic_filter_is_reported(broker, topics):
+    assert "('mag/a', 'mag/#/b'): Invalid" in open_error(
         topics(broker.port, topics=('mag/a', 'mag/#/b')))
 
 
-def test_nobody_listens(topics):
-    assert failure(topics(free_port())).endswith(
+def test_a_missing_broker_is_reported(topics):
+    assert open_error(topics(free_port())).endswith(
         'connection refused; check that the broker is running')
 
 
-def test_host_that_does_not_exist(topics):
-    assert 'cannot connect' in failure(topics(1883, host='no-such-host.invalid'))
+def test_an_unknown_host_is_reported(topics):
+    assert 'cannot connect' in open_error(topics(1883, host='no-such-host.invalid'))
 
 
-def test_something_else_listens(topics):
+def test_a_server_other_than_mqtt_is_reported(topics):
     with ScriptedBroker(b'HTTP/1.1 400 Bad Request\r\n\r\n' + b'x' * 200) as server:
         threading.Timer(0.2, server.hang_up).start()
-        assert 'Check that it is an MQTT broker and that it expects tls: false' in failure(
+        assert 'Check that it is an MQTT broker and that it expects tls: false' in open_error(
             topics(server.port))
 
 
 @pytest.mark.parametrize('tls', [False, True])
-def test_something_silent_listens(topics, tls):
+def test_a_silent_server_is_reported(topics, tls):
     with ScriptedBroker(b'') as server:
-        said = failure(topics(server.port, connect_timeout_s=0.3, tls=tls))
-    assert 'timed out' in said if tls else 'no answer within 0.3 s; is it an MQTT broker?' in said
+        message = open_error(topics(server.port, connect_timeout_s=0.3, tls=tls))
+    assert ('timed out' in message if tls
+            else 'no answer within 0.3 s; is it an MQTT broker?' in message)
 
 
 @pytest.mark.parametrize('code, text', [
-    # To paho a broker of another version of the protocol is none.
+    # paho reports another version of the protocol as a protocol error.
     (1, 'A network protocol error occurred when communicating with the broker. Check that it is '
      'an MQTT broker'),
     *((code, f'connection refused: {text}') for code, text in (
         (2, 'Client identifier not valid'), (3, 'Server unavailable'),
         (4, 'Bad user name or password'), (5, 'Not authorized')))])
-def test_the_reason_of_a_refusal_is_told_and_not_tried_again(topics, code, text):
+def test_the_reason_of_a_refusal_is_reported_without_a_retry(topics, code, text):
     with ScriptedBroker(bytes([0x20, 2, 0, code])) as server:
-        assert f'127.0.0.1:{server.port}: {text}' in failure(topics(server.port))
+        assert f'127.0.0.1:{server.port}: {text}' in open_error(topics(server.port))
     assert len(server.heard) == 1
 
 
 @pytest.mark.parametrize('qos', [0, 1, 2])
-def test_the_quality_of_service_that_is_asked_for(topics, qos):
+def test_the_configured_quality_of_service_is_requested(topics, qos):
     with ScriptedBroker(CONNECTED, granted) as server:
         topics(server.port, qos=qos).open()
     assert server.heard[1].endswith(b'mag/#' + bytes([qos]))
 
 
-def test_broker_that_accepts_and_then_is_silent(topics):
+def test_a_broker_that_does_not_answer_a_subscription_is_reported(topics):
     with ScriptedBroker(CONNECTED, b'') as server:
-        said = failure(topics(server.port, connect_timeout_s=0.3))
-        assert 'no answer within 0.3 s' in said
+        message = open_error(topics(server.port, connect_timeout_s=0.3))
+        assert 'no answer within 0.3 s' in message
     assert b'mag/#' in server.heard[1]
 
 
@@ -371,7 +373,7 @@ def test_broker_that_accepts_and_then_is_silent(topics):
     bytes([0x90, 5, 0, 1, 77, 88, 99]), bytes([0x90, 4, 0, 1, 0, 0]), bytes([0x90, 1, 0]),
     bytes([0x20, 0]), bytes([0xF0, 0]), bytes([0x30, 1, 0]), bytes([0x32, 2, 0, 0]),
     bytes([0x00, 0]), b'\x30\xff\xff\xff\xff\xff'])
-def test_bytes_that_are_no_mqtt_end_the_connection_and_are_told(topics, garbage):
+def test_invalid_packets_end_the_connection_and_are_reported(topics, garbage):
     with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + garbage) as server:
         mqtt = topics(server.port, connect_timeout_s=2.0)
         try:
@@ -383,64 +385,65 @@ def test_bytes_that_are_no_mqtt_end_the_connection_and_are_told(topics, garbage)
                 mqtt.read(5.0)
 
 
-def test_duplicates_are_counted_and_handed_on(topics):
+def test_duplicates_are_counted_and_passed_on(topics):
     packets = publish_packet(b'mag/a', b'1') + publish_packet(b'mag/a', b'1', 0x08)
     with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
         mqtt = topics(server.port)
         mqtt.open()
-        assert [c.data for c in gather(mqtt, 2)] == [b'1', b'1']
+        assert [c.data for c in read_chunks(mqtt, 2)] == [b'1', b'1']
         assert mqtt.counts == {'messages with the dup flag': 1}
 
 
-def test_topic_that_is_no_text_is_counted(topics):
+def test_a_topic_that_is_not_utf_8_is_counted(topics):
     packets = publish_packet(b'mag/\xff', b'1') + publish_packet(b'mag/a', b'2')
     with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
         mqtt = topics(server.port)
         mqtt.open()
-        assert [c.data for c in gather(mqtt, 1)] == [b'2']
+        assert [c.data for c in read_chunks(mqtt, 1)] == [b'2']
         assert mqtt.counts == {'messages whose topic is not UTF-8': 1}
 
 
-def test_what_was_counted_before_a_loss_is_not_forgotten(topics):
+def test_counts_survive_a_lost_connection(topics):
     packets = publish_packet(b'mag/\xff', b'1')
     with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
         mqtt = topics(server.port)
         mqtt.open()
         server.hang_up()
-        wait_until(lambda: not loops())
+        wait_until(lambda: not connection_threads())
         assert not mqtt.counts
-        assert 'connection refused; check that the broker is running' in failure(mqtt)
+        assert 'connection refused; check that the broker is running' in open_error(mqtt)
         assert mqtt.counts == {'messages whose topic is not UTF-8': 1}
 
 
-def test_tls(tmp_path, topics):
+def test_tls_verifies_the_certificate_and_the_host(tmp_path, topics):
     cert, key = certificate(tmp_path)
     with Broker(tmp_path, f'certfile {cert}', f'keyfile {key}') as broker:
         mqtt = topics(broker.port, host='localhost', tls=True, ca_file=str(cert))
         mqtt.open()
         other = topics(broker.port, host='localhost', tls=True)
-        assert 'TLS failed' in failure(other) and 'certificate verify failed' in failure(other)
-        # The certificate is of localhost, and of nobody else.
+        assert ('TLS failed' in open_error(other)
+                and 'certificate verify failed' in open_error(other))
+        # The certificate is valid only for localhost.
         other = topics(broker.port, tls=True, ca_file=str(cert))
-        assert 'TLS failed' in failure(other) and 'mismatch' in failure(other)
-        assert 'that it expects tls: false' in failure(topics(broker.port))
+        assert 'TLS failed' in open_error(other) and 'mismatch' in open_error(other)
+        assert 'that it expects tls: false' in open_error(topics(broker.port))
         assert mqtt.read(0.0) == []
 
 
-def test_tls_at_a_broker_without(broker, topics):
-    said = failure(topics(broker.port, tls=True))
-    assert 'cannot connect: [Errno 104]' in said or 'TLS failed' in said
+def test_a_broker_without_tls_is_reported(broker, topics):
+    message = open_error(topics(broker.port, tls=True))
+    assert 'cannot connect: [Errno 104]' in message or 'TLS failed' in message
 
 
-def test_certificates_that_cannot_be_used(tmp_path, topics):
+def test_an_unusable_ca_file_is_reported(tmp_path, topics):
     path = tmp_path / 'ca.pem'
     mqtt = topics(free_port(), tls=True, ca_file=str(path))
-    assert f'ca_file {path} cannot be read: No such file' in failure(mqtt)
+    assert f'ca_file {path} cannot be read: No such file' in open_error(mqtt)
     path.write_text('no certificate')
-    assert f'ca_file {path} cannot be read: ' in failure(mqtt)
+    assert f'ca_file {path} cannot be read: ' in open_error(mqtt)
 
 
-def test_closing(broker, topics):
+def test_close_ends_a_waiting_read_and_may_be_repeated(broker, topics):
     mqtt = topics(broker.port)
     mqtt.close()
     with pytest.raises(DeviceError, match='not open'):
@@ -458,15 +461,15 @@ def test_closing(broker, topics):
         mqtt.read(20.0)
 
 
-def test_opening_again_closes_the_connection_before(topics):
+def test_reopening_closes_the_previous_connection(topics):
     with ScriptedBroker(CONNECTED, granted) as first:
         mqtt = topics(first.port)
         mqtt.open()
-        assert 'connection refused; check that the broker is running' in failure(mqtt)
+        assert 'connection refused; check that the broker is running' in open_error(mqtt)
         wait_until(lambda: first.heard[-1] == b'\xe0\x00')
 
 
-def test_leaving_is_said_to_the_broker(topics):
+def test_close_sends_a_disconnect_packet(topics):
     with ScriptedBroker(CONNECTED, granted) as server:
         mqtt = topics(server.port)
         mqtt.open()
@@ -476,8 +479,8 @@ def test_leaving_is_said_to_the_broker(topics):
         assert server.heard[-1] == b'\xe0\x00'
 
 
-def test_closing_while_it_opens(topics, monkeypatch):
-    """The broker is reached, but has not answered."""
+def test_close_during_connecting_ends_open(topics, monkeypatch):
+    """The broker has been reached, but has not answered."""
     with ScriptedBroker() as server:
         mqtt = topics(server.port)
         real = Client.connect
@@ -487,16 +490,16 @@ def test_closing_while_it_opens(topics, monkeypatch):
             mqtt.close()
 
         monkeypatch.setattr(Client, 'connect', connect)
-        assert failure(mqtt).endswith('not open')
+        assert open_error(mqtt).endswith('not open')
 
 
-def test_closing_while_the_broker_thinks(topics):
+def test_close_while_waiting_for_the_broker_ends_open(topics):
     with ScriptedBroker(b'') as server:
         mqtt = topics(server.port)
         closer = threading.Timer(0.1, mqtt.close)
         closer.start()
         start = time.monotonic()
-        assert failure(mqtt).endswith('not open')
+        assert open_error(mqtt).endswith('not open')
         assert time.monotonic() - start < 2.0
         closer.join()
 
@@ -504,6 +507,6 @@ def test_closing_while_the_broker_thinks(topics):
 @pytest.mark.parametrize('changes, text', [
     ({'topics': ('',)}, 'topics: '), ({'topics': ('mag', '')}, 'topics: '),
     ({'password_file': 'x'}, 'password_file: '), ({'ca_file': 'x'}, 'ca_file: ')])
-def test_settings_that_make_no_sense(changes, text):
+def test_invalid_settings_are_refused(changes, text):
     with pytest.raises(SettingsError, match=text):
         MqttTopics(replace(SETTINGS, **changes))

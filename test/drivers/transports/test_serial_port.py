@@ -1,4 +1,4 @@
-"""Serial lines through real pseudo-terminals; only the kernel's error counters are made up."""
+"""Serial ports over real pseudo-terminals; only the kernel's error counters are simulated."""
 
 import fcntl
 import os
@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 class Device:
-    """A device at the other end of a pseudo-terminal, reachable under a link that stays."""
+    """Device at the other end of a pseudo-terminal, with a permanent link to its port."""
 
     def __init__(self, folder):
         self.link = folder / 'magnetometer'
@@ -33,29 +33,29 @@ class Device:
         self.plug()
 
     def plug(self):
-        """A new port under the old name."""
+        """Create a new port under the same link."""
         self.master, slave = os.openpty()
         tty.setraw(slave)
         self.path = os.ttyname(slave)
-        # One end stays open, as the device is there whether or not anybody reads.
+        # This end stays open: the device exists whether or not a program reads it.
         self.slave = slave
         self.link.unlink(missing_ok=True)
         self.link.symlink_to(self.path)
 
     def unplug(self):
-        """Pull it out."""
+        """Remove the port."""
         for end in (self.master, self.slave):
             with suppress(OSError):
                 os.close(end)
 
     def wait_for(self, n):
-        """Until the port holds `n` bytes."""
+        """Wait until the port holds `n` bytes."""
         end = time.monotonic() + 5.0
         while time.monotonic() < end:
             if struct.unpack('i', fcntl.ioctl(self.slave, termios.FIONREAD, bytes(4)))[0] == n:
                 return
             time.sleep(0.001)
-        raise AssertionError(f'{n} bytes have not come')
+        raise AssertionError(f'{n} bytes have not arrived')
 
     def write(self, data):
         while data:
@@ -71,7 +71,7 @@ def device(tmp_path):
 
 @pytest.fixture
 def handles(monkeypatch):
-    """What pyserial opens from here on, in order."""
+    """Ports opened by pyserial, in order."""
     made = []
 
     class Recorded(serial.Serial):
@@ -91,40 +91,40 @@ def port(device):
     opened.close()
 
 
-def failure(port):
+def open_error(port):
     with pytest.raises(DeviceError) as caught:
         port.open()
     return str(caught.value)
 
 
-def gather(port, n, seconds=5.0):
+def read_bytes(port, n, seconds=5.0):
     data, end = b'', time.monotonic() + seconds
     while len(data) < n and time.monotonic() < end:
         data += b''.join(chunk.data for chunk in port.read(0.2))
     return data
 
 
-def test_a_million_bytes_come_whole_and_in_order(device, port):
+def test_a_million_bytes_arrive_complete_and_in_order(device, port):
     sent = os.urandom(1_000_000)
     writer = threading.Thread(target=device.write, args=(sent,))
     writer.start()
-    assert gather(port, len(sent), 20.0) == sent
+    assert read_bytes(port, len(sent), 20.0) == sent
     writer.join()
     assert not port.counts and not port.whole
 
 
-def test_every_byte_comes_as_it_is(device, port):
-    """No end of line, control character or echo is made of any."""
+def test_every_byte_arrives_unchanged(device, port):
+    """No byte is translated, treated as a control character or echoed."""
     sent = bytes(range(256)) * 3
     device.write(sent)
-    assert gather(port, len(sent)) == sent
+    assert read_bytes(port, len(sent)) == sent
     assert not select.select([device.master], [], [], 0.05)[0]
 
 
-def test_what_is_there_comes_at_once_as_one_chunk(device, port):
+def test_available_bytes_are_returned_at_once_as_one_chunk(device, port):
     device.write(b'a first line\n')
     device.write(b'and half of')
-    # The kernel moves them from end to end on its own time.
+    # The kernel transfers the bytes asynchronously.
     device.wait_for(24)
     start = time.monotonic()
     chunk, = port.read(20.0)
@@ -132,18 +132,18 @@ def test_what_is_there_comes_at_once_as_one_chunk(device, port):
     assert chunk.data == b'a first line\nand half of' and chunk.source == ''
 
 
-def test_read_waits_no_longer_than_it_is_told(port):
+def test_read_returns_at_its_timeout(port):
     for timeout in (0.0, 0.03, 0.1):
-        took = []
+        durations = []
         for _ in range(3):
             start = time.monotonic()
             assert port.read(timeout) == []
-            took.append(time.monotonic() - start)
-        # The machine may be busy at times, but not each time.
-        assert timeout <= min(took) < timeout + 0.04
+            durations.append(time.monotonic() - start)
+        # The machine may be busy during one attempt, but not during all of them.
+        assert timeout <= min(durations) < timeout + 0.04
 
 
-def test_the_time_is_that_of_the_wake_up(device, port):
+def test_the_arrival_time_is_that_of_the_wake_up(device, port):
     threading.Timer(0.3, device.write, (b'x',)).start()
     start = time.monotonic_ns()
     chunk, = port.read(5.0)
@@ -151,19 +151,19 @@ def test_the_time_is_that_of_the_wake_up(device, port):
     assert 0 <= time.monotonic_ns() - chunk.arrival_ns < 0.1e9
 
 
-def test_what_came_before_opening_is_thrown_away(device):
+def test_bytes_received_before_opening_are_discarded(device):
     device.write(b'lf a frame\n')
     device.wait_for(11)
     port = SerialPort(SerialSettings(port=device.path))
     port.open()
     device.write(b'a whole one\n')
-    assert gather(port, 12) == b'a whole one\n'
+    assert read_bytes(port, 12) == b'a whole one\n'
     port.close()
 
 
-def test_a_device_that_is_pulled_out_is_told(device, port):
+def test_an_unplugged_device_is_reported(device, port):
     device.write(b'x')
-    assert gather(port, 1) == b'x'
+    assert read_bytes(port, 1) == b'x'
     device.unplug()
     start = time.monotonic()
     for _ in range(2):
@@ -172,7 +172,7 @@ def test_a_device_that_is_pulled_out_is_told(device, port):
     assert time.monotonic() - start < 1.0
 
 
-def test_a_read_that_waits_is_told_at_once(device, port):
+def test_unplugging_ends_a_waiting_read_at_once(device, port):
     threading.Timer(0.2, device.unplug).start()
     start = time.monotonic()
     with pytest.raises(DeviceError, match='connection lost'):
@@ -180,33 +180,34 @@ def test_a_read_that_waits_is_told_at_once(device, port):
     assert time.monotonic() - start < 1.0
 
 
-def test_the_same_device_after_it_was_plugged_in_again(device, port):
+def test_a_device_can_be_reopened_after_it_was_plugged_in_again(device, port):
     for text in (b'once', b'twice'):
         device.unplug()
         device.link.unlink()
         with pytest.raises(DeviceError):
             port.read(1.0)
         port.close()
-        assert 'not found' in failure(port)
+        assert 'not found' in open_error(port)
         device.plug()
         port.open()
         device.write(text)
-        assert gather(port, len(text)) == text
+        assert read_bytes(port, len(text)) == text
 
 
-def test_a_port_that_is_not_there_names_those_that_are(monkeypatch):
+def test_the_error_of_a_missing_port_lists_the_available_ports(monkeypatch):
     port = SerialPort(SerialSettings(port='/dev/ttyNONE0'))
     monkeypatch.setattr(serial_port.list_ports, 'comports', lambda: [])
-    assert failure(port) == ('serial port /dev/ttyNONE0: not found; no ports available')
+    assert open_error(port) == ('serial port /dev/ttyNONE0: not found; no ports available')
 
     class Known:
         device, description = '/dev/ttyUSB7', 'FT232R'
 
     monkeypatch.setattr(serial_port.list_ports, 'comports', lambda: [Known, Known])
-    assert failure(port).endswith('available ports: /dev/ttyUSB7 (FT232R), /dev/ttyUSB7 (FT232R)')
+    assert open_error(port).endswith(
+        'available ports: /dev/ttyUSB7 (FT232R), /dev/ttyUSB7 (FT232R)')
 
 
-def test_no_permission(device):
+def test_a_missing_permission_is_reported_with_the_remedy(device):
     os.chmod(device.path, 0)
     code = ('import os, sys\n'
             'from mag_tracking.errors import DeviceError\n'
@@ -219,42 +220,43 @@ def test_no_permission(device):
             '    SerialPort(SerialSettings(port=sys.argv[1])).open()\n'
             'except DeviceError as error:\n'
             '    print(error)\n')
-    said = subprocess.run([sys.executable, '-c', code, device.path], cwd=ROOT, text=True,
-                          capture_output=True, check=True, timeout=60).stdout
-    assert said.startswith(f'serial port {device.path}: no permission; ')
-    assert 'usermod -aG dialout' in said
+    output = subprocess.run([sys.executable, '-c', code, device.path], cwd=ROOT, text=True,
+                            capture_output=True, check=True, timeout=60).stdout
+    assert output.startswith(f'serial port {device.path}: no permission; ')
+    assert 'usermod -aG dialout' in output
 
 
-def test_two_at_one_port(device, port):
+def test_a_port_in_use_is_reported(device, port):
     other = SerialPort(SerialSettings(port=device.path))
-    assert failure(other) == f'serial port {device.path}: in use by another program'
-    # The refused one leaves the port as it was, and gets it as soon as it is free.
+    assert open_error(other) == f'serial port {device.path}: in use by another program'
+    # The refused program leaves the port unchanged, and can open it once it is free.
     device.write(b'x')
-    assert gather(port, 1) == b'x'
+    assert read_bytes(port, 1) == b'x'
     port.close()
     other.open()
     other.close()
 
 
-def test_a_port_may_be_shared_where_that_is_wanted(device, port):
+def test_a_port_may_be_shared_if_not_exclusive(device, port):
     other = SerialPort(SerialSettings(port=device.path, exclusive=False))
     other.open()
     device.write(b'x')
-    assert gather(other, 1) == b'x'
+    assert read_bytes(other, 1) == b'x'
     other.close()
 
 
-def test_what_is_no_serial_port(tmp_path):
+def test_paths_that_are_no_serial_port_are_refused(tmp_path):
     (tmp_path / 'file').write_text('text')
     for path in (tmp_path / 'file', tmp_path, Path('/dev/null')):
-        said = failure(SerialPort(SerialSettings(port=str(path))))
-        assert said.startswith(f'serial port {path}: not a serial port, or no device is connected')
+        message = open_error(SerialPort(SerialSettings(port=str(path))))
+        assert message.startswith(
+            f'serial port {path}: not a serial port, or no device is connected')
 
 
-def test_a_refused_open_leaves_nothing_open(device, port, tmp_path):
+def test_a_failed_open_leaves_no_file_descriptor(device, port, tmp_path):
     before = len(os.listdir('/proc/self/fd'))
     for path in (device.path, '/dev/null', '/dev/ttyNONE0', str(tmp_path)):
-        failure(SerialPort(SerialSettings(port=path)))
+        open_error(SerialPort(SerialSettings(port=path)))
     assert len(os.listdir('/proc/self/fd')) == before
     for _ in range(5):
         port.open()
@@ -265,54 +267,54 @@ def test_a_refused_open_leaves_nothing_open(device, port, tmp_path):
 @pytest.mark.parametrize('parity, flags', [
     ('N', 0), ('E', termios.PARENB), ('O', termios.PARENB | termios.PARODD)])
 @pytest.mark.parametrize('stop_bits', [1, 2])
-def test_the_line_is_set_up_as_asked(device, handles, parity, flags, stop_bits):
+def test_baud_rate_parity_and_stop_bits_are_set(device, handles, parity, flags, stop_bits):
     port = SerialPort(SerialSettings(str(device.link), 57600, parity, stop_bits))
     port.open()
     _, _, cflag, _, ispeed, ospeed, _ = termios.tcgetattr(device.slave)
     assert ispeed == ospeed == termios.B57600
-    # A pseudo-terminal knows no parity: the kernel clears it, and tells so.
+    # A pseudo-terminal has no parity: the kernel clears the flags.
     assert cflag & termios.CSTOPB == (termios.CSTOPB if stop_bits == 2 else 0)
     assert handles[-1].parity == parity and bool(flags) == (parity != 'N')
     assert cflag & termios.CSIZE == termios.CS8
     port.close()
 
 
-def test_a_device_that_goes_while_it_is_opened(device, monkeypatch):
-    def gone(*_):
+def test_a_device_lost_during_opening_is_reported(device, monkeypatch):
+    def fail(*_):
         raise termios.error(5, 'Input/output error')
 
-    monkeypatch.setattr(termios, 'tcflush', gone)
+    monkeypatch.setattr(termios, 'tcflush', fail)
     port = SerialPort(SerialSettings(port=device.path))
-    assert 'Input/output error' in failure(port)
+    assert 'Input/output error' in open_error(port)
 
 
-def test_a_speed_that_the_port_cannot(device, monkeypatch):
-    def refused(*_):
+def test_an_unsupported_baud_rate_is_reported(device, monkeypatch):
+    def refuse(*_):
         raise ValueError('Failed to set custom baud rate (12345): [Errno 22]')
 
-    monkeypatch.setattr('serial.Serial._set_special_baudrate', refused)
+    monkeypatch.setattr('serial.Serial._set_special_baudrate', refuse)
     port = SerialPort(SerialSettings(port=device.path, baud=12345))
-    assert 'cannot be opened at 12345 bit/s: Failed' in failure(port)
+    assert 'cannot be opened at 12345 bit/s: Failed' in open_error(port)
 
 
-def test_what_the_line_loses_is_counted_from_opening_on(device, monkeypatch):
-    """The counters run since the machine's start, and overflow."""
-    real, now = serial_port.fcntl.ioctl, [7] * 20
+def test_line_errors_are_counted_from_opening_on(device, monkeypatch):
+    """The kernel's counters run since boot, and overflow."""
+    real, counters = serial_port.fcntl.ioctl, [7] * 20
 
     def ioctl(fd, request, *args):
         if request == 0x545D:
             assert len(args[0]) == 80
-            return struct.pack('20i', *now)
+            return struct.pack('20i', *counters)
         return real(fd, request, *args)
 
     monkeypatch.setattr(serial_port.fcntl, 'ioctl', ioctl)
-    now[9] = 2**31 - 1
+    counters[9] = 2**31 - 1
     port = SerialPort(SerialSettings(port=device.path))
     port.open()
     assert port.read(0.0) == [] and not port.counts
-    now[:] = [100 + i for i in range(20)]
-    now[9] = -2**31 + 1
-    now[7] = -2**31 + 20
+    counters[:] = [100 + i for i in range(20)]
+    counters[9] = -2**31 + 1
+    counters[7] = -2**31 + 20
     device.write(b'x')
     assert [c.data for c in port.read(1.0)] == [b'x']
     lost = {'framing errors on the line (check the baud rate)': 99,
@@ -320,16 +322,16 @@ def test_what_the_line_loses_is_counted_from_opening_on(device, monkeypatch):
             'break conditions on the line': 2, 'bytes lost to driver buffer overruns': 103}
     assert port.counts == lost
     assert port.read(0.0) == [] and port.counts == lost
-    # Also where nothing arrives.
-    now[6] += 1
+    # Errors are counted even if no byte arrives.
+    counters[6] += 1
     assert port.read(0.0) == []
     assert port.counts['framing errors on the line (check the baud rate)'] == 100
-    # A port that was plugged in again counts from the beginning.
-    now[:] = [0] * 20
+    # The counters restart at zero if the port is plugged in again.
+    counters[:] = [0] * 20
     port.open()
     assert port.read(0.0) == []
     assert sum(port.counts.values()) == sum(lost.values()) + 1
-    # Nor does one that does not count stand in the way of reading.
+    # A port without counters can still be read.
     monkeypatch.undo()
     port.open()
     device.write(b'y')
@@ -337,7 +339,7 @@ def test_what_the_line_loses_is_counted_from_opening_on(device, monkeypatch):
     port.close()
 
 
-def test_closing(device, handles):
+def test_close_ends_a_waiting_read_and_may_be_repeated(device, handles):
     port = SerialPort(SerialSettings(port=device.path))
     port.close()
     with pytest.raises(DeviceError, match=f'{device.path}: not open'):
@@ -357,7 +359,7 @@ def test_closing(device, handles):
             port.read(0.0)
 
 
-def test_settings_that_make_no_sense():
+def test_invalid_settings_are_refused():
     with pytest.raises(SettingsError, match='port: '):
         SerialPort(SerialSettings())
     for parity in ('n', '', 'M', 'EO'):

@@ -1,4 +1,4 @@
-"""UDP through real sockets of this machine."""
+"""UDP over real sockets of this machine."""
 
 import os
 import socket
@@ -20,7 +20,7 @@ SETTINGS = UdpSettings(address='127.0.0.1')
 
 @pytest.fixture
 def listen():
-    """Makes sockets that are open, and closed at the end."""
+    """Factory of open sockets, which are closed at the end."""
     made = []
 
     def make(report=print, **changes):
@@ -36,7 +36,7 @@ def listen():
 
 @pytest.fixture
 def sockets(monkeypatch):
-    """Those that are made from here on, in order."""
+    """Sockets created from here on, in order."""
     made = []
 
     class Recorded(socket.socket):
@@ -50,7 +50,7 @@ def sockets(monkeypatch):
 
 @pytest.fixture
 def sender():
-    """Sends datagrams to a `UdpSocket` at a loopback address."""
+    """Function that sends datagrams to a `UdpSocket` at a loopback address."""
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as opened:
         opened.bind(('127.0.0.1', 0))
 
@@ -62,7 +62,7 @@ def sender():
         yield send
 
 
-def failure(udp):
+def open_error(udp):
     with pytest.raises(DeviceError) as caught:
         udp.open()
     return str(caught.value)
@@ -80,25 +80,25 @@ def test_each_datagram_is_a_chunk(listen, sender):
     assert not udp.counts and udp.whole
 
 
-def test_the_source_with_its_port(listen, sender):
+def test_the_source_may_include_its_port(listen, sender):
     udp = listen(source_port=True)
     sender(udp, b'x')
     assert [c.source for c in udp.read(5.0)] == [f'127.0.0.1:{sender.port}']
 
 
-def test_read_waits_no_longer_than_it_is_told(listen):
+def test_read_returns_at_its_timeout(listen):
     udp = listen()
     for timeout in (0.0, 0.03, 0.1):
-        took = []
+        durations = []
         for _ in range(3):
             start = time.monotonic()
             assert udp.read(timeout) == []
-            took.append(time.monotonic() - start)
-        # The machine may be busy at times, but not each time.
-        assert timeout <= min(took) < timeout + 0.04
+            durations.append(time.monotonic() - start)
+        # The machine may be busy during one attempt, but not during all of them.
+        assert timeout <= min(durations) < timeout + 0.04
 
 
-def test_read_returns_as_soon_as_something_comes(listen, sender):
+def test_read_returns_as_soon_as_a_datagram_arrives(listen, sender):
     udp = listen()
     threading.Timer(0.2, sender, (udp, b'x')).start()
     start = time.monotonic()
@@ -106,15 +106,15 @@ def test_read_returns_as_soon_as_something_comes(listen, sender):
     assert 0.15 < time.monotonic() - start < 1.0
 
 
-def test_one_read_gives_so_many_at_most(listen, sender, monkeypatch):
+def test_one_read_returns_a_limited_number_of_datagrams(listen, sender, monkeypatch):
     monkeypatch.setattr(udp_socket, 'AT_ONCE', 10)
     udp = listen()
     sender(udp, *(bytes([i]) for i in range(25)))
     assert [len(udp.read(0.0)) for _ in range(4)] == [10, 10, 5, 0]
 
 
-def wait_for_times(udp, sender):
-    """Until the kernel has begun to stamp what comes, and not only what is read."""
+def wait_for_kernel_timestamps(udp, sender):
+    """Wait until the kernel timestamps datagrams at reception instead of at reading."""
     end = time.monotonic() + 5.0
     while time.monotonic() < end:
         sender(udp, b'x')
@@ -122,12 +122,12 @@ def wait_for_times(udp, sender):
         now = time.monotonic_ns()
         if [c for c in udp.read(0.0) if now - c.arrival_ns > 5e6]:
             return
-    raise AssertionError('the times are those of the reading')
+    raise AssertionError('datagrams are still timestamped at reading')
 
 
-def test_the_time_is_that_of_the_coming_not_of_the_reading(listen, sender):
+def test_the_arrival_time_is_that_of_reception_not_of_reading(listen, sender):
     udp = listen()
-    wait_for_times(udp, sender)
+    wait_for_kernel_timestamps(udp, sender)
     between = []
     for i in range(3):
         before = time.monotonic_ns()
@@ -135,16 +135,16 @@ def test_the_time_is_that_of_the_coming_not_of_the_reading(listen, sender):
         between.append((before, time.monotonic_ns()))
         time.sleep(0.1)
     for chunk, (before, after) in zip(udp.read(0.0), between, strict=True):
-        # The clocks are compared to some microseconds.
+        # The clocks are compared to within a few microseconds.
         assert before - 50_000 < chunk.arrival_ns < after + 50_000
     assert not udp.counts
 
 
-TIMED = 'datagrams timestamped at wake-up instead of by the kernel'
+WAKE_UP_TIMES = 'datagrams timestamped at wake-up instead of by the kernel'
 
 
 @pytest.mark.parametrize('step_s', [-3600.0, -0.02, 0.02, 3600.0])
-def test_a_wall_clock_that_is_set_does_no_harm(listen, sender, monkeypatch, step_s):
+def test_a_step_of_the_wall_clock_does_not_shift_arrival_times(listen, sender, monkeypatch, step_s):
     udp = listen()
     sender(udp, b'before')
     real = udp_socket.clock_difference
@@ -152,24 +152,24 @@ def test_a_wall_clock_that_is_set_does_no_harm(listen, sender, monkeypatch, step
     monkeypatch.setattr(udp_socket, 'AT_ONCE', 1)
     sender(udp, b'behind')
     for count in (1, 2):
-        # It lies in the queue since before the clock was set, though another was read since.
+        # The datagram was queued before the step, although another was read since then.
         woken = time.monotonic_ns()
         chunk, = udp.read(1.0)
         assert 0 <= chunk.arrival_ns - woken < 50e6
-        assert udp.counts == {TIMED: count}
-    # The queue was seen to be full only; once it was empty, the kernel's time is taken again.
+        assert udp.counts == {WAKE_UP_TIMES: count}
+    # The queue was never empty so far. Once it is, the timestamps of the kernel are used again.
     monkeypatch.setattr(udp_socket, 'AT_ONCE', 10)
     sender(udp, b'last')
     udp.read(1.0)
-    assert udp.counts == {TIMED: 3}
+    assert udp.counts == {WAKE_UP_TIMES: 3}
     sender(udp, b'after')
     chunk, = udp.read(1.0)
-    # The kernel knows nothing of the made-up step.
+    # The simulated step does not affect the kernel.
     assert chunk.arrival_ns + step_s * 1e9 == pytest.approx(time.monotonic_ns(), abs=50e6)
-    assert udp.counts == {TIMED: 3}
+    assert udp.counts == {WAKE_UP_TIMES: 3}
 
 
-def test_clocks_that_cannot_be_compared_are_not(listen, sender, monkeypatch):
+def test_arrival_times_are_wake_up_times_if_clocks_are_not_comparable(listen, sender, monkeypatch):
     udp = listen()
     real = time.time_ns
 
@@ -182,22 +182,22 @@ def test_clocks_that_cannot_be_compared_are_not(listen, sender, monkeypatch):
     assert udp_socket.clock_difference() is None
     assert len(udp.read(1.0)) == 1
     monkeypatch.undo()
-    assert udp.counts == {TIMED: 1}
-    # Not against a comparison that failed either.
+    assert udp.counts == {WAKE_UP_TIMES: 1}
+    # A failed comparison is not used as a reference either.
     sender(udp, b'x')
     udp.read(1.0)
-    assert udp.counts == {TIMED: 2}
+    assert udp.counts == {WAKE_UP_TIMES: 2}
     sender(udp, b'x')
     udp.read(1.0)
-    assert udp.counts == {TIMED: 2}
+    assert udp.counts == {WAKE_UP_TIMES: 2}
 
 
-def test_the_difference_of_the_clocks():
+def test_the_clock_difference_is_wall_minus_monotonic_time():
     between = time.time_ns() - time.monotonic_ns()
     assert abs(udp_socket.clock_difference() - between) < 1e6
 
 
-def test_the_best_of_three_comparisons_counts(monkeypatch):
+def test_the_fastest_of_three_clock_comparisons_is_used(monkeypatch):
     mono = iter([0, 500_000, 1_000_000, 1_000_100, 2_000_000, 2_400_000])
     wall = iter([77, 5_000_050, 99])
     monkeypatch.setattr(udp_socket.time, 'monotonic_ns', lambda: next(mono))
@@ -205,20 +205,20 @@ def test_the_best_of_three_comparisons_counts(monkeypatch):
     assert udp_socket.clock_difference() == 5_000_050 - 1_000_050
 
 
-def test_what_the_kernel_drops_is_counted(listen, sender):
+def test_datagrams_dropped_by_the_kernel_are_counted(listen, sender):
     udp = listen(receive_buffer=20_000)
-    got = 0
+    n_received = 0
     for burst in (3, 2000, 1, 3000):
         sender(udp, *(b'x' * 50 for _ in range(burst)))
         while chunks := udp.read(0.05):
-            got += len(chunks)
+            n_received += len(chunks)
     dropped = udp.counts['datagrams dropped by the kernel']
-    assert got + dropped == 5004
+    assert n_received + dropped == 5004
     assert dropped > 3000 and set(udp.counts) == {'datagrams dropped by the kernel'}
 
 
 def test_a_reader_that_keeps_up_loses_nothing(listen, sender):
-    """A sender of 2000 a second, each larger than usual."""
+    """Up to 2500 datagrams of 200 bytes are sent per second."""
     udp = listen()
     sent = [i.to_bytes(4, 'big') * 50 for i in range(1000)]
 
@@ -229,18 +229,18 @@ def test_a_reader_that_keeps_up_loses_nothing(listen, sender):
 
     thread = threading.Thread(target=send)
     thread.start()
-    got, end = [], time.monotonic() + 10.0
-    while len(got) < len(sent) and time.monotonic() < end:
-        got += udp.read(0.1)
+    received, end = [], time.monotonic() + 10.0
+    while len(received) < len(sent) and time.monotonic() < end:
+        received += udp.read(0.1)
     thread.join()
-    assert [c.data for c in got] == sent
-    arrivals = [c.arrival_ns for c in got]
-    # Each read compares the clocks anew, to some microseconds.
+    assert [c.data for c in received] == sent
+    arrivals = [c.arrival_ns for c in received]
+    # Each read compares the clocks again, to within a few microseconds.
     assert all(b - a > -50_000 for a, b in zip(arrivals, arrivals[1:], strict=False))
     assert not udp.counts
 
 
-def test_the_counter_of_the_kernel_may_overflow(listen, monkeypatch):
+def test_an_overflow_of_the_kernel_counter_is_handled(listen, monkeypatch):
     class Dropping(socket.socket):
         drops = 0
 
@@ -258,7 +258,7 @@ def test_the_counter_of_the_kernel_may_overflow(listen, monkeypatch):
         assert udp.counts['datagrams dropped by the kernel'] == total
 
 
-def test_drops_are_counted_anew_after_opening_again(listen, sender):
+def test_dropped_datagrams_add_up_over_reopening(listen, sender):
     udp = listen(receive_buffer=4096)
     for total in (100, 200):
         sender(udp, *(b'x' * 50 for _ in range(100)))
@@ -270,14 +270,14 @@ def test_drops_are_counted_anew_after_opening_again(listen, sender):
         udp.open()
 
 
-def test_what_is_too_long_or_empty_is_counted(listen, sender):
+def test_long_and_empty_datagrams_are_counted(listen, sender):
     udp = listen(max_length=100)
     sender(udp, b'x' * 101, b'y' * 100, b'', b'z' * 5000, b'a')
     assert [c.data for c in udp.read(1.0)] == [b'y' * 100, b'a']
     assert udp.counts == {'datagrams longer than max_length': 2, 'empty datagrams': 1}
 
 
-def test_only_the_sources_that_were_named(listen, sender):
+def test_only_datagrams_of_the_configured_sources_are_read(listen, sender):
     udp = listen(sources=('127.0.0.9', '127.0.0.8'))
     sender(udp, b'foreign', b'foreign too')
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as known:
@@ -295,7 +295,7 @@ def multicast(port, group, data):
         opened.sendto(data, (group, port))
 
 
-def test_a_group_and_nothing_but_the_group(listen, sender):
+def test_a_multicast_socket_receives_only_its_group(listen, sender):
     first = listen(group='239.77.1.2')
     port = first.settings.port
     second = listen(group='239.77.1.2', port=port)
@@ -308,17 +308,17 @@ def test_a_group_and_nothing_but_the_group(listen, sender):
         assert udp.read(0.05) == []
 
 
-def test_all_addresses_of_this_machine(listen, sender):
+def test_address_0_0_0_0_receives_at_all_addresses(listen, sender):
     udp = listen(address='0.0.0.0')
     sender(udp, b'x')
     sender(udp, b'y', to='127.0.0.5')
     assert [c.data for c in udp.read(1.0)] == [b'x', b'y']
 
 
-def test_a_port_that_is_in_use(listen):
+def test_a_port_in_use_is_reported(listen):
     udp = listen()
     other = UdpSocket(udp.settings)
-    assert failure(other) == (
+    assert open_error(other) == (
         f'UDP 127.0.0.1:{udp.settings.port}: the port is in use by another program; '
         'choose another port')
     udp.close()
@@ -332,46 +332,47 @@ def test_a_port_that_is_in_use(listen):
     ({'address': '192.0.2.1', 'group': '239.1.2.3'}, 'group 239.1.2.3: no interface'),
     ({'group': '192.0.2.9'}, '192.0.2.9 is not a multicast group'),
     ({'group': '127.0.0.1'}, '127.0.0.1 is not a multicast group')])
-def test_an_address_that_cannot_be_listened_at(changes, text):
+def test_an_unusable_address_is_reported(changes, text):
     port = free_port(socket.SOCK_DGRAM)
     udp = UdpSocket(replace(SETTINGS, port=port, **changes))
     before = len(os.listdir('/proc/self/fd'))
-    assert text.format(port=port) in failure(udp)
+    assert text.format(port=port) in open_error(udp)
     assert len(os.listdir('/proc/self/fd')) == before
     with pytest.raises(DeviceError, match='not open'):
         udp.read(0.0)
 
 
-def test_a_port_of_the_system(monkeypatch):
-    """Root may bind it, so the refusal is made up."""
+def test_a_reserved_port_is_reported(monkeypatch):
+    """The refusal is simulated because root may bind the port."""
     def bind(*_):
         raise PermissionError(13, 'Permission denied')
 
     monkeypatch.setattr(udp_socket.socket, 'socket', type('Socket', (socket.socket,),
                                                           {'bind': bind}))
-    assert 'ports below 1024 are reserved' in failure(UdpSocket(replace(SETTINGS, port=514)))
+    assert 'ports below 1024 are reserved' in open_error(UdpSocket(replace(SETTINGS, port=514)))
 
 
-def test_a_buffer_that_the_kernel_does_not_give(sockets, listen):
-    said = []
-    udp = listen(said.append, receive_buffer=1 << 30)
+def test_a_limited_receive_buffer_is_reported(sockets, listen):
+    reports = []
+    udp = listen(reports.append, receive_buffer=1 << 30)
     given = sockets[-1].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
-    assert said == [f'UDP 127.0.0.1:{udp.settings.port}: the kernel limits the receive buffer to '
-                    f'{given} bytes instead of {1 << 30}; increase net.core.rmem_max']
-    said.clear()
-    listen(said.append, receive_buffer=100_000)
+    assert reports == [
+        f'UDP 127.0.0.1:{udp.settings.port}: the kernel limits the receive buffer to '
+        f'{given} bytes instead of {1 << 30}; increase net.core.rmem_max']
+    reports.clear()
+    listen(reports.append, receive_buffer=100_000)
     assert sockets[-1].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == 200_000
-    assert not said
+    assert not reports
 
 
-def test_a_socket_that_fails(sockets, listen):
+def test_a_failing_socket_is_reported(sockets, listen):
     udp = listen()
     sockets[-1].close()
     with pytest.raises(DeviceError, match='UDP 127.0.0.1'):
         udp.read(1.0)
 
 
-def test_closing(sockets):
+def test_close_ends_a_waiting_read_and_may_be_repeated(sockets):
     udp = UdpSocket(replace(SETTINGS, port=free_port(socket.SOCK_DGRAM)))
     udp.close()
     with pytest.raises(DeviceError, match=f'UDP 127.0.0.1:{udp.settings.port}: not open'):
@@ -398,6 +399,6 @@ def test_closing(sockets):
     ({}, 'port: '), ({'port': 5000, 'address': 'localhost'}, 'address: .*localhost'),
     ({'port': 5000, 'address': '::1'}, 'address: '), ({'port': 5000, 'group': 'x'}, 'group: '),
     ({'port': 5000, 'sources': ('127.0.0.1', '1.2.3')}, 'sources: expected an IPv4 .*1.2.3')])
-def test_settings_that_make_no_sense(changes, text):
+def test_invalid_settings_are_refused(changes, text):
     with pytest.raises(SettingsError, match=text):
         UdpSocket(replace(SETTINGS, **changes))
