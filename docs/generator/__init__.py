@@ -21,6 +21,10 @@ def write_pages():
         'reference/topics.md': topic_page(),
         **{f'reference/{name}': text for name, text in settings_pages().items()},
         **{f'reference/{name}': text for name, text in python_pages().items()}}
+    # Pages of modules that no longer exist, from an earlier build.
+    for path in (DOCS / 'reference' / 'python').glob('*.md'):
+        if f'reference/python/{path.name}' not in pages:
+            path.unlink()
     for name, text in pages.items():
         path = DOCS / name
         path.parent.mkdir(parents=True, exist_ok=True)

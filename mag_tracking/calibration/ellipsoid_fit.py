@@ -77,10 +77,10 @@ class EllipsoidFit:
     """Size of B after correction, as given; otherwise the mean radius for det(correction) = 1, in
     the unit of the readings."""
     residual: float
-    """std/mean of |B| over all readings after correction, including outliers and saturated
+    """std/mean of ‖B‖ over all readings after correction, including outliers and saturated
     readings."""
     residual_before: float
-    """std/mean of |y|."""
+    """std/mean of ‖y‖."""
     offset_std: FloatArray
     """(3,), unit of the readings."""
     correction_std: FloatArray
@@ -89,7 +89,7 @@ class EllipsoidFit:
     """Zero if the field size was given."""
     coverage: float
     """0 to 1: smallest eigenvalue of the weighted mean of f fᵀ over the directions, with the nine
-    spherical harmonics f to degree two, which are the effects of the nine parameters on |B|. One
+    spherical harmonics f to degree two, which are the effects of the nine parameters on ‖B‖. One
     for even coverage, 0.008 for a hemisphere or a band of +-21 degrees, zero for a ring. Errors
     shared by adjacent directions are amplified by up to 1/sqrt(coverage) relative to even
     coverage."""
@@ -150,7 +150,7 @@ class _Parameters(TypedDict):
 def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> EllipsoidFit:
     """Offset and symmetric correction that give all readings the same size.
 
-    A linear quadric fit initialises a robust geometric least-squares fit of |C (y - o)|. Readings
+    A linear quadric fit initialises a robust geometric least-squares fit of ‖C (y - o)‖. Readings
     are weighted by direction: crowded directions, e.g. of a sensor at rest, have smaller weights.
     Noise of relative size s increases the radius by s², which is not corrected. The standard
     deviations are from a block jackknife in time.

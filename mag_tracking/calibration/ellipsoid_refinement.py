@@ -44,7 +44,7 @@ class Quality(TypedDict):
 
 def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
         FloatArray, FloatArray, FloatArray, Quality]:
-    """Fit the ellipsoid |C (z - o)| = 1 to normalised readings.
+    """Fit the ellipsoid ‖C (z - o)‖ = 1 to normalised readings.
 
     Parameters
     ----------

@@ -57,7 +57,7 @@ def rejected(counts: Mapping[str, int]) -> dict[str, int]:
     Returns
     -------
     dict of str to int
-        Number by cause, without the prefix ``rejected: ``.
+        Number by cause, without the prefix `rejected:`.
     """
     return {k.removeprefix('rejected: '): n for k, n in sorted(counts.items())
             if k.startswith('rejected: ')}
