@@ -14,7 +14,6 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    __version__: str
     from mag_tracking.analysis.placement import PlannedTarget, Sampling
     from mag_tracking.apps.events import EventsResult, events
     from mag_tracking.apps.fit import FitResult, fit
@@ -37,6 +36,8 @@ if TYPE_CHECKING:
     from mag_tracking.network.file import read_network
     from mag_tracking.records import Readings
     from mag_tracking.settings import read_parameter_file
+
+__version__: str
 
 __all__ = [
     'EventsResult', 'FitResult', 'FittedPass', 'MagTrackingError', 'MissingDependencyError',

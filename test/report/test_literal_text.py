@@ -76,7 +76,7 @@ def geometry():
         gain_std=np.ones(3), sensor_residual=np.ones(3), pose_residual=ONES,
         suspect_sensors=NAMES[:1], poses=(np.ones((4, 3)), np.ones((4, 3))))
     return SimpleNamespace(stated=NETWORK, network=NETWORK, geometry=found, rows=np.arange(4),
-                           suspect_rows=(), turned=np.ones(3))
+                           suspect_rows=(), rotation_angle=np.ones(3))
 
 
 ELLIPSOID = SimpleNamespace(coverage=1.0, correct=lambda readings: readings)
