@@ -168,6 +168,6 @@ def test_listen_reports_silent_sensors_and_invalid_arguments(tmp_path, capsys):
     assert 'readings of unknown sensors: mag_2' in output
     assert re.search(r'^  mag_2 +no readings$', output, re.M)
     assert cli.main(['listen', str(path), '--network', str(NETWORK_FILE), '--seconds', '0']) == 1
-    assert '--seconds: 0 is not a number above 0' in capsys.readouterr().err
+    assert '--seconds: expected a number above 0, got 0' in capsys.readouterr().err
     assert cli.main(['listen', str(tmp_path / 'none.yaml')]) == 1
     assert 'No such file' in capsys.readouterr().err
