@@ -24,8 +24,8 @@ recording, network, n_readings = import_pose_table(
 print(n_readings, 'readings of', len(mt.read_network(network)), 'sensors')
 
 # %%
-# ``target='magnet'`` selects six degrees of freedom: position and direction of the moment. The
-# rotation about the moment is not observable; it is flagged and gets the variance π².
+# ``target='magnet'`` estimates five degrees of freedom: the position and the direction of the
+# moment. The rotation about the moment is not observable; it is flagged and has the variance π².
 result = mt.track(recording, network, target='magnet')
 errors = result.errors()
 print(f'position: {1e3 * errors["position_mean"]:.2f} mm on average')
