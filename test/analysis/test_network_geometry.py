@@ -53,7 +53,7 @@ def test_calibration_reduces_the_prior_errors(boards):
         error, before = (np.sqrt(np.mean(np.square(v))) for v in (error, before))
         print(f'remaining error of {part}: {error / before:.2f}')
         assert error < share * before
-        # The errors agree with the stated stds.
+        # The errors do not exceed the stated stds.
         assert error < 1.1 * np.sqrt(np.mean(np.square(std)))
 
 

@@ -88,7 +88,7 @@ def test_a_single_fit_of_two_vehicles_is_not_trusted():
 
 
 def test_a_near_vehicle_is_not_rejected_for_its_residuals():
-    """Formerly 15 of 16 correct fits of a car at 0.8 m were rejected for 2.4 to 11.9 %."""
+    """Formerly, 15 of 16 correct fits at 0.8 m were rejected for residuals of 2.4 to 11.9 %."""
     for seed in (2, 9, 20):
         velocity, std = answers(seed).fit
         assert abs(velocity / answers(seed).truth - 1.0) < 0.1 and std < 0.25 * abs(velocity)

@@ -78,7 +78,7 @@ def test_another_unit_is_identified(unit, scale):
     assert explanations_of(fields) == {'d': (f'its unit is {unit}',)}
 
 
-def test_unit_factors():
+def test_unit_factors_are_relative_to_tesla():
     assert dict(UNITS) == {'gauss': 1e4, 'millitesla': 1e3, 'microtesla': 1e6, 'nanotesla': 1e9}
 
 

@@ -73,7 +73,7 @@ def standing_vehicle(until):
 
 
 def test_a_vehicle_present_at_the_start_is_doubted_and_replaced():
-    """It is there for four seconds; after as long without it, the background is ambiguous."""
+    """It stands for four seconds; after as long without it, the background is ambiguous."""
     for seconds, is_doubtful, has_departed in ((4.0, False, False), (9.5, True, False),
                                            (24.0, False, True)):
         b = fed(standing_vehicle(4.0), seconds)

@@ -136,7 +136,7 @@ def test_estimate_of_a_linear_model_reaches_the_bound():
 
 
 @pytest.mark.parametrize('m', [ONES, UP])
-def test_unobservable_states_have_infinite_variance_and_the_others_the_limit(m):
+def test_unobservable_states_have_infinite_variance(m):
     J = unitless(m, ONE)
     P = bound(J)
     unobservable = np.isin(NAMES, observability(J, NAMES).unobservable)
