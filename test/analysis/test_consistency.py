@@ -1,4 +1,4 @@
-"""The ratio of a track's error to the path bound that every replay with truth reports."""
+"""Ratio of the error of a track to the path bound, as reported by replays with truth."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,8 @@ from support.passes import NOISE, ROAD
 N = 30
 
 
-def passed(errors, noise=NOISE, missing=False):
-    """A log with such position errors (n, 3) on a straight way, and its truth."""
+def log_with_errors(errors, noise=NOISE, missing=False):
+    """Log of a straight pass with given position errors (n, 3), and its truth."""
     t = 0.08 * np.arange(N)
     true = np.column_stack([10.0 * t - 12.0, np.full(N, 1.0), np.full(N, 0.5)])
     log = TrackLog(1)
@@ -29,31 +29,31 @@ def ratio(log, truth, rows=range(N), field_error=0.0):
                             np.array(rows), 2)
 
 
-def test_the_ratio_is_that_of_the_error():
+def test_ratio_is_proportional_to_the_error():
     e = 0.1 * np.random.default_rng(1).standard_normal((N, 3)) * [1.0, 1.0, 0.0]
-    once = ratio(*passed(e))
-    assert ratio(*passed(3.0 * e)) == pytest.approx(3.0 * once)
-    assert ratio(*passed(np.zeros((N, 3)))) == 0.0
+    once = ratio(*log_with_errors(e))
+    assert ratio(*log_with_errors(3.0 * e)) == pytest.approx(3.0 * once)
+    assert ratio(*log_with_errors(np.zeros((N, 3)))) == 0.0
 
 
 def test_poorer_sensors_have_a_larger_bound():
     e = np.full((N, 3), 0.1)
-    once = ratio(*passed(e))
-    assert ratio(*passed(e, 4.0 * NOISE)) < 0.7 * once
-    assert ratio(*passed(e, missing=True)) < 0.7 * once
-    assert ratio(*passed(e), field_error=0.1) < once
+    once = ratio(*log_with_errors(e))
+    assert ratio(*log_with_errors(e, 4.0 * NOISE)) < 0.7 * once
+    assert ratio(*log_with_errors(e, missing=True)) < 0.7 * once
+    assert ratio(*log_with_errors(e), field_error=0.1) < once
 
 
 def test_only_poses_with_truth_count():
-    log, (stamps, true, q) = passed(np.full((N, 3), 0.1))
+    log, (stamps, true, q) = log_with_errors(np.full((N, 3), 0.1))
     assert ratio(log, (stamps[:1], true[:1], q[:1])) is None
     assert ratio(log, (stamps[:20], true[:20], q[:20]), range(25, N)) is None
     log.position[0] = np.array([1e3, 0.0, 0.0])
     assert ratio(log, (stamps, true, q), range(5, N)) < 20.0
 
 
-def test_magnets_too(magnet_replays):
-    """The aim is 1 here, too; 3 is only what was reached, with a margin."""
+def test_ratio_of_magnet_tracks_is_within_its_limits(magnet_replays):
+    """The aim is 1; the limit of 3 is the present result with a margin."""
     for run, _ in magnet_replays.values():
         found = run.summary['tracks'][0]['truth']['error_over_bound']
         print(f'magnet: error over path bound {found:.2f}')

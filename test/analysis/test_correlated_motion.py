@@ -1,4 +1,4 @@
-"""Speed and direction by the delay between sensors: laws, and what it refuses."""
+"""Speed and direction from the delay between sensors: laws, and rejected data."""
 
 import dataclasses
 
@@ -38,17 +38,17 @@ def test_the_delay_is_distance_over_speed(speed, heading):
     assert pair.delay == pytest.approx(2.0 / speed * np.cos(heading), rel=0.02)
 
 
-def test_sensors_need_not_be_turned_alike():
+def test_sensors_may_have_different_orientations():
     data = along_x(7.0)
-    turns = rotation_from_quaternion(quaternion_from_rotation_vector(
+    rotations = rotation_from_quaternion(quaternion_from_rotation_vector(
         np.array([[0.3, 1.0, -0.5], [2.0, 0.1, 0.4]])))
-    field = np.einsum('nji,nj->ni', turns[data.sensor], data.field)
-    turned = dataclasses.replace(data, network=dataclasses.replace(data.network, R_ws=turns),
+    field = np.einsum('nji,nj->ni', rotations[data.sensor], data.field)
+    rotated = dataclasses.replace(data, network=dataclasses.replace(data.network, R_ws=rotations),
                                  field=field)
-    assert correlated_motion(turned).speed == pytest.approx(7.0, rel=0.01)
+    assert correlated_motion(rotated).speed == pytest.approx(7.0, rel=0.01)
 
 
-def test_a_turn_and_a_gain_that_nobody_knows_cost_little():
+def test_small_orientation_and_gain_errors_have_little_effect():
     data = along_x(7.0)
     turn = rotation_from_quaternion(quaternion_from_rotation_vector(np.radians([1.5, -1.0, 2.0])))
     second = (data.sensor == 1)[:, None]
@@ -57,28 +57,28 @@ def test_a_turn_and_a_gain_that_nobody_knows_cost_little():
     assert abs(found.speed - 7.0) < max(3.0 * found.speed_std, 0.05)
 
 
-def test_three_sensors_off_a_line_tell_the_heading():
-    """Only pairs that feel the same count: here all do, for the target is far away."""
+def test_three_sensors_off_a_line_observe_the_heading():
+    """Only pairs with similar fields count; here all do, because the target is far away."""
     places = ((-2.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 0.6, 0.0))
     found = correlated_motion(along_x(6.0, aside=25.0, places=places, noise=1e-12))
     assert not found.reason and len(found.pairs) == 3 and 0.0 < found.heading_std < 0.5
     assert abs(np.angle(np.exp(1j * found.heading))) < max(3.0 * found.heading_std, 0.05)
 
 
-def test_other_sides_of_a_road_have_no_delay():
+def test_sensors_on_opposite_sides_of_a_road_have_no_delay():
     places = ((0.0, -4.5, 0.0), (0.0, 4.5, 0.0))
     found = correlated_motion(along_x(9.0, aside=1.5, places=places))
     assert 'different fields' in found.reason and np.isnan(found.speed)
 
 
-def test_side_by_side_is_no_delay():
-    """A target between the two, far from both, reaches them at once."""
+def test_sensors_side_by_side_have_no_delay():
+    """A distant target passes both sensors at the same time."""
     places = ((0.0, -0.25, 0.0), (0.0, 0.25, 0.0))
     found = correlated_motion(along_x(9.0, aside=20.0, places=places, noise=1e-11))
     assert 'at the same time' in found.reason
 
 
-def test_one_sensor_and_no_axis_in_common():
+def test_one_sensor_or_no_common_axis_yields_a_reason():
     data = along_x(9.0)
     field = data.field.copy()
     field[data.sensor == 0] = np.nan
@@ -89,7 +89,7 @@ def test_one_sensor_and_no_axis_in_common():
     assert 'on a common axis' in found.reason
 
 
-def test_one_axis_is_enough():
+def test_one_common_axis_is_sufficient():
     data = along_x(9.0)
     field = data.field.copy()
     field[:, :2] = np.nan
@@ -97,17 +97,17 @@ def test_one_axis_is_enough():
         9.0, rel=0.02)
 
 
-def test_what_contradicts():
+def test_contradictions_consider_speed_heading_and_their_stds():
     c = CorrelatedMotion('', 10.0, 0.2, 0.0, np.nan, 1.0)
     straight = 0.1, 0.02
     assert not contradicts_delays((10.4, 0.1), straight, c) \
         and contradicts_delays((14.0, 0.3), straight, c)
     assert contradicts_delays((10.0, 0.1), (np.pi, 0.1), c)
-    # Either a large deviation or a small difference is no contradiction.
+    # Neither a difference with a large std nor a small difference is a contradiction.
     assert not contradicts_delays((14.0, 2.0), straight, c) \
         and not contradicts_delays((10.9, 0.01), straight, c)
     assert not contradicts_delays((10.0, 0.1), (np.radians(100.0), np.radians(40.0)), c)
-    # Obliquely across the line of the sensors the delay is shorter.
+    # On a path oblique to the line of the sensors, the delay is shorter.
     assert not contradicts_delays((10.0 * np.cos(0.5), 0.1), (0.5, 0.02), c)
     assert contradicts_delays((10.0, 0.1), (0.5, 0.02), c)
     off_line = CorrelatedMotion('', 10.0, 0.2, 0.0, 0.1, 1.0)
@@ -126,42 +126,42 @@ def test_sensors_above_one_another_have_no_delay(places):
     assert 'no pair of separate sensors' in found.reason
 
 
-@pytest.mark.parametrize('spoilt', ['first constant', 'all zero', 'one infinite', 'stamps alike',
-                                    'few', 'no noise'])
+@pytest.mark.parametrize('fault', ['first sensor constant', 'all zero', 'one infinite',
+                                    'equal timestamps', 'few', 'no noise'])
 @pytest.mark.filterwarnings('error')
-def test_odd_readings_have_a_reason_or_an_answer(spoilt):
+def test_faulty_readings_yield_a_reason_or_an_estimate(fault):
     data = along_x(9.0)
     field, t = data.field.copy(), data.t.copy()
-    if spoilt == 'first constant':
+    if fault == 'first sensor constant':
         field[data.sensor == 0] = 1e-6
-    if spoilt == 'all zero':
+    if fault == 'all zero':
         field[:] = 0.0
-    if spoilt == 'one infinite':
+    if fault == 'one infinite':
         field[100, 0] = np.inf
-    if spoilt == 'stamps alike':
+    if fault == 'equal timestamps':
         for j in (0, 1):
             mine = np.flatnonzero(data.sensor == j)
             t[mine[100:900]] = t[mine[100]]
     found = dataclasses.replace(data, field=field, t=t)
-    if spoilt == 'few':
+    if fault == 'few':
         rows = np.flatnonzero(data.t > 2.98)
         found = dataclasses.replace(data, t=t[rows], sensor=data.sensor[rows], field=field[rows],
                                     covariance=data.covariance[rows])
-    if spoilt == 'no noise':
+    if fault == 'no noise':
         found = dataclasses.replace(data, covariance=0.0 * data.covariance)
     c = correlated_motion(found)
-    assert c.reason if spoilt != 'one infinite' else abs(c.speed - 9.0) < 0.3
+    assert c.reason if fault != 'one infinite' else abs(c.speed - 9.0) < 0.3
 
 
 @pytest.mark.parametrize('share', [0.9, 0.5, 0.2])
-def test_opposite_vehicles_at_once_are_no_delay(share):
+def test_simultaneous_opposite_vehicles_have_no_delay(share):
     one, other = along_x(10.0, seed=1), along_x(14.0, seed=2, heading=np.pi)
     both = dataclasses.replace(one, field=one.field + share * other.field)
     assert 'different fields' in correlated_motion(both).reason
 
 
-def test_a_missing_frame_costs_nothing():
-    """A track's log has a reading that is missing as NaN, and its covariance too."""
+def test_missing_readings_have_no_effect():
+    """In the log of a track, a missing reading and its covariance are NaN."""
     data = along_x(7.0)
     field, covariance = data.field.copy(), data.covariance.copy()
     field[[5, 1500]] = covariance[[5, 1500]] = np.nan
@@ -169,8 +169,8 @@ def test_a_missing_frame_costs_nothing():
     assert found.speed == pytest.approx(7.0, rel=0.01)
 
 
-def test_a_scaled_or_turned_field_is_another_one():
-    """A vehicle that turns away is felt less, and from another side, by the second sensor."""
+def test_a_scaled_or_rotated_field_is_different():
+    """If a vehicle turns away, its field at the second sensor is weaker and rotated."""
     data = along_x(7.0)
     second = (data.sensor == 1)[:, None]
     far = rotation_from_quaternion(quaternion_from_rotation_vector(np.radians([0.0, 0.0, 15.0])))

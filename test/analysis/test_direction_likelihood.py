@@ -1,4 +1,4 @@
-"""The likelihood ratio of two lanes: right without noise, scaled as theory has it, and refused."""
+"""Likelihood ratio of two lanes: sign, scale, and directions in the published traffic."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def passing(rng, lane):
 
 
 @pytest.mark.parametrize('height', [0.0, 0.6])
-def test_a_dipole_in_either_lane_is_told(height):
+def test_sign_of_the_ratio_identifies_the_lane_of_a_dipole(height):
     rng = np.random.default_rng(0)
     right, left = RIGHT._replace(height=height), LEFT._replace(height=height)
     for _ in range(30):
@@ -32,8 +32,8 @@ def test_a_dipole_in_either_lane_is_told(height):
             assert sign * direction_likelihood_ratio(T, noisy, 1e-8, right, left) > 0.0
 
 
-def test_a_matched_lane_leaves_the_noise():
-    """The larger of the two likelihoods is that of noise; the ratio grows with the signal."""
+def test_ratio_is_proportional_to_the_signal_to_noise_power_ratio():
+    """The lane that matches leaves no residual."""
     rng = np.random.default_rng(1)
     h = passing(rng, RIGHT)
     ratios = [direction_likelihood_ratio(T, h, std, RIGHT, LEFT) for std in (2e-8, 1e-8)]
@@ -46,9 +46,9 @@ def test_directions_in_the_published_traffic(simulator):
     """PHD15 Paper B, Table 1: 510 of 511 near, 494 of 511 fused."""
     vehicles = passings(simulator, 1)
     share = shares(vehicles, [v.log_odds_of_north() for v in vehicles])
-    # Three standard deviations of 511 below the aims of 99.8 % and 97 %. With boxes 99.5 % are
-    # reached (`bench.directions`): six of seven errors are vehicles with another one in the other
-    # lane within 0.62 s, four times a truck.
+    # Three standard deviations of 511 vehicles below the aims of 99.8 % and 97 %. Boxes reach
+    # 99.5 % (`bench.directions`): in six of seven errors another vehicle is in the other lane
+    # within 0.62 s, in four of them a truck.
     assert share.near > 0.998 - 3.0 * np.sqrt(0.998 * 0.002 / 511)
     assert share.fused > 0.97 - 3.0 * np.sqrt(0.97 * 0.03 / 511)
     stated, measured = calibration(vehicles)

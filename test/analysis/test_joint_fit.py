@@ -1,4 +1,4 @@
-"""Several targets at once, fitted together: found, with honest deviations, or refused."""
+"""Joint fit of several targets: estimates, consistent covariances, and rejected fits."""
 
 from dataclasses import replace
 
@@ -47,7 +47,7 @@ def world(rng, plan, n_dipoles, network=ROAD):
 
 
 def tracked(rng, paths):
-    """(K, 6) of the paths, as a tracker has them: half a metre and 5 % off."""
+    """Paths (K, 6) with the errors of a tracker: 0.5 m and 5 % of the speed."""
     found = np.array([path[:6] for path in paths])
     found[:, :2] += 0.5 * rng.standard_normal((len(paths), 2))
     found[:, 3] *= 1.0 + 0.05 * rng.standard_normal(len(paths))
@@ -58,7 +58,7 @@ MEETING, FOLLOWING = ((-0.3, 1), (0.2, -1)), ((-0.8, 1), (0.8, 1))
 
 
 @pytest.mark.parametrize(('plan', 'n_dipoles'), [(MEETING, 1), (MEETING, 2), (FOLLOWING, 2)])
-def test_two_vehicles_are_found_with_honest_deviations(plan, n_dipoles):
+def test_two_vehicles_are_fitted_with_consistent_covariances(plan, n_dipoles):
     z = []
     for seed in range(6):
         rng = np.random.default_rng([seed, n_dipoles])
@@ -72,12 +72,12 @@ def test_two_vehicles_are_found_with_honest_deviations(plan, n_dipoles):
             true[:3] += fit.data.stamp_ns / 1e9 * path[3:6]
             e = fit.x[:6] - true
             z.append(e @ np.linalg.solve(fit.covariance[:6, :6], e))
-    # Six numbers of each vehicle; what was known of height and climb only narrows it.
+    # Six parameters of each vehicle; the prior of height and climb only reduces the errors.
     assert chi2.cdf(np.sum(z), 6 * len(z)) < 0.999, np.round(z, 1)
     assert chi2.cdf(np.sum(z), 4 * len(z)) > 0.001, np.round(z, 1)
 
 
-def test_three_vehicles_are_found():
+def test_three_vehicles_are_fitted():
     rng = np.random.default_rng(5)
     data, paths = world(rng, ((-1.2, 1), (0.1, -1), (1.1, 1)), 1, FOUR)
     found = fit_joint(data, tracked(rng, paths), GROUND, (1, 2))
@@ -88,8 +88,8 @@ def test_three_vehicles_are_found():
         assert fit.data.stamp_ns / 1e9 == pytest.approx(-path[0] / path[3], abs=0.5)
 
 
-def test_each_is_given_what_was_measured_without_the_others():
-    """The field of the one alone and the noise are left."""
+def test_data_of_each_fit_exclude_the_fields_of_the_others():
+    """The field of one vehicle and the noise remain."""
     rng = np.random.default_rng(6)
     data, paths = world(rng, MEETING, 1)
     (first,), (second,) = fit_joint(data, tracked(rng, paths), GROUND, (1,))
@@ -101,7 +101,7 @@ def test_each_is_given_what_was_measured_without_the_others():
     assert abs(alone.speed[0] - first.speed[0]) < 2.0 * first.speed[1]
 
 
-def test_each_has_as_many_dipoles_as_it_is_worth():
+def test_order_of_each_vehicle_is_chosen_separately():
     rng = np.random.default_rng(9)
     point, m = one_path(rng, -0.3, 1, 1)
     row, moments = one_path(rng, 0.3, -1, 3)
@@ -110,15 +110,15 @@ def test_each_has_as_many_dipoles_as_it_is_worth():
     found = fit_joint(data, tracked(rng, (point, row)), GROUND, (1, 2, 3))
     orders = [choose_order(fits).n_dipoles for fits in found]
     assert orders[0] == 1 and orders[1] >= 2
-    # Whichever number one of them is given, it is the same vehicle, with the same time zero.
+    # With any number of dipoles it is the same vehicle, with the same time zero.
     for fits, path in zip(found, (point, row), strict=True):
         assert [fit.n_dipoles for fit in fits] == [1, 2, 3]
         assert len({(fit.data.stamp_ns, fit.data.t[0]) for fit in fits}) == 1
         assert all(fit.velocity[0] * path[3] > 0.0 for fit in fits if fit.converged)
 
 
-def test_a_long_row_is_not_taken_for_two_that_follow():
-    """Without tracks it is: a row of two dipoles, as long as they are apart."""
+def test_two_following_vehicles_are_not_fitted_as_one_long_row():
+    """Without tracks they are: a row of two dipoles, as long as the distance between them."""
     rng = np.random.default_rng(3)
     one, moments = one_path(rng, -0.5, 1, 2)
     other = one.copy()
@@ -136,7 +136,7 @@ def test_a_long_row_is_not_taken_for_two_that_follow():
         assert abs(fit.velocity[0] - one[3]) < 4.0 * fit.speed[1] < 2.0 and fit.length[0] < 5.0
 
 
-def test_parts_of_one_vehicle_are_no_two_vehicles():
+def test_two_tracks_of_one_vehicle_are_fitted_as_one():
     rng = np.random.default_rng(4)
     row, moments = one_path(rng, 0.0, 1, 3)
     row[6] = 7.0
@@ -148,7 +148,7 @@ def test_parts_of_one_vehicle_are_no_two_vehicles():
     assert abs(choose_order(alone).velocity[0] - row[3]) < 0.5
 
 
-def test_vehicles_that_drive_through_each_other_are_refused():
+def test_fits_of_overlapping_vehicles_are_rejected():
     rng = np.random.default_rng(1)
     slow, m = one_path(rng, 0.0, 1, 1)
     fast, more = one_path(rng, 0.3, 1, 1)
@@ -160,7 +160,7 @@ def test_vehicles_that_drive_through_each_other_are_refused():
     assert all('overlap' in fit.reason for fit in fits) and choose_order(alone) is not None
 
 
-def test_what_is_not_believed_says_why():
+def test_a_rejected_joint_fit_has_a_reason():
     rng = np.random.default_rng(7)
     data, paths = world(rng, MEETING, 1)
     alone, two = [fit_pass(data, 1)], tracked(rng, paths)
@@ -169,19 +169,19 @@ def test_what_is_not_believed_says_why():
              ('too few measurements', replace(
                  data, t=data.t[::200], sensor=data.sensor[::200], field=data.field[::200],
                  covariance=data.covariance[::200]), two),
-             # A third one that nobody tracked.
+             # A third vehicle that was not tracked.
              ('of the field unexplained', together(data, measured(
                  ROAD, *one_path(rng, 1.5, 1, 1), rng, seconds=6.0, noise=1e-15)), two)]
     for reason, of, tracks in cases:
         fits, = fit_targets(of, alone, tracks, GROUND, (1,))
         assert reason in fits[0].reason and fits[0].trusted == (), fits[0].reason
         assert choose_order(fits) is None
-    # One sensor does not tell the scale of one, let alone of two.
+    # With one sensor, the scale is not observable even for one vehicle.
     one = measured(network_of([[0.0, -4.5, 0.0]]), paths[0], np.ones((1, 3)), rng)
     assert fit_targets(one, alone, two, GROUND, (1,)) == (tuple(alone),)
 
 
-def test_vehicles_beside_and_behind_each_other_are_clear():
+def test_vehicles_side_by_side_or_following_are_separate():
     data, _ = world(np.random.default_rng(8), MEETING, 1)
     one = np.array([0.0, -1.75, 0.5, 10.0, 0.0, 0.0, 3.0])
 
@@ -191,13 +191,13 @@ def test_vehicles_beside_and_behind_each_other_are_clear():
     assert are_separate(data, (one, moved(0.0, 3.5)))
     assert are_separate(data, (one, moved(-7.0)))
     assert not are_separate(data, (one, moved(-5.0)))
-    # It catches up, but far behind the sensors' sight.
+    # One vehicle catches up within range of the sensors, another one stays far behind.
     assert not are_separate(data, (one, moved(-9.0, 0.0, 0.0, 6.0)))
     assert are_separate(data, (one, moved(-60.0, 0.0, 0.0, 2.0)))
     assert are_separate(data, (one,))
 
 
-def test_paths_begin_where_the_data_do():
+def test_path_from_refers_to_the_time_zero_of_the_data():
     rng = np.random.default_rng(2)
     data, paths = world(rng, MEETING, 2)
     data = replace(data, stamp_ns=1_700_000_000_000_000_000)
@@ -207,17 +207,17 @@ def test_paths_begin_where_the_data_do():
     assert np.isfinite(order_criteria([fits[0] for fits in found])).all()
 
 
-def test_a_track_of_nobody_is_no_vehicle():
+def test_a_false_track_is_not_fitted_as_a_vehicle():
     rng = np.random.default_rng(12)
     row, moments = one_path(rng, 0.0, 1, 2)
     data = measured(ROAD, row, moments, rng, seconds=6.0)
     alone = [fit_pass(data, n) for n in ORDERS]
-    nobody = row[:6] * [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0]
-    assert fit_targets(data, alone, np.array([row[:6], nobody]), GROUND, ORDERS) == (tuple(alone),)
+    ghost = row[:6] * [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0]
+    assert fit_targets(data, alone, np.array([row[:6], ghost]), GROUND, ORDERS) == (tuple(alone),)
 
 
-def test_what_is_wrong_with_one_is_in_the_answers_of_all():
-    """The second one goes at half its speed, and then at twice."""
+def test_a_velocity_change_of_one_target_rejects_all_fits():
+    """The second vehicle drives at half its speed, then at twice its speed."""
     rng = np.random.default_rng(11)
     (first, m), (second, more) = one_path(rng, -0.3, 1, 1), one_path(rng, 0.2, -1, 1)
     data = measured(ROAD, first, m, rng, seconds=6.0)
@@ -232,7 +232,7 @@ def test_what_is_wrong_with_one_is_in_the_answers_of_all():
     assert all(choose_order(fits) is None for fits in found)
 
 
-def test_vehicles_are_in_the_order_in_which_they_pass():
+def test_fits_are_in_the_order_of_the_passes():
     rng = np.random.default_rng(13)
     data, paths = world(rng, FOLLOWING, 1)
     for order in ([0, 1], [1, 0]):
@@ -240,11 +240,11 @@ def test_vehicles_are_in_the_order_in_which_they_pass():
         assert found[0][0].data.stamp_ns < found[1][0].data.stamp_ns
 
 
-def test_what_left_its_track_says_so():
+def test_a_fit_that_left_its_track_has_a_reason():
     rng = np.random.default_rng(14)
     data, paths = world(rng, MEETING, 1)
     astray = tracked(rng, paths)
-    # As fast as nobody was.
+    # No vehicle is this fast.
     astray[1, 3] *= 3.0
     found = fit_joint(data, astray, GROUND, (1,))
     assert sorted(fit.reason for fit, in found) == ['', 'the fit is not at the tracked position']
@@ -252,7 +252,7 @@ def test_what_left_its_track_says_so():
 
 
 def two_minima(*others):
-    """The fits of two points of which the search ended in `others` (12,), too."""
+    """Fits of two points whose search also ended at `others`, functions of theta (12,)."""
     rng = np.random.default_rng(15)
     data, paths = world(rng, MEETING, 1)
     theta = np.concatenate(paths)
@@ -264,7 +264,7 @@ def two_minima(*others):
     return data, theta, fits_at_minimum(data, (1, 1), found, p, 1.0, SensorErrors()), (p, found)
 
 
-def test_targets_that_are_exchanged_are_no_rivals_and_each_has_its_own():
+def test_exchanged_targets_are_no_rivals_of_each_other():
     def exchanged(theta):
         return np.concatenate([theta[6:], theta[:6]])
 
@@ -275,7 +275,7 @@ def test_targets_that_are_exchanged_are_no_rivals_and_each_has_its_own():
     assert first.rivals == () and len(second.rivals) == 1
     np.testing.assert_allclose(second.rivals[0][1], theta[6:] + [0.0, 3.0, 0.0, 0.0, 0.0, 0.0])
     assert assignment([theta[:6], theta[6:]], [theta[6:], theta[:6]]) == (1, 0)
-    # Later on, the rival is where it goes.
+    # A shift in time moves the rival along its own path.
     moved = second.shifted(2.0)
     np.testing.assert_allclose(moved.rivals[0][1][:3],
                                second.rivals[0][1][:3] + 2.0 * theta[9:12])
@@ -283,19 +283,19 @@ def test_targets_that_are_exchanged_are_no_rivals_and_each_has_its_own():
     assert moved.data.stamp_ns == second.data.stamp_ns + 2_000_000_000
 
 
-def test_what_was_known_beforehand_adds_to_the_information():
+def test_a_prior_adds_information():
     data, _, (_, second), (p, found) = two_minima()
     std = np.full(12, np.inf)
     std[8] = 0.05
     _, known = fits_at_minimum(data, (1, 1), found, p, 1.0, SensorErrors(), path_std=std)
-    # Of one number measured anew, whatever the others are: Sherman and Morrison.
+    # Sherman-Morrison update for one more measurement of one parameter.
     P = second.covariance
     gain = P[:, 2] / (P[2, 2] + 0.05**2)
     np.testing.assert_allclose(known.covariance, P - np.outer(gain, P[2]), rtol=1e-5,
                                atol=1e-9 * np.abs(P).max())
 
 
-def test_what_is_left_over_may_be_of_any_of_them():
+def test_residuals_near_any_target_are_not_elsewhere():
     rng = np.random.default_rng(16)
     data, paths = world(rng, FOLLOWING, 1)
     rows = [FittedRow(1, path, (RowPass(data.t, data.positions, ROAD.R_sw[data.sensor], 1).basis(
@@ -305,7 +305,7 @@ def test_what_is_left_over_may_be_of_any_of_them():
         assert residual_elsewhere(data, rows, left) < 1e-3
 
 
-def test_targets_that_are_described_poorly_together_are_ambiguous():
+def test_targets_of_a_poor_joint_fit_are_ambiguous():
     *_, (first, _), _ = two_minima()
     assert not first.ambiguous and first.n_other_unknowns == 9
     poor = replace(first, cost=2.1 * first.degrees_of_freedom)

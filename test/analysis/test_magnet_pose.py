@@ -1,4 +1,4 @@
-"""Single poses of a magnet, and its poses together with the geometry of the network."""
+"""Single poses of a magnet, and joint estimation of poses and network geometry."""
 
 from dataclasses import replace
 
@@ -13,8 +13,8 @@ from mag_tracking.physics.dipole import dipole_field
 from support.magnet_boards import HIGH, LOW, MOMENT, SETTINGS, board, estimated, simulated
 
 
-def test_single_poses_and_their_covariance():
-    """Anywhere in the box, from one reading each; the field's error is part of the noise."""
+def test_single_poses_have_consistent_covariances():
+    """Random poses in the box, one reading per sensor; the field error is part of the noise."""
     network = board(4, 0.05)
     rng = np.random.default_rng(5)
     settings = PoseSettings()
@@ -34,7 +34,7 @@ def test_single_poses_and_their_covariance():
         assert np.linalg.norm(pose.axis) == pytest.approx(1.0)
         assert np.abs(pose.covariance[3:] @ np.append(np.zeros(3), pose.axis)).max() < 1e-9 * (
             pose.covariance[3:, 3:].max())
-        # To first order, as the covariance is: across the axis.
+        # The axis error is of first order, perpendicular to the axis, as is the covariance.
         e = np.append(pose.position - r, pose.axis * (pose.axis @ u) - u)
         C = pose.covariance / max(1.0, pose.normalised_cost)
         scale = np.sqrt(np.diagonal(C))
@@ -47,7 +47,7 @@ def test_single_poses_and_their_covariance():
     assert np.mean(costs) == pytest.approx(1.0, abs=0.06)
 
 
-def test_what_is_no_pose_says_so():
+def test_a_rejected_pose_has_a_reason():
     network = board()
     u = np.array([0.6, 0.0, 0.8])
 
@@ -79,7 +79,7 @@ def test_what_is_no_pose_says_so():
 
 # Without a tracker.
 
-def test_unknown_poses_and_geometry_together():
+def test_unknown_poses_and_geometry_are_estimated_jointly():
     nees = []
     for seed in (21, 22, 23):
         network, field, positions, axes, x = simulated(seed, settings=replace(
@@ -101,7 +101,7 @@ def test_unknown_poses_and_geometry_together():
     assert low <= np.mean(nees) <= high
 
 
-def test_without_a_magnet_nothing_is_calibrated():
+def test_readings_without_a_magnet_are_rejected():
     network = board()
     field = 3e-5 + 1e-7 * np.random.default_rng(0).standard_normal((10, 9, 3))
     with pytest.raises(ValueError, match='of 10 poses were found in the box'):

@@ -1,4 +1,4 @@
-"""A network's geometry where sensors, poses or input are at fault."""
+"""Geometry calibration with faulty sensors, poses or input."""
 
 from dataclasses import replace
 
@@ -12,19 +12,19 @@ from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, es
 
 
 @pytest.fixture(scope='module')
-def many():
+def boards():
     """[(simulated, geometry)] of several boards."""
     return calibrated_boards()
 
 
-def within(g, h, network, most):
-    """Whether two estimates agree to `most` deviations of the first; NaN agrees with nothing."""
+def within(g, h, network, max_stds):
+    """Whether two estimates agree within `max_stds` stds of the first; NaN never agrees."""
     return bool((np.abs(estimated(g, network) - estimated(h, network))
-                 < most * np.sqrt(np.diagonal(g.covariance))).all())
+                 < max_stds * np.sqrt(np.diagonal(g.covariance))).all())
 
 
-def test_a_dead_sensor_is_as_none(many):
-    (network, field, positions, axes, _), _ = many[2]
+def test_a_dead_sensor_is_treated_as_missing(boards):
+    (network, field, positions, axes, _), _ = boards[2]
     dead = field.copy()
     dead[:, 4] = np.nan
     dead[3, 5, 1] = np.nan
@@ -49,20 +49,19 @@ def test_a_dead_sensor_is_as_none(many):
 
 
 @pytest.mark.parametrize('shift', [2e-2, 4e-3])
-def test_an_outlying_pose_is_named_and_harms_little(many, shift):
-    (network, field, positions, axes, _), g = many[5]
+def test_an_outlying_pose_is_reported_and_has_little_effect(boards, shift):
+    (network, field, positions, axes, _), g = boards[5]
     wrong = positions.copy()
     wrong[7, 0] += shift
     h = calibrate_geometry(network, field, wrong, axes, MOMENT, SETTINGS)
     assert h.converged and h.suspect_poses == (7,) and h.suspect_sensors == ()
     assert within(g, h, network, 1.0)
-    # One pose is not held against the sensors.
+    # One pose does not raise the residuals of the sensors.
     np.testing.assert_allclose(h.sensor_residual, g.sensor_residual, rtol=0.1)
 
 
-def test_a_pose_of_a_moved_board_is_named(many):
-    """The readings are wrong this time: those of another pose."""
-    (network, field, positions, axes, _), g = many[6]
+def test_a_pose_with_the_readings_of_another_is_reported(boards):
+    (network, field, positions, axes, _), g = boards[6]
     wrong = field.copy()
     wrong[7] = field[8]
     h = calibrate_geometry(network, wrong, positions, axes, MOMENT, SETTINGS)
@@ -70,14 +69,14 @@ def test_a_pose_of_a_moved_board_is_named(many):
     assert within(g, h, network, 1.0)
 
 
-def spoilt(field, fault):
+def faulty(field, fault):
     """A copy in which sensor 2 is at fault."""
     wrong = field.copy()
     if fault == 'flipped':
         wrong[:, 2, 1] *= -1.0
     elif fault == 'swapped':
         wrong[:, 2] = wrong[:, 2][:, [1, 0, 2]]
-    elif fault == 'turned':
+    elif fault == 'rotated':
         wrong[:, 2] = wrong[:, 2] @ rotation(np.array([0.0, 0.4, 0.0]))
     elif fault == 'gain':
         wrong[:, 2] *= 2.0
@@ -86,13 +85,13 @@ def spoilt(field, fault):
     return wrong
 
 
-@pytest.mark.parametrize('fault', ['flipped', 'swapped', 'turned', 'gain'])
-def test_a_bad_sensor_is_named(many, fault):
-    """And what is found of the others is hardly farther out than without it."""
+@pytest.mark.parametrize('fault', ['flipped', 'swapped', 'rotated', 'gain'])
+def test_a_faulty_sensor_is_reported(boards, fault):
+    """The estimates of the other sensors are hardly worse than without it."""
     others, z2 = np.delete(np.arange(9), 2), {fault: [], 'dead': []}
-    for (network, field, positions, axes, x), _ in many[:8]:
+    for (network, field, positions, axes, x), _ in boards[:8]:
         for what, found in z2.items():
-            g = calibrate_geometry(network, spoilt(field, what), positions, axes, MOMENT, SETTINGS)
+            g = calibrate_geometry(network, faulty(field, what), positions, axes, MOMENT, SETTINGS)
             z = (_corrections(g, network) - x[0][:, 3:]) / _corrections_std(g)
             found.append(np.square(z[others]).mean())
             assert g.converged and g.suspect_poses == ()
@@ -112,7 +111,7 @@ def _corrections_std(geometry):
     return np.sqrt(np.diagonal(geometry.covariance))[:-12].reshape(-1, 10)[:, 3:]
 
 
-def test_too_few_poses_are_no_answer():
+def test_too_few_poses_do_not_converge():
     network, field, positions, axes, _ = simulated(9)
     for K in (1, 2):
         g = calibrate_geometry(network, field[:K], positions[:K], axes[:K], MOMENT, SETTINGS)
@@ -121,14 +120,14 @@ def test_too_few_poses_are_no_answer():
     assert not g.converged and 'no minimum within 1 steps' in g.reason
 
 
-def test_one_sensor_alone_tells_next_to_nothing():
+def test_one_sensor_adds_almost_no_information():
     network, field, positions, axes, _ = simulated(9)
     scarce = np.full((3, 9, 3), np.nan)
     scarce[:, 0] = field[:3, 0]
     g = calibrate_geometry(network, scarce, positions[:3], axes[:3], MOMENT, SETTINGS)
     assert (g.position_std > 0.95 * SETTINGS.position_std).all()
     assert (g.gain_std > 0.95 * SETTINGS.gain_std).all()
-    # A prior is never lost, however bad the fit.
+    # Even a poor fit does not inflate the std beyond the prior.
     assert (g.position_std <= (1.0 + 1e-9) * SETTINGS.position_std).all()
     free = np.repeat([0.1, 0.5, 0.0], [3, 2, 3])
     g = fitted_geometry(network, scarce, positions[:3], axes[:3], MOMENT, SETTINGS,
@@ -137,7 +136,7 @@ def test_one_sensor_alone_tells_next_to_nothing():
     assert np.isnan(g.normalised_cost)
 
 
-def test_poses_at_one_place_tell_nothing_of_the_geometry():
+def test_poses_at_one_place_add_no_information_on_the_geometry():
     network, *_ = simulated(9)
     rng = np.random.default_rng(1)
     B = np.einsum('nij,nj->ni', network.R_sw,
@@ -150,7 +149,7 @@ def test_poses_at_one_place_tell_nothing_of_the_geometry():
     assert (g.gain_std > 0.9 * SETTINGS.gain_std).all()
 
 
-def test_another_magnet_is_refused():
+def test_a_magnet_of_opposite_polarity_is_rejected():
     network, field, positions, axes, _ = simulated(9)
     g = calibrate_geometry(network, field, positions, -axes, MOMENT, SETTINGS)
     assert not g.converged and 'normalised cost' in g.reason
@@ -169,7 +168,7 @@ def test_another_magnet_is_refused():
     ({'network': replace(board(), noise_std=(None,) * 9)}, 'sensor mag_0: noise_std is None'),
     ({'field': np.zeros((0, 9, 3)), 'positions': np.zeros((0, 3)), 'axes': np.zeros((0, 3))},
      'no poses')])
-def test_bad_input_is_named(change, message):
+def test_invalid_arguments_raise_value_error(change, message):
     network, field, positions, axes, _ = simulated(1, n_poses=5)
     given = {'network': network, 'field': field, 'positions': positions, 'axes': axes,
              'moment': MOMENT, **change}

@@ -1,4 +1,4 @@
-"""A network's geometry from a magnet's poses: errors and deviations on simulated boards."""
+"""Geometry calibration from poses of a magnet: errors and covariances on simulated boards."""
 
 from dataclasses import replace
 
@@ -12,14 +12,14 @@ from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, es
 
 
 @pytest.fixture(scope='module')
-def many():
+def boards():
     """[(simulated, geometry)] of several boards."""
     return calibrated_boards()
 
 
-def test_the_covariance_is_that_of_the_errors(many):
+def test_covariance_agrees_with_the_errors(boards):
     nees, outside, costs = [], [], []
-    for (network, *_, x), g in many:
+    for (network, *_, x), g in boards:
         assert g.converged and not g.reason
         assert g.suspect_sensors == () and g.suspect_poses == ()
         e = estimated(g, network) - np.append(x[0].ravel(), x[1])
@@ -28,20 +28,20 @@ def test_the_covariance_is_that_of_the_errors(many):
         nees.append(z @ np.linalg.solve(g.covariance / np.outer(unit, unit), z))
         outside.append(np.abs(z) > 2.0)
         costs.append(g.normalised_cost)
-    low, high = chi2.ppf([0.005, 0.995], 102 * len(many)) / len(many)
+    low, high = chi2.ppf([0.005, 0.995], 102 * len(boards)) / len(boards)
     print(f'NEES {np.mean(nees):.1f} in {low:.1f} .. {high:.1f}, cost {np.mean(costs):.3f}, '
           f'outside 2 std {np.mean(outside):.3f}')
     assert low <= np.mean(nees) <= high
-    # Neighbours share the gauge: more spread than the binomial's.
+    # The gauge is common to all sensors, so the spread exceeds that of a binomial distribution.
     assert np.mean(outside) == pytest.approx(0.0455, abs=0.02)
     assert np.mean(costs) == pytest.approx(1.0, abs=0.03)
 
 
-def test_much_is_learnt(many):
-    """Against the priors, and against each other: what all sensors share is the gauge's."""
+def test_calibration_reduces_the_prior_errors(boards):
+    """Errors relative to the mean of all sensors; a common error belongs to the gauge."""
     for part, share in ((slice(3, 4), 0.35), (slice(4, 7), 0.35), (slice(7, 10), 0.6)):
         error, before, std = [], [], []
-        for (network, *_, x), g in many:
+        for (network, *_, x), g in boards:
             e = (estimated(g, network)[:90] - x[0].ravel()).reshape(9, 10)[:, part]
             if part.start == 4:
                 e, was = (np.einsum('nij,nj->ni', network.R_ws, v) for v in (e, x[0][:, part]))
@@ -51,33 +51,33 @@ def test_much_is_learnt(many):
             before.append(was - was.mean(axis=0))
             std.append(np.sqrt(np.diagonal(g.covariance)[:90]).reshape(9, 10)[:, part])
         error, before = (np.sqrt(np.mean(np.square(v))) for v in (error, before))
-        print(f'left over of {part}: {error / before:.2f}')
+        print(f'remaining error of {part}: {error / before:.2f}')
         assert error < share * before
-        # No gain at the price of doubt: never better than it is said.
+        # The errors do not exceed the stated stds.
         assert error < 1.1 * np.sqrt(np.mean(np.square(std)))
 
 
-def test_poses_are_found_again(many):
-    left, without, z2 = [], [], []
-    for (_, _, positions, axes, x), g in many:
+def test_estimated_poses_are_closer_to_the_truth_than_tracked_ones(boards):
+    remaining, without, z2 = [], [], []
+    for (_, _, positions, axes, x), g in boards:
         magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0), MOMENT)
         r, u = g.magnet_poses(positions, axes)
         as_tracked, m, *_ = magnet.poses(x[1], np.zeros((40, 8)))
         assert np.linalg.norm(r - as_tracked, axis=1).max() < 2.5e-3
         assert (np.einsum('ki,ki->k', u, m) / np.linalg.norm(m, axis=1)).min() > np.cos(0.025)
-        is_, *_ = magnet.poses(x[1], x[2])
-        # What is common to all poses is the gauge's; the rest is the tracker's deviations.
-        for found, out in ((g.poses[0], left), (r, without)):
-            e = found - is_
+        true_r, *_ = magnet.poses(x[1], x[2])
+        # An error common to all poses belongs to the gauge; the rest is the error of the tracker.
+        for found, out in ((g.poses[0], remaining), (r, without)):
+            e = found - true_r
             out.append(np.square(e - e.mean(axis=0)).mean())
         z2.append(np.mean(np.square(g.pose - x[2]) / np.einsum('kii->ki', g.pose_covariance)))
-    print(f'left over of the tracker: {np.sqrt(np.mean(left) / np.mean(without)):.2f}')
-    assert np.mean(left) < 0.8 * np.mean(without)
+    print(f'remaining error of the tracker: {np.sqrt(np.mean(remaining) / np.mean(without)):.2f}')
+    assert np.mean(remaining) < 0.8 * np.mean(without)
     assert np.mean(z2) == pytest.approx(1.0, abs=0.1)
 
 
-def test_the_order_of_the_poses_does_not_matter(many):
-    (network, field, positions, axes, _), g = many[0]
+def test_order_of_the_poses_has_no_effect(boards):
+    (network, field, positions, axes, _), g = boards[0]
     order = np.random.default_rng(0).permutation(len(field))
     h = calibrate_geometry(network, field[order], positions[order], axes[order], MOMENT, SETTINGS)
     std = np.sqrt(np.diagonal(g.covariance))
@@ -85,18 +85,18 @@ def test_the_order_of_the_poses_does_not_matter(many):
     np.testing.assert_allclose(h.pose_residual, g.pose_residual[order], rtol=1e-4)
 
 
-def test_a_turn_of_the_world_about_z_changes_nothing_but_places(many):
-    (network, field, positions, axes, _), g = many[1]
+def test_a_rotation_of_the_world_about_z_changes_only_positions(boards):
+    (network, field, positions, axes, _), g = boards[1]
     R, d = rotation(np.array([0.0, 0.0, 2.0])), np.array([3.0, -2.0, 1.0])
-    turned = replace(network, positions=network.positions @ R.T + d, R_ws=R @ network.R_ws)
-    h = calibrate_geometry(turned, field, positions @ R.T + d, axes @ R.T, MOMENT, SETTINGS)
+    rotated = replace(network, positions=network.positions @ R.T + d, R_ws=R @ network.R_ws)
+    h = calibrate_geometry(rotated, field, positions @ R.T + d, axes @ R.T, MOMENT, SETTINGS)
     assert (np.abs(h.gain - g.gain) < 1e-4 * g.gain_std).all()
     assert (np.abs(h.bias - g.bias) < 1e-4 * g.bias_std).all()
     assert np.abs(h.network.positions - (g.network.positions @ R.T + d)).max() < 1e-8
     assert h.normalised_cost == pytest.approx(g.normalised_cost, rel=1e-6)
 
 
-def test_what_is_known_stays():
+def test_parameters_known_exactly_do_not_change():
     exact = GeometrySettings(
         gain_std=0.0, rotation_std_deg=0.0, position_std=0.0, tracker_position_std=0.0,
         tracker_tilt_std_deg=0.0, ambient_std=0.0)
@@ -112,8 +112,8 @@ def test_what_is_known_stays():
     assert chi2.ppf(0.001, 27) < (z**2).sum() < chi2.ppf(0.999, 27)
 
 
-def test_a_worse_fit_has_larger_deviations():
-    """Noise that is five times what is stated: the deviations know."""
+def test_a_worse_fit_has_larger_stds():
+    """The noise is five times the stated one."""
     loud = board(noise=5e-7)
     network, field, positions, axes, x = simulated(
         4, network=loud, settings=replace(SETTINGS, field_error=0.05))

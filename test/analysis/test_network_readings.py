@@ -1,4 +1,4 @@
-"""What a board reads of a magnet, with derivatives by all that is unknown."""
+"""Predicted readings of a magnet by a board, and their derivatives by all unknowns."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from mag_tracking.physics.dipole import dipole_field
 from support.magnet_boards import MOMENT, board, tracked
 
 
-def test_derivatives():
+def test_derivatives_agree_with_differences():
     rng = np.random.default_rng(1)
     network = board()
     positions, axes = tracked(5, rng)
@@ -35,7 +35,7 @@ def test_derivatives():
             assert np.abs(numeric - J[..., c]).max() < 1e-5 * scale, (which, c)
 
 
-def test_a_network_as_stated_reads_the_dipole():
+def test_an_exact_network_reads_the_dipole_field():
     network = board()
     positions, axes = tracked(4, np.random.default_rng(2))
     magnet = TrackedMagnet(positions, tool_rotations(axes), np.zeros(3), MOMENT)
@@ -49,7 +49,7 @@ def test_a_network_as_stated_reads_the_dipole():
     np.testing.assert_array_equal(f, signal)
 
 
-def test_each_unknown_is_what_it_is_called():
+def test_each_unknown_has_its_documented_effect():
     network = board()
     positions, axes = tracked(4, np.random.default_rng(2))
     magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0), MOMENT)
@@ -58,10 +58,10 @@ def test_each_unknown_is_what_it_is_called():
     r, m, *_ = magnet.poses(shared, pose)
     np.testing.assert_allclose(r, positions + shared[:3] - 8e-3 * axes, rtol=1e-12)
     np.testing.assert_allclose(m, MOMENT * axes, rtol=1e-12)
-    turned = np.zeros(12)
-    turned[5] = 0.1
-    r, m, *_ = magnet.poses(turned, pose)
-    R, c = rotation(turned[3:6]), positions.mean(axis=0)
+    rotated = np.zeros(12)
+    rotated[5] = 0.1
+    r, m, *_ = magnet.poses(rotated, pose)
+    R, c = rotation(rotated[3:6]), positions.mean(axis=0)
     np.testing.assert_allclose(r, c + (positions - c) @ R.T, rtol=1e-12)
     np.testing.assert_allclose(m, MOMENT * axes @ R.T, rtol=1e-12)
     sensor = np.zeros((9, 10))
@@ -74,7 +74,7 @@ def test_each_unknown_is_what_it_is_called():
     np.testing.assert_allclose(f, sensor[0, :3] + 1.1 * B @ R_ws, rtol=1e-9)
 
 
-def test_tools_turn_from_z_the_shortest_way():
+def test_tool_rotations_are_the_shortest_ones_from_z():
     axes = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
     R = tool_rotations(axes)
     np.testing.assert_allclose(R[:, :, 2], axes, atol=1e-12)

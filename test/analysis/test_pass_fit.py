@@ -1,4 +1,4 @@
-"""The batch fit of a pass: its model, its search, its covariance, and what it refuses."""
+"""Batch fit of a pass: model, global search, covariances, and rejected data."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ ORDERS = (1, 2, 3)
 
 
 def rows(n_dipoles, n=6, seed=4):
-    """A model of `n` samples at two places, and paths past them."""
+    """A model of `n` random samples, and paths and linear parameters."""
     rng = np.random.default_rng(seed)
     M = rng.standard_normal((n, 3, 3))
     model = RowPass(rng.uniform(-1.0, 1.0, n), rng.uniform(-5.0, 5.0, (n, 3)), M, n_dipoles)
@@ -61,7 +61,7 @@ def test_a_row_is_the_sum_of_its_dipoles(n_dipoles):
 @pytest.mark.parametrize('road', [True, False], ids=['road', 'any heading'])
 @pytest.mark.parametrize('n_dipoles', ORDERS)
 def test_the_search_finds_the_global_optimum(n_dipoles, road):
-    """No higher than the minimum that belongs to the truth; `make bench` counts over 200."""
+    """The cost is not above the minimum at the truth; `bench.pass_search` runs 200 passes."""
     missed = []
     for seed in range(10):
         rng = np.random.default_rng([seed, n_dipoles, road])
@@ -76,8 +76,8 @@ def test_the_search_finds_the_global_optimum(n_dipoles, road):
 
 
 @pytest.mark.parametrize('n_dipoles', ORDERS)
-def test_errors_are_as_large_as_the_covariance_says(n_dipoles):
-    """NEES of 25 passes inside its band, TSP14 eq. (47); the cost is chi-square."""
+def test_errors_agree_with_the_covariance(n_dipoles):
+    """NEES of 25 passes is inside its band, TSP14 eq. (47); the cost is chi-square."""
     nees, costs, n = [], [], 25
     for seed in range(n):
         rng = np.random.default_rng([seed, n_dipoles, 7])
@@ -86,7 +86,7 @@ def test_errors_are_as_large_as_the_covariance_says(n_dipoles):
         true = unknowns_at(path, moments, (fit.data.stamp_ns) / 1e9)
         k = len(true)
         error = fit.x[:k] - true
-        # A row of three may have a rival; and so short a length that the model is not linear.
+        # A row of three may be ambiguous, or so short that its model is not linear.
         if not fit.ambiguous and fit.length[1] < 0.3:
             nees.append(error @ np.linalg.solve(fit.covariance[:k, :k], error))
         costs.append(fit.cost)
@@ -97,13 +97,13 @@ def test_errors_are_as_large_as_the_covariance_says(n_dipoles):
     assert low < sum(costs) < high
 
 
-def test_deviations_of_what_follows_from_a_fit_are_right():
-    """Heading, speed, time and range of the closest point: squared errors over variances."""
+def test_stds_of_derived_quantities_agree_with_the_errors():
+    """Heading, speed, time and range of the CPA: squared errors over variances."""
     squares, n = [], 30
     for seed in range(n):
         rng = np.random.default_rng([seed, 21])
         path, moments = random_path(rng, 1, False)
-        # The further from zero in time the closest point is, the more its derivatives matter.
+        # A CPA far from time zero makes the derivatives matter.
         place = np.array([12.0, -9.0, 0.0])
         fit = fit_pass(measured(ROAD, path, moments, rng), 1)
         fit = replace(fit, robust_covariance=fit.covariance)
@@ -121,8 +121,8 @@ def test_deviations_of_what_follows_from_a_fit_are_right():
     assert ((low < total) & (total < high)).all(), total
 
 
-def test_what_no_order_describes_is_no_reason_for_the_next_one():
-    """The cost counts relative to that of the richest order."""
+def test_a_misfit_of_all_orders_does_not_favour_a_higher_one():
+    """The cost is normalised by that of the highest order."""
     data = measured(ROAD, *random_path(np.random.default_rng(1), 1, True),
                     np.random.default_rng(1))
     n = data.n_values
@@ -133,14 +133,14 @@ def test_what_no_order_describes_is_no_reason_for_the_next_one():
         return PassFit(n_dipoles, data, '', True, tuple('u' * k), x, np.eye(k) * 1e-4,
                        np.eye(k) * 1e-4, float(cost), 1.0, 2.0)
 
-    # The second order takes away thirty, which is worth its four unknowns where noise is all ...
+    # The cost decreases by 35. This justifies four more unknowns if the rest is noise ...
     assert choose_order([fit(1, n + 40.0), fit(2, n + 5.0)]).n_dipoles == 2
-    # ... and nothing where ten times the noise is left anyway.
+    # ... but not if the rest is ten times the noise.
     assert choose_order([fit(1, 10.0 * n + 40.0), fit(2, 10.0 * n + 5.0)]).n_dipoles == 1
 
 
-def test_correlated_residuals_count_for_less():
-    """Newey and West's covariance of a straight line's parameters in noise of 0.1 s."""
+def test_correlated_residuals_increase_the_covariance():
+    """Newey-West covariance of the parameters of a straight line in correlated noise."""
     rng, n, keep = np.random.default_rng(3), 3000, np.exp(-0.1)
     H = np.column_stack([np.ones(n), np.linspace(-1.0, 1.0, n)])
     P = np.linalg.inv(H.T @ H)
@@ -151,14 +151,14 @@ def test_correlated_residuals_count_for_less():
         errors.append(x)
         found += P @ score_sum_covariance(H * (e - H @ x)[:, None], 60) @ P / 300.0
     true = np.cov(np.transpose(errors))
-    # White, it would be said to be a twentieth of that.
+    # For white noise, the stated variance would be a twentieth of the true one.
     assert (np.diagonal(P) < 0.1 * np.diagonal(true)).all()
     assert (np.diagonal(found) > 0.7 * np.diagonal(true)).all()
     assert (np.diagonal(found) < 1.2 * np.diagonal(true)).all()
 
 
 @pytest.mark.parametrize('n_dipoles', ORDERS)
-def test_the_honest_covariance_is_never_smaller_and_no_larger_where_all_is_right(n_dipoles):
+def test_robust_covariance_is_never_below_and_close_to_the_nominal_one(n_dipoles):
     ratios = []
     for seed in range(6):
         rng = np.random.default_rng([seed, n_dipoles, 9])
@@ -172,7 +172,7 @@ def test_the_honest_covariance_is_never_smaller_and_no_larger_where_all_is_right
 
 
 def test_hard_and_soft_iron_from_four_headings():
-    """m0 and D within three deviations, from passes of a row of three; TSP14 section VI.E."""
+    """m0 and D within three stds, from passes of a row of three; TSP14 section VI.E."""
     rng = np.random.default_rng(5)
     hard, soft = np.array([[60.0, 30.0, -40.0], [120.0, -10.0, -70.0], [20.0, 40.0, 30.0]]), 5.0
     moments, headings, covariances = [], [], []
@@ -193,8 +193,8 @@ def test_hard_and_soft_iron_from_four_headings():
     assert std[3] < 0.5 and (std[:3] < 20.0).all()
 
 
-def test_the_order_is_what_the_measurements_are_worth():
-    """A point is not taken for a row, nor a row of three for a point."""
+def test_chosen_order_is_that_of_the_simulated_target():
+    """A point is not fitted as a row, nor a row of three as a point."""
     chosen = {1: [], 3: []}
     for n_dipoles, orders in chosen.items():
         for seed in range(8):
@@ -212,20 +212,20 @@ def test_the_order_is_what_the_measurements_are_worth():
     assert min(chosen[3]) >= 2 and chosen[3].count(3) >= 5
 
 
-ALONE = network_of([[0.0, -4.5, 0.0]])
+ONE_SENSOR = network_of([[0.0, -4.5, 0.0]])
 
 
-def alone(moments, seed=1, path=(0.5, 0.0, 0.6, 9.0, 0.3, 0.0)):
+def single_sensor_pass(moments, seed=1, path=(0.5, 0.0, 0.6, 9.0, 0.3, 0.0)):
     path, moments = np.array(path), np.atleast_2d(np.array(moments, dtype=float))
-    return measured(ALONE, path, moments, np.random.default_rng(seed)), path, moments
+    return measured(ONE_SENSOR, path, moments, np.random.default_rng(seed)), path, moments
 
 
-def test_one_sensor_gives_directions_and_a_time_but_no_scale():
-    data, path, moments = alone([100.0, 250.0, -200.0])
+def test_one_sensor_yields_directions_and_a_time_but_no_scale():
+    data, path, moments = single_sensor_pass([100.0, 250.0, -200.0])
     fit = fit_pass(data, 1)
     assert fit.reason.startswith('one sensor: the scale is not observable')
     b = fit.bearing
-    r, v = path[:3] - ALONE.positions[0], path[3:6]
+    r, v = path[:3] - ONE_SENSOR.positions[0], path[3:6]
     t_cpa = -(r @ v) / (v @ v)
     r_cpa = r + t_cpa * v
     zero = fit.data.stamp_ns / 1e9
@@ -236,13 +236,13 @@ def test_one_sensor_gives_directions_and_a_time_but_no_scale():
         assert np.arccos(found @ true / np.linalg.norm(true)) < 3.0 * std < 0.2
 
 
-def test_one_sensor_never_says_which_end_is_true_without_saying_that_it_does_not_know():
-    """(r, v) and (-r, -v) give the same field: taken is the one above the sensor."""
+def test_a_fit_of_one_sensor_is_ambiguous_in_the_sign_of_the_path():
+    """(r, v) and (-r, -v) give the same field; the fit is the one above the sensor."""
     for seed in range(12):
         rng = np.random.default_rng([seed, 5])
         path, moments = random_path(rng, 1, False)
-        data = measured(ALONE, path, moments, rng)
-        r, v = path[:3] - ALONE.positions[0], path[3:6]
+        data = measured(ONE_SENSOR, path, moments, rng)
+        r, v = path[:3] - ONE_SENSOR.positions[0], path[3:6]
         distance = np.linalg.norm(np.cross(r, v)) / np.linalg.norm(v)
         if not 1.5 < distance < 8.0:
             continue
@@ -252,38 +252,38 @@ def test_one_sensor_never_says_which_end_is_true_without_saying_that_it_does_not
         assert fit.ambiguous and fit.rivals[0][0] == 0.0
         both = np.array([fit.velocity, fit.rivals[0][1][3:6]])
         assert np.abs(both @ v / (v @ v) - [[1.0], [-1.0]]).min(axis=0).max() < 0.3
-        t, _, _, _ = fit.closest_approach(ALONE.positions[0])
-        assert (fit.position + t * fit.velocity)[2] >= ALONE.positions[0, 2]
+        t, _, _, _ = fit.closest_approach(ONE_SENSOR.positions[0])
+        assert (fit.position + t * fit.velocity)[2] >= ONE_SENSOR.positions[0, 2]
 
 
-def test_one_sensor_with_a_known_range_gives_all():
-    data, path, moments = alone([100.0, 250.0, -200.0])
-    r, v = path[:3] - ALONE.positions[0], path[3:6]
+def test_one_sensor_with_a_known_range_yields_all_parameters():
+    data, path, moments = single_sensor_pass([100.0, 250.0, -200.0])
+    r, v = path[:3] - ONE_SENSOR.positions[0], path[3:6]
     distance = np.linalg.norm(np.cross(r, v)) / np.linalg.norm(v)
     fit = fit_pass(data, 1, (distance + 0.1, 0.2))
     assert not fit.reason and fit.bearing is None and fit.ambiguous
     error = fit.x[:9] - unknowns_at(path, moments, fit.data.stamp_ns / 1e9)
     assert (np.abs(error) < 3.0 * np.sqrt(np.diagonal(fit.covariance)[:9])).all()
-    # The range is known to 4 %, and so is the speed.
+    # The range is known to 4 %, hence also the speed.
     assert fit.speed[1] / fit.speed[0] == pytest.approx(0.2 / distance, rel=0.2)
     with pytest.raises(ValueError, match='for one sensor'):
         fit_pass(measured(ROAD, path, moments, np.random.default_rng(1)), 1, (4.0, 0.1))
 
 
-def test_a_moment_at_right_angles_to_the_plane_leaves_directions_open():
-    """The kernel has two dimensions (TSP14 section IV.A): what it reaches is NaN."""
-    data, _, _ = alone([0.0, 0.0, 300.0], path=(0.5, 0.0, 0.0, 9.0, 0.0, 0.0))
+def test_a_moment_perpendicular_to_the_plane_leaves_directions_unknown():
+    """The kernel has two dimensions (TSP14 section IV.A); affected quantities are NaN."""
+    data, _, _ = single_sensor_pass([0.0, 0.0, 300.0], path=(0.5, 0.0, 0.0, 9.0, 0.0, 0.0))
     b = fit_pass(data, 1).bearing
     assert np.isnan(b.cpa_direction).all() and np.isnan(b.motion_direction).all()
     assert np.isfinite(b.cpa_time) and np.isfinite(b.rate)
 
 
-def test_a_path_through_the_sensor_is_refused():
-    data, _, _ = alone([0.0, 200.0, -200.0], path=(0.04, -4.5, 0.0, 9.0, 0.0, 0.0))
+def test_a_path_through_the_sensor_is_rejected():
+    data, _, _ = single_sensor_pass([0.0, 200.0, -200.0], path=(0.04, -4.5, 0.0, 9.0, 0.0, 0.0))
     assert 'r0 parallel to v0' in fit_pass(data, 1).reason
 
 
-def test_what_cannot_be_fitted_has_a_reason():
+def test_data_that_cannot_be_fitted_yield_a_reason():
     rng = np.random.default_rng(2)
     path, moments = random_path(rng, 3, True)
     data = measured(ROAD, path, moments, rng)
@@ -306,7 +306,7 @@ def test_what_cannot_be_fitted_has_a_reason():
         fit_pass(data, 0)
 
 
-def test_two_vehicles_in_one_window_are_refused():
+def test_two_vehicles_in_one_window_are_rejected():
     for seed, heading in ((1, 0.0), (2, np.pi)):
         rng = np.random.default_rng(seed)
         one, m1 = random_path(rng, 3, True)
@@ -317,7 +317,7 @@ def test_two_vehicles_in_one_window_are_refused():
         assert choose_order([fit_pass(both, d) for d in (1, 2, 3)]) is None
 
 
-def test_missing_axes_and_sensors_cost_accuracy_and_nothing_else():
+def test_missing_axes_and_sensors_only_reduce_the_accuracy():
     rng = np.random.default_rng(8)
     path, moments = random_path(rng, 1, True)
     data = measured(ROAD, path, moments, rng)
@@ -351,19 +351,20 @@ STRAIGHT = {'straight_car_right': 8.3, 'straight_small_left': 11.1, 'straight_ca
 
 @pytest.mark.parametrize('name', STRAIGHT)
 def test_order_three_describes_vehicles(recorded_passes, name):
-    """Normalised cost, speed: the project's aims."""
+    """Normalised cost and speed; the limits are the aims of the project."""
     fit = next(f for f in recorded_passes[name].fits if f.n_dipoles == 3)
     assert not fit.reason
     assert fit.normalised_cost < (8.0 if 'truck' in name else 2.0)
     assert fit.speed[0] == pytest.approx(STRAIGHT[name], rel=0.08)
-    # A truck is no row of three: its deviations are several times those of noise alone.
-    honest = np.sqrt(np.diagonal(fit.robust_covariance) / np.diagonal(fit.covariance))[:6]
-    assert np.median(honest) > (5.0 if 'truck' in name else 1.0)
-    # The order that is chosen may be another one.
+    # A row of three is a poor model of a truck: the robust stds are several times the nominal
+    # ones.
+    std_ratio = np.sqrt(np.diagonal(fit.robust_covariance) / np.diagonal(fit.covariance))[:6]
+    assert np.median(std_ratio) > (5.0 if 'truck' in name else 1.0)
+    # The chosen order may be another one.
     assert recorded_passes[name].chosen.speed[0] == pytest.approx(STRAIGHT[name], rel=0.1)
 
 
 @pytest.mark.parametrize('name', [n for n in VEHICLES if 'turns' in n])
-def test_a_turn_is_no_pass_at_constant_velocity(recorded_passes, name):
+def test_a_turn_is_rejected_as_not_at_constant_velocity(recorded_passes, name):
     assert recorded_passes[name].chosen is None
     assert any('not at constant velocity' in f.reason for f in recorded_passes[name].fits)

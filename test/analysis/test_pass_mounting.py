@@ -1,4 +1,4 @@
-"""What tracks say of the sensors' angles: folded as one estimate of all of them would be."""
+"""Fusion of the mounting angles estimated by several tracks."""
 
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -23,8 +23,8 @@ PRIOR = np.deg2rad([[0.3, 0.3, 2.0], [1.0, 2.0, 3.0], [5.0, 5.0, 5.0]])
 
 
 @dataclass
-class Toy:
-    """Tracks that measure every sensor's turn, linearly; and the joint answer."""
+class SimulatedTracks:
+    """Tracks that measure the rotation of every sensor linearly, and their joint estimate."""
 
     tracks: list
     truth: np.ndarray
@@ -32,9 +32,13 @@ class Toy:
     covariance: np.ndarray
 
 
-def toy(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=NETWORK, prior=PRIOR):
-    """`axes` directions are measured by each track, with `noise` [rad], and `claimed` times that
-    is what the track believes. The oracle is one least-squares solution of all rows."""
+def simulated_tracks(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=NETWORK,
+                     prior=PRIOR):
+    """Simulate tracks that each measure `axes` directions with noise of std `noise` [rad].
+
+    The std stated by a track is `claimed` times that. The joint estimate, the oracle, is one
+    least-squares solution of all rows.
+    """
     rng = np.random.default_rng(seed)
     n = len(network)
     truth = prior * rng.standard_normal((n, 3))
@@ -48,7 +52,7 @@ def toy(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=NETWORK, prio
             A, y = A / claimed, y / claimed
             rows[j].append((A, y))
             P = np.linalg.inv(np.diag(prior[j]**-2.0) + A.T @ A)
-            # A filter's angles turn the field in the sensor's frame: the sensor is turned back.
+            # Filter angles rotate the field in the sensor frame: inverse rotation of the sensor.
             R_sw = network.R_sw[j]
             mounting[j], covariance[j] = -R_sw @ (P @ A.T @ y), R_sw @ P @ R_sw.T
         tracks.append(SimpleNamespace(id=k + 1, mounting=mounting, mounting_covariance=covariance))
@@ -57,50 +61,50 @@ def toy(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=NETWORK, prio
         A, y = (np.concatenate(part) for part in zip(*rows[j], strict=True))
         mean[j] = np.linalg.lstsq(A, y, rcond=None)[0]
         joint[j] = np.linalg.inv(A.T @ A)
-    return Toy(tracks, truth, mean, joint)
+    return SimulatedTracks(tracks, truth, mean, joint)
 
 
 @pytest.mark.parametrize('axes', [1, 2, 3])
 @pytest.mark.parametrize('n_tracks', [1, 2, 7])
-def test_folded_tracks_are_one_estimate_of_all(n_tracks, axes):
-    # They claim too much noise, so that nothing is widened.
-    t = toy(n_tracks, noise=0.01, claimed=3.0, axes=axes)
+def test_fused_tracks_equal_one_joint_estimate(n_tracks, axes):
+    # The stated noise is too large, so the covariance is not inflated.
+    t = simulated_tracks(n_tracks, noise=0.01, claimed=3.0, axes=axes)
     e = fuse_mounting(NETWORK, PRIOR, t.tracks)
     assert e.n_tracks == n_tracks
     np.testing.assert_allclose(e.rotation, t.mean, rtol=1e-6, atol=1e-10)
     np.testing.assert_allclose(e.covariance, t.covariance, rtol=1e-6, atol=1e-12)
 
 
-def test_the_order_of_the_tracks_does_not_matter():
-    t = toy(6)
+def test_order_of_the_tracks_has_no_effect():
+    t = simulated_tracks(6)
     a, b = (fuse_mounting(NETWORK, PRIOR, tracks) for tracks in (t.tracks, t.tracks[::-1]))
     for name in ('rotation', 'covariance', 'scatter'):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-9)
 
 
-def test_no_track_leaves_what_was_known():
+def test_without_tracks_the_prior_remains():
     e = fuse_mounting(NETWORK, PRIOR, [])
     assert e.n_tracks == 0 and not e.rotation.any() and np.isnan(e.scatter).all()
     np.testing.assert_allclose(np.sqrt(np.einsum('jii->ji', e.covariance)), PRIOR)
-    assert np.isnan(fuse_mounting(NETWORK, PRIOR, toy(1).tracks).scatter).all()
+    assert np.isnan(fuse_mounting(NETWORK, PRIOR, simulated_tracks(1).tracks).scatter).all()
 
 
-def test_a_track_that_learnt_nothing_says_nothing():
-    """Its covariance is the prior's, or by the linearisation of the mean a little above."""
+def test_a_track_without_information_has_no_effect():
+    """Its covariance is that of the prior or, by linearisation at the mean, slightly larger."""
     prior = np.einsum('jik,jk,jlk->jil', NETWORK.R_sw, PRIOR**2, NETWORK.R_sw)
-    idle = SimpleNamespace(id=9, mounting=np.zeros((3, 3)),
+    uninformative = SimpleNamespace(id=9, mounting=np.zeros((3, 3)),
                            mounting_covariance=1.02 * prior)
-    e = fuse_mounting(NETWORK, PRIOR, [idle, idle])
+    e = fuse_mounting(NETWORK, PRIOR, [uninformative, uninformative])
     np.testing.assert_allclose(e.covariance, np.array([np.diag(s**2) for s in PRIOR]),
                                rtol=1e-6, atol=1e-15)
     assert np.abs(e.rotation).max() < 1e-9
 
 
 def scatters(n_runs, n_tracks, **kwargs):
-    """(n_runs * n_sensors,), and the mean NEES of the turns."""
+    """Scatter, and NEES of the rotation, of each run and sensor, (n_runs * n_sensors,) each."""
     out, nees = [], []
     for seed in range(n_runs):
-        t = toy(n_tracks, seed, **kwargs)
+        t = simulated_tracks(n_tracks, seed, **kwargs)
         e = fuse_mounting(NETWORK, PRIOR, t.tracks)
         out += e.scatter.tolist()
         off = e.rotation - t.truth
@@ -108,20 +112,20 @@ def scatters(n_runs, n_tracks, **kwargs):
     return np.array(out), np.array(nees)
 
 
-def test_honest_claims_scatter_about_one():
-    # Tracks that tell far more than the prior: this compares them with each other only.
+def test_scatter_of_consistent_tracks_is_about_one():
+    # The tracks are far more accurate than the prior, so they are only compared with each other.
     scatter, nees = scatters(60, 5, noise=1e-4)
     freedom = 3 * (5 - 1)
     low, high = chi2.ppf([0.001, 0.999], freedom * len(scatter)) / (freedom * len(scatter))
     print(f'scatter {scatter.mean():.3f}, NEES {nees.mean() / 3:.3f}')
     assert low < scatter.mean() < high
-    # Where chance says more than one it is widened, and never the other way.
+    # A scatter above one inflates the covariance; a scatter below one does not reduce it.
     assert 0.6 < nees.mean() / 3 < chi2.ppf(0.999, 3 * len(nees)) / (3 * len(nees))
 
 
 @pytest.mark.parametrize('n_tracks', [2, 5])
-def test_honest_claims_that_are_weak_scatter_about_one(n_tracks):
-    """Tracks that tell a tenth of what was known: what the prior holds back is no scatter."""
+def test_scatter_of_consistent_weak_tracks_is_not_above_one(n_tracks):
+    """Tracks with a tenth of the information of the prior: its pull is not counted as scatter."""
     scatter, _ = scatters(80, n_tracks, noise=0.15)
     freedom = 3 * (n_tracks - 1)
     high = chi2.ppf(0.999, freedom * len(scatter)) / (freedom * len(scatter))
@@ -129,25 +133,25 @@ def test_honest_claims_that_are_weak_scatter_about_one(n_tracks):
     assert scatter.mean() < high
 
 
-def test_what_tracks_claim_falsely_is_widened():
+def test_covariance_of_overconfident_tracks_is_inflated():
     scatter, nees = scatters(60, 5, noise=1e-3, claimed=0.2)
     assert scatter.mean() == pytest.approx(25.0, rel=0.1)
-    # Without it, twenty-five; by it, as by a Student's t of twelve degrees of freedom.
+    # Without inflation 25; with it as for Student's t distribution with 12 degrees of freedom.
     assert 0.6 < nees.mean() / 3 < 1.5
-    t = toy(5, 3, noise=1e-3, claimed=0.2)
+    t = simulated_tracks(5, 3, noise=1e-3, claimed=0.2)
     e = fuse_mounting(NETWORK, PRIOR, t.tracks)
     ratio = np.trace(e.covariance, axis1=1, axis2=2) / np.trace(t.covariance, axis1=1, axis2=2)
     np.testing.assert_allclose(ratio, e.scatter, rtol=0.02)
 
 
-def test_a_track_of_another_network_is_refused():
-    t = toy(2)
+def test_a_track_of_another_network_is_rejected():
+    t = simulated_tracks(2)
     t.tracks[1].mounting = t.tracks[1].mounting[:2]
     with pytest.raises(ValueError, match='track 2 has mounting angles of 2 sensors, expected 3'):
         fuse_mounting(NETWORK, PRIOR, t.tracks)
 
 
-def test_the_network_is_turned_about_the_worlds_axes():
+def test_network_is_rotated_about_the_world_axes():
     rotation = np.deg2rad([[0.0, 0.0, 6.0], [2.0, 0.0, 0.0], [1.0, -2.0, 3.0]])
     C = np.tile(np.diag(np.deg2rad([1.0, 2.0, 3.0])**2), (3, 1, 1))
     found = with_evidence(NETWORK, MountingEvidence(rotation, C, np.full(3, np.nan), 1))
@@ -163,8 +167,8 @@ CHANGES = {**POINT, 'track.field_error': 0.0, 'track.vehicle.near_field_lengths'
 
 
 @pytest.fixture(scope='module')
-def turned_passes():
-    """(network as stated, as it is, evidence) of passes by a sensor turned by 6 degrees."""
+def rotated_sensor_passes():
+    """(stated network, true R_ws, evidence) of passes with one sensor rotated by 6 degrees."""
     stated = line_network(4, tilt=0.5)
     R_ws = stated.R_ws.copy()
     R_ws[1] = rotation_about_z(np.deg2rad(6.0)) @ R_ws[1]
@@ -183,23 +187,23 @@ def turned_passes():
     return stated, R_ws, fuse_mounting(stated, prior, tracks)
 
 
-def test_passes_turn_a_sensor_to_where_it_points(turned_passes):
-    stated, truth, evidence = turned_passes
+def test_passes_correct_the_orientation_of_a_rotated_sensor(rotated_sensor_passes):
+    stated, truth, evidence = rotated_sensor_passes
     found = with_evidence(stated, evidence)
     before, after = (Rotation.from_matrix(truth @ np.swapaxes(R, 1, 2)).as_rotvec()
                      for R in (stated.R_ws, found.R_ws))
     print(np.degrees(evidence.rotation).round(2), np.degrees(after).round(2),
           np.degrees(found.orientation_std).round(2))
-    # To the truth, not away from it, about the vertical.
+    # The correction about the vertical is towards the truth.
     assert evidence.rotation[1, 2] > np.deg2rad(3.0)
     assert abs(after[1, 2]) < 0.5 * abs(before[1, 2])
-    # The others are left about where they were, and all are as well known as is claimed.
+    # The other sensors hardly rotate, and all errors agree with the stated stds.
     assert np.abs(evidence.rotation[[0, 2, 3]]).max() < 3.0 * np.deg2rad(5.0) / 3.0
     assert np.abs(after / np.array(found.orientation_std)).max() < 4.0
     assert np.array(found.orientation_std)[:, 2].max() < np.deg2rad(5.0)
 
 
-def test_a_tracker_without_angles_is_refused():
+def test_a_track_without_mounting_angles_is_rejected():
     network = line_network(2)
     tracks, *_ = drive(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
                        Path(np.array([-70.0, -1.2]), 0.0, 10.0),

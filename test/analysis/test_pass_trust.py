@@ -1,4 +1,4 @@
-"""What a fit is trusted with: what real vehicles leave over, and each answer for itself."""
+"""Trusted quantities of a fit: residuals of real vehicles, and the limit of each quantity."""
 
 from dataclasses import replace
 
@@ -20,8 +20,8 @@ from support.passes import NOISE, ROAD, measured, random_path, together
 PATH = np.array([0.0, -2.0, 0.5, 10.0, 0.0, 0.0, 3.0])
 
 
-def test_how_far_iron_reaches():
-    """TSP14 Tables I and II as shares of the energy: cost less one over 87, at 4.5 m."""
+def test_reach_covers_the_residuals_of_published_vehicles():
+    """TSP14 Tables I and II as shares of the energy: (cost - 1) / 87, at 4.5 m."""
     cars, trucks = (10, 14, 17), ((302.6, 9.09), (76.7, 11.25))
     for cost in cars:
         assert 1.0 < 4.5 * np.sqrt((cost - 1.0) / 87.0) <= reach(1, 0.0)
@@ -39,15 +39,15 @@ def field_and_data(seed=3):
     return noisy, clean.field
 
 
-def test_what_is_left_over_near_the_vehicle_is_not_elsewhere():
+def test_residuals_near_the_vehicle_are_not_elsewhere():
     data, field = field_and_data()
     W = data.whitening
     place = PATH[:3] + data.t[:, None] * PATH[3:6] - data.positions
     near = np.minimum(1.0, 0.3 / np.linalg.norm(place, axis=1))[:, None]
-    for left, low, high in ((0.0 * field, 0.0, 0.0), (near * field, 0.0, 1e-6),
+    for residual, low, high in ((0.0 * field, 0.0, 0.0), (near * field, 0.0, 1e-6),
                             (0.3 * field, 0.001, 0.2)):
         share = residual_elsewhere(data, [FittedRow(3, PATH, field)],
-                                  np.einsum('nij,nj->ni', W, left))
+                                  np.einsum('nij,nj->ni', W, residual))
         assert low <= share <= high
     # The same energy at another time, as of a second vehicle.
     late = np.roll(field, 150, axis=0)
@@ -56,16 +56,16 @@ def test_what_is_left_over_near_the_vehicle_is_not_elsewhere():
     assert share > 0.02
 
 
-def test_noise_is_nothing_left_over():
+def test_noise_is_not_counted_as_residual_elsewhere():
     data, field = field_and_data()
-    left = np.random.default_rng(0).standard_normal(field.shape)
+    residual = np.random.default_rng(0).standard_normal(field.shape)
     weak = 1e-3 * field
-    assert residual_elsewhere(data, [FittedRow(3, PATH, field)], left) < 1e-6
-    assert residual_elsewhere(data, [FittedRow(3, PATH, weak)], left) < 0.05
+    assert residual_elsewhere(data, [FittedRow(3, PATH, field)], residual) < 1e-6
+    assert residual_elsewhere(data, [FittedRow(3, PATH, weak)], residual) < 0.05
 
 
 @pytest.mark.parametrize('seed', [34, 36])
-def test_speed_and_direction_are_known_where_the_length_is_not(seed):
+def test_speed_and_direction_are_trusted_without_the_length(seed):
     fit, (_, truth, _) = fit_pass(pass_of(seed), 3), readings_of(seed)
     assert 'not determined: a length' in fit.reason
     assert fit.trusted == ('speed', 'direction', 'time')
@@ -76,7 +76,7 @@ def test_speed_and_direction_are_known_where_the_length_is_not(seed):
     assert row['trusted'] == 'speed direction time' and np.isnan(row['x']) and np.isnan(row['mx'])
 
 
-def test_nothing_is_trusted_of_two_vehicles():
+def test_a_single_fit_of_two_vehicles_is_not_trusted():
     rng = np.random.default_rng(2)
     one, m1 = random_path(rng, 3, True)
     other, m2 = random_path(rng, 3, True)
@@ -87,16 +87,16 @@ def test_nothing_is_trusted_of_two_vehicles():
     assert 'not one target' in fit.reason and fit.trusted == ()
 
 
-def test_a_near_vehicle_is_not_refused_for_what_it_leaves_over():
-    """15 of 16 right fits of a car at 0.8 m were, for 2.4 to 11.9 % of the field."""
+def test_a_near_vehicle_is_not_rejected_for_its_residuals():
+    """Formerly, 15 of 16 correct fits at 0.8 m were rejected for residuals of 2.4 to 11.9 %."""
     for seed in (2, 9, 20):
         velocity, std = answers(seed).fit
         assert abs(velocity / answers(seed).truth - 1.0) < 0.1 and std < 0.25 * abs(velocity)
 
 
 @pytest.mark.parametrize('errors', [SensorErrors(), SensorErrors(np.deg2rad(4.0), 0.03)])
-def test_errors_of_the_sensors_are_in_the_deviations(errors):
-    """Sensors turned and with gains as assumed: errors over deviations are about one."""
+def test_covariance_includes_the_errors_of_the_sensors(errors):
+    """With rotations and gains as assumed, the normalised errors are about one."""
     z = []
     for seed in range(12):
         rng = np.random.default_rng([seed, 40])
@@ -115,11 +115,11 @@ def test_errors_of_the_sensors_are_in_the_deviations(errors):
         P = fit.robust_covariance[:6, :6]
         e = fit.x[:6] - true
         z.append(e @ np.linalg.solve(P, e) / 6.0)
-    # Twelve times six numbers; the 0.1 % and 99.9 % of chi-square over its mean.
+    # 0.1 % and 99.9 % quantiles of chi-square over its mean, for twelve times six values.
     assert 0.4 < np.mean(z) < 1.7, np.round(z, 2)
 
 
-def test_rests_of_a_coarse_sensor_count_once():
+def test_resting_readings_of_a_coarse_sensor_count_once():
     data, _ = field_and_data()
     coarse = data.covariance.copy()
     coarse[::2] *= 60.0
@@ -128,13 +128,13 @@ def test_rests_of_a_coarse_sensor_count_once():
     assert found.n_independent == pytest.approx(data.n_values / 2.0 * (1.0 + 1.0 / 60.0))
     np.testing.assert_allclose(found.whitening[0], data.whitening[0] / np.sqrt(60.0))
     np.testing.assert_allclose(found.whitening[1], np.eye(3) / NOISE)
-    # Learning noise differs by some percent, and each reading counts.
+    # While the noise is being learnt it varies by some percent; each reading counts.
     slightly = data.covariance * np.linspace(1.0, 1.3, len(data.t))[:, None, None]
     assert replace(data, covariance=slightly).n_independent == data.n_values
 
 
 def fitted(std_speed, std_heading, change=0.0):
-    """A `PassFit` of a point with given deviations of speed [m/s] and heading [rad]."""
+    """A `PassFit` of a point with given stds of speed [m/s] and heading [rad]."""
     data, _ = field_and_data()
     x = np.concatenate([[0.0, -2.0, 0.5], [10.0, 0.0, 0.0], np.ones(9)])
     P = 1e-4 * np.eye(len(x))
@@ -143,10 +143,10 @@ def fitted(std_speed, std_heading, change=0.0):
                    velocity_change=change, velocity_change_std=0.05, residual_elsewhere=0.0)
 
 
-def test_each_answer_is_trusted_by_its_own_deviation():
+def test_each_quantity_is_trusted_by_its_own_std():
     assert trusted(fitted(0.5, 0.1)) == ('speed', 'direction', 'time')
     assert 'speed' not in trusted(fitted(2.6, 0.1))
-    # Without a speed that differs from zero there is no direction.
+    # If the speed does not differ from zero, the direction is unknown.
     assert 'direction' not in trusted(fitted(5.1, 0.1))
     assert 'direction' not in trusted(fitted(0.5, 0.6)) and 'speed' in trusted(fitted(0.5, 0.6))
     late = fitted(0.5, 0.1)

@@ -1,4 +1,4 @@
-"""Planning: bounds against independent ones and against fits, detection against the detector."""
+"""Sensor placement: bounds against oracles and fits, detection, and the command `plan`."""
 
 import json
 
@@ -29,16 +29,16 @@ CAR = PlannedTarget(400.0, 0.5, 10.0)
 POINTS = np.array([[0.0, 1.0], [4.0, -2.0], [-9.0, 6.0]])
 
 
-def place_of(network):
+def poses_of(network):
     return network.positions, network.R_sw
 
 
 @pytest.mark.parametrize('error, background_std', [(0.0, np.inf), (0.04, 1e-8), (0.0, 1e-9)])
-def test_information_is_that_of_all_measurements_at_once(error, background_std):
-    """Against a plain stack of Jacobians with the backgrounds as states."""
+def test_information_equals_that_of_all_measurements_stacked(error, background_std):
+    """Oracle: a stack of Jacobians with the backgrounds as states."""
     network = line_network(4)
     sampling = Sampling(0.1, 4e-9, error, background_std, 1.0)
-    found = pass_information(*place_of(network), CAR, sampling, POINTS, 0.7)
+    found = pass_information(*poses_of(network), CAR, sampling, POINTS, 0.7)
     assert found.shape == (3, 7, 4, 9, 9)
     t, each = sampling.times()
     assert each == 1.0 and len(t) == 21
@@ -60,8 +60,8 @@ def test_information_is_that_of_all_measurements_at_once(error, background_std):
                                        expected / np.outer(scale, scale), rtol=0, atol=1e-9)
 
 
-def test_bounds_are_the_blocks_of_the_bound():
-    J = pass_information(*place_of(ROAD), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
+def test_bounds_are_those_of_the_blocks_of_the_covariance():
+    J = pass_information(*poses_of(ROAD), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
     for prior in (np.zeros((9, 9)), PlannedTarget(400.0, 0.5, 10.0, 0.2, 0.1).prior()):
         found = bounds_of(J, prior)
         for at in ((0, 1), (2, 5)):
@@ -70,7 +70,7 @@ def test_bounds_are_the_blocks_of_the_bound():
             np.testing.assert_allclose(found[at], expected, rtol=1e-5)
 
 
-def test_a_further_sensor_never_harms_and_a_prior_neither():
+def test_neither_another_sensor_nor_a_prior_increases_the_bounds():
     place = np.vstack([ROAD.positions, [[6.0, 1.0, 0.0]]]), np.tile(np.eye(3), (3, 1, 1))
     J = pass_information(*place, CAR, Sampling(0.1, 4e-9), POINTS, 0.0)
     two, three = bounds_of(J[:, :, :2].sum(axis=2), np.zeros((9, 9))), bounds_of(
@@ -80,21 +80,21 @@ def test_a_further_sensor_never_harms_and_a_prior_neither():
     assert (known <= three * (1.0 + 1e-9)).all()
 
 
-def test_everything_scales():
-    """A network u times as large with moments u^3 times as large: bounds u times as large."""
+def test_bounds_scale_with_the_network():
+    """A network scaled by u with moments scaled by u^3 has position bounds scaled by u."""
     u = 0.02
     small = PlannedTarget(400.0 * u**3, 0.5 * u, 10.0 * u)
-    J = pass_information(*place_of(ROAD), CAR, Sampling(0.1, 4e-9), POINTS, 0.3).sum(axis=2)
+    J = pass_information(*poses_of(ROAD), CAR, Sampling(0.1, 4e-9), POINTS, 0.3).sum(axis=2)
     K = pass_information(u * ROAD.positions, ROAD.R_sw, small, Sampling(0.1, 4e-9), u * POINTS,
                          0.3).sum(axis=2)
     none = np.zeros((9, 9))
-    # bounds_of has a floor of 1e-12 in each unit's information, which is not scaled.
+    # `bounds_of` has a lower limit of 1e-12 in the information per unit, which is not scaled.
     np.testing.assert_allclose(bounds_of(K, none) / [u, u, u**3], bounds_of(J, none), rtol=1e-4)
 
 
-def test_one_sensor_knows_no_scale_and_says_so():
+def test_position_bound_of_one_sensor_is_very_large():
     alone = network_of([[0.0, -4.5, 0.0]])
-    J = pass_information(*place_of(alone), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
+    J = pass_information(*poses_of(alone), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
     assert (bounds_of(J, np.zeros((9, 9)))[..., 0] > 1e3).all()
 
 
@@ -102,22 +102,22 @@ def test_fits_reach_the_bound():
     """Errors of 40 batch fits of a point: their mean square over the bound is chi-square / n."""
     rng, path = np.random.default_rng(3), np.array([0.0, 1.0, 0.5, 10.0, 0.0, 0.0])
     sampling = Sampling(0.01, NOISE, half_window=2.0, max_frames=500)
-    J = pass_information(*place_of(ROAD), CAR, sampling, path[None, :2], 0.0)[0, 4].sum(axis=0)
+    J = pass_information(*poses_of(ROAD), CAR, sampling, path[None, :2], 0.0)[0, 4].sum(axis=0)
     P = bound(J)[:2, :2]
     nees = 0.0
     for _ in range(40):
         fit = fit_pass(measured(ROAD, path, 400.0 * DIRECTIONS[4:5], rng), 1)
-        # The fit's time zero is elsewhere: back to the path's.
+        # Convert from the time zero of the fit to that of the path.
         error = (fit.position - fit.data.stamp_ns / 1e9 * fit.velocity - path[:3])[:2]
         nees += error @ np.linalg.solve(P, error)
     low, high = chi2.ppf([0.0005, 0.9995], 80)
     assert low < nees < high
 
 
-def test_detection_is_that_of_the_energy_test():
+def test_detection_probability_is_that_of_the_energy_test():
     points = np.array([[12.0, 0.0], [0.0, 30.0], [14.0, 3.0]])
     noise = np.array([4e-9, 6e-9])
-    found = detection_probabilities(*place_of(ROAD), CAR, Sampling(0.08, noise), points, 1e-3)
+    found = detection_probabilities(*poses_of(ROAD), CAR, Sampling(0.08, noise), points, 1e-3)
     rng = np.random.default_rng(1)
     for p, d in ((0, 0), (1, 2), (2, 5)):
         r = np.append(points[p], 0.5)
@@ -139,7 +139,7 @@ def road_plan():
 def test_a_plan_is_consistent(road_plan):
     p = road_plan
     lane, = p.lanes
-    # What has been and what comes is more than what has been.
+    # A whole pass has more information than its part up to a frame.
     assert (lane.pass_std[:, 0] <= 1.05 * lane.filter_std).all()
     assert lane.detection[np.argmin(np.abs(lane.along))] > 0.999
     # The road and the two sensors are symmetric.
@@ -152,7 +152,7 @@ def test_a_plan_is_consistent(road_plan):
     assert (p.blocks['with prior'] <= p.blocks['without prior'] * (1.0 + 1e-9)).all()
 
 
-def test_plan_writes_all_that_it_promises(tmp_path, capsys):
+def test_plan_writes_all_its_files(tmp_path, capsys):
     out = tmp_path / 'out'
     out.mkdir()
     for name in ('plan.json', 'plan_lanes.png'):
@@ -188,7 +188,7 @@ def test_plan_writes_all_that_it_promises(tmp_path, capsys):
     (['--heading', '0', '0'], 'two lanes are equal'),
     (['--target', 'magnet'], '--moment: required for a magnet, together with height'),
 ])
-def test_plan_refuses_what_makes_no_sense(tmp_path, capsys, options, text):
+def test_plan_rejects_invalid_options(tmp_path, capsys, options, text):
     assert main(['plan', '--network', str(NETWORK_FILE), *options,
                  '--out', str(tmp_path / 'out')]) == 1
     assert text in capsys.readouterr().err
@@ -196,12 +196,12 @@ def test_plan_refuses_what_makes_no_sense(tmp_path, capsys, options, text):
 
 
 @pytest.mark.parametrize('options', [
-    # Points of the map and of a lane on the very sensor; no free place; two lanes of one heading.
+    # Points of the map and of a lane at a sensor; no free place; two lanes with one heading.
     ['--height', '0', '--heading', '0', '--offset', '4.5', '--area', '-10', '-10', '10', '10'],
     ['--height', '0', '--heading', '90', '--area', '-9', '-9', '9', '9', '--clearance', '1e6'],
     ['--heading', '0', '0', '--offset', '2', '-2', '--rate', '1'],
 ])
-def test_plan_bears_what_is_odd(tmp_path, capsys, options):
+def test_plan_accepts_unusual_options(tmp_path, capsys, options):
     out = tmp_path / 'out'
     assert main(['plan', '--network', str(NETWORK_FILE), '--grid', '9', *options,
                  '--out', str(out)]) == 0
@@ -212,7 +212,7 @@ def test_plan_bears_what_is_odd(tmp_path, capsys, options):
         assert 'the area has no place clear of the lanes' in capsys.readouterr().out
 
 
-def test_lanes_keep_a_further_sensor_away_from_each_of_them():
+def test_another_sensor_keeps_clear_of_every_lane():
     p = compute_plan(ROAD, CAR, Sampling(0.08, 4e-9, 0.04, 1e-8),
                      [('a', 0.0, 2.0), ('b', 0.0, -3.0)], (-12.0, -12.0, 12.0, 12.0),
                      settings_for('vehicle'), clearance=1.5, n_grid=13)
@@ -221,7 +221,7 @@ def test_lanes_keep_a_further_sensor_away_from_each_of_them():
     assert np.array_equal(np.isfinite(p.with_one_more).all(axis=1), free)
 
 
-def test_a_pass_is_missed_as_often_as_no_run_of_frames_detects():
+def test_missed_detection_probability_agrees_with_simulation():
     rng = np.random.default_rng(2)
     p = rng.uniform(0.0, 0.6, (12, 2))
     found = missed_detection_probability(p, 3)
@@ -233,7 +233,7 @@ def test_a_pass_is_missed_as_often_as_no_run_of_frames_detects():
 
 
 def test_a_lane_counts_every_frame_once():
-    """A third of the frames with a third of the variance are the same, step by step."""
+    """A third of the frames with a third of the variance gives the same std at every step."""
     slow = PlannedTarget(400.0, 0.5, 0.8, 0.2, 0.1)
     lanes = [compute_plan(
         ROAD, slow, Sampling(0.08 * k, 4e-9 / np.sqrt(k), 0.04 / np.sqrt(k), 1e-8, 20.0),
@@ -243,9 +243,9 @@ def test_a_lane_counts_every_frame_once():
     np.testing.assert_allclose(lanes[0].filter_std, lanes[1].filter_std, rtol=1e-6)
 
 
-def test_a_lane_is_the_median_over_the_directions(road_plan):
+def test_std_of_a_lane_is_the_median_over_moment_directions(road_plan):
     lane, = road_plan.lanes
-    J = pass_information(*place_of(ROAD), road_plan.target, road_plan.sampling, lane.points,
+    J = pass_information(*poses_of(ROAD), road_plan.target, road_plan.sampling, lane.points,
                          lane.heading).sum(axis=2)
     std = bounds_of(J, road_plan.target.prior())
     np.testing.assert_allclose(lane.pass_std, np.median(std, axis=1))

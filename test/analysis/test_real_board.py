@@ -1,4 +1,4 @@
-"""A board of 41 sensors calibrated from its own readings, and tested on those left out."""
+"""Calibration of a board of 41 sensors from recorded readings, tested on other readings."""
 
 import numpy as np
 import pytest
@@ -18,13 +18,13 @@ def recorded():
 
 
 @pytest.mark.parametrize('first', studied([0, 1], [0]))
-def test_calibrated_on_every_other_row(recorded, first):
+def test_calibration_on_every_other_row_is_accurate_on_the_rest(recorded, first):
     network, field, positions, axes = recorded
     g = calibrate_geometry(network, field[first::2], positions[first::2], axes[first::2], MOMENT,
                            GeometrySettings())
     assert g.converged and g.suspect_sensors == () and g.suspect_poses == ()
     assert 0.4 < g.normalised_cost < 1.0
-    # The magnet is some 8 mm below the tracked point.
+    # The magnet is about 8 mm below the tracked point.
     assert g.tool_offset[0][2] == pytest.approx(-8e-3, abs=1e-3)
     assert g.tool_offset[1][2] < 3e-4 and (g.tool_tilt[1] < 2e-3).all()
     rest = slice(1 - first, None, 2)
@@ -33,7 +33,7 @@ def test_calibrated_on_every_other_row(recorded, first):
     said(f'known poses, rows {first}::2', place, turn, low)
     within_limits(place, turn, low)
     if first == 0:
-        # Taken as stated, but for the biases: what the registration is for.
+        # The stated geometry with calibrated biases only is at least three times worse.
         stated = GeometrySettings(
             gain_std=0.0, rotation_std_deg=0.0, position_std=0.0, board_shift_std=0.0,
             board_rotation_std_deg=0.0, tool_offset_std=0.0, tool_tilt_std_deg=0.0)
@@ -45,7 +45,7 @@ def test_calibrated_on_every_other_row(recorded, first):
 
 
 def registered(r, u, positions, axes):
-    """Function from tracked poses to world: the best motion, offset and tilt of the tool."""
+    """Map from tracked poses to the world: best rigid motion, tool offset and tool tilt."""
     centre = positions.mean(axis=0)
 
     def poses(x, positions, axes):
@@ -63,8 +63,8 @@ def registered(r, u, positions, axes):
 
 
 @pytest.mark.study
-def test_unknown_poses_of_real_readings(recorded):
-    """Calibrated without the tracker; registered by the training rows, tested on the others."""
+def test_blind_calibration_is_accurate_on_the_other_rows(recorded):
+    """Calibrated without the tracker, registered by the training rows, tested on the others."""
     network, field, positions, axes = recorded
     g = calibrate_geometry_blind(network, field[::2], MOMENT, *BOX, GeometrySettings())
     assert g.converged and g.suspect_sensors == () and len(g.rows) >= 155

@@ -1,4 +1,4 @@
-"""Trained classes: accuracy, calibrated probabilities, unknown signatures, refused labels."""
+"""Classifier of signatures: accuracy, calibration, unknown signatures, rejected labels."""
 
 from functools import cache
 
@@ -30,19 +30,19 @@ def trained(e):
 
 
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
-def test_classes_are_told_better_than_by_the_largest_one(simulator):
+def test_accuracy_is_better_than_the_share_of_the_largest_class(simulator):
     e = examples(simulator)
     found = evaluate_splits(e.x, e.labels, e.groups, e.axes, e.unit, 5)
     assert found.majority == pytest.approx(100 / 140, abs=0.03)
     assert found.accuracy.mean() > found.majority + 0.05
-    # Of three classes a constant answer has a third.
+    # A constant answer has a balanced accuracy of a third.
     assert found.balanced_accuracy.mean() > 0.65
-    # 0.05 is the aim; three standard errors of 5 x 42 answers come on top.
+    # The aim is 0.05; three standard errors of 5 x 42 answers are added.
     assert found.reliability < 0.05 + 3.0 * np.sqrt(0.1 / 210)
     assert found.unknown.mean() < 0.1
 
 
-def test_what_is_far_from_all_examples_is_unknown():
+def test_a_signature_far_from_all_examples_is_unknown():
     e = examples()
     model = trained(e)
     assert np.mean(np.array(model.names(e.x)) == UNKNOWN) < 0.05
@@ -51,7 +51,7 @@ def test_what_is_far_from_all_examples_is_unknown():
     assert model.posterior(far).sum(axis=1) == pytest.approx(1.0)
 
 
-def test_training_is_repeated_exactly_and_survives_its_file(tmp_path):
+def test_training_is_reproducible_and_a_model_file_is_lossless(tmp_path):
     e, other = examples(), examples(seed=1)
     model = trained(e)
     write_model(tmp_path / 'classes.json', model)
@@ -64,7 +64,7 @@ def test_training_is_repeated_exactly_and_survives_its_file(tmp_path):
         evaluate(stored, other.x, ['tank'] * len(other.labels))
 
 
-def test_two_classes_have_probabilities_too():
+def test_two_classes_have_probabilities():
     e = examples()
     rows = [k for k, label in enumerate(e.labels) if label != 'motorcycle']
     model = train(e.x[rows], [e.labels[k] for k in rows], [e.groups[k] for k in rows], e.axes, 'T')
@@ -74,30 +74,30 @@ def test_two_classes_have_probabilities_too():
                     for k, r in zip(p.argmax(axis=1), rows, strict=True)]) > 0.9
 
 
-@pytest.mark.parametrize(('labels', 'why'), [
+@pytest.mark.parametrize(('labels', 'message'), [
     (['car'] * 10, 'at least two classes, got car'), (['car'] * 9 + ['truck'], "got 1 of 'truck'"),
     (['car'] * 5 + [''] * 5, 'no label'), (['car'] * 5 + ['unknown'] * 5, 'rename the class')])
-def test_labels_from_which_nothing_is_learnt_are_refused(labels, why):
+def test_labels_unsuitable_for_training_are_rejected(labels, message):
     x = np.random.default_rng(0).standard_normal((10, 4))
-    with pytest.raises(LabelsError, match=why):
+    with pytest.raises(LabelsError, match=message):
         train(x, labels, list(map(str, range(10))), ('x',), 'T')
 
 
-def test_the_reliability_error_is_that_of_its_definition():
+def test_reliability_error_follows_its_definition():
     assert reliability_error(np.array([0.9] * 10), np.array([True] * 9 + [False])) == \
         pytest.approx(0.0)
     assert reliability_error(np.array([0.95] * 10), np.array([True] * 5 + [False] * 5)) == \
         pytest.approx(0.45)
 
 
-def test_labels_of_chance_are_not_learnt_from_several_sensors_of_one_pass():
-    """Four sensors feel nearly the same: one of them in the test set would give all away."""
+def test_random_labels_are_not_learnt_from_sensors_of_one_pass():
+    """Four sensors measure nearly the same: one of them in the test set would leak the labels."""
     rng = np.random.default_rng(2)
     of_pass = rng.standard_normal((40, 20)).repeat(4, axis=0)
     x = of_pass + 0.01 * rng.standard_normal(of_pass.shape)
     labels = rng.choice(['a', 'b'], 40).repeat(4).tolist()
     groups = list(map(str, np.arange(40).repeat(4)))
     found = evaluate_splits(x, labels, groups, ('x',), 'T', 10)
-    # Ten splits of twelve passes: a coin, within three standard errors, which share passes.
+    # Chance level within three standard errors of ten splits of twelve passes, which overlap.
     assert abs(found.balanced_accuracy.mean() - 0.5) < 0.25
     assert found.accuracy.mean() < 0.8

@@ -1,6 +1,10 @@
-"""`make bench`: several vehicles at once: who is found, how well, and what it costs.
+"""Tracking of several vehicles at once: detection, accuracy and cost.
 
-`--data FOLDER` takes the recordings of another folder (`*.mcap` with `*.truth.json`).
+Recordings and simulated worlds with meeting and following vehicles and dense traffic are tracked.
+The figures are the share of vehicles found, RMS error, NEES, false tracks, and the time of a search
+for another vehicle. At most 1 % of the poses without a flag may be wrong, including passes of
+single vehicles. A frame of two vehicles may take four times as long as a frame of one vehicle. With
+`--data FOLDER`, the recordings of another folder are used (`*.mcap` with `*.truth.json`).
 """
 
 import argparse
@@ -26,9 +30,9 @@ from support.random_passes import KINDS, are_wrong, one_random_pass
 
 AIMS = {'meeting': (1.0, 4.0, 1.0), 'meeting more': (0.7, 3.0, 1.0),
         'following': (0.9, None, 1.0), 'traffic': (None, None, 11 / 12)}
-"""{recordings: median RMS [m], median NEES of two, share of vehicles found}; None = no aim."""
+"""{recordings: median RMS [m], median NEES of two axes, share found}; None = no aim."""
 MIN_MEETING = 15 / 16
-"""With two sensors one of sixteen may be missed."""
+"""With two sensors, one of sixteen vehicles may be missed."""
 MAX_WRONG, MAX_COST = 0.01, 4.0
 N_HYP, RUNS = 20, 25
 
@@ -42,13 +46,13 @@ def aims_of(name):
 
 
 def shown(items, what):
-    """The items, with a bar on a terminal."""
+    """The items, with a progress bar on a terminal."""
     return tqdm(items, desc=what, disable=None, leave=False)
 
 
 @contextmanager
 def searches():
-    """[s] that each search for another vehicle takes."""
+    """Durations [s] of the searches for another vehicle."""
     seconds, find = [], NewTargetSearch.find
 
     def timed(search):
@@ -66,7 +70,7 @@ def searches():
 
 
 def recordings(figures, folder):
-    """[(poses without a flag, of them wrong)] of the recordings."""
+    """[(number of poses without a flag, number of wrong ones)] of the recordings."""
     counted = []
     for path in shown(sorted(folder.glob('*.truth.json')), 'recordings'):
         name = path.name.removesuffix('.truth.json')
@@ -84,13 +88,13 @@ def recordings(figures, folder):
         figures.add(f'{name}: NEES', float(np.nanmedian(got.nees)), '', nees)
         figures.add(f'{name}: tracks of nobody', got.n_extra, '', 0)
         figures.add(f'{name}: a search', float(np.median(seconds)), 's',
-                    note=f' (longest {max(seconds):.2g}, {len(seconds)} of them)')
+                    note=f' (longest {max(seconds):.2g} s, {len(seconds)} searches)')
         counted.append((got.n_sure, got.n_wrong))
     return counted
 
 
 def simulated(figures, seeds):
-    """[(poses without a flag, of them wrong)] of worlds of the second simulator."""
+    """[(number of poses without a flag, of wrong ones)] of worlds of the second simulator."""
     counted = []
     for how in ('meeting', 'following', 'traffic'):
         scores = [tracked(busy(how, n, 'boxes', seed))[0]
@@ -105,8 +109,10 @@ def simulated(figures, seeds):
 
 
 def of_one(passes):
-    """[(poses without a flag, of them wrong)] of single vehicles: the recordings, and passes of
-    each kind of the second simulator."""
+    """[(number of poses without a flag, number of wrong ones)] of single vehicles.
+
+    These are the bundled recordings and passes of each kind of the second simulator.
+    """
     counted = []
     for name in shown(VEHICLES, 'vehicles'):
         result = track(vehicle_path(name), NETWORK_FILE)
@@ -125,7 +131,7 @@ def of_one(passes):
 
 
 def cost():
-    """Time of a frame of two vehicles with two sensors over that of one, as many hypotheses."""
+    """Time of a frame of two vehicles over that of one, with equal numbers of hypotheses."""
     settings, network = settings_for('vehicle').track, NETWORKS[2]
     model, C = vehicle_model(settings.vehicle, network), np.tile(3.6e-17 * np.eye(3), (2, 1, 1))
     frame = FieldFrame(0, np.full((2, 3), 2e-8), C, np.full(2, 4), np.zeros(2), True)
@@ -154,11 +160,11 @@ def cost():
 
 
 def main():
-    """Print the figures; returns 1 where an aim is missed."""
+    """Print the figures; return 1 if an aim is missed."""
     parser = argparse.ArgumentParser()
     parser.add_argument('--data', type=Path, metavar='FOLDER', default=BUSY)
     parser.add_argument('--seeds', type=int, default=3, help='worlds of each kind')
-    parser.add_argument('--passes', type=int, default=33, help='of each kind of single vehicle')
+    parser.add_argument('--passes', type=int, default=33, help='single vehicles of each kind')
     given = parser.parse_args()
     figures = Figures('busy')
     print('Several vehicles at once')

@@ -1,10 +1,11 @@
-"""What the middleware alone takes: four bare rclpy nodes that hand on what the nodes hand on.
+"""Latency of the middleware alone: a chain of four bare rclpy nodes.
 
     PYTHONPATH=test python -m bench.chain [--seconds 60]
 
-A source sends a message of a hundred readings a hundred times a second; two nodes hand it on as it
-is, and the last one sends a pose for every eighth: the peer of `load.py`, whose nodes do their work
-besides. Printed is how long a pose comes after its readings were sent, by this machine's clock.
+A source publishes a message of a hundred readings at 100 Hz, two nodes forward it, and the last
+node publishes a pose for every eighth message. The figure is the delay of a pose after its readings
+were sent, by the clock of this machine. It is the reference for `bench.load`, whose nodes do their
+work in addition, and has no aim.
 """
 
 import argparse
@@ -23,7 +24,7 @@ ROLES = ('last', 'second', 'first', 'source')
 
 
 def readings(k):
-    """A FieldReadings with covariances."""
+    """`FieldReadings` message with covariances."""
     from mag_tracking_msgs.msg import FieldReadings
 
     from mag_tracking.messages.schema import readings_dict
@@ -36,7 +37,7 @@ def readings(k):
 
 
 def play(role):
-    """One node until it is stopped."""
+    """Run the node of a role until it is stopped."""
     import rclpy
     from geometry_msgs.msg import PoseWithCovarianceStamped
     from mag_tracking_msgs.msg import FieldReadings
@@ -68,7 +69,7 @@ def play(role):
 
 
 def main():
-    """The command."""
+    """Run the benchmark, or the node of one role."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seconds', type=float, default=60.0)
     parser.add_argument('--role', choices=ROLES, help=argparse.SUPPRESS)
@@ -100,7 +101,7 @@ def main():
     figures.keep('four bare nodes: pose after its readings, median', np.median(late), 'ms')
     figures.keep('four bare nodes: pose after its readings, 99 %', np.quantile(late, 0.99), 'ms')
     figures.save()
-    print(f'{len(late)} poses of four bare nodes, after their readings were sent: median '
+    print(f'{len(late)} poses of four bare nodes, delay after their readings were sent: median '
           f'{np.median(late):.1f} ms, p99 {np.quantile(late, 0.99):.1f} ms, worst '
           f'{late.max():.1f} ms')
 

@@ -1,6 +1,10 @@
-"""`make bench`: vehicle classes by moment and length, and by signatures of one sensor.
+"""Classification of vehicles by moment and length, and by signatures of one sensor.
 
-Both simulators; signatures are trained and tested on splits.
+Random passes of motorcycles, cars and trucks of two simulators are tracked with two sensors. The
+figures are the share of counted vehicles, the share of correct classes, the recall of each class
+and the reliability error of the class probabilities. In addition, a classifier is trained and
+tested on splits of simulated signatures of one sensor. The aims are 95 % correct classes and a
+reliability error of at most 0.05.
 """
 
 import sys
@@ -24,16 +28,16 @@ from support.samples import scenario
 from support.situation_worlds import car, small, truck
 
 SHARES = {'motorcycle': 0.05, 'car': 0.8, 'truck': 0.15}
-"""Those of `traffic.class_shares`."""
+"""Shares of the classes, as in `traffic.class_shares`."""
 N = 120
-"""Passes of each simulator."""
+"""Number of passes per simulator."""
 EXAMPLES = {'motorcycle': 30, 'car': 160, 'truck': 30}
-"""Signatures of each class."""
+"""Number of signatures of each class."""
 MIN_RIGHT, MAX_SEPARATION = 0.95, 0.05
 
 
 def body_of(rng, name, simulator):
-    """A vehicle of a class; two-wheelers as heavy as a touring motorcycle."""
+    """Body of a vehicle of a class; two-wheelers are as heavy as a touring motorcycle."""
     if name == 'motorcycle':
         return small(rng, simulator, rng.uniform(1.9, 2.3), rng.uniform(40.0, 120.0))
     return (car if name == 'car' else truck)(rng, simulator)
@@ -56,7 +60,7 @@ def classified(simulator, seed):
 
 
 def main():
-    """Print the figures; 1 where an aim is missed."""
+    """Print the figures; return 1 if an aim is missed."""
     figures = Figures('classes')
     print('Vehicle classes by moment and length, two sensors')
     classes = settings_for('vehicle').traffic.class_names
@@ -81,7 +85,7 @@ def main():
         found = evaluate_classes(examples, progress=partial(
             tqdm, desc='splits', disable=None, leave=False))
         figures.add(f'{simulator}, one sensor: accuracy', float(found.accuracy.mean()), '', None,
-                    True, f' (of the largest class {found.majority:.3f})')
+                    True, f' (share of the largest class {found.majority:.3f})')
         figures.add(f'{simulator}, one sensor: balanced accuracy',
                     float(found.balanced_accuracy.mean()), '', None, True)
         figures.add(f'{simulator}, one sensor: reliability error', found.reliability, '',

@@ -1,4 +1,11 @@
-"""`make bench`: driving directions by single sensors, in a replica of published traffic."""
+"""Driving directions by single sensors, in a replica of the traffic of PHD15 Paper B.
+
+Three replicas of 511 vehicles on a road with two lanes are simulated by each of two simulators,
+with a two-axis sensor on each side of the road. The figures are the shares of correct directions by
+the sensor of the near lane, by that of the far lane, and by fusion of both, for the correlation and
+for the likelihood ratio. The aims for the correlation are 99.8 % near and 97 % fused. The stated
+error probabilities may differ by 0.05 from the measured ones.
+"""
 
 import sys
 
@@ -9,18 +16,18 @@ from support.two_way_traffic import calibration, passings, shares
 
 SIMULATORS = ('clouds', 'boxes')
 SEEDS = (1, 2, 3)
-"""Replicas of 511 vehicles."""
+"""Seeds of the replicas of 511 vehicles."""
 PUBLISHED = {'near': 510 / 511, 'far': 454 / 511, 'fused': 494 / 511}
 LIKELIHOOD = {'near': 488 / 511, 'far': 379 / 511, 'fused': 480 / 511}
 AIMS = {'near': 0.998, 'far': None, 'fused': 0.97}
 MAX_SEPARATION = 0.05
-"""Stated error probabilities are right within this."""
+"""Maximum difference between stated and measured error probability."""
 
 
 def main():
-    """Print the figures; 1 where an aim is missed."""
+    """Print the figures; return 1 if an aim is missed."""
     figures = Figures('directions')
-    print('Driving directions, by one sensor with two axes and by two')
+    print('Driving directions by one sensor with two axes, and by two such sensors')
     for simulator in SIMULATORS:
         vehicles = [v for seed in tqdm(SEEDS, desc=simulator, disable=None, leave=False)
                     for v in passings(simulator, seed)]

@@ -21,7 +21,7 @@ from support.bundled import ROOT
 FOLDER = ROOT / 'benchmarks'
 LATEST, HISTORY = FOLDER / 'latest.json', FOLDER / 'history.jsonl'
 WORSE = 1.15
-"""A figure that is worse by this factor is named."""
+"""Factor beyond which a figure is reported as worse."""
 RUNS = 5
 RED, PLAIN = '\033[31m', '\033[0m'
 
@@ -34,7 +34,7 @@ class Figures:
 
     def keep(self, name, value, unit='', aim=None, more_is_better=False, note=''):
         """Record a figure; `aim` is the worst acceptable value. Returns whether it is missed."""
-        # NaN reaches no aim.
+        # NaN misses every aim.
         is_missed = aim is not None and not (value >= aim if more_is_better else value <= aim)
         self.missed += is_missed
         self._figures[name] = {'value': float(value), 'unit': unit, 'aim': aim,
@@ -49,7 +49,7 @@ class Figures:
               + (' (missed)' if is_missed else ''), flush=True)
 
     def save(self):
-        """Write them beside those of the other benchmarks; 1 if an aim is missed, else 0."""
+        """Add the figures to `benchmarks/latest.json`; return 1 if an aim is missed, else 0."""
         FOLDER.mkdir(exist_ok=True)
         found = json.loads(LATEST.read_text()) if LATEST.exists() else {}
         found[self._benchmark] = run_facts() | {'figures': self._figures}
@@ -64,14 +64,14 @@ def run_facts():
 
 
 def read_history():
-    """The runs before, oldest first."""
+    """Earlier runs, oldest first."""
     if not HISTORY.exists():
         return []
     return [json.loads(line) for line in HISTORY.read_text().splitlines()]
 
 
 def machine():
-    """What the figures of two runs have to have in common to be compared."""
+    """Description of the machine; only runs with equal descriptions are compared."""
     try:
         with open('/proc/cpuinfo') as stream:
             models = {line.partition(':')[2].strip() for line in stream
@@ -82,9 +82,9 @@ def machine():
 
 
 def worse(run, before):
-    """[(benchmark, name, figure, best of before)] of a run's figures that got worse, or are NaN.
+    """[(benchmark, name, figure, best earlier value)] of the figures that got worse or are NaN.
 
-    `before` are the earlier runs on such a machine.
+    `before` holds the earlier runs on the same kind of machine.
     """
     out = []
     for benchmark, figures in run.items():
@@ -102,7 +102,7 @@ def worse(run, before):
 
 
 def commit():
-    """The commit that was measured, with a + where the tree differs from it."""
+    """Measured commit, with a + if the package differs from it."""
     def git(*words):
         return subprocess.run(['git', *words], cwd=ROOT, capture_output=True, text=True,
                               check=True).stdout.strip()
@@ -114,7 +114,7 @@ def commit():
 
 
 def main():
-    """Add the run to the history; what got worse in red."""
+    """Append the run to the history, and print figures that got worse in red."""
     if not LATEST.exists():
         print('no benchmark has been run: there is no benchmarks/latest.json')
         return 1
@@ -128,8 +128,8 @@ def main():
     with HISTORY.open('a') as stream:
         stream.write(json.dumps(run, sort_keys=True) + '\n')
     compared = f'{len(found)} got worse' if before else \
-        f'none was compared: no earlier run is of such a machine ({machine()})'
-    print(f'{sum(map(len, figures.values()))} figures are kept in {HISTORY.relative_to(ROOT)}; '
+        f'none were compared: no earlier run on such a machine ({machine()})'
+    print(f'{sum(map(len, figures.values()))} figures added to {HISTORY.relative_to(ROOT)}; '
           f'{compared}')
     return int(bool(found))
 

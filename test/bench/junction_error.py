@@ -1,8 +1,9 @@
-"""What the error of one car at its closest point depends on: junction_left_turns_to_rear.
+"""Causes of the position error of a turning car at its closest point.
 
-Prints the error with what the network file leaves out (mountings, clocks) made exact, with
-other settings, and where the magnetic centre lies: least squares for dipoles that move
-exactly as the truth does.
+The recording `junction_left_turns_to_rear` is replayed with the network file, with exact clocks,
+with exact mountings, and with other settings. The figures are the errors at the closest point. A
+least squares fit of dipoles that move exactly as the truth locates the magnetic centre of the car.
+There is no aim.
 """
 
 import json
@@ -26,7 +27,7 @@ from support.samples import one, recorded
 NAME = 'junction_left_turns_to_rear'
 NOISE = 1.2e-8
 POINT, ROW = (0.0,), (-1.0, 0.0, 1.0)
-"""Places of the dipoles along the body, in half lengths."""
+"""Positions of the dipoles along the body, in half lengths."""
 SETTINGS = {'iron three times as uneven': {'track.vehicle.difference_stds': [0.0, 90.0, 360.0]},
             'speeds of 5 m/s only': {'track.vehicle.speeds': [5.0]},
             'acceleration 0.3': {'track.vehicle.acceleration': 0.3},
@@ -34,7 +35,7 @@ SETTINGS = {'iron three times as uneven': {'track.vehicle.difference_stds': [0.0
 
 
 def network_with(mountings, clocks):
-    """The network of the file, with exact orientations and clocks where they are asked for."""
+    """Network of the file, optionally with exact mountings and exact clocks."""
     network = read_network(NETWORK_FILE)
     truth = json.loads(vehicle_path(NAME).with_suffix('.truth.json').read_text())['sensor_truth']
     if mountings:
@@ -45,13 +46,13 @@ def network_with(mountings, clocks):
 
 
 def replayed(network, changes):
-    """`Run` of the recording, without files that stay."""
+    """`Run` of the recording; its files are temporary."""
     with tempfile.TemporaryDirectory() as out:
         return replay(Recording(vehicle_path(NAME)), network, settings_for('vehicle', changes), out)
 
 
 def errors(network, changes, figures=None, name=''):
-    """One line with the errors of the track, which are also added to `figures`."""
+    """One line with the errors of the track, which are also recorded in `figures`."""
     track, = replayed(network, changes).summary['tracks']
     truth, smoothed = track['truth'], track['smoothed']['truth']
     if figures is not None:
@@ -75,7 +76,7 @@ def true_motion(data, truth):
 
 
 def magnetic_centre(network, row):
-    """Middle (3,) [m] in the body frame, half length [m], whole moments and normalised cost."""
+    """Centre (3,) [m] in the body frame, half length [m], total moments and normalised cost."""
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
     collector = PassCollector(network, settings_for('vehicle'))
     passes = [p for s in recorded(reader) for p in collector.feed(one(s))] + collector.flush()
@@ -112,7 +113,7 @@ def main():
     for name, changes in SETTINGS.items():
         print(f'{name}: {errors(network_with(False, False), changes)}; '
               f'both exact: {errors(network_with(True, True), changes)}', flush=True)
-    print('dipoles on the true path, both exact: forward, left, up of the origin of the truth')
+    print('dipoles on the true path, both exact: centre forward, left, up from the true position')
     for name, row in (('a point', POINT), ('a row of three', ROW)):
         centre, half, moments, cost = magnetic_centre(network_with(True, True), row)
         shape = f', half length {half:.2f} m' if len(row) > 1 else ''

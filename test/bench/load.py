@@ -1,13 +1,15 @@
-"""What the nodes cost: driver, calibration, detection and tracker as processes, live.
+"""Latency, CPU time and memory of the nodes with live sensors.
 
     PYTHONPATH=test python -m bench.load                         # 100 sensors x 100 Hz, ten minutes
-    PYTHONPATH=test python -m bench.load --pages 10              # the same, with live pages open
-    PYTHONPATH=test python -m bench.load --sensors 2 --minutes 2 --lean   # two, 126 hypotheses
-                                --one-process --batches          # the same, as cheap as can be
+    PYTHONPATH=test python -m bench.load --pages 10              # the same with ten live pages open
+    PYTHONPATH=test python -m bench.load --sensors 2 --minutes 2 --lean  # two, 126 hypotheses
+                                --one-process --batches          # the same at minimum cost
 
-The simulator is the hardware; it runs in the driver's process. Printed are how long a pose comes
-after the sample that completed its frame, by this machine's clock, what was lost, and what each
-process takes of a core and of memory. Exits with 1 where a sample or a frame was lost.
+Driver, calibration, detection and tracker run as processes; a simulator in the driver replaces the
+hardware. The figures are the delay of a pose after the sample that completed its frame, by the
+clock of this machine, the CPU time of all nodes, their growth of memory, and the kinds of losses.
+The aim is a median delay of 10 ms, or 5 ms with all nodes in one process, without losses. The exit
+status is 1 if a sample or a frame was lost.
 """
 
 import argparse
@@ -30,18 +32,18 @@ os.environ.setdefault('ROS_DOMAIN_ID', str(101 + os.getpid() % 100))
 ROOT = Path(__file__).resolve().parents[2]
 NODES = ('calibration_node', 'detection_node', 'tracker_node', 'driver_node')
 RATE, PERIOD_S = 100.0, 0.08
-"""[Hz] of each sensor, and the length of a frame (`align.period_s`)."""
+"""[Hz] Rate of each sensor; [s] period of a frame (`align.period_s`)."""
 WARM_UP_S = 20.0
 BEGINS_AFTER_S = 0.5
-"""[s] A pose that comes so long after the one before is the first of a track."""
+"""[s] A pose that is later than the previous one by more than this is the first of a track."""
 MANY, GATHER_S = 16, 0.002
-"""More sensors than this send their readings together; those of [s], where they measure in turn."""
+"""More sensors than this send their readings in batches; [s] of each batch if in sequence."""
 LEAN = {'arrival_names': "['left']", 'arrival_headings_deg': '[0.0]'}
-"""One kind, one arrival: 3 offsets x 14 moments x 3 speeds = 126 hypotheses, all of them kept."""
+"""One kind, one arrival: 3 offsets x 14 moments x 3 speeds = 126 hypotheses, all are kept."""
 
 
 def network_yaml(n):
-    """`n` sensors in pairs along a road."""
+    """Network file of `n` sensors in pairs along a road."""
     rows = [f'  mag_{i + 1}: {{position: [{9.0 * (i // 2)}, {4.5 if i % 2 else -4.5}, 0.0], '
             'orientation: [0, 0, 0, 1], noise_std: 1.2e-8}' for i in range(n)]
     return '\n'.join(['frame: map', 'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]', 'sensors:', *rows,
@@ -49,7 +51,7 @@ def network_yaml(n):
 
 
 def drivers_yaml(n, network, sequential):
-    """The simulator for all of them: a car at 20 m/s, as often as the road is free."""
+    """Driver file of a simulator for all sensors: a car at 20 m/s whenever the road is free."""
     gather = f'  batch_s: {GATHER_S}\n' if sequential and n > MANY else ''
     return (f'road:\n  device: simulator\n{gather}  simulator: {{network: {network}, '
             f'rate_hz: {RATE}, speed: 20.0, period_s: 5.0, offset: 1.0, '
@@ -65,7 +67,7 @@ def usage(process):
 
 
 class Ear:
-    """Listens to poses and diagnostics."""
+    """Subscriptions to poses and diagnostics."""
 
     def __init__(self, node, sequential):
         from diagnostic_msgs.msg import DiagnosticArray
@@ -76,25 +78,25 @@ class Ear:
         # Whether each pose is the first of a track.
         self.begins, self._stamp = [], 0.0
         self._unread = []
-        # The stamp is the mean of the samples; the one that shows that they were all comes behind:
-        # half a frame, and what the sensors are apart.
+        # The timestamp is the mean of the samples. The sample that completes the frame is later by
+        # half a frame and the time between the sensors.
         self._completed_s = PERIOD_S / 2.0 + (1.0 if sequential else 0.5) / RATE
         node.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose', self._pose,
                                  STREAM)
-        # Read when all is over: what poses wait for here is no latency of theirs.
+        # Diagnostics are parsed later, so that they do not delay the reception of poses.
         self._type = DiagnosticArray
         node.create_subscription(DiagnosticArray, '/diagnostics', self._unread.append, STREAM,
                                  raw=True)
 
     def _pose(self, message):
-        """How long after the sample that completed the frame it came."""
+        """Record the delay after the sample that completed the frame."""
         stamp = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
         self.latencies.append(time.time() - stamp - self._completed_s)
         self.begins.append(stamp - self._stamp > BEGINS_AFTER_S)
         self._stamp = stamp
 
     def _read(self):
-        """Keep the latest of what has been heard."""
+        """Parse the received diagnostics; keep the latest values."""
         from rclpy.serialization import deserialize_message
         for raw in self._unread:
             for status in deserialize_message(raw, self._type).status:
@@ -104,16 +106,16 @@ class Ear:
         self._unread.clear()
 
     def begin(self):
-        """What was before was the warm-up: sensors that a car stood at learn later than others."""
+        """Discard the warm-up, in which sensors next to a car learn their background later."""
         self._before, self.latencies, self.begins, self.troubles = self._losses(), [], [], {}
 
     def losses(self):
-        """{what: how many} of all that says that something was lost since `begin`."""
+        """{counter: number} of all losses since `begin`."""
         return {k: n - self._before.get(k, 0) for k, n in self._losses().items()
                 if n != self._before.get(k, 0)}
 
     def _losses(self):
-        """The same, of all time."""
+        """{counter: number} of all losses since the start."""
         self._read()
         return {f'{name}: {key}': int(value) for name, values in self.values.items()
                 for key, value in values.items() if value and key.startswith(
@@ -121,7 +123,7 @@ class Ear:
 
 
 def start(folder, n, parameters, sequential, batches, together):
-    """The nodes as processes, the driver last; or all `together` in one."""
+    """Start the nodes as processes, the driver last, or all `together` in one process."""
     network, drivers = folder / 'network.yaml', folder / 'drivers.yaml'
     network.write_text(network_yaml(n))
     drivers.write_text(drivers_yaml(n, network, sequential))
@@ -143,7 +145,7 @@ def start(folder, n, parameters, sequential, batches, together):
 
 
 def open_pages(n):
-    """The server of the live page, and as many viewers, which read all that comes."""
+    """Start the server of the live page and `n` viewers that read all its data."""
     server = subprocess.Popen(
         [Path(sys.executable).with_name('mag-tracking'), 'watch', '--port', '0'],
         stdout=subprocess.PIPE, text=True)
@@ -154,7 +156,7 @@ def open_pages(n):
 
 
 def parameters_of(folder, lean):
-    """The parameter file."""
+    """Write the parameter file; return its path."""
     text = (ROOT / 'config' / 'large_network.yaml').read_text()
     if lean:
         text = re.sub(r'max_hypotheses: \d+', 'max_hypotheses: 126', text) \
@@ -172,7 +174,7 @@ def watch(processes, ear, executor, minutes):
         until = begin + 10.0 * (len(rows) + 1)
         spin(executor, lambda until=until: time.monotonic() > until)
         if time.monotonic() < until:
-            # Ctrl-C: the nodes have got it, too.
+            # Ctrl-C, which also stops the nodes.
             break
         rows.append((time.monotonic() - begin, {k: usage(p) for k, p in processes.items()}))
         print(f'{rows[-1][0]:6.0f} s  {len(ear.latencies):6d} poses  ' + '  '.join(
@@ -182,21 +184,21 @@ def watch(processes, ear, executor, minutes):
 
 
 def report(ear, rows, figures, aim):
-    """Print and record the results; (99 % quantile of the latency [ms], whether any is lost)."""
+    """Print and record the results; return (99 % quantile of the latency [ms], any losses)."""
     late = 1e3 * np.array(ear.latencies)
     if not len(late):
-        print('no pose has come')
+        print('no pose was received')
     else:
         figures.keep('pose after the last sample of its frame, median', np.median(late), 'ms', aim)
         figures.keep('pose after the last sample of its frame, 99 %', np.quantile(late, 0.99),
                      'ms')
-        print(f'{len(late)} poses, after the sample that completed the frame: median '
+        print(f'{len(late)} poses, delay after the sample that completed the frame: median '
           f'{np.median(late):.1f} ms, p99 {np.quantile(late, 0.99):.1f} ms, '
           f'worst {late.max():.1f} ms')
         begins = np.array(ear.begins)
         first, rest = late[begins], late[~begins]
         if len(first) and len(rest):
-            print(f'{len(first)} of them are the first of a track: median {np.median(first):.1f} '
+            print(f'{len(first)} are the first pose of a track: median {np.median(first):.1f} '
                   f'ms, worst {first.max():.1f} ms; the others: p99 {np.quantile(rest, 0.99):.1f} '
                   f'ms, worst {rest.max():.1f} ms')
     first, last = rows[0], rows[-1]
@@ -207,7 +209,7 @@ def report(ear, rows, figures, aim):
         total += share
         print(f'{node}: {100.0 * share:.1f} % of a core, {last[1][node][1]:.1f} MB, '
               f'{last[1][node][1] - minute[1][node][1]:+.1f} MB since the first minute')
-    print(f'together: {100.0 * total:.1f} % of a core')
+    print(f'all nodes: {100.0 * total:.1f} % of a core')
     figures.keep('all nodes', 100.0 * total, '% of a core')
     figures.keep('growth of the largest process after the first minute',
                  max(last[1][node][1] - minute[1][node][1] for node in last[1]), 'MB')
@@ -216,23 +218,23 @@ def report(ear, rows, figures, aim):
     figures.save()
     print(f'lost: {losses or "nothing"}')
     for text, n in Counter(ear.troubles.values()).most_common(5):
-        print(f'diagnostics of {n}: {text}')
+        print(f'diagnostics of {n} components: {text}')
     return float(np.quantile(late, 0.99)) if len(late) else float('nan'), bool(losses)
 
 
 def main():
-    """The command."""
+    """Run the benchmark; exit status 1 if something was lost."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--sensors', type=int, default=100)
     parser.add_argument('--minutes', type=float, default=10.0)
     parser.add_argument('--batches', action='store_true',
-                        help='readings go together in one message, as they do of many sensors')
+                        help='send readings in batches, as always with many sensors')
     parser.add_argument('--one-process', action='store_true',
-                        help='the nodes in one process, as `mag-tracking run` has them')
+                        help='all nodes in one process, as with `mag-tracking run`')
     parser.add_argument('--lean', action='store_true', help='126 hypotheses')
     parser.add_argument('--sequential', action='store_true',
-                        help='the sensors measure one after the other, not all at the same time')
-    parser.add_argument('--pages', type=int, default=0, help='so many look at the live page')
+                        help='the sensors measure one after the other, not simultaneously')
+    parser.add_argument('--pages', type=int, default=0, help='number of open live pages')
     found = measure(parser.parse_args())
     return 1 if found is None else int(found[1])
 
@@ -245,18 +247,18 @@ def name_of(args):
 
 
 def measure(args):
-    """Result of `report`; None if the run was interrupted before its first row."""
+    """Run the nodes; return the result of `report`, or None if interrupted before the first row."""
     import rclpy
 
     from mag_tracking.nodes.stage_node import make_executor, spin
-    # A listener of a user's, who knows nothing of profiles.
+    # Like a subscriber of a user, without the middleware profile of the nodes.
     rclpy.init()  # noqa: TID251
     node, executor = rclpy.create_node('load'), make_executor()
     executor.add_node(node)
     ear = Ear(node, args.sequential)
     with tempfile.TemporaryDirectory() as folder:
         os.environ['ROS_HOME'] = folder
-        # What the meter's own garbage takes is no latency of poses.
+        # Garbage collection in this process must not add to the latency.
         gc.disable()
         processes = start(Path(folder), args.sensors, parameters_of(Path(folder), args.lean),
                           args.sequential, args.batches, args.one_process)

@@ -1,9 +1,11 @@
-"""Measure the time and memory of the start of a track that 32 sensors see.
+"""Duration and memory of the start of a track within the range of 32 sensors.
 
     PYTHONPATH=test python -m bench.many_sensors
 
-A car passes along 32 sensors, whose mounting and model error are estimated: with as many of them
-as a track uses by default, and with all. One thread; each in a process of its own.
+A simulated car passes 32 sensors, whose mounting and model errors are estimated. The track uses the
+default number of sensors, or all of them. The figures are the time of the start (aim: 2 s), the
+peak memory of the process (aim: 500 MB) and the mean time of a frame. Each case runs on one thread,
+in a process of its own.
 """
 
 import json
@@ -27,11 +29,11 @@ from support.samples import one, simulate  # noqa: E402
 
 N_SENSORS, SPEED = 32, 15.0
 FRAMES = 20
-"""After so many frames of the track it is enough."""
+"""Number of frames of the track that are measured."""
 
 
 def measured(max_sensors):
-    """Print what a pass took: [s] of the start and of each frame, [MB] at most."""
+    """Print as JSON: time [s] of the start and of a frame, and peak memory [MB]."""
     network = line_network(N_SENSORS, tilt=0.02)
     path = Path(np.array([-60.0, -1.5]), 0.0, SPEED)
     samples, *_ = simulate(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5), path, 50.0,
@@ -61,12 +63,12 @@ def measured(max_sensors):
 
 
 def main():
-    """Print the figures; exit status 1 where an aim is missed."""
+    """Print the figures; exit status 1 if an aim is missed."""
     if len(sys.argv) > 1:
         measured(int(sys.argv[1]))
         return 0
     figures = Figures('many_sensors')
-    print(f'a car along {N_SENSORS} sensors, mounting and model error estimated')
+    print(f'a car along {N_SENSORS} sensors; mounting and model error are estimated')
     for name, most in (('those that a track uses by default', 0), ('all', N_SENSORS)):
         found = json.loads(subprocess.run(
             [sys.executable, '-m', 'bench.many_sensors', str(most)], check=True,

@@ -1,9 +1,11 @@
-"""How many times faster than real time recordings are replayed, on one thread.
+"""Speed of replays relative to real time, on one thread.
 
     PYTHONPATH=test python -m bench.replay [--minutes 60]
 
-A road of five minutes with thirty vehicles and two sensors, by the command; a quiet road of two
-sensors at 100 Hz; and how long each frame of a track takes.
+The command `replay` processes a road of five minutes with thirty vehicles and two sensors (aim: 40
+times real time), and a quiet road with two sensors at 100 Hz (aim: 600 times). The duration of the
+frames of tracks is measured with the bundled vehicle recordings. The aims are a mean of 5 ms and a
+maximum of 15 ms.
 """
 
 import argparse
@@ -32,7 +34,7 @@ ROAD = DATA / 'two_way_road' / 'two_way_road.mcap'
 
 
 def road_network(folder):
-    """The network file of the road, whose sensors stand farther apart."""
+    """Write the network file of the road, whose sensors are farther apart; return its path."""
     path = folder / 'network.yaml'
     path.write_text(NETWORK_FILE.read_text().replace('4.5', '5.5'))
     assert np.abs(read_network(path).positions[:, 1]).tolist() == [5.5, 5.5]
@@ -49,7 +51,7 @@ def real_time(recording, network_file, folder):
 
 
 def frame_times():
-    """(frames of running tracks, starts of tracks) [s], over the bundled vehicles."""
+    """Durations [s] of (frames of running tracks, starts of tracks), of the bundled vehicles."""
     network, frames, starts = read_network(NETWORK_FILE), [], []
     for name in VEHICLES:
         pipeline = Pipeline(network, settings_for('vehicle'))
@@ -73,9 +75,9 @@ def frame_times():
 
 
 def main():
-    """Print the figures; exit status 1 where an aim is missed."""
+    """Print the figures; exit status 1 if an aim is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--minutes', type=float, default=60.0, help='of the quiet road')
+    parser.add_argument('--minutes', type=float, default=60.0, help='duration of the quiet road')
     args = parser.parse_args()
     figures = Figures('replay')
     print('times real time, one thread, mag-tracking replay --no-figures')

@@ -1,7 +1,9 @@
-"""`make bench`: random passes of both simulators, spoilt by each fault of a poor sensor.
+"""Random passes with each fault of a poor sensor.
 
-Whether they are detected and tracked, and the share of poses that are sure and wrong. Live: no
-first pass looks for a quiet stretch. A flagged or missing track is no error here; a wrong one is.
+Passes of two simulators are spoilt by one fault at a time and tracked live with two sensors at 100
+Hz, without a prescan. The figures are the share of tracked passes, and the share of poses that are
+wrong although they have no flag (sure and wrong). The aim is at most 1 % of such poses. A flagged
+or missing track is not an error.
 """
 
 import argparse
@@ -33,11 +35,11 @@ FAULTS = {
     'beginning cut by 5 s': (spoiler.beginning_cut, 5.0),
     'dense traffic for 5 s': (dense_traffic, 5.0),
 }
-"""{what: (what makes the fault, its arguments)}."""
+"""{fault: (function that returns the fault, its arguments)}."""
 
 
 def spoil_with(what):
-    """[function of `Readings`] of the fault `what` of `FAULTS`."""
+    """[function of `Readings`] that applies the fault `what` of `FAULTS`."""
     if not FAULTS[what]:
         return []
     fault, *arguments = FAULTS[what]
@@ -50,7 +52,7 @@ def spoilt_pass(what, simulator, kind, seed):
 
 
 def summary(figures, what, simulator, kind, found):
-    """(line, whether the aim is met) of the `Tracked` of one product."""
+    """(line, whether the aim is met) of the `Tracked` of one combination."""
     n_sure, share = share_of_wrong(found)
     n_tracked = sum(len(f.error) > 0 for f in found)
     right = sum(bool(f.heading > HEADING) for f in found)
@@ -59,19 +61,19 @@ def summary(figures, what, simulator, kind, found):
     figures.keep(f'{what}; {simulator}, {kind}: tracked', n_tracked / len(found), '', None, True)
     return (f'  {what:27s} {simulator}, {kind}: {sum(f.detected for f in found):2d} of '
             f'{len(found)} detected, {n_tracked:2d} tracked, {right:2d} in the right direction; '
-            f'{sum((~f.ambiguous).any() for f in found):2d} somewhere sure, sure and wrong '
+            f'{sum((~f.ambiguous).any() for f in found):2d} with unflagged poses, sure and wrong '
             f'{share:5.1%} in {sum(f.sure_and_wrong.any() for f in found)} passes'
             f'{"" if met else "  MISSED"}', met)
 
 
 def main():
-    """Print a line for each product; returns 1 where more than 1 % are sure and wrong."""
+    """Print a line for each combination; return 1 if more than 1 % are sure and wrong."""
     parser = argparse.ArgumentParser()
     parser.add_argument('--passes', type=int, default=8)
     parser.add_argument('--kinds', nargs='+', choices=KINDS, default=['car'])
     given = parser.parse_args()
-    print(f'{given.passes} random passes of each product, two sensors, 100 Hz; the aim is at most '
-          f'{MAX_WRONG:.0%} sure and wrong')
+    print(f'{given.passes} random passes of each combination, two sensors, 100 Hz; the aim is at '
+          f'most {MAX_WRONG:.0%} sure and wrong')
     figures = Figures('spoilt_passes')
     status = count_over([(w, s, k) for w in FAULTS for s in SIMULATORS for k in given.kinds],
                         spoilt_pass, given.passes, partial(summary, figures))

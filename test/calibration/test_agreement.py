@@ -1,4 +1,4 @@
-"""All sensors measure the same Earth: faults are named, a right network is left in peace."""
+"""Comparison of sensors with the Earth field: identified faults, and no false alarms."""
 
 from itertools import combinations
 
@@ -20,13 +20,13 @@ BIAS = 6e-7
 STD = np.deg2rad([0.3, 0.3, 5.0])
 NAMES = ('a', 'b', 'c', 'd')
 
-# So that no axis lies across the field, and no two sensors alike.
+# No axis is perpendicular to the field, and no two sensors are parallel.
 R_WS = np.array([Rotation.from_euler('zyx', angles, True).as_matrix() for angles in (
     [50.0, 10.0, -20.0], [140.0, -15.0, 25.0], [-60.0, 20.0, 10.0], [-130.0, -25.0, -12.0])])
 
 
-def right(rng=None, R_ws=R_WS, std=STD):
-    """(n, 3) [T] what right sensors measure; of `rng` come biases and turns."""
+def correct_fields(rng=None, R_ws=R_WS, std=STD):
+    """Fields (n, 3) [T] of correct sensors; with `rng`, biases and mounting errors are added."""
     out = np.einsum('jki,k->ji', R_ws, EARTH)
     if rng is not None:
         turns = Rotation.from_rotvec(std * rng.standard_normal((len(R_ws), 3))).as_matrix()
@@ -35,83 +35,83 @@ def right(rng=None, R_ws=R_WS, std=STD):
     return out
 
 
-def told(fields, R_ws=R_WS, std=STD, earth=EARTH, bias_std=BIAS):
+def explanations_of(fields, R_ws=R_WS, std=STD, earth=EARTH, bias_std=BIAS):
     """{sensor: explanations}."""
     n = len(fields)
     found = disagreements(NAMES[:n], fields, R_ws, np.tile(std, (n, 1)), earth, bias_std)
     return {d.sensor: d.explanations for d in found}
 
 
-def test_right_sensors_are_left_in_peace():
-    assert told(right()) == {}
+def test_correct_sensors_raise_no_alarm():
+    assert explanations_of(correct_fields()) == {}
 
 
 @pytest.mark.parametrize('seed', range(5))
 @pytest.mark.parametrize('axis', range(3))
-def test_a_flipped_axis_is_named(axis, seed):
-    fields = right(np.random.default_rng(seed))
+def test_a_flipped_axis_is_identified(axis, seed):
+    fields = correct_fields(np.random.default_rng(seed))
     fields[1, axis] *= -1.0
-    assert told(fields) == {'b': (f'{"xyz"[axis]} is flipped',)}
+    assert explanations_of(fields) == {'b': (f'{"xyz"[axis]} is flipped',)}
 
 
 @pytest.mark.parametrize('seed', range(5))
 @pytest.mark.parametrize('pair', list(combinations(range(3), 2)))
-def test_a_swapped_pair_is_named(pair, seed):
-    fields = right(np.random.default_rng(seed))
+def test_a_swapped_pair_is_identified(pair, seed):
+    fields = correct_fields(np.random.default_rng(seed))
     fields[2, list(pair)] = fields[2, list(pair[::-1])]
     first, second = (f'{"xyz"[i]}' for i in pair)
-    assert f'{first} and {second} are swapped' in told(fields)['c']
+    assert f'{first} and {second} are swapped' in explanations_of(fields)['c']
 
 
 @pytest.mark.parametrize('order, text', [([2, 0, 1], 'z, x, y'), ([1, 2, 0], 'y, z, x')])
-def test_axes_in_another_order_are_named_by_what_the_sensor_sends(order, text):
-    """What is sent as x is its z, as y its x, and so on."""
-    fields = right()
+def test_axes_in_another_order_are_identified(order, text):
+    """In the first case, the sensor sends its z as x, its x as y and its y as z."""
+    fields = correct_fields()
     fields[0] = fields[0][order]
-    assert told(fields) == {'a': (f'its axes are in the order {text}',)}
+    assert explanations_of(fields) == {'a': (f'its axes are in the order {text}',)}
 
 
 @pytest.mark.parametrize('unit, scale', UNITS)
-def test_another_unit_is_named(unit, scale):
-    fields = right(np.random.default_rng(3))
+def test_another_unit_is_identified(unit, scale):
+    fields = correct_fields(np.random.default_rng(3))
     fields[3] *= scale
-    assert told(fields) == {'d': (f'its unit is {unit}',)}
+    assert explanations_of(fields) == {'d': (f'its unit is {unit}',)}
 
 
-def test_what_a_unit_is_worth():
+def test_unit_factors_are_relative_to_tesla():
     assert dict(UNITS) == {'gauss': 1e4, 'millitesla': 1e3, 'microtesla': 1e6, 'nanotesla': 1e9}
 
 
 @pytest.mark.parametrize('i, j', list(combinations(range(4), 2)))
-def test_sensors_in_each_others_place_are_named(i, j):
-    fields = right(np.random.default_rng(7))
+def test_exchanged_sensors_are_identified(i, j):
+    fields = correct_fields(np.random.default_rng(7))
     fields[[i, j]] = fields[[j, i]]
-    found = told(fields)
+    found = explanations_of(fields)
     assert set(found) == {NAMES[i], NAMES[j]}
     assert f'it is exchanged with {NAMES[j]}' in found[NAMES[i]]
     assert f'it is exchanged with {NAMES[i]}' in found[NAMES[j]]
 
 
-def test_one_that_would_fit_anothers_place_is_not_exchanged_with_it():
-    """The other is odd, too, but would not fit here."""
-    fields = right()
+def test_a_match_in_one_direction_is_not_an_exchange():
+    """The other sensor is faulty, too, but does not match the first one."""
+    fields = correct_fields()
     fields[0], fields[1] = fields[1], fields[1] + [9e-6, -7e-6, 8e-6]
-    assert told(fields) == {'a': (), 'b': ()}
+    assert explanations_of(fields) == {'a': (), 'b': ()}
 
 
 @pytest.mark.parametrize('turn', [90.0, 180.0])
-def test_sensors_rotated_by_right_angles_in_each_others_place_are_named(turn):
-    """As most are installed; two sensors with the same two axes flipped are less likely."""
+def test_exchanged_sensors_at_right_angles_are_identified(turn):
+    """Most sensors are installed so; two sensors with the same two flipped axes are less likely."""
     R_ws = np.array([np.eye(3), rotation_about_z(np.deg2rad(turn)), *R_WS[2:]])
-    fields = right(None, R_ws)
+    fields = correct_fields(None, R_ws)
     fields[[0, 1]] = fields[[1, 0]]
-    found = told(fields, R_ws)
+    found = explanations_of(fields, R_ws)
     assert set(found) == {'a', 'b'}
     assert 'it is exchanged with b' in found['a'] and 'it is exchanged with a' in found['b']
 
 
-def test_iron_beside_a_sensor_is_not_explained_away():
-    fields = right()
+def test_iron_near_a_sensor_has_no_explanation():
+    fields = correct_fields()
     fields[1] += [9e-6, -7e-6, 8e-6]
     (d,) = disagreements(NAMES, fields, R_WS, np.tile(STD, (4, 1)), EARTH, BIAS)
     assert (d.sensor, d.explanations) == ('b', ())
@@ -119,122 +119,123 @@ def test_iron_beside_a_sensor_is_not_explained_away():
     assert str(d).startswith("b differs from the Earth's field by 13.9 uT: no axis, unit or")
 
 
-def test_the_message_names_what_would_explain_it():
-    fields = right()
+def test_message_contains_the_explanation():
+    fields = correct_fields()
     fields[0, 2] *= -1.0
     (d,) = disagreements(NAMES, fields, R_WS, np.tile(STD, (4, 1)), EARTH, BIAS)
     assert str(d) == f"a differs from the Earth's field by {d.size * 1e6:.3g} uT: z is flipped"
 
 
-def test_what_cannot_be_seen_is_not_claimed():
-    """An upright sensor with x to the east: x is 2 uT, less than five degrees and a bias."""
+def test_faults_that_are_not_observable_are_not_reported():
+    """Upright sensors with x to the east: 2 uT on x, within a heading error and a bias."""
     R_ws = np.tile(np.eye(3), (3, 1, 1))
-    fields = right(None, R_ws)
+    fields = correct_fields(None, R_ws)
     fields[0, 0] *= -1.0
-    assert told(fields, R_ws) == {}
-    # Of two sensors alike nobody sees that they are exchanged.
-    fields = right(np.random.default_rng(0), R_ws)
+    assert explanations_of(fields, R_ws) == {}
+    # An exchange of two parallel sensors is not observable.
+    fields = correct_fields(np.random.default_rng(0), R_ws)
     fields[[0, 1]] = fields[[1, 0]]
-    assert told(fields, R_ws) == {}
+    assert explanations_of(fields, R_ws) == {}
 
 
 @pytest.mark.parametrize('yaw', [10.0, 30.0, 45.0, 90.0, 180.0])
-def test_a_heading_that_nobody_stated_is_no_fault(yaw):
-    """Turned by less than its deviation; an upright axis that is flipped is seen all the same."""
+def test_an_unknown_heading_is_no_fault(yaw):
+    """The heading is within its std; a flipped vertical axis is detected nevertheless."""
     R_ws, std = np.tile(np.eye(3), (3, 1, 1)), np.deg2rad([0.3, 0.3, 180.0])
-    fields = right(None, R_ws)
+    fields = correct_fields(None, R_ws)
     fields[0] = rotation_about_z(np.deg2rad(yaw)).T @ EARTH
-    assert told(fields, R_ws, std) == {}
+    assert explanations_of(fields, R_ws, std) == {}
     fields[0, 2] *= -1.0
-    assert 'a' in told(fields, R_ws, std)
+    assert 'a' in explanations_of(fields, R_ws, std)
 
 
 @pytest.mark.parametrize('std', [np.deg2rad([0.3, 0.3, 5.0]), np.deg2rad([2.0, 2.0, 2.0])])
 @pytest.mark.parametrize('missing', [None, 2])
 def test_false_alarms_are_as_rare_as_stated(std, missing, n=300):
-    """Against the limit of a single sensor, which a hundredth of its own size tells early."""
+    """Number of alarms within the 99.9 % quantile for the stated probability per sensor."""
     rng = np.random.default_rng(11)
     alarms = 0
     for k in range(n):
         R_ws = Rotation.random(4, random_state=k).as_matrix()
-        fields = right(rng, R_ws, std)
+        fields = correct_fields(rng, R_ws, std)
         if missing is not None:
             fields[:, missing] = np.nan
-        alarms += len(told(fields, R_ws, std))
+        alarms += len(explanations_of(fields, R_ws, std))
     assert alarms <= binom.ppf(0.999, 4 * n, FALSE_ALARM_PROBABILITY)
 
 
 def test_the_statistic_is_chi_square(monkeypatch, n=200):
-    """With a limit that is met often, alarms are as frequent as it says."""
+    """With a false-alarm probability of 0.1, the rate of alarms agrees with it."""
     monkeypatch.setattr('mag_tracking.calibration.agreement.FALSE_ALARM_PROBABILITY', 0.1)
     std, rng = np.deg2rad([0.3, 0.5, 2.0]), np.random.default_rng(12)
     for missing in ([], [2]):
         alarms = 0
         for k in range(n):
             R_ws = Rotation.random(4, random_state=k).as_matrix()
-            fields = right(rng, R_ws, std)
+            fields = correct_fields(rng, R_ws, std)
             fields[:, missing] = np.nan
-            alarms += len(told(fields, R_ws, std))
+            alarms += len(explanations_of(fields, R_ws, std))
         low, high = binom.ppf([0.001, 0.999], 4 * n, 0.1)
         assert low <= alarms <= high
 
 
-def test_sensors_agree_without_being_told_the_field():
-    fields = right(np.random.default_rng(2))
+def test_consensus_does_not_need_the_earth_field():
+    fields = correct_fields(np.random.default_rng(2))
     fields[1] *= -1.0
     fields[3, 1] = np.nan
     with pytest.raises(ValueError, match='three sensors with three axes .* there are 2'):
         consensus(fields[[0, 1, 3]], R_WS[[0, 1, 3]])
-    five, R = np.vstack([fields, right(R_ws=R_WS[:1])]), np.vstack([R_WS, R_WS[:1]])
-    # The one that is wrong has no say, the one with two axes neither.
+    five, R = np.vstack([fields, correct_fields(R_ws=R_WS[:1])]), np.vstack([R_WS, R_WS[:1]])
+    # The faulty sensor and the one with two axes do not contribute.
     assert np.abs(consensus(five, R) - EARTH).max() < 3e-6
-    np.testing.assert_allclose(consensus(right(), R_WS), EARTH, rtol=1e-9)
+    np.testing.assert_allclose(consensus(correct_fields(), R_WS), EARTH, rtol=1e-9)
 
 
 def test_axes_that_are_not_reported_are_not_compared():
-    fields = right(np.random.default_rng(1))
+    fields = correct_fields(np.random.default_rng(1))
     fields[:, 2] = np.nan
-    assert told(fields) == {}
+    assert explanations_of(fields) == {}
     fields[1, 0] *= -1.0
-    assert 'x is flipped' in told(fields)['b']
+    assert 'x is flipped' in explanations_of(fields)['b']
     fields[1] = np.nan
-    assert told(fields) == {}
+    assert explanations_of(fields) == {}
 
 
-def test_the_simplest_explanation_is_the_only_one():
-    """A flipped pair is told as that, not as an order with three signs."""
-    fields = right(np.random.default_rng(4))
+def test_only_the_simplest_explanation_is_reported():
+    """Two flipped axes are not reported as a permutation with three signs."""
+    fields = correct_fields(np.random.default_rng(4))
     fields[2, :2] *= -1.0
-    assert told(fields) == {'c': ('x and y are flipped',)}
+    assert explanations_of(fields) == {'c': ('x and y are flipped',)}
 
 
-def test_two_faults_are_told_apart():
-    fields = right(np.random.default_rng(6))
+def test_two_faults_are_identified_separately():
+    fields = correct_fields(np.random.default_rng(6))
     fields[0, 2] *= -1.0
     fields[3] *= 1e4
-    assert told(fields) == {'a': ('z is flipped',), 'd': ('its unit is gauss',)}
+    assert explanations_of(fields) == {'a': ('z is flipped',), 'd': ('its unit is gauss',)}
 
 
-@pytest.mark.parametrize('sensor, axis', [(j, a) for j, a in np.argwhere(np.abs(right()) > 2e-5)])
-def test_a_flipped_axis_is_named_also_where_iron_is_beside_it(sensor, axis):
-    """Where the axis carries little of the field, flipping it explains little."""
-    said = []
+@pytest.mark.parametrize('sensor, axis', [
+    (j, a) for j, a in np.argwhere(np.abs(correct_fields()) > 2e-5)])
+def test_a_flipped_axis_is_identified_with_iron_nearby(sensor, axis):
+    """Only axes with a large part of the field; flipping another one explains little."""
+    first_explanations = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        fields = right(rng)
+        fields = correct_fields(rng)
         iron = rng.standard_normal(3)
         fields[sensor] += 5e-6 * iron / np.linalg.norm(iron)
         fields[sensor, axis] *= -1.0
-        said += told(fields)[NAMES[sensor]][:1]
-    named = [text for text in said if text.startswith(f'{"xyz"[axis]} is flipped')]
-    # By chance the iron makes two flipped axes fit as well.
+        first_explanations += explanations_of(fields)[NAMES[sensor]][:1]
+    named = [text for text in first_explanations if text.startswith(f'{"xyz"[axis]} is flipped')]
+    # By chance, with the iron, two flipped axes may fit as well.
     assert len(named) >= 18 and sum(' uT' in text for text in named) > 10
 
 
-def test_iron_alone_is_not_called_a_flipped_axis():
+def test_iron_alone_is_not_reported_as_a_flipped_axis():
     rng = np.random.default_rng(0)
     for _ in range(50):
-        fields = right(rng)
+        fields = correct_fields(rng)
         iron = rng.standard_normal(3)
         fields[1] += 1e-5 * iron / np.linalg.norm(iron)
-        assert not any(' uT' in text for text in told(fields).get('b', ()))
+        assert not any(' uT' in text for text in explanations_of(fields).get('b', ()))

@@ -1,4 +1,4 @@
-"""Clock offsets from knocks: law, statistics, and what becomes of a knock that tells nothing."""
+"""Clock offsets from knocks: laws, statistics, and recordings that yield no offset."""
 
 import numpy as np
 import pytest
@@ -13,12 +13,12 @@ NOISE = 0.02
 
 
 def double_sided(t):
-    """As in the recordings: 30 ms to both sides."""
+    """Shape as in the recordings: exponential, 30 ms on both sides."""
     return np.exp(-np.abs(t) / 0.03)
 
 
 def ringing(t):
-    """A post that was struck: it rings at 10 Hz."""
+    """Response of a struck post, which rings at 10 Hz."""
     s = np.maximum(t, 0.0)
     return np.where(t > 0.0, np.exp(-s / 0.08) * np.sin(2.0 * np.pi * 10.0 * s), 0.0)
 
@@ -27,9 +27,9 @@ def smooth(t):
     return np.exp(-0.5 * (t / 0.02)**2)
 
 
-def felt(t, shape=double_sided, knocks=KNOCKS, rotation=None, direction=(0.3, -0.5, 0.8),
+def accelerations(t, shape=double_sided, knocks=KNOCKS, rotation=None, direction=(0.3, -0.5, 0.8),
          rng=None, noise=0.0):
-    """(n, 3) [m/s^2] acceleration at the true times `t`, by a sensor that is turned."""
+    """Accelerations (n, 3) [m/s^2] of a rotated sensor at the true times `t`."""
     level = sum(8.0 * shape(t - k) for k in knocks)
     R = Rotation.identity() if rotation is None else rotation
     a = R.inv().apply(GRAVITY + level[:, None] * np.asarray(direction))
@@ -37,31 +37,31 @@ def felt(t, shape=double_sided, knocks=KNOCKS, rotation=None, direction=(0.3, -0
 
 
 def times(rng, rate, end=5.0):
-    """Irregular by a fifth of an interval, and of any phase."""
+    """Sampling times (n,) [s] of random phase, with a jitter of a fifth of an interval."""
     n = int(end * rate)
     return (np.arange(n) + rng.random() + 0.2 * rng.uniform(-1.0, 1.0, n)) / rate
 
 
-def pair(offset, seed=0, rates=(100.0, 100.0), noise=NOISE, turned=True, **kwargs):
+def pair(offset, seed=0, rates=(100.0, 100.0), noise=NOISE, is_rotated=True, **kwargs):
     """(t, shock, t, shock) of two sensors; the clock of the second is `offset` ahead."""
     rng = np.random.default_rng(seed)
     out = []
     for ahead, rate in zip((0.0, offset), rates, strict=True):
         t = times(rng, rate)
-        R = Rotation.random(random_state=rng) if turned else None
-        out += [t + ahead, shock(felt(t, rotation=R, rng=rng, noise=noise, **kwargs))]
+        R = Rotation.random(random_state=rng) if is_rotated else None
+        out += [t + ahead, shock(accelerations(t, rotation=R, rng=rng, noise=noise, **kwargs))]
     return out
 
 
 @pytest.mark.parametrize('offset', [-0.31, -0.0123, 0.0, 0.0007, 0.0049, 0.05, 0.4])
-def test_the_sensor_that_stamps_later_is_ahead(offset):
+def test_offset_is_positive_if_the_clock_is_ahead(offset):
     lag = knock_lag(*pair(offset, rates=(400.0, 400.0)), 0.5)
     assert lag.reason == '' and lag.correlation > 0.99
-    # A knock of 30 ms, a fraction of a sample.
+    # A tenth of a sample.
     assert abs(lag.offset - offset) < 0.25e-3
 
 
-def test_a_sensor_against_itself_has_no_lag():
+def test_a_sensor_has_no_lag_to_itself():
     t, s, *_ = pair(0.0)
     lag = knock_lag(t, s, t, s, 0.5)
     assert abs(lag.offset) < 2e-6 and lag.correlation == pytest.approx(1.0)
@@ -72,30 +72,30 @@ def test_exchanged_sensors_have_the_opposite_lag(seed):
     p = pair(0.0237, seed, rates=(100.0, 100.0))
     there, back = knock_lag(*p, 0.5), knock_lag(*p[2:], *p[:2], 0.5)
     assert there.reason == back.reason == ''
-    # Which of the two is interpolated is the other way round: a part of a sample remains.
+    # The other sensor is interpolated, so a fraction of a sample remains.
     assert abs(there.offset + back.offset) < 1.5e-3 and there.offset > 0.02
 
 
-def test_what_both_times_are_moved_by_does_not_count():
+def test_a_common_shift_of_the_times_has_no_effect():
     t, s, u, v = pair(0.02)
     a, b = knock_lag(t, s, u, v, 0.5), knock_lag(t + 40.0, s, u + 40.0, v, 0.5)
     assert b.offset == pytest.approx(a.offset, abs=3e-6)
 
 
-def test_how_strongly_each_felt_it_does_not_count():
+def test_size_of_the_knock_has_no_effect():
     t, s, u, v = pair(0.02)
     a, b = knock_lag(t, s, u, v, 0.5), knock_lag(t, s, u, 3.0 * v, 0.5)
     assert b.offset == pytest.approx(a.offset, abs=3e-6)
     assert b.std == pytest.approx(a.std, rel=1e-2)
 
 
-def test_shock_is_the_same_however_the_sensor_is_turned():
+def test_shock_does_not_depend_on_the_orientation():
     t = np.arange(0.0, 5.0, 0.01)
-    a = felt(t)
+    a = accelerations(t)
     for seed in range(5):
         R = Rotation.random(random_state=seed)
         np.testing.assert_allclose(shock(R.apply(a)), shock(a), atol=1e-12)
-    # Rest, not gravity, is zero, and what is missing stays missing.
+    # The shock at rest is zero, and missing values stay missing.
     a[7] = np.nan
     s = shock(a)
     assert np.isnan(s[7]) and np.nanmedian(s) == 0.0
@@ -106,16 +106,16 @@ def test_shock_is_the_same_however_the_sensor_is_turned():
 SHAPES = {'double-sided': double_sided, 'ringing': ringing, 'smooth': smooth}
 
 
-FOLDED = pytest.mark.xfail(strict=True, reason=(
-    'mean square 2.0: what rings at 10 Hz has a cusp every 50 ms where its size is zero, and of '
-    'those 100 Hz shows too little'))
+UNRESOLVED = pytest.mark.xfail(strict=True, reason=(
+    'mean square 2.0: the size of a ringing at 10 Hz has a cusp every 50 ms, which is not resolved '
+    'at 100 Hz'))
 
 
 @pytest.mark.parametrize('shape, rates', [
-    pytest.param(shape, rates, marks=[FOLDED] * (shape == 'ringing' and rates[0] == 100.0))
+    pytest.param(shape, rates, marks=[UNRESOLVED] * (shape == 'ringing' and rates[0] == 100.0))
     for shape in SHAPES for rates in [(100.0, 100.0), (200.0, 100.0), (400.0, 400.0)]])
-def test_the_error_is_as_its_deviation_says(shape, rates, n=60):
-    """The sum of n squares is below its chi-square limit, and the claim is not idle."""
+def test_error_agrees_with_its_std(shape, rates, n=60):
+    """The sum of n squares is below its chi-square limit, and the std is not far too large."""
     squares, missed = [], 0
     for seed in range(n):
         rng = np.random.default_rng(1000 + seed)
@@ -137,14 +137,14 @@ def test_the_error_is_as_its_deviation_says(shape, rates, n=60):
 @pytest.mark.parametrize('rates', [(50.0, 50.0), (50.0, 400.0), (100.0, 100.0), (400.0, 100.0),
                                    (400.0, 400.0)])
 @pytest.mark.parametrize('shape', ['double-sided', 'smooth'])
-def test_the_error_is_a_part_of_a_sample(shape, rates):
+def test_error_is_a_fraction_of_a_sample(shape, rates):
     errors = [knock_lag(*pair(0.0173, seed, rates, shape=SHAPES[shape]), 0.5).offset - 0.0173
               for seed in range(20)]
     assert np.abs(errors).max() < 0.2 / min(rates)
 
 
-def test_ten_hertz_at_rest_and_a_hundred_near_the_knock():
-    """As in the recordings."""
+def test_lag_is_exact_with_10_hz_at_rest_and_100_hz_near_knocks():
+    """The recordings are sampled so."""
     for seed in range(10):
         t, s, u, v = pair(-0.0213, seed)
         keep = []
@@ -155,7 +155,7 @@ def test_ten_hertz_at_rest_and_a_hundred_near_the_knock():
         assert lag.reason == '' and abs(lag.offset + 0.0213) < 1e-3
 
 
-def test_a_sensor_without_a_knock_is_named():
+def test_a_sensor_without_a_knock_is_reported():
     t, s, u, v = pair(0.01)
     still = 0.02 * np.random.default_rng(0).random(len(t))
     for args, text in (((t, still, u, v), 'the reference measured no knock'),
@@ -167,50 +167,50 @@ def test_a_sensor_without_a_knock_is_named():
         assert np.isnan(lag.offset) and np.isnan(lag.std)
 
 
-def test_knocks_that_each_felt_alone_give_no_lag():
+def test_knocks_measured_by_one_sensor_each_yield_no_lag():
     rng = np.random.default_rng(3)
     t = times(rng, 100.0, 12.0)
-    s = shock(felt(t, knocks=(2.0,), rng=rng, noise=NOISE))
-    v = shock(felt(t, knocks=(9.0,), rng=rng, noise=NOISE))
+    s = shock(accelerations(t, knocks=(2.0,), rng=rng, noise=NOISE))
+    v = shock(accelerations(t, knocks=(9.0,), rng=rng, noise=NOISE))
     lag = knock_lag(t, s, t, v, 0.5)
     assert lag.reason.startswith('the knocks are 6.') and 'maximum 0.5 s' in lag.reason
     assert np.isnan(lag.offset)
 
 
-def test_clocks_that_are_decades_apart_are_told_at_once():
+def test_clocks_decades_apart_yield_no_lag():
     t, s, u, v = pair(0.01)
     lag = knock_lag(t, s, u + 1e9, v, 0.5)
     assert lag.reason == 'the knocks are 1e+09 s apart, maximum 0.5 s'
 
 
 @pytest.mark.parametrize('offset', [0.51, 0.52, 0.53, 0.56, 0.6, 0.8, 2.0, -0.52, -0.53, -0.8])
-def test_a_lag_beyond_the_longest_is_none_rather_than_wrong(offset):
+def test_a_lag_beyond_the_maximum_is_never_wrong(offset):
     lag = knock_lag(*pair(offset, knocks=(2.0, 2.8)), 0.5)
     assert lag.reason or abs(lag.offset - offset) < max(5.0 * lag.std, 1e-3)
-    # A sample or two more may be right; far beyond is not looked at.
+    # A lag up to two samples beyond may be correct; larger ones are not searched.
     assert lag.reason or abs(offset) < 0.54
 
 
-def test_an_even_row_of_knocks_is_ambiguous():
+def test_evenly_spaced_knocks_are_ambiguous():
     row = tuple(1.0 + 0.25 * k for k in range(13))
     assert 'unevenly' in knock_lag(*pair(0.02, knocks=row), 0.5).reason
-    # One more, out of step: the row is told apart.
+    # Uneven spacing resolves the ambiguity.
     uneven = tuple(np.cumsum([1.0, 0.25, 0.4, 0.17, 0.33, 0.21, 0.46]))
     assert knock_lag(*pair(0.02, knocks=uneven), 0.5).offset == pytest.approx(0.02, abs=5e-4)
 
 
-def test_a_gap_in_the_readings_does_no_harm():
+def test_a_gap_in_the_readings_does_not_affect_the_lag():
     t, s, u, v = pair(0.02)
     keep = (u < 2.4) | (u > 2.9)
     assert knock_lag(t, s, u[keep], v[keep], 0.5).offset == pytest.approx(0.02, abs=5e-4)
-    # A gap that swallows one of the knocks of one sensor: no lag, or the right one.
+    # A gap over a knock of one sensor: no lag, or the correct one.
     keep = (u < 1.8) | (u > 2.3)
     lag = knock_lag(t, s, u[keep], v[keep], 0.5)
     assert lag.reason or lag.offset == pytest.approx(0.02, abs=1e-3)
 
 
 @pytest.mark.parametrize('first', [1.9, 1.96, 1.98, 2.0, 2.02])
-def test_a_recording_that_begins_in_a_knock(first):
+def test_a_recording_cut_in_a_knock_yields_no_wrong_lag(first):
     t, s, u, v = pair(0.02, knocks=(2.0,))
     for a in ((t[t > first], s[t > first], u, v), (t, s, u[u > first], v[u > first]),
               (t[t < first], s[t < first], u[u < first], v[u < first])):
@@ -218,7 +218,7 @@ def test_a_recording_that_begins_in_a_knock(first):
         assert lag.reason or abs(lag.offset - 0.02) < max(5.0 * lag.std, 2e-3)
 
 
-def test_what_is_not_a_number_is_left_out():
+def test_nan_readings_are_ignored():
     t, s, u, v = pair(0.02)
     before = knock_lag(t, s, u, v, 0.5)
     s[5:400:9], v[3:400:11] = np.nan, np.nan
@@ -228,7 +228,7 @@ def test_what_is_not_a_number_is_left_out():
     assert none.reason == 'the reference measured no knock'
 
 
-def test_times_that_do_not_increase_are_refused():
+def test_times_that_do_not_increase_are_rejected():
     t, s, u, v = pair(0.02)
     with pytest.raises(ValueError, match='times of the reference do not increase'):
         knock_lag(t[::-1], s, u, v, 0.5)

@@ -1,4 +1,4 @@
-"""Decimation: what passes, what does not, and when it was."""
+"""Decimation: frequency response, timestamps, noise and restarts."""
 
 import numpy as np
 import pytest
@@ -15,26 +15,25 @@ NS = 10**9
 
 
 def run(decimator, t, field):
-    """(stamps [s], fields) that come out."""
+    """Timestamps [s] and fields after decimation."""
     out = [o for s, f in zip(t, field, strict=True)
            for o in decimator.feed(int(round(s * NS)), f)]
     return np.array([s / NS for s, _ in out]), np.array([f for _, f in out]).reshape(-1, 3)
 
 
 @pytest.mark.parametrize('factor', [2, 4, 8, 10])
-def test_what_would_be_folded_is_taken_out(factor):
+def test_lowpass_passes_the_band_and_suppresses_aliases(factor):
     taps = lowpass(factor)
     assert len(taps) % 2 and taps.sum() == pytest.approx(1.0)
     np.testing.assert_allclose(taps, taps[::-1])
     w, h = freqz(taps, worN=8192)
     nyquist = np.pi / factor
-    passed, folded = w < 0.5 * nyquist, w > 1.5 * nyquist
+    passed, aliased = w < 0.5 * nyquist, w > 1.5 * nyquist
     assert np.abs(np.abs(h[passed]) - 1.0).max() < 2e-3
-    assert np.abs(h[folded]).max() < 2e-3
+    assert np.abs(h[aliased]).max() < 2e-3
 
 
-def test_a_ramp_keeps_its_place_in_time():
-    """The delay of the filter is not in the stamps."""
+def test_timestamps_compensate_the_delay_of_the_filter():
     t = 100.0 + np.arange(0.0, 4.0, 0.005)
     ramp = np.outer(t - 100.0, [1.0, -2.0, 0.5])
     stamps, fields = run(Decimator(25.0), t, ramp)
@@ -43,41 +42,41 @@ def test_a_ramp_keeps_its_place_in_time():
     np.testing.assert_allclose(fields, np.outer(stamps - 100.0, [1.0, -2.0, 0.5]), atol=1e-8)
 
 
-def test_a_hum_does_not_come_back_as_something_slow():
+def test_a_hum_is_not_aliased():
     t = np.arange(0.0, 10.0, 1 / 400)
-    # 52 Hz would be folded to 2 Hz at 25 Hz.
+    # 52 Hz would be aliased to 2 Hz at 25 Hz.
     hum = np.outer(np.sin(2 * np.pi * 52.0 * t), np.ones(3))
     _, fields = run(Decimator(25.0), t, hum)
     assert np.abs(fields).max() < 2e-3 and len(fields) > 200
     assert np.abs(hum[::16]).max() > 0.9
 
 
-def test_noise_is_as_much_less_as_it_says():
+def test_noise_is_reduced_by_the_stated_gain():
     rng = np.random.default_rng(0)
     d = Decimator(20.0)
     with pytest.raises(ValueError, match='not known'):
         d.noise_gain()
     _, fields = run(d, np.arange(0.0, 300.0, 0.005), rng.standard_normal((60000, 3)))
-    # White noise comes out nearly white: so many independent values.
+    # The output of white noise is nearly white, so all values are independent.
     assert fields.var() == pytest.approx(d.noise_gain(), rel=4 * np.sqrt(2 / fields.size))
     assert d.noise_gain() < 0.12
 
 
-def test_a_gap_and_a_step_of_the_clock_begin_anew():
+def test_a_gap_or_a_clock_step_restarts_the_filter():
     t = np.arange(0.0, 6.0, 0.01)
     t[300:] += 1.0
     t[450:] -= 3.0
     level = np.zeros((600, 3))
     level[300:] = 1.0
     stamps, fields = run(Decimator(10.0), t, level)
-    # Nothing of one side of the gap in the other.
+    # No value mixes both sides of a gap.
     assert set(np.round(fields[:, 0], 6)) <= {0.0, 1.0}
     before = stamps < 2.99
     assert 20 < before.sum() < len(stamps) - 10
     assert set(np.round(fields[stamps > 3.5, 0], 6)) == {1.0}
 
 
-def test_a_slow_sensor_is_left_alone():
+def test_a_slow_sensor_is_not_decimated():
     rng = np.random.default_rng(1)
     t, field = np.arange(0.0, 10.0, 0.1), rng.standard_normal((100, 3))
     d = Decimator(25.0)
@@ -94,8 +93,8 @@ def test_a_missing_axis_stays_missing():
     assert len(fields) and np.isnan(fields[:, 2]).all() and (np.abs(fields[:, :2] - 1) < 1e-9).all()
 
 
-def test_the_stage_thins_and_tells():
-    """A reading's own covariance is the filtered one's; duplicates do not reach the filter."""
+def test_stage_decimates_and_propagates_the_covariance():
+    """The covariance of a reading is scaled by the noise gain; duplicates are not filtered."""
     network = line_network(1)
     stage = Calibrate(network, replace(CalibrateSettings(), {'decimate_to_hz': 20.0}))
     rng = np.random.default_rng(2)
@@ -107,7 +106,7 @@ def test_the_stage_thins_and_tells():
             out += fed(stage, sample)
     assert stage.counts['rejected: duplicate timestamp'] == 667
     assert stage.counts_of('mag_1')['accepted'] == 2000
-    # Of 200 samples until the background is known none comes out.
+    # There is no output until the background is known, after 200 samples.
     assert len(out) == stage.counts['calibrated'] > 120
     gain = Decimator(20.0)
     run(gain, np.arange(0.0, 1.0, 0.005), np.zeros((200, 3)))

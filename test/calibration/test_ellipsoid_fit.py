@@ -1,4 +1,4 @@
-"""Hard and soft iron from the sizes of a tumbled sensor's readings."""
+"""Hard and soft iron from the readings of a tumbled sensor."""
 
 import re
 
@@ -22,7 +22,7 @@ PERIOD = 618
 
 
 def tumbling(n):
-    """(n, 3) unit vectors that go round smoothly, all over the sphere."""
+    """Unit vectors (n, 3) on a smooth curve that covers the sphere."""
     k = np.arange(n)
     z = 0.98 * np.cos(2.0 * np.pi * k / PERIOD * 1.236)
     rho, angle = np.sqrt(1.0 - z * z), 2.0 * np.pi * k / PERIOD * 13.0
@@ -30,13 +30,13 @@ def tumbling(n):
 
 
 def scattered(n, seed=0):
-    """(n, 3) unit vectors at random."""
+    """Random unit vectors (n, 3)."""
     u = np.random.default_rng(seed).standard_normal((n, 3))
     return u / np.linalg.norm(u, axis=1)[:, None]
 
 
 def readings(u, noise=0.01, seed=1, correction=CORRECTION, offset=OFFSET):
-    """(n, 3) readings of a field of size one from directions `u`."""
+    """Readings (n, 3) of a field of size one from directions `u`."""
     field = u + noise * np.random.default_rng(seed).standard_normal(u.shape)
     return offset + np.linalg.solve(correction, field.T).T
 
@@ -58,11 +58,12 @@ def recordings():
 
 RECORDINGS = [('tumbled', 0.015, 0.31951, [0.148, 0.389, -0.059], 5e-4),
               ('counts', 0.03, 0.09519, [6195.0, 250.0, 3480.0], 0.5)]
-"""Largest residual, residual before, offset of another program and half of its last digit."""
+"""Maximum residual, residual before, offset by another program and half of its last digit."""
 
 
 @pytest.mark.parametrize('name, limit, before, offset, digit', RECORDINGS)
-def test_recordings(recordings, name, limit, before, offset, digit):
+def test_fits_of_recordings_agree_with_another_program(recordings, name, limit, before, offset,
+                                                       digit):
     y = recordings[name]
     fit = fit_ellipsoid(y)
     print(f'{name}: {fit.residual_before:.5f} to {fit.residual:.5f}, offset {fit.offset} '
@@ -84,11 +85,11 @@ def test_half_of_a_recording_predicts_the_other(recordings, name, limit):
     fits = [fit_ellipsoid(y[k::2], field_size=1.0) for k in (0, 1)]
     for fit, rest in zip(fits, (y[1::2], y[::2]), strict=True):
         assert spread(fit.correct(rest)) <= limit
-    # Neighbours share their errors: the two differ by less than either is off the truth.
+    # Adjacent readings share errors, so the two fits differ by less than their errors.
     assert (np.abs(fits[0].offset - fits[1].offset) < 3.0 * fits[0].offset_std).all()
 
 
-def test_a_recording_of_a_still_sensor_is_refused(recordings):
+def test_a_recording_of_a_sensor_at_rest_is_rejected(recordings):
     fit = fit_ellipsoid(recordings['counts'][:3000])
     assert not fit.converged and 'a sensor at rest' in fit.reason
 
@@ -111,7 +112,7 @@ def test_exact_readings_give_exact_parameters(seed, decade):
 
 @pytest.mark.parametrize('unit', [1e-9, 3e-5, 2e4])
 @pytest.mark.parametrize('size', [None, 5e-5])
-def test_units_change_nothing_else(unit, size):
+def test_units_only_scale_the_result(unit, size):
     y = readings(tumbling(1000))
     one, other = fit_ellipsoid(y, size), fit_ellipsoid(unit * y, size)
     scale = unit if size is None else 1.0
@@ -124,7 +125,7 @@ def test_units_change_nothing_else(unit, size):
         np.testing.assert_allclose(b, a, rtol=1e-5)
 
 
-def test_the_field_size_given_is_that_of_the_corrected_field():
+def test_corrected_field_has_the_given_size():
     y = readings(tumbling(1000))
     free, fit = fit_ellipsoid(y), fit_ellipsoid(y, 5e-5)
     assert fit.field_size == 5e-5 and fit.field_size_std == 0.0 and free.field_size_std > 0.0
@@ -134,14 +135,14 @@ def test_the_field_size_given_is_that_of_the_corrected_field():
     assert np.array_equal(fit.offset, free.offset)
 
 
-def test_turned_and_shifted_readings_turn_and_shift_the_fit():
+def test_rotated_and_shifted_readings_rotate_and_shift_the_fit():
     y = readings(tumbling(3000))
     one = fit_ellipsoid(y)
     for seed in range(4):
         R = special_ortho_group.rvs(3, random_state=seed)
         shift = np.array([5.0, -3.0, 2.0])
         other = fit_ellipsoid(y @ R.T + shift)
-        # The cells stay where they are, and with them the weights change a little.
+        # The cells do not rotate with the readings, so the weights change slightly.
         assert np.abs(R.T @ (other.offset - shift) - one.offset).max() \
             < 0.3 * one.offset_std.max()
         assert np.abs(R.T @ other.correction @ R - one.correction).max() \
@@ -149,8 +150,8 @@ def test_turned_and_shifted_readings_turn_and_shift_the_fit():
         assert other.coverage == pytest.approx(one.coverage, abs=0.05)
 
 
-def test_the_optimum_is_that_of_a_general_solver():
-    """Of the soft L1 of sizes, with differences for a Jacobian; evenly spread, all weights one."""
+def test_optimum_is_that_of_a_general_solver():
+    """Soft L1 loss of the sizes, numerical Jacobian; evenly spread readings have unit weights."""
     y = readings(scattered(2000), 0.03)
     y[::30] = OFFSET + 1.3 * (y[::30] - OFFSET)
     rows, columns = np.triu_indices(3)
@@ -171,9 +172,11 @@ def test_the_optimum_is_that_of_a_general_solver():
 
 
 @pytest.mark.parametrize('correlation', studied([0.0, 0.8], [0.0]))
-def test_the_stated_deviations_cover_the_truth(correlation):
-    """Also where noise is correlated in time, as that of real sensors is. It is small: the radius
-    is too large by its square."""
+def test_stated_stds_cover_the_truth(correlation):
+    """Also for noise that is correlated in time, as that of real sensors.
+
+    The noise is small, because the radius is biased by its square.
+    """
     n_runs, n, rng = 150, 1500, np.random.default_rng(3)
     u, errors = tumbling(n), []
     for _ in range(n_runs):
@@ -192,23 +195,23 @@ def test_the_stated_deviations_cover_the_truth(correlation):
     assert (low <= inside.sum(axis=0)).all() and (inside.sum(axis=0) <= high).all()
 
 
-def test_a_field_whose_size_wanders_leaves_the_shape_certain():
-    """Each stretch of time sees the whole sphere at a size of its own; det(correction) is one."""
+def test_a_varying_field_size_does_not_affect_the_std_of_the_shape():
+    """Each time block covers the whole sphere with its own field size; det(correction) is one."""
     size = 1.0 + 0.02 * np.random.default_rng(6).standard_normal(N_BLOCKS)
     fit = fit_ellipsoid(readings(tumbling(20000) * np.repeat(size, 20000 // N_BLOCKS)[:, None]))
     assert fit.field_size_std == pytest.approx(0.02 / np.sqrt(N_BLOCKS), rel=0.4)
     assert np.diagonal(fit.correction_std).max() < 0.5 * fit.field_size_std
 
 
-def test_a_still_sensor_weighs_no_more_than_one_direction():
-    """Something bends the field by three percent in a pattern that no ellipsoid follows."""
+def test_readings_at_rest_weigh_no_more_than_one_direction():
+    """The field is distorted by 3 % in a pattern that no ellipsoid describes."""
     u = tumbling(2000)
     x, y, z = u.T
     bent = readings(u * (1.0 + 0.03 * (5.0 * z**3 - 3.0 * z) / 2.0)[:, None], 0.002)
     still = readings(np.tile([0.0, 0.0, 1.03], (6000, 1)), 0.002, seed=5)
     even, piled = fit_ellipsoid(bent), fit_ellipsoid(np.concatenate([still, bent]))
     assert piled.converged
-    # The pile has the weight of three cells in five hundred; as readings, of three in four.
+    # The readings at rest weigh as 3 of 500 cells, although they are 3 of 4 readings.
     assert np.abs(piled.offset - even.offset).max() < 0.001
 
 
@@ -225,18 +228,18 @@ def test_outliers_are_bounded_and_counted(factor):
     assert fit.residual == pytest.approx(spread(fit.correct(y)), rel=1e-12)
 
 
-def test_glitches_are_left_out_and_counted():
+def test_glitches_are_excluded_and_counted():
     y = readings(tumbling(2000))
     clean = fit_ellipsoid(y)
     y[::100] = [[32767.0, -32768.0, 40.0]]
     fit = fit_ellipsoid(y)
     assert fit.converged and fit.n_outliers == 20 and fit.n_readings == 1980
     assert (np.abs(fit.offset - clean.offset) < clean.offset_std).all()
-    # Nothing is left out of the residual.
+    # The residual includes all readings.
     assert fit.residual > 1.0 and any('residual' in w for w in fit.warnings)
 
 
-def test_missing_readings_are_left_out_and_counted():
+def test_missing_readings_are_excluded_and_counted():
     y = readings(tumbling(1000))
     gaps = np.insert(y, range(0, 1000, 10), [np.nan, 1.0, 1.0], axis=0)
     fit, whole = fit_ellipsoid(gaps), fit_ellipsoid(y)
@@ -246,7 +249,7 @@ def test_missing_readings_are_left_out_and_counted():
     assert fit.residual == whole.residual and fit.residual_before == whole.residual_before
 
 
-def test_readings_at_the_end_of_the_range_are_left_out_and_named():
+def test_saturated_readings_are_excluded_and_reported():
     y = readings(tumbling(20000))
     top = 0.5 * (OFFSET[1] + y[:, 1].max())
     y[:, 1] = np.minimum(y[:, 1], top)
@@ -260,7 +263,7 @@ def test_readings_at_the_end_of_the_range_are_left_out_and_named():
 
 
 def ball(n):
-    """(n, 3) vectors that fill a ball."""
+    """Vectors (n, 3) that fill a ball."""
     return scattered(n) * np.cbrt(np.random.default_rng(9).uniform(size=n))[:, None]
 
 
@@ -295,14 +298,14 @@ LONG = np.diag([1.0, 1.0, 8.0])
     (readings(POSES, 1e-4), '^15 different directions, minimum 18'),
     (readings(EVEN) * np.where(np.arange(1500) % 25 == 0, 100.0, 1.0)[:, None],
      'share of 0.96 of the readings are outliers, maximum 0.2')])
-def test_what_cannot_be_fitted_is_refused(y, reason):
+def test_readings_that_cannot_be_fitted_are_rejected(y, reason):
     fit = fit_ellipsoid(y)
     print(fit.reason)
     assert not fit.converged and re.search(reason, fit.reason)
 
 
 @pytest.mark.parametrize('seed', range(40))
-def test_a_fit_that_is_not_refused_is_near_the_truth(seed):
+def test_an_accepted_fit_is_near_the_truth(seed):
     """Parts of the sphere of any shape, few readings, much noise."""
     rng = np.random.default_rng(seed)
     u = scattered(1200, seed)
@@ -316,13 +319,13 @@ def test_a_fit_that_is_not_refused_is_near_the_truth(seed):
         assert np.linalg.norm(fit.offset - OFFSET) < 0.1
 
 
-def test_an_offset_that_is_uncertain_is_refused():
+def test_an_uncertain_offset_is_rejected():
     fit = fit_ellipsoid(readings(U[U[:, 2] > -0.3][:60], 0.06, seed=4))
     print(fit.reason)
     assert not fit.converged and 'the standard deviation of the offset is 0.' in fit.reason
 
 
-def test_least_squares_that_stop_early_are_refused(monkeypatch):
+def test_least_squares_without_convergence_are_rejected(monkeypatch):
     solve = ellipsoid_refinement.least_squares
     monkeypatch.setattr(ellipsoid_refinement, 'least_squares',
                         lambda *a, **k: solve(*a, **(k | {'max_nfev': 1})))
@@ -330,20 +333,20 @@ def test_least_squares_that_stop_early_are_refused(monkeypatch):
     assert not fit.converged and 'least squares did not converge' in fit.reason
 
 
-@pytest.mark.parametrize('y, note', [
+@pytest.mark.parametrize('y, warning', [
     (readings(U[np.abs(U[:, 2]) < 0.5]), 'coverage 0.0.*, recommended at least 0.1'),
     (readings(U[(U < 0.0).any(axis=1)]), r'few or no readings from \+x\+y\+z$'),
     (readings(EVEN, 0.08), 'residual 0.0.* after correction, recommended at most 0.05')])
-def test_what_is_mediocre_is_warned_of(y, note):
+def test_readings_of_poor_quality_raise_a_warning(y, warning):
     fit = fit_ellipsoid(y)
-    assert fit.converged and len(fit.warnings) == 1 and re.match(note, fit.warnings[0])
+    assert fit.converged and len(fit.warnings) == 1 and re.match(warning, fit.warnings[0])
 
 
-def test_coverage_is_that_of_the_directions():
-    """Known: the harmonics to degree two, integrated over part of a sphere."""
+def test_coverage_equals_the_known_values():
+    """Known values: harmonics up to degree two, integrated over part of a sphere."""
     u = scattered(60000)
-    for least, known in [(-1.0, 1.0), (-0.5, 0.10852), (0.0, 0.0078433)]:
-        fit = fit_ellipsoid(readings(u[u[:, 0] > least], 0.0))
+    for min_x, known in [(-1.0, 1.0), (-0.5, 0.10852), (0.0, 0.0078433)]:
+        fit = fit_ellipsoid(readings(u[u[:, 0] > min_x], 0.0))
         assert fit.coverage == pytest.approx(known, rel=0.25)
 
 
@@ -355,6 +358,6 @@ def test_coverage_is_that_of_the_directions():
     (EVEN, -1.0, 'field_size is -1.0, must be positive'),
     (EVEN, np.nan, 'field_size is nan, must be positive'),
     (EVEN, np.inf, 'field_size is inf, must be positive')])
-def test_bad_input_is_named(y, size, message):
+def test_invalid_arguments_raise_value_error(y, size, message):
     with pytest.raises(ValueError, match=message):
         fit_ellipsoid(y, size)

@@ -1,4 +1,4 @@
-"""Vehicles that come and vehicles that leave, told apart by either end of the change of a field."""
+"""Arrivals and departures of vehicles, distinguished by the two ends of a level change."""
 
 import dataclasses
 from functools import partial
@@ -22,11 +22,11 @@ BLOCK_S = 0.25
 
 
 @pytest.mark.parametrize('ratio', [4.0, 10.0, 40.0])
-def test_growth_from_afar_and_from_rest_are_as_theory_says(ratio):
-    """Sizes at even times: (distance)^-3 at a constant speed, and the square of the time."""
+def test_growth_of_an_approach_and_of_a_start_agrees_with_theory(ratio):
+    """Sizes: distance^-3 at constant speed, and the square of the time."""
     t = np.linspace(0.0, 1.0, 4001)
     near = ratio**(-1.0 / 3.0)
-    # From a little below 1 to a little above the ratio.
+    # The size grows from slightly below 1 to slightly above the ratio.
     distance = 1.02 - (1.05 - 0.98 * near) * t
     for size, each in ((distance**-3.0, ratio**(1.0 / 12.0)),
                        (1.1 * ratio * t**2, ratio**-0.125)):
@@ -36,13 +36,13 @@ def test_growth_from_afar_and_from_rest_are_as_theory_says(ratio):
         assert growth.early + growth.late == growth.whole
 
 
-def test_no_growth_is_timed_that_has_no_beginning_or_no_end():
+def test_growth_without_start_or_end_is_not_evaluated():
     t = np.arange(6.0)
     assert growth_of(t, np.array([2.0, 3.0, 4.0, 6.0, 8.0, 20.0]), 1.0, 10.0) is None
     assert growth_of(t, np.array([0.5, 1.0, 2.0, 3.0, 4.0, 5.0]), 1.0, 10.0) is None
 
 
-def test_no_growth_is_timed_across_a_gap():
+def test_growth_across_a_gap_is_not_evaluated():
     t, size = np.arange(12.0), 0.3 * 1.5**np.arange(12.0)
     whole, parted = np.arange(12), np.r_[0:4, 7:12]
     quarter = np.log(10.0) / np.log(1.5) / 4.0
@@ -51,7 +51,7 @@ def test_no_growth_is_timed_across_a_gap():
 
 
 def ride(t, at, acceleration, top, stops):
-    """(n,) [m] along the road: to rest at a time `at` [s], or from rest."""
+    """Position (n,) [m] along the road of a vehicle that stops or starts at time `at` [s]."""
     since = np.maximum(at - t if stops else t - at, 0.0)
     straight = np.minimum(since, top / acceleration)
     way = 0.5 * acceleration * straight**2 + top * (since - straight)
@@ -59,7 +59,7 @@ def ride(t, at, acceleration, top, stops):
 
 
 def vehicle(seed, stops, at=12.0):
-    """Signal (3,) [T] of t [s]: of one that stops beside a sensor, or stood there and leaves."""
+    """Signal (3,) [T] over t [s] of a vehicle that stops at a sensor, or starts from there."""
     rng = np.random.default_rng(seed)
     moment = rng.uniform(200.0, 600.0) * _direction(rng)
     place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
@@ -77,31 +77,31 @@ def _direction(rng):
 
 
 def blocks_of(signal, seconds, seed=0):
-    """`Blocks` of a signal, with the noise of 25 readings in each."""
+    """`Blocks` of a signal, each with the noise of the mean of 25 readings."""
     time = np.arange(0.5 * BLOCK_S, seconds, BLOCK_S)
     noise = np.random.default_rng(seed).standard_normal((len(time), 3)) * SIGMA / 5.0
     mean = np.array([signal(t) for t in time]) + noise
     return Blocks(time, mean, np.zeros((len(time), 3, 3)), np.full((len(time), 3), 25.0))
 
 
-def judged(blocks, n_steady=12):
+def evaluated(blocks, n_steady=12):
     before = np.tile(blocks.mean[:6].mean(axis=0), (len(blocks.time), 1))
     return level_change(blocks, n_steady, before, SIGMA, 0.0)
 
 
-def backwards(blocks):
+def time_reversed(blocks):
     return blocks._replace(mean=blocks.mean[::-1])
 
 
 @pytest.mark.parametrize('stops', [True, False])
-def test_a_vehicle_that_stops_has_come_and_one_that_starts_has_left(stops):
-    """Eighty vehicles each; forwards and backwards in time the same change says the opposite."""
+def test_a_stopping_vehicle_has_arrived_and_a_starting_one_has_departed(stops):
+    """Eighty vehicles each; in reversed time, the same change gives the opposite result."""
     verdicts = []
     for seed in range(80):
         begin, end = (0.0, 16.0) if stops else (8.0, 30.0)
         signal = vehicle(seed, stops)
         blocks = blocks_of(lambda t, s=signal, b=begin: s(t + b), end - begin, seed)
-        found, reverse = judged(blocks), judged(backwards(blocks))
+        found, reverse = evaluated(blocks), evaluated(time_reversed(blocks))
         if found.size >= CLEAR_SIZE:
             verdicts.append(found.has_departed)
             assert found.has_departed is None \
@@ -113,7 +113,7 @@ def test_a_vehicle_that_stops_has_come_and_one_that_starts_has_left(stops):
 
 
 def queue(seed):
-    """(signal, end [s]): a vehicle stops beside a sensor, and soon another one behind it."""
+    """(signal, end [s]): a vehicle stops at a sensor, and soon another one behind it."""
     rng = np.random.default_rng(seed)
     gap, delay = rng.uniform(6.0, 8.0), rng.uniform(1.5, 5.0)
     place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
@@ -127,26 +127,28 @@ def queue(seed):
     return signal, 12.0 + delay
 
 
-@pytest.mark.parametrize('what', ['queue', 'reverse'])
-def test_a_queue_and_a_vehicle_that_parks_backwards_have_not_left(what):
-    """Whenever the latest two seconds are steady. One in fifty queues is taken for it; the aim is
-    none."""
-    left, came = 0, 0
+@pytest.mark.parametrize('case', ['queue', 'reverse'])
+def test_a_queue_or_a_reversing_vehicle_has_not_departed(case):
+    """Evaluated whenever the latest two seconds are steady.
+
+    One of fifty queues is classified as a departure; the aim is zero.
+    """
+    n_departed, n_arrived = 0, 0
     for seed in range(50):
-        signal, end = queue(seed) if what == 'queue' else reverse(seed)
+        signal, end = queue(seed) if case == 'queue' else reverse(seed)
         blocks = blocks_of(signal, end + 8.0, seed)
         verdicts = set()
         for k in range(round(14.0 / BLOCK_S), len(blocks.time)):
             so_far = Blocks(*(values[:k] for values in blocks))
             latest = so_far.mean[-8:]
             if (np.abs(latest - latest.mean(axis=0)) < 2.0 * SIGMA).all():
-                verdicts.add(judged(so_far, 8).has_departed)
-        left, came = left + (True in verdicts), came + (False in verdicts)
-    assert left <= 1 and came > 20
+                verdicts.add(evaluated(so_far, 8).has_departed)
+        n_departed, n_arrived = n_departed + (True in verdicts), n_arrived + (False in verdicts)
+    assert n_departed <= 1 and n_arrived > 20
 
 
 def reverse(seed):
-    """(signal, end [s]): a vehicle drives on by 6 m, stands for a second, and reverses."""
+    """(signal, end [s]): a vehicle overshoots by 6 m, stands for a second, and reverses."""
     rng = np.random.default_rng(seed)
     moment = rng.uniform(200.0, 600.0) * _direction(rng)
     place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
@@ -158,28 +160,28 @@ def reverse(seed):
     return signal, 19.0
 
 
-def test_a_jump_a_ramp_and_a_small_change_are_not_decided():
+def test_a_step_a_ramp_and_a_small_change_are_not_decided():
     def ramp(t, length=2.0, size=1e-6):
         return size * np.clip((t - 6.0) / length, 0.0, 1.0) * np.ones(3)
     for signal in (lambda t: ramp(t, 1e-3), ramp, lambda t: 1e-3 * vehicle(0, True)(t)):
-        assert judged(blocks_of(signal, 16.0)).has_departed is None
+        assert evaluated(blocks_of(signal, 16.0)).has_departed is None
 
 
-def test_a_change_that_is_not_clear_is_judged_by_a_clear_one():
+def test_a_change_that_is_not_clear_is_decided_by_a_clear_one():
     shared = SharedChanges()
     weak = LevelChange(100.0, 0.5 * CLEAR_SIZE, False)
     strong = LevelChange(101.0, 2.0 * CLEAR_SIZE, True)
     assert shared.evaluate_change(0, weak) is False
     assert shared.evaluate_change(1, strong) is True
     assert shared.evaluate_change(0, weak) is True
-    # Not by one of another time, and a clear one only by itself.
+    # A change at another time has no effect, and a clear change is evaluated alone.
     assert shared.evaluate_change(0, dataclasses.replace(weak, since=90.0)) is False
     assert shared.evaluate_change(2, dataclasses.replace(
         strong, size=1.5 * CLEAR_SIZE, has_departed=False)) is False
 
 
 def is_clear(seed):
-    """Whether the field of a vehicle where it stands is one that is judged alone."""
+    """Whether the field of the standing vehicle is a clear change, with a margin."""
     field = vehicle(seed, stops=True, at=0.0)(1.0)
     return np.linalg.norm(field / SIGMA) > 1.2 * CLEAR_SIZE
 
@@ -189,30 +191,32 @@ CLEAR = [seed for seed in range(20) if is_clear(seed)][:4]
 
 @pytest.mark.parametrize('seed', CLEAR)
 @pytest.mark.parametrize('rate', [100.0, 20.0])
-def test_a_vehicle_that_leaves_is_no_background_three_seconds_later(seed, rate):
-    """By then it is 30 m away or more; its own tail is within the noise of one reading. At 20 Hz,
-    where blocks are of 0.4 s, it takes a second longer."""
+def test_a_departed_vehicle_is_removed_from_the_background_in_seconds(seed, rate):
+    """By then the vehicle is at least 30 m away and its field is within the noise of one reading.
+
+    At 20 Hz, with blocks of 0.4 s, the replacement takes a second longer.
+    """
     signal = vehicle(seed, stops=False, at=15.0)
     b = running()
     b.sensors['first_ns'] = 0
     end = 22.5 if rate == 100.0 else 23.5
     feed(b, np.arange(0.0, end, 1.0 / rate), signal=signal)
     assert b.n_relearnt == 1 and (np.abs(b.level(end) - EARTH - signal(end)) < 2.0 * SIGMA).all()
-    # All that was measured against it is doubtful, and nothing is from now on.
+    # All readings with the replaced background are doubtful, later ones are not.
     (begin, end_ns), = b.doubtful_times
     assert 0 < begin < 1e9 and end_ns is not None and not b.doubtful
     assert b.departed_at == pytest.approx(19.5, abs=2.5)
 
 
 @pytest.mark.parametrize('seed', CLEAR)
-def test_a_vehicle_that_stops_is_no_background_while_a_traffic_light_is_red(seed):
-    """Though the background was seen for a few seconds only, it is not doubted for that."""
+def test_a_vehicle_at_a_red_light_does_not_become_the_background(seed):
+    """The background is not doubted, although it was measured for a few seconds only."""
     b = running(relearn=120.0)
     feed(b, np.arange(0.0, 70.0, 0.02), signal=vehicle(seed, stops=True, at=12.0))
     assert b.frozen and not b.n_relearnt and not b.doubtful and b.departed_at is None
 
 
-def test_one_axis_is_judged_too_and_one_that_is_missing_holds_up_nothing():
+def test_one_axis_is_sufficient_and_a_missing_axis_causes_no_delay():
     signal = vehicle(CLEAR[0], stops=False, at=15.0)
     one, two = running(), running()
     rng = np.random.default_rng(0)
@@ -225,7 +229,7 @@ def test_one_axis_is_judged_too_and_one_that_is_missing_holds_up_nothing():
     assert (np.abs(two.level(24.0) - EARTH) < SIGMA)[:2].all()
 
 
-def test_a_level_of_before_the_time_jumped_back_judges_nothing():
+def test_a_change_before_a_backward_time_jump_is_not_used():
     shared = SharedChanges()
     b = running(evaluate_change=partial(shared.evaluate_change, 1))
     shared.evaluate_change(1, LevelChange(100.0, 2.0 * CLEAR_SIZE, True))
@@ -233,7 +237,7 @@ def test_a_level_of_before_the_time_jumped_back_judges_nothing():
     assert shared.evaluate_change(0, LevelChange(100.0, 1.0, None)) is None
 
 
-def test_a_background_that_was_given_is_not_replaced_by_a_level_that_is_left():
+def test_a_given_background_is_not_replaced_after_a_departure():
     signal = vehicle(CLEAR[0], stops=False, at=15.0)
     b = running(background=EARTH + signal(0.0), noise_std=SIGMA)
     feed(b, np.arange(0.0, 22.5, 0.01), signal=signal)

@@ -1,4 +1,4 @@
-"""Tilt and heading: laws, honest deviations, and what cannot be told."""
+"""Tilt and heading: laws, consistent standard deviations, and unobservable headings."""
 
 import numpy as np
 import pytest
@@ -24,24 +24,24 @@ EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 UP = np.array([0.0, 0.0, 1.0])
 BIAS = 6e-7
 
-POSTURES = {'upright': np.eye(3), 'on its head': Rotation.from_euler('x', 180.0, True).as_matrix(),
+POSTURES = {'upright': np.eye(3), 'upside down': Rotation.from_euler('x', 180.0, True).as_matrix(),
             'on its side': Rotation.from_euler('x', 90.0, True).as_matrix(),
             'on its front': Rotation.from_euler('y', -90.0, True).as_matrix(),
             'askew': Rotation.from_euler('zyx', [130.0, 40.0, -70.0], True).as_matrix()}
 
 
 def up_of(R_ws, std=0.0):
-    """`UpDirection` of a sensor that is turned by `R_ws`."""
+    """`UpDirection` of a sensor with orientation `R_ws`."""
     return UpDirection(R_ws.T @ UP, GRAVITY, std, 100, 0)
 
 
 def angles_between(R, S):
-    """(3,) [rad] rotation vector that takes R to S, world."""
+    """Rotation vector (3,) [rad] from R to S, world frame."""
     return Rotation.from_matrix(S @ R.T).as_rotvec()
 
 
 def at_rest(R_ws, n=200, noise=0.02, seed=0, bias=0.0):
-    """(n, 3) [m/s^2]."""
+    """Accelerations (n, 3) [m/s^2] of a sensor at rest."""
     rng = np.random.default_rng(seed)
     return GRAVITY * R_ws.T @ UP + bias + noise * rng.standard_normal((n, 3))
 
@@ -51,10 +51,10 @@ rotations = st.integers(0, 2**31).map(lambda s: Rotation.random(random_state=s).
 
 @settings(max_examples=40, derandomize=True, deadline=None)
 @given(rotations)
-def test_up_turns_with_the_sensor(R):
+def test_up_direction_rotates_with_the_sensor(R):
     a = at_rest(np.eye(3))
-    up, turned = up_direction(a, 0.05), up_direction(a @ R, 0.05)
-    np.testing.assert_allclose(turned.direction, R.T @ up.direction, atol=2e-3)
+    up, rotated = up_direction(a, 0.05), up_direction(a @ R, 0.05)
+    np.testing.assert_allclose(rotated.direction, R.T @ up.direction, atol=2e-3)
     exact = up_direction(at_rest(R, noise=0.0), 0.05)
     np.testing.assert_allclose(exact.direction, R.T @ UP, atol=1e-12)
     assert exact.size == pytest.approx(GRAVITY)
@@ -62,7 +62,7 @@ def test_up_turns_with_the_sensor(R):
     assert (exact.n, exact.n_left_out) == (200, 0)
 
 
-def test_knocks_and_what_is_not_finite_are_left_out():
+def test_knocks_and_readings_that_are_not_finite_are_excluded():
     a = at_rest(np.eye(3))
     still = up_direction(a, 0.0)
     a[50:60] += [30.0, -20.0, 10.0]
@@ -83,12 +83,12 @@ def test_knocks_and_what_is_not_finite_are_left_out():
     (at_rest(np.eye(3)) / GRAVITY, r'is its unit g\?'),
     (np.zeros((50, 3)), 'at rest is 0, not 9.81'),
     (1.2 * at_rest(np.eye(3)), 'at rest is 11.8, not 9.81')])
-def test_what_is_no_accelerometer_at_rest_is_refused(a, message):
+def test_readings_other_than_gravity_at_rest_are_rejected(a, message):
     with pytest.raises(ValueError, match=message):
         up_direction(a, 0.05)
 
 
-def test_the_tilt_is_as_far_off_as_its_deviation_says(n=400):
+def test_tilt_error_agrees_with_its_std(n=400):
     rng = np.random.default_rng(1)
     squares = []
     for k in range(n):
@@ -97,7 +97,7 @@ def test_the_tilt_is_as_far_off_as_its_deviation_says(n=400):
         off = np.cross(R @ up.direction, UP)[:2]
         squares.append(off @ off / up.std**2)
     low, high = chi2.ppf([0.001, 0.999], 2 * n)
-    # 20 readings tell their own scatter to a sixth; it is a seventh of the variance.
+    # The scatter is known to a sixth from 20 readings; it is a seventh of the variance.
     assert 0.9 * low < np.sum(squares) < 1.1 * high
 
 
@@ -115,8 +115,8 @@ def test_without_bias_the_orientation_is_exact(posture, yaw):
 
 @settings(max_examples=40, derandomize=True, deadline=None)
 @given(rotations, rotations)
-def test_the_orientation_turns_with_the_sensor(R, S):
-    """What the sensor measures is turned by S: so is the answer, and nothing else."""
+def test_orientation_rotates_with_the_sensor(R, S):
+    """A rotation of the readings by S only rotates the orientation and the bias."""
     rng = np.random.default_rng(0)
     y, up = R.T @ EARTH + BIAS * rng.standard_normal(3), up_of(R, 5e-3)
     a = compass_orientation(up, y, EARTH, BIAS)
@@ -125,11 +125,11 @@ def test_the_orientation_turns_with_the_sensor(R, S):
     np.testing.assert_allclose(angles_between(b.R_ws, a.R_ws @ S), 0.0, atol=1e-8)
     np.testing.assert_allclose(b.std, a.std, rtol=1e-6)
     np.testing.assert_allclose(b.bias, S.T @ a.bias, atol=1e-13)
-    # Up stays up.
+    # The measured up direction stays vertical.
     np.testing.assert_allclose(a.R_ws @ up.direction, UP, atol=1e-12)
 
 
-def test_the_orientation_turns_with_the_world():
+def test_orientation_rotates_with_the_world():
     y = EARTH + [3e-7, -5e-7, 1e-7]
     a = compass_orientation(up_of(np.eye(3)), y, EARTH, BIAS)
     for yaw in (0.7, -2.5):
@@ -139,8 +139,8 @@ def test_the_orientation_turns_with_the_world():
 
 
 @pytest.mark.parametrize('lean, missing', [(0.3, None), (3.0, None), (0.3, 2), (3.0, 2)])
-def test_the_heading_is_as_far_off_as_its_deviation_says(lean, missing, n=300):
-    """Unknown bias on each axis, an accelerometer that is off: over many mountings."""
+def test_heading_error_agrees_with_its_std(lean, missing, n=300):
+    """Many mountings, each with an unknown bias per axis and an accelerometer error."""
     rng = np.random.default_rng(5)
     heading, tilt, gross = [], [], 0
     for k in range(n):
@@ -154,14 +154,14 @@ def test_the_heading_is_as_far_off_as_its_deviation_says(lean, missing, n=300):
             found = compass_orientation(up, y, EARTH, BIAS)
         except ValueError:
             continue
-        # A missing axis that lies level leaves two headings, or one that is hardly known.
+        # A missing horizontal axis leaves two headings, or a poorly known one.
         if not np.isnan(found.rival) or found.std[2] > np.deg2rad(5.0):
             continue
         off = angles_between(found.R_ws, R)
         if abs(off[2]) > 0.5:
             gross += 1
             continue
-        # To second order a rotation vector's parts do not mix: tilts are a third of a degree.
+        # The tilts are a third of a degree, so the rotation vector has independent components.
         heading.append((off[2] / found.std[2])**2)
         tilt.append(np.sum((off[:2] / found.std[:2])**2))
     print(f'missing {missing}: heading {np.mean(heading):.3f}, tilt {np.mean(tilt) / 2:.3f}, '
@@ -170,13 +170,13 @@ def test_the_heading_is_as_far_off_as_its_deviation_says(lean, missing, n=300):
         low, high = chi2.ppf([0.001, 0.999], each * len(squares))
         assert low < np.sum(squares) < high
     assert len(heading) > (0.95 if missing is None or lean < 1.0 else 0.4) * n
-    # The true one of two headings is dropped when its bias is worse than RIVAL.
+    # The true one of two headings is dropped if the cost of its bias exceeds MAX_RIVAL_COST.
     assert gross <= binom.ppf(0.999, n, chi2.sf(MAX_RIVAL_COST, 1)) * (missing is not None)
 
 
 @pytest.mark.parametrize('posture', POSTURES)
-def test_a_compass_without_bias_is_as_far_off_as_its_tilt_makes_it(posture, n=200):
-    """At 72 degrees of dip a tilt turns the heading by three times itself."""
+def test_heading_error_without_bias_is_that_of_the_tilt(posture, n=200):
+    """At a dip of 72 degrees, a tilt changes the heading by three times the tilt."""
     rng, squares = np.random.default_rng(8), []
     for k in range(n):
         R = rotation_about_z(rng.uniform(-np.pi, np.pi)) @ POSTURES[posture]
@@ -190,12 +190,12 @@ def test_a_compass_without_bias_is_as_far_off_as_its_tilt_makes_it(posture, n=20
 
 @pytest.mark.parametrize('earth', [[0.0, 0.0, -5e-5], [0.0, 0.0, 5e-5], [3e-7, 0.0, -5e-5],
                                    [0.0, 0.0, 0.0]])
-def test_a_field_straight_down_tells_no_heading(earth):
+def test_heading_is_not_observable_in_a_vertical_field(earth):
     with pytest.raises(ValueError, match='heading is not observable'):
         compass_orientation(up_of(np.eye(3)), np.array(earth), earth, BIAS)
 
 
-def test_an_upright_axis_alone_tells_no_heading():
+def test_heading_is_not_observable_with_a_vertical_axis_alone():
     y = np.array([np.nan, np.nan, EARTH[2]])
     with pytest.raises(ValueError, match='heading is not observable'):
         compass_orientation(up_of(np.eye(3)), y, EARTH, BIAS)
@@ -203,7 +203,7 @@ def test_an_upright_axis_alone_tells_no_heading():
         compass_orientation(up_of(np.eye(3)), np.full(3, np.nan), EARTH, BIAS)
 
 
-def test_two_axes_tell_what_three_do_where_the_third_is_upright():
+def test_a_vertical_axis_adds_nothing_to_two_horizontal_ones():
     R = rotation_about_z(0.4)
     y = R.T @ EARTH + [2e-7, 1e-7, 0.0]
     three = compass_orientation(up_of(R, 5e-3), y, EARTH, BIAS)
@@ -214,11 +214,11 @@ def test_two_axes_tell_what_three_do_where_the_third_is_upright():
 
 
 @pytest.mark.parametrize('yaw', [-140.0, -60.0, 25.0, 60.0, 120.0])
-def test_a_single_level_axis_has_a_rival(yaw):
+def test_a_single_horizontal_axis_has_a_rival(yaw):
     R = rotation_about_z(np.deg2rad(yaw))
     y = np.array([(R.T @ EARTH)[0], np.nan, np.nan])
     found = compass_orientation(up_of(R), y, EARTH, BIAS)
-    # The axis may lie to either side of the field.
+    # The axis may be on either side of the field.
     to_field = np.arctan2(EARTH[1], EARTH[0]) - np.deg2rad(yaw)
     other = np.deg2rad(yaw) + 2.0 * to_field
     headings = np.angle(np.exp(1j * np.array([np.deg2rad(yaw), other])))
@@ -230,22 +230,22 @@ def test_a_single_level_axis_has_a_rival(yaw):
 
 
 @pytest.mark.parametrize('yaw', np.linspace(-180.0, 150.0, 12))
-def test_sensors_with_two_level_axes_or_three_have_no_rival(yaw):
+def test_sensors_with_two_horizontal_axes_have_no_rival(yaw):
     R = rotation_about_z(np.deg2rad(yaw))
-    for gone in ([], [2]):
+    for missing_axes in ([], [2]):
         y = R.T @ EARTH + BIAS * np.array([1.0, -1.0, 0.5])
-        y[gone] = np.nan
+        y[missing_axes] = np.nan
         assert np.isnan(compass_orientation(up_of(R), y, EARTH, BIAS).rival)
 
 
 @settings(max_examples=40, derandomize=True, deadline=None)
 @given(rotations, st.floats(-3.0, 3.0))
-def test_yaw_between_is_the_turn_about_the_vertical(R, yaw):
+def test_yaw_between_is_the_rotation_about_the_vertical(R, yaw):
     assert yaw_between(R, rotation_about_z(yaw) @ R) == pytest.approx(yaw, abs=1e-9)
     assert yaw_between(rotation_about_z(yaw) @ R, R) == pytest.approx(-yaw, abs=1e-9)
 
 
-def test_yaw_between_is_the_nearest():
+def test_yaw_between_is_the_closest_rotation():
     R, S = Rotation.random(2, random_state=3).as_matrix()
     yaws = np.deg2rad(np.arange(-180.0, 180.0, 0.05))
     traces = [np.trace((rotation_about_z(a) @ R).T @ S) for a in yaws]
@@ -253,7 +253,7 @@ def test_yaw_between_is_the_nearest():
 
 
 def heading_of(yaw_deg, std_deg, R=POSTURES['upright']):
-    """`Orientation` with that heading."""
+    """`Orientation` with a heading and its std."""
     return Orientation(rotation_about_z(np.deg2rad(yaw_deg)) @ R,
                        np.deg2rad([0.3, 0.4, std_deg]), np.array([1e-7, 0.0, 0.0]), np.nan)
 
@@ -261,18 +261,18 @@ def heading_of(yaw_deg, std_deg, R=POSTURES['upright']):
 @pytest.mark.parametrize('compass, stated, expected, std', [
     (2.0, 2.0, 3.0, np.sqrt(2.0)), (1.0, 3.0, 0.6, np.sqrt(0.9)), (3.0, 1.0, 5.4, np.sqrt(0.9)),
     (2.0, 180.0, 6.0 * 4.0 / 32404.0, 2.0)])
-def test_each_heading_counts_by_its_variance(compass, stated, expected, std):
+def test_headings_are_weighted_by_their_variances(compass, stated, expected, std):
     R = POSTURES['askew']
     both = with_stated_heading(heading_of(0.0, compass, R), heading_of(6.0, 0.0, R).R_ws,
                                np.deg2rad(stated))
     assert np.degrees(yaw_between(R, both.R_ws)) == pytest.approx(expected, rel=1e-3)
     np.testing.assert_allclose(np.degrees(both.std), [0.3, 0.4, std], rtol=1e-3)
-    # The tilt is the accelerometer's.
+    # The tilt is that of the accelerometer.
     np.testing.assert_allclose(both.R_ws.T @ UP, R.T @ UP, atol=1e-12)
     assert both.bias[0] == 1e-7
 
 
-def test_a_stated_heading_that_is_too_far_off_is_not_mixed_in():
+def test_an_inconsistent_stated_heading_is_not_fused():
     def both(apart):
         return with_stated_heading(heading_of(0.0, 3.0), heading_of(apart, 0.0).R_ws,
                                    np.deg2rad(4.0))
@@ -282,14 +282,14 @@ def test_a_stated_heading_that_is_too_far_off_is_not_mixed_in():
     assert both(180.0) is None
 
 
-def test_levelling_turns_the_least_and_makes_up_up():
+def test_levelling_is_the_smallest_rotation_to_the_vertical():
     for posture in POSTURES.values():
         lean = Rotation.from_rotvec([0.05, -0.08, 0.0]).as_matrix()
         truth = lean @ posture
         found = levelled(up_of(truth, 5e-3), posture, np.deg2rad([5.0, 5.0, 4.0]))
         np.testing.assert_allclose(found.R_ws @ (truth.T @ UP), UP, atol=1e-12)
         turn = angles_between(posture, found.R_ws)
-        # About a level axis, by no more than the sensor leans.
+        # The rotation is about a horizontal axis, by the tilt of the sensor.
         assert abs(turn[2]) < 1e-12
         assert np.linalg.norm(turn) == pytest.approx(np.hypot(0.05, 0.08), rel=1e-6)
         np.testing.assert_allclose(found.std, [5e-3, 5e-3, np.deg2rad(4.0)])
@@ -301,7 +301,7 @@ def biased(bias):
     return Orientation(np.eye(3), np.zeros(3), np.array(bias), np.nan)
 
 
-def test_the_pooled_bias_counts_what_is_seen():
+def test_pooled_bias_counts_only_observed_components():
     assert pooled_bias_std([], BIAS) == pytest.approx(BIAS)
     one = pooled_bias_std([biased([0.0, 3e-7, 4e-7])], BIAS, 4.0)
     assert one == pytest.approx(np.sqrt((4.0 * BIAS**2 + 25e-14) / 6.0))
@@ -309,7 +309,7 @@ def test_the_pooled_bias_counts_what_is_seen():
     assert two == pytest.approx(np.sqrt((4.0 * BIAS**2 + 25e-14) / 5.0))
 
 
-def test_the_pooled_bias_is_that_of_many_sensors():
+def test_pooled_bias_of_many_sensors_is_the_true_one():
     rng, found = np.random.default_rng(2), []
     for k in range(200):
         R = Rotation.random(random_state=k).as_matrix()
@@ -319,9 +319,9 @@ def test_the_pooled_bias_is_that_of_many_sensors():
     assert low < pooled_bias_std(found, 1.5e-6) / 1.5e-6 < high
 
 
-def test_a_rotation_and_its_quaternion():
+def test_quaternion_from_rotation_is_the_same_rotation():
     R = Rotation.random(50, random_state=0).as_matrix()
-    # Half turns are where all but one component vanish.
+    # For half turns, all but one component vanish.
     for M in [*R, *(Rotation.from_rotvec(np.pi * e).as_matrix() for e in np.eye(3)), np.eye(3)]:
         q = quaternion_from_rotation(M)
         assert np.linalg.norm(q) == pytest.approx(1.0)

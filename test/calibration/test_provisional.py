@@ -1,4 +1,4 @@
-"""A background without a quiet beginning, live: provisional, doubted, replaced."""
+"""Live background without a quiet beginning: provisional, doubtful and replaced."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ RATE = 50.0
 
 
 def fed(signal, seconds, **changes):
-    """A background after `seconds` [s] of a signal [T] on the Earth's field."""
+    """Background after `seconds` [s] of a signal [T] added to the Earth field."""
     b = running(**changes)
     feed(b, np.arange(0.0, seconds, 1.0 / RATE), signal=signal)
     return b
@@ -35,8 +35,8 @@ def level_deviation(b):
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_between_vehicles_a_provisional_background_is_found(seed):
-    """No stretch of three seconds is quiet; the level is right within its own deviation."""
+def test_a_provisional_background_is_found_between_vehicles(seed):
+    """No interval of three seconds is quiet; the level is correct within its std."""
     signal = traffic(2.0, seed=seed)
     assert not fed(signal, 5.5).ready
     b = fed(signal, 14.0)
@@ -46,15 +46,15 @@ def test_between_vehicles_a_provisional_background_is_found(seed):
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_it_gets_better_and_certain(seed):
+def test_a_provisional_background_becomes_certain(seed):
     signal = traffic(2.0, seed=seed)
     b = fed(signal, 60.0)
     assert b.certain and (level_deviation(b) == 0.0).all()
-    # Blocks of 12 readings lie within their own noise, and the tails of vehicles stay below that.
+    # Tails of vehicles within the noise of a block of 12 readings are not detected.
     assert (np.abs(b.level(60.0) - EARTH) < 2.0 * SIGMA).all()
 
 
-def test_a_quiet_stretch_ends_it():
+def test_a_quiet_interval_makes_the_background_certain():
     b = fed(traffic(2.0, end=12.0), 18.0)
     assert b.certain
     assert (np.abs(b.level(18.0) - EARTH) < SIGMA).all()
@@ -68,27 +68,27 @@ def test_after_a_quiet_beginning_nothing_is_doubtful(signal, relearn):
     assert b.certain and not b.doubtful_times
 
 
-def stood(until):
+def standing_vehicle(until):
     return lambda t: np.array([2e-6, -1e-6, 0.0]) * (t < until)
 
 
-def test_what_stood_there_in_the_beginning_is_doubted_and_replaced():
-    """Seen for four seconds: after as long without it, nobody knows which one is the background."""
+def test_a_vehicle_present_at_the_start_is_doubted_and_replaced():
+    """It stands for four seconds; after as long without it, the background is ambiguous."""
     for seconds, is_doubtful, has_departed in ((4.0, False, False), (9.5, True, False),
                                            (24.0, False, True)):
-        b = fed(stood(4.0), seconds)
+        b = fed(standing_vehicle(4.0), seconds)
         assert b.ready and b.doubtful == is_doubtful
         error = np.abs(b.level(seconds) - EARTH)
         assert (error < SIGMA).all() == has_departed
 
 
 @pytest.mark.parametrize('stood_s', [4.0, 20.0])
-def test_what_stood_there_before_dense_traffic_is_doubted_and_replaced(stood_s):
-    """No stretch is quiet any more: the most frequent level is the other one."""
+def test_a_vehicle_present_before_dense_traffic_is_doubted_and_replaced(stood_s):
+    """There is no quiet interval any more, but the most frequent level is another one."""
     vehicles = traffic(2.0, begin=stood_s)
 
     def signal(t):
-        return stood(stood_s)(t) + vehicles(t)
+        return standing_vehicle(stood_s)(t) + vehicles(t)
 
     doubted = fed(signal, stood_s + 55.0)
     assert doubted.doubtful or (np.abs(doubted.level(60.0) - EARTH) < 2.0 * SIGMA).all()
@@ -96,21 +96,21 @@ def test_what_stood_there_before_dense_traffic_is_doubted_and_replaced(stood_s):
     assert b.certain and (np.abs(b.level(140.0) - EARTH) < 2.0 * SIGMA).all()
 
 
-def test_a_wrong_background_that_was_given_gives_way_once():
+def test_a_wrong_given_background_is_replaced_once():
     b = fed(traffic(2.0), 140.0, background=EARTH + 2e-6, noise_std=SIGMA)
     assert b.n_relearnt == 1 and (np.abs(b.level(140.0) - EARTH) < 2.0 * SIGMA).all()
 
 
-def test_what_halts_in_dense_traffic_is_not_certain_for_ever():
-    """It is the only level for half a minute; then it leaves, and the traffic goes on."""
+def test_a_vehicle_that_stood_in_dense_traffic_is_replaced():
+    """It is the only level for half a minute; then it departs, and the traffic continues."""
     vehicles = traffic(2.0, begin=40.0)
-    b = fed(lambda t: stood(40.0)(t) + vehicles(t) + traffic(2.0, end=6.0)(t), 170.0)
+    b = fed(lambda t: standing_vehicle(40.0)(t) + vehicles(t) + traffic(2.0, end=6.0)(t), 170.0)
     assert b.certain and (np.abs(b.level(170.0) - EARTH) < 2.0 * SIGMA).all()
 
 
 @pytest.mark.parametrize('later', [60.0, 700.0])
-def test_another_car_that_halts_is_no_former_background(later):
-    """One parked for 100 s; a while later one halts for five, with two thirds of its field."""
+def test_another_stopping_car_is_not_a_former_background(later):
+    """One car parks for 100 s; later another one stops for 5 s, with 0.6 times its field."""
     def signal(t):
         halts = 120.0 + later
         return np.array([2e-6, 0.0, 1e-6]) * ((20.0 < t < 120.0)
@@ -120,7 +120,7 @@ def test_another_car_that_halts_is_no_former_background(later):
     assert b.n_relearnt == 2 and (np.abs(b.level(127.0 + later) - EARTH) < SIGMA).all()
 
 
-def test_an_axis_that_falls_silent_early_does_not_hold_up_the_others():
+def test_an_axis_that_stops_early_does_not_delay_the_others():
     vehicles = traffic(2.0)
     b, rng = running(), np.random.default_rng(0)
     for t in np.arange(0.0, 14.0, 1.0 / RATE):
@@ -129,8 +129,8 @@ def test_an_axis_that_falls_silent_early_does_not_hold_up_the_others():
     assert b.ready and (np.abs(b.level(14.0) - EARTH)[:2] < 3.0 * level_deviation(b)[:2]).all()
 
 
-def test_a_level_that_was_the_background_before_is_so_at_once():
-    """A car that parks for two minutes, and leaves."""
+def test_a_former_background_is_restored_at_once():
+    """A car parks for two minutes and departs."""
     def parked(t):
         return np.array([2e-6, 0.0, 1e-6]) * (20.0 < t < 140.0)
     assert (np.abs(fed(parked, 130.0).level(130.0) - EARTH - parked(130.0)) < SIGMA).all()
@@ -139,8 +139,8 @@ def test_a_level_that_was_the_background_before_is_so_at_once():
     assert (np.abs(b.level(146.0) - EARTH) < SIGMA).all()
 
 
-def test_a_drift_that_no_sensor_has_is_doubted():
-    """A vehicle comes near while the background is learnt; a sensor that is warming does not."""
+def test_a_drift_too_large_for_a_sensor_is_doubted():
+    """A vehicle that approaches is doubted; the smaller drift of a warming sensor is not."""
     for rate, is_doubtful in ((2e-8, True), (1e-9, False)):
         b = fed(lambda t, rate=rate: rate * t * np.ones(3), 6.0)
         assert b.ready and b.doubtful == is_doubtful
@@ -160,7 +160,7 @@ def calibrated(parts, network=None, **changes):
         [c.stamp_ns for c in out])
 
 
-def test_readings_say_what_a_provisional_background_may_be_off_by():
+def test_covariance_includes_the_error_of_a_provisional_background():
     stage, covariance, stamps = calibrated([readings(traffic(2.0), 60.0)])
     times = stage.doubtful_intervals()['mag_1']
     doubtful = np.array([are_doubtful(times, s) for s in stamps.tolist()])
@@ -171,7 +171,7 @@ def test_readings_say_what_a_provisional_background_may_be_off_by():
     assert variance[doubtful].min() > 1.5 * variance[~doubtful].max()
 
 
-def test_what_is_doubtful_does_not_depend_on_the_batches():
+def test_doubtful_intervals_do_not_depend_on_the_batches():
     whole = readings(traffic(2.0), 40.0)
     stage, covariance, _ = calibrated([whole])
     parts = [whole.part(slice(i, i + 7)) for i in range(0, len(whole), 7)]
@@ -180,7 +180,7 @@ def test_what_is_doubtful_does_not_depend_on_the_batches():
     np.testing.assert_array_equal(covariance, again)
 
 
-def test_the_times_of_doubt_follow_the_clock():
+def test_doubtful_intervals_follow_the_clock():
     network = line_network(1)
     stage, *_ = calibrated([readings(traffic(2.0), 14.0)], network)
     (begin, _), = stage.doubtful_intervals()['mag_1']
@@ -188,21 +188,21 @@ def test_the_times_of_doubt_follow_the_clock():
     assert stage.doubtful_intervals()['mag_1'] == ((begin - 500_000_000, None),)
 
 
-def test_what_is_given_is_not_doubted():
+def test_a_given_background_is_not_doubted():
     network = dataclasses.replace(line_network(1), background=(EARTH,))
     stage, covariance, _ = calibrated([readings(traffic(2.0), 30.0)], network)
     assert stage.doubtful_intervals() == {}
     np.testing.assert_array_equal(stage.background('mag_1'), EARTH)
 
 
-def test_what_is_doubtful_is_not_kept_for_a_restart():
+def test_a_doubtful_background_is_not_stored_for_a_restart():
     stage, *_ = calibrated([readings(traffic(2.0), 14.0)])
     assert stage.stored('mag_1') is None
     stage, *_ = calibrated([readings(traffic(2.0), 60.0)])
     assert stage.stored('mag_1') is not None
 
 
-def test_stretches_of_doubt():
+def test_doubtful_intervals_are_recorded_and_merged():
     times = ()
     for stamp, is_doubtful in ((1, False), (2, True), (3, True), (5, False), (9, True)):
         times = updated(times, stamp, is_doubtful)
@@ -213,16 +213,16 @@ def test_stretches_of_doubt():
         times = updated(times, 10 + k, k % 2 == 1)
     assert len(times) == 16 and times[-1] == (109, None)
     assert shifted(times, 5)[-1] == (114, None)
-    # What turns out to have begun earlier takes the place of what was open.
+    # An interval that began earlier replaces the open one.
     assert merged({'a': ((1, 2), (4, None))}, {'a': ((3, 6),)}) == {'a': ((1, 2), (3, 6))}
     assert doubtful_since(((1, 2), (4, 5), (6, None)), 3) == ((1, 2), (3, None))
     assert doubtful_since(((1, 4),), 3) == ((1, None),)
     assert merged({'a': ((1, 2), (4, None))}, {'a': ((4, 6),), 'b': ((3, None),)}) \
         == {'a': ((1, 2), (4, 6)), 'b': ((3, None),)}
-    # A stretch with a missing end closes at the next begin.
+    # An interval without an end is closed at the start of the next one.
     assert merged({'a': ((1, None),)}, {'a': ((4, 6),)}) == {'a': ((1, 4), (4, 6))}
-    # A stretch that begins and ends with the same reading, and its successor.
+    # An interval that begins and ends with the same reading, and its successor.
     assert merged({'a': ((4, None),)}, {'a': ((4, 4),)}) == {'a': ((4, 4),)}
     assert merged({'a': ((4, 4),)}, {'a': ((4, None),)}) == {'a': ((4, None),)}
-    # The doubtful background was replaced by one that never was.
+    # The doubtful background was replaced by one that was never doubtful.
     assert merged({'a': ((1, 2), (4, None))}, {'a': ()}) == {'a': ((1, 2),)}

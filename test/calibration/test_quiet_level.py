@@ -1,4 +1,4 @@
-"""The most frequent level of a sensor, and when it is needed."""
+"""Prescan of a recording for the most frequent level of a sensor, and when it is needed."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ NETWORK, SETTINGS = line_network(1), CalibrateSettings()
 
 
 def readings(signal, seconds=60.0, rate=50.0, seed=0, step=0.0):
-    """Readings of one sensor: noise, the Earth's field, and `signal(t)` (3,) or a number [T]."""
+    """Readings of one sensor: noise, the Earth field, and `signal(t)`, (3,) or a number [T]."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 1.0 / rate)
     fields = [EARTH + signal(s) + SIGMA * rng.standard_normal(3) for s in t]
     if step:
@@ -34,21 +34,21 @@ def passing(*times, size=1e-6):
     return lambda t: sum(size * np.exp(-((t - at) / 0.8)**2) for at in times)
 
 
-def stands(until):
-    """A vehicle that leaves at `until` [s]."""
+def departing(until):
+    """Signal of a vehicle that departs at `until` [s]."""
     return lambda t: 2e-6 / (1.0 + np.exp(np.clip((t - until) / 0.2, -50.0, 50.0)))
 
 
 @pytest.mark.parametrize('signal', [
     lambda t: 0.0, passing(20.0), passing(7.0, 12.0, 17.0, 30.0), lambda t: 3e-9 * t,
     lambda t: 1e-8 * t, lambda t: 2e-6 * (25.0 < t < 40.0)])
-def test_after_a_quiet_beginning_nothing_is_needed(signal):
+def test_no_level_is_needed_after_a_quiet_beginning(signal):
     assert found(signal).levels == {}
 
 
 @pytest.mark.parametrize('signal', [
     passing(1.0), passing(2.0, 9.0, 14.0), passing(*np.arange(1.5, 60.0, 5.0)),
-    stands(10.0), lambda t: stands(8.0)(t) + passing(11.0)(t)])
+    departing(10.0), lambda t: departing(8.0)(t) + passing(11.0)(t)])
 @pytest.mark.parametrize('step', [0.0, 1e-7])
 def test_the_most_frequent_level_is_that_between_the_targets(signal, step):
     level = found(signal, step=step).levels['mag_1']
@@ -56,9 +56,9 @@ def test_the_most_frequent_level_is_that_between_the_targets(signal, step):
     assert not step or (np.sqrt(level.covariance.diagonal()) < step).all()
 
 
-def test_a_target_that_stands_there_at_first_is_not_the_background():
-    """It leaves; from then on the background is what it was after that."""
-    signal = readings(stands(10.0))
+def test_a_target_present_at_the_start_is_not_the_background():
+    """The background is the level after its departure."""
+    signal = readings(departing(10.0))
     stage = Calibrate(NETWORK, SETTINGS)
     prescan([signal], NETWORK, SETTINGS).apply(stage)
     out = stage.feed(signal)[0]
@@ -69,17 +69,17 @@ def test_a_target_that_stands_there_at_first_is_not_the_background():
 
 
 @pytest.mark.parametrize('arrives, until', [(10.0, 40.0), (6.0, 20.0)])
-def test_a_target_that_comes_later_and_stays_is_not_the_background(arrives, until):
+def test_a_target_that_arrives_later_and_stays_is_not_the_background(arrives, until):
     def signal(t):
-        return 2e-6 - stands(arrives)(t)
+        return 2e-6 - departing(arrives)(t)
     assert found(signal, seconds=until).levels == {}
-    # Without relearning, a level stays the background whatever lasts longer.
+    # Without relearning, a level stays the background even if another one lasts longer.
     never = replace(SETTINGS, {'relearn_s': 0.0})
     assert found(signal, never, seconds=10.0 * until).levels == {}
 
 
-def test_what_stood_there_for_most_of_the_recording_is_not_the_background():
-    """It is seen to leave: the level that it leaves behind is, however short."""
+def test_a_level_that_lasts_most_of_the_recording_is_not_the_background():
+    """The vehicle departs, so the short level after it is the background."""
     def shutdown(t):
         way = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
         return 4e-6 / (1.0 + (way / 5.0)**2)**1.5
@@ -87,8 +87,8 @@ def test_what_stood_there_for_most_of_the_recording_is_not_the_background():
     assert (np.abs(level.level - EARTH) < SIGMA).all() and level.begin > 33.0
 
 
-def test_a_level_of_the_beginning_that_comes_back_is_that_of_the_background():
-    """Whatever left in between: half of the field of what came stays for a while."""
+def test_a_first_level_that_returns_is_the_background():
+    """Two vehicles arrive; after one has departed, half of their field remains until 60 s."""
     def queue(t):
         way = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
         return (2e-6 + 2e-6 / (1.0 + (way / 5.0)**2)**1.5) * (20.0 < t < 60.0)
@@ -97,7 +97,7 @@ def test_a_level_of_the_beginning_that_comes_back_is_that_of_the_background():
 
 @pytest.mark.parametrize('rates', [(50.0, 1.0), (2.0, 2.0), (100.0, 5.0)])
 @pytest.mark.parametrize('starts', [0.0, 7.0, 40.0])
-def test_sensors_that_are_slow_or_start_late_begin_quietly(rates, starts):
+def test_slow_and_late_sensors_have_a_quiet_beginning(rates, starts):
     network, parts = line_network(2), []
     for j, (rate, start) in enumerate(zip(rates, (0.0, starts), strict=True)):
         part = readings(lambda t: 0.0, 120.0, rate, seed=j)
@@ -112,23 +112,23 @@ def test_sensors_that_are_slow_or_start_late_begin_quietly(rates, starts):
                                    EARTH + np.array([1.234e-8, -5.6e-9, 7.7e-9])])
 def test_a_sensor_that_never_changes_has_no_background(value):
     hung = batch([MagSample(int(k * 1e7), 'mag_1', value) for k in range(2000)])
-    stage, pass_ = Calibrate(NETWORK, SETTINGS), prescan([hung], NETWORK, SETTINGS)
-    pass_.apply(stage)
+    stage, found_levels = Calibrate(NETWORK, SETTINGS), prescan([hung], NETWORK, SETTINGS)
+    found_levels.apply(stage)
     assert stage.feed(hung) == [] and stage.unready() == ['mag_1']
 
 
-def test_nothing_is_searched_where_the_background_is_given_or_nothing_is_asked_for():
+def test_no_level_is_searched_if_the_background_is_given_or_disabled():
     given = dataclasses.replace(NETWORK, background=(EARTH,))
     assert found(passing(1.0), network=given).levels == {}
     assert found(passing(1.0), replace(SETTINGS, {'look_ahead_s': 0.0})).levels == {}
 
 
-def test_a_recording_of_nothing_but_a_target_has_no_level():
+def test_a_recording_of_only_a_target_has_no_level():
     assert found(lambda t: 1e-7 * t, seconds=20.0).levels == {}
     assert found(lambda t: 0.0, seconds=0.5).levels == {}
 
 
-def test_the_readings_may_come_in_batches_of_any_size():
+def test_level_does_not_depend_on_the_batches():
     whole = readings(passing(1.0))
     expected = prescan([whole], NETWORK, SETTINGS).levels['mag_1']
     parts = (whole.part(slice(i, i + 7)) for i in range(0, len(whole), 7))

@@ -1,4 +1,4 @@
-"""Steps of a sensor: found in what it measures, and what they add to its noise."""
+"""Resolution of a sensor: steps found in its readings, and the error that they add."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from support.fed_background import FedBackground
 MS = 1_000_000
 
 
-def noted(fields, interval=10 * MS):
+def sensor_after(fields, interval=10 * MS):
     """(1,) SENSOR after `fields` (n, 3)."""
     sensors = new_sensors(1)
     for k, field in enumerate(fields):
@@ -32,9 +32,9 @@ def coarse(sigma, step, n=600, offset=0.3, seed=0):
 @pytest.mark.parametrize('sigma, step', [(1e-8, 1e-7), (4e-8, 1e-7), (1e-7, 1e-7), (1e-8, 1e-10)])
 def test_the_smallest_change_is_the_step(sigma, step):
     y = 5e-5 + coarse(sigma, step, offset=0.45, n=6000)
-    np.testing.assert_allclose(noted(y)[0]['step'], step, rtol=1e-6)
+    np.testing.assert_allclose(sensor_after(y)[0]['step'], step, rtol=1e-6)
     np.testing.assert_allclose(smallest_steps(y), step, rtol=1e-6)
-    # Single precision does not hide it.
+    # Single precision does not affect the result.
     y = y.astype(np.float32).astype(float)
     np.testing.assert_allclose(smallest_steps(y), step, rtol=1e-3 if step > 1e-9 else 10.0)
 
@@ -44,16 +44,16 @@ def test_missing_axes_and_spikes_do_not_change_the_step():
     y[::7, 1] = np.nan
     y[::50, 0] += 2e-5
     y[:, 2] = np.nan
-    for step in (noted(y)[0]['step'], smallest_steps(y)):
+    for step in (sensor_after(y)[0]['step'], smallest_steps(y)):
         np.testing.assert_allclose(step, [1e-7, 1e-7, np.inf])
 
 
-def test_a_field_that_moves_with_every_reading_shows_no_steps():
+def test_a_field_that_changes_with_every_reading_shows_no_steps():
     y = np.cumsum(np.random.default_rng(0).uniform(1e-6, 3e-6, (60, 3)), axis=0)
-    state = noted(y)
+    state = sensor_after(y)
     assert (state[0]['step'] > 1e-6).all() and (raw_steps(state) == 0.0).all()
-    assert (raw_steps(noted(coarse(1e-8, 1e-7, offset=0.45))) > 0.0).all()
-    assert np.isinf(raw_steps(noted(np.ones((5, 3))))).all()
+    assert (raw_steps(sensor_after(coarse(1e-8, 1e-7, offset=0.45))) > 0.0).all()
+    assert np.isinf(raw_steps(sensor_after(np.ones((5, 3))))).all()
 
 
 def test_the_compiled_rule_agrees_with_the_plain_one():
@@ -69,34 +69,34 @@ def test_the_compiled_rule_agrees_with_the_plain_one():
             np.testing.assert_array_equal(sensors[0][name], background.sensors[0][name], name)
 
 
-def test_a_rest_counts_as_one_measurement_for_a_while():
+def test_a_rest_counts_as_one_measurement_for_a_limited_time():
     n = MAX_REST_NS // (10 * MS)
-    assert noted(np.ones((3, 3)))[0]['n_rest'].tolist() == [3, 3, 3]
-    assert noted(np.ones((10 * n, 3)))[0]['n_rest'].tolist() == [n + 1] * 3
-    one_moves = noted([*np.ones((10 * n, 3)), [1.0, 1.0, 2.0]])
+    assert sensor_after(np.ones((3, 3)))[0]['n_rest'].tolist() == [3, 3, 3]
+    assert sensor_after(np.ones((10 * n, 3)))[0]['n_rest'].tolist() == [n + 1] * 3
+    one_moves = sensor_after([*np.ones((10 * n, 3)), [1.0, 1.0, 2.0]])
     assert one_moves[0]['n_rest'].tolist() == [n + 1, n + 1, 1]
 
 
 @pytest.mark.parametrize('sigma', [0.01, 0.1, 0.2, 0.4, 0.5, 1.0, 3.0])
-def test_an_average_is_as_good_as_stated(sigma):
-    """Over all levels: of `n` readings at rest the error is within what noise and steps state."""
+def test_mean_of_readings_has_the_stated_error(sigma):
+    """Over all levels, the mean of `n` readings has the error stated by noise and steps."""
     rng, n, errors, stated = np.random.default_rng(0), 8, [], []
     for level in rng.uniform(-0.5, 0.5, 4000):
         y = np.round(level + sigma * rng.standard_normal((n, 1)))
         variance = np.array([np.var(np.round(level + sigma * rng.standard_normal(200)))])
-        rests = variance[0] <= DITHERED
+        at_rest = variance[0] <= DITHERED
         runs, run = [], 0
         for k in range(n):
             run = run + 1 if k and y[k] == y[k - 1] else 1
             runs.append(run)
         errors.append(y.mean() - level)
-        stated.append(np.sum(variance[0] + rests * np.array(runs) / 12.0) / n**2)
+        stated.append(np.sum(variance[0] + at_rest * np.array(runs) / 12.0) / n**2)
     ratio = np.mean(np.square(errors)) / np.mean(stated)
-    # Stated too large where noise carries it over the edge of a step; hardly ever too small.
+    # The stated error is too large if noise crosses the edge of a step, and rarely too small.
     assert 0.2 < ratio < 1.8, ratio
 
 
-def test_an_axis_that_never_changed_rests_or_is_dead():
+def test_an_axis_that_never_changed_is_at_rest_or_dead():
     v, inf = np.array([0.0, 0.01, 0.0]), np.inf
     np.testing.assert_array_equal(completed_steps(v, np.array([inf, 1.0, inf])), [1.0, 1.0, 1.0])
     fine = np.array([0.0, 4.0, 0.0])
@@ -108,8 +108,8 @@ def test_an_axis_that_never_changed_rests_or_is_dead():
     np.testing.assert_array_equal(completed_steps(one, np.array([inf, 2.0, inf])), [inf, 2.0, inf])
 
 
-def test_an_axis_that_rests_keeps_its_steps_when_another_gets_loud():
-    """Else its readings would have no noise at all."""
+def test_an_axis_at_rest_keeps_its_steps_if_another_gets_noisy():
+    """Otherwise its readings would have zero noise."""
     sensors = new_sensors(1)
     sensors['noise'], sensors['step'] = np.zeros((3, 3)), [np.inf, 1e-6, np.inf]
     limits = np.empty(3)

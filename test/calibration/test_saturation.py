@@ -1,4 +1,4 @@
-"""Readings at the end of a sensor's range."""
+"""Detection and exclusion of saturated readings."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def curve(n=200):
     return 500.0 * np.exp(-((np.arange(n) - 90.0) / 15.0)**2)
 
 
-def test_a_limit_is_seen_through_noise():
+def test_a_limit_is_detected_in_noise():
     noisy = curve() + np.random.default_rng(1).standard_normal(200)
     cut = np.minimum(noisy, 300.0)
     expected = np.convolve(noisy >= 300.0, np.ones(2 * MARGIN + 1), 'same') > 0.0
@@ -30,13 +30,13 @@ def test_coarse_steps_are_no_limit(step):
     assert not saturated_readings(np.round(curve() / step) * step).any()
 
 
-def test_short_stretches():
+def test_saturation_requires_three_equal_readings():
     assert saturated_readings([0.0, 1.0, 5.0, 5.0, 5.0, 1.0, 0.0]).all()
     assert not saturated_readings([0.0, 1.0, 5.0, 5.0, 1.0]).any() \
         and not saturated_readings([]).any()
 
 
-def test_what_is_missing_or_stuck_is_no_limit():
+def test_missing_or_stuck_readings_are_no_limit():
     cut = np.minimum(curve() + np.random.default_rng(1).standard_normal(200), 300.0)
     cut[::7] = np.nan
     found = saturated_readings(cut)
@@ -45,8 +45,8 @@ def test_what_is_missing_or_stuck_is_no_limit():
         and not saturated_readings(np.full(5, np.nan)).any()
 
 
-def test_a_saturated_stretch_is_left_out_of_a_pass_and_named():
-    """Cut off at a third of its field; what is left is fitted, within its covariance."""
+def test_a_saturated_segment_is_excluded_from_a_pass_and_reported():
+    """Clipped at a third of its peak; the fit of the rest agrees with its covariance."""
     from mag_tracking.analysis.pass_fit import fit_pass
 
     rng = np.random.default_rng(11)

@@ -1,4 +1,4 @@
-"""Spikes and stuck sensors: found where they are, and nowhere else."""
+"""Detection of spikes and stuck sensors, without false alarms."""
 
 import functools
 import math
@@ -18,8 +18,8 @@ from support.samples import simulate
 from support.sensor_noise import EARTH, NS, SIGMA, noise
 
 
-def in_steps(fields, step):
-    """Fields as a sensor has them whose steps are `step` noise deviations; 0 = fine ones."""
+def quantised(fields, step):
+    """Fields quantised to steps of `step` noise stds; 0 = not quantised."""
     return np.round(fields / (step * SIGMA)) * step * SIGMA if step else fields
 
 
@@ -32,7 +32,7 @@ class SpikeScreen:
         self.sensors['is_ready'], self.sensors['noise_std'] = std is not None, std or np.nan
 
     def feed(self, row, stamp, field):
-        """[(row, whether it is a spike)] of what is known by now."""
+        """[(row, whether it is a spike)] of the readings that are decided by this one."""
         verdict, out = core.screen_spike(self.sensors, self._threshold, stamp, field), []
         if verdict == SPIKE:
             assert self.sensors['n_held'][0] == len(self._held)
@@ -45,51 +45,53 @@ class SpikeScreen:
         return out + self.flush()
 
     def flush(self):
-        """The readings that are held pass."""
+        """Release the held readings."""
         out, self._held = [(r, False) for r in self._held], []
         self.sensors['n_held'] = self.sensors['n_released'] = 0
         return out
 
 
 def screened(fields, rate=100.0, std=SIGMA, threshold=30.0, step=np.inf):
-    """([row that was taken for a spike], most that waited at once, [rows that were given late])."""
-    spikes, most, late, out, f = [], 0, [], 0, SpikeScreen(threshold, std, step)
+    """([rows of spikes], maximum number of held readings, [rows that were released late])."""
+    spikes, max_held, late, out, f = [], 0, [], 0, SpikeScreen(threshold, std, step)
     for k, field in enumerate(fields):
         got = f.feed(k, round(k * NS / rate), field)
         assert [row for row, _ in got] == list(range(out, out + len(got)))
         out += len(got)
-        most = max(most, k + 1 - out)
+        max_held = max(max_held, k + 1 - out)
         spikes += [row for row, is_spike in got if is_spike]
         late += [row for row, _ in got if row < k]
     rest = f.flush()
     assert [row for row, _ in rest] == list(range(out, len(fields)))
     assert not any(is_spike for _, is_spike in rest)
-    return spikes, most, late
+    return spikes, max_held, late
 
 
 def stuck(fields):
-    """[row that was taken for a repetition]."""
+    """[rows that are rejected as repetitions]."""
     sensors = new_sensors(1)
     return [k for k, field in enumerate(fields) if core.is_stuck(sensors, field)]
 
 
-# Nothing is found where nothing is.
+# No false alarms.
 
 @pytest.mark.parametrize('step', [0.0, 0.3, 1.0, 3.0, 10.0])
 @pytest.mark.parametrize('slope', [0.0, 2e-11])
 @pytest.mark.parametrize('rate', [10.0, 100.0])
 def test_noise_and_coarse_steps_at_rest_pass_at_once(step, slope, rate):
-    """10 000 readings, also with a background that drifts from one step of the sensor to the next:
-    there a sensor of coarse steps was once taken for stuck."""
+    """10 000 readings, also with a background that drifts from one step of the sensor to the next.
+
+    There, a sensor with coarse steps was formerly classified as stuck.
+    """
     y = noise(10_000) + slope * np.arange(10_000)[:, None] * [1.0, 0.8, -0.6]
-    y = in_steps(y, step)
+    y = quantised(y, step)
     assert stuck(y) == []
     assert screened(y, rate) == ([], 0, [])
 
 
 @functools.cache
 def passes(rate, speed, n=4):
-    """Readings of a sensor that `n` vehicles pass, a metre from it, one after the other."""
+    """Readings of a sensor that `n` vehicles pass at a distance of one metre, in sequence."""
     rng, fields = np.random.default_rng(1), []
     network = line_network(1)
     for k in range(n):
@@ -107,10 +109,12 @@ def passes(rate, speed, n=4):
 @pytest.mark.parametrize('step', [0.0, 1.0, 3.0, 10.0])
 @pytest.mark.parametrize('rate', [10.0, 50.0, 100.0])
 def test_vehicles_at_a_metre_are_no_spikes(rate, step):
-    """At ten readings a second all of a pass was once rejected, and behind it a sensor with coarse
-    steps was taken for stuck, for as long as it was at rest."""
+    """Formerly, a whole pass was rejected at 10 Hz.
+
+    After it, a sensor with coarse steps was classified as stuck for as long as it was at rest.
+    """
     for speed in (6.0, 13.0, 25.0):
-        y = in_steps(passes(rate, speed), step)
+        y = quantised(passes(rate, speed), step)
         assert np.ptp(y) > 1000 * SIGMA
         assert screened(y, rate)[0] == []
         assert stuck(y) == []
@@ -122,21 +126,21 @@ def test_vehicles_at_a_metre_are_no_spikes(rate, step):
 @pytest.mark.parametrize('n', [1, 2, 3])
 @pytest.mark.parametrize('axis', [0, 1, 2])
 @pytest.mark.parametrize('size, rate', [(2e-6, 100.0), (5e-4, 100.0), (5e-4, 10.0)])
-def test_spikes_are_taken_out_and_nothing_else(size, rate, axis, n, sign):
+def test_only_spikes_are_rejected(size, rate, axis, n, sign):
     y = noise(60)
     y[30:30 + n, axis] += sign * size * np.array([1.0, 0.8, 1.3])[:n]
-    spikes, most, late = screened(y, rate)
-    assert spikes == late == list(range(30, 30 + n)) and most == n
+    spikes, max_held, late = screened(y, rate)
+    assert spikes == late == list(range(30, 30 + n)) and max_held == n
 
 
-def test_spikes_of_changing_sign_and_axis():
+def test_spikes_of_changing_sign_and_axis_are_rejected():
     y = noise(60)
     y[30:33] += [[3e-6, 0.0, 0.0], [-4e-6, 0.0, 1e-6], [0.0, 9e-6, 0.0]]
     assert screened(y)[0] == [30, 31, 32]
 
 
-def test_spikes_one_after_the_other():
-    """They leave nothing behind that the next would be compared with."""
+def test_spikes_in_quick_succession_are_rejected():
+    """A spike does not affect the comparison of the next one."""
     y = noise(200)
     rows = [20, 22, 24, 40, 41, 43, 100, 105]
     y[rows] += 5e-6
@@ -144,7 +148,7 @@ def test_spikes_one_after_the_other():
 
 
 @pytest.mark.parametrize('size, found', [(28.0, False), (35.0, True)])
-def test_the_threshold_is_in_noise_deviations(size, found):
+def test_threshold_is_in_standard_deviations_of_the_noise(size, found):
     y = np.tile(EARTH, (40, 1))
     y[30, 1] += size * SIGMA
     assert screened(y)[0] == ([30] if found else [])
@@ -152,12 +156,12 @@ def test_the_threshold_is_in_noise_deviations(size, found):
 
 
 @pytest.mark.parametrize('before, found', [(3.0, True), (5.0, False)])
-def test_a_spike_is_steeper_than_what_was_before(before, found):
+def test_a_spike_is_steeper_than_preceding_changes(before, found):
     y = np.tile(EARTH, (40, 1))
     y[22:, 0] += before * SIGMA
     y[25, 0] += 36.0 * SIGMA
     assert bool(screened(y)[0]) == found
-    # Eight readings later it is forgotten.
+    # After eight readings, the earlier change has no effect.
     later = np.tile(EARTH, (40, 1))
     later[16:, 0] += before * SIGMA
     later[25, 0] += 36.0 * SIGMA
@@ -166,14 +170,14 @@ def test_a_spike_is_steeper_than_what_was_before(before, found):
 
 @pytest.mark.parametrize('rate, size, found', [
     (50.0, 25.0, False), (50.0, 35.0, True), (10.0, 3300.0, False), (10.0, 3700.0, True)])
-def test_rare_readings_need_a_larger_spike(rate, size, found):
-    """130 (30 m/s at 1 m: s = 30 / rate)^3 times the noise, where that is more than 30."""
+def test_a_lower_rate_requires_a_larger_spike(rate, size, found):
+    """Limit for 30 m/s at 1 m: 130 (30 / rate)^3 noise stds, but at least 30."""
     y = np.tile(EARTH, (40, 1))
     y[30, 1] += size * SIGMA
     assert screened(y, rate)[0] == ([30] if found else [])
 
 
-def test_a_gap_counts_as_rare_readings():
+def test_a_gap_counts_as_a_lower_rate():
     f, spikes = SpikeScreen(30.0), []
     for k in range(40):
         stamp = k * NS // 100 + (NS if k >= 20 else 0)
@@ -183,42 +187,42 @@ def test_a_gap_counts_as_rare_readings():
 
 
 @pytest.mark.parametrize('size', [2e-6, -5e-4])
-def test_a_step_is_a_step(size):
+def test_a_step_is_no_spike(size):
     y = noise(80)
     y[30:] += size
-    spikes, most, late = screened(y)
-    assert (spikes, most, late) == ([], MAX_HELD, [30, 31, 32])
+    spikes, max_held, late = screened(y)
+    assert (spikes, max_held, late) == ([], MAX_HELD, [30, 31, 32])
 
 
-def test_behind_a_step_it_learns_anew_what_is_usual():
+def test_usual_changes_are_learnt_again_after_a_step():
     y = np.tile(EARTH, (60, 1))
     y[30:] += 3e-6
     y[34:] += 40.0 * SIGMA * np.arange(26)[:, None]
     assert screened(y) == ([], MAX_HELD, [30, 31, 32])
 
 
-def test_eight_steps_are_needed_to_compare_with():
+def test_a_spike_requires_eight_preceding_changes():
     for row, found in ((8, []), (9, [9])):
         y = np.tile(EARTH, (20, 1))
         y[row] += 3e-6
         assert screened(y)[0] == found
 
 
-def test_the_axis_that_is_steep_is_the_one_that_is_high():
+def test_steepness_and_size_are_compared_on_the_same_axis():
     y = np.tile(EARTH, (40, 1))
     y[22:, 0] += 5.0 * SIGMA
     y[25] += np.array([36.0, 9.0, 0.0]) * SIGMA
     assert screened(y) == ([], 0, [])
 
 
-def test_four_readings_are_a_step_and_a_spike_behind_it_is_found_again():
+def test_four_readings_are_a_step_and_a_later_spike_is_rejected():
     y = noise(80)
     y[30:34] += 3e-6
     y[60] += 3e-6
     assert screened(y)[0] == [60]
 
 
-def test_back_to_a_share_of_it():
+def test_a_spike_returns_close_to_the_previous_level():
     for share, found in ((0.25, True), (0.35, False)):
         y = np.tile(EARTH, (60, 1))
         y[30] += 3e-6
@@ -226,7 +230,7 @@ def test_back_to_a_share_of_it():
         assert bool(screened(y)[0]) == found
 
 
-def test_a_missing_axis_is_no_spike_and_hides_none():
+def test_a_missing_axis_is_no_spike_and_masks_none():
     y = noise(80)
     y[20:50, 2] = np.nan
     y[30] += 4e-6
@@ -238,18 +242,18 @@ def test_a_missing_axis_is_no_spike_and_hides_none():
     assert screened(once)[0] == [30]
     y[:, 0] = np.nan
     y[31, 1] = np.nan
-    spikes, most, _ = screened(y)
-    # Where the axis of the spike is missing behind it, the next tells.
-    assert spikes == [30, 31] and most == 2
+    spikes, max_held, _ = screened(y)
+    # If the axis is missing after the spike, the next reading decides.
+    assert spikes == [30, 31] and max_held == 2
     assert screened(np.full((30, 3), np.nan)) == ([], 0, [])
 
 
-def test_before_the_noise_is_known_recent_differences_are_its_measure():
+def test_recent_differences_replace_an_unknown_noise():
     y = noise(3000)
     y[300:2900:100] += 5e-6
-    rows, most, _ = screened(y, std=None, step=1e-11)
-    assert rows == list(range(300, 2900, 100)) and most == 1
-    # Without a known step a change may be the first one of a sensor that rests.
+    rows, max_held, _ = screened(y, std=None, step=1e-11)
+    assert rows == list(range(300, 2900, 100)) and max_held == 1
+    # Without a known step, a change may be the first one of a sensor at rest.
     assert screened(y, std=None) == ([], 0, [])
     coarse = 2e-7 * np.round(y / 2e-7)
     assert screened(coarse, std=None, step=2e-7)[0] == rows
@@ -258,8 +262,8 @@ def test_before_the_noise_is_known_recent_differences_are_its_measure():
 
 
 @pytest.mark.parametrize('size, found', [(4e-5, True), (6e-6, False)])
-def test_an_axis_that_has_only_rested_may_have_a_glitch(size, found):
-    """No step of a magnetometer is as large as 13 microtesla; one of 6 may be."""
+def test_a_glitch_of_an_axis_at_rest_is_rejected(size, found):
+    """No magnetometer has steps of 13 uT; steps of 6 uT are possible."""
     y = np.tile([2e-6, 1.6e-5, -4.8e-5], (200, 1))
     y[100, 1] += size
     assert screened(y, std=None)[0] == ([100] if found else [])
@@ -267,40 +271,40 @@ def test_an_axis_that_has_only_rested_may_have_a_glitch(size, found):
 
 @settings(derandomize=True, deadline=None, max_examples=40)
 @given(st.integers(0, 10_000))
-def test_every_reading_comes_out_once_in_order_and_at_most_three_wait(seed):
+def test_readings_are_released_once_in_order_and_at_most_three_are_held(seed):
     rng = np.random.default_rng(seed)
     y = noise(300, seed)
-    off = rng.random(300) < rng.choice([0.02, 0.2, 0.6])
-    y[off] += rng.standard_normal((off.sum(), 3)) * 10.0 ** rng.uniform(-8, -3)
+    is_spike = rng.random(300) < rng.choice([0.02, 0.2, 0.6])
+    y[is_spike] += rng.standard_normal((is_spike.sum(), 3)) * 10.0 ** rng.uniform(-8, -3)
     y[rng.random((300, 3)) < 0.05] = np.nan
-    _, most, _ = screened(y, float(rng.choice([10.0, 100.0, 1000.0])))
-    assert most <= MAX_HELD
+    _, max_held, _ = screened(y, float(rng.choice([10.0, 100.0, 1000.0])))
+    assert max_held <= MAX_HELD
 
 
-# Repetition.
+# Repetitions.
 
-@pytest.mark.parametrize('step, seen', [(0.0, 6), (0.3, 6), (1.0, 7)])
+@pytest.mark.parametrize('step, delay', [(0.0, 6), (0.3, 6), (1.0, 7)])
 @pytest.mark.parametrize('n', [15, 150])
-def test_a_sensor_that_freezes_is_found_soon_and_returns_at_once(step, seen, n):
-    y = in_steps(noise(2000), step)
+def test_a_frozen_sensor_is_detected_soon_and_recovers_at_once(step, delay, n):
+    y = quantised(noise(2000), step)
     y[1500:1500 + n] = y[1499]
     found = stuck(y)
-    assert found == list(range(found[0], 1500 + n)) and 1500 <= found[0] < 1500 + seen
+    assert found == list(range(found[0], 1500 + n)) and 1500 <= found[0] < 1500 + delay
 
 
-def test_again_and_again():
+def test_repeated_freezes_are_detected():
     y = noise(3000)
     for k in range(500, 3000, 100):
         y[k:k + 60] = y[k - 1]
     rows = stuck(y)
     frozen = {r for k in range(500, 3000, 100) for r in range(k, k + 60)}
     assert set(rows) <= frozen
-    # Of each freeze all but the first few.
+    # In each freeze, all but the first few readings are rejected.
     assert len(rows) >= 25 * 50
     assert max(Counter(r // 100 for r in frozen - set(rows)).values()) <= 7
 
 
-def test_not_before_it_has_changed_often_enough_nor_in_fewer_than_five():
+def test_repetitions_need_enough_changes_and_a_minimum_number():
     few, many = noise(49), noise(51)
     assert stuck(np.concatenate([few, np.tile(few[-1], (100, 1))])) == []
     assert stuck(np.concatenate([many, np.tile(many[-1], (100, 1))])) != []
@@ -309,8 +313,8 @@ def test_not_before_it_has_changed_often_enough_nor_in_fewer_than_five():
     assert stuck(y) == list(range(30_003, 30_010))
 
 
-def test_chance_is_that_of_the_usual_repetitions():
-    """One of 30 readings repeats the one before: seven of them in a row are a fault, not six."""
+def test_limit_depends_on_the_usual_rate_of_repetitions():
+    """If one in 30 readings repeats the previous one, seven in a row are a fault, six are not."""
     y = noise(9000)
     y[29::30] = y[28::30]
     assert stuck(y) == []
@@ -319,8 +323,8 @@ def test_chance_is_that_of_the_usual_repetitions():
     assert stuck(y) == list(range(9000 + limit, 9020))
 
 
-def test_what_was_usual_long_ago_is_forgotten():
-    """It sent the same for a while when it began; later it is judged as any other."""
+def test_old_repetitions_are_forgotten():
+    """A sensor that repeated itself at the start is later evaluated as any other."""
     y = noise(70_000)
     y[60:2000] = y[59]
     begin, end = stuck(y), 30_000
@@ -333,8 +337,8 @@ def test_what_was_usual_long_ago_is_forgotten():
     assert {59_010, 59_049} <= set(rows)
 
 
-def test_coarse_steps_are_not_judged():
-    """At rest on one step such a sensor says the same for ever, after any number of changes."""
+def test_coarse_steps_are_not_classified_as_stuck():
+    """At rest on one step, such a sensor repeats itself forever after any number of changes."""
     rng = np.random.default_rng(0)
     changes = np.eye(3)[rng.integers(0, 3, 4000)] * rng.choice([-1.0, 0.0, 1.0], (4000, 1))
     moving = np.cumsum(changes, axis=0) * 1e-7
@@ -343,15 +347,15 @@ def test_coarse_steps_are_not_judged():
     assert stuck(y) == []
 
 
-def test_a_coarse_sensor_that_begins_in_a_passing_target_recovers():
-    """A hundred changes, then rests with a few changes between: it is not stuck for ever."""
+def test_a_coarse_sensor_that_starts_in_a_pass_recovers():
+    """A hundred changes, then rests with few changes in between: it is not stuck permanently."""
     moving = np.arange(100.0)[:, None] * np.array([1e-7, 2e-7, -1e-7])
     rest = [np.tile(moving[-1] + (k % 2) * 1e-7, (500, 1)) for k in range(20)]
     rows = np.array(stuck(np.concatenate([moving, *rest])))
     assert rows.max() < 100 + 5 * 500
 
 
-def test_a_missing_axis_repeats_itself_too():
+def test_a_missing_axis_counts_as_a_repetition():
     y = noise(500)
     y[:, 1] = np.nan
     assert stuck(y) == []

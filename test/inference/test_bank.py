@@ -1,4 +1,4 @@
-"""The filter bank: weights in logarithms, pruning, merging, the verdict, and its statistics."""
+"""Filter bank: log-weights, pruning, best hypothesis, ambiguity and consistency."""
 
 from copy import copy
 
@@ -26,7 +26,7 @@ def bank(n=4, spread=10.0, label=None):
                       np.zeros(n, dtype=int), np.arange(n), np.arange(n)[:, None] + 0.5)
 
 
-def test_the_innovations_stay_with_their_hypotheses():
+def test_pruning_keeps_innovations_with_their_hypotheses():
     b = bank(6)
     b.log_w = np.log([0.1, 0.3, 1e-14, 0.2, 0.2, 0.2])
     b.kind = 10 * np.arange(6)
@@ -38,7 +38,7 @@ def test_the_innovations_stay_with_their_hypotheses():
 
 @pytest.mark.parametrize('other, label, ambiguous', [
     (0.01, 1, False), (0.2, 1, True), (0.2, 0, False)])
-def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
+def test_another_arrival_makes_a_track_ambiguous_at_equal_positions(
         other, label, ambiguous):
     model = RowVehicle(np.zeros(3), np.ones(3), n_dipoles=1)
     x = np.tile([1.0, 2.0, 0.5, 10.0, 0.0, 0.0, 100.0, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 1))
@@ -56,14 +56,14 @@ def test_another_arrival_makes_a_track_ambiguous_even_where_the_places_agree(
     assert track.nis_by_sensor.tolist() == [1.0, 2.0]
     assert track.kind_weight == pytest.approx(1.0 - other)
     assert [h.kind for h in track.hypotheses] == ['truck', 'car']
-    lighter = track.hypotheses[-1]
-    assert lighter.weight == pytest.approx(other)
-    assert lighter.arrival == ('left', 'right')[label]
-    assert lighter.position.tolist() == [1.0, 2.0, 0.5]
-    assert lighter.velocity.tolist() == [10.0, 0.0, 0.0]
-    assert lighter.moment.tolist() == [100.0, 0.0, 0.0]
-    np.testing.assert_array_equal(lighter.covariance, np.eye(6))
-    assert [h.weight for h in track.hypotheses[1:]] == [lighter.weight]
+    other_hypothesis = track.hypotheses[-1]
+    assert other_hypothesis.weight == pytest.approx(other)
+    assert other_hypothesis.arrival == ('left', 'right')[label]
+    assert other_hypothesis.position.tolist() == [1.0, 2.0, 0.5]
+    assert other_hypothesis.velocity.tolist() == [10.0, 0.0, 0.0]
+    assert other_hypothesis.moment.tolist() == [100.0, 0.0, 0.0]
+    np.testing.assert_array_equal(other_hypothesis.covariance, np.eye(6))
+    assert [h.weight for h in track.hypotheses[1:]] == [other_hypothesis.weight]
 
 
 def test_log_sum_exp_equals_scipy_and_survives_extremes():
@@ -72,7 +72,7 @@ def test_log_sum_exp_equals_scipy_and_survives_extremes():
     assert log_sum_exp([-np.inf, -np.inf]) == -np.inf
 
 
-def test_hypotheses_thousands_of_nats_apart_stay_apart():
+def test_log_weights_thousands_of_nats_apart_are_exact():
     b = bank(2)
     b.reweight(np.array([-4500.0, 0.0]))
     np.testing.assert_allclose(b.log_w, [-4500.0, 0.0], atol=1e-12)
@@ -80,7 +80,7 @@ def test_hypotheses_thousands_of_nats_apart_stay_apart():
     np.testing.assert_allclose(b.log_w, [0.0, -100.0], atol=1e-9)
 
 
-def test_bayes_rule_of_the_weights():
+def test_weights_follow_bayes_rule():
     rng = np.random.default_rng(0)
     b, total = bank(5), np.zeros(5)
     for _ in range(20):
@@ -90,7 +90,7 @@ def test_bayes_rule_of_the_weights():
     np.testing.assert_allclose(b.log_w, total - logsumexp(total), atol=1e-12)
 
 
-def test_a_hypothesis_that_is_not_finite_loses_its_weight_and_no_other():
+def test_a_likelihood_that_is_not_finite_removes_only_its_own_weight():
     b = bank(3)
     assert np.isfinite(b.reweight(np.array([np.nan, 0.0, 0.0])))
     np.testing.assert_allclose(np.exp(b.log_w), [0.0, 0.5, 0.5])
@@ -98,7 +98,7 @@ def test_a_hypothesis_that_is_not_finite_loses_its_weight_and_no_other():
     np.testing.assert_allclose(np.exp(b.log_w), [0.0, 0.5, 0.5])
 
 
-def test_prune_by_ratio_and_by_number():
+def test_prune_limits_the_weight_ratio_and_the_number():
     b = bank(4)
     b.log_w = np.log([0.9, 0.1 - 1e-9 - 1e-14, 1e-9, 1e-14])
     assert b.prune(-np.log(1e-12), 10) == 1
@@ -107,21 +107,24 @@ def test_prune_by_ratio_and_by_number():
     assert len(b) == len(b.x) == len(b.P) == len(b.label) == 2
 
 
-def test_the_best_is_the_heaviest_of_the_heaviest_label():
+def test_best_is_the_heaviest_hypothesis_of_the_heaviest_label():
     b = bank(3, label=[0, 1, 1])
     b.log_w = np.log([0.4, 0.35, 0.25])
     assert b.best() == 1
 
 
-def test_the_best_is_of_the_heaviest_kind_of_the_heaviest_arrival():
+def test_best_is_of_the_heaviest_kind_of_the_heaviest_arrival():
     b = bank(4, label=[0, 1, 1, 1])
     b.kind = np.array([0, 0, 1, 1])
     b.log_w = np.log([0.35, 0.25, 0.22, 0.18])
     assert b.best() == 2
 
 
-def test_the_best_is_where_the_mixture_is_densest():
-    """Of two far apart with the same weight the surer; the heaviest where one is no Gaussian."""
+def test_best_is_at_the_maximum_of_the_mixture_density():
+    """Of two distant hypotheses of equal weight, the more certain one is the best one.
+
+    If a covariance is invalid, the heaviest hypothesis is the best one.
+    """
     b = bank(3, spread=100.0, label=[0, 0, 0])
     b.P[1, :3, :3] *= 0.5
     assert b.best() == 1
@@ -133,28 +136,28 @@ def test_the_best_is_where_the_mixture_is_densest():
 
 @pytest.mark.parametrize('spread', [0.5, 5.0, 500.0])
 @pytest.mark.parametrize('n', [1, 2, 60])
-def test_the_densest_mean_is_that_of_the_densities_one_by_one(n, spread):
+def test_best_equals_the_maximum_of_individually_computed_densities(n, spread):
     rng = np.random.default_rng(n)
     for _ in range(20):
         A = rng.standard_normal((n, 3, 3))
         b = FilterBank(spread * rng.standard_normal((n, 3)), A @ np.swapaxes(A, 1, 2),
                        np.log(rng.dirichlet(np.full(n, 3.0))), np.zeros(n, dtype=int),
                        np.zeros(n, dtype=int), np.arange(n), np.zeros((n, 1)))
-        able = np.flatnonzero(b.log_w >= b.log_w.max() - np.log(100.0))
-        density = sum(np.exp(b.log_w[i]) * multivariate_normal.pdf(b.x[able], b.x[i], b.P[i])
-                      for i in able)
-        assert b.best() == able[np.argmax(density)]
+        candidates = np.flatnonzero(b.log_w >= b.log_w.max() - np.log(100.0))
+        density = sum(np.exp(b.log_w[i]) * multivariate_normal.pdf(b.x[candidates], b.x[i], b.P[i])
+                      for i in candidates)
+        assert b.best() == candidates[np.argmax(density)]
 
 
-def test_separated_weight_counts_only_what_is_apart():
+def test_separated_weight_counts_distant_hypotheses_only():
     b = bank(3, spread=1.0)
     b.x[2, 0] = 30.0
     b.log_w = np.log([0.6, 0.3, 0.1])
     assert b.weight(b.apart(0)) == pytest.approx(0.1)
 
 
-def starts(network, earth, offset_std=0.5):
-    """126 hypotheses about a tight prior, all for one arrival along x."""
+def initial_bank(network, earth, offset_std=0.5):
+    """Bank of 126 hypotheses with a tight prior, all of one arrival along x."""
     x, P = [], []
     for m in 300.0 * moment_directions():
         for lateral in (-1.0, 0.0, 1.0):
@@ -169,9 +172,9 @@ def starts(network, earth, offset_std=0.5):
 
 
 def matched_run(rng, network, model, sigma):
-    """NEES of the best hypothesis at the closest point of one simulated, matched pass."""
+    """NEES per state of the best hypothesis at the end of one simulated, matched run."""
     earth = model.earth_field
-    bank = starts(network, earth)
+    bank = initial_bank(network, earth)
     row = rng.integers(len(bank))
     n_t, n_x = len(model.state_names), bank.x.shape[1]
     truth = rng.multivariate_normal(bank.x[row], bank.P[row])
@@ -196,8 +199,8 @@ def matched_run(rng, network, model, sigma):
     return float(e @ np.linalg.solve(bank.P[i, :6, :6], e)) / 6.0
 
 
-def test_anees_of_the_matched_case():
-    """200 runs, two sensors, 12.5 Hz, tight prior, 126 starts: position and velocity."""
+def test_anees_of_matched_runs_is_near_one():
+    """Position and velocity; 200 runs, two sensors, 12.5 Hz, tight prior, 126 hypotheses."""
     earth = np.array([2e-6, 1.55e-5, -4.9e-5])
     network = line_network(2, tilt=0.0)
     model = RowVehicle(earth, np.array([0.1, 0.1, 1e-4]), 0.003, n_dipoles=1)
@@ -206,7 +209,7 @@ def test_anees_of_the_matched_case():
                      for _ in range(200)])
     print(f'matched ANEES {nees.mean():.3f}, median {np.median(nees):.3f}, max {nees.max():.1f}')
     assert nees.mean() <= 1.3
-    # A covariance that says nothing would pass from below: it must also not be far too wide.
+    # The lower limit rejects a covariance that is far too large.
     assert nees.mean() >= 0.7
 
 
@@ -218,11 +221,11 @@ def random_bank(n, n_x, n_sensors=1):
                       np.arange(n), np.zeros((n, n_sensors)))
 
 
-@pytest.mark.parametrize('gone', [[2], [0, 5], [0, 1, 2, 4]])
-def test_what_is_kept_is_as_it_was(gone):
+@pytest.mark.parametrize('removed', [[2], [0, 5], [0, 1, 2, 4]])
+def test_keep_leaves_the_remaining_hypotheses_unchanged(removed):
     bank = random_bank(6, 3)
-    before, mask = bank.copy(), ~np.isin(np.arange(6), gone)
-    assert bank.keep(mask) == len(gone)
+    before, mask = bank.copy(), ~np.isin(np.arange(6), removed)
+    assert bank.keep(mask) == len(removed)
     np.testing.assert_array_equal(bank.x, before.x[mask])
     np.testing.assert_array_equal(bank.P, before.P[mask])
     assert bank.x.flags.c_contiguous and bank.P.flags.c_contiguous
@@ -230,8 +233,8 @@ def test_what_is_kept_is_as_it_was(gone):
     np.testing.assert_allclose(np.exp(bank.log_w).sum(), 1.0)
 
 
-def test_a_start_gives_the_rows_of_the_bank_that_it_was_made_of():
-    """Whatever has become of that bank, and of a start that has the same arrays."""
+def test_an_initial_bank_returns_the_rows_of_its_source_bank():
+    """Later changes of that bank and of a copy with the same arrays have no effect."""
     from_targets = random_bank(5, 4)
     own = np.array([np.diag([1.0, 2.0]), np.diag([3.0, 4.0])])
     bank = FilterBank.from_targets(from_targets.x, from_targets.P, from_targets.label, 2, 1e-8, own,

@@ -1,4 +1,4 @@
-"""Information, observability and bounds: the source's check values, laws and oracles."""
+"""Information, observability and bounds: check values of TSP14, laws and oracles."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def jacobian(m, positions, r0=R0, v0=V0, n_t=60):
 
 
 def unitless(m, positions):
-    """Information of the sources' example: R = I and the field without mu0/4pi."""
+    """Information of the example of TSP14: R = I and the field without mu0/4pi."""
     return information(jacobian(m, positions) / K_DIPOLE, np.eye(3))
 
 
@@ -50,19 +50,19 @@ CAR_SCALE = np.repeat([5.0, 5.0, 300.0, 1e-8], [3, 3, 3, 6])
 CORRELATED = NOISE * np.array([[2.0, 0.5, 0.0], [0.5, 1.0, -0.3], [0.0, -0.3, 1.5]])
 
 
-# The field of a moment across the plane of motion shows distances only.
-TURNING = [*np.cross(UP, R0), *np.cross(UP, V0), 0.0, 0.0, 0.0]
+# The field of a moment perpendicular to the plane of motion depends on the distance only.
+ROTATION_KERNEL = [*np.cross(UP, R0), *np.cross(UP, V0), 0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize('m, sensors, kernel, smallest, condition, unobservable', [
     (ONES, ONE, [[*R0, *V0, 3, 3, 3]], (0.2305, 5e-5), (np.inf, 0), 'r0_x r0_y v0_x m_x m_y m_z'),
-    (UP, ONE, [[*R0, *V0, 0, 0, 3], TURNING], (0.714, 5e-4), (np.inf, 0),
+    (UP, ONE, [[*R0, *V0, 0, 0, 3], ROTATION_KERNEL], (0.714, 5e-4), (np.inf, 0),
      'r0_x r0_y v0_x v0_y m_z'),
     (ONES, TWO, np.empty((0, 9)), (3.956, 5e-4), (2571, 0.5), ''),
 ])
-def test_observability_of_the_sources_example(m, sensors, kernel, smallest, condition,
+def test_observability_of_the_published_example(m, sensors, kernel, smallest, condition,
                                               unobservable):
-    """Check values of seeds.md item 12, to the digits given there; TSP14 Proposition 1."""
+    """Check values of an example of TSP14 Proposition 1, to the given digits."""
     o, k = observability(unitless(m, sensors), NAMES), len(kernel)
     print(f'{len(sensors)} sensors, m = {m}:', o.eigenvalues, o.condition_number)
     assert np.all(np.abs(o.eigenvalues[:k]) < 1e-12 * o.eigenvalues[-1])
@@ -74,7 +74,7 @@ def test_observability_of_the_sources_example(m, sensors, kernel, smallest, cond
 
 
 def test_scaled_observability_does_not_depend_on_units():
-    """Metres or millimetres, tesla or nanotesla: with the scale told, the same numbers."""
+    """With given scales, metres and millimetres, tesla and nanotesla give the same eigenvalues."""
     J = information(car(ROAD), NOISE * np.eye(3))
     unit = np.repeat([1e3, 1e3, 1.0, 1e9], [3, 3, 3, 6])
     names = NAMES + list('abcdef')
@@ -82,9 +82,9 @@ def test_scaled_observability_does_not_depend_on_units():
     theirs = observability(J / np.outer(unit, unit), names, CAR_SCALE * unit)
     assert ours.kernel_dimension == 0
     np.testing.assert_allclose(ours.eigenvalues, theirs.eigenvalues, rtol=1e-6)
-    # Unscaled, a tesla of background drowns all the rest.
+    # Without scales, the background in tesla dominates all other states.
     assert observability(J, names).kernel_dimension > 0
-    # The kernel comes back in metres: [r0, v0, 3 m, 0].
+    # The kernel is returned in the units of the states: [r0, v0, 3 m, 0].
     one = information(car(ROAD[:1]), NOISE * np.eye(3))
     kernel = observability(one, names[:12], CAR_SCALE[:12]).kernel
     x = np.concatenate([CAR[:6], 3.0 * np.array(CAR[6:]), np.zeros(3)])
@@ -95,15 +95,15 @@ def test_scaled_observability_does_not_depend_on_units():
 def test_known_cpa_range_makes_one_sensor_observable():
     J, prior = unitless(ONES, ONE), cpa_information(R0, V0, 0.1)
     assert observability(J + prior, NAMES).kernel_dimension == 0
-    # Nothing but the prior tells the range, so its bound is the prior's own.
+    # Only the prior determines the range, so its bound is that of the prior.
     gradient = np.array([0.0, 1.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 0.0])
     assert gradient @ bound(J, prior) @ gradient == pytest.approx(0.1**2, rel=1e-9)
-    # Not so where the kernel is larger: the heading remains.
+    # With a kernel of two dimensions, the heading remains unobservable.
     assert observability(unitless(UP, ONE) + prior, NAMES).kernel_dimension == 1
 
 
-def test_cpa_gradient_is_that_of_the_range():
-    """Against central differences: the minus sign that TSP14 does not print."""
+def test_cpa_information_is_that_of_the_gradient_of_the_range():
+    """Oracle: central differences. TSP14 omits the minus sign."""
     def cpa_range(x):
         return np.linalg.norm(np.cross(x[:3], x[3:6])) / np.linalg.norm(x[3:6])
 
@@ -121,7 +121,7 @@ def test_estimate_of_a_linear_model_reaches_the_bound():
     x = CAR_SCALE * rng.standard_normal((n, 15))
     y = np.einsum('tsai,ni->ntsa', H, x)
     y += np.einsum('ab,ntsb->ntsa', L, rng.standard_normal(y.shape))
-    # The estimate by another road: least squares of x / scale on rows whitened by Cholesky.
+    # Independent estimate: least squares of x / scale on rows whitened by Cholesky.
     A = np.vstack([np.linalg.solve(L, H).reshape(-1, 15) * CAR_SCALE, np.eye(15)])
     z = np.hstack([np.linalg.solve(L, y[..., None]).reshape(n, -1), np.zeros((n, 15))])
     e = CAR_SCALE * np.linalg.lstsq(A, z.T, rcond=None)[0].T - x
@@ -129,35 +129,37 @@ def test_estimate_of_a_linear_model_reaches_the_bound():
     low, high = chi2.ppf([0.005, 0.995], 15 * n) / (15 * n)
     print(f'NEES per state {nees / (15 * n):.4f}, limits {low:.4f} .. {high:.4f}')
     assert low <= nees / (15 * n) <= high
-    # Each variance by itself, at one chance in a hundred over all fifteen.
+    # Each variance separately, at a significance of 1 % over all fifteen.
     low, high = chi2.ppf([0.005 / 15, 1.0 - 0.005 / 15], n) / n
     ratio = (e**2).mean(axis=0) / np.diag(P)
     assert np.all((low <= ratio) & (ratio <= high)), ratio
 
 
 @pytest.mark.parametrize('m', [ONES, UP])
-def test_unobservable_states_have_infinite_variance_and_the_others_the_limit(m):
+def test_unobservable_states_have_infinite_variance(m):
     J = unitless(m, ONE)
     P = bound(J)
-    lost = np.isin(NAMES, observability(J, NAMES).unobservable)
-    assert np.array_equal(np.isinf(np.diag(P)), lost)
-    assert np.all(np.isnan(P[lost][:, ~lost])) and np.all(np.isfinite(P[np.ix_(~lost, ~lost)]))
+    unobservable = np.isin(NAMES, observability(J, NAMES).unobservable)
+    assert np.array_equal(np.isinf(np.diag(P)), unobservable)
+    assert np.all(np.isnan(P[unobservable][:, ~unobservable])) and np.all(
+        np.isfinite(P[np.ix_(~unobservable, ~unobservable)]))
     for weak in (1e-6 * np.eye(9), 1e-6 * np.diag(1.0 + np.arange(9.0))):
-        limit = np.linalg.inv(J + weak)[np.ix_(~lost, ~lost)]
-        np.testing.assert_allclose(P[np.ix_(~lost, ~lost)], limit, rtol=1e-4, atol=1e-5)
+        limit = np.linalg.inv(J + weak)[np.ix_(~unobservable, ~unobservable)]
+        np.testing.assert_allclose(P[np.ix_(~unobservable, ~unobservable)], limit, rtol=1e-4,
+                                   atol=1e-5)
 
 
-def test_a_state_with_a_small_part_in_what_is_lost_is_lost():
-    """Its part is so small that the others by themselves look unobservable."""
+def test_a_state_with_a_small_part_in_the_kernel_is_unobservable():
+    """Its part is so small that the other states alone appear unobservable."""
     A = np.random.default_rng(4).standard_normal((20, 6))
     n = np.array([1e-5, 1.0, -2.0, 1.0, 0.0, 3.0])
     A -= np.outer(A @ n, n) / (n @ n)
     J = A.T @ A
-    lost = n != 0.0
-    assert np.array_equal(np.isinf(np.diag(bound(J))), lost)
+    unobservable = n != 0.0
+    assert np.array_equal(np.isinf(np.diag(bound(J))), unobservable)
     for i in range(6):
-        assert np.isinf(bound(marginal(J, [i]))[0, 0]) == lost[i]
-    # And one of which nothing at all is known, beside units of many decades.
+        assert np.isinf(bound(marginal(J, [i]))[0, 0]) == unobservable[i]
+    # A state without any information, next to units that differ by many decades.
     np.testing.assert_allclose(bound(np.diag([4.0, 0.0, 1e16])), [
         [0.25, np.nan, 0.0], [np.nan, np.inf, np.nan], [0.0, np.nan, 1e-16]], rtol=1e-12)
 
@@ -169,8 +171,8 @@ def test_bound_of_an_observable_case_is_the_inverse_in_any_units():
     np.testing.assert_allclose(P, expected, rtol=1e-9, atol=1e-9 * expected.max())
 
 
-def test_prior_bounds_the_bound():
-    """MITRE12 figure 5: far away the bounds approach the prior's, and never exceed them."""
+def test_bound_never_exceeds_the_prior():
+    """MITRE12 figure 5: far away, the bounds approach those of the prior."""
     std = np.array([30.0, 5.0, 1.0, 4.5, 1.0, 0.1, 100.0, 100.0, 100.0])
     near, far = (np.sqrt(np.diag(bound(information(
         jacobian(CAR[6:], ONE, [-20.0, y, 0.0], [11.0, 0.0, 0.0]), NOISE * np.eye(3)),
@@ -179,8 +181,8 @@ def test_prior_bounds_the_bound():
     np.testing.assert_allclose(far, std, rtol=1e-3)
 
 
-def test_states_known_exactly_are_as_if_they_were_not_estimated():
-    """MITRE12 section 4.3: variance zero."""
+def test_states_known_exactly_are_treated_as_not_estimated():
+    """MITRE12 section 4.3: their variance is zero."""
     J, free = unitless(ONES, ONE), np.ix_([1, 2, 3, 5, 6, 7, 8], [1, 2, 3, 5, 6, 7, 8])
     expected = np.zeros((9, 9))
     expected[free] = np.linalg.inv(J[free])
@@ -201,8 +203,8 @@ def test_marginal_information_is_the_schur_complement():
 
 @pytest.mark.parametrize('keep', [[0], [2], [2, 0], [0, 1, 2], [3, 4, 5], [6, 7, 8], range(9)])
 @pytest.mark.parametrize('m', [ONES, UP])
-def test_marginal_information_of_what_is_lost_is_lost(m, keep):
-    """What rounding leaves of it must not come back as an enormous but finite bound."""
+def test_unobservable_states_stay_unobservable_in_marginal_information(m, keep):
+    """Rounding errors must not turn an infinite bound into a large finite one."""
     J, keep = unitless(m, ONE), np.array(keep)
     whole, part = bound(J)[np.ix_(keep, keep)], bound(marginal(J, keep))
     assert np.array_equal(np.isinf(np.diag(part)), np.isinf(np.diag(whole)))
@@ -210,13 +212,13 @@ def test_marginal_information_of_what_is_lost_is_lost(m, keep):
 
 
 def plain_kalman(F, Q, H, C, P):
-    """The textbook recursion, each sensor's rows stacked: the oracle."""
+    """Oracle: the textbook recursion with the rows of all sensors stacked."""
     out = []
     for F_k, Q_k, H_k in zip(F, Q, H, strict=True):
         P = F_k @ P @ F_k.T + Q_k
-        there = ~np.isnan(H_k).any(axis=-1).ravel()
-        A = H_k.reshape(-1, H_k.shape[-1])[there]
-        R = np.kron(np.eye(len(H_k)), C)[np.ix_(there, there)]
+        is_present = ~np.isnan(H_k).any(axis=-1).ravel()
+        A = H_k.reshape(-1, H_k.shape[-1])[is_present]
+        R = np.kron(np.eye(len(H_k)), C)[np.ix_(is_present, is_present)]
         K = P @ A.T @ np.linalg.inv(A @ P @ A.T + R)
         P = P - K @ A @ P
         out.append(P)
@@ -224,7 +226,7 @@ def plain_kalman(F, Q, H, C, P):
 
 
 def filter_problem():
-    """A car as [r, v, m, b]: Jacobians along its path, with sensors and axes missing."""
+    """A car as [r, v, m, b]: models and Jacobians along its path, some sensors and axes missing."""
     dt, n = 0.1, 40
     F, Q, H = np.eye(15), np.zeros((15, 15)), car(ROAD)
     F[:3, 3:6] = dt * np.eye(3)
@@ -236,40 +238,40 @@ def filter_problem():
 
 
 def relative(P, expected):
-    """Difference in units of the standard deviations."""
+    """Maximum difference in units of the standard deviations."""
     std = np.sqrt(np.einsum('...ii->...i', expected))
     return np.abs((P - expected) / (std[..., :, None] * std[..., None, :])).max()
 
 
-def test_path_bound_is_the_kalman_filters_covariance():
+def test_path_bound_is_the_covariance_of_the_kalman_filter():
     F, Q, H, P0 = filter_problem()
     expected = plain_kalman(F, Q, H, CORRELATED, P0)
     P = path_bound(F, Q, H, CORRELATED, P0)
     print('path bound against the filter:', relative(P, expected))
     assert relative(P, expected) < 1e-7
     assert P[-1][0, 0] < 0.02 * P0[0, 0]
-    # Whitened beforehand, and one F and Q for all steps.
+    # Whitened Jacobians, and one F and Q for all steps.
     white = np.linalg.solve(np.linalg.cholesky(CORRELATED), H[:7])
     assert relative(path_bound(F[0], Q[0], white, None, P0), expected[:7]) < 1e-7
 
 
-def test_path_bound_accepts_what_is_known_exactly():
-    """A start without variance, and heights that never change."""
+def test_path_bound_accepts_states_known_exactly():
+    """Vertical components without initial variance and process noise."""
     (F, Q, H, P0), known = filter_problem(), [2, 5, 8]
     Q[:, known] = Q[:, :, known] = P0[known, known] = 0.0
     P = path_bound(F, Q, H, CORRELATED, P0)
     assert np.all(P[:, known] == 0.0)
     free = np.setdiff1d(np.arange(15), known)
-    few = np.ix_(range(40), free, free)
-    expected = plain_kalman(F[few], Q[few], H[..., free], CORRELATED, P0[np.ix_(free, free)])
-    assert relative(P[few], expected) < 1e-7
+    subset = np.ix_(range(40), free, free)
+    expected = plain_kalman(F[subset], Q[subset], H[..., free], CORRELATED, P0[np.ix_(free, free)])
+    assert relative(P[subset], expected) < 1e-7
 
 
 def test_path_bound_without_process_noise_ends_at_the_batch_bound():
     F, Q, H, P0 = filter_problem()
     F[0] = np.eye(15)
     P = path_bound(F, 0.0 * Q, H, CORRELATED, P0)
-    # The batch is about the start, the filter's last step 39 samples later.
+    # The batch bound refers to the first sample, the last filter step to 39 samples later.
     H_batch = H.copy()
     H_batch[..., 3:6] = 0.1 * np.arange(40)[:, None, None, None] * H[..., :3]
     shift = np.eye(15) + 3.9 * np.eye(15, k=3) * (np.arange(15) < 6)
@@ -277,7 +279,7 @@ def test_path_bound_without_process_noise_ends_at_the_batch_bound():
     assert relative(P[-1], batch) < 1e-7
 
 
-def test_missing_axes_and_sensors_count_for_nothing():
+def test_missing_axes_and_sensors_add_no_information():
     H = car(ROAD)[:5]
     H[1, 0] = H[2, 1, 1] = np.nan
     C = np.repeat(CORRELATED[None], 2, axis=0) * np.array([1.0, 3.0])[:, None, None]
@@ -287,15 +289,15 @@ def test_missing_axes_and_sensors_count_for_nothing():
         J += H[t, j, p].T @ np.linalg.inv(C[j][np.ix_(p, p)]) @ H[t, j, p]
     ours, size = information(H, C), np.outer(CAR_SCALE, CAR_SCALE)
     np.testing.assert_allclose(ours * size, J * size, rtol=1e-12, atol=1e-12 * (J * size).max())
-    # The noise of what is missing is not read.
+    # The covariance of missing axes is ignored.
     C = np.broadcast_to(C, (5, 2, 3, 3)).copy()
     C[1, 0], C[2, 1, 1], C[2, 1, :, 1] = np.nan, np.nan, np.nan
     np.testing.assert_array_equal(information(H, C), ours)
     assert np.all(information(np.full((4, 3, 9), np.nan), np.eye(3)) == 0.0)
 
 
-def test_snr_is_the_energy_of_the_field_and_least_abeam():
-    """T10 (5.21) is the least over all directions; four times as much along the axis."""
+def test_snr_is_the_energy_of_the_field_and_minimal_abeam():
+    """T10 eq. (5.21) is the minimum over all directions; along the axis the SNR is four times."""
     h = 1e-8 * np.array([[1.0, -2.0, 0.5], [1.0, np.nan, 2.0], [np.nan] * 3])
     expected, _ = whitened_energy(h, np.repeat(CORRELATED[None], 3, axis=0))
     np.testing.assert_allclose(snr(h, CORRELATED), expected, rtol=1e-12)
@@ -309,7 +311,7 @@ def test_snr_is_the_energy_of_the_field_and_least_abeam():
 
 
 def test_range_of_a_magnetometer_is_about_ten_metres():
-    """T10 (5.22)-(5.24), (6.1), and the same at TSP14's scale, which is the right one."""
+    """T10 eq. (5.22)-(5.24), (6.1), and the same at the correct scale, that of TSP14."""
     t10 = snr_range(1.0, np.sqrt(1e-21), 9.2)
     cars = snr_range(np.array([300.0, 600.0, 1800.0]), np.sqrt(NOISE), 9.2)
     print(f'range: {t10:.2f} m; cars and truck {cars}')
@@ -322,7 +324,7 @@ def test_range_of_a_magnetometer_is_about_ten_metres():
 H9, I9, SKEW = np.ones((4, 3, 9)), np.eye(9), np.eye(3) + 0.5 * np.eye(3, k=1)
 
 
-@pytest.mark.parametrize('call, named', [
+@pytest.mark.parametrize('call, message', [
     (lambda: information(H9, np.ones((1, 3))), r'C has shape \(1, 3\), expected \(4, 3, 3\)'),
     (lambda: information(H9, np.ones((5, 3, 3))), r'C has shape \(5, 3, 3\)'),
     (lambda: information(H9, 1e-16 * np.ones((3, 3))), r'C\[0\] is not positive definite.*1e-16'),
@@ -344,6 +346,6 @@ H9, I9, SKEW = np.ones((4, 3, 9)), np.eye(9), np.eye(3) + 0.5 * np.eye(3, k=1)
     (lambda: path_bound(I9, -I9, H9, None, I9), r'Q\[0\] is not positive semidefinite'),
     (lambda: path_bound(I9, 0 * I9, H9, None, -I9), 'P0 is not positive semidefinite'),
 ])
-def test_bad_input_is_refused_with_its_value(call, named):
-    with pytest.raises(ValueError, match=named):
+def test_invalid_arguments_raise_value_error_with_the_value(call, message):
+    with pytest.raises(ValueError, match=message):
         call()

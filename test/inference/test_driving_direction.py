@@ -1,4 +1,4 @@
-"""The sense in which a field rotates: published numbers, theory against Monte Carlo, fusion."""
+"""Direction from the sense of rotation of a field: published values, Monte Carlo, fusion."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from mag_tracking.inference.driving_direction import (
 )
 
 N = 100
-"""Samples of the window of the paper's simulation."""
+"""Number of samples in the window of the published simulation."""
 
 
 def signal(distance=1.0, direction=1.0, n=N):
@@ -28,13 +28,13 @@ def noise_for(h, snr_db):
     return float(np.sqrt(np.mean(np.sum(h**2, axis=1)) * 10.0**(-snr_db / 10.0)))
 
 
-def test_the_published_simulation():
-    """PHD15 Paper B, section VI; computed again for the printed numbers."""
+def test_expected_rotation_equals_the_published_simulation():
+    """PHD15 Paper B, section VI, recomputed with the published parameters."""
     h = signal()
     assert np.mean(np.sum(h**2, axis=1)) == pytest.approx(0.583103, abs=1e-6)
     assert expected_rotation(h, 1.0, 1).correlation == pytest.approx(-8.73775, abs=1e-5)
     assert expected_rotation(h, 1.0, 15).correlation == pytest.approx(-1.12269, abs=1e-5)
-    # As 20 000 runs have it.
+    # Agrees with 20 000 Monte Carlo runs.
     assert expected_rotation(h, noise_for(h, -10.0), 15).variance == pytest.approx(33.42, abs=5e-3)
     for snr_db, error in ((-20, 0.4919), (-15, 0.4747), (-10, 0.4230), (-5, 0.2881), (0, 0.0773),
                           (5, 0.00098)):
@@ -42,8 +42,8 @@ def test_the_published_simulation():
         assert found.error_probability == pytest.approx(error, abs=1e-4)
 
 
-def deviations(snr_db, lag, runs=4000):
-    """Means of statistic, variance and error rate less theory, in standard errors."""
+def normalised_deviations(snr_db, lag, runs=4000):
+    """Deviations from theory in standard errors: mean, variance, error rate, variance estimate."""
     rng, h = np.random.default_rng([snr_db + 50, lag]), signal()
     std = noise_for(h, snr_db)
     padded = np.pad(h, ((lag, lag), (0, 0)))
@@ -55,33 +55,32 @@ def deviations(snr_db, lag, runs=4000):
     root, error = np.sqrt(runs), max(expected.error_probability, 1.0 / runs)
     out = [(f.mean() - expected.correlation) / f.std() * root,
            (f.var() - expected.variance) / np.std((f - f.mean())**2) * root,
-           # The sum is not quite normally distributed: a percentage point is allowed for that.
+           # The statistic is not exactly normal; the tolerance is one percentage point.
            max(0.0, abs(np.mean(f > 0.0) - error) - 0.01) / np.sqrt(error * (1 - error)) * root]
-    # Where noise dominates the floor makes the estimate of the variance larger.
+    # If noise dominates, the lower limit increases the estimate of the variance.
     return [*out, (estimates.mean() - expected.variance) / estimates.std() * root
             if snr_db >= 0 else 0.0]
 
 
-def test_mean_variance_and_errors_are_those_of_theory():
-    """PHD15 Paper B eq. (12), (14), (17), (16), at six ratios and four lags."""
-    z = np.abs([deviations(snr_db, lag) for snr_db in (-10, -5, 0, 5, 10, 20)
+def test_mean_variance_and_error_rate_agree_with_theory():
+    """PHD15 Paper B eq. (12), (14), (17), (16), at six signal-to-noise ratios and four lags."""
+    z = np.abs([normalised_deviations(snr_db, lag) for snr_db in (-10, -5, 0, 5, 10, 20)
                 for lag in (3, 7, 11, 15)])
-    # Of 24 one is beyond three standard errors in one case of sixteen, two in one of 500.
+    # Of 24 values, one exceeds three standard errors with probability 1/16, two with 1/500.
     assert (np.count_nonzero(z > 3.0, axis=0) <= 1).all() and z.max() < 4.0, z
 
 
-def test_direction_and_orientation_of_the_sensor():
-    """The sign is that of the direction; the statistic does not depend on the sensor's yaw."""
+def test_sign_is_that_of_the_direction_for_any_yaw_of_the_sensor():
     h, c, s = signal(), np.cos(0.7), np.sin(0.7)
     left = expected_rotation(h, 0.1, 7)
     assert left.left_to_right > 0.999 and left.log_odds > 6.0
     assert expected_rotation(signal(direction=-1.0), 0.1, 7).log_odds < -6.0
-    turned = expected_rotation(h @ np.array([[c, -s], [s, c]]), 0.1, 7)
-    assert turned == pytest.approx(left)
+    rotated = expected_rotation(h @ np.array([[c, -s], [s, c]]), 0.1, 7)
+    assert rotated == pytest.approx(left)
 
 
-def test_the_best_lag_of_the_paper_needs_two_metres():
-    """With the printed distance of 1 m it is 7 samples; about 15, as published, with 2 m."""
+def test_the_published_best_lag_requires_a_distance_of_two_metres():
+    """The best lag is 7 samples at the published distance of 1 m; at 2 m it is the published 15."""
     def best(distance):
         h = signal(distance)
         std, lags = noise_for(h, -5.0), list(range(1, 26))
@@ -91,7 +90,7 @@ def test_the_best_lag_of_the_paper_needs_two_metres():
     assert best(1.0) == 7 and 13 <= best(2.0) <= 15
 
 
-def test_a_lag_is_found_from_a_training_set():
+def test_best_lag_is_near_the_optimum_for_a_training_set():
     rng, h = np.random.default_rng(3), signal()
     std = noise_for(h, 0.0)
     windows = [np.pad(h, ((25, 25), (0, 0))) + std * rng.standard_normal((N + 50, 2))
@@ -102,7 +101,7 @@ def test_a_lag_is_found_from_a_training_set():
     assert errors[lag_of(windows[0], std, 25)] < 3.0 * min(errors.values())
 
 
-def test_nothing_but_noise_tells_no_direction():
+def test_noise_alone_yields_no_direction():
     rng = np.random.default_rng(4)
     p = np.array([field_rotation(rng.standard_normal((80, 2)), 1.0, 5).left_to_right
                   for _ in range(2000)])
@@ -114,10 +113,10 @@ def test_nothing_but_noise_tells_no_direction():
 
 
 def test_sensors_on_both_sides_are_fused():
-    """PHD15 Paper B eq. (20)-(23): the product of the odds, swapped on the other side."""
+    """PHD15 Paper B eq. (20)-(23): product of the odds, inverted on the other side of the road."""
     near, far = FieldRotation(-2.0, 1.0), FieldRotation(1.0, 1.0)
     p, q = near.left_to_right, 1.0 - far.left_to_right
     fused = fused_log_odds([near.log_odds, far.log_odds], [True, False])
     assert fused == pytest.approx(np.log(p * q / ((1.0 - p) * (1.0 - q))))
-    # Far in the tail, where a probability would round to one.
+    # A log-odds whose probability rounds to one.
     assert FieldRotation(-40.0, 1.0).log_odds > 800.0

@@ -1,4 +1,4 @@
-"""The bank of integrated random walks against plain Kalman filters, and on its own process."""
+"""Bank of integrated random walks: against plain Kalman filters, and on data of its own model."""
 
 import numpy as np
 import pytest
@@ -10,14 +10,14 @@ from mag_tracking.inference.gauss_markov import STRENGTHS, SWITCH_S, GaussMarkov
 
 
 def plain_filter(density, std):
-    """filterpy's filter of one component."""
+    """filterpy filter of one component."""
     kf = KalmanFilter(dim_x=2, dim_z=1)
     kf.H, kf.P = np.array([[1.0, 0.0]]), np.diag([std**2, density])
     return kf
 
 
 def by_plain_filters(series, variance, dt, scale, std):
-    """Log-densities of the columns of `series` (n, m), which are one vector."""
+    """Log-densities of the vectors `series` (n, m), by plain filters of each component."""
     banks = [[plain_filter((s * scale)**2, std) for _ in series[0]] for s in STRENGTHS]
     log_w = np.full(len(STRENGTHS), -np.log(len(STRENGTHS)))
     out = []
@@ -36,25 +36,25 @@ def by_plain_filters(series, variance, dt, scale, std):
     return np.array(out)
 
 
-def test_densities_are_those_of_plain_filters():
+def test_densities_equal_those_of_plain_filters():
     rng = np.random.default_rng(0)
     series = np.cumsum(rng.standard_normal((25, 3)), axis=0)
     series[7, 1] = series[11] = np.nan
     ours = GaussMarkovVectors(1, np.full(3, 0.5), 2.0)
     densities = []
     for y in series:
-        there = np.isfinite(y)
+        is_present = np.isfinite(y)
         densities.append(ours.log_density(
-            np.zeros(there.sum(), dtype=np.int64), np.eye(3)[there], y[there],
-            np.full(there.sum(), 0.04), 0.1))
+            np.zeros(is_present.sum(), dtype=np.int64), np.eye(3)[is_present], y[is_present],
+            np.full(is_present.sum(), 0.04), 0.1))
     theirs = by_plain_filters(series, 0.04, 0.1, 0.5, 2.0)
     assert densities == pytest.approx(theirs, rel=1e-9)
 
 
-def test_vectors_are_independent_and_seen_from_any_side():
+def test_vectors_are_independent_and_measured_in_any_orientation():
     rng = np.random.default_rng(1)
     R = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    both, turned = GaussMarkovVectors(2, np.ones(3), 1.0), GaussMarkovVectors(1, np.ones(3), 1.0)
+    both, rotated = GaussMarkovVectors(2, np.ones(3), 1.0), GaussMarkovVectors(1, np.ones(3), 1.0)
     alone = [GaussMarkovVectors(1, np.ones(3), 1.0) for _ in range(2)]
     zero, variance = np.zeros(3, dtype=np.int64), np.full(3, 0.01)
     for _ in range(20):
@@ -64,27 +64,27 @@ def test_vectors_are_independent_and_seen_from_any_side():
         each = [f.log_density(zero, np.eye(3), v, variance, 0.05)
                 for f, v in zip(alone, y, strict=True)]
         assert joint == pytest.approx(sum(each), rel=1e-9)
-        # The axes of a sensor that is turned measure the same.
-        assert turned.log_density(zero, R, R @ y[0], variance, 0.05) == pytest.approx(
+        # A rotated sensor measures the same vector.
+        assert rotated.log_density(zero, R, R @ y[0], variance, 0.05) == pytest.approx(
             each[0], rel=1e-6)
 
 
 @pytest.mark.parametrize('strength', [0.1, 10.0, 1000.0])
-def test_it_explains_its_own_process_as_well_as_the_filter_that_knows_the_strength(strength):
+def test_density_of_its_own_model_is_near_that_of_the_true_filter(strength):
     rng = np.random.default_rng(2)
     dt, n = 0.08, 400
     rate = np.cumsum(strength * np.sqrt(dt) * rng.standard_normal(n))
     y = np.cumsum(rate) * dt + rng.standard_normal(n)
-    bank, knows = GaussMarkovVectors(1, np.ones(1), 1.0), plain_filter(strength**2, 1.0)
+    bank, true_filter = GaussMarkovVectors(1, np.ones(1), 1.0), plain_filter(strength**2, 1.0)
     ours = theirs = 0.0
     for value in y:
         ours += bank.log_density(np.zeros(1, dtype=np.int64), np.ones((1, 1)), np.array([value]),
                                  np.ones(1), dt)
-        knows.predict(F=np.array([[1.0, dt], [0.0, 1.0]]),
+        true_filter.predict(F=np.array([[1.0, dt], [0.0, 1.0]]),
                       Q=Q_continuous_white_noise(2, dt, strength**2))
-        knows.update(value, R=1.0)
-        theirs += knows.log_likelihood
-    # Not to know it costs the start and what is kept for a switch: at most log(1/stay) a frame.
+        true_filter.update(value, R=1.0)
+        theirs += true_filter.log_likelihood
+    # The unknown strength costs its initial weight and at most log(1/stay) per frame.
     assert theirs - n * dt / SWITCH_S - np.log(len(STRENGTHS)) < ours < theirs + 10.0
 
 
@@ -97,16 +97,16 @@ def test_densities_stay_finite_over_long_gaps_and_with_little_noise(gap, noise):
                                    1e-6 + noise * rng.standard_normal(3), np.full(3, noise**2),
                                    gap if k % 5 == 4 else 0.08)
         assert np.isfinite(density)
-    # It still follows: what repeats itself within its noise is expected.
+    # The bank still follows the signal: a repeated value has a high density.
     y = np.full(3, 1e-6)
     known = [bank.log_density(np.zeros(3, dtype=np.int64), np.eye(3), value, np.full(3, noise**2),
                               0.08) for value in (y, y, y + 1e3 * noise)]
-    # A strength a thousand times larger costs log(1000) on each axis.
+    # A strength larger by a factor of 1000 costs log(1000) per axis.
     assert known[2] < known[1] - 15.0
 
 
-def test_components_that_do_not_change_are_constants():
-    """One that changes and a constant, seen together and apart, against filterpy."""
+def test_components_of_zero_strength_are_constant():
+    """One varying and one constant component, measured in combinations, against filterpy."""
     rng = np.random.default_rng(5)
     bank = GaussMarkovVectors(1, np.array([0.5, 0.0]), 2.0)
     H = np.array([[1.0, 0.3], [0.2, -1.0]])
@@ -133,6 +133,6 @@ def test_components_that_do_not_change_are_constants():
             == pytest.approx(expected, rel=1e-8)
 
 
-def test_a_component_that_does_not_change_stands_behind_those_that_do():
+def test_constant_components_must_come_last():
     with pytest.raises(ValueError, match='must come last'):
         GaussMarkovVectors(1, np.array([0.0, 1.0]), 1.0)

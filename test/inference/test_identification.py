@@ -1,4 +1,4 @@
-"""Enrolled vehicles: the published passes of one, and two cars of equal size."""
+"""Identification of enrolled vehicles: published passes of one, and two cars of equal size."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from mag_tracking.physics.dipole import MU0
 from support.vehicle_5 import TABLE
 
 SCALE = 450.0
-"""[A m^2] of T10's unit of moment (the ratio of TSP14 to T10 for the same vehicles)."""
+"""[A m^2] Unit of moment of T10: the ratio of TSP14 to T10 for the same vehicles."""
 MOMENTS = SCALE * TABLE[:, 1:4]
 COVARIANCES = np.array([np.diag((SCALE * std)**2) for std in TABLE[:, 4:7]])
 HEADINGS = np.deg2rad(TABLE[:, 0])
@@ -19,7 +19,7 @@ HARD, SOFT = SCALE * np.array([-0.47, 0.29, -0.56]), 1.22
 
 
 def distances(between_std, monkeypatch):
-    """Squared distances of each published pass to what the twelve others predict."""
+    """Squared distance of each published pass from the prediction of the twelve others."""
     monkeypatch.setattr('mag_tracking.inference.identification.PASS_TO_PASS_STD', between_std)
     out = []
     for k in range(len(TABLE)):
@@ -31,14 +31,14 @@ def distances(between_std, monkeypatch):
 
 
 def test_published_passes_are_consistent_with_the_spread_between_passes(monkeypatch):
-    """T10 Table 6.9, each pass left out; the stated deviations alone are too small."""
+    """T10 Table 6.9, leaving one pass out; the stated standard deviations alone are too small."""
     low, high = chi2.ppf([0.005, 0.995], 3 * len(TABLE)) / len(TABLE)
     assert low < distances(PASS_TO_PASS_STD, monkeypatch).mean() < high
     assert distances(1e-6, monkeypatch).mean() > high
 
 
-def test_a_heading_that_was_not_enrolled_is_identified():
-    """T10 Table 6.9, all passes of one heading left out."""
+def test_a_pass_at_a_heading_not_enrolled_is_identified():
+    """T10 Table 6.9, leaving all passes of one heading out."""
     for heading in np.unique(HEADINGS):
         rest = heading != HEADINGS
         vehicle = enrol('5', MOMENTS[rest], COVARIANCES[rest], HEADINGS[rest], INDUCTION)
@@ -52,18 +52,18 @@ def moment_at(hard, heading):
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ hard + SOFT * INDUCTION
 
 
-def turned(degrees):
-    """The hard iron of a car of equal size."""
+def rotated_hard_iron(degrees):
+    """Hard iron of a car of equal size."""
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ HARD
 
 
 @pytest.mark.parametrize('degrees', [60, 90, 120, 180])
-def test_two_cars_of_equal_size_are_told_apart(degrees):
-    """T10 Fig. 7.1 in kind: enrolled heading north and south, identified at any heading."""
+def test_two_cars_of_equal_size_are_distinguished(degrees):
+    """As T10 Fig. 7.1: enrolled at headings north and south, identified at any heading."""
     rng, C = np.random.default_rng(degrees), np.diag([8.0, 8.0, 15.0])**2
     spread = np.linalg.cholesky(C + PASS_TO_PASS_STD**2 * np.eye(3))
-    cars = {'vehicle 5': HARD, 'other': turned(degrees)}
+    cars = {'vehicle 5': HARD, 'other': rotated_hard_iron(degrees)}
     enrolled_at = np.deg2rad([90.0, 90.0, 270.0, 270.0])
 
     def passes(hard, headings):
@@ -80,11 +80,11 @@ def test_two_cars_of_equal_size_are_told_apart(degrees):
     right = [identify(fleet, m, C, heading, 0.02, INDUCTION).name == name
              for name, hard in cars.items() for heading in np.deg2rad([90.0, 270.0, 20.0, 200.0])
              for m in passes(hard, [heading] * 10)]
-    # One in a hundred is further away than the threshold of `unknown`.
+    # One in a hundred exceeds the threshold of `unknown`.
     assert np.mean(right) > 0.99 - 3.0 * np.sqrt(0.01 * 0.99 / len(right))
 
 
-def test_one_heading_is_compared_at_that_heading_only():
+def test_a_vehicle_enrolled_at_one_heading_is_compared_there_only():
     C = np.tile(np.diag([10.0] * 3)**2, (2, 1, 1))
     headings = np.deg2rad([88.0, 92.0])
     one = enrol('van', np.array([moment_at(HARD, h) for h in headings]), C, headings, INDUCTION)
@@ -95,18 +95,18 @@ def test_one_heading_is_compared_at_that_heading_only():
     assert found.name == UNKNOWN and found.not_compared == ('van',)
 
 
-def test_a_stranger_is_unknown():
+def test_a_vehicle_not_enrolled_is_unknown():
     C = np.tile(np.diag([10.0] * 3)**2, (4, 1, 1))
     headings = np.deg2rad([0.0, 90.0, 180.0, 270.0])
     one = enrol('van', np.array([moment_at(HARD, h) for h in headings]), C, headings, INDUCTION)
-    found = identify([one], moment_at(2.0 * turned(90), 0.3), C[0], 0.3, 0.02, INDUCTION)
+    found = identify([one], moment_at(2.0 * rotated_hard_iron(90), 0.3), C[0], 0.3, 0.02, INDUCTION)
     assert found.name == UNKNOWN and found.distances['van'] > 11.3
 
 
-@pytest.mark.parametrize(('headings', 'why'), [
+@pytest.mark.parametrize(('headings', 'message'), [
     ([], 'at least one pass'), ([0.0, 25.0], '25 degrees apart')])
-def test_what_cannot_be_enrolled_is_named(headings, why):
+def test_insufficient_passes_are_not_enrolled(headings, message):
     headings = np.deg2rad(headings)
     moments = np.array([moment_at(HARD, h) for h in headings]).reshape(-1, 3)
-    with pytest.raises(ValueError, match=why):
+    with pytest.raises(ValueError, match=message):
         enrol('van', moments, np.tile(np.eye(3), (len(headings), 1, 1)), headings, INDUCTION)

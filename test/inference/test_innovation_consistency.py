@@ -1,4 +1,4 @@
-"""Innovations over time against their law."""
+"""Consistency test of innovations over time: false alarms and detections."""
 
 import numpy as np
 
@@ -25,21 +25,21 @@ def test_consistent_filters_fail_as_often_as_stated():
     rng = np.random.default_rng(0)
     n = 2500
     runs = [run(rng.chisquare(3, (30, 2))) for _ in range(n)]
-    # The whole network, and the two sensors with half the probability each: at most 2 x 1e-3, and
-    # at least that of the network alone; four deviations of the binomial.
+    # The network and, at half the probability each, the two sensors are tested: the total rate is
+    # 1e-3 to 2e-3, within four standard deviations of the binomial distribution.
     for failed in (sum(r.fails for r in runs), sum(r.excess > 1.0 for r in runs)):
         assert FALSE_ALARM * n - 4 * np.sqrt(n * FALSE_ALARM) < failed \
             < 2 * FALSE_ALARM * n + 4 * np.sqrt(2 * n * FALSE_ALARM)
 
 
-def test_innovations_twice_as_large_as_stated_are_found_and_measured():
+def test_innovations_twice_as_large_as_stated_are_detected_and_quantified():
     rng = np.random.default_rng(1)
     runs = [run(4.0 * rng.chisquare(3, (30, 2))) for _ in range(200)]
     assert all(r.fails for r in runs)
     assert 3.5 < np.median([r.excess for r in runs]) < 6.0
 
 
-def test_one_of_many_sensors_is_found():
+def test_one_inconsistent_sensor_is_detected():
     rng = np.random.default_rng(2)
     nis = rng.chisquare(3, (30, 2))
     nis[:, 1] *= 0.1
@@ -47,7 +47,7 @@ def test_one_of_many_sensors_is_found():
     assert run(nis).fails
 
 
-def test_a_burst_passes_with_its_window_and_missing_sensors_count_nothing():
+def test_a_burst_expires_with_its_window_and_missing_sensors_are_ignored():
     nis = np.full((40, 2), 1.0)
     nis[10:13] = 40.0
     nis[:, 1] = np.nan

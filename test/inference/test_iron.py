@@ -19,8 +19,8 @@ def moments_at(headings):
     return np.stack([c * x - s * y, s * x + c * y, z + 0.0 * c], axis=1) + SOFT * INDUCTION
 
 
-def test_the_table_of_the_source_is_refitted():
-    """All alike, as (6.16) has it; with T10's 3 B0/mu0. It prints D = 1.23."""
+def test_fit_reproduces_the_published_iron():
+    """Equal weights as in T10 eq. (6.16), with 3 B0/mu0 as in T10, which states D = 1.23."""
     B0 = 1.7e-7 * np.array([0.0, 0.31, -0.95])
     fit = hard_and_soft_iron(TABLE[:, 1:4], np.deg2rad(TABLE[:, 0]), 3.0 * B0 / MU0)
     print(f'T10 Table 6.9: m0 = {fit.hard.round(3)}, D = {fit.soft:.3f}')
@@ -37,7 +37,7 @@ def test_exact_moments_give_exact_iron():
 
 
 @pytest.mark.parametrize('stated', [True, False])
-def test_the_covariance_is_that_of_the_errors(stated):
+def test_covariance_agrees_with_the_errors(stated):
     rng = np.random.default_rng(1)
     headings = np.deg2rad([10.0, 100.0, 190.0, 280.0] * 2)
     C = np.tile(np.diag([9.0, 16.0, 25.0]) if stated else 16.0 * np.eye(3), (8, 1, 1))
@@ -62,13 +62,13 @@ def test_the_covariance_is_that_of_the_errors(stated):
 @pytest.mark.parametrize('headings, induction', [
     ([0.3], INDUCTION), ([0.3, 0.3, 0.3 + 2.0 * np.pi], INDUCTION),
     ([0.3, 1.3, 2.3], [0.0, 0.0, -39.0]), ([0.3, 1.3, 2.3], np.zeros(3))])
-def test_what_cannot_be_told_apart_is_refused(headings, induction):
+def test_inseparable_hard_and_soft_iron_is_rejected(headings, induction):
     headings = np.array(headings)
     with pytest.raises(ValueError, match='cannot be separated'):
         hard_and_soft_iron(moments_at(headings), headings, induction)
 
 
-def test_bad_input_is_named():
+def test_invalid_arguments_raise_value_error():
     headings = np.array([0.0, 1.0, 2.0])
     m = moments_at(headings)
     with pytest.raises(ValueError, match=r'expected moments \(n, 3\)'):

@@ -1,6 +1,4 @@
-"""The plain filter, an oracle of the compiled one: against the dense filter and filterpy, and its
-statistics.
-"""
+"""Plain Kalman filter, the oracle of the compiled one: against a dense filter and filterpy."""
 
 import numpy as np
 import pytest
@@ -19,7 +17,7 @@ from support.samples import one, simulate
 
 
 def dense_update(x, P, y, h, H, C, inflation, x_lin, n_own=0):
-    """The textbook, stacked update of one hypothesis: the oracle."""
+    """Oracle: the stacked textbook update of one hypothesis."""
     n_sensors, n_t = len(H), H.shape[2] - n_own
     full = np.zeros((3 * n_sensors, len(x)))
     full[:, -3 * n_sensors:] = np.eye(3 * n_sensors)
@@ -30,11 +28,11 @@ def dense_update(x, P, y, h, H, C, inflation, x_lin, n_own=0):
     R = np.zeros((3 * n_sensors, 3 * n_sensors))
     for j in range(n_sensors):
         R[3 * j:3 * j + 3, 3 * j:3 * j + 3] = C[j] + inflation[j] * np.eye(3)
-    there = ~np.isnan(y.ravel())
-    full, R = full[there], R[np.ix_(there, there)]
-    predicted = (h.ravel() + x_lin[-3 * n_sensors:])[there] + full @ (x - x_lin)
-    nu = y.ravel()[there] - predicted
-    # Whitened, as the tesla scale would be lost on general-purpose tolerances.
+    is_present = ~np.isnan(y.ravel())
+    full, R = full[is_present], R[np.ix_(is_present, is_present)]
+    predicted = (h.ravel() + x_lin[-3 * n_sensors:])[is_present] + full @ (x - x_lin)
+    nu = y.ravel()[is_present] - predicted
+    # Whitened, because values in tesla are below general-purpose tolerances.
     W = np.linalg.inv(np.linalg.cholesky(R))
     A = W @ full
     S = A @ P @ A.T + np.eye(len(A))
@@ -47,8 +45,8 @@ def dense_update(x, P, y, h, H, C, inflation, x_lin, n_own=0):
             (A, z, S))
 
 
-def tracked(n_sensors, missing=False):
-    """A bank in the middle of a simulated pass, and the ingredients of its next update."""
+def bank_in_a_pass(n_sensors, missing=False):
+    """State of a bank in the middle of a simulated pass, and the inputs of its next update."""
     network = line_network(n_sensors)
     rng = np.random.default_rng(5)
     samples, *_ = simulate(network, point_body([250.0, -120.0, 90.0], 5.0, 0.5),
@@ -80,8 +78,8 @@ def tracked(n_sensors, missing=False):
 
 
 def compare(n_sensors, missing=False, shift=0.0):
-    """Largest differences in mean [sd] and covariance [sd^2] from both oracles."""
-    x, P, y, h, H, C, inflation = tracked(n_sensors, missing)
+    """Maximum differences in mean [sd] and covariance [sd^2] from both oracles."""
+    x, P, y, h, H, C, inflation = bank_in_a_pass(n_sensors, missing)
     x_lin = x + shift * np.sqrt(np.einsum('nii->ni', P))
     new_x, new_P = x.copy(), P.copy()
     log_likelihood, nis, _ = plain_kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin)
@@ -117,8 +115,8 @@ def test_update_with_missing_axes_and_sensors():
 
 @pytest.mark.parametrize('n_own', [0, 2, 3])
 @pytest.mark.parametrize('n_t', [0, 3, 5, 7, 12])
-def test_update_in_numbers_near_one_with_any_axes_missing(n_t, n_own):
-    """In tesla a missing axis that is only given a large noise would look like one left out."""
+def test_update_of_values_near_one_with_any_axes_missing(n_t, n_own):
+    """In tesla, an axis with large noise could not be distinguished from an excluded axis."""
     rng = np.random.default_rng(n_t)
     n_sensors = 8
     n_x = n_t + (n_own + 3) * n_sensors
@@ -144,7 +142,7 @@ def test_update_in_numbers_near_one_with_any_axes_missing(n_t, n_own):
     np.testing.assert_allclose([log_likelihood[0], nis[0].sum()], [oll, onis], rtol=1e-9)
 
 
-def test_update_linearised_elsewhere():
+def test_update_linearised_away_from_the_mean():
     assert max(compare(2, shift=0.3)[:2]) <= 1e-8
 
 
@@ -169,7 +167,7 @@ def test_nees_of_a_linear_gaussian_case_is_chi_square():
         noise = rng.standard_normal((runs, n_sensors, 3)) * np.sqrt([0.5, 1.0, 2.0])
         y = np.einsum('pjic,pc->pji', H, truth[:, :n_t]) \
             + truth[:, n_t:].reshape(runs, n_sensors, 3) + noise
-        # The measurement differs from run to run, so each is an update of its own.
+        # The measurement differs between runs, so each run is updated separately.
         for p in range(runs):
             h = np.einsum('jic,c->ji', H[p], x[p, :n_t])[None]
             nis.append(plain_kalman.update(x[p:p + 1], P[p:p + 1], y[p], h, H[p:p + 1], C,
@@ -179,7 +177,7 @@ def test_nees_of_a_linear_gaussian_case_is_chi_square():
     low, high = chi2.ppf([0.025, 0.975], runs * n_x) / runs
     print(f'linear Gaussian NEES {nees.mean():.3f}, band {low:.3f} .. {high:.3f}')
     assert low <= nees.mean() <= high
-    # Innovations are white: each sensor's alone has three degrees of freedom, in every step.
+    # Innovations are white: in every step, those of each sensor have three degrees of freedom.
     low, high = chi2.ppf([0.005, 0.995], 3 * len(nis)) / len(nis)
     by_sensor = np.mean(nis, axis=0)
     print(f'NIS by sensor {by_sensor.round(3)}, band {low:.3f} .. {high:.3f}')

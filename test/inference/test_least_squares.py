@@ -1,4 +1,4 @@
-"""Searches that run away, and what is known beforehand."""
+"""Nonlinear least squares: divergent starts, infinite models and priors."""
 
 import warnings
 
@@ -9,8 +9,8 @@ from mag_tracking.inference.least_squares import project_out_linear, refine
 from mag_tracking.inference.separable_fit import SeparableProblem
 
 
-class Grows:
-    """basis exp(theta) of one number: infinite beyond 709."""
+class ExponentialModel:
+    """Basis exp(theta t) of one parameter; overflows beyond theta t = 709."""
 
     t = np.linspace(0.5, 1.0, 8)
 
@@ -22,9 +22,9 @@ class Grows:
         return self.t[:, None] * self.basis(theta) * p[:, None]
 
 
-def test_a_start_that_is_no_number_costs_infinity_and_the_others_are_found():
-    y = 2.0 * np.exp(3.0 * Grows.t)
-    problem = SeparableProblem(Grows(), y)
+def test_a_divergent_start_has_infinite_cost_and_does_not_affect_others():
+    y = 2.0 * np.exp(3.0 * ExponentialModel.t)
+    problem = SeparableProblem(ExponentialModel(), y)
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         x, cost, _, _ = refine(problem.residual_and_jacobian, [[1e6], [2.5], [600.0], [np.nan]])
@@ -33,7 +33,7 @@ def test_a_start_that_is_no_number_costs_infinity_and_the_others_are_found():
     assert np.isinf(problem.cost(np.array([[1e6]])))
 
 
-def test_a_model_that_is_infinite_has_no_linear_part():
+def test_an_infinite_model_has_no_linear_solution():
     A = np.stack([np.eye(3)[:, :2], np.full((3, 2), np.inf)])
     with np.errstate(invalid='ignore'):
         p, _, inverse = project_out_linear(A, np.array([1.0, 2.0, 3.0]))
@@ -41,8 +41,8 @@ def test_a_model_that_is_infinite_has_no_linear_part():
     assert np.isnan(inverse[1]).all()
 
 
-class Waves:
-    """a sin(f t) + b cos(f t), and a slope: of theta = (f, phase that nothing depends on)."""
+class SineModel:
+    """a sin(f t) + b cos(f t), with theta = (f, unused phase)."""
 
     t = np.linspace(0.0, 3.0, 40)
 
@@ -56,35 +56,35 @@ class Waves:
         return np.stack([by_f, np.zeros_like(by_f)], axis=2)
 
 
-def waves(prior):
-    y = np.sin(2.0 * Waves.t) + 0.3 * np.random.default_rng(1).standard_normal(40)
-    return SeparableProblem(Waves(), y, prior=prior)
+def sinusoid(prior):
+    y = np.sin(2.0 * SineModel.t) + 0.3 * np.random.default_rng(1).standard_normal(40)
+    return SeparableProblem(SineModel(), y, prior=prior)
 
 
 def test_a_prior_counts_like_a_measurement():
-    """The minimum of Bayes' rule, by scipy on all unknowns at once."""
+    """Oracle: maximum a posteriori estimate by scipy, with all unknowns at once."""
     mean, std = np.array([2.4, 0.7]), np.array([0.05, 0.2])
-    problem, y = waves((mean, std)), np.sin(2.0 * Waves.t) + 0.3 * np.random.default_rng(
+    problem, y = sinusoid((mean, std)), np.sin(2.0 * SineModel.t) + 0.3 * np.random.default_rng(
         1).standard_normal(40)
     x, cost, P, converged = refine(problem.residual_and_jacobian, mean[None] + 0.1)
 
     def residual(u):
         f, phase, a, b = u
-        return np.concatenate([y - a * np.sin(f * Waves.t) - b * np.cos(f * Waves.t),
+        return np.concatenate([y - a * np.sin(f * SineModel.t) - b * np.cos(f * SineModel.t),
                                (mean - [f, phase]) / std])
 
     peer = least_squares(residual, [2.4, 0.7, 1.0, 0.0], xtol=1e-12, ftol=1e-12, gtol=1e-12)
     np.testing.assert_allclose(x[0], peer.x[:2], rtol=1e-5)
     assert converged[0] and np.isclose(cost[0], 2.0 * peer.cost)
     np.testing.assert_allclose(problem.cost(x), cost)
-    # What nothing measures stays as it was known.
+    # A parameter that is not measured keeps its prior.
     assert np.isclose(x[0, 1], 0.7) and np.isclose(P[0, 1, 1], 0.2**2)
     covariance = np.linalg.inv(peer.jac.T @ peer.jac)
     np.testing.assert_allclose(P[0, 0, 0], covariance[0, 0], rtol=1e-4)
 
 
-def test_an_infinite_deviation_says_nothing():
-    alone, known = waves(None), waves((np.array([9.0, 9.0]), np.full(2, np.inf)))
+def test_a_prior_of_infinite_std_has_no_effect():
+    alone, known = sinusoid(None), sinusoid((np.array([9.0, 9.0]), np.full(2, np.inf)))
     theta = np.array([[2.1, 0.0], [1.7, 3.0]])
     np.testing.assert_array_equal(alone.cost(theta), known.cost(theta))
     for a, b in zip(alone.residual_and_jacobian(theta), known.residual_and_jacobian(theta),

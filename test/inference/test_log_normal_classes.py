@@ -1,4 +1,4 @@
-"""Classes by moment and length: the posterior of the laws, unknown vehicles, and calibration."""
+"""Vehicle classes by moment and length: posterior, unknown vehicles, and calibration."""
 
 import numpy as np
 import pytest
@@ -21,14 +21,14 @@ def posterior(size, length, moment_std=0.0, length_std=0.0):
 @pytest.mark.parametrize(('name', 'size', 'length'), [
     ('motorcycle', 50.0, 0.0), ('car', 335.0, 2.1), ('car', 581.0, 5.0), ('car', 400.0, 0.0),
     ('truck', 1734.0, 9.1), ('truck', 1897.0, 11.3), ('truck', 2500.0, 0.0)])
-def test_published_vehicles(name, size, length):
-    """TSP14 Tables II and V: the smallest and the largest of each kind."""
+def test_published_vehicles_are_classified(name, size, length):
+    """TSP14 Tables II and V: the smallest and the largest vehicle of each class."""
     found = posterior(size, length, 20.0, 0.3)
     assert found.name == name and found.probabilities.sum() == pytest.approx(1.0)
     assert found.probabilities.max() > 0.8
 
 
-def test_the_posterior_is_that_of_the_densities():
+def test_posterior_follows_bayes_rule():
     size, length, std = 900.0, 6.0, 0.8
     expected = np.array([
         share * norm.pdf(np.log(size), np.log(m), a) * norm.pdf(
@@ -43,12 +43,12 @@ def test_the_posterior_is_that_of_the_densities():
 def test_a_vehicle_that_fits_no_class_is_unknown():
     assert posterior(1e5, 0.0).name == UNKNOWN and posterior(0.5, 0.0).name == UNKNOWN
     assert posterior(400.0, 60.0).name == UNKNOWN
-    # With so large a deviation it may be any.
+    # With this std of the length, any class is possible.
     assert posterior(400.0, 60.0, length_std=120.0).name == 'car'
 
 
 def test_posteriors_are_calibrated():
-    """Vehicles of the laws themselves: a stated probability is the share that is right."""
+    """Vehicles of the assumed distributions: stated probabilities equal the rates of success."""
     rng, s = np.random.default_rng(0), SETTINGS
     stated, right = [], []
     for _ in range(4000):
@@ -60,6 +60,6 @@ def test_posteriors_are_calibrated():
         right.append(int(np.argmax(found.probabilities)) == k)
     stated, right = np.array(stated), np.array(right)
     for low, high in ((0.33, 0.7), (0.7, 0.9), (0.9, 0.99), (0.99, 1.01)):
-        mine = (low <= stated) & (stated < high)
-        allowed = 3.0 * np.sqrt(0.25 / max(mine.sum(), 1))
-        assert abs(stated[mine].mean() - right[mine].mean()) < allowed
+        in_range = (low <= stated) & (stated < high)
+        allowed = 3.0 * np.sqrt(0.25 / max(in_range.sum(), 1))
+        assert abs(stated[in_range].mean() - right[in_range].mean()) < allowed

@@ -1,4 +1,4 @@
-"""The matched filter: Parseval, oracles in time and by integration, measured rates."""
+"""Matched filter: Parseval's theorem, oracles in time and by integration, measured rates."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ MITRE = {'background': 1e-10, 'resolution': 9e-10, 'bandwidth': 11.0}
 
 
 def mitre(f):
-    """Its density [T^2/Hz]."""
+    """Noise density of MITRE12 [T^2/Hz]."""
     return noise_spectrum(f, **MITRE)
 
 
@@ -28,22 +28,22 @@ def white(density):
 
 
 def within_binomial(hits, n, p):
-    """Whether a count is what probability p gives, but for one chance in a thousand."""
+    """Whether a count agrees with probability `p`, at a significance of 0.1 %."""
     low, high = binom.ppf([0.0005, 0.9995], n, p)
     return low <= hits <= high
 
 
 def pulse(n, rate, rng=None):
-    """Two axes of a smooth signal [T], or of a random one."""
+    """Two axes of a smooth signal [T], or of a random one if `rng` is given."""
     t = np.arange(n) / rate
     if rng is not None:
         return 1e-9 * rng.standard_normal((n, 2))
     return 1e-9 * np.stack([np.exp(-60.0 * (t - 0.2)**2), t * np.cos(40.0 * t)], axis=-1)
 
 
-def test_noise_spectrum_of_the_source():
-    """(B.8) at 4 Hz in a town; (B.9): the steps' density integrates to step^2/12."""
-    # Not approx: its absolute tolerance of 1e-12 would pass anything of this size.
+def test_noise_spectrum_equals_the_published_one():
+    """MITRE12 eq. (B.8) at 4 Hz in a town; (B.9): the density of steps integrates to step^2/12."""
+    # Not pytest.approx: its absolute tolerance of 1e-12 exceeds these values.
     np.testing.assert_allclose(noise_spectrum(4.0, 1e-10, 0.0, 11.0), 2.5e-21, rtol=1e-12)
     steps = noise_spectrum(np.array([0.0, 5.0]), 0.0, 9e-10, 11.0)
     np.testing.assert_allclose(steps * 2 * 11.0, (9e-10)**2 / 12, rtol=1e-12)
@@ -56,7 +56,7 @@ def test_noise_spectrum_of_the_source():
 
 @pytest.mark.parametrize('n', [11, 12, 1, 2])
 def test_white_noise_gives_energy_over_noise_power(n):
-    """Parseval, for odd and even numbers of samples; the power of a sample is S times the rate."""
+    """For odd and even numbers of samples; the power of a sample is S times the rate."""
     rate, power = 22.0, (3e-10)**2
     B = pulse(n, rate, np.random.default_rng(n))
     expected = np.sqrt(np.sum(B**2) / power)
@@ -64,8 +64,8 @@ def test_white_noise_gives_energy_over_noise_power(n):
 
 
 @pytest.mark.parametrize('n, rate', [(11, 22.0), (24, 48.0)])
-def test_coloured_noise_equals_the_estimate_in_time(n, rate):
-    """d^2 = s' C^+ s with the covariance of the band-passed noise, summed up in time."""
+def test_coloured_noise_gives_the_deflection_of_the_time_domain(n, rate):
+    """d^2 = s' C^+ s in the time domain, with the covariance C of the band-passed noise."""
     B, band = pulse(n, rate), (3.0, 11.0)
     k = np.arange(-(n // 2) + (n % 2 == 0), n // 2 + 1)
     f = k * rate / n
@@ -77,8 +77,8 @@ def test_coloured_noise_equals_the_estimate_in_time(n, rate):
     assert deflection(B, rate, mitre, band) == pytest.approx(expected, rel=1e-8)
 
 
-def test_a_long_smooth_signal_equals_the_integral():
-    """Gaussian pulse: its continuous transform is known; the density is smooth."""
+def test_a_long_smooth_signal_gives_the_deflection_of_the_integral():
+    """A Gaussian pulse with its known continuous transform, and a smooth density."""
     width, size = 0.1, 2e-9
     t = np.arange(-400, 400) / 50.0
     B = size * np.exp(-0.5 * (t / width)**2)[:, None]
@@ -94,36 +94,36 @@ def test_a_long_smooth_signal_equals_the_integral():
     assert deflection(B, 50.0, density, ALL) == pytest.approx(expected, rel=1e-10)
 
 
-def test_the_sampling_rate_does_not_matter_for_a_band_limited_signal():
-    """The misprint of (B.11): with the plain DFT d would grow with the rate."""
+def test_sampling_rate_has_no_effect_on_a_band_limited_signal():
+    """MITRE12 eq. (B.11) has a misprint: with the plain DFT, d would grow with the rate."""
     def at(rate):
         t = np.arange(round(0.5 * rate)) / rate
         B = 1e-9 * np.stack([np.cos(8 * np.pi * t) + 0.5 * np.sin(20 * np.pi * t + 0.3),
                              np.sin(12 * np.pi * t)], axis=-1)
         return deflection(B, rate, mitre, (3.0, 11.0))
 
-    # Over half a second a sine of amplitude a has energy a^2/4.
+    # Over half a second, a sine of amplitude a has energy a^2/4.
     S = mitre(np.array([4.0, 10.0, 6.0]))
     expected = 1e-9 * np.sqrt(np.sum(np.array([1.0, 0.25, 1.0]) / 4.0 / S))
     for rate in (22.0, 44.0, 90.0, 1000.0):
         assert at(rate) == pytest.approx(expected, rel=1e-10)
 
 
-def test_the_band_keeps_its_edges_and_drops_the_rest():
+def test_band_includes_its_edges_and_excludes_other_frequencies():
     t = np.arange(11) / 22.0
     tone = 1e-9 * np.cos(2 * np.pi * np.outer(t, [4.0, 6.0, 8.0]))
     d = [deflection(tone[:, [i]], 22.0, mitre, (4.0, 6.0)) for i in range(3)]
     assert d[0] > 1.0 and d[1] > 1.0 and d[2] < 1e-9
-    # 0.3/3 falls short of 0.1 by rounding.
+    # 0.3/3 is below 0.1 by rounding.
     assert deflection([[1.0], [2.0], [4.0]], 0.3, white(1.0), (0.1, 1.0)) > 0.0
-    # The earth's field, constant, is not seen, though its noise density is infinite.
+    # The constant Earth field does not count, although the noise density at 0 Hz is infinite.
     field = np.full((11, 2), 5e-5) + tone[:, :2]
     for band in (ALL, (3.0, 11.0)):
         assert deflection(field, 22.0, mitre, band) == pytest.approx(
             deflection(tone[:, :2], 22.0, mitre, band), rel=1e-6)
 
 
-def test_axes_add_up_and_missing_ones_do_not_count():
+def test_axes_add_up_and_missing_axes_are_ignored():
     B = np.random.default_rng(2).standard_normal((4, 3, 11, 2)) * 1e-9
     d = deflection(B, 22.0, mitre, (3.0, 11.0))
     assert d.shape == (4, 3)
@@ -138,7 +138,7 @@ def test_axes_add_up_and_missing_ones_do_not_count():
     assert any_detection_probability([np.nan, np.nan]) == 0.0
 
 
-def test_detection_probability_has_its_fixed_points_and_grows():
+def test_detection_probability_has_its_fixed_points_and_increases():
     p_fa = np.array([1e-12, 1e-6, 0.01, 0.5])
     np.testing.assert_allclose(detection_probability(0.0, p_fa), p_fa, rtol=1e-9)
     np.testing.assert_allclose(detection_probability(norm.isf(p_fa), p_fa), 0.5, rtol=1e-12)
@@ -146,12 +146,12 @@ def test_detection_probability_has_its_fixed_points_and_grows():
     p = detection_probability(d[:, None], p_fa[:3])
     assert p.shape == (50, 3) and np.all(np.diff(p[d < 6.0], axis=0) > 0.0)
     assert np.all(np.diff(p, axis=1) >= 0.0) and detection_probability(np.inf, 1e-6) == 1.0
-    # 59.3 % at 1e-6, MITRE12 section 5.1: what deflection it takes.
+    # MITRE12 section 5.1: 59.3 % at a false-alarm probability of 1e-6.
     assert detection_probability(norm.isf(1e-6) - norm.isf(0.593), 1e-6) == pytest.approx(0.593)
 
 
-def test_measured_rate_of_a_matched_filter_in_white_noise():
-    """The filter in time, s'y/sigma^2 over a threshold, on noise alone and on the signal."""
+def test_measured_rate_in_white_noise_agrees_with_theory():
+    """Filter in the time domain, s'y/sigma^2 above a threshold, with and without the signal."""
     rng, n, sigma, rate = np.random.default_rng(7), 40_000, 4e-10, 22.0
     s = pulse(11, rate)
     noise = sigma * rng.standard_normal((n, 11, 2))
@@ -166,8 +166,8 @@ def test_measured_rate_of_a_matched_filter_in_white_noise():
             assert size == 0.0 or p_fa * 1.2 < p < 0.97
 
 
-def test_measured_rate_in_the_sources_noise():
-    """Noise made tone by tone with powers 2 S df, and the filter in frequency."""
+def test_measured_rate_in_the_published_noise_agrees_with_theory():
+    """Noise as a sum of tones of power 2 S df, and the filter in the frequency domain."""
     rng, n, rate, n_t = np.random.default_rng(8), 20_000, 22.0, 11
     s, f = 3.0 * pulse(n_t, rate)[:, 0], np.array([4.0, 6.0, 8.0, 10.0])
     t, df = np.arange(n_t) / rate, rate / n_t
@@ -184,7 +184,7 @@ def test_measured_rate_in_the_sources_noise():
     assert within_binomial(hits, n, p) and 0.1 < p < 0.95
 
 
-def test_any_detects_is_one_minus_the_product():
+def test_any_detection_probability_is_one_minus_the_product():
     p = np.random.default_rng(3).uniform(0.0, 1.0, (3, 4, 5))
     for axis in (None, 0, -1, (1, 2)):
         np.testing.assert_allclose(any_detection_probability(p, axis),
@@ -192,12 +192,12 @@ def test_any_detects_is_one_minus_the_product():
     assert (any_detection_probability([0.3, 1.0, 0.0]) == 1.0
             and any_detection_probability([0.0, 0.0]) == 0.0)
     assert any_detection_probability(0.25) == pytest.approx(0.25, rel=1e-15)
-    # Nothing is lost: 1 - (1 - 1e-30)^3 is 0 in plain arithmetic.
+    # No loss of precision: 1 - (1 - 1e-30)^3 is 0 in plain arithmetic.
     np.testing.assert_allclose(any_detection_probability([1e-30] * 3), 3e-30, rtol=1e-12)
     np.testing.assert_allclose(any_detection_probability(np.full(1000, 1e-17)), 1e-14, rtol=1e-9)
 
 
-def test_measured_rate_of_a_network():
+def test_measured_rate_of_a_network_agrees_with_theory():
     rng, n = np.random.default_rng(5), 20_000
     p = np.array([[0.01, 0.2, 0.05], [0.1, 0.02, 0.0]])
     hits = np.sum((rng.uniform(size=(n, 2, 3)) < p).any(axis=(1, 2)))
@@ -229,6 +229,6 @@ GOOD = np.ones((11, 2))
     (lambda: any_detection_probability([0.5, 1.5]), r'probability\[1\].*from 0 to 1, got 1.5'),
     (lambda: any_detection_probability(-0.1), 'probability.*got -0.1'),
 ])
-def test_bad_input_is_named(call, message):
+def test_invalid_arguments_raise_value_error(call, message):
     with pytest.raises(ValueError, match=message):
         call()

@@ -1,4 +1,4 @@
-"""The Anderson expansion is the dipole field of a straight pass."""
+"""The Anderson expansion equals the dipole field of a straight pass."""
 
 import math
 
@@ -45,7 +45,7 @@ def test_expansion_equals_the_dipole(one_pass, m):
 
 
 @given(passes, moment, vector)
-def test_expansion_turns_with_the_scene(one_pass, m, axis):
+def test_expansion_rotates_with_the_scene(one_pass, m, axis):
     r0, v0 = one_pass
     R = Rotation.from_rotvec(axis).as_matrix()
     B = anderson_field(0.1, r0, v0, m)
@@ -54,7 +54,7 @@ def test_expansion_turns_with_the_scene(one_pass, m, axis):
 
 
 @given(st.floats(-1e3, 1e3))
-def test_functions_are_the_printed_ones_corrected(tau):
+def test_functions_equal_the_corrected_published_ones(tau):
     expected = np.array([1.0, tau, tau * tau]) / (tau * tau + 1)**2.5
     np.testing.assert_allclose(anderson_functions(tau), expected, rtol=1e-13, atol=1e-300)
 
@@ -76,7 +76,7 @@ def test_only_the_odd_function_is_orthogonal_to_the_others():
 
 
 @given(passes, st.floats(-1.0, 1.0))
-def test_no_point_of_the_pass_is_closer(one_pass, dt):
+def test_no_point_of_the_pass_is_closer_than_the_cpa(one_pass, dt):
     r0, v0 = one_pass
     time, distance, r_cpa = closest_approach(r0, v0)
     size = np.linalg.norm(r0)
@@ -86,8 +86,8 @@ def test_no_point_of_the_pass_is_closer(one_pass, dt):
     assert np.linalg.norm(r0 + (time + dt) * v0) >= distance * (1 - 1e-13)
 
 
-def test_a_grazing_pass_keeps_its_right_angle():
-    # Here the rounding of r0 along v0 is no longer small beside the range.
+def test_cpa_of_a_grazing_pass_is_perpendicular_to_the_velocity():
+    # The rounding error of r0 along v0 is not small compared with the range here.
     rng = np.random.default_rng(0)
     for v0, sideways in rng.standard_normal((50, 2, 3)):
         r0 = 1000.0 * v0 + 1e-10 * sideways
@@ -113,15 +113,15 @@ def test_a_pass_through_the_sensor_has_range_zero_and_no_expansion(v0, factor, s
 
 
 def test_coefficients_of_a_known_pass():
-    # Passing at y = 2 along x with a moment along z: only the third row is not zero.
+    # Path along x at y = 2, moment along z: only the third row is non-zero.
     C = anderson_coefficients([0.0, 2.0, 0.0], [3.0, 0.0, 0.0], [0.0, 0.0, 8.0])
     np.testing.assert_allclose(C, [[0, 0, 0], [0, 0, 0], [-1e-7, 0, -1e-7]], rtol=0, atol=1e-22)
-    # With a moment along the way it is the middle function that shows at the side.
+    # Moment along the path: the lateral component is the middle function.
     C = anderson_coefficients([0.0, 2.0, 0.0], [3.0, 0.0, 0.0], [8.0, 0.0, 0.0])
     np.testing.assert_allclose(C, [[-1e-7, 0, 2e-7], [0, 3e-7, 0], [0, 0, 0]], rtol=0, atol=1e-22)
 
 
-def test_bad_input_is_named():
+def test_invalid_arguments_raise_value_error():
     r0, v0, m = [-3.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
     for v in ([0.0, 0.0, 0.0], [math.nan, 0.0, 0.0], [math.inf, 0.0, 0.0]):
         with pytest.raises(ValueError, match='v0 must be finite and non-zero'):

@@ -1,4 +1,4 @@
-"""The second simulator of the tests: boxes have the field of their moments, drivers their speed."""
+"""The second vehicle simulator: fields of box vehicles, and speed and heading of a drive."""
 
 import numpy as np
 import pytest
@@ -9,10 +9,10 @@ from support.box_vehicles import Drive, box_car, box_truck
 from support.passes import EARTH
 
 
-@pytest.mark.parametrize('made', [box_car, box_truck])
+@pytest.mark.parametrize('make_vehicle', [box_car, box_truck])
 @pytest.mark.parametrize('heading', [0.0, 2.1])
-def test_far_away_a_box_vehicle_is_its_moment(made, heading):
-    body = made(np.random.default_rng(4), moment=500.0)
+def test_a_box_vehicle_far_away_has_the_field_of_its_moment(make_vehicle, heading):
+    body = make_vehicle(np.random.default_rng(4), moment=500.0)
     R, _ = body_poses(np.zeros((1, 2)), np.array([heading]))
     parts = body.moments((EARTH @ R[0])[None])[0]
     m = R[0] @ parts.sum(axis=0)
@@ -21,7 +21,7 @@ def test_far_away_a_box_vehicle_is_its_moment(made, heading):
     far = 3000.0 * np.array([[0.6, 0.64, 0.48]])
     B = body.field(EARTH, np.zeros((1, 2)), np.array([heading]), far)[0, 0]
     np.testing.assert_allclose(B, dipole_field(far[0], m), rtol=0.02, atol=0.02 * np.abs(B).max())
-    assert made(np.random.default_rng(4)).length == body.length
+    assert make_vehicle(np.random.default_rng(4)).length == body.length
 
 
 def test_a_sheet_is_magnetised_in_its_plane():
@@ -30,7 +30,7 @@ def test_a_sheet_is_magnetised_in_its_plane():
     assert floor[:2].min() > 5.0 * floor[2] and side[[0, 2]].min() > 5.0 * side[1]
 
 
-def test_a_driver_brakes_and_swerves_and_keeps_to_the_speed():
+def test_a_drive_follows_its_speed_and_heading():
     drive = Drive(Path(np.array([-50.0, 0.0]), 0.3, 10.0), -0.2, 4.0, 2.0, 0.3, 5.0, 2.0)
     t = np.linspace(0.0, 10.0, 4001)
     position, heading = drive.at(t)

@@ -1,4 +1,4 @@
-"""The dipole: laws of magnetostatics, and an independent program's numbers."""
+"""Dipole field and Jacobians: laws of magnetostatics, and comparison with magpylib."""
 
 import magpylib
 import numpy as np
@@ -33,7 +33,7 @@ def test_field_falls_with_the_cube_of_the_distance(r, m, u):
 
 
 @given(away, moment, vector)
-def test_field_turns_with_the_scene(r, m, axis):
+def test_field_rotates_with_the_scene(r, m, axis):
     R = Rotation.from_rotvec(axis).as_matrix()
     B = dipole_field(r, m)
     np.testing.assert_allclose(dipole_field(R @ r, R @ m), R @ B, rtol=0,
@@ -68,25 +68,25 @@ def test_field_equals_magpylib():
                                    atol=1e-9 * np.linalg.norm(expected))
 
 
-def test_singular_point_is_nan_and_harms_no_neighbour():
+def test_singular_point_is_nan_and_does_not_affect_others():
     B = dipole_field(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), [0.0, 0.0, 1.0])
     assert np.isnan(B[0]).all()
     np.testing.assert_allclose(B[1], [0.0, 0.0, -1e-7])
 
 
-def test_a_wrong_last_axis_is_named():
+def test_a_wrong_last_axis_is_rejected():
     with pytest.raises(ValueError, match='last axis of length 3'):
         dipole_field(np.zeros((4, 2)), np.zeros(2))
 
 
-def test_arrays_that_may_not_be_written_are_taken():
+def test_read_only_arrays_are_accepted():
     r, m = np.ones((4, 3)), np.ones((4, 3))
     expected = dipole_field(r, m)
     r.flags.writeable = m.flags.writeable = False
     np.testing.assert_array_equal(dipole_field(r, m), expected)
 
 
-def test_sensor_fields_add_dipoles_and_turn_into_the_sensors_frame():
+def test_sensor_fields_sum_dipoles_and_rotate_to_the_sensor_frame():
     rng = np.random.default_rng(1)
     positions, R_sw = rng.uniform(-5, 5, (3, 3)), Rotation.random(3, random_state=2).as_matrix()
     r, m = rng.uniform(-1, 1, (4, 2, 3)), rng.standard_normal((4, 2, 3))

@@ -1,4 +1,4 @@
-"""The permeable ellipsoid: numerical integration, limits, and the corrected source."""
+"""Permeable ellipsoid: numerical integration, limits, and the corrected equations of MITRE12."""
 
 import math
 
@@ -48,7 +48,7 @@ def test_factors_sum_to_one(exponent):
 
 
 @given(st.floats(1.05, 50.0))
-def test_factors_are_those_of_the_source_corrected(m):
+def test_factors_equal_the_corrected_published_ones(m):
     c = math.sqrt(m * m - 1)
     t1 = m / (2 * c) * math.log((m + c) / (m - c)) - 1
     L1, L2 = demagnetisation_factors(m)
@@ -73,7 +73,7 @@ def test_factors_keep_the_shape():
 
 
 @pytest.mark.parametrize('aspect', [0.0, -2.0, math.nan, math.inf, [1.0, 0.0]])
-def test_a_bad_aspect_is_named(aspect):
+def test_an_invalid_aspect_is_rejected(aspect):
     with pytest.raises(ValueError, match='aspect must be between 1e-100 and 1e100, got'):
         demagnetisation_factors(aspect)
 
@@ -88,14 +88,14 @@ def test_sphere_has_the_moment_of_t10(radius, mu_r, heading, B0):
 
 
 @given(semi_axis, semi_axis, permeability, angle, angle, induction)
-def test_moment_turns_with_the_scene(a, b, mu_r, heading, turn, B0):
+def test_moment_rotates_with_the_scene(a, b, mu_r, heading, turn, B0):
     R = Rotation.from_euler('z', turn).as_matrix()
     m = ellipsoid_moment((a, b), mu_r, heading, B0)
-    turned = ellipsoid_moment((a, b), mu_r, heading + turn, R @ B0)
-    # Driving the other way it is the same body, and its response is linear.
+    rotated = ellipsoid_moment((a, b), mu_r, heading + turn, R @ B0)
+    # With the reverse heading it is the same body, and its response is linear.
     back = ellipsoid_moment((a, b), mu_r, heading + math.pi, 2 * B0)
     limit = 1e-12 * 4 / 3 * math.pi * a * b * b * mu_r * np.linalg.norm(B0) / MU0
-    np.testing.assert_allclose(turned, R @ m, rtol=0, atol=limit)
+    np.testing.assert_allclose(rotated, R @ m, rtol=0, atol=limit)
     np.testing.assert_allclose(back, 2 * m, rtol=0, atol=limit)
 
 
@@ -111,7 +111,7 @@ def test_moment_along_and_across_the_axis(a, b, mu_r, heading):
                                    atol=1e-10 * kappa * 40.0)
 
 
-def test_moment_is_that_of_the_source_in_its_own_axes():
+def test_moment_equals_the_published_one_in_vehicle_axes():
     # MITRE12 table 1: a light vehicle in Tucson; eq. (A.1)-(A.7), course 30 degrees from north.
     a, b, kappa, B0 = 2.0, 1.0, 10.0, 57e-6
     course, inclination, declination = np.deg2rad([30.0, 59.0, -11.0])
@@ -125,7 +125,7 @@ def test_moment_is_that_of_the_source_in_its_own_axes():
     M = 4 * math.pi * a * b * b / 3 * P * H
     m = ellipsoid_moment((a, b), 1 + kappa, math.pi / 2 - course, [east, north, -down])
     np.testing.assert_allclose([m @ [s, c, 0], m @ [-c, s, 0], -m[2]], M, rtol=1e-10)
-    # The printed factor, with B0 in microtesla, is this one.
+    # The published factor, with B0 in microtesla, equals B0/mu0.
     np.testing.assert_allclose(2.5 * 57 / math.pi, B0 / MU0, rtol=1e-12)
 
 
@@ -137,7 +137,7 @@ def test_moment_broadcasts():
     np.testing.assert_array_equal(ellipsoid_moment((2.0, 0.8), 1.0, headings, B0), 0.0)
 
 
-def test_bad_input_is_named():
+def test_invalid_arguments_raise_value_error():
     B0 = np.array([0.0, 2e-5, -4e-5])
     for semi_axes in ((0.0, 1.0), (1.0, -1.0), (math.nan, 1.0), (1.0, math.inf)):
         with pytest.raises(ValueError, match=r'semi_axes must be positive and finite, got '):

@@ -1,4 +1,4 @@
-"""Multipoles: laws of magnetostatics, clouds of dipoles, and an independent program's magnet."""
+"""Multipole fields: laws of magnetostatics, clouds of dipoles, and a magnet of magpylib."""
 
 import math
 from itertools import permutations, product
@@ -26,7 +26,7 @@ moments15 = st.lists(component, min_size=15, max_size=15).map(np.array).filter(
 seed = st.integers(0, 10**6)
 
 PARTS = {1: slice(0, 3), 2: slice(3, 8), 3: slice(8, 15)}
-KEPT = {1: ('x', 'y', 'z'), 2: ('xx', 'xy', 'xz', 'yy', 'yz'),
+COMPONENTS = {1: ('x', 'y', 'z'), 2: ('xx', 'xy', 'xz', 'yy', 'yz'),
         3: ('xxx', 'xxy', 'xxz', 'xyy', 'xyz', 'yyy', 'yyz')}
 
 
@@ -40,7 +40,7 @@ def only(order, moments):
 def tensor(order, moments):
     """The full symmetric traceless tensor, from the names of its components."""
     T = np.zeros((3,) * order)
-    for name, value in zip(KEPT[order], moments[PARTS[order]], strict=True):
+    for name, value in zip(COMPONENTS[order], moments[PARTS[order]], strict=True):
         for axes in set(permutations(['xyz'.index(c) for c in name])):
             T[axes] = value
     for rest in product(range(3), repeat=order - 2) if order > 1 else ():
@@ -50,8 +50,8 @@ def tensor(order, moments):
     return T
 
 
-def printed_field(r, order, moments):
-    """T10 eq. (3.39) and (3.40) to the letter."""
+def published_field(r, order, moments):
+    """T10 eq. (3.39) and (3.40) as published."""
     distance = np.linalg.norm(r)
     M = tensor(order, moments)
     for _ in range(order - 1):
@@ -61,7 +61,7 @@ def printed_field(r, order, moments):
 
 
 def cloud(n, size):
-    """Points within a cube of half the given size on each side, and dipoles."""
+    """`n` points in a cube of edge length `size`, and their dipole moments."""
     rng = np.random.default_rng(n)
     return rng.uniform(-0.5 * size, 0.5 * size, (n, 3)), rng.standard_normal((n, 3))
 
@@ -80,15 +80,15 @@ def test_order_one_is_the_dipole(r, m):
 
 @pytest.mark.parametrize('order', [1, 2, 3])
 @given(r=away, moments=moments15)
-def test_field_is_the_printed_one(order, r, moments):
+def test_field_equals_the_published_one(order, r, moments):
     scale = 1e-7 * 15 / np.linalg.norm(r)**(order + 2)
     np.testing.assert_allclose(multipole_field(r, only(order, moments)),
-                               printed_field(r, order, moments), rtol=0, atol=1e-13 * scale)
+                               published_field(r, order, moments), rtol=0, atol=1e-13 * scale)
 
 
 @given(away, moments15)
 def test_field_has_neither_divergence_nor_curl(r, moments):
-    # Of each order apart: their sum would hide the octupole far away.
+    # One order at a time: far away, the sum would mask the octupole.
     for order in PARTS:
         J, _ = multipole_jacobians(r, only(order, moments))
         assert abs(np.trace(J)) <= 2e-12 * np.abs(J).max()
@@ -97,7 +97,7 @@ def test_field_has_neither_divergence_nor_curl(r, moments):
 
 @pytest.mark.parametrize('order', [1, 2, 3])
 @given(r=away, moments=moments15, u=st.floats(0.5, 4.0))
-def test_field_of_an_order_falls_with_its_power(order, r, moments, u):
+def test_field_of_each_order_decays_with_its_power_of_the_distance(order, r, moments, u):
     near = multipole_field(r, only(order, moments))
     far = multipole_field(u * r, only(order, moments))
     scale = 1e-7 * np.abs(moments[PARTS[order]]).max() / np.linalg.norm(r)**(order + 2)
@@ -105,23 +105,23 @@ def test_field_of_an_order_falls_with_its_power(order, r, moments, u):
 
 
 @given(away, vector, seed)
-def test_field_turns_with_the_scene(r, axis, seed):
+def test_field_rotates_with_the_scene(r, axis, seed):
     R = Rotation.from_rotvec(axis).as_matrix()
     rng = np.random.default_rng(seed)
     points, dipoles = rng.uniform(-1, 1, (4, 3)), rng.standard_normal((4, 3))
     moments = multipole_moments(points, dipoles, 3)
-    turned = multipole_moments(points @ R.T, dipoles @ R.T, 3)
+    rotated = multipole_moments(points @ R.T, dipoles @ R.T, 3)
     for order in PARTS:
         B = multipole_field(r, only(order, moments))
         scale = 1e-7 * np.abs(moments).max() / np.linalg.norm(r)**(order + 2)
-        np.testing.assert_allclose(multipole_field(R @ r, only(order, turned)), R @ B, rtol=0,
+        np.testing.assert_allclose(multipole_field(R @ r, only(order, rotated)), R @ B, rtol=0,
                                    atol=2e-12 * scale)
 
 
 @pytest.mark.parametrize('order', [1, 2, 3])
 @given(r=away, moments=moments15)
 def test_jacobians_agree_with_differences(order, r, moments):
-    # Of one order, so that none hides behind another; the vector ends with it.
+    # One order at a time, so that none masks another; the vector ends with that order.
     part = PARTS[order]
     moments = only(order, moments)[:part.stop]
     dB_dr, dB_dm = multipole_jacobians(r, moments)
@@ -166,13 +166,13 @@ def test_expansion_of_a_cloud_converges_with_the_first_neglected_order(order):
         exact = dipole_field(r[:, None] - points, dipoles).sum(axis=1)
         return np.sqrt(np.mean((multipole_field(r, moments) - exact)**2))
 
-    # Each order adds a power of the distance: 4, 5, 6 for expansions up to 1, 2, 3.
+    # The error decays with power 4, 5 or 6 of the distance for expansions up to order 1, 2 or 3.
     measured = np.log2(error(20.0) / error(40.0))
     assert abs(measured - (order + 3)) < 0.05
 
 
 def test_expansion_of_a_cuboid_magnet_equals_magpylib():
-    # Two Gauss points an axis integrate every moment up to order 3 (and 4) exactly.
+    # Two Gauss points per axis integrate every moment up to order 3 (and 4) exactly.
     sides, polarization = np.array([0.03, 0.02, 0.05]), np.array([0.3, -0.5, 1.1])
     magnet = magpylib.magnet.Cuboid(dimension=sides, polarization=polarization)
     corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
@@ -183,11 +183,11 @@ def test_expansion_of_a_cuboid_magnet_equals_magpylib():
     r = r[np.linalg.norm(r, axis=1) > 0.3]
     expected = magnet.getB(r)
     assert relative_error(multipole_field(r, moments[:3]), expected).max() > 1e-3
-    # Order 5 is the first that is missing: (size/distance)^4.
+    # Order 5 is the first one missing: (size/distance)^4.
     assert relative_error(multipole_field(r, moments), expected).max() < 1e-4
 
 
-def test_singular_point_is_nan_and_harms_no_neighbour():
+def test_singular_point_is_nan_and_does_not_affect_others():
     r = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     moments = np.arange(1.0, 16.0)
     B, (dB_dr, dB_dm) = multipole_field(r, moments), multipole_jacobians(r, moments)
@@ -196,7 +196,7 @@ def test_singular_point_is_nan_and_harms_no_neighbour():
         assert np.isfinite(values[1]).all()
 
 
-def test_shapes_broadcast_and_read_only_arrays_serve():
+def test_shapes_broadcast_and_read_only_arrays_are_accepted():
     r = np.broadcast_to([1.0, 2.0, 3.0], (4, 1, 3))
     moments = np.random.default_rng(0).standard_normal((5, 8))
     assert multipole_field(r, moments).shape == (4, 5, 3)
@@ -211,7 +211,7 @@ def test_shapes_broadcast_and_read_only_arrays_serve():
     np.testing.assert_array_equal(batch[:, :8], multipole_moments(points, dipoles, 2))
 
 
-def test_bad_input_is_named():
+def test_invalid_arguments_raise_value_error():
     with pytest.raises(ValueError, match='r needs a last axis of length 3'):
         multipole_field(np.zeros((4, 2)), np.zeros(3))
     with pytest.raises(ValueError, match='3, 8 or 15, got \\(5,\\)'):

@@ -1,4 +1,4 @@
-"""Every model of a pass, found by itself: against differences, and against each other."""
+"""Every pass model: derivatives against finite differences, and models against each other."""
 
 import inspect
 
@@ -21,13 +21,14 @@ RNG = np.random.default_rng(4)
 T, PLACES, M = RNG.uniform(-1.0, 1.0, 6), RNG.uniform(-5.0, 5.0, (6, 3)), RNG.standard_normal(
     (6, 3, 3))
 EXAMPLES = {
-    **{f'RowPass of {d}': RowPass(T, PLACES, M, d) for d in (1, 2, 3, 4)},
-    **{f'MultipolePass of {d}': MultipolePass(T, PLACES, M, d) for d in (1, 2, 3)},
+    **{f'RowPass with n_dipoles={d}': RowPass(T, PLACES, M, d) for d in (1, 2, 3, 4)},
+    **{f'MultipolePass of order {d}': MultipolePass(T, PLACES, M, d) for d in (1, 2, 3)},
     'AndersonPass': AndersonPass(T, M),
     'SuperposedPasses': SuperposedPasses.of((1, 3), T, PLACES, M)}
-WIDTHS = {name: model.paths[-1].stop if isinstance(model, SuperposedPasses) else len(model.names)
-          for name, model in EXAMPLES.items()}
-"""Numbers of a path."""
+N_PARAMETERS = {
+    name: model.paths[-1].stop if isinstance(model, SuperposedPasses) else len(model.names)
+    for name, model in EXAMPLES.items()}
+"""Number of path parameters of each model."""
 
 
 def test_every_model_has_an_example():
@@ -38,9 +39,9 @@ def test_every_model_has_an_example():
 
 
 @pytest.mark.parametrize('name', EXAMPLES)
-def test_derivatives(name):
+def test_derivatives_agree_with_differences(name):
     model = EXAMPLES[name]
-    theta = np.random.default_rng(5).uniform(1.0, 4.0, (5, WIDTHS[name]))
+    theta = np.random.default_rng(5).uniform(1.0, 4.0, (5, N_PARAMETERS[name]))
     p = np.random.default_rng(6).standard_normal((5, model.basis(theta).shape[-1]))
     D = model.derivative(theta, p)
     for k in range(theta.shape[1]):
@@ -62,21 +63,21 @@ def test_superposed_fields_add_up():
         np.testing.assert_array_equal(path, found)
 
 
-def test_a_row_from_its_other_end_is_the_same():
+def test_a_row_of_negative_length_is_reversed():
     rng = np.random.default_rng(8)
     model = SuperposedPasses.of((3, 1), T, PLACES, M)
     theta, p = rng.uniform(1.0, 4.0, 13), rng.standard_normal(12)
     theta[6] = -2.5
-    turned, moments = model.forward(theta, p)
-    assert turned[6] == 2.5
-    np.testing.assert_allclose(model.basis(turned[None])[0] @ moments,
+    reversed_theta, moments = model.forward(theta, p)
+    assert reversed_theta[6] == 2.5
+    np.testing.assert_allclose(model.basis(reversed_theta[None])[0] @ moments,
                                model.basis(theta[None])[0] @ p)
-    same, unchanged = model.forward(turned, moments)
-    np.testing.assert_array_equal(same, turned)
+    same, unchanged = model.forward(reversed_theta, moments)
+    np.testing.assert_array_equal(same, reversed_theta)
     np.testing.assert_array_equal(unchanged, moments)
 
 
-def test_a_row_far_away_is_its_multipoles():
+def test_a_row_far_away_has_the_field_of_its_multipoles():
     path, moments = np.array([1.0, 2.0, 0.5, 3.0, 1.0, 0.0, 2.0]), RNG.standard_normal((3, 3))
     far = PLACES + [60.0, 0.0, 0.0]
     row = RowPass(T, far, M, 3)
@@ -92,7 +93,7 @@ def test_a_row_far_away_is_its_multipoles():
 
 
 def test_multipoles_describe_a_vehicle_better_with_every_order():
-    """A cloud of sixty parts, seen from four metres."""
+    """A cloud of sixty dipoles at a distance of four metres."""
     network = network_of([[0.0, -4.0, 0.0], [0.0, 4.0, 0.0]])
     rng = np.random.default_rng(3)
     path = np.array([0.0, 0.0, 0.5, 9.0, 0.0, 0.0])
@@ -111,7 +112,7 @@ def test_multipoles_describe_a_vehicle_better_with_every_order():
 
 
 def test_anderson_functions_and_the_dipole_agree_on_one_sensor():
-    """The time of the closest approach, and speed over range, from two models of one pass."""
+    """Both models estimate the same CPA time and the same ratio of speed to range."""
     network = network_of([[0.0, -4.5, 0.0]])
     path, m = np.array([0.5, 0.0, 0.6, 9.0, 0.3, 0.0]), np.array([[100.0, 250.0, -200.0]])
     data = measured(network, path, m, np.random.default_rng(1))
@@ -123,7 +124,7 @@ def test_anderson_functions_and_the_dipole_agree_on_one_sensor():
     b = fit_pass(data, 1)
     zero = b.data.stamp_ns / 1e9
     assert converged[0] and abs(cost[0] / data.n_values - 1.0) < 0.1
-    # The dipole has fewer unknowns and the same measurements: it knows no less.
+    # The dipole has fewer unknowns for the same measurements, so its std is not larger.
     std = np.sqrt(np.diagonal(P[0]))
     assert abs(theta[0, 0] - b.bearing.cpa_time - zero) < 3.0 * std[0] < 0.05
     assert abs(theta[0, 1] - b.bearing.rate) < 3.0 * std[1] < 0.2

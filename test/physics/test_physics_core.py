@@ -1,4 +1,4 @@
-"""Compiled functions refuse arrays that do not fit each other, and only read their arguments."""
+"""Compiled functions reject arrays of mismatched shape or type and do not modify arguments."""
 
 import numpy as np
 import pytest
@@ -43,13 +43,13 @@ CALLS = {
     'steady_derivatives': {'theta': BENT, 'moments': MOMENTS, **PASS, 'clock': CLOCK},
     'anderson_residual': {'t': numbers(20), 'y': numbers(20, 2), 'time': 0.1, 'scale': 1.0},
 }
-FREE = {
+INDEPENDENT_AXES = {
     ('rotated_fields', 'H', 3), ('turned', 'x', 0), ('turned', 'x', 1),
     ('row_dipoles', 'x', 0), ('row_dipoles', 'x', 1), ('row_bases', 'theta', 0),
     ('row_bases', 'places', 0), ('steady_bases', 'theta', 0), ('steady_bases', 'theta', 1),
     ('steady_bases', 'places', 0), ('steady_derivatives', 'theta', 1),
     ('anderson_residual', 'y', 1)}
-"""(function, argument, axis) that may be longer, whatever the other arguments are."""
+"""(function, argument, axis) whose length does not depend on the other arguments."""
 
 ARRAYS = [(name, argument) for name, call in CALLS.items() for argument, value in call.items()
           if isinstance(value, np.ndarray)]
@@ -61,17 +61,17 @@ def test_every_function_has_an_example():
 
 
 @pytest.mark.parametrize(('name', 'argument'), ARRAYS)
-def test_an_array_of_another_shape_is_refused(name, argument):
+def test_an_array_of_another_shape_is_rejected(name, argument):
     value = CALLS[name][argument]
     others = [np.repeat(value, 2, axis=axis) for axis in range(value.ndim)
-              if (name, argument, axis) not in FREE]
+              if (name, argument, axis) not in INDEPENDENT_AXES]
     for other in (*others, value[None].copy(), value[0].copy()):
         with pytest.raises((ValueError, TypeError)):
             getattr(core, name)(**{**CALLS[name], argument: other})
 
 
 @pytest.mark.parametrize(('name', 'argument'), ARRAYS)
-def test_an_array_of_another_kind_is_refused(name, argument):
+def test_an_array_of_another_type_or_layout_is_rejected(name, argument):
     value = CALLS[name][argument]
     wide = np.repeat(value, 2, axis=-1)[..., ::2]
     for other in (value.astype(np.float32), value.astype(np.complex128), wide):
@@ -80,7 +80,7 @@ def test_an_array_of_another_kind_is_refused(name, argument):
 
 
 @pytest.mark.parametrize('name', CALLS)
-def test_arguments_are_only_read(name):
+def test_arguments_are_not_modified(name):
     call = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in CALLS[name].items()}
     for argument, value in call.items():
         if isinstance(value, np.ndarray):
@@ -91,7 +91,7 @@ def test_arguments_are_only_read(name):
 
 
 @pytest.mark.parametrize('name', ['steady_bases', 'steady_derivatives'])
-def test_a_clock_that_theta_does_not_hold_is_refused(name):
+def test_a_clock_index_outside_theta_is_rejected(name):
     with pytest.raises(ValueError, match='clock'):
         getattr(core, name)(**{**CALLS[name], 'clock': np.array([0, 1, 2, 0, 0])})
     with pytest.raises(ValueError, match='theta'):
@@ -99,7 +99,7 @@ def test_a_clock_that_theta_does_not_hold_is_refused(name):
 
 
 @pytest.mark.parametrize('n_dipoles', [-1, 0, 4])
-def test_states_of_other_dipoles_are_refused(n_dipoles):
+def test_a_state_of_another_number_of_dipoles_is_rejected(n_dipoles):
     with pytest.raises(ValueError, match='dipoles'):
         core.row_dipoles(**{**CALLS['row_dipoles'], 'n_dipoles': n_dipoles})
     k = 3 * max(n_dipoles, 0)
@@ -108,15 +108,15 @@ def test_states_of_other_dipoles_are_refused(n_dipoles):
 
 
 @pytest.mark.parametrize('k', [4, 8, 10])
-def test_a_walk_that_is_not_of_whole_moments_is_refused(k):
+def test_a_walk_of_incomplete_moments_is_rejected(k):
     with pytest.raises(ValueError, match='walk'):
         core.set_moment_noise(**{**CALLS['set_moment_noise'], 'walk': np.zeros((k, k))})
 
 
-def test_a_state_without_turn_rate_is_refused():
+def test_a_state_without_turn_rate_is_rejected():
     with pytest.raises(ValueError, match='turn rate'):
         core.turned(numbers(2, 6), 0.1, 1.0, 1.0)
 
 
-def test_the_constants_agree():
+def test_dipole_constant_equals_mu0_over_4_pi():
     assert pytest.approx(MU0 / (4.0 * np.pi), rel=1e-15) == K_DIPOLE

@@ -1,4 +1,4 @@
-"""Every source model, found by itself: Jacobians against differences, noise against integrals."""
+"""Every source model: Jacobians against differences, process noise against exact integrals."""
 
 import inspect
 
@@ -17,15 +17,15 @@ from mag_tracking.physics.vehicles import MAX_TURN_RATE, RowVehicle
 EARTH, ACCELERATION = np.array([2e-6, 1.5e-5, -4.9e-5]), np.array([1.0, 1.0, 0.1])
 EXAMPLES = {
     'RowVehicle': RowVehicle(EARTH, ACCELERATION, 0.1, 0.02),
-    'RowVehicle of one': RowVehicle(EARTH, ACCELERATION, 0.1, n_dipoles=1),
-    'RowVehicle of four': RowVehicle(EARTH, ACCELERATION, 0.1, 0.02, 4),
-    'RowVehicle that turns': RowVehicle(EARTH, ACCELERATION, 0.1, 0.02, 3, 3.0, 1.5),
+    'RowVehicle with one dipole': RowVehicle(EARTH, ACCELERATION, 0.1, n_dipoles=1),
+    'RowVehicle with four dipoles': RowVehicle(EARTH, ACCELERATION, 0.1, 0.02, 4),
+    'RowVehicle with turn rate': RowVehicle(EARTH, ACCELERATION, 0.1, 0.02, 3, 3.0, 1.5),
     'Magnet': Magnet(np.array([0.1, 0.2, 0.3]), 0.5),
 }
 
 
-def found():
-    """The classes that behave as a SourceModel."""
+def model_names():
+    """Names of the classes with the interface of a `SourceModel`."""
     return sorted(name for module in (sources, vehicles)
                   for name, c in inspect.getmembers(module, inspect.isclass)
                   if hasattr(c, 'dipoles') and hasattr(c, 'propagate')
@@ -40,11 +40,11 @@ def states(model, n=6):
 
 
 def test_every_model_has_an_example():
-    assert found() == sorted({name.split()[0] for name in EXAMPLES})
+    assert model_names() == sorted({name.split()[0] for name in EXAMPLES})
 
 
 @pytest.mark.parametrize('name', EXAMPLES)
-def test_dipole_derivatives(name):
+def test_dipole_derivatives_agree_with_differences(name):
     model = EXAMPLES[name]
     x = states(model)
     d = model.dipoles(x)
@@ -60,7 +60,7 @@ def test_dipole_derivatives(name):
 
 @pytest.mark.parametrize('dt', [-0.5, 0.003, 0.3, 4.0])
 @pytest.mark.parametrize('name', EXAMPLES)
-def test_propagation_derivatives(name, dt):
+def test_propagation_derivatives_agree_with_differences(name, dt):
     model = EXAMPLES[name]
     x = states(model)
     _, F, _ = model.propagate(x, dt)
@@ -72,7 +72,7 @@ def test_propagation_derivatives(name, dt):
 
 
 @pytest.mark.parametrize('name', EXAMPLES)
-def test_process_noise_is_symmetric_and_not_negative(name):
+def test_process_noise_is_symmetric_and_positive_semidefinite(name):
     model = EXAMPLES[name]
     _, _, Q = model.propagate(states(model), 0.2)
     np.testing.assert_allclose(Q, np.swapaxes(Q, -1, -2), rtol=0, atol=1e-15)
@@ -80,7 +80,7 @@ def test_process_noise_is_symmetric_and_not_negative(name):
 
 
 def test_constant_velocity_noise_is_the_exact_integral():
-    """Van Loan's matrix exponential as the oracle."""
+    """Oracle: Van Loan's matrix exponential."""
     dt, density = 0.37, np.array([1.0, 2.0, 0.5])
     A = np.zeros((6, 6))
     A[:3, 3:] = np.eye(3)
@@ -93,8 +93,8 @@ def test_constant_velocity_noise_is_the_exact_integral():
 
 
 @pytest.mark.parametrize('rate', [-0.8, -1e-9, 0.0, 1e-5, 0.4])
-def test_a_turn_is_an_arc(rate):
-    """The exponential of the motion as the oracle; there and back is where it began."""
+def test_a_coordinated_turn_is_a_circular_arc(rate):
+    """Oracle: the matrix exponential. Backward propagation restores the state."""
     x, dt = np.array([[1.0, 2.0, 0.5, 6.0, -3.0, 0.2, rate]]), 1.7
     A = np.zeros((6, 6))
     A[:3, 3:] = np.eye(3)
@@ -108,8 +108,8 @@ def test_a_turn_is_an_arc(rate):
                                    / abs(rate), rtol=1e-6)
 
 
-def test_the_turn_rate_is_a_gauss_markov_process_of_its_size():
-    model, dt = EXAMPLES['RowVehicle that turns'], 0.4
+def test_turn_rate_is_a_stationary_gauss_markov_process():
+    model, dt = EXAMPLES['RowVehicle with turn rate'], 0.4
     rng = np.random.default_rng(0)
     x = states(model, 200_000)
     x[:, 3:6] = [6.0, 0.0, 0.0]
@@ -122,30 +122,30 @@ def test_the_turn_rate_is_a_gauss_markov_process_of_its_size():
         MAX_TURN_RATE**2, MAX_TURN_RATE**2, 0.25**2]
 
 
-def test_a_turn_is_as_large_in_one_step_as_in_many():
-    model = EXAMPLES['RowVehicle that turns']
+def test_a_turn_does_not_depend_on_the_step_size():
+    model = EXAMPLES['RowVehicle with turn rate']
     x = np.zeros((1, len(model.state_names)))
     x[0, 3], x[0, -1] = 6.0, 1.0
     steps = x.copy()
     for _ in range(100):
         steps = model.propagate(steps, 0.02)[0]
     at_once = model.propagate(x, 2.0)[0]
-    # The integral of a rate that fades with 1.5 s.
+    # Integral of a turn rate that decays with a time constant of 1.5 s.
     expected = 1.5 * -np.expm1(-2.0 / 1.5)
     for moved in (steps, at_once):
         assert np.arctan2(moved[0, 4], moved[0, 3]) == pytest.approx(expected, rel=1e-9)
         assert moved[0, -1] == pytest.approx(np.exp(-2.0 / 1.5), rel=1e-9)
 
 
-def test_backwards_a_turn_rate_is_as_uncertain_as_it_is():
-    """There the process noise is left out, so nothing may fade either."""
-    model = EXAMPLES['RowVehicle that turns']
+def test_turn_rate_does_not_decay_in_backward_propagation():
+    """Backward propagation omits the process noise, so the turn rate must not decay."""
+    model = EXAMPLES['RowVehicle with turn rate']
     moved, F, _ = model.propagate(states(model), -3.0)
     assert np.array_equal(moved[:, -1], states(model)[:, -1]) and (F[:, -1, -1] == 1.0).all()
 
 
-def test_a_turn_rate_that_is_known_goes_straight_on():
-    straight, turning = EXAMPLES['RowVehicle'], EXAMPLES['RowVehicle that turns']
+def test_a_turn_rate_known_to_be_zero_keeps_the_path_straight():
+    straight, turning = EXAMPLES['RowVehicle'], EXAMPLES['RowVehicle with turn rate']
     x = states(turning)
     x[:, -1] = 0.0
     P = np.tile(np.eye(x.shape[1]), (len(x), 1, 1))
@@ -155,13 +155,13 @@ def test_a_turn_rate_that_is_known_goes_straight_on():
     np.testing.assert_allclose(moved[:, :-1], expected, atol=1e-12)
     np.testing.assert_allclose(F[0, :-1, :-1], F_straight, atol=1e-12)
     np.testing.assert_allclose(Q[:, :-1, :-1], Q_straight, atol=1e-15)
-    # Exactly zero, for ever: by that it is told from those that turn.
+    # The turn rate stays exactly zero, which identifies hypotheses that do not turn.
     after = F @ P @ np.swapaxes(F, 1, 2) + Q
     assert not moved[:, -1].any() and not after[:, -1].any() and not after[:, :, -1].any()
 
 
-def test_vehicle_moment_is_hard_iron_turned_plus_soft_iron():
-    model = EXAMPLES['RowVehicle of one']
+def test_vehicle_moment_is_rotated_hard_iron_plus_soft_iron():
+    model = EXAMPLES['RowVehicle with one dipole']
     x = np.zeros((1, 12))
     x[0, 3:6], x[0, 6:9], x[0, 9:] = [0.0, 7.0, 0.0], [100.0, 20.0, 5.0], 6.0
     expected = np.array([-20.0, 100.0, 5.0]) + 6.0 / MU0 * model.earth_field
@@ -170,7 +170,7 @@ def test_vehicle_moment_is_hard_iron_turned_plus_soft_iron():
 
 @pytest.mark.parametrize('heading', [0.0, 0.7, 2.0, -2.9])
 def test_soft_iron_is_induced_along_the_axes_of_the_vehicle(heading):
-    """R D R' B0/mu0; and `ellipsoid_moment`, MITRE12 eq. (A.5), the same written elsewhere."""
+    """Equals R D R' B0/mu0, and `ellipsoid_moment`, MITRE12 eq. (A.5)."""
     model, axes = EXAMPLES['RowVehicle'], (2.1, 0.9)
     along = np.array([1.0, 0.0, 0.0])
     p1, p2 = (ellipsoid_moment(axes, 11.0, 0.0, b)[k] * MU0 for k, b in (
@@ -186,21 +186,21 @@ def test_soft_iron_is_induced_along_the_axes_of_the_vehicle(heading):
                                ellipsoid_moment(axes, 11.0, heading, EARTH), rtol=1e-9)
 
 
-@pytest.mark.parametrize('name', ['RowVehicle', 'RowVehicle of one'])
-def test_standing_vehicle_has_a_finite_model(name):
+@pytest.mark.parametrize('name', ['RowVehicle', 'RowVehicle with one dipole'])
+def test_model_of_a_stationary_vehicle_is_finite(name):
     model = EXAMPLES[name]
     x = np.zeros((1, len(model.state_names)))
     assert all(np.isfinite(a).all() for a in (*model.dipoles(x), *model.propagate(x, 0.1)))
 
 
-def test_states_of_another_model_are_refused():
+def test_states_of_another_model_are_rejected():
     with pytest.raises(ValueError,
                        match=r'3 dipoles need 19 states, got an array of shape \(2, 10\)'):
         EXAMPLES['RowVehicle'].dipoles(np.zeros((2, 10)))
 
 
 def row_state(d, length, heading=0.6):
-    """A state of a row of `d` dipoles whose whole moment does not depend on `d`."""
+    """State of a row of `d` dipoles whose total moment does not depend on `d`."""
     x = np.zeros((1, 6 + 3 * d + (4 if d > 1 else 3)))
     x[0, :6] = [3.0, -1.0, 0.5, 8.0 * np.cos(heading), 8.0 * np.sin(heading), 0.2]
     x[0, 6:6 + 3 * d] = np.tile(np.array([250.0, -90.0, 60.0]) / d, d)
@@ -214,24 +214,24 @@ def field_of(model, x, places):
     return sensor_fields(places, np.tile(np.eye(3), (len(places), 1, 1)), *model.dipoles(x))[0][0]
 
 
-def test_a_row_lies_along_the_heading_with_its_middle_at_the_position():
+def test_a_row_is_centred_at_the_position_along_the_heading():
     """TSP14 eq. (10b), written out for four dipoles."""
     x = row_state(4, 3.6)
-    r = EXAMPLES['RowVehicle of four'].dipoles(x).r[0]
+    r = EXAMPLES['RowVehicle with four dipoles'].dipoles(x).r[0]
     heading = np.array([np.cos(0.6), np.sin(0.6), 0.0])
     for i in (1, 2, 3, 4):
         np.testing.assert_allclose(r[i - 1], x[0, :3] + (i - 2.5) * 3.6 / 3 * heading, atol=1e-12)
 
 
-def test_a_row_without_length_is_a_point():
+def test_a_row_of_zero_length_equals_a_point():
     places = np.random.default_rng(0).uniform(-8.0, 8.0, (20, 3))
-    point = field_of(EXAMPLES['RowVehicle of one'], row_state(1, 0.0), places)
-    for name, d in (('RowVehicle', 3), ('RowVehicle of four', 4)):
+    point = field_of(EXAMPLES['RowVehicle with one dipole'], row_state(1, 0.0), places)
+    for name, d in (('RowVehicle', 3), ('RowVehicle with four dipoles', 4)):
         np.testing.assert_allclose(field_of(EXAMPLES[name], row_state(d, 0.0), places), point,
                                    rtol=1e-11, atol=1e-11 * np.abs(point).max())
 
 
-def test_a_row_turned_end_for_end_is_the_same_row():
+def test_a_row_reversed_end_to_end_has_the_same_field():
     x = row_state(3, 3.0)
     x[0, 6:15] = [100.0, 20.0, 3.0, 80.0, -9.0, 1.0, 10.0, 70.0, 5.0]
     y = x.copy()
@@ -243,21 +243,21 @@ def test_a_row_turned_end_for_end_is_the_same_row():
                                atol=1e-12 * np.abs(B).max())
 
 
-def test_far_away_an_even_row_becomes_its_dipole_with_the_square_of_the_distance():
-    """Without a quadrupole the first term that is left is two orders of distance smaller."""
+def test_a_uniform_row_approaches_a_dipole_with_the_squared_distance():
+    """Without a quadrupole, the first error term is smaller by two powers of the distance."""
     direction = np.array([[0.3, 0.9, 0.1]])
     errors = []
     for distance in (40.0, 80.0, 160.0):
         x1, x3 = row_state(1, 0.0), row_state(3, 3.0)
         places = x1[:, :3] + distance * direction / np.linalg.norm(direction)
-        B = field_of(EXAMPLES['RowVehicle of one'], x1, places)
+        B = field_of(EXAMPLES['RowVehicle with one dipole'], x1, places)
         errors.append(np.linalg.norm(field_of(EXAMPLES['RowVehicle'], x3, places) - B)
                       / np.linalg.norm(B))
     assert errors[0] < 0.02
     np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 4.0, rtol=0.02)
 
 
-def test_the_whole_moment_drifts_as_stated_and_the_differences_apart_from_it():
+def test_total_moment_and_differences_drift_separately_as_stated():
     model = EXAMPLES['RowVehicle']
     x = row_state(3, 3.0)
     Q = model.propagate(x, 0.5)[2][0, 6:15, 6:15].reshape(3, 3, 3, 3)
@@ -268,7 +268,7 @@ def test_the_whole_moment_drifts_as_stated_and_the_differences_apart_from_it():
 
 
 @pytest.mark.parametrize('angle', [0.0, 1e-9, 0.0099, 0.0101, 0.5, 3.0])
-def test_left_jacobian_is_the_mean_of_the_rotations_on_the_way(angle):
+def test_left_jacobian_is_the_mean_of_the_intermediate_rotations(angle):
     v = angle * np.array([0.6, -0.48, 0.64])
     K, term, series = cross_matrix(v), np.eye(3), np.zeros((3, 3))
     for n in range(1, 40):
@@ -281,9 +281,9 @@ def magnet_state(m, w):
     return np.r_[0.1, 0.2, 0.3, 0.0, 0.0, 0.0, m, w][None]
 
 
-def test_a_magnet_turns_by_its_whole_angle_and_keeps_its_size():
+def test_a_magnet_rotates_by_the_full_angle_and_keeps_its_moment():
     model = EXAMPLES['Magnet']
-    # About x by a right angle: z goes to -y.
+    # A rotation about x by 90 degrees maps z to -y.
     moved, _, _ = model.propagate(magnet_state([0.0, 0.0, 2.0], [0.5 * np.pi, 0.0, 0.0]), 1.0)
     np.testing.assert_allclose(moved[0, 6:9], [0.0, -2.0, 0.0], atol=1e-12)
     x = states(model)
@@ -295,8 +295,8 @@ def test_a_magnet_turns_by_its_whole_angle_and_keeps_its_size():
         np.testing.assert_allclose(back, x, atol=1e-9)
 
 
-def test_a_magnet_that_turns_a_little_follows_the_source():
-    """PHD15 Paper A eq. (24), which is the first order of it."""
+def test_a_small_rotation_of_a_magnet_follows_the_published_model():
+    """PHD15 Paper A eq. (24) is its first order."""
     dt, x = 1e-4, states(EXAMPLES['Magnet'])
     moved, F, Q = EXAMPLES['Magnet'].propagate(x, dt)
     m, w = x[:, 6:9], x[:, 9:12]
@@ -307,8 +307,8 @@ def test_a_magnet_that_turns_a_little_follows_the_source():
         np.testing.assert_allclose(Q[p, 6:9, 9:12], 0.5 * dt**2 / 2.0 * C, atol=1e-11)
 
 
-def turned_noise(std_w, std_m, dt, density=0.0):
-    """(second moment along the turned m by sampling, that of the model's extra noise, extra)."""
+def rotation_noise(std_w, std_m, dt, density=0.0):
+    """Variance along the rotated moment: by sampling, and of the model's additional noise."""
     model = Magnet(np.zeros(3), density)
     rng = np.random.default_rng(8)
     x = magnet_state(np.array([0.3, -0.4, 1.2]), np.array([0.2, 0.1, 0.0]))
@@ -327,24 +327,24 @@ def turned_noise(std_w, std_m, dt, density=0.0):
 
 
 @pytest.mark.study
-def test_the_second_order_of_an_uncertain_turn_is_in_its_noise():
-    """By sampling: how far turned moments end from the plane that the Jacobian moves them in."""
+def test_noise_covers_the_second_order_of_an_uncertain_rotation():
+    """Oracle: deviation of sampled, rotated moments from the linearised rotation."""
     std_w = np.array([0.10, 0.25, 0.15])
-    expected, extra = turned_noise(std_w, np.zeros(3), 0.5)
+    expected, extra = rotation_noise(std_w, np.zeros(3), 0.5)
     assert extra == pytest.approx(expected, rel=0.05)
-    # However little is known of the turn, a moment is never shorter than nothing.
-    assert turned_noise(1e3 * std_w, np.zeros(3), 0.5)[1] == pytest.approx(1.69)
+    # The deviation is limited to the length of the moment.
+    assert rotation_noise(1e3 * std_w, np.zeros(3), 0.5)[1] == pytest.approx(1.69)
 
 
-def test_a_turn_that_is_known_costs_nothing_however_uncertain_the_moment():
-    """Else each of many short steps would count the same doubt again."""
-    expected, extra = turned_noise(np.zeros(3), np.full(3, 0.2), 0.5)
+def test_a_known_rotation_adds_no_noise_to_an_uncertain_moment():
+    """Otherwise each of many short steps would add the same uncertainty again."""
+    expected, extra = rotation_noise(np.zeros(3), np.full(3, 0.2), 0.5)
     assert expected < 1e-20 and extra < 1e-20
-    # Unknown spin is a density, too: its angles grow with the third power of the time.
-    assert turned_noise(np.zeros(3), np.zeros(3), 1.0, 0.04)[1] == pytest.approx(
+    # The noise density of the angular velocity adds an angle variance of the third power of time.
+    assert rotation_noise(np.zeros(3), np.zeros(3), 1.0, 0.04)[1] == pytest.approx(
         2.0 * (0.04 / 3.0) ** 2 * 1.69)
 
 
-def test_a_magnet_of_no_moment_has_a_finite_noise():
+def test_noise_of_a_magnet_without_moment_is_finite():
     _, F, Q = EXAMPLES['Magnet'].propagate(np.zeros((1, 12)), 0.1, np.eye(12)[None])
     assert np.isfinite(F).all() and np.isfinite(Q).all() and not Q[0, 6:9, 6:9].any()

@@ -1,4 +1,4 @@
-"""A row of dipoles on a path that bends steadily, seen by clocks that are apart."""
+"""Row of dipoles on a path with acceleration and turn rate, with sensor clock offsets."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ T, PLACES, M = RNG.uniform(-1.0, 1.0, 6), RNG.uniform(-5.0, 5.0, (6, 3)), RNG.st
     (6, 3, 3))
 CLOCK = np.array([-1, 0, -1, 1, 0, 1])
 STRAIGHT = np.array([1.0, 2.0, 0.5, 9.0, 0.3, 0.2, 2.5])
-BENT = np.append(STRAIGHT, [1.5, -0.6, 0.8])
+CURVED = np.append(STRAIGHT, [1.5, -0.6, 0.8])
 
 
 def model(free, n_dipoles=3, t=T, fixed=None):
@@ -20,7 +20,7 @@ def model(free, n_dipoles=3, t=T, fixed=None):
 
 
 @pytest.mark.parametrize('n_dipoles', [1, 3, 5])
-def test_without_bends_it_is_a_row_at_constant_velocity(n_dipoles):
+def test_a_straight_path_equals_a_row_at_constant_velocity(n_dipoles):
     v, heading = STRAIGHT[3:5]
     path = np.array([*STRAIGHT[:3], v * np.cos(heading), v * np.sin(heading), 0.0, STRAIGHT[6]])
     level = np.where(np.arange(N_STRAIGHT) == PATH.index('climb'), 0.0, STRAIGHT)
@@ -29,31 +29,30 @@ def test_without_bends_it_is_a_row_at_constant_velocity(n_dipoles):
                                atol=1e-20)
 
 
-def test_a_clock_that_is_ahead_says_too_late_a_time():
+def test_clock_offsets_shift_the_sample_times():
     offsets = np.array([0.12, -0.05])
     late = T - np.append(offsets, 0.0)[CLOCK]
-    apart = model(N_PATH + 2).basis(np.append(BENT, offsets)[None])
-    np.testing.assert_allclose(apart, model(N_PATH, t=late).basis(BENT[None]), rtol=1e-12)
+    apart = model(N_PATH + 2).basis(np.append(CURVED, offsets)[None])
+    np.testing.assert_allclose(apart, model(N_PATH, t=late).basis(CURVED[None]), rtol=1e-12)
 
 
-def test_a_bend_is_where_many_small_steps_lead():
-    """One dipole: where the field of the last sample says that it is."""
-    _, _, _, v, heading, climb, _, gain, rate, more = BENT
+def test_a_curved_path_equals_its_numerical_integration():
+    """One dipole: its field equals that of a dipole at the integrated position."""
+    _, _, _, v, heading, climb, _, gain, rate, more = CURVED
     for time in (-1.0, 0.7, 1.5):
         steps = (np.arange(200_000) + 0.5) * time / 200_000
         angle = heading + (rate + 0.5 * more * steps) * steps
         speed = v + gain * steps
         way = np.array([np.mean(speed * np.cos(angle)), np.mean(speed * np.sin(angle)), climb])
         there = np.zeros(N_PATH + 2)
-        there[:3] = BENT[:3] + time * way
-        bent = model(N_PATH, 1, np.full(6, time)).basis(BENT[None])
+        there[:3] = CURVED[:3] + time * way
+        curved = model(N_PATH, 1, np.full(6, time)).basis(CURVED[None])
         still = model(N_PATH, 1, np.zeros(6)).basis(there[None, :N_PATH])
-        np.testing.assert_allclose(bent, still, rtol=1e-6, atol=1e-20)
+        np.testing.assert_allclose(curved, still, rtol=1e-6, atol=1e-20)
 
 
-@pytest.mark.parametrize('path', [np.append(STRAIGHT, [0.0, 0.0, 0.0]), BENT])
-def test_derivatives(path):
-    """Against differences."""
+@pytest.mark.parametrize('path', [np.append(STRAIGHT, [0.0, 0.0, 0.0]), CURVED])
+def test_derivatives_agree_with_differences(path):
     theta = np.append(path, [0.02, -0.03])[None]
     m = model(N_PATH + 2)
     p = RNG.standard_normal((1, 9))
@@ -64,8 +63,8 @@ def test_derivatives(path):
         np.testing.assert_allclose(D[:, :, k], numeric, rtol=0, atol=1e-6 * np.abs(numeric).max())
 
 
-def test_what_is_not_free_stays_as_it_is_fixed():
-    fixed = np.append(BENT, [0.1, 0.2])
+def test_parameters_that_are_not_free_keep_their_fixed_values():
+    fixed = np.append(CURVED, [0.1, 0.2])
     part = SteadyPass(T, PLACES, M, CLOCK, np.array([0, 3, 10]), fixed, 3)
     theta = np.array([[1.5, 8.0, 0.3]])
     whole = fixed.copy()

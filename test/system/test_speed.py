@@ -92,5 +92,5 @@ def test_figures_are_kept_and_what_got_worse_is_said(tmp_path, monkeypatch, caps
     kept = figures.Figures('replay')
     kept.add('a frame, mean', np.nan, 'ms', 9.0)
     assert kept.missed == 1 and kept.save() == 1 and figures.main() == 0
-    assert 'none was compared: no earlier run is of such a machine (another)' in \
+    assert 'none were compared: no earlier run on such a machine (another)' in \
         capsys.readouterr().out
