@@ -1,4 +1,4 @@
-"""Render docs/images/report.png and report_telephone.png: the report of a recording in Chromium.
+"""Draw the pictures of README and documentation in docs/images, from the bundled recordings.
 
     PYTHONPATH=test .venv/bin/python tools/take_pictures.py
 """
@@ -7,9 +7,16 @@ import sys
 import tempfile
 from pathlib import Path
 
+import mag_tracking as mt
+from mag_tracking.apps.calibrate import calibrate
 from mag_tracking.cli import main as command
+from mag_tracking.pipeline import settings_for
+from mag_tracking.recording.reader import Recording
+from mag_tracking.report.calibration_figures import calibration_figure
+from mag_tracking.report.fit_figures import pass_figure
+from mag_tracking.report.plan_figures import position_figure, sensor_figure
 from support.browser import Page, browser
-from support.bundled import NETWORK_FILE, vehicle_path
+from support.bundled import DATA, NETWORK_FILE, vehicle_path
 
 IMAGES = Path(__file__).resolve().parents[1] / 'docs' / 'images'
 RECORDING = vehicle_path('junction_left_turns_to_rear')
@@ -18,8 +25,24 @@ SHOWN_S = 2.4
 """Time of the slider [s]: the car begins to turn."""
 
 
+def figures():
+    """{name: matplotlib Figure}."""
+    track = mt.track(RECORDING, NETWORK_FILE)
+    truck = mt.fit(vehicle_path('straight_truck_right'), NETWORK_FILE).passes[0].chosen
+    plan = mt.plan(NETWORK_FILE, 'car', heading=[0.0, 180.0], offset=[-2.0, -2.0])
+    corridor = mt.read_network(DATA / 'corridor' / 'network.yaml')
+    found = calibrate(Recording(DATA / 'corridor' / 'corridor_8_sensors.mcap'), corridor,
+                      settings_for('vehicle'), date='2026-05-01')
+    return {'junction_map': track.map_figure(), 'junction_weights': track.weights_figure(),
+            'junction_field': track.field_figure(), 'truck_fit': pass_figure(truck, 'truck'),
+            'plan_position': position_figure(plan), 'plan_sensor': sensor_figure(plan),
+            'calibration': calibration_figure(found, corridor)}
+
+
 def main():
-    """Replay the recording and render its report; return the exit status."""
+    """Draw the figures, replay the recording and render its report; return the exit status."""
+    for name, figure in figures().items():
+        figure.savefig(IMAGES / f'{name}.png', dpi=110)
     with tempfile.TemporaryDirectory() as folder, browser() as chromium:
         status = command(['replay', str(RECORDING), '--network', str(NETWORK_FILE), '--out', folder,
                           '--no-figures'])

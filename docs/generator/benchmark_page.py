@@ -36,7 +36,7 @@ def description_of(name):
     source = ROOT / 'test' / 'bench' / f'{module}.py'
     text = ast.get_docstring(ast.parse(source.read_text(encoding='utf-8')))
     paragraphs = [p for p in text.split('\n\n') if not p.startswith('    ')]
-    return module, '\n\n'.join(paragraphs).removeprefix('`make bench`: ')
+    return module, '\n\n'.join(paragraphs)
 
 
 def draw_situations(path):
