@@ -27,7 +27,7 @@ def tables(tmp_path_factory):
 
 
 @pytest.mark.parametrize('name', ['by_sample', 'by_row'])
-def test_train_evaluate_and_predict(tables, tmp_path, capsys, name):
+def test_commands_train_evaluate_and_predict(tables, tmp_path, capsys, name):
     table, model = str(tables / f'{name}.csv'), str(tmp_path / 'classes.json')
     assert main(['classes', 'evaluate', table, '--splits', '3']) == 0
     printed = capsys.readouterr().out

@@ -71,7 +71,7 @@ def test_several_recordings_get_a_folder_each(tmp_path):
     assert sorted(p.name for p in out.iterdir()) == names
 
 
-def test_import_and_replay_of_a_magnet(tmp_path, capsys):
+def test_a_magnet_table_is_imported_and_replayed(tmp_path, capsys):
     source = DATA / 'magnet_16_sensors'
     assert main(['import', str(source / 'lisa_data1.csv'), '--background',
                  str(source / 'lisa_data1_background.csv'), '--out', str(tmp_path / 'm')]) == 0
@@ -98,7 +98,7 @@ def fail(capsys, *arguments):
 def test_errors_are_reported_in_one_line(tmp_path, capsys):
     common = ['--network', NETWORK_FILE, '--out', tmp_path / 'out']
     recording = vehicle_path(NAME)
-    assert 'there is no' in fail(capsys, 'replay', tmp_path / 'x.mcap', *common)
+    assert 'x.mcap does not exist' in fail(capsys, 'replay', tmp_path / 'x.mcap', *common)
     typo = tmp_path / 'typo.yaml'
     typo.write_text('track: {vehicle: {momnet: 3.0}}')
     assert 'did you mean track.vehicle.moments?' in fail(
