@@ -1,4 +1,4 @@
-"""Recordings for archives, and the archive of them."""
+"""Recordings for archive tests, and an archive of them."""
 
 import pytest
 
@@ -10,13 +10,13 @@ from support.bundled import NETWORK_FILE, QUICK
 
 @pytest.fixture(scope='session')
 def recordings(tmp_path_factory):
-    """A folder of three recordings and a file that is no recording."""
+    """Folder of three recordings and an invalid file."""
     return archive_recordings(tmp_path_factory.mktemp('recordings'))
 
 
 @pytest.fixture(scope='session')
-def whole(tmp_path_factory, recordings):
-    """The archive that nobody interrupted."""
-    out = tmp_path_factory.mktemp('whole') / 'out'
+def complete_archive(tmp_path_factory, recordings):
+    """Archive of an uninterrupted run."""
+    out = tmp_path_factory.mktemp('complete') / 'out'
     archive([recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)
     return out

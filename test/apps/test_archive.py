@@ -1,4 +1,4 @@
-"""Archives: rows are those of replays, nothing is lost or done twice, bad input is named."""
+"""Archives: rows equal those of a replay, runs continue, invalid recordings are named."""
 
 import contextlib
 import os
@@ -34,14 +34,14 @@ TRACKED = ('tracks', 'poses', 'smoothed', 'passes')
 
 @pytest.fixture(scope='module')
 def road_network_file(tmp_path_factory):
-    """That of the road, whose sensors stand farther apart."""
+    """Network file of the two-way road, whose sensors are farther apart."""
     path = tmp_path_factory.mktemp('road') / 'network.yaml'
     path.write_text(NETWORK_FILE.read_text().replace('4.5', '5.5'))
     return path
 
 
-def archived(folder, recording, network, settings, in_order=True):
-    """An archive of one recording without a cluster."""
+def archive_without_cluster(folder, recording, network, settings, in_order=True):
+    """Archive one recording without a cluster; return (its columns, number of segments)."""
     work = folder / 'unfinished'
     work.mkdir(parents=True)
     job = Job(recording, work, folder, network, settings)
@@ -52,7 +52,7 @@ def archived(folder, recording, network, settings, in_order=True):
 
 
 def assert_rows_of_replay(folder, result):
-    """The tables hold the poses and tracks of a result, in order."""
+    """Assert that the tables hold the poses and tracks of a result, in order."""
     for table, poses in (('poses', result.poses),
                          ('smoothed', result.smoothed[result.smoothed['complete']])):
         files = pq.read_table(folder / table).to_pandas()
@@ -72,12 +72,12 @@ def assert_rows_of_replay(folder, result):
             == {n: summary[n] for n in ('poses', 'arrival', 'speed', 'verdict', 'end_ns')}
 
 
-def test_a_recording_that_is_cut_gives_the_rows_of_one_that_is_not(
+def test_a_recording_in_segments_gives_the_rows_of_a_replay(
         tmp_path, monkeypatch, road_network_file):
     monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 60)
     monkeypatch.setattr(archive_segments, 'CHUNK_FRAMES', 50)
     settings, network = settings_for('vehicle', QUICK), read_network(road_network_file)
-    known, n = archived(tmp_path, ROAD, network, settings, in_order=False)
+    known, n = archive_without_cluster(tmp_path, ROAD, network, settings, in_order=False)
     result = mt.track(ROAD, network, settings=QUICK)
     assert n > 8 and known['tracks'] == len(result.tracks) >= 20
     assert known['passes'] == pq.read_table(tmp_path / 'passes').num_rows >= 20
@@ -86,9 +86,9 @@ def test_a_recording_that_is_cut_gives_the_rows_of_one_that_is_not(
 
 @pytest.mark.study
 @pytest.mark.parametrize('ahead_s', [0.0, 0.2])
-def test_clocks_that_are_apart_are_remembered_from_stretch_to_stretch(
+def test_clock_differences_carry_over_between_segments(
         tmp_path, monkeypatch, road_network_file, ahead_s):
-    """Tracks are doubted then, by the passes of all stretches before."""
+    """With different clocks, tracks are doubted because of passes in earlier segments."""
     monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 60)
     path = tmp_path / 'network.yaml'
     text = road_network_file.read_text()
@@ -97,16 +97,16 @@ def test_clocks_that_are_apart_are_remembered_from_stretch_to_stretch(
     assert network.clock_offset.tolist() == [0.0, ahead_s]
     tracked, manager = [], archive_work.TrackManager
     monkeypatch.setattr(archive_work, 'TrackManager', lambda *a: tracked.append(a) or manager(*a))
-    _, n = archived(tmp_path / 'archive', ROAD, network, settings_for('vehicle'))
+    _, n = archive_without_cluster(tmp_path / 'archive', ROAD, network, settings_for('vehicle'))
     result = mt.track(ROAD, network)
     assert_rows_of_replay(tmp_path / 'archive', result)
-    # Those that the evidence of others could have changed were tracked once more.
+    # Segments whose tracks depend on earlier segments were tracked a second time.
     assert n > 1 and (len(tracked) > n) == bool(ahead_s)
     assert any(CLOCKS_APART in d for d in result.poses['doubts']) == bool(ahead_s)
 
 
-def test_an_archive_of_recordings(tmp_path, recordings, capsys):
-    """On two processes; one that is none is named and stops nobody; a second run does nothing."""
+def test_an_archive_contains_all_valid_recordings(tmp_path, recordings, capsys):
+    """Two workers; the invalid recording is named and skipped; a second run changes nothing."""
     out, lines = tmp_path / 'out', []
     settings = settings_for('vehicle', QUICK)
     run = archive([recordings], NETWORK_FILE, settings, out, workers=2, report=lines.append)
@@ -145,7 +145,7 @@ def test_a_recording_that_changed_is_tracked_again(tmp_path, recordings):
     assert len(rows(tmp_path / 'out', 'recordings')) == 1
 
 
-def test_a_run_that_is_stopped_is_gone_on_with(tmp_path, recordings, whole):
+def test_a_stopped_run_continues(tmp_path, recordings, complete_archive):
     out, settings = tmp_path / 'out', settings_for('vehicle', QUICK)
     seen = []
     first = archive([recordings], NETWORK_FILE, settings, out, progress=seen.append,
@@ -154,31 +154,31 @@ def test_a_run_that_is_stopped_is_gone_on_with(tmp_path, recordings, whole):
     second = archive([recordings], NETWORK_FILE, settings, out)
     assert not second.interrupted and len(second.done) + len(first.done) == 3
     assert sorted(second.already_done) == sorted(first.done)
-    assert same_tables(out, whole)
+    assert same_tables(out, complete_archive)
 
 
-def test_a_run_that_is_killed_is_gone_on_with(tmp_path, recordings, whole):
+def test_a_killed_run_continues(tmp_path, recordings, complete_archive):
     out = tmp_path / 'out'
-    words = command(recordings, out, tmp_path, '--workers', '1')
-    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    arguments = command(recordings, out, tmp_path, '--workers', '1')
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     wait_for(lambda: list(out.glob('done/*.json')))
     for child in psutil.Process(process.pid).children(recursive=True):
         with contextlib.suppress(psutil.NoSuchProcess):
             child.kill()
     process.kill()
     process.communicate()
-    done = subprocess.run(words, capture_output=True, text=True)
+    done = subprocess.run(arguments, capture_output=True, text=True)
     assert done.returncode == 1 and 'recordings failed: 1' in done.stdout, done.stderr
-    assert same_tables(out, whole)
+    assert same_tables(out, complete_archive)
 
 
-def test_ctrl_c_keeps_what_is_done(tmp_path, recordings):
+def test_ctrl_c_ends_the_command_with_a_hint_to_continue(tmp_path, recordings):
     out = tmp_path / 'out'
     process = subprocess.Popen(command(recordings, out, tmp_path, '--workers', '1'),
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                                start_new_session=True)
     wait_for(lambda: list(out.glob('unfinished/*/.*.cut')))
-    # As a terminal does it: to all processes.
+    # A terminal sends Ctrl-C to the whole process group.
     os.killpg(process.pid, signal.SIGINT)
     text, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and 'run the same command to continue' in text, errors
@@ -186,7 +186,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path, recordings):
 
 
 def frames(*segments):
-    """Frames every 0.1 s: (seconds, whether a target is near) one after the other."""
+    """Frames at 10 Hz of consecutive segments (duration [s], target present)."""
     out = []
     for seconds, present in segments:
         for _ in range(round(10 * seconds)):
@@ -196,7 +196,7 @@ def frames(*segments):
 
 
 @pytest.mark.parametrize('quiet_s, n', [(0.5, 1), (2.5, 1), (3.5, 2), (30.0, 2)])
-def test_stretches_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quiet_s, n):
+def test_segments_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quiet_s, n):
     monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 10)
     monkeypatch.setattr(archive_segments, 'CHUNK_FRAMES', 7)
     given = frames((20.0, False), (2.0, True), (quiet_s, False), (2.0, True), (9.0, False))
@@ -209,25 +209,25 @@ def test_stretches_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quie
         kept = [f for piece in read_segment(tmp_path / f'segment-{k}.pickle')
                 for f, _ in piece.frames()]
         first = next(i for i, f in enumerate(kept) if f.target_present)
-        # All frames that a track may look back to, and the one that ends it.
+        # All frames that a track may look back to, and the frame that ends the track.
         assert kept[first].stamp_ns - kept[0].stamp_ns in (3_000_000_000, 3_100_000_000)
         assert not kept[-1].target_present
     assert max(len(p.stamp_ns) for k in range(n) for p in read_segment(
         tmp_path / f'segment-{k}.pickle')) <= 7 + 31
 
 
-def test_a_time_that_jumps_back_between_stretches_blocks_nothing(tmp_path):
+def test_a_backward_time_jump_between_segments_loses_no_frames(tmp_path):
     writer = SegmentWriter(tmp_path, 3.0)
     for f in frames((60.0, False)) + frames((60.0, False), (2.0, True), (9.0, False)):
         writer.add_frame(f, {})
     writer.close()
     kept = [f for p in read_segment(tmp_path / 'segment-0.pickle') for f, _ in p.frames()]
     assert len(kept) == 31 + 20 + 1
-    assert not (tmp_path / 'stretch-1.pickle').exists()
+    assert not (tmp_path / 'segment-1.pickle').exists()
 
 
-def test_doubts_go_with_the_frames_of_a_stretch(tmp_path):
-    """Whenever they change, and at the beginning of each stretch."""
+def test_doubts_are_stored_with_the_frames_of_a_segment(tmp_path):
+    """At the beginning of each segment and whenever they change."""
     writer = SegmentWriter(tmp_path, 3.0)
     first, second = {'mag_1': ((1, None),)}, {'mag_1': ((1, 5),)}
     for k, f in enumerate(frames((5.0, False), (2.0, True), (9.0, False))):
@@ -239,8 +239,8 @@ def test_doubts_go_with_the_frames_of_a_stretch(tmp_path):
     assert found[0][0] < 5_000_000_000 and found[1][0] == 6_000_000_000
 
 
-def test_rows_are_by_the_day_and_what_is_not_known_is_null(whole):
-    for path in whole.rglob('*-*.parquet'):
+def test_rows_are_partitioned_by_day_and_unknown_values_are_null(complete_archive):
+    for path in complete_archive.rglob('*-*.parquet'):
         table = pq.read_table(path, partitioning=None)
         days = {str(t.date()) for t in table['time'].to_pandas()}
         assert days == {path.parent.name.removeprefix('date=')}
@@ -249,7 +249,7 @@ def test_rows_are_by_the_day_and_what_is_not_known_is_null(whole):
                 assert not np.isnan(table[name].drop_null().to_numpy()).any(), (path, name)
 
 
-def test_a_recording_over_midnight_is_in_two_days(tmp_path):
+def test_a_recording_over_midnight_is_split_into_two_days(tmp_path):
     midnight = 20_000 * 86_400 * 10**9
     with TableWriter(tmp_path / 'part.parquet', TABLES['health']) as table:
         for k in (-2, -1, 0, 1):

@@ -1,4 +1,4 @@
-"""Archives: what is bad or missing is named, and what is lost is done again."""
+"""Archives: faults are reported, and lost work is repeated."""
 
 import contextlib
 import gc
@@ -24,14 +24,14 @@ from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 from support.mqtt_broker import free_port
 
 
-def test_a_lost_worker_costs_nothing_but_time(tmp_path, recordings, whole):
+def test_the_work_of_a_lost_worker_is_repeated(tmp_path, recordings, complete_archive):
     out, runs = tmp_path / 'out', []
     before = {*psutil.Process().children(recursive=True)}
     thread = threading.Thread(target=lambda: runs.append(archive(
         [recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)))
     thread.start()
     wait_for(lambda: list(out.glob('unfinished/*/cut')))
-    # The youngest are the workers; the others look after them.
+    # Processes without children are the workers; the others supervise them.
     workers = [p for p in psutil.Process().children(recursive=True) if p not in before
                and not p.children()]
     for worker in workers:
@@ -40,34 +40,34 @@ def test_a_lost_worker_costs_nothing_but_time(tmp_path, recordings, whole):
                 worker.kill()
     thread.join(120)
     assert runs and len(runs[0].done) == 3 and runs[0].lost_workers >= 1
-    assert same_tables(out, whole)
+    assert same_tables(out, complete_archive)
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path, recordings, whole):
+def test_an_incompatible_folder_is_refused(tmp_path, recordings, complete_archive):
     settings = settings_for('vehicle', QUICK)
-    some = [recordings / 'straight_car_right.mcap']
+    paths = [recordings / 'straight_car_right.mcap']
     (tmp_path / 'taken').mkdir()
     (tmp_path / 'taken' / 'photo.jpg').write_text('')
     with pytest.raises(OutputError, match='is not empty and is not an archive'):
-        archive(some, NETWORK_FILE, settings, tmp_path / 'taken')
+        archive(paths, NETWORK_FILE, settings, tmp_path / 'taken')
     with pytest.raises(OutputError, match='other values of settings'):
-        archive(some, NETWORK_FILE, settings_for('vehicle'), whole)
+        archive(paths, NETWORK_FILE, settings_for('vehicle'), complete_archive)
     other = tmp_path / 'network.yaml'
     other.write_text(NETWORK_FILE.read_text().replace('4.5', '4.6'))
     with pytest.raises(OutputError, match='other values of network'):
-        archive(some, other, settings, whole)
+        archive(paths, other, settings, complete_archive)
     old = tmp_path / 'old'
-    shutil.copytree(whole, old)
+    shutil.copytree(complete_archive, old)
     head = json.loads((old / 'archive.json').read_text())
     (old / 'archive.json').write_text(json.dumps({**head, 'schema': 0}))
     with pytest.raises(OutputError, match='tables of version 0; this program writes version 1'):
-        archive(some, NETWORK_FILE, settings, old)
+        archive(paths, NETWORK_FILE, settings, old)
     (old / 'archive.json').write_text('{"schema"')
     with pytest.raises(OutputError, match='cannot read'):
-        archive(some, NETWORK_FILE, settings, old)
+        archive(paths, NETWORK_FILE, settings, old)
 
 
-def test_two_archives_into_one_folder(tmp_path, recordings):
+def test_a_second_run_into_the_same_folder_is_refused(tmp_path, recordings):
     out, lines = tmp_path / 'out', []
     settings = settings_for('vehicle', QUICK)
 
@@ -81,7 +81,7 @@ def test_two_archives_into_one_folder(tmp_path, recordings):
     assert lines == ['refused']
 
 
-def test_a_scheduler_that_does_not_answer(tmp_path, recordings, monkeypatch):
+def test_a_scheduler_that_does_not_respond_is_an_error(tmp_path, recordings, monkeypatch):
     monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT_S', 1.0)
     settings = settings_for('vehicle', QUICK)
     for address, why in ((f'tcp://127.0.0.1:{free_port()}', 'no response from a Dask scheduler'),
@@ -90,25 +90,25 @@ def test_a_scheduler_that_does_not_answer(tmp_path, recordings, monkeypatch):
             archive([recordings], NETWORK_FILE, settings, tmp_path / 'out', scheduler=address)
 
 
-def test_a_scheduler_without_workers_and_with(tmp_path, recordings, monkeypatch):
+def test_a_scheduler_requires_workers(tmp_path, recordings, monkeypatch):
     from distributed import LocalCluster
 
     settings = settings_for('vehicle', QUICK)
     with LocalCluster(n_workers=0, processes=True, dashboard_address=None,
-                      threads_per_worker=1) as there:
+                      threads_per_worker=1) as local_cluster:
         monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT_S', 1.0)
         with pytest.raises(ClusterError, match='the scheduler has no workers'):
             archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
-                    scheduler=there.scheduler_address)
+                    scheduler=local_cluster.scheduler_address)
         monkeypatch.undo()
-        there.scale(1)
+        local_cluster.scale(1)
         run = archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
-                      scheduler=there.scheduler_address)
+                      scheduler=local_cluster.scheduler_address)
         assert len(run.done) == 3
 
 
-def test_a_client_that_failed_does_not_hold_up_the_next(tmp_path, recordings, monkeypatch):
-    """Wherever it is collected; Dask's own loop of events waited for itself."""
+def test_a_failed_client_does_not_block_the_next_one(tmp_path, recordings, monkeypatch):
+    """Garbage collection of a failed client in Dask's event loop caused a deadlock."""
     from distributed import LocalCluster
     from tornado.ioloop import IOLoop
 
@@ -122,7 +122,7 @@ def test_a_client_that_failed_does_not_hold_up_the_next(tmp_path, recordings, mo
         return current(*args, **kwargs)
 
     with LocalCluster(n_workers=1, processes=False, dashboard_address=None,
-                      threads_per_worker=1) as there:
+                      threads_per_worker=1) as local_cluster:
         gc.disable()
         try:
             with pytest.raises(ClusterError, match='no response from a Dask scheduler'):
@@ -130,25 +130,25 @@ def test_a_client_that_failed_does_not_hold_up_the_next(tmp_path, recordings, mo
                         scheduler='nonsense://x')
             monkeypatch.setattr(IOLoop, 'current', collecting)
             run = archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
-                          scheduler=there.scheduler_address)
+                          scheduler=local_cluster.scheduler_address)
         finally:
             gc.enable()
         assert len(run.done) == 3
 
 
-def test_a_full_disk_stops_the_run_and_another_goes_on(tmp_path, recordings, whole):
-    """A limit on the size of a file stands for the disk."""
+def test_a_run_continues_after_a_full_disk(tmp_path, recordings, complete_archive):
+    """A limit on the file size simulates a full disk."""
     out = tmp_path / 'out'
-    words = command(recordings, out, tmp_path, '--workers', '1')
-    done = subprocess.run(['bash', '-c', 'ulimit -f 30; exec "$@"', '-', *words],
+    arguments = command(recordings, out, tmp_path, '--workers', '1')
+    done = subprocess.run(['bash', '-c', 'ulimit -f 30; exec "$@"', '-', *arguments],
                           capture_output=True, text=True)
     assert done.returncode == 1 and 'mag-tracking: cannot write' in done.stderr
     assert 'Traceback' not in done.stderr and not list(out.glob('done/*.json'))
-    assert subprocess.run(words, capture_output=True).returncode == 1
-    assert same_tables(out, whole)
+    assert subprocess.run(arguments, capture_output=True).returncode == 1
+    assert same_tables(out, complete_archive)
 
 
-def test_a_table_is_whole_or_not_there(tmp_path):
+def test_a_table_is_complete_or_missing(tmp_path):
     health = TABLES['health']
     with pytest.raises(RuntimeError), TableWriter(tmp_path / 'a.parquet', health) as table:
         table.add({'stamp_ns': 1})
@@ -159,7 +159,7 @@ def test_a_table_is_whole_or_not_there(tmp_path):
         TableWriter(tmp_path / 'file' / 'c.parquet', health)
 
 
-def test_names_of_recordings(tmp_path, recordings):
+def test_folders_and_patterns_select_recordings(tmp_path, recordings):
     found = recordings_of([recordings, recordings / 'straight_*.mcap'])
     assert [p.name for p in found] == ['junction_left_to_right.mcap', 'damaged.mcap',
                                        'straight_car_right.mcap', 'straight_small_left.mcap']
@@ -172,17 +172,17 @@ def test_names_of_recordings(tmp_path, recordings):
             recordings_of([nothing])
 
 
-def test_command_line_errors(tmp_path, recordings, capsys):
-    words = ['archive', str(recordings), '--network', str(NETWORK_FILE), '--out',
-             str(tmp_path / 'out')]
-    assert main([*words, '--workers', '0']) == 1
+def test_invalid_arguments_are_named(tmp_path, recordings, capsys):
+    arguments = ['archive', str(recordings), '--network', str(NETWORK_FILE), '--out',
+                 str(tmp_path / 'out')]
+    assert main([*arguments, '--workers', '0']) == 1
     assert '--workers: expected 1 or more' in capsys.readouterr().err
-    assert main(['archive', str(tmp_path / 'none'), *words[2:]]) == 1
+    assert main(['archive', str(tmp_path / 'none'), *arguments[2:]]) == 1
     assert 'no recording found' in capsys.readouterr().err
 
 
-def test_a_recording_that_grows_while_it_is_tracked_is_tracked_again(tmp_path):
-    """As one that is still being written."""
+def test_a_recording_that_grows_during_tracking_is_tracked_again(tmp_path):
+    """For example a recording in progress."""
     path, out, settings = tmp_path / 'a.mcap', tmp_path / 'out', settings_for('vehicle', QUICK)
     data = vehicle_path('straight_car_right').read_bytes()
     path.write_bytes(data[:len(data) // 2])
@@ -197,8 +197,8 @@ def test_a_recording_that_grows_while_it_is_tracked_is_tracked_again(tmp_path):
     assert archive([path], NETWORK_FILE, settings, out).already_done == [path]
 
 
-def test_nothing_of_another_state_of_a_recording_is_used(tmp_path):
-    """Neither tables nor what a run that was killed has left."""
+def test_leftovers_of_an_earlier_state_of_a_recording_are_discarded(tmp_path):
+    """Both tables and intermediate files of a killed run."""
     path = tmp_path / 'a[1] = ö.mcap'
     shutil.copy(vehicle_path('straight_car_right'), path)
     with ArchiveFolder(tmp_path / 'out', {}) as dataset:
@@ -214,16 +214,16 @@ def test_nothing_of_another_state_of_a_recording_is_used(tmp_path):
         assert other != work and not work.exists() and not list(other.iterdir())
 
 
-def test_a_recording_that_kills_its_workers_stops_nobody(tmp_path, recordings, monkeypatch):
-    """A file name that makes a worker end stands for one that needs too much memory. What
-    waits at the same worker is lost with it, and is no worse for that."""
+def test_a_recording_that_kills_its_workers_fails_alone(tmp_path, recordings, monkeypatch):
+    """A file name that ends its worker simulates a recording that needs too much memory. Other
+    work that is lost with the worker is repeated."""
     folder = tmp_path / 'recordings'
     folder.mkdir()
     shutil.copy(recordings / 'straight_car_right.mcap', folder / 'good.mcap')
     shutil.copy(recordings / 'straight_car_right.mcap', folder / 'deadly.mcap')
     site = tmp_path / 'site'
     site.mkdir()
-    (site / 'sitecustomize.py').write_text(DEADLY)
+    (site / 'sitecustomize.py').write_text(EXIT_ON_DEADLY_FILE)
     monkeypatch.setenv('PYTHONPATH', f'{site}:{os.environ.get("PYTHONPATH", "")}')
     lines = []
     run = archive([folder], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out',
@@ -233,7 +233,7 @@ def test_a_recording_that_kills_its_workers_stops_nobody(tmp_path, recordings, m
     assert len(rows(tmp_path / 'out', 'recordings')) == 2
 
 
-DEADLY = '''
+EXIT_ON_DEADLY_FILE = '''
 import builtins, os, sys
 if any('spawn' in word for word in sys.argv) or '--multiprocessing-fork' in sys.argv:
     opened = builtins.open
@@ -245,7 +245,7 @@ if any('spawn' in word for word in sys.argv) or '--multiprocessing-fork' in sys.
 '''
 
 
-def test_names_that_parquet_or_the_disk_do_not_like(tmp_path):
+def test_unusual_file_names_are_archived(tmp_path):
     folder, settings = tmp_path / 'recordings', settings_for('vehicle', QUICK)
     folder.mkdir()
     names = ['n' * 245 + '.mcap', os.fsdecode(b'caf\xe9.mcap'), 'a = b, ü.MCAP']
@@ -256,7 +256,7 @@ def test_names_that_parquet_or_the_disk_do_not_like(tmp_path):
     assert 'caf\\udce9' in {row[0] for row in rows(tmp_path / 'out', 'recordings')}
 
 
-def test_what_is_no_file_is_left_out_and_nothing_is_found_twice(tmp_path):
+def test_special_files_are_skipped_and_each_recording_is_found_once(tmp_path):
     (tmp_path / 'dangling.mcap').symlink_to('nowhere')
     (tmp_path / 'loop').symlink_to(tmp_path)
     os.mkfifo(tmp_path / 'pipe.mcap')
@@ -269,7 +269,7 @@ def test_what_is_no_file_is_left_out_and_nothing_is_found_twice(tmp_path):
     assert recordings_of([bag / '*.mcap']) == [bag / 'bag_0.mcap']
 
 
-def test_rows_of_nothing_are_null(tmp_path):
+def test_an_empty_recording_has_null_values(tmp_path):
     (tmp_path / 'empty.mcap').write_bytes(
         vehicle_path('straight_car_right').read_bytes()[:500])
     archive([tmp_path], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out')

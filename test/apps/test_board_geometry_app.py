@@ -1,4 +1,4 @@
-"""What becomes of a network where a magnet's poses calibrate it."""
+"""Network geometry calibrated with the poses of a magnet."""
 
 from dataclasses import replace
 
@@ -14,8 +14,8 @@ from support.geometry_command import command, through_calibrate, write_table
 from support.magnet_boards import HIGH, LOW, MOMENT, simulated
 
 
-def before(network):
-    """A board whose sensors were tumbled, and had their clocks compared."""
+def with_earlier_calibration(network):
+    """The network with an earlier calibration: tumbled sensors and clock offsets."""
     n = len(network)
     rng = np.random.default_rng(8)
     C = np.eye(3) + 0.1 * rng.standard_normal((n, 3, 3))
@@ -25,21 +25,21 @@ def before(network):
         calibrated=(CalibrationRecord('2020-01-01', 'hand', 1e-3),) * n)
 
 
-def raw(network, field):
-    """Readings (K, n, 3) that the network's offsets and corrections make `field`."""
+def raw_readings(network, field):
+    """Raw readings (K, n, 3) that the network calibrates to `field`."""
     return np.stack([np.linalg.solve(C, field[:, j].T).T + o for j, (C, o) in enumerate(
         zip(network.correction, network.offset, strict=True))], axis=1)
 
 
-def test_an_earlier_calibration_is_counted_with(tmp_path):
+def test_an_earlier_calibration_is_included(tmp_path):
     stated, field, positions, axes, _ = simulated(2)
-    tumbled = before(stated)
+    tumbled = with_earlier_calibration(stated)
     g = calibrate_geometry(stated, field, positions, axes, MOMENT, GeometrySettings())
     write_network(tmp_path / 'stated.yaml', tumbled)
-    table = write_table(tmp_path / 'poses.csv', raw(tumbled, field), positions, axes)
+    table = write_table(tmp_path / 'poses.csv', raw_readings(tumbled, field), positions, axes)
     assert command(table, '--network', tmp_path / 'stated.yaml', out=tmp_path / 'out.yaml') == 0
     network = read_network(tmp_path / 'out.yaml')
-    B = through_calibrate(network, raw(tumbled, field))
+    B = through_calibrate(network, raw_readings(tumbled, field))
     np.testing.assert_allclose(B, g.signal(field), rtol=0, atol=1e-11)
     np.testing.assert_allclose(network.positions, g.network.positions, atol=1e-8)
     np.testing.assert_allclose(network.R_ws, g.network.R_ws, atol=1e-6)
@@ -47,14 +47,14 @@ def test_an_earlier_calibration_is_counted_with(tmp_path):
                for c in network.calibrated) and (network.clock_offset == 0.02).all()
 
 
-def test_deviations_are_about_the_axes_of_the_world(tmp_path):
-    """A sensor that hears only its own x cannot tell a turn about it."""
+def test_orientation_stds_are_about_world_axes(tmp_path):
+    """A sensor that measures only x does not observe a rotation about x."""
     stated, field, positions, axes, _ = simulated(3)
-    # Sensor 4's x is along the world's y, and its y along z.
+    # The x axis of sensor 4 is along world y, its y axis along world z.
     R = stated.R_ws.copy()
-    turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    field[:, 4] = field[:, 4] @ R[4].T @ turn
-    R[4] = turn
+    mounting = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    field[:, 4] = field[:, 4] @ R[4].T @ mounting
+    R[4] = mounting
     field[:, 4, 1:] = np.nan
     write_network(tmp_path / 'stated.yaml', replace(stated, R_ws=R))
     table = write_table(tmp_path / 'poses.csv', field, positions, axes)
@@ -63,13 +63,13 @@ def test_deviations_are_about_the_axes_of_the_world(tmp_path):
     assert std[1] == pytest.approx(2.0, rel=0.05) and std[0] < 1.0 and std[2] < 1.0
 
 
-def test_what_is_not_heard_stays_as_stated(tmp_path, capsys):
+def test_a_sensor_without_readings_keeps_its_nominal_geometry(tmp_path, capsys):
     stated, field, positions, axes, _ = simulated(3)
-    tumbled = before(stated)
+    tumbled = with_earlier_calibration(stated)
     field[:, 4] = np.nan
     field[5] = np.nan
-    readings = raw(tumbled, field)
-    # Of a sensor that was never tumbled a single axis may be missing.
+    readings = raw_readings(tumbled, field)
+    # A sensor that was not tumbled may lack a single axis.
     plain = replace(tumbled, offset=(*tumbled.offset[:6], None, *tumbled.offset[7:]),
                     correction=(*tumbled.correction[:6], None, *tumbled.correction[7:]))
     readings[:, 6], readings[:, 6, 2] = field[:, 6], np.nan
@@ -85,14 +85,14 @@ def test_what_is_not_heard_stays_as_stated(tmp_path, capsys):
     for name in ('positions', 'R_ws', 'noise_std', 'background', 'correction', 'orientation_std'):
         was_4, now_4 = (getattr(network, name)[4] for network in (was, now))
         assert (now_4 is None) == (was_4 is None)
-        # Through a quaternion and back, once more.
+        # The file stores quaternions, so rotations change by rounding.
         assert now_4 is None or np.abs(now_4 - was_4).max() < 1e-14, name
     assert now.calibrated[4] == was.calibrated[4] and now.calibrated[3].by != 'hand'
     assert now.background[6] is None and now.correction[6][0, 0] != 1.0
 
 
-def test_rows_of_unknown_poses(tmp_path):
-    """Rows are those of the table, whatever was left out."""
+def test_unknown_poses_keep_the_row_numbers_of_the_table(tmp_path):
+    """Row numbers are those of the table, also if rows were skipped."""
     stated, field, positions, axes, x = simulated(21)
     field[4] = np.nan
     table = write_table(tmp_path / 'poses.csv', field, positions, axes)
@@ -107,7 +107,7 @@ def test_rows_of_unknown_poses(tmp_path):
 
 
 def rotation_vector(R):
-    """(3,) of a rotation by less than a right angle."""
+    """Rotation vector (3,) [rad] of a rotation below 90 degrees."""
     v = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     s = np.linalg.norm(v)
     np.testing.assert_allclose(rotation(v / s * np.arcsin(s)), R, atol=1e-9)

@@ -1,4 +1,4 @@
-"""`mag-tracking classes`: tables, recordings with intervals, and bad labels."""
+"""`mag-tracking classes`: tables, labelled intervals of recordings, and invalid labels."""
 
 import csv
 import json
@@ -19,7 +19,7 @@ ROAD = DATA / 'two_way_road'
 
 @pytest.fixture(scope='module')
 def tables(tmp_path_factory):
-    """The same signatures as a table by sample and by row."""
+    """Folder with the same signatures as a table by sample and by row."""
     folder, found = tmp_path_factory.mktemp('classes'), signatures(COUNTS, 'boxes')
     write_by_sample(folder / 'by_sample.csv', found)
     write_by_row(folder / 'by_row.csv', found)
@@ -27,7 +27,7 @@ def tables(tmp_path_factory):
 
 
 @pytest.mark.parametrize('name', ['by_sample', 'by_row'])
-def test_train_evaluate_and_predict(tables, tmp_path, capsys, name):
+def test_commands_train_evaluate_and_predict(tables, tmp_path, capsys, name):
     table, model = str(tables / f'{name}.csv'), str(tmp_path / 'classes.json')
     assert main(['classes', 'evaluate', table, '--splits', '3']) == 0
     printed = capsys.readouterr().out
@@ -42,19 +42,20 @@ def test_train_evaluate_and_predict(tables, tmp_path, capsys, name):
     assert 'car' in last and 'truck' in last
 
 
-def test_both_kinds_of_table_hold_the_same(tables):
-    one, other = (labelled_signatures(tables / f'{name}.csv') for name in ('by_sample', 'by_row'))
-    assert [s.label for s in one] == [s.label for s in other]
-    np.testing.assert_allclose(one[0].field[0], other[0].field[0])
+def test_both_table_formats_give_the_same_signatures(tables):
+    by_sample, by_row = (
+        labelled_signatures(tables / f'{name}.csv') for name in ('by_sample', 'by_row'))
+    assert [s.label for s in by_sample] == [s.label for s in by_row]
+    np.testing.assert_allclose(by_sample[0].field[0], by_row[0].field[0])
 
 
-def intervals(path, rows, header=('label', 'begin_s', 'end_s')):
+def write_intervals(path, rows, header=('label', 'begin_s', 'end_s')):
     with open(path, 'w', newline='') as stream:
         csv.writer(stream).writerows([header, *rows])
     return path
 
 
-def test_intervals_of_a_recording(tmp_path):
+def test_labelled_intervals_give_a_signature_of_each_sensor(tmp_path):
     truth = json.loads((ROAD / 'two_way_road.truth.json').read_text())
     vehicles = [v for k, v in enumerate(truth['vehicles'])
                 if all(abs(v['cpa_time_s'] - w['cpa_time_s']) > 5.0
@@ -62,37 +63,38 @@ def test_intervals_of_a_recording(tmp_path):
     rows = [('truck' if v['length_m'] > 6 else 'car', v['cpa_time_s'] - 2.0, v['cpa_time_s'] + 2.0)
             for v in vehicles]
     network = read_network(NETWORK_FILE)
-    found = labelled_signatures(ROAD / 'two_way_road.mcap', intervals(tmp_path / 'a.csv', rows),
-                                network)
-    # Two sensors with two axes.
+    found = labelled_signatures(ROAD / 'two_way_road.mcap', write_intervals(
+        tmp_path / 'a.csv', rows), network)
+    # Two sensors with two axes each.
     assert len(found) == 2 * len(rows) and all(s.field.shape[1] == 2 for s in found)
     epoch = truth['epoch_s']
     absolute = [(label, round((epoch + a) * 1e9), round((epoch + b) * 1e9), 'mag_2')
                 for label, a, b in rows]
-    of_one = labelled_signatures(ROAD / 'two_way_road.mcap', intervals(
+    of_one = labelled_signatures(ROAD / 'two_way_road.mcap', write_intervals(
         tmp_path / 'b.csv', absolute, ('label', 'begin_ns', 'end_ns', 'sensor')), network)
     assert len(of_one) == len(rows) and all('mag_2' in s.source for s in of_one)
     assert {s.label for s in of_one} == {'car', 'truck'}
 
 
-@pytest.mark.parametrize(('rows', 'why'), [
+@pytest.mark.parametrize(('rows', 'error'), [
     ([('car', 5, 9), ('truck', 8, 11)], 'rows 2 and 3 overlap'),
     ([('', 5, 9)], 'row 2: the label is empty'), ([('car', 9, 5)], 'ends before it begins'),
     ([('car', 5000, 5009)], 'the interval contains no readings')])
-def test_bad_intervals_are_named(tmp_path, rows, why):
-    with pytest.raises(LabelsError, match=why):
+def test_invalid_intervals_are_named(tmp_path, rows, error):
+    with pytest.raises(LabelsError, match=error):
         labelled_signatures(vehicle_path('straight_car_right'),
-                            intervals(tmp_path / 'a.csv', rows), read_network(NETWORK_FILE))
+                            write_intervals(tmp_path / 'a.csv', rows),
+                            read_network(NETWORK_FILE))
 
 
-def test_bad_tables_are_named(tmp_path, tables, capsys):
-    bad = {'no label': 'a,x0,x1\n1,2,3\n', 'numbered': 'label,x,y\ncar,1,2\n',
-           'two x': 'label,x0,x1,bx0,bx1\ncar,1,2,3,4\n', 'a gap': 'label,x0,x2\ncar,1,2\n',
-           'half a unit': 'label,x_nt_0,y_0\ncar,1,2\n', 'semicolons': 'label;x0\ncar;1\n',
-           'several labels': 'label,signature,time_s,x\ncar,1,0,1\ntruck,1,1,2\n',
-           'tells one': 'label,time_s,x\ncar,0,1\n', 'too few': 'label,x0,x1\ncar,1,2\n',
-           'no number': 'label,x0,x1\ncar,1,two\n', 'has no rows': 'label,x0\n'}
-    for k, text in enumerate(bad.values()):
+def test_invalid_tables_are_refused(tmp_path, tables, capsys):
+    invalid = {'no label': 'a,x0,x1\n1,2,3\n', 'numbered': 'label,x,y\ncar,1,2\n',
+               'two x': 'label,x0,x1,bx0,bx1\ncar,1,2,3,4\n', 'a gap': 'label,x0,x2\ncar,1,2\n',
+               'half a unit': 'label,x_nt_0,y_0\ncar,1,2\n', 'semicolons': 'label;x0\ncar;1\n',
+               'several labels': 'label,signature,time_s,x\ncar,1,0,1\ntruck,1,1,2\n',
+               'one sample': 'label,time_s,x\ncar,0,1\n', 'too few': 'label,x0,x1\ncar,1,2\n',
+               'no number': 'label,x0,x1\ncar,1,two\n', 'has no rows': 'label,x0\n'}
+    for k, text in enumerate(invalid.values()):
         path = tmp_path / f'{k}.csv'
         path.write_text(text)
         assert main(['classes', 'train', str(path), '--out', str(tmp_path / 'm.json')]) == 1
@@ -118,7 +120,7 @@ def test_a_model_of_other_axes_is_refused(tables, tmp_path, capsys):
 
 
 def test_units_are_converted_or_refused(tables, tmp_path, capsys):
-    """The same signatures in nanotesla, in tesla, and in an unknown unit."""
+    """The same signatures in nanotesla, tesla, microtesla and an unknown unit."""
     found = signatures(COUNTS, 'boxes')
     for name, suffix, unit in (('t', '_t', 1.0), ('ut', '_ut', 1e6), ('none', '', 1e9)):
         write_by_sample(tmp_path / f'{name}.csv', found, unit)
@@ -126,18 +128,18 @@ def test_units_are_converted_or_refused(tables, tmp_path, capsys):
         (tmp_path / f'{name}.csv').write_text(text)
     model = str(tmp_path / 'classes.json')
     assert main(['classes', 'train', str(tables / 'by_sample.csv'), '--out', model]) == 0
-    answers = []
+    predictions = []
     for path in (tables / 'by_sample.csv', tmp_path / 't.csv', tmp_path / 'ut.csv'):
         capsys.readouterr()
         assert main(['classes', 'predict', str(path), '--model', model]) == 0
-        answers.append(capsys.readouterr().out.splitlines()[-1])
-    assert len(set(answers)) == 1 and 'car' in answers[0]
+        predictions.append(capsys.readouterr().out.splitlines()[-1])
+    assert len(set(predictions)) == 1 and 'car' in predictions[0]
     assert main(['classes', 'predict', str(tmp_path / 'none.csv'), '--model', model]) == 1
     assert 'in an unknown unit, but the model was trained on T' in capsys.readouterr().err
 
 
-def test_signatures_of_events_can_be_predicted(tmp_path, capsys):
-    """They are empty before the first reading, and after the last one."""
+def test_signatures_of_events_can_be_classified(tmp_path, capsys):
+    """They have no values before the first reading and after the last one."""
     recording, network = str(ROAD / 'two_way_road.mcap'), str(NETWORK_FILE)
     assert main(['events', recording, '--network', network, '--out', str(tmp_path)]) == 0
     found = labelled_signatures(tmp_path / 'signatures.csv', is_labelled=False)
@@ -145,7 +147,7 @@ def test_signatures_of_events_can_be_predicted(tmp_path, capsys):
     assert len(usable.labels) > 0.9 * len(found) and usable.unit == 'T'
 
 
-def test_a_model_that_does_not_fit_together_is_refused(tables, tmp_path, capsys):
+def test_an_inconsistent_model_is_refused(tables, tmp_path, capsys):
     model = tmp_path / 'classes.json'
     assert main(['classes', 'train', str(tables / 'by_row.csv'), '--out', str(model)]) == 0
     good = json.loads(model.read_text())

@@ -1,4 +1,4 @@
-"""Enrolled vehicles: enrol by recordings, recognise in others, and what is refused."""
+"""Enrolled vehicles: enrolment from recordings, recognition, and invalid enrolments."""
 
 import csv
 import json
@@ -11,24 +11,25 @@ from mag_tracking.inference.log_normal_classes import UNKNOWN
 from support.bundled import DATA, NETWORK_FILE, vehicle_path
 from support.iron_passes import HARD, recorded
 
-OTHER = [-x for x in HARD[:2]] + [HARD[2]]
-"""Hard iron of a vehicle of equal size."""
+OTHER_HARD = [-x for x in HARD[:2]] + [HARD[2]]
+"""Hard iron of another vehicle, of equal magnitude."""
 
 
 @pytest.fixture(scope='module')
 def recordings(tmp_path_factory):
-    """{name: recording} of two vehicles heading east and west."""
+    """{name: recording} of two vehicles, each heading east and west."""
     rng, folder, out = np.random.default_rng(7), tmp_path_factory.mktemp('fleet'), {}
     for name, heading, hard in (('van_east', 0.0, HARD), ('van_west', 180.0, HARD),
-                                ('van_again', 0.0, HARD), ('other_east', 0.0, OTHER),
-                                ('other_west', 180.0, OTHER), ('other_again', 180.0, OTHER)):
+                                ('van_again', 0.0, HARD), ('other_east', 0.0, OTHER_HARD),
+                                ('other_west', 180.0, OTHER_HARD),
+                                ('other_again', 180.0, OTHER_HARD)):
         (folder / name).mkdir()
         out[name] = str(recorded(folder / name, heading, rng, hard))
     return out
 
 
-def command(*words):
-    return main(['traffic', *words, '--network', str(NETWORK_FILE)])
+def command(*arguments):
+    return main(['traffic', *arguments, '--network', str(NETWORK_FILE)])
 
 
 def vehicles_of(folder):
@@ -46,14 +47,14 @@ def test_enrolled_vehicles_are_recognised(recordings, tmp_path, capsys):
     assert 'vehicle van' in capsys.readouterr().out
     for name in ('other_east', 'other_west'):
         assert command(recordings[name], *fleet, '--enrol', 'other') == 0
-    said = capsys.readouterr().out
-    assert 'other is recognised at a heading of' in said and 'only (passes: 1)\n' in said
+    printed = capsys.readouterr().out
+    assert 'other is recognised at a heading of' in printed and 'only (passes: 1)\n' in printed
     assert command(recordings['other_again'], recordings['van_again'], *fleet, '--out',
                    str(tmp_path / 'both')) == 0
     assert vehicles_of(tmp_path / 'both') == [('other_again', 'other'), ('van_again', 'van')]
 
 
-def test_what_cannot_be_enrolled_is_named(recordings, tmp_path, capsys):
+def test_invalid_enrolments_are_named(recordings, tmp_path, capsys):
     file = tmp_path / 'fleet.json'
     assert command(recordings['van_east'], '--enrol', 'van') == 1
     assert '--enrol: give the fleet file with --fleet' in capsys.readouterr().err
@@ -74,7 +75,7 @@ def test_what_cannot_be_enrolled_is_named(recordings, tmp_path, capsys):
     assert 'empty: enrolment requires at least one pass' in capsys.readouterr().err
 
 
-def test_without_an_earth_field_nothing_is_recognised(tmp_path, capsys):
+def test_enrolment_requires_an_earth_field(tmp_path, capsys):
     network = tmp_path / 'network.yaml'
     network.write_text('sensors:\n  mag_1: {position: [0, -4.5, 0]}\n'
                        '  mag_2: {position: [0, 4.5, 0]}\n')

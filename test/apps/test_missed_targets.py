@@ -1,4 +1,4 @@
-"""A sensor that hangs is told from a quiet one by what the others feel."""
+"""A stuck sensor is distinguished from a quiet one by targets that other sensors measure."""
 
 import numpy as np
 import pytest
@@ -12,9 +12,9 @@ from support.samples import MagSample, batch
 STEP = 2e-7
 
 
-def said(last_felt, hangs_from, n_targets=4):
-    """Findings on three coarse sensors; the third one feels targets of `last_felt` [T], and
-    repeats its reading from `hangs_from` [s] on.
+def findings_of(last_amplitude, stuck_from, n_targets=4):
+    """Findings for three sensors of coarse resolution. The third one measures targets of
+    `last_amplitude` [T] and repeats its reading from `stuck_from` [s].
     """
     network, samples = line_network(3), []
     rng = np.random.default_rng(0)
@@ -22,10 +22,10 @@ def said(last_felt, hangs_from, n_targets=4):
     held = None
     for s in t:
         pulse = sum(np.exp(-((s - 10.0 * k - 8.0) / 0.7)**2) for k in range(n_targets))
-        for j, size in enumerate((3e-6, 2e-6, last_felt)):
+        for j, size in enumerate((3e-6, 2e-6, last_amplitude)):
             field = EARTH + size * pulse + 3e-8 * rng.standard_normal(3)
             field = STEP * np.round(field / STEP)
-            if j == 2 and s >= hangs_from:
+            if j == 2 and s >= stuck_from:
                 held = field = field if held is None else held
             samples.append(MagSample(int(1e9 * s), f'mag_{j + 1}', field))
     doctor = Doctor(network, settings_for('vehicle'))
@@ -34,11 +34,11 @@ def said(last_felt, hangs_from, n_targets=4):
     return [str(f) for f in doctor.findings()]
 
 
-@pytest.mark.parametrize('last_felt, hangs_from, missed', [
+@pytest.mark.parametrize('last_amplitude, stuck_from, missed', [
     (2e-6, np.inf, None), (5e-7, np.inf, None), (2e-6, 5.0, 4), (2e-6, 12.0, 3),
     (2e-6, 0.0, 4), (2e-6, 36.0, None)])
-def test_a_sensor_that_hangs_misses_what_the_others_feel(last_felt, hangs_from, missed):
-    found = [f for f in said(last_felt, hangs_from) if 'did not change while' in f]
+def test_a_stuck_sensor_misses_targets_of_the_others(last_amplitude, stuck_from, missed):
+    found = [f for f in findings_of(last_amplitude, stuck_from) if 'did not change while' in f]
     if missed is None:
         assert found == []
     else:
@@ -46,5 +46,5 @@ def test_a_sensor_that_hangs_misses_what_the_others_feel(last_felt, hangs_from, 
         assert f' sensed {missed} targets' in found[0]
 
 
-def test_quiet_sensors_miss_nothing():
-    assert not any('did not change' in f for f in said(2e-6, np.inf, n_targets=0))
+def test_quiet_sensors_miss_no_targets():
+    assert not any('did not change' in f for f in findings_of(2e-6, np.inf, n_targets=0))

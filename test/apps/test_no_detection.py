@@ -1,4 +1,4 @@
-"""Where nothing is detected, one sentence says what stands in the way."""
+"""Reason why nothing was detected, in one sentence."""
 
 import dataclasses
 
@@ -16,14 +16,14 @@ QUIET = recorded('straight_car_right').readings
 QUIET = QUIET.part(QUIET.stamp_ns < QUIET.stamp_ns[0] + 5_000_000_000)
 
 
-def why(*faults, network=NETWORK, readings=None, **settings):
+def reason_of(*faults, network=NETWORK, readings=None, **settings):
     readings = recorded('straight_small_left').readings if readings is None else readings
     return mt.track(spoiler.apply(readings, *faults), network, settings={
         name.replace('__', '.'): value for name, value in settings.items()}).no_detection_reason
 
 
-def test_after_a_detection_nothing_is_to_be_explained():
-    assert why() is None
+def test_no_reason_is_given_after_a_detection():
+    assert reason_of() is None
 
 
 @pytest.mark.parametrize('expected, arguments', [
@@ -39,41 +39,41 @@ def test_after_a_detection_nothing_is_to_be_explained():
      {'readings': QUIET.part(slice(0, 200))}),
     ('there were no readings on /mag_1/imu/mag, /mag_2/imu/mag',
      {'readings': QUIET.part(slice(0, 0))})])
-def test_the_obstacle_is_named(expected, arguments):
+def test_the_reason_names_the_cause(expected, arguments):
     import re
 
-    assert re.search(expected, why(**arguments)), why(**arguments)
+    assert re.search(expected, reason_of(**arguments)), reason_of(**arguments)
 
 
-def test_covariances_that_are_taken_as_they_are_stand_in_the_way():
-    said = why(spoiler.covariance(1e-2), calibrate__trust_covariances=True)
-    assert 'calibrate.trust_covariances' in said
-    assert why(spoiler.covariance(1e-2)) is None
+def test_trusted_covariances_are_named():
+    reason = reason_of(spoiler.covariance(1e-2), calibrate__trust_covariances=True)
+    assert 'calibrate.trust_covariances' in reason
+    assert reason_of(spoiler.covariance(1e-2)) is None
 
 
-def test_another_unit_is_named():
+def test_a_wrong_unit_is_named():
     readings = recorded('straight_small_left').readings
-    said = why(readings=dataclasses.replace(readings, field=1e6 * readings.field))
-    assert 'no reading was usable: 2800 were rejected (above 0.001 T' in said
+    reason = reason_of(readings=dataclasses.replace(readings, field=1e6 * readings.field))
+    assert 'no reading was usable: 2800 were rejected (above 0.001 T' in reason
 
 
-def test_given_backgrounds_that_were_not_compared_with_readings():
-    """Too few readings for the scatter of any sensor."""
+def test_given_backgrounds_need_no_comparison_with_readings():
+    """Too few readings to estimate the scatter of a sensor."""
     given = dataclasses.replace(NETWORK, noise_std=(np.full(3, 1e-8),) * 2, background=tuple(
         np.median(QUIET.field[np.array(QUIET.sensor_names()) == name], axis=0)
         for name in NETWORK.names))
-    assert 'of the threshold' in why(network=given, readings=QUIET.part(slice(0, 40)))
+    assert 'of the threshold' in reason_of(network=given, readings=QUIET.part(slice(0, 40)))
 
 
-def test_one_sensor_without_a_background_is_named():
+def test_a_sensor_without_a_background_is_named():
     readings = recorded('straight_small_left').readings
     t = (readings.stamp_ns - readings.stamp_ns[0]) / 1e9
     keep = np.array(readings.sensor_names()) == 'mag_1'
-    said = why(readings=readings.part((keep & (t < 5.0)) | (~keep & (t < 1.0))))
-    assert 'mag_2 had no background' in said
+    reason = reason_of(readings=readings.part((keep & (t < 5.0)) | (~keep & (t < 1.0))))
+    assert 'mag_2 had no background' in reason
 
 
-def test_the_commands_say_it(tmp_path, capsys):
+def test_commands_print_the_reason(tmp_path, capsys):
     params = tmp_path / 'p.yaml'
     params.write_text('detect: {onset_frames: 500}')
     for command in ('replay', 'fit'):

@@ -1,4 +1,4 @@
-"""Passes are cut out of batches of readings, whatever the batches hold."""
+"""Collection of passes from batches of readings."""
 
 import numpy as np
 
@@ -8,8 +8,8 @@ from support.passes import EARTH, ROAD
 from support.samples import MagSample, batch
 
 
-def test_a_batch_without_readings_may_come_while_one_is_held():
-    """A message may hold nothing but readings of sensors that the network does not have."""
+def test_an_empty_batch_may_arrive_while_a_reading_is_held():
+    """A message may contain only readings of sensors outside the network."""
     rng, passes = np.random.default_rng(0), []
     collector = PassCollector(ROAD, settings_for('vehicle'))
 
@@ -19,7 +19,7 @@ def test_a_batch_without_readings_may_come_while_one_is_held():
             for name in ROAD.names]))
 
     for k in range(1000):
-        # The last before the empty batch is steeply off: it is held until the next tells.
+        # The reading before the empty batch is an outlier: it is held until the next reading.
         passes += feed(k, 5e-6 * (k == 600))
         if k == 600:
             passes += collector.feed(batch([]))

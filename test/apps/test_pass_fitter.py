@@ -1,4 +1,4 @@
-"""Vehicles that are seen at once: tracked, and fitted together."""
+"""Joint fit of vehicles that pass at the same time."""
 
 from functools import cache
 
@@ -18,7 +18,7 @@ from support.track_records import NS, track_pose
 
 @cache
 def fitted(how, simulator):
-    """(fitted passes, `World`) of one pair."""
+    """(fitted passes, `World`) of a pair of vehicles."""
     a_world = busy(how, 2, simulator, 3, n=1)
     return fits_of_world(a_world, (2, 3)), a_world
 
@@ -27,17 +27,17 @@ def fitted(how, simulator):
 @pytest.mark.parametrize('how', ['meeting', 'following'])
 def test_two_vehicles_are_fitted_together(how, simulator):
     passes, a_world = fitted(how, simulator)
-    assert [one.label for one in passes] == ['pass 1, vehicle 1', 'pass 1, vehicle 2']
+    assert [fit.label for fit in passes] == ['pass 1, vehicle 1', 'pass 1, vehicle 2']
     right = with_vehicles(passes, [(a_world.t, position) for position in a_world.positions])
-    assert sorted(of.vehicle for of in right) == [0, 1]
-    for of in right:
-        assert '2 vehicles were fitted together' in of.one.notes[-1]
-        # 10 %, or what is said of it: a driver may brake.
-        found, std = of.one.chosen.speed
-        assert abs(found - of.speed) < max(0.1 * of.speed, 3.0 * std)
+    assert sorted(match.vehicle for match in right) == [0, 1]
+    for match in right:
+        assert '2 vehicles were fitted together' in match.one.notes[-1]
+        # Within 10 %, or three standard deviations: a driver may brake.
+        found, std = match.one.chosen.speed
+        assert abs(found - match.speed) < max(0.1 * match.speed, 3.0 * std)
 
 
-def test_a_run_that_is_stopped_ends():
+def test_a_stopped_run_returns_no_fits():
     a_world = busy('meeting', 2, 'clouds', 3, n=1)
     fitter = PassFitter('x', a_world.network, settings_for('vehicle'), (1, 2))
     assert [*fitter.feed(a_world.readings, lambda: True), *fitter.flush(lambda: True)] == []
@@ -46,15 +46,15 @@ def test_a_run_that_is_stopped_ends():
 @pytest.mark.study
 @pytest.mark.parametrize('name', ['meeting_2_sensors', 'following_2_sensors'])
 def test_every_vehicle_of_a_recording_is_fitted(name):
-    """All sixteen, each in its direction; nine of ten speeds within 10 %."""
+    """All sixteen have the right direction; 90 % of the speeds are within 10 %."""
     passes, right = fits_of_recording(name)
-    off = np.array([of.one.chosen.speed[0] / of.speed - 1.0 for of in right])
+    off = np.array([match.one.chosen.speed[0] / match.speed - 1.0 for match in right])
     assert len(right) == len(passes) == 16
     assert (np.abs(off) < 0.1).mean() >= 0.9, np.round(off, 2)
 
 
 def pass_of(begin, end):
-    """`PassData` from one time to another [s]."""
+    """`PassData` between two times [s]."""
     t = np.arange(0.0, end - begin, 0.1)
     n = len(t)
     return PassData(ROAD, round(begin * NS), np.tile(t, 2), np.repeat([0, 1], n),
@@ -62,68 +62,68 @@ def pass_of(begin, end):
 
 
 def crossing(number, at, y, v, n=5, std=0.1):
-    """Poses of a track that is surest at a time [s], when it is at the origin."""
+    """Poses of a track at x = 0 at time `at` [s], when its covariance is smallest."""
     return [track_pose(at + 0.2 * k, 0.2 * k * v, y, v, id=number,
                        covariance=(std + 0.1 * abs(k))**2 * np.eye(6))
             for k in range(-n, n + 1)]
 
 
-def in_time(*tracks):
-    """The records of some tracks as a tracker gives them."""
+def in_order(*tracks):
+    """Records of several tracks in the order of their timestamps."""
     return sorted((record for track in tracks for record in track), key=lambda r: r.stamp_ns)
 
 
-def test_vehicles_of_a_pass_are_those_that_are_surest_in_it():
+def test_vehicles_of_a_pass_have_their_smallest_covariance_in_it():
     tracks = PassTracks(settings_for('vehicle').track)
-    # The third one is of the next pass, which begins while this one is still seen.
-    tracks.add([object(), *in_time(crossing(1, 3.0, -1.7, 10.0), crossing(2, 4.0, 1.7, -12.0),
+    # The third vehicle belongs to the next pass, which begins before this one ends.
+    tracks.add([object(), *in_order(crossing(1, 3.0, -1.7, 10.0), crossing(2, 4.0, 1.7, -12.0),
                                     crossing(3, 8.0, -1.7, 14.0, n=20))])
     paths = tracks.paths(pass_of(0.0, 6.0))
     np.testing.assert_allclose(sorted(paths[:, 3]), [-12.0, 10.0])
     for path in paths:
-        # Where it is when the pass begins.
+        # Its position at the beginning of the pass.
         at = 3.0 if path[3] > 0.0 else 4.0
         np.testing.assert_allclose(path[:2], [-at * path[3], -np.sign(path[3]) * 1.7])
     np.testing.assert_allclose(tracks.paths(pass_of(5.0, 12.0))[:, 3], [14.0])
     assert tracks.paths(pass_of(12.0, 13.0)).shape == (0, 6)
 
 
-def test_a_vehicle_that_was_lost_and_found_is_one():
+def test_a_vehicle_with_two_tracks_counts_once():
     tracks = PassTracks(settings_for('vehicle').track)
-    tracks.add(in_time(crossing(1, 3.0, -1.7, 10.0), [track_pose(4.1, 11.0, id=1, ended=True)],
+    tracks.add(in_order(crossing(1, 3.0, -1.7, 10.0), [track_pose(4.1, 11.0, id=1, ended=True)],
                         crossing(2, 3.2, -1.5, 10.5, std=0.4)))
     np.testing.assert_allclose(tracks.paths(pass_of(0.0, 6.0))[:, 3], [10.0])
 
 
-def test_a_vehicle_is_one_whose_track_ended_when_it_was_surest():
+def test_a_track_that_ends_at_its_smallest_covariance_is_a_vehicle():
     tracks = PassTracks(settings_for('vehicle').track)
-    coming = crossing(1, 3.0, -1.7, 10.0)[:6]
-    tracks.add(coming)
+    approaching = crossing(1, 3.0, -1.7, 10.0)[:6]
+    tracks.add(approaching)
     assert len(tracks.paths(pass_of(0.0, 3.1))) == 0
     tracks.add([track_pose(3.2, 2.0, id=1, ended=True)])
     np.testing.assert_allclose(tracks.paths(pass_of(0.0, 3.5))[:, 3], [10.0])
-    # It is forgotten then.
+    # Tracks that were returned are forgotten.
     assert len(tracks.paths(pass_of(0.0, 3.5))) == 0
 
 
-def test_poses_from_before_a_jump_of_the_time_are_of_no_pass():
+def test_poses_before_a_time_jump_belong_to_no_pass():
     tracks = PassTracks(settings_for('vehicle').track)
     tracks.add(crossing(1, 30.0, -1.7, 10.0))
     tracks.add(crossing(2, 3.0, 1.7, -12.0))
     np.testing.assert_allclose(tracks.paths(pass_of(0.0, 40.0))[:, 3], [-12.0])
 
 
-def test_magnets_are_no_vehicles():
+def test_magnets_are_not_vehicles():
     tracks = PassTracks(settings_for('magnet').track)
-    tracks.add(in_time(crossing(1, 3.0, -1.7, 10.0), crossing(2, 4.0, 1.7, -12.0)))
+    tracks.add(in_order(crossing(1, 3.0, -1.7, 10.0), crossing(2, 4.0, 1.7, -12.0)))
     assert len(tracks.paths(pass_of(0.0, 6.0))) == 0
 
 
-def test_the_ground_is_that_of_the_settings():
+def test_the_ground_prior_follows_the_settings():
     settings = settings_for('vehicle', {
         'track.vehicle.heights': [0.4, 0.4, 1.0], 'track.vehicle.height_stds': [0.3, 0.3, 0.3],
         'track.vehicle.climb_std': 0.2})
     ground = ground_prior(settings.track)
-    # The spread of the means, and that of each.
+    # Variance of the means plus the variance of each.
     assert ground.height == pytest.approx((0.6, np.sqrt(0.08 + 0.09)))
     assert ground.climb_std == 0.2

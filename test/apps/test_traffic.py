@@ -1,4 +1,4 @@
-"""`mag-tracking traffic`: counts, directions, speeds and classes of a road with truth; tables."""
+"""`mag-tracking traffic`: counts, directions, speeds, classes and tables of roads with truth."""
 
 import csv
 import dataclasses
@@ -37,11 +37,11 @@ def test_thirty_vehicles_are_counted_with_direction_class_and_speed():
     cars = [p.vehicle_class == 'car' for p, v in right if v['length_m'] < 6.0]
     assert np.count_nonzero(kinds) == 30 and np.count_nonzero(cars) >= 22
     speeds = np.array([[p.speed, p.speed_std, v['speed_mps']] for p, v in right])
-    off = np.abs(speeds[:, 0] - speeds[:, 2])
-    # The aim is 30. Three small cars that the tracker takes for points are 12 to 24 % too slow, two
-    # of them within two standard deviations, the third is ambiguous.
-    assert np.count_nonzero(off < 0.1 * speeds[:, 2]) >= 27
-    assert np.count_nonzero(off < 3.0 * speeds[:, 1]) >= 29
+    errors = np.abs(speeds[:, 0] - speeds[:, 2])
+    # The target is 30. The speeds of three small cars, tracked as point targets, are 12 to 24 % too
+    # low: two of them within two standard deviations, the third ambiguous.
+    assert np.count_nonzero(errors < 0.1 * speeds[:, 2]) >= 27
+    assert np.count_nonzero(errors < 3.0 * speeds[:, 1]) >= 29
 
 
 def test_fields_and_tracks_agree_on_directions():
@@ -58,24 +58,24 @@ def test_summaries_add_up():
 
 
 def test_speeds_by_track_and_by_delay_agree_along_a_road():
-    """The second estimate needs sensors one behind the other, and a vehicle that is alone."""
+    """The delay estimate requires sensors along the road and a single vehicle."""
     result = mt.traffic(DATA / 'corridor' / 'corridor_8_sensors.mcap',
                         DATA / 'corridor' / 'network.yaml')
-    (one,) = result.vehicles
-    assert one.delay.reason == '' and not one.speeds_contradict
-    assert one.passage.speed == pytest.approx(one.delay.speed, rel=0.1)
-    wrong = dataclasses.replace(one.passage, speed=1.3 * one.passage.speed, speed_std=0.1)
-    assert dataclasses.replace(one, passage=wrong).speeds_contradict
-    back = dataclasses.replace(one.passage, velocity=-one.passage.velocity)
-    assert dataclasses.replace(one, passage=back).speeds_contradict
-    # Sensors on both sides of a road feel different fields.
+    (vehicle,) = result.vehicles
+    assert vehicle.delay.reason == '' and not vehicle.speeds_contradict
+    assert vehicle.passage.speed == pytest.approx(vehicle.delay.speed, rel=0.1)
+    faster = dataclasses.replace(vehicle.passage, speed=1.3 * vehicle.passage.speed, speed_std=0.1)
+    assert dataclasses.replace(vehicle, passage=faster).speeds_contradict
+    opposite = dataclasses.replace(vehicle.passage, velocity=-vehicle.passage.velocity)
+    assert dataclasses.replace(vehicle, passage=opposite).speeds_contradict
+    # Sensors on both sides of a road measure different fields.
     assert all(v.delay.reason and not v.speeds_contradict for v in road().vehicles)
 
 
 def test_tables_hold_every_vehicle_and_interval(tmp_path, capsys):
-    words = ['traffic', str(vehicle_path('straight_car_right')),
-             str(vehicle_path('straight_truck_right')), '--network', str(NETWORK_FILE)]
-    assert main([*words, '--out', str(tmp_path)]) == 0
+    arguments = ['traffic', str(vehicle_path('straight_car_right')),
+                 str(vehicle_path('straight_truck_right')), '--network', str(NETWORK_FILE)]
+    assert main([*arguments, '--out', str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert printed.count('1 vehicles') == 2 and 'truck (' in printed
     with open(tmp_path / 'passages.csv', newline='') as stream:
@@ -96,24 +96,24 @@ def test_tables_hold_every_vehicle_and_interval(tmp_path, capsys):
     assert float(rows[0]['speed']) == pytest.approx(truth['vehicles'][0]['speed_mps'], rel=0.15)
 
 
-def test_what_cannot_be_counted_is_named(tmp_path, capsys):
+def test_invalid_input_is_named(tmp_path, capsys):
     recording = vehicle_path('straight_car_right')
     with pytest.raises(SettingsError, match='track.target'):
         mt.traffic(recording, NETWORK_FILE, {'track.target': 'magnet'})
-    words = ['traffic', str(recording), '--network', str(NETWORK_FILE)]
-    assert main([*words, '--target', 'magnet']) == 1
+    arguments = ['traffic', str(recording), '--network', str(NETWORK_FILE)]
+    assert main([*arguments, '--target', 'magnet']) == 1
     assert 'traffic counts only vehicles' in capsys.readouterr().err
     assert main(['traffic', str(tmp_path / 'none.mcap'), '--network', str(NETWORK_FILE)]) == 1
-    assert main(['traffic', str(recording), *words[1:]]) == 1
+    assert main(['traffic', str(recording), *arguments[1:]]) == 1
     assert 'several recordings are named' in capsys.readouterr().err
 
 
 def test_tables_without_rows_have_their_columns(tmp_path, capsys):
-    """And nothing of an earlier run stays."""
+    """They replace the tables of an earlier run."""
     recording = str(vehicle_path('straight_car_right'))
-    one = tmp_path / 'one.yaml'
-    one.write_text('sensors:\n  mag_1: {position: [0, -4.5, 0]}\n')
-    for network, n in ((str(NETWORK_FILE), 1), (str(one), 0)):
+    one_sensor = tmp_path / 'one_sensor.yaml'
+    one_sensor.write_text('sensors:\n  mag_1: {position: [0, -4.5, 0]}\n')
+    for network, n in ((str(NETWORK_FILE), 1), (str(one_sensor), 0)):
         assert main(['traffic', recording, '--network', network, '--out', str(tmp_path)]) == 0
         printed = capsys.readouterr().out
         assert f'{n} vehicles' in printed
@@ -130,12 +130,12 @@ def test_every_column_is_described():
         assert [c.name for c in columns if not c.meaning] == []
 
 
-def test_what_stops_a_run_is_found_before_it(tmp_path, capsys):
+def test_invalid_input_is_found_before_the_run(tmp_path, capsys):
     good = str(vehicle_path('straight_car_right'))
-    magnets = tmp_path / 'other.mcap'
-    with RecordingWriter(magnets) as writer:
+    other = tmp_path / 'other.mcap'
+    with RecordingWriter(other) as writer:
         writer.write('/elsewhere', MAGNETIC_FIELD, field_dict(0, 'mag_9', np.ones(3)), 0)
-    assert main(['traffic', good, str(magnets), '--network', str(NETWORK_FILE)]) == 1
+    assert main(['traffic', good, str(other), '--network', str(NETWORK_FILE)]) == 1
     out, err = capsys.readouterr()
     assert '1 vehicles' not in out and 'mag-tracking: ' in err
     (tmp_path / 'file').write_text('')
@@ -145,7 +145,7 @@ def test_what_stops_a_run_is_found_before_it(tmp_path, capsys):
     assert '1 vehicles' not in out and 'mag-tracking: ' in err
 
 
-def test_lines_that_nobody_crosses_count_nobody():
+def test_lines_without_crossings_count_no_vehicles():
     result = mt.traffic(vehicle_path('straight_car_right'), NETWORK_FILE, {
         **QUICK, 'traffic.line_offsets': (500.0,)})
     assert result.vehicles == () and result.counts['tracks that crossed no line'] == 1

@@ -1,4 +1,4 @@
-"""A recording on a live page: its tracks are those of a replay, and bad timestamps stop nothing."""
+"""Recording on a live page: tracks equal those of a replay; wrong timestamps are tolerated."""
 
 import json
 import time
@@ -21,8 +21,8 @@ NAME = 'straight_small_left'
 YEARS_NS = 10 * 365 * 86400 * 1_000_000_000
 
 
-class Scene(LiveScene):
-    """Keeps all that it was given."""
+class StoringScene(LiveScene):
+    """Live scene that stores its tracks and notes."""
 
     def __init__(self, network):
         super().__init__('road', network)
@@ -41,15 +41,16 @@ class Scene(LiveScene):
         self.notes = [note.text for note in notes]
 
 
-def shown(path, network, rate):
-    scene = Scene(network)
+def view_recording(path, network, rate):
+    """View a recording at a rate; return (scene, duration [s])."""
+    scene = StoringScene(network)
     began = time.monotonic()
     view(Recording(path), network, settings_for('vehicle', QUICK), scene, rate, lambda: False)
     return scene, time.monotonic() - began
 
 
-def test_tracks_are_those_of_a_replay(road_network):
-    scene, seconds = shown(vehicle_path(NAME), road_network, 4.0)
+def test_tracks_equal_those_of_a_replay(road_network):
+    scene, seconds = view_recording(vehicle_path(NAME), road_network, 4.0)
     expected = track(vehicle_path(NAME), NETWORK_FILE, settings=QUICK)
     poses = [t for t in scene.tracks if not t.ended]
     np.testing.assert_array_equal([p.stamp_ns for p in poses], expected.poses['stamp_ns'])
@@ -61,15 +62,15 @@ def test_tracks_are_those_of_a_replay(road_network):
     assert json.loads(scene.whole()[-1])['tables'][0]['rows'][0][1] == 'ready'
 
 
-def test_an_hour_without_messages_is_not_waited_for(road_network, tmp_path):
+def test_an_hour_without_messages_is_skipped(road_network, tmp_path):
     path = tmp_path / 'gap.mcap'
-    rewritten(path, road_network, lambda k, ns: ns + (3600 * 1_000_000_000 if k > 900 else 0),
-              lambda k, ns: ns)
-    assert shown(path, road_network, 20.0)[1] < 60.0
+    rewrite(path, road_network, lambda k, ns: ns + (3600 * 1_000_000_000 if k > 900 else 0),
+            lambda k, ns: ns)
+    assert view_recording(path, road_network, 20.0)[1] < 60.0
 
 
-def rewritten(path, network, log_time_of, stamp_of):
-    """A copy of the recording with other times of message `k`."""
+def rewrite(path, network, log_time_of, stamp_of):
+    """Copy the recording with log times and timestamps as functions of message `k`."""
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
     with RecordingWriter(path) as writer:
         for k, (readings, log_ns) in enumerate(reader.readings_as_received()):
@@ -80,24 +81,24 @@ def rewritten(path, network, log_time_of, stamp_of):
 
 
 @pytest.mark.parametrize('wrong_ns', [YEARS_NS, -YEARS_NS])
-def test_a_wrong_timestamp_does_not_stop_it(road_network, tmp_path, wrong_ns):
+def test_a_wrong_timestamp_does_not_stop_the_view(road_network, tmp_path, wrong_ns):
     path = tmp_path / 'wrong.mcap'
-    rewritten(path, road_network, lambda k, ns: ns,
-              lambda k, ns: ns + (wrong_ns if k == 900 else 0))
-    scene, seconds = shown(path, road_network, 20.0)
+    rewrite(path, road_network, lambda k, ns: ns,
+            lambda k, ns: ns + (wrong_ns if k == 900 else 0))
+    scene, seconds = view_recording(path, road_network, 20.0)
     assert seconds < 60.0
     assert scene.notes[0] == 'end of the recording' and len(scene.notes) > 1
     assert len([t for t in scene.tracks if not t.ended]) > 20
 
 
-def test_it_ends_when_it_is_told(road_network):
-    asked = []
+def test_the_view_ends_when_stopped(road_network):
+    polls = []
 
     def stopped():
-        asked.append(None)
-        return len(asked) > 50
+        polls.append(None)
+        return len(polls) > 50
 
-    scene = Scene(road_network)
+    scene = StoringScene(road_network)
     view(Recording(vehicle_path(NAME)), road_network, settings_for('vehicle', QUICK), scene, 1.0,
          stopped)
     assert 'end of the recording' not in scene.notes

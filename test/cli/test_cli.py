@@ -1,4 +1,4 @@
-"""The command line: what it writes, what it says, how it fails."""
+"""The command line: output files, printed lines and error messages."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from support.cli_runs import NAME, quick_file, replay_one
 from support.permissions import as_files_say
 
 
-def test_replay_writes_all_that_it_promises(tmp_path, capsys):
+def test_replay_writes_all_documented_files(tmp_path, capsys):
     out = tmp_path / 'out'
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE),
                  '--out', str(out)]) == 0
@@ -32,14 +32,14 @@ def test_replay_writes_all_that_it_promises(tmp_path, capsys):
     track = json.loads((out / 'summary.json').read_text())['tracks'][0]
     assert track['arrival'] == 'left' and track['verdict'] == 'unique'
     assert {'speed', 'moment', 'poses', 'truth', 'smoothed', 'kind'} <= set(track)
-    said = capsys.readouterr().out
-    assert 'from left (100%), car (100%)' in said and 'replacing' not in said
+    output = capsys.readouterr().out
+    assert 'from left (100%), car (100%)' in output and 'replacing' not in output
     n = track['doubts']['another_arrival']
-    assert f'ambiguous in {n} of {track["poses"]} poses' in said
+    assert f'ambiguous in {n} of {track["poses"]} poses' in output
     assert n == sum('another_arrival' in row for row in (out / 'poses.csv').read_text().split())
 
 
-def test_a_replay_says_what_it_replaces_and_writes_through_no_link(tmp_path, capsys):
+def test_replay_reports_replaced_results_and_follows_no_links(tmp_path, capsys):
     out, theirs = tmp_path / 'out', tmp_path / 'theirs'
     out.mkdir()
     theirs.write_text('- tracks.mcap\n')
@@ -48,15 +48,15 @@ def test_a_replay_says_what_it_replaces_and_writes_through_no_link(tmp_path, cap
     (out / 'field_track_7.png').write_text('of an earlier run')
     (out / 'notes.txt').write_text('mine')
     assert replay_one(out) == 0
-    said = capsys.readouterr().out.splitlines()
-    assert said.count(f'replacing the results of an earlier run in {out}') == 1
+    output = capsys.readouterr().out.splitlines()
+    assert output.count(f'replacing the results of an earlier run in {out}') == 1
     assert theirs.read_text() == '- tracks.mcap\n' and (out / 'notes.txt').exists()
     assert not any(path.is_symlink() for path in out.iterdir())
     assert {path.name for path in out.glob('*.png')} == {
         f'{kind}_track_1.png' for kind in ('map', 'weights', 'field')}
 
 
-def test_a_track_that_is_too_long_to_smooth_is_said(tmp_path, capsys):
+def test_replay_warns_of_a_track_too_long_to_smooth(tmp_path, capsys):
     params = parameter_file(tmp_path / 'short.yaml', QUICK | {'track.max_smoothing_s': 1.0})
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
                  str(params), '--no-figures', '--out', str(tmp_path / 'out')]) == 0
@@ -71,7 +71,7 @@ def test_several_recordings_get_a_folder_each(tmp_path):
     assert sorted(p.name for p in out.iterdir()) == names
 
 
-def test_import_and_replay_of_a_magnet(tmp_path, capsys):
+def test_a_magnet_table_is_imported_and_replayed(tmp_path, capsys):
     source = DATA / 'magnet_16_sensors'
     assert main(['import', str(source / 'lisa_data1.csv'), '--background',
                  str(source / 'lisa_data1_background.csv'), '--out', str(tmp_path / 'm')]) == 0
@@ -80,7 +80,7 @@ def test_import_and_replay_of_a_magnet(tmp_path, capsys):
     assert '63 poses' in capsys.readouterr().out
 
 
-def test_info(capsys):
+def test_info_lists_topics_and_sensors(capsys):
     assert main(['info', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE)]) == 0
     out = capsys.readouterr().out
     assert '/mag_1/imu/mag  sensor_msgs/msg/MagneticField  2000' in out
@@ -88,17 +88,17 @@ def test_info(capsys):
 
 
 def fail(capsys, *arguments):
-    """Run, expect failure, return the one line of the message."""
+    """Run a command that must fail; return its error message of one line."""
     assert main([str(a) for a in arguments]) == 1
     error = capsys.readouterr().err.strip()
     assert error.startswith('mag-tracking: ') and '\n' not in error
     return error
 
 
-def test_failures_are_one_clear_line(tmp_path, capsys):
+def test_errors_are_reported_in_one_line(tmp_path, capsys):
     common = ['--network', NETWORK_FILE, '--out', tmp_path / 'out']
     recording = vehicle_path(NAME)
-    assert 'there is no' in fail(capsys, 'replay', tmp_path / 'x.mcap', *common)
+    assert 'x.mcap does not exist' in fail(capsys, 'replay', tmp_path / 'x.mcap', *common)
     typo = tmp_path / 'typo.yaml'
     typo.write_text('track: {vehicle: {momnet: 3.0}}')
     assert 'did you mean track.vehicle.moments?' in fail(
@@ -117,28 +117,28 @@ def test_failures_are_one_clear_line(tmp_path, capsys):
                                           '--out', tmp_path / 'out')
 
 
-@pytest.mark.parametrize('words', [
+@pytest.mark.parametrize('command', [
     'replay a\0b --network n.yaml --out out', 'replay a.mcap --network n.yaml --out a\0b',
     'events a\0b --network n.yaml', 'calibrate a.mcap --network a\0b --out c.yaml',
     'tumble a.mcap --network n.yaml --out a\0b', 'board-geometry a\0b --moment 1 --out b.yaml',
     'doctor a\0b --network n.yaml', 'fit a.mcap --network n.yaml --out a\0b',
     'plan --network n.yaml --out a\0b', 'listen a\0b', 'record --network n.yaml --out a\0b',
     'repair a\0b', 'run --network a\0b', 'info a\0b', 'import a\0b --background b --out out'])
-def test_an_argument_with_a_nul_is_named(capsys, words):
-    assert fail(capsys, *words.split()) == "mag-tracking: 'a\\x00b' contains a NUL character"
+def test_an_argument_with_a_nul_character_is_named(capsys, command):
+    assert fail(capsys, *command.split()) == "mag-tracking: 'a\\x00b' contains a NUL character"
 
 
 def test_a_read_only_folder_is_named(tmp_path, capsys):
     folder = tmp_path / 'theirs'
     folder.mkdir(mode=0o500)
     with as_files_say():
-        told = fail(capsys, 'replay', vehicle_path(NAME), '--network', NETWORK_FILE,
-                    '--out', folder / 'out')
-    assert f'cannot write to {folder / "out"}' in told and 'Permission denied' in told
+        error = fail(capsys, 'replay', vehicle_path(NAME), '--network', NETWORK_FILE,
+                     '--out', folder / 'out')
+    assert f'cannot write to {folder / "out"}' in error and 'Permission denied' in error
     assert list(folder.iterdir()) == []
 
 
-def test_a_recording_too_short_to_learn_says_so(tmp_path, capsys):
+def test_replay_reports_a_recording_too_short_to_learn_a_background(tmp_path, capsys):
     params = tmp_path / 'p.yaml'
     params.write_text('calibrate: {learn_s: 600.0}')
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
@@ -148,7 +148,7 @@ def test_a_recording_too_short_to_learn_says_so(tmp_path, capsys):
     assert json.loads((tmp_path / 'out/summary.json').read_text())['tracks'] == []
 
 
-def test_help_teaches(capsys):
+def test_help_contains_an_example(capsys):
     text = subprocess.run([sys.executable, '-m', 'mag_tracking.cli', 'replay', '--help'],
                           capture_output=True, text=True, check=True).stdout
     assert 'example' in text
@@ -158,7 +158,7 @@ def test_help_teaches(capsys):
         assert 'example' in capsys.readouterr().out
 
 
-def test_a_sensor_on_its_head_is_named(tmp_path, capsys):
+def test_an_upside_down_sensor_is_named(tmp_path, capsys):
     network = tmp_path / 'turned.yaml'
     text, upright = NETWORK_FILE.read_text(), 'orientation: [0.0, 0.0, 0.0, 1.0]'
     assert text.count(upright) == 1
@@ -166,12 +166,12 @@ def test_a_sensor_on_its_head_is_named(tmp_path, capsys):
     assert main(['replay', str(vehicle_path('straight_car_right')), '--network', str(network),
                  '--out', str(tmp_path / 'out'), '--no-figures']) == 0
     assert 'orientation in the network file is wrong' in capsys.readouterr().out
-    # And a network that is right raises no alarm.
+    # A correct network causes no warning.
     assert replay_one(tmp_path / 'right', '--no-figures') == 0
     assert 'fits best if rotated' not in capsys.readouterr().out
 
 
-def test_a_recording_without_a_target_says_so(tmp_path, capsys):
+def test_replay_reports_a_recording_without_targets(tmp_path, capsys):
     assert replay_one(tmp_path, '--no-figures', '--target', 'magnet') == 0
     assert 'nothing was detected with the settings for a magnet' in capsys.readouterr().out
 
@@ -193,7 +193,7 @@ def test_the_demo_draws_a_track_over_topics(tmp_path):
         p.name for p in tmp_path.iterdir()}
 
 
-def test_fit_writes_all_that_it_promises(tmp_path, capsys):
+def test_fit_writes_all_documented_files(tmp_path, capsys):
     out = tmp_path / 'out'
     names = ['straight_car_fast_left', 'junction_right_turns_to_rear']
     out.mkdir()
@@ -215,7 +215,7 @@ def test_fit_writes_all_that_it_promises(tmp_path, capsys):
     assert 'a turn, braking' in text and 'closest to the centre of the sensors' in text
 
 
-def test_a_file_name_need_not_be_text(tmp_path):
+def test_a_file_name_may_be_invalid_utf8(tmp_path):
     path = tmp_path / os.fsdecode(b'\xff$a$.mcap')
     path.write_bytes(vehicle_path('straight_car_right').read_bytes())
     done = subprocess.run(
@@ -227,8 +227,8 @@ def test_a_file_name_need_not_be_text(tmp_path):
     assert '\n\\udcff$a$,1,1,' in (tmp_path / 'out' / 'fits.csv').read_text()
 
 
-def test_fit_of_one_vehicle_tells_its_iron(tmp_path, capsys):
-    """Two passes of the same heading cannot; the file says so with a null."""
+def test_fit_of_a_single_pass_cannot_separate_hard_and_soft_iron(tmp_path, capsys):
+    """`iron` is null then."""
     name = str(vehicle_path('straight_car_right'))
     assert main(['fit', name, '--network', str(NETWORK_FILE), '--orders', '3', '--same-vehicle',
                  '--no-figures', '--out', str(tmp_path)]) == 0
@@ -236,7 +236,7 @@ def test_fit_of_one_vehicle_tells_its_iron(tmp_path, capsys):
     assert json.loads((tmp_path / 'fits.json').read_text())['iron'] is None
 
 
-def test_fit_of_one_sensor_keeps_what_it_knows(tmp_path, capsys):
+def test_fit_with_one_sensor_writes_the_observable_values(tmp_path, capsys):
     network = tmp_path / 'one.yaml'
     network.write_text('sensors:\n  mag_1:\n    position: [0.0, -4.5, 0.0]\n')
     assert main(['fit', str(vehicle_path('straight_car_right')), '--network', str(network),
@@ -247,7 +247,7 @@ def test_fit_of_one_sensor_keeps_what_it_knows(tmp_path, capsys):
     assert '(or both reversed)' in capsys.readouterr().out
 
 
-def test_fit_opens_everything_before_it_writes(tmp_path, capsys):
+def test_fit_opens_all_recordings_before_it_writes(tmp_path, capsys):
     out = tmp_path / 'out'
     out.mkdir()
     (out / 'fits.csv').write_text('old')
@@ -263,7 +263,7 @@ def test_fit_opens_everything_before_it_writes(tmp_path, capsys):
     (['--orders', '2', '2'], '--orders'),
     (['--cpa-range', '4', '1'], 'only for a single sensor; the 2 sensors'),
 ])
-def test_fit_refuses_options_that_make_no_sense(tmp_path, capsys, options, text):
+def test_fit_refuses_invalid_options(tmp_path, capsys, options, text):
     assert main(['fit', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), *options,
                  '--out', str(tmp_path / 'out')]) == 1
     assert text in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""mag-tracking board-geometry, as somebody types it."""
+"""The command `mag-tracking board-geometry`."""
 
 import signal
 import subprocess
@@ -20,7 +20,7 @@ POSITIONS = FOLDER / 'sensor_positions_m.csv'
 
 @pytest.fixture(scope='module')
 def calibrated(tmp_path_factory):
-    """(network as read from the written file, what was said, folder); from every other row."""
+    """(written network, output, folder) of a calibration with every other row."""
     folder = tmp_path_factory.mktemp('geometry')
     stated, field, positions, axes = board_of_41()
     write_network(folder / 'stated.yaml', stated)
@@ -33,13 +33,13 @@ def calibrated(tmp_path_factory):
 
 
 def test_the_written_network_locates_the_magnet(calibrated):
-    """Raw readings that were held out, through the stage Calibrate."""
+    """Locate the magnet with held-out raw readings after the stage Calibrate."""
     network, *_ = calibrated
     stated, field, positions, axes = board_of_41()
     g = calibrate_geometry(stated, field[::2], positions[::2], axes[::2], MOMENT,
                            GeometrySettings())
     B = through_calibrate(network, field[1::2])
-    # Within the file's digits, and nowhere drifted away from the background.
+    # Equal within the digits of the file; the background has not drifted.
     np.testing.assert_allclose(B, g.signal(field[1::2]), rtol=0, atol=1e-12)
     found = [locate_magnet(network, b, MOMENT, *BOX, PoseSettings()) for b in B]
     assert all(p.converged for p in found)
@@ -52,7 +52,7 @@ def test_the_written_network_locates_the_magnet(calibrated):
     within_limits(place, turn, low)
 
 
-def test_what_is_said_and_drawn(calibrated):
+def test_the_printed_table_and_figure_match_the_network(calibrated):
     network, text, folder = calibrated
     rows = [line.split() for line in text.splitlines() if line.startswith('mag_')]
     assert [r[0] for r in rows] == list(network.names)
@@ -76,13 +76,13 @@ def test_what_is_said_and_drawn(calibrated):
     np.testing.assert_allclose(np.array(network.noise_std), noise, rtol=1e-9)
 
 
-def test_positions_alone_are_enough(tmp_path, capsys):
+def test_sensor_positions_alone_are_sufficient(tmp_path, capsys):
     out = tmp_path / 'board.yaml'
     few = write_table(tmp_path / 'poses.csv', *(v[::6] for v in board_of_41()[1:]))
     assert command(few, '--sensors', POSITIONS, out=out) == 0
     text = capsys.readouterr().out
     assert 'note: noise of 41 sensors assumed to be 1e-07 T' in text
-    # One noise for two kinds of sensors: the noisier kind stands out.
+    # With one noise level for two kinds of sensors, the noisier kind is inconsistent.
     assert 'warning: sensors inconsistent with the others' in text
     network = read_network(out)
     assert network.noise_std == (None,) * 41 and network.imu_topics == (None,) * 41
@@ -93,8 +93,8 @@ def test_positions_alone_are_enough(tmp_path, capsys):
     np.testing.assert_allclose(noise, 3e-7, rtol=1e-9)
 
 
-def test_what_does_not_fit_is_named(tmp_path, capsys, monkeypatch):
-    """A sensor with a swapped pair; a pose, by its row in the file, before it a row is lost."""
+def test_inconsistent_sensors_and_poses_are_named(tmp_path, capsys, monkeypatch):
+    """A sensor with swapped axes, and a pose by its row in the file after a skipped row."""
     stated, field, positions, axes, _ = simulated(5)
     field[:, 2] = field[:, 2][:, [1, 0, 2]]
     field[3] = np.nan
@@ -118,9 +118,9 @@ def test_what_does_not_fit_is_named(tmp_path, capsys, monkeypatch):
     assert any('do not fit: 1' in title for title in titles)
 
 
-# Nothing is written.
+# Rejected calibrations, settings and invalid input.
 
-def test_a_magnet_the_wrong_way_round_is_refused(tmp_path, capsys):
+def test_a_reversed_magnet_is_refused(tmp_path, capsys):
     stated, field, positions, axes, _ = simulated(9)
     write_network(tmp_path / 'stated.yaml', stated)
     table = write_table(tmp_path / 'poses.csv', field, positions, -axes)
@@ -132,7 +132,7 @@ def test_a_magnet_the_wrong_way_round_is_refused(tmp_path, capsys):
     assert {p.name for p in tmp_path.iterdir()} == {'stated.yaml', 'poses.csv'}
 
 
-def test_settings_come_from_a_file(tmp_path, capsys):
+def test_settings_are_read_from_a_file(tmp_path, capsys):
     stated, field, positions, axes, _ = simulated(9)
     write_network(tmp_path / 'stated.yaml', stated)
     table = write_table(tmp_path / 'poses.csv', field, positions, axes)
@@ -142,7 +142,7 @@ def test_settings_come_from_a_file(tmp_path, capsys):
     assert command(table, *common, out=tmp_path / 'out.yaml') == 0
     network = read_network(tmp_path / 'out.yaml')
     np.testing.assert_allclose(network.R_ws, stated.R_ws, atol=1e-12)
-    # What was held fixed has no deviation that a file could hold.
+    # A fixed orientation has no standard deviation in the file.
     assert network.orientation_std == (None,) * 9
     assert 'moment 0.26' in (text := capsys.readouterr().out) and '(given)' not in text
     params.write_text('gain_sdt: 0.1')
@@ -166,14 +166,14 @@ def test_settings_come_from_a_file(tmp_path, capsys):
     (['--noise-std', '0.01'], '--noise-std: expected 1e-15 T or more and less than 1e-3 T'),
     (['--figure', '/nowhere/board.png'], 'the folder /nowhere does not exist'),
     (['--params', '/nowhere.yaml'], '/nowhere.yaml')])
-def test_bad_options_are_named(tmp_path, capsys, options, message):
+def test_invalid_options_are_named(tmp_path, capsys, options, message):
     assert command(FOLDER / 'poses.csv', '--sensors', POSITIONS, *options,
                    out=tmp_path / 'out.yaml') == 1
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_bad_files_are_named(tmp_path, capsys):
+def test_invalid_files_are_named(tmp_path, capsys):
     few = tmp_path / 'few.csv'
     few.write_text('0,0,0\n1,0,0\n')
     out = tmp_path / 'out.yaml'
@@ -193,13 +193,13 @@ def test_bad_files_are_named(tmp_path, capsys):
     assert not out.exists()
 
 
-# Without a tracker.
+# Unknown poses: no motion tracker.
 
 BOX_OPTIONS = ('--unknown-poses', '--low', -0.08, -0.08, 0.03, '--high', 0.2, 0.2, 0.25)
 
 
-def test_unknown_poses(tmp_path, capsys):
-    """The table need not have any."""
+def test_unknown_poses_are_estimated(tmp_path, capsys):
+    """The table has no columns of poses."""
     stated, field, positions, axes, _ = simulated(21)
     field[4] = np.nan
     write_network(tmp_path / 'stated.yaml', stated)
@@ -219,14 +219,14 @@ def test_unknown_poses(tmp_path, capsys):
     assert pose.converged and pose.normalised_cost < 3.0
 
 
-def test_ctrl_c_ends_it_and_nothing_is_written(tmp_path):
+def test_ctrl_c_ends_the_command_without_files(tmp_path):
     process = subprocess.Popen(
         [sys.executable, '-m', 'mag_tracking.cli', 'board-geometry', FOLDER / 'poses.csv',
          '--sensors',
          POSITIONS, '--moment', str(MOMENT), '--unknown-poses', '--low', *map(str, BOX[0]),
          '--high', *map(str, BOX[1]), '--out', tmp_path / 'out.yaml'],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        # A background job, which these tests may be, passes on that it ignores SIGINT.
+        # In a background job, the process would inherit that SIGINT is ignored.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     assert process.stdout.readline() == 'estimating the poses and geometry of 41 sensors\n'
     process.send_signal(signal.SIGINT)
@@ -236,18 +236,18 @@ def test_ctrl_c_ends_it_and_nothing_is_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_being_written_is_written(tmp_path, monkeypatch):
-    """A Ctrl-C between network and figure leaves no half of the two."""
+def test_ctrl_c_while_writing_loses_no_file(tmp_path, monkeypatch):
+    """The Ctrl-C arrives between the network file and the figure."""
     from mag_tracking.cli import board_geometry as geometry
     stated, field, positions, axes, _ = simulated(9)
     write_network(tmp_path / 'stated.yaml', stated)
     table = write_table(tmp_path / 'poses.csv', field, positions, axes)
 
-    def impatient(*args):
+    def interrupted(*args):
         write_network(*args)
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(geometry, 'write_network', impatient)
+    monkeypatch.setattr(geometry, 'write_network', interrupted)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',

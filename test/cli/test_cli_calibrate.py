@@ -1,4 +1,4 @@
-"""mag-tracking calibrate and tumble, as somebody types them."""
+"""The commands `mag-tracking calibrate` and `tumble`."""
 
 import gzip
 import json
@@ -22,8 +22,8 @@ from support.samples import MagSample, recorded, sample_dict
 ROAD = vehicle_path('straight_car_right')
 
 
-def record(folder, readings, name='mag_1'):
-    """A recording of readings (n, 3) [T] at 100 Hz."""
+def write_recording(folder, readings, name='mag_1'):
+    """Write a recording of readings (n, 3) [T] at 100 Hz; return its path."""
     with RecordingWriter(folder / 'hand.mcap') as writer:
         for k, field in enumerate(readings):
             stamp = 10**18 + k * 10**7
@@ -33,18 +33,18 @@ def record(folder, readings, name='mag_1'):
 
 
 def tumbled():
-    """Bundled readings of a tumbled sensor, in tesla."""
+    """Bundled readings (n, 3) [T] of a tumbled sensor."""
     gauss = np.loadtxt(DATA / 'calibration' / 'tumbled_acc_mag.csv', delimiter=',', skiprows=1)
     return gauss[:, 3:] * 1e-4
 
 
-def test_calibrate_writes_a_network_that_replay_takes(tmp_path, capsys):
+def test_calibrate_writes_a_network_that_replay_accepts(tmp_path, capsys):
     out, figure = tmp_path / 'calibrated.yaml', tmp_path / 'calibration.png'
     assert main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--out', str(out),
                  '--figure', str(figure)]) == 0
-    said = capsys.readouterr().out
-    assert ('clock offsets relative to mag_1' in said and 'passes used: 1' in said
-            and 'warning' not in said)
+    output = capsys.readouterr().out
+    assert ('clock offsets relative to mag_1' in output and 'passes used: 1' in output
+            and 'warning' not in output)
     assert figure.stat().st_size > 20000
     found = read_network(out)
     assert all(c.date.startswith('20') and 'compass' in c.by for c in found.calibrated)
@@ -57,8 +57,8 @@ def test_calibrate_writes_a_network_that_replay_takes(tmp_path, capsys):
     assert '1 tracks' in capsys.readouterr().out
 
 
-def test_calibrated_again_it_knows_no_more(tmp_path):
-    """The same compass and the same pass are no further evidence."""
+def test_a_repeated_calibration_adds_no_information(tmp_path):
+    """The same compass and the same pass are no new evidence."""
     first, again = tmp_path / 'first.yaml', tmp_path / 'again.yaml'
     for network, out in ((NETWORK_FILE, first), (first, again)):
         assert main(['calibrate', str(ROAD), '--network', str(network), '--out', str(out)]) == 0
@@ -67,7 +67,7 @@ def test_calibrated_again_it_knows_no_more(tmp_path):
     np.testing.assert_allclose(b.orientation_std, a.orientation_std, rtol=1e-6)
 
 
-def test_a_background_in_the_file_hides_no_flipped_axis(tmp_path, capsys):
+def test_a_given_background_does_not_hide_a_flipped_axis(tmp_path, capsys):
     first, flipped = tmp_path / 'first.yaml', tmp_path / 'flipped.yaml'
     main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--no-passes', '--out',
           str(first)])
@@ -82,21 +82,21 @@ def test_a_background_in_the_file_hides_no_flipped_axis(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('std', [20.0, 180.0])
-def test_a_sensor_that_may_be_turned_far_is_tracked_with_a_warning(tmp_path, capsys, std):
+def test_replay_warns_of_a_large_orientation_uncertainty(tmp_path, capsys, std):
     network = read_network(NETWORK_FILE)
     path = tmp_path / 'network.yaml'
     write_network(path, replace(network, orientation_std=(np.full(3, np.deg2rad(std)), None)))
     assert main(['replay', str(ROAD), '--network', str(path), '--out', str(tmp_path / 'run'),
                  '--no-figures']) == 0
-    said = capsys.readouterr().out
-    assert ('1 sensors have an orientation uncertainty of more than 15 degrees' in said
-            and '1 tracks' in said)
+    output = capsys.readouterr().out
+    assert ('1 sensors have an orientation uncertainty of more than 15 degrees' in output
+            and '1 tracks' in output)
     angles = json.loads((tmp_path / 'run' / 'summary.json').read_text())['tracks'][0]['mounting']
-    # It is tracked as if it were known to 15 degrees.
+    # Tracking limits the uncertainty to 15 degrees.
     assert 5.0 < max(angles['mag_1']['std_deg']) <= 15.0
 
 
-def test_without_passes_it_says_less(tmp_path, capsys):
+def test_a_calibration_without_passes_is_less_certain(tmp_path, capsys):
     stds = []
     for extra in ([], ['--no-passes']):
         out = tmp_path / f'{len(extra)}.yaml'
@@ -116,11 +116,11 @@ def test_a_flipped_axis_is_named(tmp_path, capsys):
                 replace(sample, field=sample.field * flipped), sample.sensor), sample.stamp_ns)
     assert main(['calibrate', str(tmp_path / 'flipped.mcap'), '--network', str(NETWORK_FILE),
                  '--out', str(tmp_path / 'out.yaml')]) == 2
-    said = capsys.readouterr().out
-    assert "mag_2 differs from the Earth's field by 9" in said and ' uT: z is flipped\n' in said
-    assert 'mag_1 differs' not in said and 'passes were not used' in said
-    assert said.count('no accelerations: its orientation is not surveyed') == 2
-    assert 'clocks stay as they were: too few accelerometers' in said
+    output = capsys.readouterr().out
+    assert "mag_2 differs from the Earth's field by 9" in output and ' uT: z is flipped\n' in output
+    assert 'mag_1 differs' not in output and 'passes were not used' in output
+    assert output.count('no accelerations; the orientation is not surveyed') == 2
+    assert 'clock offsets are unchanged: too few accelerometers' in output
 
 
 @pytest.mark.parametrize('arguments, message', [
@@ -131,7 +131,7 @@ def test_a_flipped_axis_is_named(tmp_path, capsys):
      '--figure: expected a file name ending in .png, .pdf, .svg; got found.xyz'),
     (['tumble', str(ROAD), '--field-size', '50'], '--field-size: expected 1e-6 to 1e-3 T, got 50'),
 ])
-def test_what_cannot_be_done_is_said(tmp_path, capsys, arguments, message):
+def test_invalid_arguments_are_named(tmp_path, capsys, arguments, message):
     command, *rest = arguments
     status = main([command, *rest, '--network', str(NETWORK_FILE), '--out',
                    str(tmp_path / 'out.yaml')])
@@ -140,7 +140,7 @@ def test_what_cannot_be_done_is_said(tmp_path, capsys, arguments, message):
 
 
 @pytest.mark.parametrize('option', ['--out', '--figure'])
-def test_a_folder_that_is_not_there_is_told_before_the_work(tmp_path, capsys, option):
+def test_a_missing_folder_is_named_before_the_calibration(tmp_path, capsys, option):
     missing = ['--out', str(tmp_path / 'o.yaml')] if option == '--figure' else []
     assert main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), *missing, option,
                  str(tmp_path / 'no' / 'x.png')]) == 1
@@ -148,26 +148,26 @@ def test_a_folder_that_is_not_there_is_told_before_the_work(tmp_path, capsys, op
             and not list(tmp_path.iterdir()))
 
 
-def test_interrupted_it_writes_nothing(tmp_path):
+def test_an_interrupted_calibration_writes_nothing(tmp_path):
     process = subprocess.Popen(
         [sys.executable, '-c', 'import os, signal, sys\n'
          'from mag_tracking.apps import calibrate as calibrating\n'
          'from mag_tracking.cli import main\n'
          'feed = calibrating.Survey.feed\n'
-         'def struck(self, sample):\n'
+         'def interrupted(self, sample):\n'
          '    os.kill(os.getpid(), signal.SIGINT)\n    return feed(self, sample)\n'
-         'calibrating.Survey.feed = struck\nsys.exit(main(sys.argv[1:]))',
+         'calibrating.Survey.feed = interrupted\nsys.exit(main(sys.argv[1:]))',
          'calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--out', str(tmp_path / 'o.yaml')],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    said, _ = process.communicate(timeout=120)
-    assert process.returncode == 130 and 'interrupted: nothing was written' in said, said
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 130 and 'interrupted: nothing was written' in output, output
     assert process.returncode != -signal.SIGINT and not (tmp_path / 'o.yaml').exists()
 
 
-def test_tumbling_a_real_sensor(tmp_path, capsys):
+def test_tumbling_calibrates_a_real_sensor(tmp_path, capsys):
     readings = tumbled()
     out, figure = tmp_path / 'out.yaml', tmp_path / 'tumbled.png'
-    assert main(['tumble', str(record(tmp_path, readings)), '--network', str(NETWORK_FILE),
+    assert main(['tumble', str(write_recording(tmp_path, readings)), '--network', str(NETWORK_FILE),
                  '--sensor', 'mag_1', '--out', str(out), '--figure', str(figure)]) == 0
     assert 'scatter of the field magnitude 1.26% (uncorrected 32.0%)' in capsys.readouterr().out
     assert figure.stat().st_size > 20000
@@ -178,11 +178,11 @@ def test_tumbling_a_real_sensor(tmp_path, capsys):
     assert 'as stated; tumbled to 1.3 % of the field' == found.calibrated[0].by
 
 
-def test_tumbling_takes_out_what_was_of_uncorrected_readings(tmp_path, capsys):
+def test_tumbling_removes_background_and_noise_of_raw_readings(tmp_path, capsys):
     network = read_network(NETWORK_FILE)
     stated = replace(network, background=(np.full(3, 1e-5),) * 2, noise_std=(np.full(3, 1e-8),) * 2)
     write_network(tmp_path / 'stated.yaml', stated)
-    recording = record(tmp_path / 'hand', tumbled())
+    recording = write_recording(tmp_path / 'hand', tumbled())
     assert main(['tumble', str(recording), '--network', str(tmp_path / 'stated.yaml'), '--sensor',
                  'mag_1', '--out', str(tmp_path / 'out.yaml')]) == 0
     found = read_network(tmp_path / 'out.yaml')
@@ -190,21 +190,21 @@ def test_tumbling_takes_out_what_was_of_uncorrected_readings(tmp_path, capsys):
     np.testing.assert_array_equal(found.background[1], stated.background[1])
 
 
-def test_tumbling_raw_counts(tmp_path, capsys):
-    """The other sensor lay still for a minute first."""
+def test_tumbling_calibrates_raw_counts(tmp_path, capsys):
+    """Another kind of sensor, at rest for the first minute."""
     with gzip.open(DATA / 'calibration' / 'qmc5883l_raw_counts.csv.gz', 'rt') as stream:
         counts = np.loadtxt(stream, delimiter=',', skiprows=3)
-    assert main(['tumble', str(record(tmp_path, counts * 1e-9)), '--network', str(NETWORK_FILE),
-                 '--sensor', 'mag_1', '--out', str(tmp_path / 'out.yaml')]) == 0
+    assert main(['tumble', str(write_recording(tmp_path, counts * 1e-9)), '--network',
+                 str(NETWORK_FILE), '--sensor', 'mag_1', '--out', str(tmp_path / 'out.yaml')]) == 0
     found = read_network(tmp_path / 'out.yaml')
     size = np.linalg.norm((counts * 1e-9 - found.offset[0]) @ found.correction[0].T, axis=1)
     print(capsys.readouterr().out, size.std() / size.mean())
     assert size.std() / size.mean() <= 0.03
 
 
-def test_sensors_that_were_not_turned_are_refused(tmp_path, capsys):
+def test_tumbling_refuses_sensors_that_were_not_rotated(tmp_path, capsys):
     assert main(['tumble', str(ROAD), '--network', str(NETWORK_FILE), '--out',
                  str(tmp_path / 'out.yaml')]) == 1
-    said = capsys.readouterr().out
-    assert said.count('calibration rejected') == 2 and 'nothing was written' in said
+    output = capsys.readouterr().out
+    assert output.count('calibration rejected') == 2 and 'nothing was written' in output
     assert not (tmp_path / 'out.yaml').exists()

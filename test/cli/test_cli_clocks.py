@@ -1,4 +1,4 @@
-"""`replay` names a clock that is off, and the offset that it gives puts it right."""
+"""`replay` reports a clock offset, which corrects the clock in the network file."""
 
 import json
 import re
@@ -23,7 +23,7 @@ sensors:
 
 @pytest.fixture(scope='module')
 def recording(tmp_path_factory):
-    """Three cars past two sensors, the clock of the second 0.2 s ahead."""
+    """Recording of three cars and two sensors; the clock of mag_2 is 0.2 s ahead."""
     a_world = ambient_world(np.random.default_rng(5), 'boxes', None, 75.0, cars=3)
     path = tmp_path_factory.mktemp('clocks') / 'cars.mcap'
     with RecordingWriter(path) as writer:
@@ -33,8 +33,8 @@ def recording(tmp_path_factory):
     return str(path)
 
 
-def replayed(recording, folder, offset, capsys):
-    """(what was said, summary) with a `clock_offset` [s] in the network file."""
+def replay(recording, folder, offset, capsys):
+    """(output, summary) of a replay with a `clock_offset` [s] of mag_2 in the network file."""
     folder.mkdir()
     (folder / 'network.yaml').write_text(NETWORK.format(offset))
     params = parameter_file(folder / 'params.yaml', QUICK)
@@ -43,12 +43,12 @@ def replayed(recording, folder, offset, capsys):
     return capsys.readouterr().out, json.loads((folder / 'out' / 'summary.json').read_text())
 
 
-def test_the_clock_is_named_and_its_offset_puts_it_right(recording, tmp_path, capsys):
-    said, summary = replayed(recording, tmp_path / 'wrong', 0.0, capsys)
-    assert f'warning: {summary["clocks_apart"]}' in said
-    assert 'the clock of mag_2 is' in said and 'clocks_apart' in summary['tracks'][-1]['doubts']
-    offset = float(re.search(r'increase clock_offset of mag_2 by (\S+) s', said).group(1))
+def test_the_reported_offset_corrects_the_clock(recording, tmp_path, capsys):
+    output, summary = replay(recording, tmp_path / 'wrong', 0.0, capsys)
+    assert f'warning: {summary["clocks_apart"]}' in output
+    assert 'the clock of mag_2 is' in output and 'clocks_apart' in summary['tracks'][-1]['doubts']
+    offset = float(re.search(r'increase clock_offset of mag_2 by (\S+) s', output).group(1))
     assert offset == pytest.approx(0.2, abs=0.05)
-    said, summary = replayed(recording, tmp_path / 'right', offset, capsys)
-    assert summary['clocks_apart'] == '' and 'the clock' not in said
+    output, summary = replay(recording, tmp_path / 'right', offset, capsys)
+    assert summary['clocks_apart'] == '' and 'the clock' not in output
     assert not any('clocks_apart' in t['doubts'] for t in summary['tracks'])

@@ -1,4 +1,4 @@
-"""A close pair from a recording: what `fit`, `replay` and `doctor` say of it."""
+"""Recording of a close pair of sensors: output of `fit`, `replay` and `doctor`."""
 
 import csv
 import json
@@ -33,12 +33,12 @@ def pair(tmp_path_factory):
     return str(folder / 'pair.mcap'), str(folder / 'network.yaml'), velocity
 
 
-def test_fit_says_speed_and_direction_twice(pair, tmp_path, capsys):
+def test_fit_reports_speed_and_direction_by_two_methods(pair, tmp_path, capsys):
     recording, network, velocity = pair
     assert main(['fit', recording, '--network', network, '--out', str(tmp_path), '--no-figures',
                  '--orders', '2', '3']) == 0
-    said = capsys.readouterr().out
-    assert 'velocity from the delay between sensors' in said and 'contradict' not in said
+    output = capsys.readouterr().out
+    assert 'velocity from the delay between sensors' in output and 'contradict' not in output
     with open(tmp_path / 'fits.csv', encoding='utf-8') as stream:
         rows = list(csv.DictReader(stream))
     chosen = next(row for row in rows if row['chosen'] == '1')
@@ -51,7 +51,7 @@ def test_fit_says_speed_and_direction_twice(pair, tmp_path, capsys):
     assert json.loads((tmp_path / 'fits.json').read_text())['fits'][0]['no_delay'] == ''
 
 
-def test_replay_sets_the_delay_beside_the_track(pair, tmp_path, capsys):
+def test_replay_reports_the_delay_of_the_track(pair, tmp_path, capsys):
     recording, network, velocity = pair
     params = parameter_file(tmp_path / 'params.yaml', QUICK)
     assert main(['replay', recording, '--network', network, '--params', str(params), '--out',
@@ -64,7 +64,7 @@ def test_replay_sets_the_delay_beside_the_track(pair, tmp_path, capsys):
     assert isinstance(track['delay']['contradicts'], bool)
 
 
-def test_frames_that_are_too_long_are_warned_of(pair, tmp_path, capsys):
+def test_commands_warn_of_frames_that_are_too_long(pair, tmp_path, capsys):
     recording, network, _ = pair
     params = parameter_file(tmp_path / 'long.yaml', QUICK | {'align.period_s': 0.08})
     options = ['--network', network, '--params', str(params)]

@@ -14,7 +14,7 @@ HEADINGS = {'east': 0.0, 'west': 180.0, 'north_east': 50.0, 'south_east': -40.0}
 
 @pytest.fixture(scope='module')
 def passes(tmp_path_factory):
-    """{name: recording} of the vehicle at each of the headings."""
+    """{name: recording} of the vehicle at each heading."""
     rng = np.random.default_rng(5)
     folder = tmp_path_factory.mktemp('iron')
     found = {}
@@ -25,25 +25,25 @@ def passes(tmp_path_factory):
 
 
 def iron_of(names, passes, out):
-    """`iron` of the fits of some passes."""
+    """`iron` in the results of a fit of some passes."""
     assert main(['fit', *(str(passes[n]) for n in names), '--network', str(NETWORK_FILE),
                  '--orders', '1', '--same-vehicle', '--no-figures', '--out', str(out)]) == 0
     return json.loads((out / 'fits.json').read_text())['iron']
 
 
-def test_passes_at_several_headings_tell_hard_and_soft_iron(passes, tmp_path, capsys):
+def test_passes_at_several_headings_separate_hard_and_soft_iron(passes, tmp_path, capsys):
     iron = iron_of(HEADINGS, passes, tmp_path)
     found = np.array([*iron['hard'], iron['soft']])
     std, true = np.array(iron['std']), np.array([*HARD, SOFT])
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     print(f'm0, D: {found.round(3)} ({std.round(3)}), simulated {true}')
-    # Truth inside four deviations, which are small beside what is told apart.
+    # Errors are within four standard deviations, which are small compared with the values.
     assert np.all(np.abs(found - true) < 4.0 * std)
     assert np.all(std[:3] < 0.05 * np.linalg.norm(HARD)) and std[3] < 0.05 * SOFT
     assert iron['passes'] == len(HEADINGS) and 0.1 < iron['normalised_cost'] < 5.0
-    assert 'hard iron m0 =' in said and '4 passes' in said
+    assert 'hard iron m0 =' in output and '4 passes' in output
 
 
-def test_without_another_heading_they_are_not_told_apart(passes, tmp_path, capsys):
+def test_hard_and_soft_iron_are_not_separated_at_a_single_heading(passes, tmp_path, capsys):
     assert iron_of(['east'], passes, tmp_path) is None
     assert 'cannot be separated' in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Interrupted commands keep finished results; a repeated signal ends them at once."""
+"""Interrupted commands keep finished results; a repeated signal ends them immediately."""
 
 import errno
 import json
@@ -16,7 +16,7 @@ from support.bundled import NETWORK_FILE, vehicle_path
 from support.cli_runs import NAME, quick_file, replay_one
 
 
-def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
+def test_an_interrupted_replay_keeps_finished_results(tmp_path):
     out = tmp_path / 'out'
     recordings = [tmp_path / f'{NAME}_{k}.mcap' for k in range(40)]
     for path in recordings:
@@ -38,7 +38,7 @@ def test_an_interrupted_replay_keeps_what_is_done(tmp_path):
 
 
 def interrupt_feed(monkeypatch, at):
-    """Let a signal come at one of the pipeline's batches; returns the list of batches fed."""
+    """Interrupt the pipeline at batch number `at`; return the list of batches fed."""
     from mag_tracking.pipeline import Pipeline
     feed, calls = Pipeline.feed, []
 
@@ -56,7 +56,7 @@ def summary_of(out):
     return json.loads((out / 'summary.json').read_text())
 
 
-def test_an_interruption_ends_the_reading_after_the_batch(tmp_path, monkeypatch):
+def test_an_interrupt_ends_reading_after_the_current_batch(tmp_path, monkeypatch):
     calls = interrupt_feed(monkeypatch, 3)
     before = signal.getsignal(signal.SIGINT)
     assert replay_one(tmp_path, '--no-figures') == 130
@@ -65,44 +65,44 @@ def test_an_interruption_ends_the_reading_after_the_batch(tmp_path, monkeypatch)
     assert summary_of(tmp_path)['interrupted'] is True
 
 
-def test_an_interruption_need_not_wait_for_the_next_batch(tmp_path, monkeypatch):
+def test_an_interrupt_does_not_wait_for_the_next_batch(tmp_path, monkeypatch):
     from mag_tracking.recording.sample_reader import SampleReader
     waited = []
 
-    def no_batch_for_long(self, progress):
+    def no_batches(self, progress):
         signal.raise_signal(signal.SIGINT)
         progress(1)
         waited.append(True)
         yield from ()
 
-    monkeypatch.setattr(SampleReader, 'readings', no_batch_for_long)
+    monkeypatch.setattr(SampleReader, 'readings', no_batches)
     assert replay_one(tmp_path, '--no-figures') == 130
     assert not waited and summary_of(tmp_path)['interrupted'] is True
 
 
 @pytest.mark.parametrize('step', ['summarise', 'add', 'errors_against_truth', 'write_figures'])
-def test_an_interruption_while_writing_loses_nothing(tmp_path, monkeypatch, capsys, step):
-    """First or second, in the middle of an update or of what is written at the end."""
+def test_an_interrupt_while_writing_loses_no_results(tmp_path, monkeypatch, capsys, step):
+    """One or two interrupts, during an update or while the results are written."""
     from mag_tracking.apps import replay as app
     from mag_tracking.cli import replay
 
     module = {'write_figures': replay, 'add': app.RunCollector}.get(step, app)
-    whole, count = getattr(module, step), []
+    original, calls = getattr(module, step), []
 
-    def impatient(*args, **named):
-        count.append(step)
-        if len(count) in (1, 2):
+    def interrupted(*args, **named):
+        calls.append(step)
+        if len(calls) in (1, 2):
             signal.raise_signal(signal.SIGINT)
-        return whole(*args, **named)
+        return original(*args, **named)
 
-    monkeypatch.setattr(module, step, impatient)
+    monkeypatch.setattr(module, step, interrupted)
     assert replay_one(tmp_path) == 130
     assert summary_of(tmp_path)['interrupted'] is (step == 'add')
     assert 'interrupted; partial results in' in capsys.readouterr().out
     assert not list(tmp_path.glob('*.png'))
 
 
-def test_who_insists_is_obeyed(tmp_path, monkeypatch):
+def test_a_repeated_interrupt_ends_the_command(tmp_path, monkeypatch):
     from mag_tracking.apps import replay as app
 
     def hanging(*_):
@@ -114,7 +114,7 @@ def test_who_insists_is_obeyed(tmp_path, monkeypatch):
     assert replay_one(tmp_path, '--no-figures') == 130
 
 
-def test_a_background_job_ignores_interruptions_as_it_was_told(tmp_path, monkeypatch):
+def test_a_background_job_ignores_interrupts(tmp_path, monkeypatch):
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         interrupt_feed(monkeypatch, 3)
@@ -132,8 +132,8 @@ def test_the_command_works_outside_the_main_thread(tmp_path):
 
 
 @pytest.mark.parametrize('unbuffered', ['', '1'])
-def test_nobody_reads_on(unbuffered):
-    """As behind `| head`: no complaint, and the exit status of other programs."""
+def test_a_closed_pipe_ends_the_command_silently(unbuffered):
+    """As with `| head`: no error message, and the usual exit status."""
     command = [sys.executable, '-m', 'mag_tracking.cli', 'info', str(vehicle_path(NAME))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                           env={**os.environ, 'PYTHONUNBUFFERED': unbuffered}) as process:
@@ -141,10 +141,10 @@ def test_nobody_reads_on(unbuffered):
         assert process.stderr.read() == b'' and process.wait() == 141
 
 
-def test_another_broken_pipe_is_an_error(monkeypatch, capfd):
-    def lost(path):
+def test_a_broken_pipe_elsewhere_is_an_error(monkeypatch, capfd):
+    def broken(path):
         raise BrokenPipeError(errno.EPIPE, 'the sensor')
 
-    monkeypatch.setattr('mag_tracking.cli.info.Recording', lost)
+    monkeypatch.setattr('mag_tracking.cli.info.Recording', broken)
     assert main(['info', str(vehicle_path(NAME))]) == 1
     assert 'the sensor' in capfd.readouterr().err

@@ -1,4 +1,4 @@
-"""`mag-tracking record` and `repair` in this process: lines, options, refusals."""
+"""`mag-tracking record` and `repair` in this process: output, options and errors."""
 
 import argparse
 import os
@@ -26,29 +26,29 @@ from support.bundled import NETWORK_FILE
 from support.recorded_topics import FIELDS, IMUS
 
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(600)]
-S = 10**9
+NS = 10**9
 
 
-def arguments_of(*words):
-    """The parsed command line."""
+def arguments_of(*arguments):
+    """Parsed command line."""
     parser = argparse.ArgumentParser()
     commands = parser.add_subparsers()
     record.add(commands)
     repair.add(commands)
-    return parser.parse_args([str(w) for w in words])
+    return parser.parse_args([str(a) for a in arguments])
 
 
-def test_the_command_in_this_process(tmp_path, monkeypatch, capsys):
-    """Lines of progress, a SIGINT, the summary; a best-effort driver's QoS is noted."""
+def test_record_prints_progress_and_a_summary(tmp_path, monkeypatch, capsys):
+    """SIGINT ends the recording; the QoS of a best-effort driver is recorded."""
     monkeypatch.setattr(record_node, 'PROGRESS_INTERVAL_S', 0.2)
-    # So seldom that what came just before the end is fetched at the end.
+    # Rare polls, so that the last messages are fetched at the end.
     monkeypatch.setattr(record_node, 'POLL_INTERVAL_S', 0.5)
-    stopped, told = threading.Event(), []
+    stopped, logged = threading.Event(), []
     monkeypatch.setattr(record_node, 'log', lambda text, log=record_node.log: (
-        told.append(text), log(text)))
+        logged.append(text), log(text)))
 
     def n_recorded():
-        numbers = [re.search(r' s: (\d+) messages', text) for text in told]
+        numbers = [re.search(r' s: (\d+) messages', text) for text in logged]
         return max((int(number[1]) for number in numbers if number), default=0)
 
     def drive():
@@ -59,7 +59,7 @@ def test_the_command_in_this_process(tmp_path, monkeypatch, capsys):
             depth=10, reliability=ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.VOLATILE))
         while not stopped.wait(0.01) and (
-                sum(' s: ' in text for text in told) < 3 or n_recorded() <= 50
+                sum(' s: ' in text for text in logged) < 3 or n_recorded() <= 50
                 or len(list((tmp_path / 'a').glob('*.mcap'))) < 2):
             publisher.publish(MagneticField())
         last = MagneticField()
@@ -87,16 +87,16 @@ def test_the_command_in_this_process(tmp_path, monkeypatch, capsys):
         assert reader.connections[0].ext.offered_qos_profiles[0].reliability.name == 'BEST_EFFORT'
 
 
-def test_what_the_options_mean(tmp_path, monkeypatch):
+def test_options_select_topics_and_limit_files(tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(record_node, 'run', lambda selection, *more: calls.append(
-        (selection.resolved(absolute), *more)) or 7)
-    words = ('record', '--network', NETWORK_FILE, '--out', tmp_path)
-    for more in ((), ('--topics', '/a', '/b', '--split-mb', 0.5, '--split-s', 60, '--all'),
-                 ('--results',)):
-        args = arguments_of(*words, *more)
+    monkeypatch.setattr(record_node, 'run', lambda selection, *options: calls.append(
+        (selection.resolved(absolute), *options)) or 7)
+    common = ('record', '--network', NETWORK_FILE, '--out', tmp_path)
+    for options in ((), ('--topics', '/a', '/b', '--split-mb', 0.5, '--split-s', 60, '--all'),
+                    ('--results',)):
+        args = arguments_of(*common, *options)
         assert args.run_command(args) == 7
-    assert calls == [(selection.resolved(absolute), tmp_path, size, seconds * S, [])
+    assert calls == [(selection.resolved(absolute), tmp_path, size, seconds * NS, [])
                      for selection, size, seconds in (
         (Selection(FIELDS, IMUS), 10**9, 3600),
         (Selection(FIELDS, IMUS, ('/a', '/b'), everything=True), 500_000, 60),
@@ -109,14 +109,14 @@ def test_what_the_options_mean(tmp_path, monkeypatch):
     (('--split-s', 'inf'), '--split-s: expected 1 or more, got inf'),
     (('--split-s', '-5'), '--split-s: expected 1 or more, got -5'),
     (('--topics', '/a', 'i mu'), "--topics: 'i mu'")])
-def test_bad_options_are_named(tmp_path, options, message):
+def test_invalid_options_are_named(tmp_path, options, message):
     args = arguments_of('record', '--network', NETWORK_FILE, '--out', tmp_path / 'a', *options)
     with pytest.raises(SettingsError, match=message):
         args.run_command(args)
     assert not (tmp_path / 'a').exists()
 
 
-def test_another_recording_is_not_touched(tmp_path):
+def test_an_existing_recording_is_not_overwritten(tmp_path):
     (tmp_path / 'a_0.mcap').write_text('theirs')
     args = arguments_of('record', '--network', NETWORK_FILE, '--out', tmp_path)
     with pytest.raises(OutputError, match='already contains a recording'):
@@ -124,7 +124,7 @@ def test_another_recording_is_not_touched(tmp_path):
     assert not rclpy.ok() and [p.name for p in tmp_path.iterdir()] == ['a_0.mcap']
 
 
-def test_the_command_repair(tmp_path, capsys):
+def test_repair_writes_the_index(tmp_path, capsys):
     with Recorder(tmp_path / 'a') as recorder:
         recorder.add_topic('/x', 'std_msgs/msg/Header')
         recorder.write('/x', b'\0\1\0\0', 1)

@@ -1,4 +1,4 @@
-"""Two vehicles at once in a recording: what `fit` writes."""
+"""`fit` of a recording in which two vehicles pass at the same time."""
 
 import csv
 import json
@@ -13,7 +13,7 @@ from support.busy_worlds import busy
 from support.samples import sample_dict, samples_of
 
 
-def test_fit_gives_each_vehicle_a_table(tmp_path, capsys):
+def test_fit_writes_rows_and_a_figure_of_each_vehicle(tmp_path, capsys):
     a_world = busy('meeting', 2, 'clouds', 3, n=1)
     with RecordingWriter(tmp_path / 'pair.mcap') as writer:
         for s in samples_of(a_world.readings):
@@ -23,9 +23,9 @@ def test_fit_gives_each_vehicle_a_table(tmp_path, capsys):
     out = tmp_path / 'fits'
     assert main(['fit', str(tmp_path / 'pair.mcap'), '--network', str(tmp_path / 'network.yaml'),
                  '--orders', '1', '2', '--out', str(out)]) == 0
-    said = capsys.readouterr().out
-    assert 'pair, pass 1, vehicle 1:' in said and 'pair, pass 1, vehicle 2:' in said
-    assert said.count('2 vehicles were fitted together') == 2
+    output = capsys.readouterr().out
+    assert 'pair, pass 1, vehicle 1:' in output and 'pair, pass 1, vehicle 2:' in output
+    assert output.count('2 vehicles were fitted together') == 2
     with open(out / 'fits.csv', encoding='utf-8') as stream:
         rows = list(csv.DictReader(stream))
     assert [(r['pass'], r['vehicle'], r['n_vehicles'], r['n_dipoles']) for r in rows] == [

@@ -1,4 +1,4 @@
-"""The compiled encoder of messages, beside that of another library."""
+"""Compiled encoder of messages, compared with the writer of mcap_ros2."""
 
 import io
 import math
@@ -20,8 +20,8 @@ RANGES = {'bool': (0, 1), 'byte': (0, 255), **{
     for u in ('', 'u') for n in (8, 16, 32, 64)}}
 
 
-def some_value(kind, package, rng):
-    """A value of a type that is named in a definition of a `package`."""
+def random_value(kind, package, rng):
+    """Random value of a type as named in a message definition of `package`."""
     if kind == 'string':
         return TEXTS[rng.integers(len(TEXTS))]
     if kind.startswith('float'):
@@ -32,11 +32,11 @@ def some_value(kind, package, rng):
         value = rng.choice([low, high, (low + high) // 3 + 1])
         return bool(value) if kind == 'bool' else int(value)
     owner, _, leaf = kind.rpartition('/')
-    return some_message(f'{owner or package}/msg/{leaf}', rng)
+    return random_message(f'{owner or package}/msg/{leaf}', rng)
 
 
-def some_message(name, rng):
-    """A message as nested dicts, some of whose fields are missing."""
+def random_message(name, rng):
+    """Random message as nested dicts; some fields are missing."""
     content = {}
     for line in DEFINITIONS[name].splitlines():
         kind, field = line.split()[:2]
@@ -44,13 +44,13 @@ def some_message(name, rng):
             continue
         base, bracket, length = kind.partition('[')
         n = int(length[:-1] or rng.integers(4)) if bracket else None
-        values = [some_value(base, name.partition('/')[0], rng) for _ in range(n or 1)]
+        values = [random_value(base, name.partition('/')[0], rng) for _ in range(n or 1)]
         content[field] = values[0] if n is None else values[:n]
     return content
 
 
-def by_the_library(name, messages):
-    """The CDR bytes of each message, as the writer of mcap_ros2 has them."""
+def encoded_by_mcap_ros2(name, messages):
+    """CDR bytes of each message from the writer of mcap_ros2."""
     stream = io.BytesIO()
     writer = Writer(stream)
     schema = writer.register_msgdef(name, definition(name))
@@ -62,13 +62,13 @@ def by_the_library(name, messages):
 
 
 @pytest.mark.parametrize('name', DEFINITIONS)
-def test_the_bytes_are_those_of_another_library(name):
+def test_encoded_bytes_equal_those_of_mcap_ros2(name):
     rng = np.random.default_rng(len(name))
-    messages = [some_message(name, rng) for _ in range(12)]
-    assert [encoder(name)(message) for message in messages] == by_the_library(name, messages)
+    messages = [random_message(name, rng) for _ in range(12)]
+    assert [encoder(name)(message) for message in messages] == encoded_by_mcap_ros2(name, messages)
 
 
-def test_what_is_missing_has_its_default():
+def test_missing_fields_have_their_defaults():
     empty = decode(RawMessage('/markers', MARKER, 0, encoder(MARKER)({'pose': None}),
                               schema_of(MARKER)))
     orientation = empty.pose.orientation
@@ -92,7 +92,7 @@ def test_what_is_missing_has_its_default():
     ('geometry_msgs/msg/PoseWithCovariance', {'covariance': 'nothing'}, TypeError),
     ('nav_msgs/msg/Path', {'poses': {'x': 1.0}}, TypeError),
     ('nav_msgs/msg/Path', {'poses': 3}, TypeError)])
-def test_what_does_not_fit_the_type_is_refused(name, message, error):
+def test_values_of_a_wrong_type_or_range_are_refused(name, message, error):
     with pytest.raises(error):
         encoder(name)(message)
 
@@ -104,7 +104,7 @@ def test_an_error_names_the_field():
         encoder('geometry_msgs/msg/PoseWithCovariance')({'covariance': [0.0] * 35})
 
 
-def test_values_are_taken_as_python_would_take_them():
+def test_values_are_converted_as_in_python():
     point = encoder('geometry_msgs/msg/Point')
     assert point({'x': '1.5', 'y': 2, 'z': True}) == point({'x': 1.5, 'y': 2.0, 'z': 1.0})
     time = encoder('builtin_interfaces/msg/Time')

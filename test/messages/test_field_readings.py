@@ -1,4 +1,4 @@
-"""Readings of many sensors in one message: to it and back, and out of a recording."""
+"""Readings of several sensors in one message: conversion both ways, and recordings."""
 
 from array import array
 from collections import Counter
@@ -19,17 +19,17 @@ from mag_tracking.recording.writer import RecordingWriter
 from support.networks import line_network
 from support.samples import MagSample, batch, recorded, sample_dict, samples_of
 
-TOGETHER = absolute(RAW_READINGS)
+BATCH_TOPIC = absolute(RAW_READINGS)
 START = 1_700_000_000_123_456_789
 
 
 def message(content):
-    """As a decoder gives it."""
+    """Message object as a decoder returns it."""
     return SimpleNamespace(**content)
 
 
-def some(n, known, rng, names=('mag_2', 'mag_1', 'sensor three')):
-    """`n` samples; fields with axes missing, covariances that are not symmetric, to tell them."""
+def random_samples(n, known, rng, names=('mag_2', 'mag_1', 'sensor three')):
+    """`n` samples; some lack axes. Asymmetric covariances would reveal a transposition."""
     out = []
     for k in range(n):
         field = rng.standard_normal(3) * 1e-5
@@ -39,8 +39,8 @@ def some(n, known, rng, names=('mag_2', 'mag_1', 'sensor three')):
     return out
 
 
-def same(a, b):
-    """Whether two lists of samples are alike to the last bit."""
+def identical(a, b):
+    """Whether two lists of samples are identical to the last bit."""
     return len(a) == len(b) and all(
         (x.stamp_ns, x.sensor) == (y.stamp_ns, y.sensor)
         and x.field.tobytes() == y.field.tobytes()
@@ -51,11 +51,11 @@ def same(a, b):
 
 @settings(derandomize=True, deadline=None, max_examples=50)
 @given(st.integers(1, 40), st.booleans(), st.integers(0, 1000))
-def test_there_and_back_in_the_order_in_which_they_came(n, known, seed):
-    samples = some(n, known, np.random.default_rng(seed))
+def test_a_round_trip_keeps_samples_and_their_order(n, known, seed):
+    samples = random_samples(n, known, np.random.default_rng(seed))
     content = readings_dict(batch(samples))
     back = samples_of(readings_of(message(content)))
-    assert same(back, samples)
+    assert identical(back, samples)
     assert all(isinstance(s.stamp_ns, int) for s in back)
     assert sorted(content['sensors']) == sorted({s.sensor for s in samples})
     latest = max(s.stamp_ns for s in samples)
@@ -63,8 +63,8 @@ def test_there_and_back_in_the_order_in_which_they_came(n, known, seed):
         'stamp': {'sec': latest // 10**9, 'nanosec': latest % 10**9}, 'frame_id': ''}
 
 
-def test_the_arrays_are_those_of_the_definition():
-    """Row by row; numbers that come as integers or as single precision are numbers all the same."""
+def test_arrays_follow_the_message_definition():
+    """Row by row; integers and single-precision numbers are accepted."""
     samples = [MagSample(7, 'b', np.array([1, 2, 3]), np.diag([1, 2, 3])),
                MagSample(5, 'a', np.array([0.5, 1.5, 2.5], dtype=np.float32),
                          np.arange(9, dtype=np.float32).reshape(3, 3)),
@@ -78,19 +78,19 @@ def test_the_arrays_are_those_of_the_definition():
     whole = [MagSample(7, 'b', np.ones(3), np.eye(3, dtype=int))]
     assert readings_dict(batch(whole))['covariance'].tolist() == np.eye(3).ravel().tolist()
     single = [MagSample(7, 'b', np.ones(3, dtype=np.float32), np.eye(3, dtype=np.float32))]
-    assert same(samples_of(readings_of(message(readings_dict(batch(single))))),
-                [MagSample(7, 'b', np.ones(3), np.eye(3))])
+    assert identical(samples_of(readings_of(message(readings_dict(batch(single))))),
+                     [MagSample(7, 'b', np.ones(3), np.eye(3))])
 
 
-def test_some_covariances_known_or_no_sample_is_no_message():
+def test_partial_covariances_and_empty_batches_are_refused():
     rng = np.random.default_rng(0)
-    for samples in ([], some(2, True, rng) + some(1, False, rng),
-                    some(1, False, rng) + some(2, True, rng)):
+    for samples in ([], random_samples(2, True, rng) + random_samples(1, False, rng),
+                    random_samples(1, False, rng) + random_samples(2, True, rng)):
         with pytest.raises(RecordingError, match='covariances of all readings or of none'):
             readings_dict(batch(samples))
 
 
-@pytest.mark.parametrize('changes, said', [
+@pytest.mark.parametrize('changes, error', [
     ({'stamp': array('q', [1])}, 'of 2 readings: got 1 timestamps, 6 field values'),
     ({'sensor': array('H', [0])}, 'of 1 readings: got 2 timestamps'),
     ({'field': array('d', range(5))}, '5 field values'),
@@ -99,21 +99,21 @@ def test_some_covariances_known_or_no_sample_is_no_message():
     ({'sensors': []}, 'sensor index 0 is out of range; there are 0'),
     ({'stamp': array('q', [0, 2**63 - 1])}, 'timestamps 0 to 9223372036854775807 ns'),
     ({'stamp': array('q', [-2**63, 0])}, 'timestamps -9223372036854775808')])
-def test_what_does_not_fit_is_told(changes, said):
+def test_inconsistent_messages_are_refused(changes, error):
     content = readings_dict(batch(
         [MagSample(k, 'a', np.ones(3), np.eye(3)) for k in range(2)]))
     assert len(readings_of(message(content))) == 2
-    with pytest.raises(RecordingError, match=said):
+    with pytest.raises(RecordingError, match=error):
         readings_of(message(content | changes))
 
 
-def test_a_message_of_nothing_is_no_reading():
+def test_an_empty_message_has_no_readings():
     empty = {'sensors': [], 'sensor': [], 'stamp': [], 'field': [], 'covariance': []}
     assert len(readings_of(message(empty))) == 0
 
 
 def recording(path, messages):
-    """A recording of [(topic, type, content)], a second apart."""
+    """Recording of [(topic, type, content)] at intervals of one second."""
     path.parent.mkdir(exist_ok=True)
     with RecordingWriter(path) as writer:
         for k, (topic, kind, content) in enumerate(messages):
@@ -122,49 +122,51 @@ def recording(path, messages):
 
 
 @pytest.mark.parametrize('known', [True, False])
-def test_a_recording_gives_the_same_samples(tmp_path, known):
+def test_a_recording_returns_the_same_samples(tmp_path, known):
     rng = np.random.default_rng(1)
-    groups = [some(n, known, rng, ('mag_1', 'mag_2')) for n in (5, 1, 100)]
+    groups = [random_samples(n, known, rng, ('mag_1', 'mag_2')) for n in (5, 1, 100)]
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
-        (TOGETHER, FIELD_READINGS, readings_dict(batch(g))) for g in groups]),
+        (BATCH_TOPIC, FIELD_READINGS, readings_dict(batch(g))) for g in groups]),
                           line_network(2))
     assert reader.missing_topics() == []
     got = list(reader.readings_as_received())
-    assert same(samples_of(*(r for r, _ in got)), [s for g in groups for s in g])
+    assert identical(samples_of(*(r for r, _ in got)), [s for g in groups for s in g])
     assert [t for _, t in got] == [START + k * 10**9 for k, g in enumerate(groups)]
-    assert same(samples_of(*reader.readings_and_accelerations()), recorded(reader))
+    assert identical(samples_of(*reader.readings_and_accelerations()), recorded(reader))
     assert reader.rejected == Counter()
 
 
-def test_readings_of_others_and_messages_that_are_none_are_counted(tmp_path):
+def test_unknown_sensors_and_undecodable_messages_are_counted(tmp_path):
     rng = np.random.default_rng(2)
-    mine, other = some(3, False, rng, ('mag_1',)), some(4, False, rng, ('elsewhere',))
+    mine = random_samples(3, False, rng, ('mag_1',))
+    other = random_samples(4, False, rng, ('elsewhere',))
     broken = readings_dict(batch(mine))
     broken['stamp'] = broken['stamp'][:2]
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
-        (TOGETHER, FIELD_READINGS, readings_dict(batch(other + mine))),
-        (TOGETHER, FIELD_READINGS, broken)]), line_network(2))
-    assert same(recorded(reader), mine)
+        (BATCH_TOPIC, FIELD_READINGS, readings_dict(batch(other + mine))),
+        (BATCH_TOPIC, FIELD_READINGS, broken)]), line_network(2))
+    assert identical(recorded(reader), mine)
     assert reader.rejected == {'reading of elsewhere, which is not in the network': 4,
-                               f'undecodable message on {TOGETHER}': 1}
+                               f'undecodable message on {BATCH_TOPIC}': 1}
 
 
-def test_both_kinds_of_topics_are_read(tmp_path):
+def test_single_and_batch_topics_are_read(tmp_path):
     rng = np.random.default_rng(3)
-    (one,), many = some(1, True, rng, ('mag_2',)), some(3, True, rng, ('mag_1',))
+    (one,) = random_samples(1, True, rng, ('mag_2',))
+    many = random_samples(3, True, rng, ('mag_1',))
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
         ('/mag_2/imu/mag', MAGNETIC_FIELD, sample_dict(one, 'mag_2')),
-        (TOGETHER, FIELD_READINGS, readings_dict(batch(many)))]), line_network(2))
-    assert same(recorded(reader), [one, *many])
+        (BATCH_TOPIC, FIELD_READINGS, readings_dict(batch(many)))]), line_network(2))
+    assert identical(recorded(reader), [one, *many])
 
 
-def test_a_topic_of_that_name_with_another_type_is_left_alone(tmp_path):
-    (one,) = some(1, True, np.random.default_rng(4), ('mag_1',))
+def test_a_batch_topic_of_another_type_is_ignored(tmp_path):
+    (one,) = random_samples(1, True, np.random.default_rng(4), ('mag_1',))
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
         ('/mag_1/imu/mag', MAGNETIC_FIELD, sample_dict(one, 'mag_1')),
-        (TOGETHER, MAGNETIC_FIELD, sample_dict(one, 'mag_1'))]), line_network(2))
-    assert same(recorded(reader), [one])
+        (BATCH_TOPIC, MAGNETIC_FIELD, sample_dict(one, 'mag_1'))]), line_network(2))
+    assert identical(recorded(reader), [one])
     assert reader.missing_topics() == ['/mag_2/imu/mag']
     with pytest.raises(RecordingError, match="none of the network's topics"):
         SampleReader(recording(tmp_path / 'b' / 'b.mcap', [
-            (TOGETHER, MAGNETIC_FIELD, sample_dict(one, 'mag_1'))]), line_network(2))
+            (BATCH_TOPIC, MAGNETIC_FIELD, sample_dict(one, 'mag_1'))]), line_network(2))

@@ -1,4 +1,4 @@
-"""Messages as arrays against the decoder of one message after the other."""
+"""Messages decoded into arrays, compared with the decoder of single messages."""
 
 import struct
 
@@ -13,7 +13,7 @@ from mag_tracking.records import Readings
 
 
 def message(k, frame='mag_1', covariance=None):
-    """CDR bytes of one message, which differs from the others."""
+    """CDR bytes of message `k`; each message is different."""
     rng = np.random.default_rng(k)
     readings = Readings.single('mag_1', 1_790_000_000_000_000_000 + 12_345_678 * k,
                                1e-5 * rng.standard_normal(3), covariance)
@@ -22,13 +22,13 @@ def message(k, frame='mag_1', covariance=None):
 
 
 def read(messages):
-    """`FieldArrays` of the bytes of `messages`, one after the other."""
+    """`FieldArrays` of the concatenated bytes of `messages`."""
     ends = np.cumsum([len(m) for m in messages], dtype=np.int64)
     return magnetic_fields(b''.join(messages), ends - [len(m) for m in messages], ends)
 
 
 def decoded(data):
-    """`Readings` of one message, by the library."""
+    """`Readings` of one message by the decoder of single messages."""
     return reading_of(decode(RawMessage('/mag', MAGNETIC_FIELD, 0, data,
                                         schema_of(MAGNETIC_FIELD))), 'mag_1')
 
@@ -36,7 +36,7 @@ def decoded(data):
 @pytest.mark.parametrize('frames', [
     ['mag_1'], ['', 'a', 'ab', 'abc', 'abcd', 'a much longer name']])
 @pytest.mark.parametrize('known', ['none', 'all', 'some'])
-def test_all_that_the_decoder_reads_is_read_the_same(frames, known):
+def test_arrays_equal_the_decoded_messages(frames, known):
     C = [None if known == 'none' or known == 'some' and k % 3 else (k + 1.0) * 1e-16 * np.eye(3)
          for k in range(40)]
     data = [message(k, frames[k % len(frames)], C[k]) for k in range(40)]
@@ -49,10 +49,10 @@ def test_all_that_the_decoder_reads_is_read_the_same(frames, known):
         np.testing.assert_array_equal(found.covariance, expected.covariance)
 
 
-def test_a_covariance_that_is_unknown_and_nan_in_a_message_stay_apart():
+def test_unknown_and_nan_covariances_are_distinguished():
     unknown, nan = np.zeros((3, 3)), np.full((3, 3), np.nan)
     unknown[0, 0] = -1.0
-    # In `Readings` NaN is an unknown covariance; in a message it is a fault.
+    # NaN is an unknown covariance in `Readings`, but a fault in a message.
     data = [message(0, covariance=1e-16 * np.eye(3)), message(1, covariance=unknown),
             message(2)[:-72] + nan.tobytes()]
     found, expected = read(data), Readings.joined(decoded(m) for m in data)
@@ -60,16 +60,16 @@ def test_a_covariance_that_is_unknown_and_nan_in_a_message_stay_apart():
     assert np.isnan(found.covariance[1]).all() and not found.covariance[2].any()
 
 
-@pytest.mark.parametrize('spoil', [
+@pytest.mark.parametrize('damage', [
     lambda m: b'', lambda m: m[:3], lambda m: m[:15], lambda m: m[:40], lambda m: m[:-1],
     lambda m: b'\x00\x00' + m[2:], lambda m: b'\x07' + m[1:],
     lambda m: m[:12] + struct.pack('<I', 2**31 + 5) + m[16:],
     lambda m: m[:12] + struct.pack('<I', 0) + m[16:],
     lambda m: m[:16] + b'\xff' + m[17:], lambda m: m[:21] + b'x' + m[22:]])
-def test_what_is_damaged_or_unusual_is_left_to_the_decoder(spoil):
+def test_damaged_or_unusual_messages_are_left_to_the_decoder(damage):
     data = [message(k) for k in range(5)]
     good = read(data)
-    data[2] = spoil(data[2])
+    data[2] = damage(data[2])
     found = read(data)
     assert found.is_decoded.tolist() == [True, True, False, True, True]
     others = found.is_decoded
@@ -77,14 +77,14 @@ def test_what_is_damaged_or_unusual_is_left_to_the_decoder(spoil):
     np.testing.assert_array_equal(found.stamp_ns[others], good.stamp_ns[others])
 
 
-def test_of_no_message_nothing_is_read():
+def test_no_messages_give_empty_arrays():
     found = read([])
     assert found.is_decoded.shape == (0,) and found.field.shape == (0, 3)
     assert found.covariance is None
 
 
-def test_any_bytes_are_read_or_left_out():
-    """Garbage behind a true head, of any length: never an error, never beyond a message."""
+def test_random_bytes_are_decoded_or_skipped():
+    """Valid beginnings and random bytes of any length: no error, no read beyond the message."""
     rng = np.random.default_rng(3)
     data = [message(k)[:rng.integers(0, 130)] + rng.bytes(int(rng.integers(0, 40)))
             for k in range(2000)]
@@ -95,7 +95,7 @@ def test_any_bytes_are_read_or_left_out():
 
 
 def pose_message(k, frame):
-    """CDR bytes of geometry_msgs/PoseStamped, which differ from the others'."""
+    """CDR bytes of geometry_msgs/PoseStamped `k`; each message is different."""
     numbers = np.random.default_rng(k).standard_normal(7).tolist()
     return encoder(POSE)({'header': header_dict(10**18 + 7 * k, frame), 'pose': {
         'position': dict(zip('xyz', numbers, strict=False)),
@@ -103,31 +103,32 @@ def pose_message(k, frame):
 
 
 def poses_of(messages, frame='map'):
-    """`PoseArrays` of the bytes of `messages`."""
+    """`PoseArrays` of the concatenated bytes of `messages`."""
     ends = np.cumsum([len(m) for m in messages], dtype=np.int64)
     return poses(b''.join(messages), ends - [len(m) for m in messages], ends, frame)
 
 
 @pytest.mark.parametrize('frame', ['map', '', 'a much longer name', 'möp'])
-def test_poses_of_a_frame_are_read_as_by_the_decoder(frame):
-    """Also where another frame has a name of the same length."""
+def test_poses_of_a_frame_equal_the_decoded_messages(frame):
+    """Also if the name of another frame has the same length."""
     frames = ['map', 'utm', '', 'a', 'a much longer name', 'möp', 'odom']
     data = [pose_message(k, frames[k % len(frames)]) for k in range(28)]
     found = poses_of(data, frame)
     assert found.is_decoded.tolist() == [frames[k % len(frames)] == frame for k in range(28)]
     for k in np.flatnonzero(found.is_decoded):
-        said = decode(RawMessage('/p', POSE, 0, data[k], schema_of(POSE)))
-        p, q = said.pose.position, said.pose.orientation
+        expected = decode(RawMessage('/p', POSE, 0, data[k], schema_of(POSE)))
+        p, q = expected.pose.position, expected.pose.orientation
         assert found.pose[k].tolist() == [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
-        assert found.stamp_ns[k] == said.header.stamp.sec * 10**9 + said.header.stamp.nanosec
+        assert found.stamp_ns[k] == (expected.header.stamp.sec * 10**9
+                                     + expected.header.stamp.nanosec)
 
 
-@pytest.mark.parametrize('spoil', [
+@pytest.mark.parametrize('damage', [
     lambda m: b'', lambda m: m[:3], lambda m: m[:15], lambda m: m[:40], lambda m: m[:-1],
     lambda m: b'\x00\x00' + m[2:], lambda m: b'\x07' + m[1:],
     lambda m: m[:12] + struct.pack('<I', 2**31 + 5) + m[16:],
     lambda m: m[:12] + struct.pack('<I', 0) + m[16:], lambda m: m[:19] + b'x' + m[20:]])
-def test_poses_that_are_damaged_or_unusual_are_left_to_the_decoder(spoil):
+def test_damaged_or_unusual_poses_are_left_to_the_decoder(damage):
     data = [pose_message(k, 'map') for k in range(5)]
-    data[2] = spoil(data[2])
+    data[2] = damage(data[2])
     assert poses_of(data).is_decoded.tolist() == [True, True, False, True, True]

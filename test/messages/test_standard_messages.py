@@ -1,4 +1,4 @@
-"""Tracks and sensors as messages of other packages: transforms, detections, markers."""
+"""Tracks and sensors as standard messages: transforms, detections, markers."""
 
 import dataclasses
 
@@ -26,7 +26,7 @@ from support.track_runs import magnet_frames
 
 @pytest.fixture(scope='module')
 def tracks():
-    """{ambiguous: the last such `Track`} of one replay."""
+    """{is ambiguous: last such `Track`} of one replay."""
     from mag_tracking.network.file import read_network
     from mag_tracking.pipeline import Pipeline, settings_for
     from mag_tracking.recording.reader import Recording
@@ -44,7 +44,7 @@ def tracks():
     return found
 
 
-def test_transforms_of_the_sensors_are_the_network():
+def test_sensor_transforms_equal_the_network():
     network = line_network(4)
     messages = sensor_transform_dicts(network, 7)
     assert tuple(m['child_frame_id'] for m in messages) == network.names
@@ -56,7 +56,7 @@ def test_transforms_of_the_sensors_are_the_network():
         assert m['header'] == {'stamp': {'sec': 0, 'nanosec': 7}, 'frame_id': 'map'}
 
 
-def test_the_transform_of_a_track_is_its_pose(tracks):
+def test_a_track_transform_equals_its_pose(tracks):
     track = tracks[False]
     (message,) = track_transform_dict(track, 'map', 'target')['transforms']
     pose = pose_message_dict(track, 'map')['pose']['pose']
@@ -66,7 +66,7 @@ def test_the_transform_of_a_track_is_its_pose(tracks):
     assert track_transform_dict(tracks[True], 'map', 'target') is None
 
 
-def test_a_track_is_a_detection_with_the_probability_of_each_kind(tracks):
+def test_a_detection_has_the_probability_of_each_kind(tracks):
     for track in tracks.values():
         ((detection,),) = [detections_3d_dict(track, 'map')['detections']]
         scores = {r['hypothesis']['class_id']: r['hypothesis']['score']
@@ -77,12 +77,12 @@ def test_a_track_is_a_detection_with_the_probability_of_each_kind(tracks):
         assert detection['bbox']['size']['x'] == track.length and detection['id'] == '1'
         pose = pose_message_dict(track, 'map')['pose']
         assert all(r['pose'] == pose for r in detection['results'])
-    held = dataclasses.replace(track, topic_uncertainty=None)
-    for gone in (held, dataclasses.replace(track, ended=True)):
+    without_uncertainty = dataclasses.replace(track, topic_uncertainty=None)
+    for gone in (without_uncertainty, dataclasses.replace(track, ended=True)):
         assert detections_3d_dict(gone, 'map')['detections'] == []
 
 
-def test_a_magnet_has_a_class_too():
+def test_a_magnet_has_a_class():
     from mag_tracking.pipeline import settings_for
     from mag_tracking.stages.track.manager import TrackManager
     network, frames, _ = magnet_frames(3)
@@ -92,7 +92,7 @@ def test_a_magnet_has_a_class_too():
     assert [r['hypothesis']['class_id'] for r in detection['results']] == ['magnet']
 
 
-def test_markers_have_a_namespace_a_kind_and_an_id_a_track(tracks):
+def test_markers_have_a_namespace_per_kind_and_an_id_per_track(tracks):
     track = dataclasses.replace(tracks[False], id=7)
     markers = track_markers(track, 'map')['markers']
     assert tuple(m['ns'] for m in markers) == TRACK_KINDS
@@ -104,18 +104,18 @@ def test_markers_have_a_namespace_a_kind_and_an_id_a_track(tracks):
     assert track_markers(tracks[True], 'map')['markers'][2]['text'].endswith(' m/s?')
 
 
-def test_the_ellipsoid_is_that_of_the_pose_topics(tracks):
-    """The ellipsoid of an ambiguous track covers all that is possible."""
+def test_the_ellipsoid_matches_the_covariance_of_pose_topics(tracks):
+    """The ellipsoid of an ambiguous track covers all hypotheses."""
     for ambiguous, track in tracks.items():
         scale = track_markers(track, 'map')['markers'][0]['scale']
-        about = track.topic_uncertainty.covariance[:3, :3]
+        published = track.topic_uncertainty.covariance[:3, :3]
         np.testing.assert_allclose(
-            sorted(scale.values()), 2 * 2.5003 * np.sqrt(np.linalg.eigvalsh(about)), rtol=1e-9)
+            sorted(scale.values()), 2 * 2.5003 * np.sqrt(np.linalg.eigvalsh(published)), rtol=1e-9)
         own = 2 * 2.5003 * np.sqrt(np.linalg.eigvalsh(track.covariance[:3, :3])[-1])
         assert (max(scale.values()) > 1.001 * own) <= ambiguous
 
 
-def test_sensors_are_shown_where_they_are():
+def test_sensor_markers_are_at_the_sensor_positions():
     network = line_network(4, spacing=0.02)
     network = dataclasses.replace(network, positions=network.positions * 0.01)
     markers = sensor_markers(network)['markers']
@@ -124,5 +124,5 @@ def test_sensors_are_shown_where_they_are():
     for j, m in enumerate(markers[::2]):
         p = m['pose']['position']
         np.testing.assert_allclose([p['x'], p['y'], p['z']], network.positions[j])
-        # On a board a marker is smaller than the distance of two.
+        # On a board, a marker is smaller than the sensor spacing.
         assert 0.0 < m['scale']['x'] < 0.0002

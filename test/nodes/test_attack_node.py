@@ -1,4 +1,4 @@
-"""An attack on running nodes: nothing is written outside, no node dies, every call is answered."""
+"""Attack on running nodes: no file outside is written, no node dies, all calls are answered."""
 
 import os
 from pathlib import Path
@@ -20,8 +20,8 @@ from support.node_processes import MAX_S, start, stop
 
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(600)]
 
-N_TRIES = 200
-N_AT_ONCE = 40
+N_ATTACKS = 200
+N_CONCURRENT = 40
 PATHS = ('', '/', '.', '..', '/etc/passwd', '/dev/full', '/dev/null', '../../../../x.yaml',
          '~/.bashrc', 'a' * 5000, '/proc/self/mem', 'outside/theirs.yaml', '\n', '//', 'ä\u202e',
          '/nonexistent/dir/file.yaml', 'link.yaml', 'network.yaml')
@@ -33,29 +33,29 @@ FIXED = {'calibration_node': ('network', 'save_as', 'state_file', 'target', 'rel
 
 
 @pytest.fixture
-def place(tmp_path):
-    """(folder of the network file, folder that nobody may touch); links lead from one to other."""
-    here, theirs = tmp_path / 'here', tmp_path / 'outside'
-    here.mkdir()
-    theirs.mkdir()
-    (here / 'network.yaml').write_text(NETWORK_FILE.read_text())
+def folders(tmp_path):
+    """(folder of the network file, protected folder); links in the first lead to the second."""
+    own, protected = tmp_path / 'here', tmp_path / 'outside'
+    own.mkdir()
+    protected.mkdir()
+    (own / 'network.yaml').write_text(NETWORK_FILE.read_text())
     for name in ('network_calibrated.yaml', 'network_calibrated.yaml.part', 'link.yaml'):
-        (theirs / name).write_text('theirs')
-        (here / name).symlink_to(theirs / name)
-    (here / 'outside').symlink_to(theirs)
-    return here, theirs
+        (protected / name).write_text('theirs')
+        (own / name).symlink_to(protected / name)
+    (own / 'outside').symlink_to(protected)
+    return own, protected
 
 
 def contents(*folders):
-    """{path: (bytes, link)} of all that lies in folders."""
+    """{path: (bytes, is a link)} of all files in folders."""
     return {path: (path.read_bytes() if path.is_file() else b'', path.is_symlink())
             for folder in folders for path in sorted(Path(folder).rglob('*'))}
 
 
-def nodes_of(here, home):
-    """The nodes as processes, with a recording that plays over and over."""
-    network = ['-p', f'network:={here / "network.yaml"}']
-    drivers = here / 'drivers.yaml'
+def start_nodes(own, home):
+    """Start the nodes as processes; a recording is played in a loop."""
+    network = ['-p', f'network:={own / "network.yaml"}']
+    drivers = own / 'drivers.yaml'
     drivers.write_text(NO_DEVICES)
     return {name: start(name, *arguments, home=home) for name, arguments in {
         'calibration_node': network, 'detection_node': network, 'tracker_node': network,
@@ -76,14 +76,14 @@ nobody:
 
 
 class Attacker:
-    """Calls services, each through one client."""
+    """Client of services; each service has one client."""
 
     def __init__(self, ros):
         self.node, self.spin_until = ros
         self._clients = {}
 
     def __call__(self, kind, name, request):
-        """The response of a service."""
+        """Response of a service."""
         client = self._clients.get(name) or self.node.create_client(kind, name)
         self._clients[name] = client
         assert self.spin_until(client.service_is_ready), f'there is no {name}'
@@ -96,7 +96,7 @@ class Attacker:
 
 
 def set_parameters(call, node, pairs, atomically=False):
-    """Results of setting parameters of a node."""
+    """Set parameters of a node; return the results."""
     parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in pairs]
     kind, leaf = (SetParametersAtomically, 'set_parameters_atomically') if atomically else \
         (SetParameters, 'set_parameters')
@@ -104,8 +104,8 @@ def set_parameters(call, node, pairs, atomically=False):
     return [answer.result] if atomically else answer.results
 
 
-def one_try(call, rng, k):
-    """One of the attacks: a parameter, a service with odd values."""
+def attack_once(call, rng, k):
+    """Attack number `k`: set a parameter or call a service with invalid values."""
     node = NODES[k % len(NODES)]
     path = PATHS[int(rng.integers(len(PATHS)))]
     if k % 4 < 2:
@@ -124,8 +124,8 @@ def one_try(call, rng, k):
         assert answer.success == (offset == 2.0)
 
 
-def many_at_once(ros):
-    """Ask for many things at once; every call is answered."""
+def send_concurrent_calls(ros):
+    """Send many calls at once and assert that each is answered."""
     node, spin_until = ros
     clients = [(node.create_client(kind, name), request) for kind, name, request in (
         (Survey, '/calibration_node/survey', Survey.Request(save=True)),
@@ -133,83 +133,83 @@ def many_at_once(ros):
         (Trigger, '/replay_node/pause', Trigger.Request()),
         (GetParameters, '/tracker_node/get_parameters', GetParameters.Request(names=['network'])),
         (Trigger, '/replay_node/resume', Trigger.Request()))
-        for _ in range(N_AT_ONCE // 5)]
+        for _ in range(N_CONCURRENT // 5)]
     assert spin_until(lambda: all(c.service_is_ready() for c, _ in clients))
-    # A server may know a client a moment later than the client knows it.
+    # A server may discover a client later than the client discovers the server.
     spin_until(lambda: False, 2.0)
     futures = [client.call_async(request) for client, request in clients]
     assert spin_until(lambda: all(f.done() for f in futures), MAX_S), sum(
         f.done() for f in futures)
     one, request = clients[0]
-    futures = [one.call_async(request) for _ in range(N_AT_ONCE)]
+    futures = [one.call_async(request) for _ in range(N_CONCURRENT)]
     assert spin_until(lambda: all(f.done() for f in futures), MAX_S), sum(
         f.done() for f in futures)
     for client, _ in clients:
         node.destroy_client(client)
 
 
-def test_an_attack(ros, place, tmp_path):
-    here, theirs = place
+def test_nodes_survive_an_attack(ros, folders, tmp_path):
+    own, protected = folders
     node, spin_until = ros
     home = tmp_path / 'home'
     home.mkdir()
-    processes = nodes_of(here, home)
+    processes = start_nodes(own, home)
     try:
         assert spin_until(lambda: set(NODES) <= set(node.get_node_names()))
-        before, attack = contents(here, theirs), Attacker(ros)
-        # The one thing that may be written is, in the place of a link that was planted.
+        before, attack = contents(own, protected), Attacker(ros)
+        # The only file that may be written replaces a planted link.
         answers = []
         assert spin_until(lambda: answers.append(attack(
             Survey, '/calibration_node/survey', Survey.Request(save=True)).success)
             or any(answers))
         rng = np.random.default_rng(0)
-        for k in range(N_TRIES):
-            one_try(attack, rng, k)
-        many_at_once(ros)
+        for k in range(N_ATTACKS):
+            attack_once(attack, rng, k)
+        send_concurrent_calls(ros)
         assert not [name for name, p in processes.items() if p.poll() is not None]
-        after = contents(here, theirs)
+        after = contents(own, protected)
     finally:
         codes, outputs = stop(list(processes.values()))
     assert not any(codes), outputs
     assert not any('Traceback' in text for text in outputs), outputs
     changed = {p for p in before.keys() | after.keys() if before.get(p) != after.get(p)}
-    assert changed == {here / 'network_calibrated.yaml'}
-    assert not (here / 'network_calibrated.yaml').is_symlink()
+    assert changed == {own / 'network_calibrated.yaml'}
+    assert not (own / 'network_calibrated.yaml').is_symlink()
     written = [p.relative_to(home) for p in home.rglob('*') if p.is_file()]
     assert all(p.parts[0] in ('mag_tracking', 'log') for p in written), written
 
 
 @pytest.mark.parametrize('parameter', ['save_as', 'state_file'])
-@pytest.mark.parametrize('name, told', [
+@pytest.mark.parametrize('name, message', [
     ('/etc/x.yaml', 'must be in the folder of the network file'),
     ('../x.yaml', 'must be in the folder of'),
     ('outside/x.yaml', 'must be in the folder of'), ('..', 'is not a file name'),
     ('network.yaml', 'is the network file, which must not be')])
-def test_a_place_outside_is_refused_at_the_start(place, parameter, name, told):
-    here, theirs = place
-    with pytest.raises(SettingsError, match=told):
-        created(here, parameter, name)
-    assert set(os.listdir(theirs)) == {'network_calibrated.yaml', 'network_calibrated.yaml.part',
-                                       'link.yaml'}
+def test_a_file_outside_the_folder_is_refused_at_start(folders, parameter, name, message):
+    own, protected = folders
+    with pytest.raises(SettingsError, match=message):
+        create_node(own, parameter, name)
+    assert set(os.listdir(protected)) == {'network_calibrated.yaml', 'network_calibrated.yaml.part',
+                                          'link.yaml'}
 
 
-def created(here, parameter, name):
-    """A calibration node that is given the name of a file."""
+def create_node(own, parameter, name):
+    """Create a calibration node with a file name in a parameter."""
     begin()
     try:
         node = CalibrationNode(parameter_overrides=[
-            Parameter('network', value=str(here / 'network.yaml')),
+            Parameter('network', value=str(own / 'network.yaml')),
             Parameter(parameter, value=name)])
         node.destroy_node()
     finally:
         rclpy.try_shutdown()
 
 
-def test_a_file_of_somebody_else_is_not_taken_for_backgrounds(place):
-    here, _ = place
-    (here / 'notes.txt').write_text('theirs')
+def test_a_file_without_backgrounds_is_refused_as_state_file(folders):
+    own, _ = folders
+    (own / 'notes.txt').write_text('theirs')
     with pytest.raises(SettingsError, match='exists and is not a file of backgrounds'):
-        created(here, 'state_file', 'notes.txt')
-    write_backgrounds(here / 'kept.json', {})
-    created(here, 'state_file', 'kept.json')
-    created(here, 'state_file', 'new.json')
+        create_node(own, 'state_file', 'notes.txt')
+    write_backgrounds(own / 'kept.json', {})
+    create_node(own, 'state_file', 'kept.json')
+    create_node(own, 'state_file', 'new.json')

@@ -1,4 +1,4 @@
-"""The file of stored backgrounds is written when there is something new, and else now and then."""
+"""The file of backgrounds is written as soon as a background is known, else at intervals."""
 
 import json
 from dataclasses import replace
@@ -30,7 +30,7 @@ def test_a_background_is_stored_as_soon_as_it_is_known(tmp_path):
     assert stored() == {}
     stage.feed(one(MagSample(10**18, 'mag_1', np.full(3, 1e-8))))
     assert stored() == {'mag_1': 10**18}
-    # Another reading is no news; another sensor is.
+    # A background is written for another sensor, not for another reading.
     stage.feed(one(MagSample(10**18 + 10**7, 'mag_1', np.full(3, 2e-8))))
     assert stored() == {'mag_1': 10**18}
     stage.feed(one(MagSample(10**18, 'mag_2', np.full(3, 1e-8))))

@@ -1,4 +1,4 @@
-"""Work that waits until the results are out: once, in time, and nothing of it is lost."""
+"""Deferred work: done once, in time, and never lost."""
 
 import time
 
@@ -18,38 +18,37 @@ from support.node_processes import start, stop
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 
 
-def test_who_asks_twice_is_called_once(ros):
+def test_repeated_requests_cause_one_call(ros):
     node, spin_until = ros
-    called, asked = [], []
-    later = Deferred(node, 0.05, lambda: called.append(time.monotonic()))
+    called, requested = [], []
+    deferred = Deferred(node, 0.05, lambda: called.append(time.monotonic()))
 
-    def ask():
-        asked.append(time.monotonic())
-        later.request()
+    def request():
+        requested.append(time.monotonic())
+        deferred.request()
     for n in (1, 2):
         for _ in range(3):
-            ask()
+            request()
         assert spin_until(lambda n=n: len(called) == n)
-        assert called[-1] - asked[-3] > 0.045
+        assert called[-1] - requested[-3] > 0.045
         spin_until(lambda: False, 0.2)
         assert len(called) == n
 
 
-def test_what_waits_is_asked_for_all_the_time_and_done_all_the_same(ros):
-    """Who asks while it waits does not put it off."""
+def test_continuous_requests_do_not_postpone_the_call(ros):
     node, spin_until = ros
     called = []
-    later = Deferred(node, 0.05, lambda: called.append(0))
-    node.create_timer(0.01, later.request)
+    deferred = Deferred(node, 0.05, lambda: called.append(0))
+    node.create_timer(0.01, deferred.request)
     assert spin_until(lambda: len(called) >= 5)
 
 
-def test_of_readings_that_come_together_each_is_looked_at(ros):
-    """Though the calibration looks at them behind its publishing."""
+def test_every_reading_of_a_message_is_evaluated(ros):
+    """The calibration evaluates them after publishing."""
     node, spin_until = ros
-    heard, statuses, rng, stamps = [], {}, np.random.default_rng(0), []
+    received, statuses, rng, stamps = [], {}, np.random.default_rng(0), []
     publisher = node.create_publisher(FieldReadings, RAW_READINGS, STREAM)
-    node.create_subscription(FieldReadings, '/field_readings_calibrated', heard.append, STREAM)
+    node.create_subscription(FieldReadings, '/field_readings_calibrated', received.append, STREAM)
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: statuses.update(
         {s.name: {v.key: v.value for v in s.values} for s in m.status}), RESULTS)
 
@@ -65,10 +64,10 @@ def test_of_readings_that_come_together_each_is_looked_at(ros):
 
         def values(name):
             return statuses.get(f'calibration_node: {name}', {})
-        assert spin_until(lambda: heard and all(
+        assert spin_until(lambda: received and all(
             values(name).get('background') == 'ready' for name in ('mag_1', 'mag_2')))
         timer.cancel()
-        # Were it every other one, it would be half of this.
+        # If every other reading were missed, the rate would be half of this.
         sent = 1e9 / np.median(np.diff(stamps))
         for name in ('mag_1', 'mag_2'):
             assert 0.75 * sent < float(values(name)['rate [Hz]']) < 1.33 * sent

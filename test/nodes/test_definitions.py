@@ -1,4 +1,4 @@
-"""Definitions of message types, as recordings carry them."""
+"""Definitions of message types as stored in recordings."""
 
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -11,8 +11,8 @@ from support.bundled import ROOT
     'sensor_msgs/msg/Imu', 'diagnostic_msgs/msg/DiagnosticArray', 'nav_msgs/msg/Odometry',
     'sensor_msgs/msg/PointCloud2', 'visualization_msgs/msg/MarkerArray',
     'rcl_interfaces/msg/ParameterEvent', 'nav_msgs/msg/Path', 'rosgraph_msgs/msg/Clock'])
-def test_definitions_are_those_of_ros(type_name):
-    """As rosbags has them of its own: every type, field and constant."""
+def test_definitions_equal_those_of_ros(type_name):
+    """Every type, field and constant equals that of rosbags."""
     store = get_typestore(Stores.ROS2_JAZZY)
     found = get_types_from_msg(definition_of(type_name), type_name)
     needed = {type_name}
@@ -23,7 +23,7 @@ def test_definitions_are_those_of_ros(type_name):
 
 
 def names_in(definition):
-    """The message types that a type of rosbags names."""
+    """Message types named in a definition of rosbags."""
     def walk(node):
         if isinstance(node, str):
             return {node} if '/msg/' in node else set()
@@ -31,10 +31,10 @@ def names_in(definition):
     return walk(definition[1])
 
 
-def test_definitions_of_our_own_and_of_unknown_types(monkeypatch, tmp_path):
-    ours = definition_of('mag_tracking_msgs/msg/HypothesisArray')
-    assert ours.count('MSG: mag_tracking_msgs/Hypothesis\n') == 1
-    assert ours.startswith((ROOT / 'msg_defs/msg/HypothesisArray.msg').read_text())
+def test_own_types_have_a_definition_and_unknown_types_have_none(monkeypatch, tmp_path):
+    own = definition_of('mag_tracking_msgs/msg/HypothesisArray')
+    assert own.count('MSG: mag_tracking_msgs/Hypothesis\n') == 1
+    assert own.startswith((ROOT / 'msg_defs/msg/HypothesisArray.msg').read_text())
     assert definition_of('odd_msgs/msg/Odd') is None
     monkeypatch.setenv('AMENT_PREFIX_PATH', f'/nowhere:{tmp_path}')
     folder = tmp_path / 'share' / 'new_msgs' / 'msg'

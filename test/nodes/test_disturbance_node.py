@@ -1,4 +1,4 @@
-"""A field that no target explains, from node to node: the tracker says the same as offline."""
+"""Disturbance through the nodes: the tracker publishes the same as a replay."""
 
 import numpy as np
 import pytest
@@ -21,16 +21,16 @@ pytestmark = pytest.mark.timeout(600)
 NAMES = ('calibration_node', 'detection_node', 'tracker_node')
 
 
-def test_the_tracker_publishes_the_disturbance_that_a_replay_finds(ros):
+def test_the_tracker_publishes_the_disturbance_of_a_replay(ros):
     node, spin_until = ros
     world = made('a temperature step', 'boxes', 0)
     readings = world.readings.part(world.readings.stamp_ns < 14 * NS)
     pipeline = Pipeline(world.network, settings_for('vehicle'))
     expected = [r for r in pipeline.feed(readings) if isinstance(r, Disturbance)]
     assert len(expected) == 1 and not expected[0].ended
-    found, frames, heard = [], [], set()
-    # A node whose diagnostics come has also found what this one subscribes to.
-    node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: heard.update(
+    found, frames, discovered = [], [], set()
+    # A node whose diagnostics arrive has also discovered the subscriptions of this node.
+    node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: discovered.update(
         s.name.split(':')[0].strip('/') for s in m.status), RESULTS)
     node.create_subscription(DisturbanceMessage, '/tracker_node/disturbances', found.append,
                              STREAM_OUTPUT)
@@ -43,11 +43,11 @@ def test_the_tracker_publishes_the_disturbance_that_a_replay_finds(ros):
                           and node.count_subscribers('/network_frame') > 1
                           and node.count_publishers('/network_frame')
                           and node.count_publishers('/tracker_node/disturbances')
-                          and heard.issuperset(NAMES))
+                          and discovered.issuperset(NAMES))
         for i in range(0, len(readings), 40):
             part = readings.part(slice(i, i + 40))
             publisher.publish(to_message(FieldReadings, readings_dict(part)))
-            # Nothing is lost where nobody is ahead: wait for the frames, but for the open one.
+            # Wait for all frames but the open one, so that no queue overflows.
             reached = int(part.stamp_ns[0]) - NS // 2
             assert spin_until(lambda reached=reached: reached < 4 * NS or frames
                               and stamp_ns(frames[-1].header.stamp) >= reached)
@@ -55,7 +55,8 @@ def test_the_tracker_publishes_the_disturbance_that_a_replay_finds(ros):
     finally:
         codes, outputs = stop(processes)
     assert codes == [0] * 3, outputs
-    said = to_message(DisturbanceMessage, disturbance_dict(expected[0], 'map'))
-    assert np.isclose(found[0].largest, said.largest) and np.isclose(found[0].uniform, said.uniform)
+    offline = to_message(DisturbanceMessage, disturbance_dict(expected[0], 'map'))
+    assert (np.isclose(found[0].largest, offline.largest)
+            and np.isclose(found[0].uniform, offline.uniform))
     for name in ('header', 'id', 'ended', 'begin', 'sensors', 'track_id'):
-        assert getattr(found[0], name) == getattr(said, name), name
+        assert getattr(found[0], name) == getattr(offline, name), name

@@ -1,4 +1,4 @@
-"""A background that is doubtful, from node to node: the tracker flags what comes of it."""
+"""Doubtful background through the nodes: the tracker flags its poses as ambiguous."""
 
 import pytest
 from mag_tracking_msgs.msg import CalibrationState, FieldReadings, TrackArray
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.timeout(600)
 NAMES = ('calibration_node', 'detection_node', 'tracker_node')
 
 
-def test_after_dense_traffic_the_nodes_track_and_flag(ros):
+def test_nodes_track_and_flag_poses_after_dense_traffic(ros):
     node, spin_until = ros
     readings = after_dense_traffic('junction_left_to_right', 7.0)
     t = (readings.stamp_ns - readings.stamp_ns.min()) / NS

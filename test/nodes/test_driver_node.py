@@ -1,4 +1,4 @@
-"""The driver node: a device at one end, topics and diagnostics at the other; its life cycle."""
+"""Driver node: from a device to topics and diagnostics; lifecycle."""
 
 import time
 
@@ -33,7 +33,7 @@ board:
 
 
 def line_of(sensor, k, tick):
-    """Line k of a sensor, lying flat, at a tick of 10 ms; x [nT] says which tick."""
+    """Line `k` of a level sensor at a tick of 10 ms; x [nT] encodes the tick."""
     body = f'{sensor},{k},{10_000 * tick},{2000 + tick},15500,-49000,0,0,1'
     checksum = 0
     for c in body.encode():
@@ -43,9 +43,9 @@ def line_of(sensor, k, tick):
 
 @pytest.fixture
 def board(ros, tmp_path):
-    """(node, talk, files): a board that speaks at 100 Hz while `talk` waits for a condition.
+    """(node, spin_until, line, drivers file, state) of a board that sends at 100 Hz.
 
-    Its clock goes on while the test's process gets no time to speak.
+    Its clock continues while the process of the test is delayed.
     """
     node, spin_until = ros
     line = SerialLine(tmp_path / 'port')
@@ -55,7 +55,7 @@ def board(ros, tmp_path):
     state = {'k': 0, 'tick': 0, 'plugged': True, 'garbage': b'', 'skip': 0}
     began = time.monotonic()
 
-    def speak():
+    def send():
         tick = int((time.monotonic() - began) / 0.01)
         if tick == state['tick']:
             return
@@ -66,22 +66,22 @@ def board(ros, tmp_path):
                 line_of(s, state['k'], tick) for s in 'AB'))
             state['garbage'] = b''
 
-    node.create_timer(0.01, speak)
+    node.create_timer(0.01, send)
     yield node, spin_until, line, drivers, state
     if state['plugged']:
         line.pull_out()
 
 
 def listen(node, kind, topic, qos=STREAM):
-    """A list that fills with the messages of a topic, each with the time when it came."""
-    heard = []
-    node.create_subscription(kind, topic, lambda m: heard.append((time.time_ns(), m)), qos)
-    return heard
+    """List of (arrival [ns], message) of a topic, filled while `node` spins."""
+    received = []
+    node.create_subscription(kind, topic, lambda m: received.append((time.time_ns(), m)), qos)
+    return received
 
 
-def status_of(heard):
-    """The newest status of the board; None before the first."""
-    for _, array in reversed(heard):
+def status_of(received):
+    """Latest status of the board; None before the first."""
+    for _, array in reversed(received):
         for status in array.status:
             if status.hardware_id == 'board':
                 return status
@@ -93,42 +93,42 @@ def values_of(status):
     return {v.key: v.value for v in status.values}
 
 
-def test_a_board_on_a_serial_line(board):
+def test_a_serial_board_is_published_and_reconnected(board):
     node, spin_until, line, drivers, state = board
     fields = listen(node, MagneticField, '/mag_1/imu/mag')
     accelerations = listen(node, Imu, '/mag_2/imu/data_raw')
     diagnostics = listen(node, DiagnosticArray, '/diagnostics', RESULTS)
     process = start('driver_node', '-p', f'drivers:={drivers}', '-p', f'network:={NETWORK_FILE}')
     try:
-        # What the board has said before the port was open comes at once, at the beginning.
+        # Lines that were sent before the port was opened arrive together at the beginning.
         assert spin_until(lambda: len(fields) > 100 and len(accelerations) > 100
                           and fields[-100][0] > fields[0][0] + 200_000_000)
         _, message = fields[-1]
         np.testing.assert_allclose(message.magnetic_field.y, 1.55e-5, rtol=1e-12)
         assert message.header.frame_id == 'mag_1'
         assert not any(message.magnetic_field_covariance)
-        _, shaken = accelerations[-1]
-        assert shaken.linear_acceleration.z == pytest.approx(9.80665)
-        assert shaken.orientation_covariance[0] == -1.0
-        # Stamped by the board's clock: evenly, however late they came; and close to now. The
-        # least delay counts, for on a loaded machine readings wait for this process.
+        _, imu = accelerations[-1]
+        assert imu.linear_acceleration.z == pytest.approx(9.80665)
+        assert imu.orientation_covariance[0] == -1.0
+        # Timestamps follow the board's clock: regular even if readings arrive late, and close to
+        # the arrival. The smallest delay counts: on a busy machine, readings wait for this process.
         stamps = np.array([stamp_ns(m.header.stamp) for _, m in fields[-80:]])
         steps = np.array([round(1e9 * m.magnetic_field.x) for _, m in fields[-80:]])
         late = np.array([came for came, _ in fields[-80:]]) - stamps
         assert np.abs(np.diff(stamps) / np.diff(steps) - 1e7).max() < 1e6
         assert 0 <= late.min() < 50_000_000
 
-        # What is lost or garbled is counted and told.
+        # Lost and garbled lines are counted and reported.
         state['skip'], state['garbage'] = 7, b'A,1,2,3*00\nA,half a li'
         assert spin_until(lambda: status_of(diagnostics) is not None
                           and 'lost: mag_1' in values_of(status_of(diagnostics)))
         values = values_of(status_of(diagnostics))
-        # Seven were skipped, and the half line took the whole one behind it along.
+        # Seven were skipped, and the incomplete line corrupted the line after it.
         assert (values['lost: mag_1'], values['lost: mag_2']) == ('8', '7')
         assert any('checksum' in key for key in values)
         assert status_of(diagnostics).level == DiagnosticStatus.WARN
 
-        # The port vanishes: an error that names it; it comes back, and within 2 s so do fields.
+        # A missing port is an error that names it. Fields are back within 2 s of its return.
         line.pull_out()
         state['plugged'] = False
         assert spin_until(lambda: status_of(diagnostics).level == DiagnosticStatus.ERROR)
@@ -138,7 +138,7 @@ def test_a_board_on_a_serial_line(board):
         line.plug_in()
         state['plugged'] = True
         assert spin_until(lambda: len(fields) > n, 2.0)
-        # What was lost meanwhile is a warning first.
+        # The readings lost meanwhile cause a warning first.
         assert spin_until(lambda: status_of(diagnostics).level == DiagnosticStatus.OK)
     finally:
         codes, outputs = stop([process])
@@ -146,7 +146,7 @@ def test_a_board_on_a_serial_line(board):
     assert 'open again' in outputs[0]
 
 
-def test_a_life_cycle(board):
+def test_lifecycle_transitions_start_and_stop_publishing(board):
     node, spin_until, line, drivers, _ = board
     fields = listen(node, MagneticField, '/mag_2/imu/mag')
     process = start('driver_node', '-p', 'autostart:=false', '-p', f'drivers:={drivers}')
@@ -181,7 +181,7 @@ def test_a_life_cycle(board):
     assert 'gauss' in outputs[0]
 
 
-def test_readings_in_batches(board):
+def test_readings_are_published_in_batches(board):
     node, spin_until, _, drivers, _ = board
     drivers.write_text(drivers.read_text().replace('  unit: nT', '  unit: nT\n  batch_s: 0.05'))
     batches = listen(node, FieldReadings, '/field_readings')
@@ -202,8 +202,8 @@ def test_readings_in_batches(board):
     np.testing.assert_allclose(samples[0][0].field[1:], [1.55e-5, -4.9e-5])
 
 
-def test_readings_in_batches_reach_the_tracker(ros, tmp_path):
-    """The simulator's readings go in batches from node to node, and none is missing in a frame."""
+def test_readings_in_batches_reach_the_frames(ros, tmp_path):
+    """Readings of a simulator pass the nodes in batches, and no frame lacks a reading."""
     node, spin_until = ros
     network, drivers = tmp_path / 'network.yaml', tmp_path / 'drivers.yaml'
     rows = ''.join(f'  mag_{k}: {{position: [{9 * k}, 0, 0], noise_std: 1.2e-8, '
@@ -225,30 +225,30 @@ def test_readings_in_batches_reach_the_tracker(ros, tmp_path):
         codes, outputs = stop(processes)
     assert codes == [0] * 3, outputs
     n = np.array([m.n_samples for _, m in frames[5:30]])
-    # Where the estimate of the device's clock moves, a reading may fall into the frame beside: that
-    # of all sensors, which have one clock.
+    # When the clock estimate of the device changes, a reading may fall into the adjacent frame.
+    # This affects all sensors, because they share the clock.
     assert n.shape == (25, 20) and n.min() >= 7 and np.ptp(n, axis=1).max() <= 1
     assert abs(n.mean() - 8.0) < 0.25
     assert np.nanmax(np.abs([m.field for _, m in frames[5:30]])) < 1e-7
 
 
-@pytest.mark.parametrize('content, told', [
+@pytest.mark.parametrize('content, error', [
     (BOARD.replace('PORT', '/dev/null').replace('B: mag_2', 'B: mag_9'),
      'sensor mag_9 is not in the network'),
     (BOARD.replace('PORT', '/dev/null').replace('B: mag_2', 'B: mag_1'),
      'sensor mag_1 is already assigned to board'),
     (BOARD.replace('PORT', '/dev/null').replace('  framing: text\n', ''), 'framing is missing'),
     ('', 'expected a mapping of devices')])
-def test_a_drivers_file_that_is_none_ends_the_node(ros, tmp_path, content, told):
+def test_an_invalid_drivers_file_ends_the_node(ros, tmp_path, content, error):
     drivers = tmp_path / 'drivers.yaml'
     drivers.write_text(content)
     process = start('driver_node', '-p', f'drivers:={drivers}', '-p', f'network:={NETWORK_FILE}')
     output = process.communicate(timeout=MAX_S)[0]
     assert process.returncode == 1
-    assert told in output and 'Traceback' not in output
+    assert error in output and 'Traceback' not in output
 
 
-def test_a_port_that_is_not_there_is_told_and_waited_for(board):
+def test_a_missing_port_is_reported_until_it_appears(board):
     node, spin_until, line, drivers, state = board
     line.pull_out()
     state['plugged'] = False

@@ -1,4 +1,4 @@
-"""Mistakes of a new target are reported in the log and in the diagnostics, within seconds."""
+"""Mistakes of a new user are reported in the log and the diagnostics within seconds."""
 
 import subprocess
 import sys
@@ -18,26 +18,27 @@ from support.bundled import NETWORK_FILE
 
 pytestmark = pytest.mark.alone
 
-WITHIN_S = 5.0
+MAX_REPORT_S = 5.0
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 YEAR_NS = 365 * 86400 * 1_000_000_000
 BOTH = ('mag_1', 'mag_2')
 
 
-class Newcomer:
-    """Publishes fields at 50 Hz, as somebody does who skipped the manual.
+class NewUser:
+    """Publisher of fields at 50 Hz with a mistake of a new user.
 
     Parameters
     ----------
     topic : str
-        With the sensor's name in place of {}.
+        Topic with {} in place of the sensor's name.
     unit : float
-        Published in place of one tesla.
+        Value published for one tesla.
     behind_ns : int
-        Of the stamps.
+        Delay of the timestamps.
     sensors : sequence of str
+        Sensors that are published.
     use_sim_time : bool
-        Of the node.
+        Parameter of the calibration node.
     """
 
     def __init__(self, topic='{}/imu/mag', unit=1.0, behind_ns=0, sensors=BOTH,
@@ -61,18 +62,18 @@ class Newcomer:
 
 
 CASES = {
-    'no sensor': (Newcomer(sensors=()), 'has no publisher'),
-    'one of two missing': (Newcomer(sensors=('mag_1',)), '/mag_2/imu/mag has no publisher'),
-    'another topic': (Newcomer('{}/magnetic_field'), 'are published on /case_2/mag_1/magnetic_f'),
-    'another type': (Newcomer(sensors=()), 'publishes sensor_msgs/msg/Imu on /case_3/mag_1'),
-    'gauss': (Newcomer(unit=1e4), 'gauss or microtesla published as tesla'),
-    'microtesla': (Newcomer(unit=1e6), 'gauss or microtesla published as tesla'),
+    'no sensor': (NewUser(sensors=()), 'has no publisher'),
+    'one of two missing': (NewUser(sensors=('mag_1',)), '/mag_2/imu/mag has no publisher'),
+    'another topic': (NewUser('{}/magnetic_field'), 'are published on /case_2/mag_1/magnetic_f'),
+    'another type': (NewUser(sensors=()), 'publishes sensor_msgs/msg/Imu on /case_3/mag_1'),
+    'gauss': (NewUser(unit=1e4), 'gauss or microtesla published as tesla'),
+    'microtesla': (NewUser(unit=1e6), 'gauss or microtesla published as tesla'),
     'time since the device was switched on': (
-        Newcomer(behind_ns=time.time_ns() - 100 * 1_000_000_000), 'years behind the clock'),
-    'a bag without use_sim_time': (Newcomer(behind_ns=3 * YEAR_NS), 'use_sim_time'),
+        NewUser(behind_ns=time.time_ns() - 100 * 1_000_000_000), 'years behind the clock'),
+    'a bag without use_sim_time': (NewUser(behind_ns=3 * YEAR_NS), 'use_sim_time'),
     'use_sim_time without a clock': (
-        Newcomer(use_sim_time=True), 'no message was received on /clock'),
-    'another time zone': (Newcomer(behind_ns=7200 * 1_000_000_000), 'stamps are 7200.')}
+        NewUser(use_sim_time=True), 'no message was received on /clock'),
+    'another time zone': (NewUser(behind_ns=7200 * 1_000_000_000), 'stamps are 7200.')}
 
 
 OF_ANOTHER_TYPE = """
@@ -84,54 +85,54 @@ node = rclpy.create_node('stranger')
 publisher = node.create_publisher(Imu, '/case_3/mag_1/imu/mag', 10)
 time.sleep(600.0)
 """
-"""In a process of its own: in one process a topic has one type."""
+"""A separate process, because within one process a topic has one type."""
 
 
-def node_in(namespace, new_target):
-    """A calibration node of its own for each case."""
+def node_in(namespace, user):
+    """Calibration node of one case."""
     return CalibrationNode(namespace=namespace, parameter_overrides=[
         Parameter('network', value=str(NETWORK_FILE)),
-        Parameter('use_sim_time', value=new_target.use_sim_time)])
+        Parameter('use_sim_time', value=user.use_sim_time)])
 
 
-def test_a_users_first_minutes(ros, capfd):
+def test_mistakes_of_a_new_user_are_reported_within_seconds(ros, capfd):
     node, spin_until = ros
-    told, lags = {}, []
+    reported, lags = {}, []
 
-    def take(message):
+    def check(message):
         for status in message.status:
             if status.level != DiagnosticStatus.OK:
                 case = list(CASES)[int(status.name.split('/')[0].removeprefix('case_'))]
                 if CASES[case][1] in status.message:
-                    told.setdefault(case, time.monotonic())
-    node.create_subscription(DiagnosticArray, '/diagnostics', take, RESULTS)
+                    reported.setdefault(case, time.monotonic())
+    node.create_subscription(DiagnosticArray, '/diagnostics', check, RESULTS)
     node.create_timer(0.05, lambda: lags.append(time.monotonic()))
     began, nodes = {}, []
-    stranger = subprocess.Popen([sys.executable, '-c', OF_ANOTHER_TYPE])
+    other_process = subprocess.Popen([sys.executable, '-c', OF_ANOTHER_TYPE])
     try:
         assert spin_until(lambda: node.count_publishers('/case_3/mag_1/imu/mag'))
-        for k, (case, (new_target, _)) in enumerate(CASES.items()):
-            new_target.connect(node, f'/case_{k}')
-            nodes.append(node_in(f'/case_{k}', new_target))
+        for k, (case, (user, _)) in enumerate(CASES.items()):
+            user.connect(node, f'/case_{k}')
+            nodes.append(node_in(f'/case_{k}', user))
             began[case] = time.monotonic()
             node.executor.add_node(nodes[-1])
-        spin_until(lambda: len(told) == len(CASES), 60.0)
+        spin_until(lambda: len(reported) == len(CASES), 60.0)
     finally:
-        stranger.kill()
-        stranger.wait()
+        other_process.kill()
+        other_process.wait()
         for one in nodes:
             node.executor.remove_node(one)
             one.destroy_node()
     logged = capfd.readouterr().err
-    missing = [case for case, (_, words) in CASES.items()
-               if case not in told or words not in logged]
+    missing = [case for case, (_, text) in CASES.items()
+               if case not in reported or text not in logged]
     assert not missing, logged
     for k, case in enumerate(CASES):
         line = next(line for line in logged.splitlines()
                     if f'case_{k}.' in line and CASES[case][1] in line)
         assert line.startswith(('[WARN]', '[ERROR]'))
-    took = {case: told[case] - began[case] for case in CASES}
+    took = {case: reported[case] - began[case] for case in CASES}
     print({case: round(seconds, 1) for case, seconds in took.items()})
-    # What the machine itself was late by.
+    # Delay of the machine itself.
     late = float(np.diff(lags).max())
-    assert max(took.values()) <= WITHIN_S + 2.0 * late
+    assert max(took.values()) <= MAX_REPORT_S + 2.0 * late

@@ -1,4 +1,4 @@
-"""What diagnostics say of the way between the nodes: latency, queues, and who is missing."""
+"""Diagnostics of the connections between nodes: latency, queues and missing peers."""
 
 from types import SimpleNamespace
 
@@ -19,15 +19,15 @@ NS = 1_000_000_000
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A list with the time of `time.monotonic` in it."""
+    """List of one element, the value of `time.monotonic` [s]."""
     now = [100.0]
     monkeypatch.setattr(module.time, 'monotonic', lambda: now[0])
     return now
 
 
-def status_of(flow, is_there=True):
-    """The DiagnosticStatus of a `Flow` whose sender is there or not."""
-    return flow.status('me', lambda: is_there)
+def status_of(flow, sender_exists=True):
+    """DiagnosticStatus of a `Flow` whose sender exists or not."""
+    return flow.status('me', lambda: sender_exists)
 
 
 def values(status):
@@ -35,7 +35,7 @@ def values(status):
     return {v.key: v.value for v in status.values}
 
 
-def test_latency_is_from_the_stamp_to_the_end_of_the_work(clock):
+def test_latency_is_measured_from_timestamp_to_end_of_processing(clock):
     flow = Flow('a_node')
     begin = clock[0]
     for k in range(101):
@@ -44,27 +44,27 @@ def test_latency_is_from_the_stamp_to_the_end_of_the_work(clock):
     clock[0] = begin + 1.01
     status = status_of(flow)
     assert status.name == 'me: from a_node' and status.level == DiagnosticStatus.OK
-    said = values(status)
-    assert said['messages'] == '101'
-    assert float(said['latency, median [ms]']) == pytest.approx(50.0)
-    assert float(said['latency, 99 % [ms]']) == pytest.approx(99.0)
+    found = values(status)
+    assert found['messages'] == '101'
+    assert float(found['latency, median [ms]']) == pytest.approx(50.0)
+    assert float(found['latency, 99 % [ms]']) == pytest.approx(99.0)
     # 101 times 2 ms in 1.01 s.
-    assert float(said['busy [%]']) == pytest.approx(20.0)
+    assert float(found['busy [%]']) == pytest.approx(20.0)
     clock[0] += 1.0
     again = values(status_of(flow))
     assert again['messages'] == '101' and again['busy [%]'] == '0'
     assert again['latency, median [ms]'] == 'nan'
 
 
-def test_an_input_that_has_stopped_is_an_error_until_it_is_back(clock):
+def test_a_silent_input_is_reported_until_it_returns(clock):
     flow = Flow('a_node')
     flow.topics.append('/a')
     clock[0] += 5.0
     first = status_of(flow)
-    # At first that may be as it should: the calibration learns.
+    # At first this is normal: the calibration learns the background.
     assert first.level == DiagnosticStatus.OK and first.message == 'waiting for /a'
     clock[0] += module.FIRST_MESSAGE_TIMEOUT_S
-    late = status_of(flow, is_there=False)
+    late = status_of(flow, sender_exists=False)
     assert late.level == DiagnosticStatus.WARN
     assert late.message == 'no message received on /a: it has no publisher; start the ' \
         'node or driver that publishes it'
@@ -74,17 +74,17 @@ def test_an_input_that_has_stopped_is_an_error_until_it_is_back(clock):
     assert status_of(flow).message == 'running'
     clock[0] += 1.0
     silent = status_of(flow)
-    # It may have nothing to say.
+    # The node may have no output.
     assert silent.level == DiagnosticStatus.WARN
     assert silent.message == 'no message from a_node for 3 s'
-    gone = status_of(flow, is_there=False)
+    gone = status_of(flow, sender_exists=False)
     assert gone.level == DiagnosticStatus.ERROR
     assert gone.message == silent.message + ', and its publisher is gone: check that it is running'
     flow.add(0, 0, clock[0])
     assert status_of(flow).message == 'running'
 
 
-def test_what_did_not_fit_the_queue_is_told_once(clock):
+def test_lost_messages_are_reported_once(clock):
     flow = Flow('a_node')
     flow.add(0, 0, clock[0])
     flow.n_lost += 7
@@ -96,7 +96,7 @@ def test_what_did_not_fit_the_queue_is_told_once(clock):
     assert status_of(flow).message.startswith('1 messages')
 
 
-def test_a_recording_of_old_is_not_late_and_not_live(clock):
+def test_an_old_recording_is_neither_late_nor_live(clock):
     flow = Flow('a_node')
     assert not flow.is_live
     flow.add(0, 10**18, clock[0])
@@ -109,7 +109,7 @@ def test_a_recording_of_old_is_not_late_and_not_live(clock):
 
 
 @pytest.mark.parametrize('busy_s, age_s', [(0.99, 0.0), (0.01, 2.0)])
-def test_a_computer_that_is_too_slow_is_told(clock, busy_s, age_s):
+def test_a_computer_that_is_too_slow_is_reported(clock, busy_s, age_s):
     flow = Flow('a_node')
     clock[0] += 1.0
     flow.add(10 * NS, round((10 + age_s) * NS), clock[0] - busy_s)
@@ -120,7 +120,7 @@ def test_a_computer_that_is_too_slow_is_told(clock, busy_s, age_s):
     assert status_of(flow).level == DiagnosticStatus.OK
 
 
-def test_memory_is_bounded(clock):
+def test_the_number_of_stored_latencies_is_bounded(clock):
     flow = Flow('a_node')
     for _ in range(MAX_LATENCIES + 50):
         flow.add(0, 0, clock[0])
@@ -128,11 +128,11 @@ def test_memory_is_bounded(clock):
     assert values(status_of(flow))['messages'] == str(MAX_LATENCIES + 50)
 
 
-def test_a_listener_is_missed_when_it_was_there():
-    listener = SubscriberMonitor('tracker', '/network_frame', 'its type')
+def test_a_subscriber_that_disappears_is_reported():
+    monitor = SubscriberMonitor('tracker', '/network_frame', 'its type')
 
     def status(*names):
-        return listener.status('me', set(names), lambda name: {
+        return monitor.status('me', set(names), lambda name: {
             '/other': {'its type'}, '/second': {'its type', 'more'}}.get(name, set()))
     assert status('/rviz').message == 'no tracker node has subscribed to /network_frame yet'
     assert status('/rviz', '/other').message == 'running'
@@ -140,13 +140,13 @@ def test_a_listener_is_missed_when_it_was_there():
     assert gone.level == DiagnosticStatus.ERROR and gone.name == 'me: to tracker'
     assert gone.message == '/other is gone: check that it is running'
     assert status('/other').level == DiagnosticStatus.OK
-    # One that takes its place under another name is as good; what only records is missed by none.
+    # A replacement under another name is accepted; nodes of another type are not missed.
     assert status('/second').level == DiagnosticStatus.OK
     assert status('/second', '/rviz').message == status('/second').message == 'running'
 
 
 class StandIn:
-    """What of a tracker node decides that its track is lost."""
+    """Stand-in for a tracker node: the attributes that end a track without frames."""
 
     def __init__(self, clock, is_replayed=False):
         self._clock, self.is_replayed, self._is_silent = clock, is_replayed, False
@@ -159,7 +159,7 @@ class StandIn:
         self.published += records
 
     def ticks(self, seconds, frames):
-        """The timer, four times a second; `frames`: one comes before each, an hour old."""
+        """Run the timer at 4 Hz; with `frames`, an hour-old frame arrives before each tick."""
         for _ in range(round(4 * seconds)):
             self._clock[0] += 0.25
             if frames:
@@ -178,17 +178,17 @@ def test_a_track_ends_when_frames_stop_not_when_they_are_old(clock):
     assert node.published[0] == 'no frames received'
 
 
-def test_what_waits_while_a_node_is_busy_is_no_silence(clock):
+def test_a_busy_node_does_not_end_its_track(clock):
     node = StandIn(clock)
     node.ticks(1.0, frames=True)
-    # The timer is the first to run again, and then what has waited.
+    # The timer runs before the waiting frames.
     clock[0] += 100.0
     TrackerNode.end_without_frames(node)
     node.ticks(5.0, frames=True)
     assert not node.published
 
 
-def test_a_recording_may_pause(clock):
+def test_a_paused_recording_does_not_end_its_track(clock):
     node = StandIn(clock, is_replayed=True)
     node.ticks(1.0, frames=True)
     node.ticks(1000.0, frames=False)
@@ -196,7 +196,7 @@ def test_a_recording_may_pause(clock):
 
 
 @pytest.mark.alone
-def test_a_node_tells_its_queue_and_latency(ros):
+def test_a_node_reports_its_queue_and_latency(ros):
     node, spin_until = ros
     statuses = {}
     node.create_subscription(
@@ -209,7 +209,7 @@ def test_a_node_tells_its_queue_and_latency(ros):
         message = MagneticField()
         message.header.stamp = node.get_clock().now().to_msg()
         message.magnetic_field_covariance[::4] = 1e-16
-        # The other sensor is silent, so that it waits for it.
+        # The other sensor is silent, so the reading waits in the queue.
         out.publish(message)
         assert spin_until(lambda: statuses.get(
             'detection_node: from calibration', {}).get('messages') == '1')

@@ -1,4 +1,4 @@
-"""The small substitutes for `ros2` on a live system: topics, echo, param, lifecycle."""
+"""Substitutes for `ros2` on a live system: topics, echo, param, lifecycle."""
 
 import subprocess
 import sys
@@ -13,8 +13,8 @@ from support.bundled import NETWORK_FILE
 from support.node_processes import MAX_S, start, stop
 
 pytestmark = pytest.mark.timeout(600)
-WITHIN = ('--ros-args', '-r', '__ns:=/lab')
-SLOW = """
+NAMESPACE = ('--ros-args', '-r', '__ns:=/lab')
+SLOW_NODE = """
 import time
 import rclpy
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
@@ -29,7 +29,7 @@ rclpy.spin(Slow('slow'))
 
 @pytest.fixture
 def command(capfd):
-    """f(words): (status, output) of `mag-tracking` in this process."""
+    """f(words): (exit status, output) of `mag-tracking` in this process."""
     def run(*words):
         capfd.readouterr()
         try:
@@ -42,22 +42,22 @@ def command(capfd):
 
 
 def wait_for(condition):
-    """Ask until it is so; a command takes a while each time."""
+    """Poll a condition without pauses, because each command takes time."""
     end = time.monotonic() + MAX_S
     while not condition():
         assert time.monotonic() < end
 
 
-def test_a_calibration_and_a_driver_as_seen_without_ros2(command, tmp_path):
+def test_commands_show_a_calibration_and_a_driver(command, tmp_path):
     udp = tmp_path / 'udp.yaml'
     udp.write_text('board: {transport: udp, udp: {port: 47124, address: 127.0.0.1}, framing: text,'
                    ' text: {fields: [x, y, z]}, unit: nT, sensor: mag_1}\n')
-    processes = [start('calibration_node', *WITHIN[1:], '-p', f'network:={NETWORK_FILE}'),
-                 start('driver_node', *WITHIN[1:], '-p', f'drivers:={udp}')]
+    processes = [start('calibration_node', *NAMESPACE[1:], '-p', f'network:={NETWORK_FILE}'),
+                 start('driver_node', *NAMESPACE[1:], '-p', f'drivers:={udp}')]
     try:
         wait_for(lambda: '/lab/mag_1/imu/mag  sensor_msgs/msg/MagneticField  1 publishers, 1 sub'
                  in command('topics')[1])
-        code, text = command('echo', CALIBRATION_STATE, '--count', '1', *WITHIN)
+        code, text = command('echo', CALIBRATION_STATE, '--count', '1', *NAMESPACE)
         assert code == 0 and text.endswith('---\n'), text
         message = yaml.safe_load(text.removesuffix('---\n'))
         assert [s['sensor'] for s in message['sensors']] == ['mag_1', 'mag_2']
@@ -72,7 +72,7 @@ def test_a_calibration_and_a_driver_as_seen_without_ros2(command, tmp_path):
 
 
 def check_parameters(command):
-    """Show and refuse parameters of the calibration node."""
+    """Parameters of the calibration node are shown; invalid changes are refused."""
     code, text = command('param', '/lab/calibration_node', 'network')
     assert code == 0 and text.startswith(f'network: {NETWORK_FILE}  (read-only)  # Path'), text
     code, text = command('param', '/lab/calibration_node', 'network', 'other.yaml')
@@ -82,16 +82,16 @@ def check_parameters(command):
 
 
 def check_lifecycle(command):
-    """Show and change the state of the driver node."""
-    code, text = command('lifecycle', 'driver_node', *WITHIN)
+    """The state of the driver node is shown and changed."""
+    code, text = command('lifecycle', 'driver_node', *NAMESPACE)
     assert code == 0 and text.startswith('active; possible: deactivate'), text
-    code, text = command('lifecycle', 'driver_node', 'deactivate', *WITHIN)
+    code, text = command('lifecycle', 'driver_node', 'deactivate', *NAMESPACE)
     assert code == 0 and text.startswith('inactive; possible: '), text
-    code, text = command('lifecycle', 'driver_node', 'deactivate', *WITHIN)
+    code, text = command('lifecycle', 'driver_node', 'deactivate', *NAMESPACE)
     assert code == 1 and 'deactivate is not possible in the current state; possible: ' in text, text
 
 
-def test_whole_numbers_are_taken_where_others_are_expected(command):
+def test_integers_are_accepted_for_floating_point_parameters(command):
     process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
     try:
         wait_for(lambda: '/tracker_node/pose' in command('topics')[1])
@@ -102,8 +102,8 @@ def test_whole_numbers_are_taken_where_others_are_expected(command):
     assert codes == [0], outputs
 
 
-def test_a_transition_that_takes_long_is_made_once(command):
-    process = subprocess.Popen([sys.executable, '-c', SLOW], stdout=subprocess.PIPE,
+def test_a_slow_transition_is_requested_once(command):
+    process = subprocess.Popen([sys.executable, '-c', SLOW_NODE], stdout=subprocess.PIPE,
                                stderr=subprocess.STDOUT, text=True)
     try:
         wait_for(lambda: '/slow/transition_event' in command('topics')[1])
@@ -115,17 +115,17 @@ def test_a_transition_that_takes_long_is_made_once(command):
     assert 'No transition matching' not in output
 
 
-@pytest.mark.parametrize('words, told', [
+@pytest.mark.parametrize('words, error', [
     (('echo', 'a b'), 'topic name'), (('param', '/live/bad name'), 'service name'),
     (('lifecycle', '/1abc', 'activate'), 'service name'), (('echo', '/a', '--count', '0'), '0 is'),
     (('echo', ''), 'topic name'), (('echo', '/nowhere'), '/nowhere has no publisher'),
     (('param', '/nowhere'), 'service /nowhere/list_parameters not found')])
-def test_what_is_not_there_is_one_line(command, words, told):
+def test_invalid_or_missing_names_are_reported(command, words, error):
     code, text = command(*words)
-    assert code == 1 and told in text and 'Traceback' not in text, text
+    assert code == 1 and error in text and 'Traceback' not in text, text
 
 
-def test_arguments_of_ros_are_refused_where_no_ros_runs(command):
+def test_ros_arguments_are_refused_by_commands_without_ros(command):
     code, text = command('info', 'a.mcap', '--ros-args', '-r', '__ns:=/x')
     assert code == 2 and '--ros-args: info runs without ROS' in text
     code, text = command('--version')

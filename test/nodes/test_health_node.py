@@ -26,7 +26,7 @@ from support.samples import MagSample, one, sample_dict
 
 STEP_NS = 10_000_000
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
-STRANGER = """
+OTHER_PUBLISHER = """
 import time
 import rclpy
 from std_msgs.msg import String
@@ -38,11 +38,11 @@ time.sleep(600.0)
 
 
 @pytest.fixture
-def talking(ros):
-    """Both sensors publish at 100 Hz, but those that are told to be `silent`, while it waits.
+def publish_until(ros):
+    """f(condition, silent, step): publish both sensors at 100 Hz until a condition holds.
 
-    They measure evenly: what is late on a busy machine has the time when it was due. A `step` [T]
-    is added to the field of mag_1.
+    Sensors in `silent` are not published. A `step` [T] is added to the field of mag_1. Timestamps
+    are regular: a reading that is late on a busy machine has the time when it was due.
     """
     node, spin_until = ros
     publishers = {}
@@ -69,12 +69,12 @@ def talking(ros):
 
     node.create_timer(0.01, catch_up)
 
-    def talk(condition, silent=(), step=0.0, seconds=MAX_S):
+    def publish_both(condition, silent=(), step=0.0, seconds=MAX_S):
         now.update(silent=silent, mag_1=step)
         return spin_until(condition, seconds)
 
-    talk.late_ms = now['late_ms']
-    return talk
+    publish_both.late_ms = now['late_ms']
+    return publish_both
 
 
 @pytest.fixture
@@ -88,8 +88,8 @@ def statuses(ros):
     return latest
 
 
-def test_a_parked_car_is_not_swallowed_without_a_word(talking, statuses):
-    """The background follows a step that stays, and the diagnostics say so."""
+def test_a_relearnt_background_is_reported(publish_until, statuses):
+    """The background follows a permanent step, for example of a parked car."""
     process = start('calibration_node', '-p', f'network:={NETWORK_FILE}',
                     '-p', 'calibrate.relearn_s:=4.0')
 
@@ -102,8 +102,8 @@ def test_a_parked_car_is_not_swallowed_without_a_word(talking, statuses):
         return status.message if status else ''
 
     try:
-        assert talking(lambda: background('mag_1') == background('mag_2') == 'ready')
-        assert talking(lambda: 'became its background' in message('mag_1'), step=1e-6)
+        assert publish_until(lambda: background('mag_1') == background('mag_2') == 'ready')
+        assert publish_until(lambda: 'became its background' in message('mag_1'), step=1e-6)
         assert 'background' not in message('mag_2')
         state = {v.key: v.value for v in statuses['calibration_node: mag_1'].values}
         assert state['backgrounds relearnt'] == '1' and state['background'] == 'ready'
@@ -112,23 +112,23 @@ def test_a_parked_car_is_not_swallowed_without_a_word(talking, statuses):
     assert codes == [0], outputs
 
 
-def test_a_flipped_axis_is_an_error_for_as_long_as_it_is_there(talking, statuses):
+def test_a_flipped_axis_is_an_error(publish_until, statuses):
     process = start('calibration_node', '-p', f'network:={NETWORK_FILE}')
 
-    def told(name):
+    def texts(name):
         status = statuses.get(f'calibration_node: {name}')
         return [status.message, *(v.value for v in status.values)] if status else []
 
-    def is_blamed(name):
-        return any("differs from the Earth's field" in t for t in told(name))
+    def is_flagged(name):
+        return any("differs from the Earth's field" in t for t in texts(name))
     try:
-        assert talking(lambda: is_blamed('mag_1'), step=np.array([0.0, 0.0, 9.8e-5]))
+        assert publish_until(lambda: is_flagged('mag_1'), step=np.array([0.0, 0.0, 9.8e-5]))
         seen = []
-        # The other one may have been slow or lossy on a busy machine, but is never blamed.
-        talking(lambda: seen.append(is_blamed('mag_2')), seconds=3.0,
-                step=np.array([0.0, 0.0, 9.8e-5]))
-        assert told('mag_2') and not any(seen)
-        assert ' uT: z is flipped' in told('mag_1')[0]
+        # The other sensor may be slow or lossy on a busy machine, but is not flagged.
+        publish_until(lambda: seen.append(is_flagged('mag_2')), seconds=3.0,
+                      step=np.array([0.0, 0.0, 9.8e-5]))
+        assert texts('mag_2') and not any(seen)
+        assert ' uT: z is flipped' in texts('mag_1')[0]
         assert statuses['calibration_node: mag_1'].level == DiagnosticStatus.ERROR
         assert statuses['calibration_node: mag_2'].level != DiagnosticStatus.ERROR
     finally:
@@ -136,7 +136,7 @@ def test_a_flipped_axis_is_an_error_for_as_long_as_it_is_there(talking, statuses
     assert codes == [0], outputs
 
 
-def test_each_sensor_has_its_status(talking, statuses):
+def test_each_sensor_has_a_status(publish_until, statuses):
     began = time.monotonic()
     process = start('calibration_node', '-p', f'network:={NETWORK_FILE}')
 
@@ -147,60 +147,60 @@ def test_each_sensor_has_its_status(talking, statuses):
         return {v.key: v.value for v in status(name).values}
 
     try:
-        assert talking(lambda: status('mag_1') and status('mag_2'), silent=('mag_1', 'mag_2'))
-        # It says so once a second.
+        assert publish_until(lambda: status('mag_1') and status('mag_2'), silent=('mag_1', 'mag_2'))
+        # Diagnostics are published once a second.
         up = time.monotonic() - began
         assert status('mag_1').level == DiagnosticStatus.OK
         assert status('mag_1').message == 'waiting for /mag_1/imu/mag'
-        assert talking(lambda: status('mag_1').level == DiagnosticStatus.ERROR,
-                       silent=('mag_1', 'mag_2'))
+        assert publish_until(lambda: status('mag_1').level == DiagnosticStatus.ERROR,
+                             silent=('mag_1', 'mag_2'))
         assert status('mag_1').message.startswith(
             'no message received: /mag_1/imu/mag has no publisher; start its driver')
-        # Long, for one stall of the machine that loses readings counts until so many have come.
-        assert talking(lambda: all(values(name)['background'] == 'ready' and status(name).level
-                                   == DiagnosticStatus.OK for name in ('mag_1', 'mag_2')),
-                       seconds=240.0)
+        # Long, because losses in a stall of the machine count until enough readings follow.
+        assert publish_until(
+            lambda: all(values(name)['background'] == 'ready' and status(name).level
+                        == DiagnosticStatus.OK for name in ('mag_1', 'mag_2')), seconds=240.0)
         assert status('mag_2').message == 'running' and status('mag_2').hardware_id == 'mag_2'
         assert float(values('mag_1')['rate [Hz]']) > 20.0
         assert [5.0 < float(v) < 30.0 for v in values('mag_2')['noise [nT]'].split()] == [True] * 3
-        # The rest is the middleware's, and the machine's, which may be busy.
+        # The rest is the delay of the middleware and of a busy machine.
         delay = float(values('mag_1')['delay [ms]'])
-        late = np.median(talking.late_ms)
-        print(f'delay {delay:.1f} ms, of which it was published late by {late:.1f} ms')
+        late = np.median(publish_until.late_ms)
+        print(f'delay {delay:.1f} ms, of which {late:.1f} ms before publishing')
         assert delay > 0.0 and abs(delay - late) < scaled(100.0, up - 1.0)
-        assert talking(lambda: 'silent for' in status('mag_2').message, silent=('mag_2',))
+        assert publish_until(lambda: 'silent for' in status('mag_2').message, silent=('mag_2',))
         assert status('mag_2').level == DiagnosticStatus.ERROR
         assert status('mag_1').level != DiagnosticStatus.ERROR
-        assert talking(lambda: 'readings are missing' in status('mag_2').message)
+        assert publish_until(lambda: 'readings are missing' in status('mag_2').message)
     finally:
         codes, outputs = stop([process])
     assert codes == [0], outputs
 
 
-def test_a_calibration_that_is_killed_goes_on_where_it_was(ros, talking, tmp_path):
-    """No background is given: within two seconds the target that has come meanwhile is there."""
+def test_a_restarted_calibration_restores_its_background(ros, publish_until, tmp_path):
+    """No background is given; a target that arrived meanwhile is measured within two seconds."""
     node, _ = ros
     step, calibrated = 4e-7, []
     node.create_subscription(MagneticField, '/mag_1/imu/mag_calibrated',
                              lambda m: calibrated.append((time.monotonic(), m)), STREAM)
     first = start('calibration_node', '-p', f'network:={NETWORK_FILE}', home=tmp_path)
-    assert talking(lambda: len(calibrated) > 100 and [
+    assert publish_until(lambda: len(calibrated) > 100 and [
         p for p in tmp_path.rglob('*.json') if '"mag_1"' in p.read_text()])
     first.kill()
     first.communicate(timeout=MAX_S)
-    talking(lambda: False, silent=('mag_1', 'mag_2'), seconds=0.3)
+    publish_until(lambda: False, silent=('mag_1', 'mag_2'), seconds=0.3)
     n, known = len(calibrated), endpoints(node)
     began = time.monotonic()
     second = start('calibration_node', '-p', f'network:={NETWORK_FILE}', home=tmp_path)
     try:
-        assert talking(lambda: endpoints(node) - known or len(calibrated) > n, step=step)
+        assert publish_until(lambda: endpoints(node) - known or len(calibrated) > n, step=step)
         up = time.monotonic()
-        assert talking(lambda: len(calibrated) > n + 100, step=step)
+        assert publish_until(lambda: len(calibrated) > n + 100, step=step)
     finally:
         codes, outputs = stop([second])
     assert codes == [0], outputs
     recovery = max(0.0, calibrated[n][0] - up)
-    print(f'a killed calibration without a given background: {recovery:.2f} s')
+    print(f'recovery of a killed calibration without a given background: {recovery:.2f} s')
     assert recovery <= scaled(2.0, up - began)
     f = np.array([[m.magnetic_field.x, m.magnetic_field.y, m.magnetic_field.z]
                   for _, m in calibrated[n:]])
@@ -208,37 +208,37 @@ def test_a_calibration_that_is_killed_goes_on_where_it_was(ros, talking, tmp_pat
 
 
 def endpoints(node):
-    """The publishers of diagnostics."""
+    """Publishers of /diagnostics."""
     return {tuple(p.endpoint_gid) for p in node.get_publishers_info_by_topic('/diagnostics')}
 
 
-def test_the_doctor_on_a_live_system(ros, talking):
+def test_the_doctor_finds_faults_of_a_live_system(ros, publish_until):
     node, spin_until = ros
-    stranger = subprocess.Popen([sys.executable, '-c', STRANGER])
+    other_process = subprocess.Popen([sys.executable, '-c', OTHER_PUBLISHER])
     doctor = DoctorNode(read_network(NETWORK_FILE), settings_for('vehicle'))
     executor = node.executor
     executor.add_node(doctor)
     try:
         health = doctor.doctor.sensors
-        assert talking(lambda: health['mag_1'].counts['readings'] > 300, silent=('mag_2',))
+        assert publish_until(lambda: health['mag_1'].counts['readings'] > 300, silent=('mag_2',))
         found = [str(f) for f in doctor.findings() + doctor.doctor.findings()]
         assert any(t.startswith('mag_2: no reading') for t in found), found
-        twin = node.create_publisher(MagneticField, '/mag_1/imu/mag', RESULTS)
+        second = node.create_publisher(MagneticField, '/mag_1/imu/mag', RESULTS)
         assert spin_until(lambda: len(doctor.get_publishers_info_by_topic('/mag_1/imu/mag')) == 2
                           and len(doctor.get_publishers_info_by_topic('/mag_2/imu/mag')) == 1)
         found = [str(f) for f in doctor.findings()]
         assert any('mag_1: 2 publishers of /mag_1/imu/mag' in t for t in found), found
         assert any('publishes std_msgs/msg/String on /mag_2/imu/mag' in t for t in found), found
-        assert twin
+        assert second
     finally:
-        stranger.kill()
-        stranger.wait()
+        other_process.kill()
+        other_process.wait()
         executor.remove_node(doctor)
         doctor.destroy_node()
 
 
-def test_another_clock_is_no_step_of_it():
-    """What waits to be looked at when a survey has found new clocks is by the old ones."""
+def test_a_new_clock_offset_is_no_clock_step():
+    """Readings that are pending when a survey sets new offsets have the old ones."""
     network, settings = read_network(NETWORK_FILE), settings_for('vehicle')
     stage, rng = Calibrate(network, settings.calibrate), np.random.default_rng(2)
     health = HealthDiagnostics(network, settings)
@@ -252,18 +252,18 @@ def test_another_clock_is_no_step_of_it():
     health.use_network(dataclasses.replace(network, clock_offset=np.array([0.5, -0.5])))
     feed(90, 300)
     for status in health.statuses('node', stage):
-        told = [status.message, *(v.value for v in status.values)]
-        assert not any('clock' in t or 'went back' in t for t in told), told
+        texts = [status.message, *(v.value for v in status.values)]
+        assert not any('clock' in t or 'went back' in t for t in texts), texts
 
 
-def test_what_was_wrong_is_forgotten_after_two_terms(monkeypatch):
-    """A car that parked in spring is no warning in autumn."""
+def test_past_faults_expire_after_two_windows(monkeypatch):
+    """A relearnt background, for example of a parked car."""
     now = [0.0]
     monkeypatch.setattr(sensor_health.time, 'monotonic', lambda: now[0])
     network = read_network(NETWORK_FILE)
     settings = settings_for('vehicle', {'calibrate.relearn_s': 4.0})
     stage = Calibrate(network, settings.calibrate)
-    health, rng, said = HealthDiagnostics(network, settings), np.random.default_rng(1), []
+    health, rng, reports = HealthDiagnostics(network, settings), np.random.default_rng(1), []
     for k in range(250 * 20):
         now[0] = k / 20
         for name in network.names:
@@ -273,8 +273,8 @@ def test_what_was_wrong_is_forgotten_after_two_terms(monkeypatch):
             health.add(one(sample), sample.stamp_ns)
             stage.feed(one(sample))
         if k % 100 == 99:
-            said.append((now[0], [s.message for s in health.statuses('node', stage)]))
-    told = [t for t, messages in said if 'became its background 1 times' in messages[0]]
-    assert 20.0 < min(told) < 35.0
-    assert sensor_health.WINDOW_S < max(told) - min(told) <= 2.0 * sensor_health.WINDOW_S + 5.0
-    assert said[-1][1] == ['running', 'running']
+            reports.append((now[0], [s.message for s in health.statuses('node', stage)]))
+    times = [t for t, messages in reports if 'became its background 1 times' in messages[0]]
+    assert 20.0 < min(times) < 35.0
+    assert sensor_health.WINDOW_S < max(times) - min(times) <= 2.0 * sensor_health.WINDOW_S + 5.0
+    assert reports[-1][1] == ['running', 'running']

@@ -1,4 +1,4 @@
-"""What other packages take from the nodes: transforms, detections, markers, over the middleware."""
+"""Standard messages of the nodes over the middleware: transforms, detections, markers."""
 
 import numpy as np
 import pytest
@@ -18,44 +18,44 @@ pytestmark = pytest.mark.timeout(600)
 
 
 class Consumer(Node):
-    """Keeps what it is sent."""
+    """Stores received messages."""
 
     def __init__(self):
         super().__init__('consumer')
         self.tf, self.static, self.odometry, self.detections, self.markers = [], [], [], [], []
         self.sensors = []
-        for kind, topic, kept, qos in (
+        for kind, topic, received, qos in (
                 (TFMessage, '/tf', self.tf, TRANSFORMS),
                 (TFMessage, '/tf_static', self.static, LATCHED),
                 (Odometry, 'tracker_node/odometry', self.odometry, STREAM),
                 (Detection3DArray, 'tracker_node/detections_3d', self.detections, STREAM),
                 (MarkerArray, 'tracker_node/markers', self.markers, STREAM),
                 (MarkerArray, 'tracker_node/sensor_markers', self.sensors, LATCHED)):
-            self.create_subscription(kind, topic, kept.append, qos)
+            self.create_subscription(kind, topic, received.append, qos)
 
 
-def test_transforms_detections_and_markers():
-    """In a namespace, with the parameters that `robot_localization` wants."""
+def test_transforms_detections_and_markers_describe_the_track():
+    """In a namespace, with the parameters that `robot_localization` requires."""
     holder = []
     run(NETWORK_FILE, settings_for('vehicle', {'align.max_wait_s': 5.0}),
         vehicle_path('straight_car_fast_left'), 3.0,
         observers=[lambda: holder.append(Consumer()) or holder[-1]],
         ros_arguments=['--ros-args', '-r', '__ns:=/road', '-p', 'publish_tf:=true',
                        '-p', 'child_frame:=vehicle'])
-    heard, = holder
-    frames = [t.child_frame_id for m in heard.static for t in m.transforms]
+    consumer, = holder
+    frames = [t.child_frame_id for m in consumer.static for t in m.transforms]
     assert set(frames) == {'mag_1', 'mag_2'}
-    assert {t.header.frame_id for m in heard.static for t in m.transforms} == {'map'}
-    assert len(heard.odometry) > 10
-    assert {m.child_frame_id for m in heard.odometry} == {'vehicle'}
-    transforms = [t for m in heard.tf for t in m.transforms]
+    assert {t.header.frame_id for m in consumer.static for t in m.transforms} == {'map'}
+    assert len(consumer.odometry) > 10
+    assert {m.child_frame_id for m in consumer.odometry} == {'vehicle'}
+    transforms = [t for m in consumer.tf for t in m.transforms]
     assert {t.child_frame_id for t in transforms} == {'vehicle'}
-    by_time = {stamp_ns(m.header.stamp): m.pose.pose.position for m in heard.odometry}
+    by_time = {stamp_ns(m.header.stamp): m.pose.pose.position for m in consumer.odometry}
     for t in transforms:
         p = by_time[stamp_ns(t.header.stamp)]
         np.testing.assert_array_equal([t.transform.translation.x, t.transform.translation.y],
                                       [p.x, p.y])
-    last = heard.detections[-1]
-    assert last.detections == [] and heard.detections[-2].detections[0].id == '1'
-    assert {m.ns for m in heard.markers[-1].markers} == {'ellipsoid', 'moment', 'label'}
-    assert {m.text for a in heard.sensors for m in a.markers if m.text} == {'mag_1', 'mag_2'}
+    last = consumer.detections[-1]
+    assert last.detections == [] and consumer.detections[-2].detections[0].id == '1'
+    assert {m.ns for m in consumer.markers[-1].markers} == {'ellipsoid', 'moment', 'label'}
+    assert {m.text for a in consumer.sensors for m in a.markers if m.text} == {'mag_1', 'mag_2'}

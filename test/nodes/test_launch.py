@@ -1,7 +1,7 @@
-"""The launch file: run where `launch_ros` can be had, else executed against a stand-in.
+"""The launch file: executed with a stand-in for `launch_ros`, and run if that is installed.
 
-PyPI's `launch` is another package. The stand-in keeps what the file makes; every name in it is
-then compared with what the package has: executables, parameters, arguments, files.
+PyPI's `launch` is another package. The stand-in records the objects that the file creates. Their
+executables, parameters, arguments and files are compared with those of the package.
 """
 
 import importlib.util
@@ -31,8 +31,8 @@ CLASSES = {
 """{module: classes} that the launch file imports."""
 
 
-class Made:
-    """An object of the stand-in: its class, and what it was made of."""
+class LaunchObject:
+    """Object of the stand-in: name of its class and arguments."""
 
     def __init__(self, name, arguments, named):
         self.name, self.arguments, self.named = name, arguments, named
@@ -41,32 +41,33 @@ class Made:
         raise TypeError(f'{self.name} is not iterable')
 
 
-def within(thing):
-    """All `Made` in a thing."""
-    if isinstance(thing, Made):
-        yield thing
-        for part in (*thing.arguments, *thing.named.values()):
-            yield from within(part)
-    elif isinstance(thing, Mapping):
-        for part in thing.values():
-            yield from within(part)
-    elif isinstance(thing, (list, tuple)):
-        for part in thing:
-            yield from within(part)
+def objects_in(value):
+    """All `LaunchObject` in a value."""
+    if isinstance(value, LaunchObject):
+        yield value
+        for part in (*value.arguments, *value.named.values()):
+            yield from objects_in(part)
+    elif isinstance(value, Mapping):
+        for part in value.values():
+            yield from objects_in(part)
+    elif isinstance(value, (list, tuple)):
+        for part in value:
+            yield from objects_in(part)
 
 
 @pytest.fixture
-def made(monkeypatch):
-    """[Made] of the launch file."""
+def launch_objects(monkeypatch):
+    """All `LaunchObject` of the launch file."""
     for module in ('launch', 'launch_ros', *CLASSES):
         monkeypatch.setitem(sys.modules, module, types.ModuleType(module))
     for module, names in CLASSES.items():
         for name in names:
-            setattr(sys.modules[module], name, lambda *a, _name=name, **n: Made(_name, a, n))
+            setattr(sys.modules[module], name,
+                    lambda *a, _name=name, **n: LaunchObject(_name, a, n))
     spec = importlib.util.spec_from_file_location('tracking_launch', LAUNCH_FILE)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return list(within(module.generate_launch_description()))
+    return list(objects_in(module.generate_launch_description()))
 
 
 @pytest.fixture
@@ -79,41 +80,41 @@ def executables(monkeypatch):
     return {line.split('=')[0].strip() for line in given['entry_points']['console_scripts']}
 
 
-def of(made, name):
-    """Those of a class."""
-    return [m for m in made if m.name == name]
+def of_class(launch_objects, name):
+    """Objects of a class."""
+    return [m for m in launch_objects if m.name == name]
 
 
-def test_every_name_in_the_launch_file_exists(made, executables):
-    nodes = of(made, 'Node')
+def test_every_name_in_the_launch_file_exists(launch_objects, executables):
+    nodes = of_class(launch_objects, 'Node')
     assert len(nodes) == 5
     for node in nodes:
         assert node.named['package'] == 'mag_tracking'
         assert node.named['executable'] in executables
-        assert of(within(node.named['namespace']), 'LaunchConfiguration')[0].arguments == (
-            'namespace',)
+        assert of_class(objects_in(node.named['namespace']),
+                        'LaunchConfiguration')[0].arguments == ('namespace',)
         for parameters in node.named['parameters']:
             if isinstance(parameters, dict):
                 assert parameters.keys() <= NODE_PARAMETERS
-    declared = {m.arguments[0] for m in of(made, 'DeclareLaunchArgument')}
-    used = {m.arguments[0] for m in of(made, 'LaunchConfiguration')}
+    declared = {m.arguments[0] for m in of_class(launch_objects, 'DeclareLaunchArgument')}
+    used = {m.arguments[0] for m in of_class(launch_objects, 'LaunchConfiguration')}
     assert declared == used
-    for share in of(made, 'PathJoinSubstitution'):
+    for share in of_class(launch_objects, 'PathJoinSubstitution'):
         package, *path = share.arguments[0]
         assert package.arguments == ('mag_tracking',) and ROOT.joinpath(*path).is_file()
-    for m in of(made, 'DeclareLaunchArgument'):
+    for m in of_class(launch_objects, 'DeclareLaunchArgument'):
         assert m.named.get('description') or m.arguments[0] == 'network', m.arguments
 
 
-@pytest.mark.skipif(not HAS_LAUNCH, reason='launch_ros is not on PyPI: a ROS from apt has it')
+@pytest.mark.skipif(not HAS_LAUNCH, reason='launch_ros is not on PyPI; ROS from apt has it')
 def test_the_launch_file_runs():
     process = subprocess.Popen(
         ['ros2', 'launch', str(LAUNCH_FILE), f'network:={NETWORK_FILE}', 'namespace:=road',
          f'recording:={vehicle_path("straight_car_right")}', 'rate:=3.0'], text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    # Its end, if the line never comes.
-    watch = threading.Timer(MAX_S, process.kill)
-    watch.start()
+    # Ends the process if the line never arrives.
+    watchdog = threading.Timer(MAX_S, process.kill)
+    watchdog.start()
     try:
         lines = []
         while not (lines and 'track 1 begins' in lines[-1]) and (line := process.stdout.readline()):
@@ -121,5 +122,5 @@ def test_the_launch_file_runs():
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=MAX_S)
     finally:
-        watch.cancel()
+        watchdog.cancel()
     assert 'track 1 begins' in lines[-1], lines

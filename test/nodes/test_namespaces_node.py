@@ -1,4 +1,4 @@
-"""Two networks on one graph: other namespaces, other names of nodes, remapped topics."""
+"""Two networks on one graph: namespaces, node names and remapped topics."""
 
 import csv
 import itertools
@@ -34,24 +34,24 @@ NETWORKS = {'/north': ('straight_car_right', {}),
 """{namespace: (recording, {topic: remapped})}."""
 
 
-def processes_of(namespace, remapped):
-    """The nodes of one network, but for its replay."""
+def start_network(namespace, remapped):
+    """Start the nodes of one network except its replay node."""
     names = [a for one, other in remapped.items() for a in ('-r', f'{one}:={other}')]
-    return [start(node, *names, *named(namespace, node), '-p', f'network:={NETWORK_FILE}',
+    return [start(node, *names, *name_arguments(namespace, node), '-p', f'network:={NETWORK_FILE}',
                   '-p', 'reliable_input:=true',
                   *(['-p', 'align.max_wait_s:=5.0'] if node == 'detection_node' else []))
             for node in list(NODES)[:3]]
 
 
-def named(namespace, node):
+def name_arguments(namespace, node):
     """Arguments that give a node its namespace and name."""
     return ['-r', f'__ns:={namespace}', '-r', f'__node:={NODES[node]}']
 
 
 def play(namespace, recording, remapped):
-    """The replay of one network."""
+    """Start the replay node of one network."""
     names = [a for one, other in remapped.items() for a in ('-r', f'{one}:={other}')]
-    return start('replay_node', *names, *named(namespace, 'replay_node'),
+    return start('replay_node', *names, *name_arguments(namespace, 'replay_node'),
                  '-p', f'recording:={vehicle_path(recording)}', '-p', 'rate:=2.5',
                  '-p', 'start_delay:=3.0', '-p', 'wait_for_subscribers:=300.0')
 
@@ -62,33 +62,32 @@ def positions(folder):
         return {int(r['stamp_ns']): [float(r['x']), float(r['y'])] for r in csv.DictReader(stream)}
 
 
-def test_two_networks_on_one_graph(ros, tmp_path, road_network):
+def test_two_networks_on_one_graph_do_not_interfere(ros, tmp_path, road_network):
     node, spin_until = ros
-    heard, statuses = {ns: [] for ns in NETWORKS}, {}
-    for namespace, messages in heard.items():
+    received, statuses = {ns: [] for ns in NETWORKS}, {}
+    for namespace, messages in received.items():
         node.create_subscription(TrackArray, f'{namespace}/follower/tracks', messages.append,
                                  STREAM)
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: statuses.update(
         {s.name: s.message for s in m.status}), RESULTS)
-    processes = [p for ns, (_, remapped) in NETWORKS.items() for p in processes_of(ns, remapped)]
+    processes = [p for ns, (_, remapped) in NETWORKS.items() for p in start_network(ns, remapped)]
     try:
         assert spin_until(lambda: all(
             node.count_publishers(f'{ns}/follower/tracks')
             and node.count_subscribers(f'{ns}/network_frame')
             and node.count_publishers(f'{ns}/calibration_state') for ns in NETWORKS))
         assert spin_until(lambda: node.count_subscribers('/yard/first'))
-        assert not node.count_subscribers(
-            '/a/b/mag_1/imu/mag')
-        processes += [play(ns, *what) for ns, what in NETWORKS.items()]
+        assert not node.count_subscribers('/a/b/mag_1/imu/mag')
+        processes += [play(ns, *entry) for ns, entry in NETWORKS.items()]
         assert spin_until(lambda: all(any(t.status == t.ENDED for m in messages for t in m.tracks)
-                                      for messages in heard.values()))
-        # What each waits for is found, whatever it is called.
+                                      for messages in received.values()))
+        # Each node finds its peers under any name.
         assert spin_until(lambda: all(
             statuses.get(f'{ns[1:]}/magnetic_calibration: to detection') == 'running'
             and statuses.get(f'{ns[1:]}/watchman: to tracker') == 'running' for ns in NETWORKS))
-        lost = processes.pop(2)
-        lost.kill()
-        lost.communicate(timeout=MAX_S)
+        killed = processes.pop(2)
+        killed.kill()
+        killed.communicate(timeout=MAX_S)
         assert spin_until(lambda: statuses['north/watchman: to tracker'].startswith(
             '/north/follower is gone'))
         assert statuses['a/b/watchman: to tracker'] == 'running'
@@ -97,7 +96,7 @@ def test_two_networks_on_one_graph(ros, tmp_path, road_network):
     assert not any(codes), outputs
     assert not any('Traceback' in text for text in outputs), outputs
     assert 'waiting for /yard/first, /a/b/mag_2/imu/mag' in outputs[2], outputs[2]
-    for namespace, messages in heard.items():
+    for namespace, messages in received.items():
         folder = tmp_path / namespace[1:].replace('/', '_')
         replay(Recording(vehicle_path(NETWORKS[namespace][0])), road_network,
                settings_for('vehicle', PATIENT), folder)
@@ -109,14 +108,14 @@ def test_two_networks_on_one_graph(ros, tmp_path, road_network):
 
 
 def run_command(*arguments):
-    """(status, output) of the command."""
+    """(exit status, output) of the command."""
     done = subprocess.run([sys.executable, '-m', 'mag_tracking.cli', *arguments], text=True,
                           stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=MAX_S * 2,
                           env=environment(ROS_HOME=os.environ['ROS_HOME']), check=False)
     return done.returncode, done.stdout
 
 
-def test_the_runner_takes_arguments_of_ros():
+def test_the_runner_accepts_ros_arguments():
     code, output = run_command(
         'run', '--network', str(NETWORK_FILE), '--recording',
         str(vehicle_path('straight_car_fast_left')), '--rate', '3', '--ros-args', '-r',
@@ -126,7 +125,7 @@ def test_the_runner_takes_arguments_of_ros():
     assert '[robot1.follower]' in output and 'waiting for /robot1/mag_1/imu/mag' in output, output
 
 
-def test_a_recording_of_a_namespace_is_not_played_to_nobody(tmp_path):
+def test_a_recording_of_another_namespace_is_refused(tmp_path):
     source, path = Recording(vehicle_path('straight_car_right')), tmp_path / 'a.mcap'
     with RecordingWriter(path) as writer:
         for message in itertools.islice(source.messages(), 50):
@@ -140,15 +139,15 @@ def test_a_recording_of_a_namespace_is_not_played_to_nobody(tmp_path):
         'nodes in its namespace: --ros-args -r __ns:=/robot1' in output, output
 
 
-@pytest.mark.parametrize('arguments, told', [
+@pytest.mark.parametrize('arguments, error', [
     (['-r', '__ns:=/rob ot'], '__ns'), (['-r', '__node:=1 2'], 'name'),
     (['-p', 'align.max_wait_s'], 'align.max_wait_s'), (['-p', 'align.nonsense:=1.0'], 'nonsense')])
-def test_arguments_that_are_none_are_named(arguments, told):
+def test_invalid_ros_arguments_are_named(arguments, error):
     code, output = run_command('run', '--network', str(NETWORK_FILE), '--ros-args', *arguments)
-    assert code == 1 and told in output and 'Traceback' not in output, output
+    assert code == 1 and error in output and 'Traceback' not in output, output
 
 
-def test_a_twin_of_the_same_name_is_told(ros):
+def test_two_nodes_of_the_same_name_are_reported(ros):
     node, spin_until = ros
     statuses = []
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: statuses.extend(

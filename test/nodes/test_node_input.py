@@ -1,4 +1,4 @@
-"""Nodes with faulty parameters and faulty messages: a clear word, and they live on."""
+"""Nodes with invalid parameters or messages report clear errors and do not crash."""
 
 import numpy as np
 import pytest
@@ -25,15 +25,15 @@ pytestmark = pytest.mark.timeout(600)
      'expected 3 values'),
     (['-p', f'network:={NETWORK_FILE}', '-p', 'target:=submarine'], 'submarine'),
 ])
-def test_faulty_parameters_end_the_node_with_a_clear_word(arguments, message):
+def test_invalid_parameters_end_the_node_with_a_clear_error(arguments, message):
     process = start('tracker_node', *arguments)
     output, _ = process.communicate(timeout=MAX_S)
     assert process.returncode == 1
     assert message in output and 'Traceback' not in output
 
 
-def publish_bad_and_good(publish):
-    """A sensor that learns its background and then sends one message of each fault."""
+def publish_readings_and_faults(publish):
+    """Publish readings that establish a background, then one message of each fault."""
     rng = np.random.default_rng(0)
     for k in range(150):
         field = np.array([2e-6, 1.5e-5, -4.9e-5]) + 1e-8 * rng.standard_normal(3)
@@ -47,8 +47,8 @@ def publish_bad_and_good(publish):
     publish(1700, 2e-6, 1.5e-5, nan)
 
 
-def test_bad_messages_are_counted_and_survived(ros):
-    """NaN, infinity, gauss, wrong stamps: diagnostics name them, the node lives."""
+def test_invalid_messages_are_counted(ros):
+    """NaN, infinity, gauss and wrong timestamps are named in the diagnostics."""
     node, spin_until = ros
     diagnostics, calibrated = [], []
     node.create_subscription(DiagnosticArray, '/diagnostics', diagnostics.append, 10)
@@ -66,7 +66,7 @@ def test_bad_messages_are_counted_and_survived(ros):
     try:
         assert spin_until(lambda: publisher.get_subscription_count() > 0
                           and node.count_publishers('/mag_1/imu/mag_calibrated'))
-        publish_bad_and_good(publish)
+        publish_readings_and_faults(publish)
 
         def values():
             return {v.key: int(v.value) for m in diagnostics for s in m.status for v in s.values
@@ -79,14 +79,14 @@ def test_bad_messages_are_counted_and_survived(ros):
         assert calibrated[-1].header.frame_id == 'mag_1'
         service = '/calibration_node/calibrate'
         assert call(ros, Calibrate, service, Calibrate.Request(sensors=['mag_1'])).success
-        no = call(ros, Calibrate, service, Calibrate.Request(sensors=['mag_9']))
-        assert not no.success and 'mag_9' in no.message
+        refused = call(ros, Calibrate, service, Calibrate.Request(sensors=['mag_9']))
+        assert not refused.success and 'mag_9' in refused.message
     finally:
         codes, outputs = stop([process])
     assert codes == [0], outputs
 
 
-def test_frames_that_cannot_be_are_counted(ros):
+def test_invalid_frames_are_counted(ros):
     node, spin_until = ros
     diagnostics = []
     node.create_subscription(DiagnosticArray, '/diagnostics', diagnostics.append, 10)

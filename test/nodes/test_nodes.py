@@ -1,4 +1,4 @@
-"""The nodes over the real middleware: each a process, and equal to the offline replay."""
+"""The nodes over the real middleware, compared with the offline replay."""
 
 import csv
 import dataclasses
@@ -51,13 +51,13 @@ from support.shared_memory import left_behind, segments_of
 
 pytestmark = pytest.mark.timeout(600)
 
-# Played faster, the messages of one sensor may be late by more of the recording's time than the
-# 0.5 s after which a sensor is taken for dead.
+# At a higher rate, the messages of a sensor may be late by more than the 0.5 s of recording time
+# after which a sensor is treated as silent.
 PATIENT = {'align.max_wait_s': 5.0}
 
 
 class Collector(Node):
-    """Keeps what the tracker publishes."""
+    """Stores the messages of the tracker."""
 
     def __init__(self):
         super().__init__('collector')
@@ -80,13 +80,13 @@ class Collector(Node):
 
 
 def compare_with_offline(collector, folder):
-    """Every pose of the topics equals its row of poses.csv; returns the largest difference."""
+    """Compare published poses with poses.csv; return the largest relative difference."""
     with open(folder / 'poses.csv', newline='') as stream:
         offline = {(int(r['stamp_ns']), int(r['track_id'])): r for r in csv.DictReader(stream)}
     tracks = [track_of(t) for m in collector.tracks for t in m.tracks]
     live = [t for t in tracks if not t.ended]
     assert len(live) == len(collector.poses)
-    # At the end of a stream the nodes may hold back what a flush would give: a frame or two.
+    # At the end of a stream, the nodes may hold back one or two frames until a flush.
     assert len(offline) - 2 <= len(live) <= len(offline)
     worst = 0.0
     for t, pose in zip(live, collector.poses, strict=True):
@@ -104,20 +104,20 @@ def compare_with_offline(collector, folder):
 
 
 def compare_traffic(collector, offline):
-    """Passages of the topics equal those offline; the last ones may still be held back."""
+    """Assert that published passages equal those offline; the last ones may be held back."""
     n = len(collector.passages)
     assert len(offline.vehicles) - 2 <= n <= len(offline.vehicles) and n > 5
     for ours, vehicle in zip(collector.passages, offline.vehicles, strict=False):
         theirs = to_message(VehiclePassage, vehicle_passage_dict(
             vehicle.passage, offline.class_names, 'map'))
-        # NaN is not equal to itself, and written like itself.
+        # Compared as text, because NaN is not equal to itself.
         assert str(ours) == str(theirs)
     for ours, summary in zip(collector.summaries, offline.summaries, strict=False):
         assert str(ours) == str(to_message(TrafficSummary, traffic_summary_dict(summary, 'map')))
 
 
 def compare_smoothed(collector, folder):
-    """The smoothed path equals poses_smoothed.csv; the late poses are there and are others."""
+    """Assert that the smoothed path equals poses_smoothed.csv and fixed-lag poses are close."""
     with open(folder / 'poses_smoothed.csv', newline='') as stream:
         offline = list(csv.DictReader(stream))
     assert len(collector.paths) == 1
@@ -134,11 +134,11 @@ def compare_smoothed(collector, folder):
     assert whole.length == float(offline[-1]['length'])
     for p, v, row in zip(whole.poses, whole.velocities, offline, strict=True):
         C = np.array(p.pose.covariance).reshape(6, 6)
-        said = [p.pose.pose.position.x, p.pose.pose.position.y, v.x, v.y, C[0, 0]**0.5]
+        published = [p.pose.pose.position.x, p.pose.pose.position.y, v.x, v.y, C[0, 0]**0.5]
         np.testing.assert_allclose(
-            said, [float(row[c]) for c in ('x', 'y', 'vx', 'vy', 'sd_x')], rtol=0, atol=1e-9)
+            published, [float(row[c]) for c in ('x', 'y', 'vx', 'vy', 'sd_x')], rtol=0, atol=1e-9)
     late = {stamp_ns(m.header.stamp): m.pose.pose.position for m in collector.late}
-    # Those that are ambiguous are held back: they have no flag, nor the covariance of a mixture.
+    # Ambiguous fixed-lag poses are withheld: they have no flag and no covariance of a mixture.
     assert late.keys() <= {stamp_ns(s.header.stamp) for s in steps}
     assert len(late) > 0.4 * len(steps)
     position = {stamp_ns(s.header.stamp): xyz for s, xyz in zip(steps, theirs, strict=True)}
@@ -146,8 +146,8 @@ def compare_smoothed(collector, folder):
     assert 0.01 < np.median(apart) < 2.0
 
 
-def over_topics(network_file, settings, recording, rate):
-    """Play a recording through all the nodes; the collector."""
+def collect_from_nodes(network_file, settings, recording, rate):
+    """`Collector` of a recording that is played through all nodes."""
     holder = []
     run(network_file, settings, recording, rate,
         observers=[lambda: holder.append(Collector()) or holder[-1]])
@@ -158,7 +158,7 @@ def over_topics(network_file, settings, recording, rate):
 def test_nodes_equal_offline_on_vehicles(name, tmp_path, road_network):
     settings = settings_for('vehicle', {**PATIENT, 'track.smoothing_lag_s': 0.3})
     replay(Recording(vehicle_path(name)), road_network, settings, tmp_path)
-    collector = over_topics(NETWORK_FILE, settings, vehicle_path(name), 6.0)
+    collector = collect_from_nodes(NETWORK_FILE, settings, vehicle_path(name), 6.0)
     worst = compare_with_offline(collector, tmp_path)
     compare_smoothed(collector, tmp_path)
     print(f'{name}: nodes against offline, largest relative difference {worst:.1e}')
@@ -166,13 +166,13 @@ def test_nodes_equal_offline_on_vehicles(name, tmp_path, road_network):
 
 
 def test_nodes_equal_offline_on_several_vehicles(tmp_path):
-    """Twelve in 45 seconds. Every track is smoothed by itself, and begins once in the log."""
+    """Twelve vehicles in 45 s; each track is smoothed once."""
     name = 'traffic_2_sensors'
     network = network_of_recording(name)
     write_network(network_file := tmp_path / 'network.yaml', network)
     settings, recording = settings_for('vehicle', PATIENT), BUSY / f'{name}.mcap'
     replay(Recording(recording), network, settings, tmp_path)
-    collector = over_topics(network_file, settings, recording, 2.0)
+    collector = collect_from_nodes(network_file, settings, recording, 2.0)
     worst = compare_with_offline(collector, tmp_path)
     ids = {t.id for m in collector.tracks for t in m.tracks}
     together = [s for s, n in Counter(t.header.stamp.sec for m in collector.tracks
@@ -186,10 +186,11 @@ def test_nodes_equal_offline_on_several_vehicles(tmp_path):
 
 
 def test_nodes_equal_offline_at_the_defaults(tmp_path, road_network):
-    """At the speed of the recording: no message is late by half a second."""
+    """At the rate of the recording, no message is late by half a second."""
     settings, recording = settings_for('vehicle'), vehicle_path('straight_car_fast_left')
     replay(Recording(recording), road_network, settings, tmp_path)
-    worst = compare_with_offline(over_topics(NETWORK_FILE, settings, recording, 1.0), tmp_path)
+    worst = compare_with_offline(
+        collect_from_nodes(NETWORK_FILE, settings, recording, 1.0), tmp_path)
     print(f'defaults: nodes against offline, largest relative difference {worst:.1e}')
     assert worst <= 1e-9
 
@@ -199,13 +200,14 @@ def test_nodes_equal_offline_on_magnets(run_number, magnet_runs, tmp_path):
     recording, network_file = magnet_runs[run_number]
     settings = settings_for('magnet', {'align.max_wait_s': 60.0})
     replay(Recording(recording), read_network(network_file), settings, tmp_path)
-    worst = compare_with_offline(over_topics(network_file, settings, recording, 80.0), tmp_path)
+    worst = compare_with_offline(
+        collect_from_nodes(network_file, settings, recording, 80.0), tmp_path)
     print(f'magnet run {run_number}: nodes against offline {worst:.1e}')
     assert worst <= 1e-9
 
 
-def hear(node):
-    """{message type: [messages]} of what the nodes publish, filled while `node` spins."""
+def receive_topics(node):
+    """{message type: [messages]} of the topics of the nodes, filled while `node` spins."""
     topics = {NetworkFrame: '/network_frame', TrackArray: '/tracker_node/tracks',
               Odometry: '/tracker_node/odometry', MarkerArray: '/tracker_node/markers',
               PassEvent: '/detection_node/events', Clock: '/clock',
@@ -218,7 +220,7 @@ def hear(node):
 
 
 def play_through_processes(ros, recording, received):
-    """Play a recording through a process for each node until its track and events have come.
+    """Play a recording through one process per node until its track and events have arrived.
 
     At this rate a `STREAM` queue holds 2.5 s of samples: on a machine four times slower, a node
     may be busy for more than a second.
@@ -246,9 +248,9 @@ def play_through_processes(ros, recording, received):
     assert not any('Traceback' in text for text in outputs), outputs
 
 
-def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
-    """Each node a process, as on a robot; poses equal the offline ones, and all leave cleanly."""
-    recording, received = vehicle_path('straight_car_right'), hear(ros[0])
+def test_nodes_in_four_processes_equal_offline(ros, tmp_path, road_network):
+    """One process per node, as on a robot; all processes end with status 0."""
+    recording, received = vehicle_path('straight_car_right'), receive_topics(ros[0])
     play_through_processes(ros, recording, received)
     replay(Recording(recording), road_network, settings_for('vehicle', PATIENT), tmp_path)
     with open(tmp_path / 'poses.csv', newline='') as stream:
@@ -259,7 +261,7 @@ def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
     np.testing.assert_allclose([t.position[:2] for t in live], list(offline.values()), rtol=1e-9)
     assert received[Clock] and len(received[Odometry]) == len(live)
     assert received[Odometry][0].child_frame_id == 'track_1'
-    # DELETE at the end of the track.
+    # Markers are deleted (2) at the end of the track.
     assert {m.action for m in received[MarkerArray][-1].markers} == {2}
     state = received[CalibrationState]
     assert state and all(s.ready for s in state[-1].sensors)
@@ -272,7 +274,7 @@ def test_four_processes_over_the_middleware(ros, tmp_path, road_network):
         np.testing.assert_array_equal(event.signature, expected['signature'])
 
 
-def test_services_of_the_replay(ros):
+def test_replay_services_pause_seek_and_resume(ros):
     node, spin_until = ros
     fields = []
     node.create_subscription(MagneticField, '/mag_1/imu/mag', fields.append, STREAM)
@@ -292,7 +294,7 @@ def test_services_of_the_replay(ros):
         assert call(ros, Seek, '/replay_node/seek', Seek.Request(offset=13.5)).success
         assert not call(ros, Seek, '/replay_node/seek', Seek.Request(offset=99.0)).success
         assert call(ros, Trigger, '/replay_node/resume', Trigger.Request()).success
-        # Past the end it begins again: stamps fall back to the first.
+        # At the end, the loop restarts: timestamps return to the first.
         assert spin_until(lambda: stamp_ns(fields[-1].header.stamp) - begin < 1_000_000_000
                           and len(fields) > n)
         assert (stamp_ns(fields[n].header.stamp) - begin) / 1e9 >= 13.4
@@ -324,8 +326,7 @@ def test_parameters_have_descriptors_and_are_checked(ros):
     assert codes == [0], outputs
 
 
-def test_conversion_survives_the_message():
-    """A track that went through a message is the same track."""
+def test_a_track_is_unchanged_by_conversion_to_messages_and_back():
     from mag_tracking.messages.schema import hypotheses_dict, track_dict
     from mag_tracking.stages.track.manager import TrackManager
     from support.track_runs import magnet_frames
@@ -349,9 +350,9 @@ def test_conversion_survives_the_message():
     assert len(back.hypotheses) == len(track.hypotheses)
 
 
-@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
-def test_nodes_leave_no_shared_memory_behind(ros, how):
-    """Killed nodes leave segments in /dev/shm; ours end cleanly."""
+@pytest.mark.parametrize('signum', [signal.SIGINT, signal.SIGTERM])
+def test_ended_nodes_leave_no_shared_memory(ros, signum):
+    """Unlike a killed node, an interrupted node removes its segments from /dev/shm."""
     node, spin_until = ros
     before = set(os.listdir('/dev/shm'))
     process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
@@ -359,7 +360,7 @@ def test_nodes_leave_no_shared_memory_behind(ros, how):
         assert spin_until(lambda: node.count_publishers('/tracker_node/tracks'))
         used = segments_of(process.pid) - before
     finally:
-        process.send_signal(how)
+        process.send_signal(signum)
         output, _ = process.communicate(timeout=MAX_S)
     assert (process.returncode, without_states(output)) == (0, '')
     assert used and not left_behind(used)

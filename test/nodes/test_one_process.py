@@ -1,4 +1,4 @@
-"""`mag-tracking run`: the steps call each other, and their topics are there for who listens."""
+"""`mag-tracking run`: stages call each other directly and publish their topics."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.timeout(600)
 
 
 class Listener(Node):
-    """Keeps what comes between the steps, in the order in which it comes."""
+    """Stores the messages between the stages in the order of arrival."""
 
     def __init__(self):
         super().__init__('listener')
@@ -34,7 +34,7 @@ class Listener(Node):
         self.create_subscription(DiagnosticArray, '/diagnostics', self._note, RESULTS)
 
     def _track(self, message):
-        """Count tracks that came before their frame: viewers draw both together."""
+        """Count tracks that arrive before their frame; viewers draw both together."""
         stamps = {stamp_ns(f.header.stamp) for f in self.frames}
         self.early += any(stamp_ns(t.header.stamp) not in stamps for t in message.tracks)
 
@@ -42,23 +42,24 @@ class Listener(Node):
         self.statuses |= {s.name: s for s in message.status}
 
 
-def test_topics_between_the_steps_are_there_for_those_who_listen():
+def test_topics_between_the_stages_are_published():
     holder = []
     run(NETWORK_FILE, settings_for('vehicle', {**QUICK, 'align.max_wait_s': 5.0}),
         vehicle_path('straight_car_right'), 4.0,
         observers=[lambda: holder.append(Listener()) or holder[-1]])
-    (heard,) = holder
-    stamps = [stamp_ns(f.header.stamp) for f in heard.frames]
+    (listener,) = holder
+    stamps = [stamp_ns(f.header.stamp) for f in listener.frames]
     assert len(stamps) > 100 and (np.diff(stamps) > 0).all()
-    assert {stamp_ns(p.header.stamp) for p in heard.poses} <= {*stamps} and len(heard.poses) > 10
-    assert len(heard.fields) > 900 and heard.early == 0
-    # Diagnostics tell of what goes from step to step as if it were messages.
+    assert ({stamp_ns(p.header.stamp) for p in listener.poses} <= {*stamps}
+            and len(listener.poses) > 10)
+    assert len(listener.fields) > 900 and listener.early == 0
+    # Diagnostics treat calls between stages as messages.
     for name in ('detection_node: from calibration', 'tracker_node: from detection'):
-        found = [s for key, s in heard.statuses.items() if key == name]
+        found = [s for key, s in listener.statuses.items() if key == name]
         assert found and all(s.level == b'\x00' for s in found), (name, found)
 
 
-def test_no_step_listens_to_another_one(ros):
+def test_no_stage_subscribes_to_another_one(ros):
     stages, _ = make_nodes(NETWORK_FILE, settings_for('vehicle', QUICK))
     try:
         for node in stages:

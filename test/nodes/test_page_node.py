@@ -1,4 +1,4 @@
-"""The live page of running nodes: over the middleware, in a browser, with the topic's values."""
+"""Live page of running nodes, over the middleware and in a browser."""
 
 import json
 import re
@@ -33,26 +33,26 @@ def command(*arguments):
 
 
 def address(process):
-    """The address that the command prints."""
+    """Address that the command prints."""
     for line in process.stdout:
         found = re.search(r'live page: (\S+)', line)
         if found:
             return found[1]
-    raise AssertionError(f'no address before its end with {process.wait()}')
+    raise AssertionError(f'the command ended with {process.wait()} and printed no address')
 
 
-def ended(process):
+def terminate(process):
     process.terminate()
     process.communicate(timeout=MAX_S)
     return process.returncode
 
 
 @needs_browser
-def test_the_page_of_running_nodes_has_the_values_of_the_topic(ros):
-    """The page is opened before the nodes are started, and says what it waits for."""
+def test_the_page_of_running_nodes_shows_the_values_of_the_topic(ros):
+    """The page is opened before the nodes are started and names the missing topic."""
     node, spin_until = ros
-    heard = []
-    node.create_subscription(TrackArray, '/tracker_node/tracks', heard.append, STREAM)
+    received = []
+    node.create_subscription(TrackArray, '/tracker_node/tracks', received.append, STREAM)
     watch = command('watch', '--port', 0)
     try:
         with browser() as chromium:
@@ -61,9 +61,9 @@ def test_the_page_of_running_nodes_has_the_values_of_the_topic(ros):
                       '"no publisher on /tracker_node/tracks")')
             run = command('run', '--network', NETWORK_FILE, '--recording', RECORDING,
                           '--rate', 3, *PATIENT)
-            assert spin_until(lambda: any(t.status == t.ENDED for m in heard for t in m.tracks))
+            assert spin_until(lambda: any(t.status == t.ENDED for m in received for t in m.tracks))
             page.wait('magTracking.scene?.tracks.length && magTracking.scene?.tracks[0]?.ended')
-            poses = [track_of(t) for m in heard for t in m.tracks if t.status == t.ACTIVE]
+            poses = [track_of(t) for m in received for t in m.tracks if t.status == t.ACTIVE]
             columns = 'magTracking.scene.tracks[0].columns'
             n = page.value(f'{columns}.t.length')
             begin_ns = int(page.value('magTracking.scene.begin_ns'))
@@ -84,7 +84,7 @@ def test_the_page_of_running_nodes_has_the_values_of_the_topic(ros):
             assert page.complaints == []
             run.communicate(timeout=MAX_S)
     finally:
-        assert ended(watch) == 0
+        assert terminate(watch) == 0
 
 
 def messages_of(url, until, seconds=MAX_S):
@@ -98,8 +98,8 @@ def messages_of(url, until, seconds=MAX_S):
                 return
 
 
-def test_a_tracker_of_another_name_is_found_and_may_be_restarted():
-    """Its second run begins again with track 1, at the times of the recording."""
+def test_a_renamed_tracker_is_found_and_may_be_restarted():
+    """Its second run restarts with track 1 and the times of the recording."""
     watch = command('watch', '--port', 0)
     try:
         url = address(watch)
@@ -115,11 +115,11 @@ def test_a_tracker_of_another_name_is_found_and_may_be_restarted():
             assert n > 20
             run.communicate(timeout=MAX_S)
     finally:
-        assert ended(watch) == 0
+        assert terminate(watch) == 0
 
 
 def test_a_page_ends_with_the_command_that_started_it():
-    """Also where that is killed, and cannot tell its page."""
+    """Also if the command is killed."""
     run = command('run', '--network', NETWORK_FILE, '--web', 0)
     url = address(run)
     assert urllib.request.urlopen(url, timeout=MAX_S).status == 200
@@ -133,7 +133,7 @@ def test_a_page_ends_with_the_command_that_started_it():
     run.stdout.close()
 
 
-def test_a_host_without_a_page_is_refused(capsys):
+def test_the_host_option_requires_the_page(capsys):
     assert main(['run', '--network', str(NETWORK_FILE), '--host', '0.0.0.0']) == 1
     assert 'add --web' in capsys.readouterr().err
 
@@ -142,14 +142,14 @@ def test_run_serves_the_page_and_frees_the_port():
     run = command('run', '--network', NETWORK_FILE, '--web', 0)
     url = address(run)
     assert re.fullmatch(r'http://127\.0\.0\.1:\d+/', url)
-    assert ended(run) == 0
+    assert terminate(run) == 0
     port = int(url.rstrip('/').rpartition(':')[2])
     end = time.monotonic() + MAX_S
     again = command('watch', '--port', port)
     assert address(again) == url and time.monotonic() < end
-    # The port is taken now: the command says so before any node is up.
+    # The port is in use: the command reports it before it starts a node.
     refused = command('run', '--network', NETWORK_FILE, '--web', port)
     output = refused.communicate(timeout=MAX_S)[0]
     assert refused.returncode == 1
     assert f'port {port}: Address already in use' in output
-    assert ended(again) == 0
+    assert terminate(again) == 0

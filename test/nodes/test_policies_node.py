@@ -1,4 +1,4 @@
-"""The policies for SROS 2 are what the nodes do, and well-formed."""
+"""The SROS 2 policies match the nodes and are well-formed."""
 
 import subprocess
 import sys
@@ -17,7 +17,7 @@ def test_policies_are_up_to_date():
     assert done.returncode == 0, done.stdout
 
 
-def test_policies_of_a_namespace_name_it_everywhere():
+def test_policies_of_a_namespace_contain_it_everywhere():
     done = subprocess.run([sys.executable, str(ROOT / 'tools' / 'generate_policies.py'),
                            '--namespace', '/robot1'], text=True, stdout=subprocess.PIPE,
                           stderr=subprocess.DEVNULL, timeout=MAX_S, check=False)
@@ -28,8 +28,8 @@ def test_policies_of_a_namespace_name_it_everywhere():
     assert names & common == common and all(n.startswith('/robot1/') for n in names - common)
 
 
-def test_policies_allow_each_node_what_it_needs_and_no_more():
-    """As the schema of sros2 has it: rules of allowed topics and services by profile."""
+def test_policies_allow_only_the_interfaces_of_each_node():
+    """Rules by profile, as in the schema of sros2."""
     profiles = {p.get('node'): p for p in ElementTree.parse(POLICIES).iter('profile')}
     assert set(profiles) == {'calibration_node', 'detection_node', 'tracker_node', 'driver_node',
                              'replay_node'}

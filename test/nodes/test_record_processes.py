@@ -1,4 +1,4 @@
-"""`mag-tracking record` as a process: equal to what was published, and a kill loses little."""
+"""`mag-tracking record` as a process: complete recordings, and small losses after a kill."""
 
 import csv
 import os
@@ -31,7 +31,7 @@ from support.recorded_topics import FIELDS, IMUS
 from support.shared_memory import left_behind, segments_of
 
 pytestmark = pytest.mark.timeout(600)
-S = 10**9
+NS = 10**9
 COMMAND = ('import argparse, sys; from mag_tracking.cli import record; '
            'from mag_tracking.nodes import record_node; record_node.PROGRESS_INTERVAL_S = 0.2; '
            'p = argparse.ArgumentParser(); record.add(p.add_subparsers()); '
@@ -39,7 +39,7 @@ COMMAND = ('import argparse, sys; from mag_tracking.cli import record; '
 
 
 def recording_process(out, *options):
-    """`mag-tracking record` in a process of its own, when it listens."""
+    """Start `mag-tracking record` as a process and wait until it subscribes."""
     process = subprocess.Popen(
         [sys.executable, '-u', '-c', COMMAND, 'record', '--network', NETWORK_FILE, '--out', out,
          *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -49,19 +49,19 @@ def recording_process(out, *options):
 
 
 def await_messages(process, n):
-    """Read what a recording process says until it has `n` messages, or no more for ten seconds."""
+    """Read the output of a recording process until `n` messages, or none for ten seconds."""
     before, lines = None, 0
     for line in process.stdout:
-        told = re.search(r' s: (\d+) messages', line)
-        if told:
-            lines = lines + 1 if told[1] == before else 0
-            before = told[1]
+        match = re.search(r' s: (\d+) messages', line)
+        if match:
+            lines = lines + 1 if match[1] == before else 0
+            before = match[1]
             if int(before) >= n or lines > 50:
                 return
 
 
 def contents(path, topics):
-    """{topic: [message as text]}; text, as the padding of the bytes is not defined."""
+    """{topic: [message as text]}; as text, because padding bytes are undefined."""
     out = {t: [] for t in topics}
     for m in Recording(path).messages(topics):
         out[m.topic].append(repr(decode(m)))
@@ -76,8 +76,8 @@ def poses(folder):
                      for r in rows])
 
 
-def test_a_replay_that_is_recorded_is_the_same_recording(ros, tmp_path, road_network):
-    """Every message, also for rosbags; and the same track. SIGTERM ends it cleanly."""
+def test_a_recorded_replay_equals_the_original(ros, tmp_path, road_network):
+    """Same messages, also in rosbags, and the same track. SIGTERM ends the recorder cleanly."""
     before = set(os.listdir('/dev/shm'))
     original, out = vehicle_path('straight_car_right'), tmp_path / 'night'
     process = recording_process(out)
@@ -107,7 +107,7 @@ def test_a_replay_that_is_recorded_is_the_same_recording(ros, tmp_path, road_net
     assert counts == expected
     with open(out / 'night_0.mcap', 'rb') as stream:
         times = [m.log_time for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]
-    # In order also across topics, but for what comes between the fetches of two.
+    # Ordered also across topics, except for messages that arrive between two polls.
     assert np.mean(np.diff(times) >= 0) > 0.9
     patient = settings_for('vehicle', {'align.max_wait_s': 5.0})
     for path in (original, out):
@@ -119,7 +119,7 @@ def test_a_replay_that_is_recorded_is_the_same_recording(ros, tmp_path, road_net
 
 def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):
     node, spin_until = ros
-    shm = set(os.listdir('/dev/shm'))
+    before = set(os.listdir('/dev/shm'))
     sent = []
     publisher = node.create_publisher(MagneticField, FIELDS[0], STREAM)
 
@@ -131,7 +131,7 @@ def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):
     process = recording_process(tmp_path / 'a')
     try:
         node.create_timer(0.005, publish)
-        # Some chunks are in the file, and the next is in the making.
+        # Some chunks are in the file, and the next one is being filled.
         assert spin_until(lambda: sum(
             p.stat().st_size for p in (tmp_path / 'a').glob('*.mcap')) > 6000)
         n = len(sent)
@@ -141,17 +141,17 @@ def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):
         process.kill()
         killed = time.time_ns()
         process.communicate()
-        # A killed process leaves its segments; those that were there before are ours.
-        for name in used - shm & set(os.listdir('/dev/shm')):
+        # A killed process leaves its segments; earlier segments belong to this process.
+        for name in used - before & set(os.listdir('/dev/shm')):
             os.unlink(f'/dev/shm/{name}')
     messages = list(Recording(tmp_path / 'a').messages())
     numbers = [decode(m).header.stamp.nanosec for m in messages]
     assert numbers == sorted(set(numbers)) and len(numbers) > 100
-    print(f'lost: {(killed - sent[numbers[-1]]) / S:.2f} s')
-    assert killed - sent[numbers[-1]] < S
-    # Received after it was sent, and soon: the time is of the arrival, not of the fetching.
+    print(f'lost: {(killed - sent[numbers[-1]]) / NS:.2f} s')
+    assert killed - sent[numbers[-1]] < NS
+    # Log times are those of arrival, not of the poll.
     delays = [m.log_time_ns - sent[k] for m, k in zip(messages, numbers, strict=True)]
-    assert min(delays) > 0 and np.median(delays) < record_node.POLL_INTERVAL_S * S / 4
+    assert min(delays) > 0 and np.median(delays) < record_node.POLL_INTERVAL_S * NS / 4
     assert repair(tmp_path / 'a', report=lambda _: None) == 1
     with Reader(tmp_path / 'a') as reader:
         assert reader.message_count == len(numbers)

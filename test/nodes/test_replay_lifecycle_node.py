@@ -1,4 +1,4 @@
-"""The replay node as a lifecycle node, and both forms of parameter files at the nodes."""
+"""Replay node as a lifecycle node, and both formats of parameter files."""
 
 import pytest
 from lifecycle_msgs.msg import State, Transition
@@ -18,7 +18,7 @@ ROS = ('/**:\n  ros__parameters:\n    detect:\n      onset_frames: 4\n'
        '    track.vehicle.arrival_names: [east, west, "no"]\n')
 
 
-def test_a_life_cycle(ros):
+def test_lifecycle_transitions_start_and_stop_playback(ros):
     node, spin_until = ros
     fields = []
     node.create_subscription(MagneticField, '/mag_1/imu/mag', fields.append, STREAM)
@@ -45,7 +45,7 @@ def test_a_life_cycle(ros):
         assert not spin_until(lambda: len(fields) > n, 0.5)
         assert change(Transition.TRANSITION_ACTIVATE)
         assert spin_until(lambda: len(fields) > n)
-        # It goes on from where it stopped.
+        # Playback continues where it stopped.
         assert 0 < stamp_ns(fields[n].header.stamp) - stamp_ns(fields[n - 1].header.stamp) < 1e8
         assert change(Transition.TRANSITION_DEACTIVATE)
         assert change(Transition.TRANSITION_CLEANUP)
@@ -55,7 +55,7 @@ def test_a_life_cycle(ros):
     assert codes == [0], outputs
 
 
-def test_a_recording_that_cannot_be_read_leaves_it_unconfigured(ros, tmp_path):
+def test_an_unreadable_recording_leaves_the_node_unconfigured(ros, tmp_path):
     process = start('replay_node', '-p', 'autostart:=false', '-p', f'recording:={tmp_path}/no.mcap')
     try:
         done = call(ros, ChangeState, '/replay_node/change_state', ChangeState.Request(
@@ -67,7 +67,7 @@ def test_a_recording_that_cannot_be_read_leaves_it_unconfigured(ros, tmp_path):
 
 
 @pytest.mark.parametrize('content', [PLAIN, ROS])
-def test_nodes_take_both_forms_of_parameter_files(ros, tmp_path, content):
+def test_nodes_accept_both_formats_of_parameter_files(ros, tmp_path, content):
     path = tmp_path / 'mine.yaml'
     path.write_text(content)
     nodes = {'detection_node': 'detect.onset_frames', 'tracker_node': 'track.vehicle.arrival_names'}
@@ -84,7 +84,7 @@ def test_nodes_take_both_forms_of_parameter_files(ros, tmp_path, content):
     assert list(values[1].string_array_value) == ['east', 'west', 'no']
 
 
-def test_a_parameter_file_that_is_none_is_said(tmp_path):
+def test_an_invalid_parameter_file_is_named(tmp_path):
     path = tmp_path / 'mine.yaml'
     path.write_text('detect: [\n')
     process = start('detection_node', '--params-file', str(path), '-p', f'network:={NETWORK_FILE}')

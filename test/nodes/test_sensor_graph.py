@@ -9,7 +9,7 @@ from mag_tracking.nodes.sensor_graph import node_of, shortened, topic_findings
 
 
 def endpoint(name, namespace='/', kind=MAGNETIC_FIELD):
-    """As rclpy describes one."""
+    """Endpoint as described by rclpy."""
     return SimpleNamespace(node_name=name, node_namespace=namespace, topic_type=kind)
 
 
@@ -17,18 +17,18 @@ UNKNOWN = endpoint('_NODE_NAME_UNKNOWN_', '_NODE_NAMESPACE_UNKNOWN_')
 """An endpoint that was announced before its node."""
 
 
-@pytest.mark.parametrize('one, name', [
+@pytest.mark.parametrize('info, name', [
     (endpoint('a'), '/a'), (endpoint('a', '/n/m'), '/n/m/a'), (UNKNOWN, None)])
-def test_the_node_of_an_endpoint(one, name):
-    assert node_of(one) == name
+def test_the_node_of_an_endpoint_has_its_namespace(info, name):
+    assert node_of(info) == name
 
 
-def test_two_publishers_are_a_fault_also_before_their_nodes_are_known():
-    for publishers, told in (([UNKNOWN, UNKNOWN], 'unknown'), ([endpoint('b', '/n'), UNKNOWN,
-                                                                endpoint('a')], '/a, /n/b')):
+def test_several_publishers_are_a_fault_even_if_their_nodes_are_unknown():
+    for publishers, nodes in (([UNKNOWN, UNKNOWN], 'unknown'), ([endpoint('b', '/n'), UNKNOWN,
+                                                                 endpoint('a')], '/a, /n/b')):
         graph = SimpleNamespace(get_publishers_info_by_topic=lambda _, found=publishers: found)
         (finding,) = topic_findings(graph, 'mag_1', '/mag_1/imu/mag')
-        assert finding.what == f'{len(publishers)} publishers of /mag_1/imu/mag: {told}'
+        assert finding.what == f'{len(publishers)} publishers of /mag_1/imu/mag: {nodes}'
 
 
 def test_many_names_are_shortened():

@@ -15,21 +15,21 @@ from support.bundled import NETWORK_FILE
 from support.dense_traffic import after_dense_traffic
 
 READINGS = after_dense_traffic('junction_left_to_right', 7.0)
-"""Both backgrounds become doubtful twice, one of them while the other is."""
+"""Both backgrounds become doubtful twice; one of them while the other is doubtful."""
 BATCH = 40
 
 
 class Listener:
-    """Merges the published doubtful stretches, as the tracker does."""
+    """Merges the published doubtful intervals as the tracker does."""
 
     def __init__(self):
         self.network = read_network(NETWORK_FILE)
         self.stage = Calibrate(self.network, settings_for('vehicle').calibrate)
         self.rounds = SensorRounds('calibration_node', self.network, self.stage, Mock(), Mock(),
-                                   lambda: True, Mock(), self.hear)
+                                   lambda: True, Mock(), self.receive)
         self.n, self.times = 0, {}
 
-    def hear(self, states):
+    def receive(self, states):
         self.n += 1
         self.times = merged(self.times, doubtful_times(SimpleNamespace(sensors=states)))
 
@@ -40,11 +40,11 @@ class Listener:
 
     @property
     def is_right(self):
-        """True if the received stretches equal those of the calibration."""
+        """Whether the received intervals equal those of the calibration."""
         return {n: t for n, t in self.times.items() if t} == self.stage.doubtful_intervals()
 
 
-def test_every_doubt_and_its_end_are_reported_at_once_and_once():
+def test_each_begin_and_end_of_a_doubt_is_reported_once_without_delay():
     listener, changes = Listener(), 0
     for k in range(len(READINGS) // BATCH):
         before = listener.stage.doubtful_intervals()
@@ -57,7 +57,7 @@ def test_every_doubt_and_its_end_are_reported_at_once_and_once():
 
 @pytest.mark.parametrize('steps', [1, 2, 3, 5])
 @pytest.mark.parametrize('phase', [0, 1, 2])
-def test_rounds_of_any_length_contradict_no_report(steps, phase):
+def test_rounds_of_any_length_agree_with_the_reports(steps, phase):
     """A round publishes per-sensor states of different age."""
     listener = Listener()
     for k in range(len(READINGS) // BATCH):
@@ -68,7 +68,7 @@ def test_rounds_of_any_length_contradict_no_report(steps, phase):
         assert listener.is_right
 
 
-def test_learning_anew_ends_a_doubt():
+def test_relearning_ends_a_doubt():
     """Also if the doubt began with the latest reading."""
     listener, n = Listener(), 0
     while not listener.stage.doubtful_intervals():

@@ -1,4 +1,4 @@
-"""The end of a process with ROS, also where the middleware hangs."""
+"""Shutdown of processes with ROS, also if the middleware hangs."""
 
 import ast
 import os
@@ -16,7 +16,7 @@ from support.bundled import NETWORK_FILE, ROOT
 from support.node_processes import MAX_S, environment
 
 FAST_DDS = 'rmw_fastrtps_cpp'
-STUCK = '''
+STUCK_NODE = '''
 import re, sys
 from rclpy.node import Node
 from mag_tracking.nodes import stage_node
@@ -34,7 +34,7 @@ class Stuck(Node):
             sys.stdout.flush()
             print('not flushed', end='')
         if 'fails' in sys.argv:
-            raise RuntimeError('on its way')
+            raise RuntimeError('by design')
 
     def destroy_node(self):
         # This takes years and, as in Fast DDS, never releases the interpreter's lock.
@@ -42,7 +42,7 @@ class Stuck(Node):
 
 sys.exit(stage_node.main(Stuck, ['stuck']))
 '''
-HALF_BUILT = '''
+INCOMPLETE_NODE = '''
 import atexit, re, sys, types
 import rclpy
 from mag_tracking.nodes import start
@@ -58,50 +58,50 @@ start.run_node('failing_node')
 '''
 
 
-def started(code, *words, **how):
-    """The process of some code that keeps its output until it has to be written."""
+def started(code, *arguments, **how):
+    """Start Python with arguments; its output is buffered until the end."""
     buffered = environment(ROS_HOME=os.environ['ROS_HOME'])
     buffered.pop('PYTHONUNBUFFERED', None)
-    return subprocess.Popen([sys.executable, *code, *words], text=True, **{
+    return subprocess.Popen([sys.executable, *code, *arguments], text=True, **{
         'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE, 'env': buffered, **how})
 
 
-def test_a_node_that_cannot_leave_is_ended_with_its_status():
-    with started(['-c', STUCK]) as process:
+def test_a_stuck_node_is_ended_with_its_exit_status():
+    with started(['-c', STUCK_NODE]) as process:
         assert process.stdout.readline() == 'it runs\n'
         begin = time.monotonic()
         process.send_signal(signal.SIGINT)
-        # By the stream that has read a line, and may have read more.
+        # Read from the stream itself: it may have buffered more than one line.
         output, errors = process.stdout.read(), process.stderr.read()
         assert process.wait(MAX_S) == 0 and output == 'not flushed', (output, errors)
     assert time.monotonic() - begin > SHUTDOWN_TIMEOUT_S
     assert errors.endswith(HUNG_MESSAGE)
 
 
-def test_an_error_on_its_way_is_printed_before_the_end():
-    process = started(['-c', STUCK], 'fails')
+def test_an_error_is_printed_before_a_stuck_node_is_ended():
+    process = started(['-c', STUCK_NODE], 'fails')
     _, errors = process.communicate(timeout=MAX_S)
-    assert process.returncode == 1 and f'RuntimeError: on its way\n{HUNG_MESSAGE}' in errors, errors
+    assert process.returncode == 1 and f'RuntimeError: by design\n{HUNG_MESSAGE}' in errors, errors
 
 
-def test_a_node_that_is_only_half_built_does_not_hold_up_the_end_of_python():
-    output, errors = started(['-c', HALF_BUILT]).communicate(timeout=MAX_S)
+def test_an_incomplete_node_does_not_block_the_exit():
+    output, errors = started(['-c', INCOMPLETE_NODE]).communicate(timeout=MAX_S)
     assert (output, errors) == ('there is no such file', HUNG_MESSAGE)
 
 
-@pytest.mark.parametrize('module, words, status, told', [
+@pytest.mark.parametrize('module, arguments, status, text', [
     ('mag_tracking.cli', ['topics'], 0, ''),
     ('mag_tracking.nodes.tracker_node', ['--ros-args', '-p', 'network:=/nonexistent.yaml'], 1,
      '/nonexistent.yaml')])
-def test_a_closed_output_is_no_obstacle(module, words, status, told):
-    process = started(['-m', module], *words, stdout=None, preexec_fn=lambda: os.close(1))
+def test_a_closed_output_does_not_block_the_exit(module, arguments, status, text):
+    process = started(['-m', module], *arguments, stdout=None, preexec_fn=lambda: os.close(1))
     _, errors = process.communicate(timeout=MAX_S)
-    assert process.returncode == status and told in errors and 'Traceback' not in errors, errors
+    assert process.returncode == status and text in errors and 'Traceback' not in errors, errors
 
 
 @pytest.fixture(scope='module')
 def hanging_middleware(tmp_path_factory):
-    """A library to preload, with which the middleware hangs at the end of every process."""
+    """Preloaded library that makes the middleware hang at the end of every process."""
     path = tmp_path_factory.mktemp('preloaded') / 'hanging.so'
     subprocess.run(['g++', '-shared', '-fPIC', '-o', path,
                     ROOT / 'test' / 'support' / 'hanging_middleware.cpp'], check=True)
@@ -109,25 +109,25 @@ def hanging_middleware(tmp_path_factory):
 
 
 @pytest.mark.skipif(os.environ.get('RMW_IMPLEMENTATION', FAST_DDS) != FAST_DDS,
-                    reason='the hang is one of Fast DDS')
-@pytest.mark.parametrize('module, words, status, told', [
+                    reason='only Fast DDS hangs')
+@pytest.mark.parametrize('module, arguments, status, text', [
     ('mag_tracking.cli', ['topics'], 0, '/rosout'),
     ('mag_tracking.cli', ['doctor', '--live', '1', '--network', NETWORK_FILE], 2, 'WRONG'),
     ('mag_tracking.cli', ['run', '--network', NETWORK_FILE, '--drivers', '/none.yaml'], 1,
      '/none.yaml'),
     ('mag_tracking.nodes.tracker_node', ['--ros-args', '-p', 'network:=/none.yaml'], 1,
      '/none.yaml')])
-def test_what_was_said_stays_when_the_middleware_hangs(hanging_middleware, module, words, status,
-                                                       told):
-    process = started(['-m', module], *map(str, words), env=environment(
+def test_output_is_complete_if_the_middleware_hangs(hanging_middleware, module, arguments, status,
+                                                    text):
+    process = started(['-m', module], *map(str, arguments), env=environment(
         ROS_HOME=os.environ['ROS_HOME'], LD_PRELOAD=str(hanging_middleware)))
     output, errors = process.communicate(timeout=MAX_S)
-    assert process.returncode == status and told in output + errors, (output, errors)
+    assert process.returncode == status and text in output + errors, (output, errors)
     assert errors.endswith(HUNG_MESSAGE), errors
 
 
-class Recorded:
-    """Takes the place of a node; remembers that it was destroyed."""
+class FakeNode:
+    """Stand-in for a node; records that it was destroyed."""
 
     def __init__(self, error=None):
         self.error, self.is_destroyed = error, False
@@ -139,14 +139,14 @@ class Recorded:
 
 
 def test_all_nodes_are_destroyed_when_one_fails():
-    nodes = [Recorded(RuntimeError('the first')), Recorded()]
+    nodes = [FakeNode(RuntimeError('the first')), FakeNode()]
     with pytest.raises(RuntimeError, match='the first'):
         shut_down(nodes)
     assert all(node.is_destroyed for node in nodes)
 
 
-def test_an_error_about_a_name_of_other_bytes_stays_what_it_is():
-    node = Recorded()
+def test_an_error_with_an_undecodable_name_is_not_replaced():
+    node = FakeNode()
     with pytest.raises(MagTrackingError, match='no such file'):
         try:
             raise MagTrackingError('\udcff: no such file')
@@ -156,30 +156,30 @@ def test_an_error_about_a_name_of_other_bytes_stays_what_it_is():
 
 
 @pytest.mark.parametrize('seconds', [-1.0, float('nan'), float('inf'), 1e10])
-def test_a_deadline_is_a_time_that_comes(seconds):
+def test_deadlines_out_of_range_are_refused(seconds):
     for limit in (Deadline, end_within):
         with pytest.raises(ValueError, match='between 0 and 1e6'):
             limit(seconds, 1, b'')
 
 
-def test_the_doctor_reports_before_it_leaves(monkeypatch, capfd):
+def test_the_doctor_reports_before_its_shutdown(monkeypatch, capfd):
     from mag_tracking.cli import main
     from mag_tracking.nodes import doctor_node
 
-    left = []
+    statuses = []
 
     def reported(nodes, executor, status):
-        left.append((status, 'has no publisher' in capfd.readouterr().out))
+        statuses.append((status, 'has no publisher' in capfd.readouterr().out))
         shut_down(nodes, executor, status)
 
     monkeypatch.setattr(doctor_node, 'shut_down', reported)
     assert main(['doctor', '--live', '1', '--network', str(NETWORK_FILE)]) == 2
-    assert left == [(2, True)]
+    assert statuses == [(2, True)]
 
 
 @pytest.mark.parametrize('path', sorted((ROOT / 'mag_tracking').rglob('*.py')),
                          ids=lambda p: p.stem)
-def test_ros_is_left_in_one_place(path):
+def test_ros_is_shut_down_in_one_module_only(path):
     names = {ast.unparse(node) for node in ast.walk(ast.parse(path.read_text()))
              if isinstance(node, ast.Attribute)}
     shutdown = names & {'rclpy.try_shutdown', 'rclpy.shutdown', 'node.destroy_node'}

@@ -1,4 +1,4 @@
-"""Faults in the log: when they appear, now and then while they last, and when they are over."""
+"""Faults in the log: at their beginning, at intervals while they last, and at their end."""
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -8,7 +8,7 @@ from mag_tracking.nodes.status_log import MAX_FAULTS, REPEAT_INTERVAL_S, StatusL
 
 
 class Logger:
-    """Keeps what is logged."""
+    """Stores log lines."""
 
     def __init__(self):
         self.lines = []
@@ -25,7 +25,7 @@ class Logger:
 
 @pytest.fixture
 def log(monkeypatch):
-    """f(seconds, level, message): what is logged of a status of that time."""
+    """f(seconds, level, message): lines that are logged for a status at that time."""
     now, logger = [0.0], Logger()
     monkeypatch.setattr(status_log.time, 'monotonic', lambda: now[0])
     statuses = StatusLog(logger)
@@ -38,7 +38,7 @@ def log(monkeypatch):
     return add
 
 
-def test_a_fault_is_told_when_it_appears_and_when_it_is_over(log):
+def test_a_fault_is_logged_at_its_beginning_and_end(log):
     assert log(0.0, DiagnosticStatus.OK, 'running') == []
     assert log(1.0, DiagnosticStatus.ERROR, 'silent for 3 s') == [
         ('error', 'mag_1: silent for 3 s')]
@@ -49,15 +49,15 @@ def test_a_fault_is_told_when_it_appears_and_when_it_is_over(log):
     assert log(5.0, DiagnosticStatus.OK, 'running') == []
 
 
-def test_a_fault_that_lasts_or_flickers_is_told_once_a_minute(log):
-    told = [k for k in range(1, 200) if any(
+def test_a_lasting_or_intermittent_fault_is_logged_once_a_minute(log):
+    times = [k for k in range(1, 200) if any(
         level == 'error' for level, _ in log(float(k), DiagnosticStatus.ERROR if k % 3
                                              else DiagnosticStatus.OK, f'silent for {k} s'))]
-    assert told[0] == 1 and len(told) == 4
-    assert all(b - a >= REPEAT_INTERVAL_S for a, b in zip(told, told[1:], strict=False))
+    assert times[0] == 1 and len(times) == 4
+    assert all(b - a >= REPEAT_INTERVAL_S for a, b in zip(times, times[1:], strict=False))
 
 
-def test_memory_is_bounded(log):
+def test_the_number_of_remembered_faults_is_bounded(log):
     for k in range(2 * MAX_FAULTS):
         log(0.0, DiagnosticStatus.WARN, 'bad', f'node: {"x" * (k % 97)}{"y" * (k // 97)}')
     assert log.statuses.n_remembered <= 2 * MAX_FAULTS
@@ -72,7 +72,7 @@ def test_a_hundred_sensors_with_one_fault_do_not_fill_the_log(log):
     lines = [line for j in range(100) for line in log(
         1.0, DiagnosticStatus.OK, 'running', f'node: mag_{j}')]
     assert len(lines) == status_log.MAX_SIMILAR_LINES
-    # Another fault is told all the same, and this one in the next minute.
+    # Another fault is still logged, and this one again in the next minute.
     assert log(2.0, DiagnosticStatus.WARN, 'noisy', 'node: mag_7') == [('warning', 'mag_7: noisy')]
     assert log(2.0 * REPEAT_INTERVAL_S, DiagnosticStatus.ERROR, 'no message on /mag_7/imu/mag',
                'node: mag_7')

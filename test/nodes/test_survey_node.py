@@ -1,4 +1,4 @@
-"""The survey over the middleware: service, latched state, file, and what the tracker takes."""
+"""Survey over the middleware: service, latched state, file and network of the tracker."""
 
 import numpy as np
 from mag_tracking_msgs.msg import CalibrationState, TrackArray
@@ -17,7 +17,7 @@ NAME = 'junction_left_turns_to_rear'
 
 
 def offline(road_network):
-    """What the command finds in the target-free beginning."""
+    """Network calibrated by the command from the beginning without targets."""
     return calibrate(Recording(vehicle_path(NAME)), road_network, settings_for('vehicle'), 'now',
                      passes=False).network
 
@@ -28,7 +28,7 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
     node.create_subscription(CalibrationState, '/calibration_state', states.append,
                              LATCHED)
     node.create_subscription(TrackArray, '/tracker_node/tracks', tracks.append, STREAM)
-    # The file lies beside that of the network.
+    # The result is saved next to the network file.
     saved, network_file = tmp_path / 'surveyed.yaml', tmp_path / 'network.yaml'
     network_file.write_text(NETWORK_FILE.read_text())
     network = ['-p', f'network:={network_file}', '-p', 'reliable_input:=true']
@@ -45,7 +45,7 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
                                '-p', 'rate:=1.0', '-p', 'start_delay:=1.0',
                                '-p', 'wait_for_subscribers:=300.0'))
         assert spin_until(lambda: states and all(s.ready for s in states[-1].sensors))
-        # The knocks are over by then, the car is seconds away.
+        # The knocks are over, and the car is seconds away.
         answer = call(ros, Survey, '/calibration_node/survey', Survey.Request(save=True))
         assert answer.success and not answer.warnings, answer
         assert spin_until(lambda: states[-1].sensors[1].clock_offset != 0.0)
@@ -61,7 +61,7 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
         assert abs(found.clock_offset[j] - expected.clock_offset[j]) < 1e-6
         assert state[j].clock_offset == found.clock_offset[j]
         assert state[j].calibrated_by == found.calibrated[j].by != ''
-    # A tracker that still had the old network would begin with five degrees about each axis.
+    # With the old network, a tracker would begin with five degrees about each axis.
     assert 'surveyed sensor orientations received' in outputs[2]
     first = next(track_of(t) for m in tracks for t in m.tracks if t.status == t.ACTIVE)
     assert (first.mounting_std.min(axis=1) < np.deg2rad(0.4)).all()

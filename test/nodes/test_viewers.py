@@ -1,4 +1,4 @@
-"""Layouts of viewers: every topic, field and frame in them exists in a running demo."""
+"""Layouts of viewers: all topics, fields and frames exist in a running demo."""
 
 import importlib.util
 import json
@@ -20,8 +20,8 @@ from support.bundled import NETWORK_FILE, ROOT, vehicle_path
 VIEWERS = ROOT / 'config' / 'viewers'
 
 
-def named():
-    """[(topic, path of fields)] of all layouts, and the frames that they name."""
+def layout_entries():
+    """[(topic, path of fields)] and frames of all layouts."""
     content = yaml.safe_load((VIEWERS / 'mag_tracking.rviz').read_text())['Visualization Manager']
     found = [(d['Topic']['Value'], '') for d in content['Displays'] if 'Topic' in d]
     frames = {content['Global Options']['Fixed Frame']}
@@ -37,20 +37,20 @@ def named():
     return found, frames
 
 
-class Witness(Node):
-    """Notes which topics the graph has, and which frames."""
+class GraphObserver(Node):
+    """Records the topics and frames of the graph."""
 
     def __init__(self):
         super().__init__('witness')
         self.types, self.frames = {}, set()
-        self.create_subscription(TFMessage, '/tf_static', self._take, LATCHED)
-        self.create_timer(0.5, self._look)
+        self.create_subscription(TFMessage, '/tf_static', self._add_frames, LATCHED)
+        self.create_timer(0.5, self._add_topics)
 
-    def _take(self, message):
+    def _add_frames(self, message):
         self.frames |= {f for t in message.transforms
                         for f in (t.header.frame_id, t.child_frame_id)}
 
-    def _look(self):
+    def _add_topics(self):
         for topic, (kind, *_) in self.get_topic_names_and_types():
             if self.count_publishers(topic):
                 self.types[topic] = kind
@@ -58,31 +58,31 @@ class Witness(Node):
 
 @pytest.fixture(scope='module')
 def demo():
-    """The `Witness` of a recording that is played through the nodes."""
+    """`GraphObserver` of a recording that is played through the nodes."""
     holder = []
     run(NETWORK_FILE, settings_for('vehicle', {'align.max_wait_s': 5.0}),
         vehicle_path('straight_car_fast_left'), 6.0,
-        observers=[lambda: holder.append(Witness()) or holder[-1]])
+        observers=[lambda: holder.append(GraphObserver()) or holder[-1]])
     return holder[0]
 
 
 def type_of(kind, fields):
-    """The type of a path of fields in a message type; fails where there is none."""
+    """Type of a path of fields in a message type; fails for an unknown field."""
     for name in fields:
         name, index = re.fullmatch(r'(\w+)(\[\d+\])?', name).groups()
         kinds = message_class(kind).get_fields_and_field_types()
         assert name in kinds, f'{kind} has no field {name}'
         kind = kinds[name]
         if index:
-            assert kind.endswith(']') or kind.startswith('sequence<'), f'{name} is no array'
+            assert kind.endswith(']') or kind.startswith('sequence<'), f'{name} is not an array'
             kind = re.sub(r'sequence<(.*)>|\[\d+\]', r'\1', kind)
         package, _, leaf = kind.partition('/')
         kind = f'{package}/msg/{leaf}' if leaf else kind
     return kind
 
 
-def test_everything_that_the_layouts_name_exists(demo):
-    found, frames = named()
+def test_topics_fields_and_frames_of_the_layouts_exist(demo):
+    found, frames = layout_entries()
     assert len(found) > 20 and frames <= demo.frames
     for topic, path in found:
         if topic is None:
