@@ -106,8 +106,8 @@ def test_the_evidence_stays_finite_over_gaps_with_rotated_sensors(gap_s):
     errors grow until it is indefinite."""
     network, rng = line_network(4), np.random.default_rng(2)
     R = np.linalg.qr(rng.standard_normal((4, 3, 3)))[0]
-    network = dataclasses.replace(network, R_ws=R * np.sign(np.linalg.det(R))[:, None,
-                                                                              None])
+    network = dataclasses.replace(
+        network, R_ws=R * np.sign(np.linalg.det(R))[:, None, None])
     other = DisturbanceModel(network, 5e-9)
     C = np.tile(1.6e-17 * np.eye(3), (4, 1, 1))
     for k in range(2500):

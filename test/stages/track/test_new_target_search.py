@@ -266,7 +266,7 @@ def test_smoothed_poses_are_complete_after_one_of_two_vehicles_leaves(following)
 
 
 @pytest.mark.parametrize('is_first', [True, False])
-def test_of_two_replacements_the_one_at_the_earlier_place_keeps_the_track(is_first):
+def test_the_replacement_at_the_earlier_place_keeps_the_track(is_first):
     places = np.array([[0.0, 0.0], [30.0, 0.0]])
 
     class Known:
