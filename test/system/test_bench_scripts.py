@@ -1,4 +1,4 @@
-"""The scripts of `make bench` can be imported; they are run too seldom to notice a moved name."""
+"""The scripts of `make bench` can be imported; they run too rarely to reveal renamed imports."""
 
 import runpy
 
@@ -9,5 +9,5 @@ from support.bundled import ROOT
 
 @pytest.mark.parametrize('path', sorted((ROOT / 'test' / 'bench').glob('*.py')),
                          ids=lambda p: p.stem)
-def test_a_script_imports(path):
+def test_a_bench_script_can_be_imported(path):
     assert runpy.run_path(str(path), run_name='imported')['__doc__']

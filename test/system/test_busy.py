@@ -1,4 +1,4 @@
-"""Several vehicles at once: recordings with truth, and worlds of the second simulator."""
+"""Several vehicles at once: recordings with ground truth, and simulated worlds."""
 
 from functools import cache
 
@@ -15,10 +15,10 @@ from support.random_passes import SIMULATORS, one_random_pass, random_pass
 from support.samples import scenario
 
 MAX_WRONG = 0.01
-"""Aim: of the poses without a flag no more than this share is wrong."""
+"""Aim: maximum share of wrong poses among those without a flag."""
 AIMS = {'meeting_2_sensors': (15, 1.0, 4.0), 'following_2_sensors': (16, 0.9, 4.0),
         'traffic_2_sensors': (11, np.inf, np.inf), 'traffic_4_sensors': (11, np.inf, np.inf)}
-"""{recording: (vehicles to be found, median RMS [m], median NEES)}."""
+"""{recording: (minimum number of vehicles, maximum median RMS error [m], maximum median NEES)}."""
 
 IN_EVERY_TEST = ('meeting_2_sensors', 'traffic_2_sensors')
 
@@ -26,20 +26,20 @@ tracked_recording = cache(busy_recordings.tracked_recording)
 
 
 @pytest.mark.parametrize('name', studied(AIMS, kept=IN_EVERY_TEST))
-def test_every_vehicle_of_a_recording_is_followed(name):
+def test_every_vehicle_of_a_recording_is_tracked(name):
     found, rms, nees = AIMS[name]
     got, poses, pipeline, *_ = tracked_recording(name)
     assert got.is_found.sum() >= found, str(got)
     assert np.nanmedian(got.rms) <= rms and np.nanmedian(got.nees) <= nees, str(got)
     assert got.n_extra == 0, str(got)
-    # A track is of one vehicle at a time, and none has two poses of one time.
+    # No track has two poses at one time, and every track is counted.
     assert len({(p.id, p.stamp_ns) for p in poses}) == len(poses)
     assert pipeline.track.counts['tracks'] == len({p.id for p in poses})
 
 
 @pytest.mark.parametrize('name', studied(AIMS, kept=IN_EVERY_TEST))
 def test_every_vehicle_of_a_recording_is_counted(name):
-    """In its direction, and no other."""
+    """It is counted in its direction, and there are no other passages."""
     passages = tracked_recording(name).passages
     right = busy_recordings.rightly_counted(name, passages)
     assert len(right) >= AIMS[name][0] and len(right) == len(passages)
@@ -49,8 +49,8 @@ def test_every_vehicle_of_a_recording_is_counted(name):
     assert np.count_nonzero(trucks) >= binom.ppf(0.01, len(trucks), 0.95)
 
 
-def test_smoothed_paths_of_newcomers_are_where_their_poses_were():
-    """They are linearised where the vehicle was found: by themselves they led 50 m astray."""
+def test_smoothed_poses_of_new_targets_are_near_the_published_ones():
+    """Smoothing is linearised where the vehicle was found; otherwise it was 50 m off."""
     n = 0
     for name in IN_EVERY_TEST:
         got = tracked_recording(name)
@@ -59,32 +59,32 @@ def test_smoothed_paths_of_newcomers_are_where_their_poses_were():
             p = published.get((s.id, s.stamp_ns))
             if p is not None:
                 n += 1
-                away = np.hypot(*(s.position - p.position)[:2])
-                assert away < 5.0 * np.sqrt(np.trace(p.covariance[:2, :2])) + 3.0
+                distance = np.hypot(*(s.position - p.position)[:2])
+                assert distance < 5.0 * np.sqrt(np.trace(p.covariance[:2, :2])) + 3.0
     assert n > 150
 
 
-def test_poses_without_a_flag_are_hardly_ever_wrong():
+def test_poses_without_a_flag_are_rarely_wrong():
     scores = [tracked_recording(name).score for name in IN_EVERY_TEST]
     n_sure, n_wrong = (sum(getattr(s, of) for s in scores) for of in ('n_sure', 'n_wrong'))
     assert n_sure > 250 and n_wrong <= MAX_WRONG * n_sure
 
 
 @pytest.mark.study
-def test_a_tracker_of_one_vehicle_at_a_time_is_worse():
-    """What all of this is for; and the setting works."""
-    alone, poses, pipeline, *_ = busy_recordings.tracked_recording(
+def test_a_tracker_of_one_vehicle_at_a_time_misses_vehicles():
+    """Joint tracks are necessary, and the setting disables them."""
+    score, poses, pipeline, *_ = busy_recordings.tracked_recording(
         'meeting_2_sensors', changes={'track.max_joint_targets': 1})
-    assert alone.is_found.sum() <= 10
+    assert score.is_found.sum() <= 10
     assert pipeline.track.counts['tracks of new targets'] == 0
 
 
 @pytest.mark.study
 @pytest.mark.parametrize('simulator', SIMULATORS)
-@pytest.mark.parametrize('how', ['meeting', 'following', 'traffic'])
-def test_vehicles_of_both_simulators_are_followed(how, simulator):
-    """The aim is nine in ten with two sensors, whichever vehicles come."""
-    scores = [busy_worlds.tracked(busy_worlds.busy(how, 2, simulator, seed))[0]
+@pytest.mark.parametrize('pattern', ['meeting', 'following', 'traffic'])
+def test_vehicles_of_both_simulators_are_tracked(pattern, simulator):
+    """The aim is nine in ten vehicles with two sensors."""
+    scores = [busy_worlds.tracked(busy_worlds.busy(pattern, 2, simulator, seed))[0]
               for seed in range(3)]
     found = np.concatenate([s.is_found for s in scores])
     assert found.sum() >= binom.ppf(0.01, len(found), 0.9), [str(s) for s in scores]
@@ -95,8 +95,8 @@ def test_vehicles_of_both_simulators_are_followed(how, simulator):
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize('simulator', SIMULATORS)
 @pytest.mark.parametrize('kind', ['car', 'truck'])
-def test_one_vehicle_is_rarely_taken_for_two(kind, simulator):
-    """The more is left out of the model of a truck, the more often."""
+def test_one_vehicle_is_rarely_tracked_as_two(kind, simulator):
+    """It happens more often with trucks, whose model is less complete."""
     network, n = read_network(NETWORK_FILE), 25
     new = []
     for seed in range(n):
@@ -110,25 +110,25 @@ def test_one_vehicle_is_rarely_taken_for_two(kind, simulator):
 
 
 def test_more_vehicles_than_are_tracked_together_are_counted():
-    """Ten vehicles in seven seconds: the work is bounded, and what was not sought is said."""
+    """Ten vehicles in seven seconds: the work is bounded, and omitted targets are counted."""
     rng = np.random.default_rng(4)
     plan = [(12.0 + 0.7 * k, 1 - 2 * (k % 2), rng.uniform(8.0, 12.0)) for k in range(10)]
     world = busy_worlds.world(
         busy_worlds.NETWORKS[4], [busy_worlds.passing(rng, 'clouds', *p) for p in plan], 26.0, rng,
         rate=50.0)
     pipeline = Pipeline(world.network, settings_for('vehicle', {'track.max_joint_targets': 2}))
-    most = 0
+    n_max = 0
     for start in range(0, len(world.readings), 800):
         pipeline.feed(world.readings.part(slice(start, start + 800)))
         bank = pipeline.track.bank
-        most = max(most, 0 if bank is None else bank.label.reshape(len(bank), -1).shape[1])
-    assert most == 2
+        n_max = max(n_max, 0 if bank is None else bank.label.reshape(len(bank), -1).shape[1])
+    assert n_max == 2
     assert pipeline.track.counts['new targets not added: too many vehicles at once'] > 0
 
 
 @pytest.mark.study
 @pytest.mark.parametrize('seed', [1, 14])
-def test_smoothed_poses_of_a_truck_that_was_taken_for_two_are_flagged(seed):
-    """Of 76 without a flag 46 were wrong."""
+def test_wrong_smoothed_poses_of_a_truck_tracked_as_two_are_flagged(seed):
+    """Previously, 46 of 76 poses without a flag were wrong."""
     got = one_random_pass('clouds', 'truck', seed)
     assert got.smoothed_wrong == 0 and not got.ambiguous.all()

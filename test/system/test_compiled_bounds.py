@@ -1,4 +1,4 @@
-"""Compiled code does not look at the bounds of arrays; built with sanitizers it does, once."""
+"""Array bounds in compiled code, checked by a build with sanitizers."""
 
 import os
 import shutil
@@ -19,7 +19,7 @@ FLAGS = ('-O1', '-g', '-std=c++17', '-shared', '-fPIC', '-fvisibility=hidden', '
 
 
 def build(source):
-    """The module beside its source, with sanitizers."""
+    """Compile a module beside its source, with sanitizers."""
     module = source.with_name('core' + sysconfig.get_config_var('EXT_SUFFIX'))
     includes = (pybind11.get_include(), sysconfig.get_path('include'))
     subprocess.run(['g++', *FLAGS, *(f'-I{folder}' for folder in includes), str(source), '-o',
@@ -27,7 +27,7 @@ def build(source):
 
 
 def sanitizer(name):
-    """Path of a library of the compiler."""
+    """Path of a sanitizer library of the compiler."""
     return subprocess.run(['g++', f'-print-file-name={name}'], capture_output=True, text=True,
                           check=True).stdout.strip()
 

@@ -1,4 +1,4 @@
-"""A sensor fails while a target passes: the track goes on or is flagged, and the fault is named."""
+"""Sensor faults during a pass: the track continues or is flagged, and the fault is named."""
 
 import functools
 
@@ -13,12 +13,12 @@ from support.faulty_streams import FAULTS, NS, stream
 from support.samples import one
 
 WRONG = chi2.ppf(1.0 - 1e-4, 2)
-"""A pose whose squared error is beyond this, in its own covariance, is wrong."""
+"""A pose is wrong if its error squared, normalised with its covariance, exceeds this."""
 
 
 @functools.cache
 def passed(n_sensors, seed, fault=None):
-    """Pipeline, [(t, error [m], squared error in deviations, flagged)], (begin, end)."""
+    """(pipeline, [(t, error [m], normalised error squared, flagged)], (begin, end)) of a pass."""
     network, samples, truth, times = stream(n_sensors, seed, fault)
     pipeline = Pipeline(network, settings_for('vehicle', POINT))
     records = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
@@ -31,7 +31,7 @@ def passed(n_sensors, seed, fault=None):
     return pipeline, rows, times
 
 
-NAMED = {
+COUNTED_AS = {
     'dies': ('align', 'frames with a sensor missing'),
     'freezes': ('mag_2', 'rejected: stuck sensor (repeated reading)'),
     'spikes of 2000 times full scale':
@@ -44,20 +44,20 @@ NAMED = {
     'sends duplicates': ('mag_2', 'rejected: duplicate timestamp'),
     'sends gauss': ('mag_2', 'rejected: above 0.001 T (gauss or microtesla as tesla?)'),
 }
-"""Where a fault is counted, and as what."""
+"""{fault: (stage or sensor that counts it, name of the count)}."""
 
 
 @pytest.mark.parametrize('fault', list(FAULTS))
 @pytest.mark.parametrize('n_sensors, seed', [
     (2, 0), pytest.param(2, 1, marks=pytest.mark.study),
     pytest.param(6, 0, marks=pytest.mark.study)])
-def test_a_fault_while_a_target_passes(n_sensors, seed, fault):
+def test_a_fault_during_a_pass_is_named_and_gives_no_unflagged_errors(n_sensors, seed, fault):
     _, whole, _ = passed(n_sensors, seed)
     pipeline, rows, (begin, end) = passed(n_sensors, seed, fault)
-    where, what = NAMED[fault]
+    where, what = COUNTED_AS[fault]
     counts = pipeline.calibrate.counts_of(where) if where == 'mag_2' else \
         pipeline.counts()[where]
-    # Named, and nothing of the others is held against them.
+    # The fault is named, and no reading of other sensors is rejected.
     assert counts[what] > 0
     assert not any(n for s in pipeline.network.names if s != 'mag_2'
                    for key, n in pipeline.calibrate.counts_of(s).items()
@@ -66,10 +66,10 @@ def test_a_fault_while_a_target_passes(n_sensors, seed, fault):
     wrong = [r for r in rows if r[2] > WRONG and not r[3]]
     assert len(wrong) <= unflagged, wrong[:3]
     if n_sensors > 2:
-        # The others carry the track; two seconds on it is as good as it would have been.
+        # The others support the track, which after two seconds is as accurate as without the fault.
         during = [r for r in rows if begin < r[0] < end]
         assert len(during) >= 0.9 * (end - begin) / 0.08 - 1
         late = [(r[1], w[1]) for r, w in zip(
             [r for r in rows if end + 2.0 < r[0]],
             [w for w in whole if end + 2.0 < w[0]], strict=False)]
-        assert all(mine < theirs + 1.0 for mine, theirs in late)
+        assert all(with_fault < without_fault + 1.0 for with_fault, without_fault in late)

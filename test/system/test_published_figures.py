@@ -1,4 +1,4 @@
-"""The examples that draw published figures: they run, and their numbers are what they say."""
+"""Examples that reproduce published figures: they run, and their numbers are right."""
 
 import importlib.util
 from pathlib import Path
@@ -14,7 +14,7 @@ PNG = b'\x89PNG\r\n\x1a\n'
 
 
 def example(name):
-    """The script as a module; examples/ is no package."""
+    """The script as a module; examples/ is not a package."""
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f'{name}.py')
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -46,13 +46,13 @@ def observed(t10):
     return t10.comparison(t10.condition_maps())
 
 
-@pytest.mark.parametrize('name, figures, said', [
+@pytest.mark.parametrize('name, figures, expected', [
     ('mitre12', '23456', ['100 pT/sqrt(Hz)', 'DFT divided by N', '62.6%, published 59.3 %',
                           '91.5%, published 90 %', 'x0, y0, v, M1, M2 have none']),
     ('t10_observability', '234', ['0, 0.2305 are', '0, 0, 0.7141', 'at [0, 2] is 2571',
                                   'truck 17.3 m']),
 ])
-def test_the_example_draws_and_says_what_differs(name, figures, said, tmp_path, capsys):
+def test_an_example_draws_figures_and_prints_differences(name, figures, expected, tmp_path, capsys):
     module, out = example(name), tmp_path / 'a' / 'b'
     module.main(['--out', str(out)])
     stem = 'figure_5_' if name.startswith('t10') else 'figure_'
@@ -60,13 +60,13 @@ def test_the_example_draws_and_says_what_differs(name, figures, said, tmp_path, 
     assert all(p.read_bytes().startswith(PNG) and p.stat().st_size > 10_000
                for p in out.iterdir())
     printed = capsys.readouterr().out
-    for words in said:
+    for words in expected:
         assert words in printed
     assert 'agrees' in printed and 'differs' in printed and 'nan' not in printed
 
 
-def test_moment_and_field_of_the_car(mitre12):
-    """(A.1)-(A.6) written out for a car that drives north, and east, and (1), (2)."""
+def test_the_moment_and_field_of_the_car_match_the_equations(mitre12):
+    """MITRE12 (A.1)-(A.6), written out for a car that drives north or east, and (1), (2)."""
     L1, dip, declination = 0.17356, np.radians(59.0), np.radians(-11.0)
     H = 57e-6 / (4e-7 * np.pi) * np.cos(dip)
     volume = 4.0 / 3.0 * np.pi * 2.0
@@ -86,18 +86,18 @@ def test_moment_and_field_of_the_car(mitre12):
     np.testing.assert_allclose(dipole_field(-np.array([x, y, 0.0]), m)[:2], B, rtol=1e-4)
 
 
-def test_periods_follow_the_sources_equations_of_motion(mitre12):
+def test_places_follow_the_published_equations_of_motion(mitre12):
     theta, k = 0.4, np.arange(11)
     r = mitre12.places(3.0, -2.0, 10.0, theta)
     np.testing.assert_allclose(r[:, 0], 3.0 - k / 22.0 * 10.0 * np.sin(theta), rtol=1e-12)
     np.testing.assert_allclose(r[:, 1], -2.0 + k / 22.0 * 10.0 * np.cos(theta), rtol=1e-12)
-    # Along x is -90 degrees there.
+    # The direction along x is -90 degrees in the paper.
     assert mitre12.places(0.0, 25.0, 10.0, mitre12.ALONG)[-1, 0] == pytest.approx(10.0 * 10 / 22)
 
 
 @pytest.mark.parametrize('z', [[-20.0, 25.0, 11.0, -np.pi / 2, -137.0, 374.0],
                                [4.0, 9.0, -6.0, 0.7, 250.0, 100.0]])
-def test_jacobian_is_that_of_the_field(mitre12, z):
+def test_the_jacobian_matches_finite_differences_of_the_field(mitre12, z):
     def field(z):
         m = np.array([z[4], z[5], 0.0])
         return dipole_field(-mitre12.places(*z[:4]), m)[:, :2]
@@ -105,14 +105,14 @@ def test_jacobian_is_that_of_the_field(mitre12, z):
     step = 1e-4 * np.array([1.0, 1.0, 1.0, 1.0, 100.0, 100.0])
     numeric = np.stack([(field(z + e) - field(z - e)) / (2.0 * e.max()) for e in np.diag(step)],
                        axis=-1)
-    ours = mitre12.jacobian(z)
+    analytic = mitre12.jacobian(z)
     size = np.abs(numeric).max(axis=(0, 1))
-    np.testing.assert_allclose(ours / size, numeric / size, atol=1e-6)
+    np.testing.assert_allclose(analytic / size, numeric / size, atol=1e-6)
 
 
 @pytest.mark.parametrize('divisor, scale, cpa', [(11.0, {}, 29.0), (22.0, {'scale': 1.0}, 25.0)])
-def test_deflection_of_a_period_by_hand(mitre12, divisor, scale, cpa):
-    """(B.8)-(B.13) as sums over the four frequencies in the band: DFT over N, and over F_s."""
+def test_the_detection_probability_matches_explicit_sums(mitre12, divisor, scale, cpa):
+    """MITRE12 (B.8)-(B.13), summed over four frequencies: DFT divided by N, or by F_s."""
     k, t = np.arange(11), np.arange(11) / 22.0
     r = np.stack([-3.0 + 25.0 * 0.44704 * t, np.full(11, cpa), np.zeros(11)], axis=-1)
     B = dipole_field(-r, mitre12.moment('car'))[:, :2]
@@ -127,19 +127,20 @@ def test_deflection_of_a_period_by_hand(mitre12, divisor, scale, cpa):
     assert p[0, 0] == pytest.approx(expected, rel=1e-9) and 0.3 < expected < 0.95
 
 
-def test_detection_against_the_published_figures(mitre12, detected):
-    """59.3 % and 90 % are reached to 3.3 and 1.5 points; what else differs is said."""
+def test_detection_probabilities_are_near_the_published_ones(mitre12, detected):
+    """The differences from 59.3 % and 90 % are 3.3 and 1.5 percentage points."""
     n = detected
-    # Aim: the published numbers. The tolerances are the printed distances, rounded up.
+    # The aim is the published numbers. Tolerances are the printed differences, rounded up.
     assert n['most'] == pytest.approx(0.593, abs=0.034)
     assert n['once'] == pytest.approx(0.900, abs=0.016)
-    # "nearly one", "almost always", "almost always fails", "a high probability", "nontrivial".
+    # MITRE12: "nearly one", "almost always", "almost always fails", "a high probability",
+    # "nontrivial".
     assert n['five'] > 0.999 and n['at 25'] > 0.999 and n['at 35'] < 0.1
     assert n['ATV at 10'] > 0.999 and n['ATV five most'] > 0.2
-    # Neither the physical transform nor a road to the east reaches them.
+    # Neither the physical transform nor a road to the east reaches the published numbers.
     assert n['once physical'] < n['once east'] < 0.2
     assert n['range physical'] < n['range east'] < n['range']
-    # Detection falls with the CPA, and grows with sensors.
+    # The probability falls with the CPA distance and grows with the number of sensors.
     for vehicle in ('car', 'ATV'):
         m = mitre12.moment(vehicle)
         once = np.array([[mitre12.at_least_once(m, c, s) for s in (mitre12.ONE, mitre12.FIVE)]
@@ -147,8 +148,8 @@ def test_detection_against_the_published_figures(mitre12, detected):
         assert np.all(np.diff(once, axis=0) <= 1e-9) and np.all(once[:, 1] >= once[:, 0])
 
 
-def test_bounds_against_the_published_figures(mitre12, bounded):
-    """One sensor does not see the scale, so that MITRE12's bounds without a prior do not exist."""
+def test_bounds_of_one_sensor_without_a_prior_are_infinite(mitre12, bounded):
+    """One sensor cannot observe the scale, so MITRE12's bounds without a prior do not exist."""
     n = bounded
     assert n['lost'] == ('x0', 'y0', 'v', 'M1', 'M2')
     m = mitre12.moment('car')
@@ -160,13 +161,13 @@ def test_bounds_against_the_published_figures(mitre12, bounded):
     assert np.isinf(n['at 0 mph'][0][3])
     assert n['at 0 mph'][1][3] == pytest.approx(15.0, rel=1e-9)
     assert n['at 10 mph'][0][3] > n['at 25 mph'][0][3] > n['at 80 mph'][0][3]
-    # Two sensors do see it.
+    # Two sensors can observe it.
     J = mitre12.measured(-20.0) + mitre12.measured(0.0)
     assert np.all(np.isfinite(mitre12.deviations(J)))
 
 
 def test_printed_jacobian_and_prior_do_not_explain_the_published_bounds(mitre12, bounded):
-    """(20) concerns phi alone; with (26) up to four no bound becomes infinite at speed zero."""
+    """(20) affects phi only; with the first four of (26), all bounds are finite at zero speed."""
     x, y, h = -20.0, 25.0, 1e-5
     phi = np.array([np.arctan2(y, x + h) - np.arctan2(y, x - h),
                     np.arctan2(y + h, x) - np.arctan2(y - h, x)]) / (2.0 * h)
@@ -179,7 +180,7 @@ def test_printed_jacobian_and_prior_do_not_explain_the_published_bounds(mitre12,
     assert np.all(bounded['prior on four'][:, 4:].max(axis=0) > 500.0)
 
 
-def test_check_values_of_observability(observed):
+def test_observability_values_match_the_published_ones(observed):
     n = observed
     biggest = n['one'][-1]
     assert abs(n['one'][0]) < 1e-12 * biggest and np.all(np.abs(n['up'][:2]) < 1e-12 * biggest)
@@ -192,8 +193,8 @@ def test_check_values_of_observability(observed):
     assert n['thrice'] < 1e-14
 
 
-def test_the_best_place_of_the_second_sensor(t10, observed):
-    """T10's conclusion holds for the position at the closest point, not for that at the start."""
+def test_the_best_place_of_the_second_sensor_depends_on_the_state(t10, observed):
+    """T10's conclusion holds for the state at the CPA, but not for the state at the start."""
     n = observed
     assert n['plain best'][0] == (-2.0, 2.0) and n['plain best'][1] == pytest.approx(1110, abs=1)
     assert n['plain best same side'][0] == (-2.2, 0.0)
@@ -204,7 +205,7 @@ def test_the_best_place_of_the_second_sensor(t10, observed):
     assert n['scaled best'][1] == pytest.approx(405, abs=1)
     for name in ('plain', 'cpa', 'scaled'):
         assert n[f'{name} best'][1] <= n[f'{name} best same side'][1]
-    # The state at the closest point, by moving the start there.
+    # The state at the CPA is that of a start moved there.
     t = 0.1 * np.arange(60)[:, None] - 3.0
     moved = t10.sensor_information(np.array([0.5, -1.0, 0.0]))
 
@@ -217,8 +218,8 @@ def test_the_best_place_of_the_second_sensor(t10, observed):
     np.testing.assert_allclose(t10.about_cpa(moved), J, rtol=1e-6, atol=1e-6 * np.abs(J).max())
 
 
-def test_threshold_and_ranges(observed):
-    """T10 prints 11.2 and 9.2."""
+def test_the_threshold_and_the_ranges_match_t10(observed):
+    """T10 states a threshold of 11.2 and an SNR of 9.2."""
     n = observed
     assert n['threshold'] == pytest.approx(chi2.isf(0.01, 3), rel=1e-9)
     assert ncx2.sf(n['threshold'], 3, n['snr']) == pytest.approx(0.5, rel=1e-6)
@@ -229,17 +230,17 @@ def test_threshold_and_ranges(observed):
     assert list(n['ranges'].values()) == pytest.approx([9.54, 12.02, 17.33], abs=0.01)
 
 
-def test_order_of_the_models_of_simulated_passes(tmp_path, capsys):
-    """TSP14 Figure 7: the cost falls with every dipole, to nearly one for cars."""
+def test_the_cost_of_simulated_passes_falls_with_the_model_order(tmp_path, capsys):
+    """TSP14 Figure 7: the cost falls with the number of dipoles, for cars to nearly one."""
     script = example('tsp14_model_order')
     found = {rate: script.passes(rate, (1, 3)) for rate in script.RATES}
     (cars, truck), (cars_3, truck_3) = (script.costs_of(found['12.5 Hz'], d) for d in (1, 3))
     assert len(cars) == 3 and (np.array(cars_3) < cars).all() and truck_3 < truck
-    # As points below and above the published ranges at their rate, as the report says.
-    (least, _), _ = script.PUBLISHED['cars']
-    (_, most), _ = script.PUBLISHED['large']
-    assert max(cars) < least and truck > most and max(cars_3) < 3.0 < 20.0 < truck_3
-    # At eight times the rate the errors of the model weigh less.
+    # Point models are below and above the published ranges at that rate, as the report states.
+    (lowest, _), _ = script.PUBLISHED['cars']
+    (_, highest), _ = script.PUBLISHED['large']
+    assert max(cars) < lowest and truck > highest and max(cars_3) < 3.0 < 20.0 < truck_3
+    # At eight times the rate, model errors have less weight.
     for d, slow in ((1, [*cars, truck]), (3, [*cars_3, truck_3])):
         fast, fast_truck = script.costs_of(found['100 Hz'], d)
         assert (np.array([*fast, fast_truck]) < slow).all()

@@ -1,7 +1,7 @@
-"""The whole way on recordings: errors against truth, covariances, repetition.
+"""Replays of the bundled recordings: errors against ground truth, covariances, repeatability.
 
-The limits are the project's targets; a number that is not reached stands here
-as what it is, strictly expected to fail, so that the day it is reached is seen.
+The limits are the targets of the project. A target that is not reached is a strict expected
+failure, so that reaching it is noticed.
 """
 
 import csv
@@ -25,65 +25,65 @@ ARRIVAL = {name: 'right' if '_left' in name and name.startswith('straight') else
 CARS = [name for name in VEHICLES if 'truck' not in name]
 
 
-def every(replays):
+def all_vehicles(replays):
     """{name: (Run, folder)} of all vehicles."""
     return {name: replays[name] for name in VEHICLES}
 
 
 MAX_STEP = 1.5
-"""A stated deviation may grow by this factor from a pose to the next: in 0.08 s a vehicle goes a
-fraction of its distance. New evidence may make it smaller at once."""
+"""Maximum growth of a standard deviation from one pose to the next: in 0.08 s a vehicle moves by a
+fraction of its distance. New evidence may reduce it by any factor."""
 
 
 def step_of(covariances):
-    """The largest ratio of the deviations of a position to those of the pose before."""
+    """Largest ratio of the standard deviation of a position to that of the previous pose."""
     std = np.sqrt(np.trace(np.array(covariances)[:, :2, :2], axis1=1, axis2=2))
     return (std[1:] / std[:-1]).max()
 
 
 def pass_of(replays, name):
-    """The one track of a recording, and its errors."""
+    """Summary of the only track of a recording, with its errors."""
     run, _ = replays[name]
     assert len(run.summary['tracks']) == 1, name
     return run.summary['tracks'][0]
 
 
 @pytest.mark.parametrize('name', VEHICLES)
-def test_arrival_direction(vehicle_replays, name):
+def test_the_arrival_direction_is_right(vehicle_replays, name):
     assert len(VEHICLES) == 8
     track = pass_of(vehicle_replays, name)
     run, _ = vehicle_replays[name]
     log = run.logs[track['id']]
     best = [max(row, key=lambda a: row[a][0]) for row in log.arrivals]
     assert track['arrival'] == best[-1] == ARRIVAL[name]
-    # And already where it matters: when the position is best known.
+    # It is already right when the position is most certain.
     sd = [np.trace(C[:2, :2]) for C in log.covariance]
     assert best[int(np.argmin(sd))] == ARRIVAL[name]
 
 
 @pytest.mark.parametrize('name', VEHICLES)
-def test_every_replay_with_truth_says_its_error_over_the_bound(vehicle_replays, name):
+def test_a_replay_with_truth_reports_its_error_over_the_bound(vehicle_replays, name):
     run, _ = vehicle_replays[name]
     found = run.summary['tracks'][0]['truth']['error_over_bound']
     print(f'{name}: error over path bound {found:.1f}')
-    # The aim is 1, the bound itself. These limits are no aim: they are only what was reached (0.9
-    # to 5.2, the truck 12.9) with a margin, so that a change for the worse is seen.
+    # The aim is 1, the bound itself. These limits are not aims, but the values reached (0.9 to 5.2,
+    # the truck 12.9) with a margin, so that a change for the worse is noticed.
     assert 0.1 < found < (20.0 if 'truck' in name else 6.0)
 
 
 def expected_to_fail(names, reasons):
-    """The parameters `names`, of which those with a reason are known not to be reached."""
+    """Parameters `names`; those with a reason are expected to fail."""
     return [pytest.param(n, marks=pytest.mark.xfail(strict=True, reason=reasons[n]))
             if n in reasons else n for n in names]
 
 
 RMS_NOT_REACHED = {
-    'straight_truck_right': '1.8 m: until its middle has passed, its front is like a car',
+    'straight_truck_right': '1.8 m: until its middle has passed, its front resembles a car',
 }
 
 
 @pytest.mark.parametrize('name', expected_to_fail(VEHICLES, RMS_NOT_REACHED))
-def test_error_while_near(vehicle_replays, name):
+def test_the_error_near_the_sensors_is_within_its_limit(vehicle_replays, name):
     track = pass_of(vehicle_replays, name)
     errors = track['truth']
     print(f'{name}: a {track["kind"]}, rms {errors["rms"]}, closest {errors["closest"]:.2f} '
@@ -95,17 +95,17 @@ def test_error_while_near(vehicle_replays, name):
 
 
 @pytest.mark.parametrize('name', CARS)
-def test_cars_are_no_surer_than_they_are_right(vehicle_replays, name):
+def test_the_covariance_of_cars_is_consistent(vehicle_replays, name):
     assert pass_of(vehicle_replays, name)['truth']['anees'] <= 3.0
 
 
 @pytest.mark.parametrize('name', CARS)
-def test_error_at_the_closest_point(vehicle_replays, name):
+def test_the_error_at_the_cpa_is_within_its_limit(vehicle_replays, name):
     assert pass_of(vehicle_replays, name)['truth']['closest'] <= (1.0 if 'fast' in name else 0.5)
 
 
 def speed_error(vehicle_replays, name):
-    """Relative error of the speed where it is most certain."""
+    """Relative error of the speed at the pose that is most certain."""
     run, _ = vehicle_replays[name]
     log = run.logs[pass_of(vehicle_replays, name)['id']]
     stamps, positions, _ = next(iter(run.truth.values()))
@@ -123,30 +123,30 @@ SPEED_NOT_REACHED = {
 
 
 @pytest.mark.parametrize('name', expected_to_fail(VEHICLES, SPEED_NOT_REACHED))
-def test_speed(vehicle_replays, name):
+def test_the_speed_error_is_within_its_limit(vehicle_replays, name):
     error = speed_error(vehicle_replays, name)
     print(f'{name}: speed {error:+.1%}')
     assert abs(error) <= 0.10
 
 
 SMOOTHED_NOT_REACHED = {
-    'junction_left_turns_to_rear': '0.64 m at the closest point: it has not settled, three more '
+    'junction_left_turns_to_rear': '0.64 m at the closest point: it has not converged, three more '
                                    'passes give 0.45 m',
 }
 
 
 @pytest.mark.parametrize('name', expected_to_fail(VEHICLES, SMOOTHED_NOT_REACHED))
-def test_smoothed(vehicle_replays, name):
-    """The limits are those asked of the filter; by what came after, all of them are kept."""
+def test_errors_of_smoothed_poses_are_within_their_limits(vehicle_replays, name):
+    """The limits of position errors are those of the filtered poses."""
     run, folder = vehicle_replays[name]
     track = pass_of(vehicle_replays, name)
     smoothed = track['smoothed']
     errors = smoothed['truth']
     print(f'{name}: smoothed rms {errors["rms"]}, closest {errors["closest"]:.2f}, '
           f'ANEES {errors["anees"]:.1f}')
-    slack = 'fast' in name or 'truck' in name
-    assert (errors['rms'] or 0.0) <= (1.2 if slack else 0.6)
-    assert errors['closest'] <= (1.0 if slack else 0.5)
+    is_relaxed = 'fast' in name or 'truck' in name
+    assert (errors['rms'] or 0.0) <= (1.2 if is_relaxed else 0.6)
+    assert errors['closest'] <= (1.0 if is_relaxed else 0.5)
     assert errors['anees'] <= (10.0 if 'truck' in name else 4.0)
     table = rows(folder / 'poses_smoothed.csv')
     assert [int(r['stamp_ns']) for r in table] == run.logs[track['id']].stamp_ns
@@ -156,15 +156,15 @@ KINDS = {name: 'truck' if 'truck' in name else 'car' for name in VEHICLES}
 
 
 @pytest.mark.parametrize('name', VEHICLES)
-def test_kind(vehicle_replays, name):
+def test_the_kind_of_vehicle_is_right(vehicle_replays, name):
     track = pass_of(vehicle_replays, name)
     print(f'{name}: {track["kind"]} {track["kind_weight"]:.3f}, {track["length"]:.1f} m')
     assert track['kind'] == KINDS[name]
 
 
 @pytest.mark.study
-def test_a_car_is_followed_along_a_corridor(tmp_path):
-    """Eight sensors along 42 m, an accelerating car: one track, all the way."""
+def test_a_car_is_tracked_along_a_corridor(tmp_path):
+    """An accelerating car at eight sensors along 42 m has a single track."""
     folder = DATA / 'corridor'
     network = read_network(folder / 'network.yaml')
     run = replay(Recording(folder / 'corridor_8_sensors.mcap'), network, settings_for('vehicle'),
@@ -183,12 +183,12 @@ def test_a_car_is_followed_along_a_corridor(tmp_path):
         assert np.ptp(true[along, 0]) > 41.0
         assert rms <= 0.6
         assert step_of(poses.covariance) < MAX_STEP
-        # As the other cars; 1 = consistent.
+        # Limits of the other cars; 1 is consistent.
         assert anees <= {'filtered': 3.0, 'smoothed': 4.0}[name]
 
 
 @pytest.mark.parametrize('run', [1, 2])
-def test_magnet(magnet_replays, run):
+def test_errors_of_the_magnet_are_within_their_limits(magnet_replays, run):
     tracks = magnet_replays[run][0].summary['tracks']
     assert len(tracks) == 1
     for name, errors in (('as published', tracks[0]['truth']),
@@ -198,7 +198,7 @@ def test_magnet(magnet_replays, run):
         assert errors['n'] >= 60
         assert errors['position_mean'] <= 0.6e-3
         assert errors['axis_median_deg'] <= 1.5
-        # Honest: neither far too sure nor far too wide.
+        # The covariance is neither far too small nor far too large.
         assert 0.1 <= errors['anees'] <= 3.0
     assert tracks[0]['moment_size'] == pytest.approx(0.866, rel=0.05)
 
@@ -208,7 +208,7 @@ def rows(path):
         return list(csv.DictReader(stream))
 
 
-def test_repetition_gives_the_same_bytes(vehicle_replays, road_network, tmp_path):
+def test_a_repeated_replay_writes_identical_files(vehicle_replays, road_network, tmp_path):
     name = 'junction_rear_turns_right'
     replay(Recording(vehicle_path(name)), road_network, settings_for('vehicle'), tmp_path)
     for table in ('poses.csv', 'poses_smoothed.csv', 'hypotheses.csv', 'detections.csv',
@@ -217,21 +217,21 @@ def test_repetition_gives_the_same_bytes(vehicle_replays, road_network, tmp_path
             (vehicle_replays[name][1] / table).read_bytes(), table
 
 
-def test_the_interleaving_of_the_sensors_does_not_matter(vehicle_replays, road_network):
-    """Sensor by sensor in blocks of 0.3 s instead of in turn."""
+def test_tracks_do_not_depend_on_the_interleaving_of_the_sensors(vehicle_replays, road_network):
+    """Samples are fed sensor by sensor, in blocks of 0.3 s."""
     name = 'straight_small_left'
     samples = recorded(SampleReader(Recording(vehicle_path(name)), road_network))
     samples.sort(key=lambda s: (s.stamp_ns // 300_000_000, s.sensor, s.stamp_ns))
     pipeline = Pipeline(road_network, settings_for('vehicle'))
     tracks = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
-    ours = [t for t in tracks if isinstance(t, Track) and not t.ended]
+    reordered = [t for t in tracks if isinstance(t, Track) and not t.ended]
     log = next(iter(vehicle_replays[name][0].logs.values()))
-    assert [t.stamp_ns for t in ours] == log.stamp_ns
-    np.testing.assert_array_equal([t.position for t in ours], log.position)
+    assert [t.stamp_ns for t in reordered] == log.stamp_ns
+    np.testing.assert_array_equal([t.position for t in reordered], log.position)
 
 
-def test_results_agree_with_each_other(vehicle_replays):
-    for name, (_, folder) in every(vehicle_replays).items():
+def test_result_files_are_consistent_with_each_other(vehicle_replays):
+    for name, (_, folder) in all_vehicles(vehicle_replays).items():
         poses, hypotheses = rows(folder / 'poses.csv'), rows(folder / 'hypotheses.csv')
         summary = json.loads((folder / 'summary.json').read_text())
         assert len(poses) == summary['tracks'][0]['poses']
@@ -246,24 +246,24 @@ def test_results_agree_with_each_other(vehicle_replays):
         assert [d['event'] for d in rows(folder / 'detections.csv')][0] == 'onset'
 
 
-def test_published_covariances_are_covariances(vehicle_replays, magnet_replays):
-    for run, _ in [*every(vehicle_replays).values(), *magnet_replays.values()]:
+def test_published_covariances_are_valid(vehicle_replays, magnet_replays):
+    for run, _ in [*all_vehicles(vehicle_replays).values(), *magnet_replays.values()]:
         for log in run.logs.values():
             C = np.array(log.covariance)
             np.testing.assert_allclose(C, np.swapaxes(C, 1, 2))
             assert np.linalg.eigvalsh(C).min() > -1e-12
 
 
-def test_what_is_stated_does_not_jump(vehicle_replays):
-    for name, (run, _) in every(vehicle_replays).items():
+def test_published_standard_deviations_do_not_jump(vehicle_replays):
+    for name, (run, _) in all_vehicles(vehicle_replays).items():
         for log in (*run.logs.values(), *run.smoothed.values()):
-            print(f'{name}: a deviation grows by {step_of(log.covariance):.2f} at most')
+            print(f'{name}: a standard deviation grows by {step_of(log.covariance):.2f} at most')
             assert step_of(log.covariance) < MAX_STEP
 
 
-def test_no_sample_is_lost_without_a_word(vehicle_replays):
-    for run, _ in every(vehicle_replays).values():
+def test_every_sample_is_counted(vehicle_replays):
+    for run, _ in all_vehicles(vehicle_replays).values():
         c = run.summary['counts']['calibrate']
-        taken = sum(s['accepted'] for s in run.summary['sensors'].values())
-        assert c['calibrated'] + c['held back while learning'] == taken
+        accepted = sum(s['accepted'] for s in run.summary['sensors'].values())
+        assert c['calibrated'] + c['held back while learning'] == accepted
         assert run.summary['rejected'] == {}

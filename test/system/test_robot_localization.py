@@ -1,7 +1,7 @@
-"""The recipe for robot_localization: another EKF that takes our pose is not worse than we are.
+"""Configuration for robot_localization: an EKF that fuses the published pose is not less accurate.
 
-`robot_localization` cannot be had from PyPI. filterpy's filter takes its place, with the motion
-model and the noise that `config/robot_localization.yaml` gives that EKF.
+`robot_localization` is not available from PyPI. A filter of filterpy replaces it, with the motion
+model and the noise of `config/robot_localization.yaml`.
 """
 
 import numpy as np
@@ -16,14 +16,14 @@ from mag_tracking.records import Track
 from mag_tracking.report.metrics import interpolate_truth
 from support.bundled import ROOT, VEHICLES, vehicle_path
 
-RECIPE = ROOT / 'config' / 'robot_localization.yaml'
+CONFIGURATION = ROOT / 'config' / 'robot_localization.yaml'
 FIRST_SPEED_STD = 30.0
-"""[m/s] Nothing is known of the velocity at the first pose."""
+"""[m/s] The velocity is unknown at the first pose."""
 
 
-def recipe():
+def settings():
     """Parameters of the EKF."""
-    return yaml.safe_load(RECIPE.read_text())['ekf_filter_node']['ros__parameters']
+    return yaml.safe_load(CONFIGURATION.read_text())['ekf_filter_node']['ros__parameters']
 
 
 def poses_of(name, network):
@@ -38,7 +38,7 @@ def poses_of(name, network):
 
 
 def filtered(poses, noise):
-    """Positions (n, 2) of an EKF of x, y, vx, vy that takes poses; `noise` (4,) a second."""
+    """Positions (n, 2) of an EKF of x, y, vx, vy that fuses poses; `noise` (4,) per second."""
     ekf, out, last_ns = KalmanFilter(dim_x=4, dim_z=2), [], None
     ekf.H = np.eye(2, 4)
     for stamp_ns, position, R in poses:
@@ -57,35 +57,35 @@ def filtered(poses, noise):
 
 
 def errors(names, road_network):
-    """{recording: (errors of the EKF (n,), ours (n,))} [m]."""
-    noise = np.diagonal(np.reshape(recipe()['process_noise_covariance'], (15, 15)))[[0, 1, 6, 7]]
+    """{recording: (errors of the EKF (n,), of the published poses (n,))} [m]."""
+    noise = np.diagonal(np.reshape(settings()['process_noise_covariance'], (15, 15)))[[0, 1, 6, 7]]
     found = {}
     for name in names:
         poses, true = poses_of(name, road_network)
-        ours = np.array([position for _, position, _ in poses])
-        found[name] = [np.hypot(*(p - true).T) for p in (filtered(poses, noise), ours)]
+        published = np.array([position for _, position, _ in poses])
+        found[name] = [np.hypot(*(p - true).T) for p in (filtered(poses, noise), published)]
     return found
 
 
 @pytest.mark.parametrize('names', [
     ('junction_rear_turns_right', 'straight_car_fast_left'),
     pytest.param(VEHICLES, marks=pytest.mark.study)], ids=['two', 'all'])
-def test_an_ekf_that_takes_our_pose_is_not_worse_than_we_are(names, road_network):
+def test_an_ekf_that_fuses_the_published_pose_is_not_less_accurate(names, road_network):
     found = errors(names, road_network)
     both = [np.concatenate(e) for e in zip(*found.values(), strict=True)]
     rms = [np.sqrt(np.nanmean(e**2)) for e in both]
     print(f'{len(both[0])} poses of {len(found)} recordings: RMS error of the EKF {rms[0]:.2f} m, '
-          f'ours {rms[1]:.2f} m')
+          f'of the published poses {rms[1]:.2f} m')
     for name, pair in found.items():
         print(f'  {name}', *(f'{np.sqrt(np.nanmean(e**2)):.2f} m' for e in pair))
     assert rms[0] <= rms[1]
 
 
-def test_the_recipe_is_complete():
-    """What robot_localization refuses or silently ignores: lengths, frames, states."""
-    given = recipe()
-    assert len(given['pose0_config']) == 15 and given['pose0_config'][:2] == [True, True]
-    assert len(given['process_noise_covariance']) == 225
-    assert given['world_frame'] == given['odom_frame'] == 'map'
-    assert len({given[f'{name}_frame'] for name in ('map', 'odom', 'base_link')}) == 3
-    assert given['pose0'] == 'tracker_node/pose'
+def test_the_configuration_is_complete():
+    """Lengths, frames and states that robot_localization would refuse or silently ignore."""
+    parameters = settings()
+    assert len(parameters['pose0_config']) == 15 and parameters['pose0_config'][:2] == [True, True]
+    assert len(parameters['process_noise_covariance']) == 225
+    assert parameters['world_frame'] == parameters['odom_frame'] == 'map'
+    assert len({parameters[f'{name}_frame'] for name in ('map', 'odom', 'base_link')}) == 3
+    assert parameters['pose0'] == 'tracker_node/pose'

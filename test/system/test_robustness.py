@@ -1,4 +1,4 @@
-"""What a reviewer broke once, and must not break again."""
+"""Regression tests of faults that reviews have found."""
 
 import dataclasses
 import json
@@ -70,7 +70,7 @@ def test_a_looped_recording_gives_the_same_track_again(road_network):
     for _ in range(2):
         tracks = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, Track)]
         loops.append([t for t in tracks if not t.ended])
-    # Frames are cut anew at the restart: the same but for the grid's phase at its very end.
+    # The restart changes the phase of the frame grid, so frames at the end may differ.
     assert abs(len(loops[0]) - len(loops[1])) <= 1
     a, b = ({t.stamp_ns: t.position for t in loop} for loop in loops)
     common = sorted(set(a) & set(b))
@@ -78,20 +78,20 @@ def test_a_looped_recording_gives_the_same_track_again(road_network):
     np.testing.assert_allclose([a[k] for k in common], [b[k] for k in common], rtol=1e-9)
 
 
-def test_a_release_below_the_onset_is_refused():
+def test_a_release_probability_below_that_of_the_onset_is_refused():
     with pytest.raises(SettingsError, match='release_probability'):
         Detect(line_network(2), replace(DetectSettings(), {
             'false_alarm_probability': 0.2, 'release_probability': 1e-3}))
 
 
 @pytest.mark.parametrize('step', [0.0, 2e-6])
-def test_a_stuck_or_coarse_sensor_is_told_and_not_taken_for_perfect(step):
+def test_a_stuck_sensor_is_not_learnt_and_a_coarse_one_is_not_noiseless(step):
     b = running()
     rng = np.random.default_rng(0)
     for t in np.arange(0, 10, 0.01):
         value = EARTH + SIGMA * rng.standard_normal(3)
         b.add(t, np.round(value / step) * step if step else EARTH)
-    # What changes now and then is as good as its steps; what never does may hang.
+    # A coarse sensor is as accurate as its steps; one that never changes may be stuck.
     assert b.ready == (step > 0.0) and b.stuck == (step == 0.0)
     assert not step or (np.sqrt(b.covariance.diagonal()) > step / 4.0).all()
 
@@ -104,7 +104,7 @@ def test_a_sensor_that_gets_stuck_keeps_its_noise():
     assert np.diagonal(b.covariance).min() > 0.5 * (SIGMA**2).min()
 
 
-def test_an_unknown_covariance_between_the_nodes_is_taken_from_the_network_or_rejected():
+def test_a_missing_covariance_between_nodes_is_replaced_or_rejected():
     align = Align(line_network(1), AlignSettings())
     out = [f for k in range(30) for f in align.feed(one(
         MagSample(k * 10_000_000, 'mag_1', np.zeros(3), None)))]
@@ -116,7 +116,7 @@ def test_an_unknown_covariance_between_the_nodes_is_taken_from_the_network_or_re
         'no finite field', 'unknown covariance, and no noise_std in the network']
 
 
-def test_an_axis_that_is_missing_now_and_then_stays_known():
+def test_an_axis_with_occasional_dropouts_is_learnt():
     b = running()
     rng = np.random.default_rng(0)
     for k, t in enumerate(np.arange(0, 20, 0.01)):
@@ -141,12 +141,12 @@ def test_a_present_axis_never_has_an_unknown_covariance():
             field[2] = np.nan
         out += fed(s, sample(0.01 * k, field))
     for r in out:
-        there = ~np.isnan(r.field)
-        assert there.any() and np.isfinite(r.covariance[np.ix_(there, there)]).all()
+        present = ~np.isnan(r.field)
+        assert present.any() and np.isfinite(r.covariance[np.ix_(present, present)]).all()
     assert s.counts['axes held back while learning'] > 0
 
 
-def test_one_corrupt_stamp_costs_one_sample():
+def test_a_corrupt_timestamp_rejects_a_single_sample():
     s = stage()
     for t in (1.0, 1.1, 3601.0, 1.2, 1.3):
         fed(s, sample(t))
@@ -156,15 +156,15 @@ def test_one_corrupt_stamp_costs_one_sample():
     assert fed(s, sample(7200.0)) == [] and len(fed(s, sample(7200.1))) == 1
 
 
-def test_a_slow_sensor_is_learnt():
+def test_the_background_of_a_slow_sensor_is_learnt():
     b = running(learn=20.0)
     feed(b, np.arange(0, 120, 0.5))
     assert b.ready and not b.frozen
 
 
 @pytest.mark.parametrize('seed', studied(range(3), kept=(0,)))
-def test_no_second_detection_in_the_wake_of_a_target(seed):
-    """A background learnt in three seconds has to last for the whole of a pass."""
+def test_a_pass_causes_no_second_detection(seed):
+    """A background that was learnt in three seconds stays valid for a whole pass."""
     network = dataclasses.replace(line_network(2), noise_std=(None, None))
     tracks, pipeline, _ = drive(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5),
                                 Path(np.array([-80.0, -1.2]), 0.0, 10.0), duration=30.0, seed=seed)
@@ -173,22 +173,22 @@ def test_no_second_detection_in_the_wake_of_a_target(seed):
 
 @pytest.mark.parametrize('content, message', [
     (b'sensors: {"m\xff": 1}', 'not valid YAML'),
-    (b'sensors:\n  "m 1": {position: [0, 0, 0]}', 'no name for a sensor'),
-    (b'sensors:\n  1abc: {position: [0, 0, 0]}', 'not a ROS topic'),
+    (b'sensors:\n  "m 1": {position: [0, 0, 0]}', 'is not a valid sensor name'),
+    (b'sensors:\n  1abc: {position: [0, 0, 0]}', 'is not a valid ROS topic'),
     (b'frame:\nsensors:\n  a: {position: [0, 0, 0]}', 'frame: expected a name'),
     (b'sensors:\n  a: {position: [0, 0, 0], noise_std: 12.0}', 'below a millitesla'),
     (b'sensors:\n  a: {position: [0, 0, 0], background: [15.0, 0, 0]}', 'microtesla'),
     (b'sensors:\n  a: {position: [0, 0, ' + b'9' * 400 + b']}', 'not a finite number'),
     (b'sensors:\n  [a]: {position: [0, 0, 0]}', 'is not a valid key'),
 ])
-def test_more_faulty_network_files(tmp_path, content, message):
+def test_invalid_network_files_are_refused(tmp_path, content, message):
     path = tmp_path / 'network.yaml'
     path.write_bytes(content)
     with pytest.raises(NetworkError, match=message):
         read_network(path)
 
 
-def test_a_full_disk_is_one_line(tmp_path, capsys, monkeypatch):
+def test_a_full_disk_is_reported(tmp_path, capsys, monkeypatch):
     out = tmp_path / 'out'
     monkeypatch.setattr(result_folder, 'new_text_file', lambda *_, **__: open('/dev/full', 'w'))
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE),
@@ -196,13 +196,13 @@ def test_a_full_disk_is_one_line(tmp_path, capsys, monkeypatch):
     assert 'No space left' in capsys.readouterr().err
 
 
-def test_a_summary_without_numbers_is_still_json(tmp_path):
+def test_a_summary_with_non_finite_numbers_is_valid_json(tmp_path):
     with result_folder.ResultFolder(tmp_path, line_network(2)) as folder:
         folder.write_summary({'a': float('nan'), 'b': [1.0, float('inf')]})
     assert json.loads((tmp_path / 'summary.json').read_text()) == {'a': None, 'b': [1.0, None]}
 
 
-def test_existence_falls_on_noise():
+def test_the_existence_of_a_target_falls_on_noise():
     network = line_network(2)
     stage_ = TrackManager(network, settings_for('vehicle').track)
     rng = np.random.default_rng(0)
@@ -215,7 +215,7 @@ def test_existence_falls_on_noise():
     assert [t for t in tracks if isinstance(t, Track)][-1].existence < 0.5
 
 
-def test_pose_covariance_is_that_of_sampled_states():
+def test_the_pose_covariance_matches_sampled_states():
     """Position, rotation and their cross terms against states drawn from the filter's Gaussian."""
     network, frames, _ = magnet_frames(4)
     stage_ = TrackManager(network, settings_for('magnet').track)
@@ -227,15 +227,15 @@ def test_pose_covariance_is_that_of_sampled_states():
     # The rotation that takes m to the drawn moment, to first order.
     w = np.cross(m, x[:, 6:9]) / (m @ m)
     drawn = np.cov(np.hstack([x[:, :3], w]).T)
-    ours = pose_covariance(track).copy()
-    ours[3:, 3:] -= np.pi**2 * np.outer(m, m) / (m @ m)
+    published = pose_covariance(track).copy()
+    published[3:, 3:] -= np.pi**2 * np.outer(m, m) / (m @ m)
     sd = np.sqrt(np.diagonal(drawn))
-    assert np.abs((drawn - ours) / np.outer(sd, sd)).max() < 0.03
-    # The cross terms are not nothing: a wrong sign would be seen.
-    assert np.abs(ours[:3, 3:] / np.outer(sd[:3], sd[3:])).max() > 0.1
+    assert np.abs((drawn - published) / np.outer(sd, sd)).max() < 0.03
+    # The cross terms are large enough to reveal a wrong sign.
+    assert np.abs(published[:3, 3:] / np.outer(sd[:3], sd[3:])).max() > 0.1
 
 
-def test_odometry_is_in_the_childs_frame():
+def test_the_odometry_twist_is_in_the_child_frame():
     tracks, _, _ = drive(line_network(2), point_body([200.0, -150.0, 80.0], 5.0, 0.5),
                          Path(np.array([1.2, -70.0]), np.pi / 2, 10.0),
                          {'track.vehicle.arrival_names': ['south'],
@@ -251,7 +251,7 @@ def test_odometry_is_in_the_childs_frame():
     assert C[0, 0] == pytest.approx(u @ track.covariance[3:5, 3:5] @ u, rel=1e-6)
 
 
-def test_detections_have_ids_that_count_the_onsets(road_network):
+def test_detection_ids_count_the_onsets(road_network):
     pipeline = Pipeline(road_network, settings_for('vehicle', QUICK))
     samples = recorded(SampleReader(Recording(vehicle_path(NAME)), road_network))
     events = [(r.id, r.onset) for s in samples for r in pipeline.feed(one(s))

@@ -1,6 +1,6 @@
-"""Situations that the tracker's model does not assume: poses without a flag are not wrong.
+"""Situations outside the model of the tracker: poses without a flag are not wrong.
 
-`bench.situations` has the table of more runs.
+`bench.situations` prints a table of more runs.
 """
 
 import functools
@@ -21,32 +21,32 @@ EXPECTED_DOUBTS = {
     'a sensor knocked': doubts.INNOVATIONS,
     'stops for 5 s': doubts.HEIGHT,
 }
-"""{situation: what its poses are doubted for, among others}."""
+"""{situation: one of the doubts about its poses}."""
 RUNS = 3
 
-MISSED = {
-    'clocks 200 ms apart': 'the clock: the four wrong poses are within 0.5 s of the closest '
-                           'point, before the pass as a whole tells',
-    'a car with a trailer': 'in part the pose is that of the car alone, 2 to 3 m before the middle '
-                            'of both, until the trailer has passed; the others: unknown',
-    'one follows, four sensors': 'in one of six runs two cars 9 m apart are taken for a truck '
+MISSED_AIMS = {
+    'clocks 200 ms apart': 'clock offset: the four wrong poses are within 0.5 s of the closest '
+                           'point, before the whole pass reveals the offset',
+    'a car with a trailer': 'some poses are those of the car alone, 2 to 3 m ahead of the middle '
+                            'of both, until the trailer has passed; for others it is unknown',
+    'one follows, four sensors': 'in one of six runs two cars 9 m apart are tracked as a truck '
                                  'between them for 0.8 s, until the second one is found',
-    'one overtakes': 'two cars side by side are taken for a truck of 8 to 12 m',
-    'one axis flipped': 'the axis: without it none is wrong',
+    'one overtakes': 'two cars side by side are tracked as a truck of 8 to 12 m',
+    'one axis flipped': 'flipped axis: without that axis no pose is wrong',
 }
-"""{situation: why it misses its aim}; checked by running it without what is named, or by looking at
-what the wrong poses are taken for."""
+"""{situation: cause of the missed aim}, verified by runs without that cause or by inspection of the
+wrong poses."""
 
-NO_DISTURBANCE = {
-    'a car that turns': '226 of 241: the other 15 are flagged for their height, or were before',
-    'a tram line switched': 'five of six: unknown; the same without new_targets',
+MISSED_EVENT_AIMS = {
+    'a car that turns': '226 of 241: the other 15 are or were flagged for their height',
+    'a tram line switched': 'five of six; the cause is unknown, the same without new_targets',
 }
-"""{situation: why it misses its aim of events}."""
+"""{situation: cause of the missed aim for events}."""
 
 RIGHT_WITHOUT_DOUBTS = {'a car': 199, 'a truck': 249, 'a car that turns': 241,
                         'a car of 25 to 40 m/s': 128, 'a U-turn': 125, 'a car, four sensors': 67}
-"""{situation: right poses without a flag in these runs, before tracks were compared with something
-else}. What is tracked well shall keep nineteen in twenty of them."""
+"""{situation: number of right poses without a flag in these runs, before tracks were compared with
+other explanations}. At least 95 % of them must remain."""
 
 
 @functools.cache
@@ -56,8 +56,8 @@ def verdicts(name, runs):
 
 @pytest.mark.parametrize('name', studied(
     list(SITUATIONS), kept=IN_EVERY_TEST,
-    also=lambda name: [pytest.mark.xfail(strict=True, reason=MISSED[name])]
-    if name in MISSED else ()))
+    also=lambda name: [pytest.mark.xfail(strict=True, reason=MISSED_AIMS[name])]
+    if name in MISSED_AIMS else ()))
 def test_poses_without_a_flag_are_not_wrong(name):
     found = verdicts(name, 1 if name in IN_EVERY_TEST else RUNS)
     sure, wrong = sum(v.n_sure for v in found), sum(v.n_wrong for v in found)
@@ -65,24 +65,24 @@ def test_poses_without_a_flag_are_not_wrong(name):
 
 
 @pytest.mark.parametrize('name', studied(EXPECTED_DOUBTS, kept=IN_EVERY_TEST))
-def test_poses_are_doubted_for_what_is_wrong(name):
+def test_poses_have_the_expected_doubt(name):
     of_all = [d for v in verdicts(name, 1) for d in v.doubts]
     assert sum(EXPECTED_DOUBTS[name] in d for d in of_all) > 0.1 * len(of_all)
 
 
 @pytest.mark.parametrize('name', studied(
     [n for n, s in SITUATIONS.items() if s.group in ('nothing', 'control')], kept=IN_EVERY_TEST,
-    also=lambda name: [pytest.mark.xfail(strict=True, reason=NO_DISTURBANCE[name])]
-    if name in NO_DISTURBANCE else ()))
-def test_disturbances_are_events_and_cars_are_none(name):
+    also=lambda name: [pytest.mark.xfail(strict=True, reason=MISSED_EVENT_AIMS[name])]
+    if name in MISSED_EVENT_AIMS else ()))
+def test_disturbances_are_events_and_cars_are_not(name):
     found = verdicts(name, 1 if name in IN_EVERY_TEST else RUNS)
     if SITUATIONS[name].group == 'control':
-        # After a release a background may be learnt wrong: that is one.
+        # A background that is learnt wrongly after a release counts as a disturbance.
         assert sum(v.n_mistaken for v in found) == 0
         right = sum(v.n_sure - v.n_wrong for v in found)
         assert right >= 0.95 * RIGHT_WITHOUT_DOUBTS[name]
     else:
-        # Where nothing was detected there is nothing to tell of.
+        # A run without a detection has no events.
         tracked = [v for v in found if v.n_tracks]
         assert sum(v.n_disturbances > 0 for v in tracked) >= 0.9 * len(tracked)
         assert sum(v.n_sure for v in found) == 0

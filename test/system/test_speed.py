@@ -1,4 +1,4 @@
-"""The quick part of the benchmarks, ratios and counts; `make bench` measures the rest."""
+"""Quick part of the benchmarks: imports, ratios and counts; `make bench` measures the rest."""
 
 import json
 import subprocess
@@ -23,18 +23,18 @@ print(json.dumps(sorted(sys.modules)))
 '''
 
 
-@pytest.mark.parametrize('words, also', [
+@pytest.mark.parametrize('args, excluded', [
     (['--help'], ('numpy',)), (['--version'], ('numpy',)), (['info', '--help'], ()),
     (['info', RECORDING], ()), (['info', RECORDING, '--network', str(NETWORK_FILE)], ()),
     (['topics', '--help'], ())])
-def test_a_command_imports_what_it_needs_and_no_more(words, also):
-    done = subprocess.run([sys.executable, '-c', IMPORTED, *words], capture_output=True, text=True,
+def test_a_command_imports_only_what_it_needs(args, excluded):
+    done = subprocess.run([sys.executable, '-c', IMPORTED, *args], capture_output=True, text=True,
                           check=True)
     imported = json.loads(done.stdout)
-    assert [m for m in imported if m.startswith((*HEAVY, *also))] == []
+    assert [m for m in imported if m.startswith((*HEAVY, *excluded))] == []
 
 
-def test_the_tracker_does_not_wait_for_what_it_rarely_needs():
+def test_the_tracker_imports_no_rarely_needed_modules():
     done = subprocess.run(
         [sys.executable, '-c', 'import sys, mag_tracking.pipeline; print("\\n".join(sys.modules))'],
         capture_output=True, text=True, check=True)
@@ -43,35 +43,35 @@ def test_the_tracker_does_not_wait_for_what_it_rarely_needs():
     assert not {'scipy.stats', 'scipy.signal', 'scipy.optimize', 'matplotlib'} & {*imported}
 
 
-@pytest.mark.parametrize('n_sensors, least', [(2, 80.0), (8, 40.0)])
-def test_the_bank_is_many_times_faster_than_a_loop_of_filterpy(n_sensors, least):
-    """The aims are 350 and 120 (`bench.bench`); beside other tests half of what is reached."""
-    _, _, highest, *_ = bank_ratio(Peer, n_sensors, False, rounds=4, repeats=20)
-    assert highest >= least
+@pytest.mark.parametrize('n_sensors, min_ratio', [(2, 80.0), (8, 40.0)])
+def test_the_bank_is_many_times_faster_than_a_loop_over_filterpy(n_sensors, min_ratio):
+    """The aims are 350 and 120 (`bench.bench`); limits are half the ratios beside other tests."""
+    _, _, ratio, *_ = bank_ratio(Peer, n_sensors, False, rounds=4, repeats=20)
+    assert ratio >= min_ratio
 
 
 def run(value, more_is_better=False, name='a frame, mean'):
-    """The figures of a run."""
+    """Figures of a benchmark run."""
     return {'replay': {name: {'value': value, 'unit': 'ms', 'aim': None,
                               'more_is_better': more_is_better}}}
 
 
-@pytest.mark.parametrize('more, values, now, is_worse', [
+@pytest.mark.parametrize('more_is_better, values, now, is_worse', [
     (False, [5.0, 4.0, 6.0], 4.5, False), (False, [5.0, 4.0, 6.0], 4.7, True),
     (True, [50.0, 40.0], 44.0, False), (True, [50.0, 40.0], 43.0, True),
-    # Older than five runs.
+    # The best value is older than five runs.
     (False, [1.0, 5.0, 5.0, 5.0, 5.0, 5.0], 5.5, False), (False, [], 9.0, False),
-    # What is not a number is worse, and hides nothing.
+    # NaN is worse than any number, and is not compared with.
     (False, [5.0], np.nan, True), (False, [np.nan, 5.0], 45.0, True),
     (False, [np.nan], 9.0, False)])
-def test_a_figure_is_compared_with_the_best_of_the_latest_runs(more, values, now, is_worse):
-    before = [{'figures': run(v, more)} for v in values]
-    found = figures.worse(run(now, more), before)
+def test_a_figure_is_compared_with_the_best_of_recent_runs(more_is_better, values, now, is_worse):
+    before = [{'figures': run(v, more_is_better)} for v in values]
+    found = figures.worse(run(now, more_is_better), before)
     assert bool(found) == is_worse
-    assert figures.worse(run(now, more, 'a new one'), before) == []
+    assert figures.worse(run(now, more_is_better, 'a new one'), before) == []
 
 
-def test_figures_are_kept_and_what_got_worse_is_said(tmp_path, monkeypatch, capsys):
+def test_figures_are_saved_and_regressions_are_printed(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(figures, 'FOLDER', tmp_path)
     for name in ('LATEST', 'HISTORY'):
         monkeypatch.setattr(figures, name, tmp_path / getattr(figures, name).name)
@@ -87,7 +87,7 @@ def test_figures_are_kept_and_what_got_worse_is_said(tmp_path, monkeypatch, caps
     assert 'worse: replay: a frame, mean: 5 ms, the best of the latest runs was 4' in out
     assert [r['figures']['replay']['a frame, mean']['value']
             for r in figures.read_history()] == [4.0, 4.4, 5.0]
-    # Another machine may be slower.
+    # Runs of another machine are not compared.
     monkeypatch.setattr(figures, 'machine', lambda: 'another')
     kept = figures.Figures('replay')
     kept.add('a frame, mean', np.nan, 'ms', 9.0)

@@ -1,4 +1,4 @@
-"""The products of simulators and faults that `make bench` counts over."""
+"""Combinations of simulators and faults that `make bench` evaluates."""
 
 import numpy as np
 import pytest
@@ -6,13 +6,13 @@ import pytest
 from bench.spoilt_passes import FAULTS, spoil_with, spoilt_pass
 from support.spoilt_runs import recorded
 
-SPOILT = [what for what, fault in FAULTS.items() if fault]
+FAULT_NAMES = [name for name, fault in FAULTS.items() if fault]
 
 
-@pytest.mark.parametrize('what', SPOILT)
-def test_every_fault_spoils(what):
+@pytest.mark.parametrize('name', FAULT_NAMES)
+def test_every_fault_changes_the_readings(name):
     readings = recorded('straight_car_right').readings
-    for fault in spoil_with(what):
+    for fault in spoil_with(name):
         spoilt = fault(readings)
         if len(spoilt) == len(readings):
             # The recording states no covariance.
@@ -25,14 +25,14 @@ def test_every_fault_spoils(what):
 
 
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
-def test_a_made_up_covariance_changes_nothing_of_a_random_pass(simulator):
-    plain, spoilt = (spoilt_pass(what, simulator, 'car', 3)
-                     for what in ('none', 'stated noise of 0.1 T'))
+def test_a_placeholder_covariance_does_not_change_a_random_pass(simulator):
+    plain, spoilt = (spoilt_pass(name, simulator, 'car', 3)
+                     for name in ('none', 'stated noise of 0.1 T'))
     assert plain.detected and len(plain.error) > 10
     np.testing.assert_array_equal(plain.error, spoilt.error)
 
 
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
-def test_after_dense_traffic_nothing_of_a_random_pass_is_sure(simulator):
+def test_a_random_pass_after_dense_traffic_is_ambiguous(simulator):
     found = spoilt_pass('dense traffic for 5 s', simulator, 'car', 3)
     assert len(found.error) > 10 and found.ambiguous.all()

@@ -1,4 +1,4 @@
-"""Alignment: the frames do not depend on how the samples arrive, and nobody waits for the dead."""
+"""Alignment into frames: order of arrival, missing sensors, burst mode, rejected samples, cost."""
 
 import dataclasses
 from collections import Counter
@@ -44,7 +44,7 @@ def key(frames):
             for f in frames]
 
 
-def test_frames_average_and_their_noise_falls():
+def test_a_frame_averages_its_samples_and_reduces_the_noise():
     frames = feed(stage(), stream(2, 800))
     assert len(frames) == 10
     assert frames[0].n_samples.tolist() == [8, 8]
@@ -52,24 +52,24 @@ def test_frames_average_and_their_noise_falls():
     np.testing.assert_allclose(frames[0].covariance[0], C / 8)
 
 
-def test_a_frame_says_when_each_sensor_was_read():
-    """Steps of 10 ms, the second sensor 3 ms later; then it reads only every 30 ms."""
+def test_time_offsets_are_the_mean_sample_times_of_each_sensor():
+    """Samples every 10 ms, those of mag_2 3 ms later; then mag_2 samples only every 30 ms."""
     frames = feed(stage(), stream(2, 800))
     np.testing.assert_allclose(frames[0].time_offset, [-1.5e-3, 1.5e-3])
     assert frames[0].stamp_ns == 36_500_000
     slow = [s for s in stream(2, 800)
             if s.sensor == 'mag_1' or s.stamp_ns % 30_000_000 == 3_000_000]
     first = feed(stage(), slow)[0]
-    # 0, 10 .. 70 and 3, 33, 63: the mean is that of all samples.
+    # Samples at 0, 10 .. 70 ms and at 3, 33, 63 ms: the timestamp is the mean of all of them.
     mean = (280 + 99) / 11 * 1e-3
     np.testing.assert_allclose(first.time_offset, [0.035 - mean, 0.033 - mean], atol=1e-9)
-    alone = feed(stage(), [s for s in stream(2, 800) if s.sensor == 'mag_1'])
-    assert alone[0].time_offset.tolist() == [0.0, 0.0]
+    single = feed(stage(), [s for s in stream(2, 800) if s.sensor == 'mag_1'])
+    assert single[0].time_offset.tolist() == [0.0, 0.0]
 
 
 @given(st.data())
 def test_frames_do_not_depend_on_the_interleaving_of_the_sensors(data):
-    """Each sensor's samples in order, the sensors mixed anyhow within the waiting time."""
+    """Each sensor's samples stay in order; the sensors are mixed within the maximum wait."""
     queues = [[s for s in stream(3, 600) if s.sensor == f'mag_{j + 1}'] for j in range(3)]
     mixed = []
     while any(queues):
@@ -79,7 +79,7 @@ def test_frames_do_not_depend_on_the_interleaving_of_the_sensors(data):
         key(feed(stage(3, max_wait_s=5.0), stream(3, 600)))
 
 
-def test_different_rates_and_a_missing_axis():
+def test_sensors_of_different_rates_and_with_a_missing_axis_share_frames():
     a = stream(1, 800)
     b = [MagSample(int(k * 40e6 + 1e6), 'mag_2', np.array([1.0, np.nan, 2.0]), C)
          for k in range(20)]
@@ -88,7 +88,7 @@ def test_different_rates_and_a_missing_axis():
     assert np.isnan(frames[0].field[1, 1]) and np.isfinite(frames[0].field[1, [0, 2]]).all()
 
 
-def test_a_sensor_that_stops_becomes_a_nan_row_and_delays_nobody():
+def test_a_sensor_that_stops_becomes_a_nan_row_and_delays_no_frames():
     samples = [s for s in stream(2, 4000) if s.sensor == 'mag_1' or s.stamp_ns < 1e9]
     align = stage(max_wait_s=0.5)
     delays, frames = [], []
@@ -102,12 +102,12 @@ def test_a_sensor_that_stops_becomes_a_nan_row_and_delays_nobody():
     assert align.counts['frames with a sensor missing'] > 20
 
 
-def test_a_sensor_that_never_spoke_is_waited_for_only_once():
+def test_a_sensor_without_any_sample_delays_frames_only_once():
     frames = feed(stage(), [s for s in stream(2, 2000) if s.sensor == 'mag_1'], flush=False)
     assert len(frames) > 20
 
 
-def test_late_duplicate_and_unordered_samples_are_counted():
+def test_late_duplicate_and_out_of_order_samples_are_counted():
     align = stage(1)
     feed(align, stream(1, 500), flush=False)
     for ms in (490, 485):
@@ -121,7 +121,7 @@ def test_late_duplicate_and_unordered_samples_are_counted():
     assert rejected(slow.counts) == {'late': 1}
 
 
-def test_an_unknown_covariance_is_that_of_the_network_or_the_sample_is_rejected():
+def test_a_missing_covariance_is_taken_from_the_network_or_rejected():
     network = line_network(2)
     stds = (None, np.array([1e-8, 2e-8, 3e-8]))
     align = Align(dataclasses.replace(network, noise_std=stds), AlignSettings())
@@ -130,7 +130,7 @@ def test_an_unknown_covariance_is_that_of_the_network_or_the_sample_is_rejected(
     assert rejected(align.counts) == {'unknown covariance, and no noise_std in the network': 1}
 
 
-def test_a_looped_recording_starts_anew_and_loses_nothing_before():
+def test_a_looped_recording_restarts_the_alignment_and_loses_no_samples():
     align = stage()
     first = feed(align, stream(2, 2400), flush=False)
     second = feed(align, stream(2, 2400))
@@ -139,7 +139,7 @@ def test_a_looped_recording_starts_anew_and_loses_nothing_before():
     assert not rejected(align.counts)
 
 
-def test_memory_is_bounded():
+def test_the_number_of_held_samples_is_bounded():
     align = stage(2, max_wait_s=3600.0, max_buffered=50)
     for k in range(1000):
         align.feed(one(sample(10.0 * k, 0)))
@@ -161,19 +161,19 @@ def test_burst_mode_does_not_mix_rounds_after_a_lost_sample():
     samples = [s for s in stream(2, 1000) if not (s.sensor == 'mag_2' and s.field[0] == 40.0)]
     frames = feed(align, samples)
     for f in frames:
-        there = f.field[f.n_samples > 0]
-        assert np.ptp(there) == 0.0
+        present = f.field[f.n_samples > 0]
+        assert np.ptp(present) == 0.0
     assert len(frames) == 100
 
 
-def test_burst_mode_reckons_who_is_dead_from_the_newest_sample_taken_ever():
-    """A sample of 10 ms makes a frame of its own, after one that reached to 150 ms."""
+def test_burst_mode_compares_silent_sensors_with_the_newest_used_sample():
+    """The sample at 10 ms forms a frame of its own, after a frame that reached 150 ms."""
     align = stage(2, burst=True, period_s=1.0, max_wait_s=0.05)
     arrivals = [(0, 0), (10, 0), (150, 1), (155, 1)]
     assert [len(align.feed(one(sample(ms, j)))) for ms, j in arrivals] == [0, 0, 2, 1]
 
 
-def test_burst_mode_takes_samples_a_nanosecond_apart():
+def test_burst_mode_accepts_samples_one_nanosecond_apart():
     frames = feed(stage(1, burst=True), [sample(1e-6 * k, 0) for k in range(1, 6)])
     assert [f.stamp_ns for f in frames] == [1, 2, 3, 4, 5]
 
@@ -185,7 +185,7 @@ def test_every_sample_is_used_exactly_once(period):
 
 
 @given(st.integers(0, 10_000))
-def test_stamps_of_frames_always_increase_and_offsets_keep_the_true_times(seed):
+def test_frame_timestamps_increase_and_offsets_preserve_sample_times(seed):
     rng = np.random.default_rng(seed)
     samples = []
     for j in range(3):
@@ -202,12 +202,12 @@ def test_stamps_of_frames_always_increase_and_offsets_keep_the_true_times(seed):
         assert times == pytest.approx(sum(s.stamp_ns for s in samples) / 1e9)
 
 
-class Plain:
-    """The rules of the alignment, all sensors looked at anew at every sample."""
+class PlainAlign:
+    """Reference implementation, which evaluates all sensors at every sample."""
 
     def __init__(self, n, s):
-        self.n, self.burst, self.most, self.counts = n, s.burst, s.max_buffered, Counter()
-        self.period, self.wait, self.jump = (
+        self.n, self.burst, self.max_held, self.counts = n, s.burst, s.max_buffered, Counter()
+        self.period, self.max_wait, self.max_jump = (
             round(1e9 * v) for v in (s.period_s, s.max_wait_s, s.max_backward_jump_s))
         self.begin()
 
@@ -222,7 +222,7 @@ class Plain:
             return []
         if t <= self.latest.get(j, -1):
             back = self.latest[j] - t
-            if back <= self.jump:
+            if back <= self.max_jump:
                 self.counts['rejected: out of order' if back
                             else 'rejected: duplicate timestamp'] += 1
                 return []
@@ -235,7 +235,7 @@ class Plain:
             return []
         self.seen.append(t)
         self.held = sorted([*self.held, (t, j, x)], key=lambda h: h[:2])
-        if len([h for h in self.held if h[1] == j]) > self.most:
+        if len([h for h in self.held if h[1] == j]) > self.max_held:
             self.held.remove(next(h for h in self.held if h[1] == j))
             self.counts['rejected: too many pending samples'] += 1
         return out + self.flush(False)
@@ -258,8 +258,8 @@ class Plain:
     def complete(self, end, heads):
         newest, last, every = max(self.seen), max(self.taken.values(), default=0), range(self.n)
         def alive(j, at):
-            return (self.latest[j] >= at - self.wait if j in self.latest
-                    else newest - min(self.seen) < self.wait)
+            return (self.latest[j] >= at - self.max_wait if j in self.latest
+                    else newest - min(self.seen) < self.max_wait)
         return all(self.latest.get(j, -1) >= end for j in every if alive(j, newest)) or (
             self.burst and all(heads[j] < end if j in heads else not alive(j, last)
                                for j in every))
@@ -289,20 +289,20 @@ class Plain:
 
 @settings(max_examples=200)
 @given(st.integers(0, 10 ** 6))
-def test_frames_and_counts_are_those_of_the_plain_rules_at_every_sample(seed):
+def test_frames_and_counts_match_the_reference_at_every_sample(seed):
     n, rng = 1 + seed % 6, np.random.default_rng(seed)
-    wanted = replace(AlignSettings(), {
+    chosen = replace(AlignSettings(), {
         'burst': bool(rng.integers(2)), 'period_s': float(rng.choice([1e-4, 0.01, 0.03, 0.2])),
         'max_wait_s': float(rng.choice([0.001, 0.02, 0.1, 0.5, 60.0])),
         'max_backward_jump_s': float(rng.choice([0.0, 0.05, 1.0])), 'max_clock_jump_s': 0.0,
         'max_buffered': int(rng.choice([2, 5, 20, 10000]))})
-    align, plain = Align(line_network(n), wanted), Plain(n, wanted)
+    align, reference = Align(line_network(n), chosen), PlainAlign(n, chosen)
     frames, rows = [], []
     for s in disorder(rng, n):
         found = align.flush() if s is None else align.feed(one(s))
-        expected = plain.flush() if s is None else plain.feed(s)
+        expected = reference.flush() if s is None else reference.feed(s)
         assert [f.stamp_ns for f in found] == [stamp for stamp, _ in expected]
-        assert +align.counts == +plain.counts
+        assert +align.counts == +reference.counts
         frames += found
         rows += [row for _, sensors in expected for row in sensors]
     for k, name in enumerate(('field', 'covariance', 'n_samples', 'time_offset')):
@@ -312,18 +312,18 @@ def test_frames_and_counts_are_those_of_the_plain_rules_at_every_sample(seed):
 
 @pytest.mark.parametrize('changes', [{}, {'burst': True, 'period_s': 0.5, 'max_wait_s': 2.0},
                                      {'max_wait_s': 3600.0, 'max_buffered': 20}])
-def test_a_sample_costs_the_same_with_any_number_of_sensors(changes):
-    """By how often it looks up anything of its own, with lost samples and a gap of one sensor."""
-    class Counted(Align):
-        asked = Counter()
+def test_the_cost_of_a_sample_does_not_depend_on_the_number_of_sensors(changes):
+    """Cost in attribute look-ups, with lost samples and a gap of one sensor."""
+    class CountedAlign(Align):
+        lookups = Counter()
         def __getattribute__(self, name):
-            Counted.asked[name] += 1
+            CountedAlign.lookups[name] += 1
             return super().__getattribute__(name)
     rng, cost = np.random.default_rng(1), []
     for n in (6, 60):
-        Counted.asked.clear()
+        CountedAlign.lookups.clear()
         samples = [s for s in stream(n, 1000.0, offset=3.6 / n) if rng.uniform() > 0.02
                    and (s.sensor != 'mag_3' or not 300e6 < s.stamp_ns < 700e6)]
-        feed(Counted(line_network(n), replace(AlignSettings(), changes)), samples)
-        cost.append(Counted.asked.total() / len(samples))
+        feed(CountedAlign(line_network(n), replace(AlignSettings(), changes)), samples)
+        cost.append(CountedAlign.lookups.total() / len(samples))
     assert cost[1] < 1.1 * cost[0]

@@ -18,14 +18,14 @@ from support.samples import batch, one
 
 @settings(max_examples=100)
 @given(st.integers(0, 10 ** 6))
-def test_batches_give_the_frames_of_single_samples(seed):
+def test_batches_give_the_same_frames_as_single_samples(seed):
     n, rng = 1 + seed % 6, np.random.default_rng(seed)
-    wanted = replace(AlignSettings(), {
+    chosen = replace(AlignSettings(), {
         'burst': bool(rng.integers(2)), 'period_s': float(rng.choice([0.01, 0.03, 0.2])),
         'max_wait_s': float(rng.choice([0.02, 0.1, 60.0])),
         'max_clock_jump_s': float(rng.choice([0.0, 0.05, 0.5])),
         'max_buffered': int(rng.choice([2, 5, 33, 10000]))})
-    single, many = Align(line_network(n), wanted), Align(line_network(n), wanted)
+    single, many = Align(line_network(n), chosen), Align(line_network(n), chosen)
     frames, held = ([], []), []
     for s in disorder(rng, n):
         frames[0].extend(single.flush() if s is None else single.feed(one(s)))
@@ -43,16 +43,16 @@ def test_batches_give_the_frames_of_single_samples(seed):
 
 
 def steady(n, n_readings, start=0, without=()):
-    """`Readings`, each of all sensors but those in `without`, every 10 ms."""
+    """`Readings` every 10 ms, each with one sample of all sensors except those in `without`."""
     names = tuple(f'mag_{j + 1}' for j in range(n))
-    there = np.array([j for j in range(n) if j not in without])
-    return [Readings(names, there, np.full(len(there), 10**18 + k * 10**7),
-                     np.ones((len(there), 3)), np.tile(np.eye(3), (len(there), 1, 1)))
+    present = np.array([j for j in range(n) if j not in without])
+    return [Readings(names, present, np.full(len(present), 10**18 + k * 10**7),
+                     np.ones((len(present), 3)), np.tile(np.eye(3), (len(present), 1, 1)))
             for k in range(start, start + n_readings)]
 
 
 class CountedAlignment(core.Alignment):
-    """Counts how often it gave which reason, all of them together."""
+    """Counts the reason codes that it returns, over all instances."""
 
     reasons: Counter[int] = Counter()
 
@@ -63,26 +63,26 @@ class CountedAlignment(core.Alignment):
 
 
 def reasons_of(stage, readings):
-    """How often compiled code gave which reason."""
+    """Number of returns from compiled code, by reason code."""
     CountedAlignment.reasons.clear()
     for r in readings:
         stage.feed(r)
     return Counter(CountedAlignment.reasons)
 
 
-def test_a_clock_that_stepped_is_asked_about_for_a_while_only(monkeypatch):
-    """A sensor whose clock steps ahead and which then dies; later it comes back."""
+def test_a_clock_step_leaves_the_compiled_path_only_temporarily(monkeypatch):
+    """The clock of a sensor steps ahead, the sensor falls silent, and later it resumes."""
     monkeypatch.setattr(core, 'Alignment', CountedAlignment)
     stage = Align(line_network(4), replace(AlignSettings(), {'max_buffered': 40,
                                                              'max_wait_s': 2.0}))
-    known = {core.DONE, core.COMPLETE}
-    assert set(reasons_of(stage, steady(4, 100))) == known
+    usual = {core.DONE, core.COMPLETE}
+    assert set(reasons_of(stage, steady(4, 100))) == usual
     ahead = [Readings(('mag_4',), np.array([0]), np.array([10**18 + 10**10 + k]), np.ones((1, 3)),
                       np.eye(3)[None]) for k in range(3)]
     assert reasons_of(stage, ahead)[core.CLOCK_STEP] == 3
     for r in steady(4, 300, 100, without=(3,)):
         stage.feed(r)
-    assert set(reasons_of(stage, steady(4, 100, 400, without=(3,)))) == known
+    assert set(reasons_of(stage, steady(4, 100, 400, without=(3,)))) == usual
     for r in steady(4, 200, 500):
         stage.feed(r)
-    assert set(reasons_of(stage, steady(4, 100, 700))) == known
+    assert set(reasons_of(stage, steady(4, 100, 700))) == usual

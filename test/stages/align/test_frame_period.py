@@ -1,4 +1,4 @@
-"""Frames by the geometry, and the warning where one is too long."""
+"""Frame period from the geometry of the network, and the warning about a long period."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ AUTO = AlignSettings()
 
 @pytest.mark.parametrize('distance, period', [(9.0, 0.08), (2.1, 0.08), (1.6, 0.04), (1.0, 0.025),
                                               (0.5, 0.02), (0.2, 0.02), (0.05, 0.08)])
-def test_a_frame_is_half_the_shortest_delay_of_a_close_network(distance, period):
+def test_the_period_is_half_the_shortest_delay_of_a_close_network(distance, period):
     network = network_of([[0.0, 0.0, 0.0], [distance, 0.0, 0.0]])
     assert frame_period(AUTO, network) == pytest.approx(period)
     assert frame_period(dataclasses.replace(AUTO, burst=True), network) == 0.08
@@ -27,38 +27,39 @@ def test_a_frame_is_half_the_shortest_delay_of_a_close_network(distance, period)
     assert frame_period(AUTO, wide) == 0.08
 
 
-def test_height_is_no_delay():
+def test_sensors_above_each_other_have_no_delay():
     mast = network_of([[0.0, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, 1.0]])
     assert shortest_delay(mast) is None and frame_period(AUTO, mast) == 0.08
 
 
-def test_one_sensor_has_no_delay():
-    one = network_of([[0.0, 0.0, 0.0]])
-    assert shortest_delay(one) is None and frame_period(AUTO, one) == 0.08
-    assert frame_period_warning(AUTO, one) is None
+def test_a_single_sensor_has_no_delay():
+    single = network_of([[0.0, 0.0, 0.0]])
+    assert shortest_delay(single) is None and frame_period(AUTO, single) == 0.08
+    assert frame_period_warning(AUTO, single) is None
 
 
-def test_a_setting_is_taken_as_it_is_and_warned_of():
+def test_a_configured_period_is_used_and_warned_about():
     close = network_of([[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]])
     long = dataclasses.replace(AUTO, period_s=0.08)
     assert frame_period(long, close) == 0.08
-    said = frame_period_warning(long, close)
-    assert '80 ms' in said and '25 ms' in said and 'mag_1 to mag_2' in said
+    warning = frame_period_warning(long, close)
+    assert '80 ms' in warning and '25 ms' in warning and 'mag_1 to mag_2' in warning
     assert frame_period_warning(dataclasses.replace(long, burst=True), close) is None
     assert frame_period_warning(long, ROAD) is None
-    # Nobody is warned of what was chosen for him.
+    # There is no warning about an automatic period.
     nearer = network_of([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0]])
     assert frame_period_warning(AUTO, close) is None and frame_period_warning(AUTO, nearer) is None
 
 
-def test_a_frame_shorter_than_any_reading_is_refused():
+def test_a_period_below_the_minimum_is_refused():
     with pytest.raises(SettingsError, match='shorter than'):
         frame_period(dataclasses.replace(AUTO, period_s=1e-9), ROAD)
 
 
-def test_many_sensors_are_looked_at_quickly():
+def test_the_shortest_delay_is_exact_in_a_large_network():
     rng = np.random.default_rng(1)
     network = network_of(rng.uniform(0.0, 100.0, (600, 3)))
-    place = network.positions[:, :2]
-    apart = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(600, 1)]
-    assert shortest_delay(network)[0] == pytest.approx(apart[apart > 0.1].min() / 20.0)
+    plane = network.positions[:, :2]
+    distance = np.linalg.norm(plane[:, None] - plane[None], axis=2)[
+        np.triu_indices(600, 1)]
+    assert shortest_delay(network)[0] == pytest.approx(distance[distance > 0.1].min() / 20.0)

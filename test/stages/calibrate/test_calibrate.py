@@ -1,4 +1,4 @@
-"""Calibration: what is learnt, when it freezes, and what becomes of bad input."""
+"""Calibration: learning and freezing of backgrounds, invalid input, corrections."""
 
 import dataclasses
 
@@ -20,13 +20,13 @@ def test_level_noise_and_drift_are_learnt():
     drift = np.array([5e-9, -3e-9, 0.0])
     feed(b, np.arange(0, 30, 0.01), drift=drift)
     error = (b.level(30.0) - EARTH - 30.0 * drift) / SIGMA
-    # A line through 2000 samples, carried 1.5 s beyond its end.
+    # A line through 2000 samples, extrapolated by 1.5 s.
     assert np.abs(error).max() < 4.5 * np.sqrt(1 / 2000 * (1 + 3 * (1 + 2 * 1.75 / 20) ** 2))
     std = np.sqrt(np.diagonal(b.covariance))
     np.testing.assert_allclose(std, SIGMA, rtol=5 / np.sqrt(2 * 2000))
 
 
-def test_not_ready_before_it_has_learnt():
+def test_a_background_is_not_ready_before_it_is_learnt():
     b = running()
     feed(b, np.arange(0, 2.0, 0.01))
     assert not b.ready
@@ -35,8 +35,8 @@ def test_not_ready_before_it_has_learnt():
 
 
 @pytest.mark.parametrize('rate', [1.0, 5.0, 8.0, 10.0, 12.5, 15.0, 25.0, 70.0, 200.0])
-def test_a_sensor_of_any_rate_learns(rate):
-    # Ten and 12.5 Hz once never did: their blocks of eight samples did not fit into the stretch.
+def test_a_background_is_learnt_at_any_sample_rate(rate):
+    # At 10 and 12.5 Hz it once was not: blocks of eight samples did not fit into the interval.
     b = running()
     feed(b, np.arange(0, 3.0 + 24 / rate, 1 / rate))
     assert b.ready
@@ -44,8 +44,8 @@ def test_a_sensor_of_any_rate_learns(rate):
 
 
 @pytest.mark.parametrize('rate, at', [(1.0, 20.0), (1.0, 8.0), (2.0, 12.0), (2.0, 6.0)])
-def test_a_target_that_passes_while_it_learns_is_no_noise(rate, at):
-    """A block of a slow sensor is long enough for a whole pass: its mean hardly tells."""
+def test_a_target_that_passes_while_learning_does_not_raise_the_noise(rate, at):
+    """A block of a slow sensor can contain a whole pass, which its mean hardly shows."""
     def target(t):
         return np.array([3e-6, -2e-6, 1e-6]) / (1 + ((t - at) / 0.8) ** 2) ** 2.5
     b = running()
@@ -68,7 +68,7 @@ def test_a_target_freezes_the_background():
     assert np.abs((b.level(30.0) - EARTH) / SIGMA).max() < 0.5
 
 
-def test_a_parked_car_becomes_background_only_after_its_time():
+def test_a_parked_car_becomes_background_only_after_the_relearn_time():
     parked = np.array([1e-6, 0.0, 0.0])
     b = running(relearn=20.0)
     feed(b, np.arange(0, 10, 0.01))
@@ -77,13 +77,13 @@ def test_a_parked_car_becomes_background_only_after_its_time():
     feed(b, np.arange(25, 40, 0.01), signal=parked)
     assert b.n_relearnt == 1
     assert np.abs((b.level(40.0) - EARTH - parked) / SIGMA).max() < 0.5
-    never = running(relearn=0.0)
-    feed(never, np.arange(0, 10, 0.01))
-    feed(never, np.arange(10, 60, 0.05), signal=parked)
-    assert never.frozen and never.n_relearnt == 0
+    disabled = running(relearn=0.0)
+    feed(disabled, np.arange(0, 10, 0.01))
+    feed(disabled, np.arange(10, 60, 0.05), signal=parked)
+    assert disabled.frozen and disabled.n_relearnt == 0
 
 
-def test_a_target_in_the_beginning_is_not_learnt():
+def test_a_target_at_the_start_is_not_learnt():
     def passing(t):
         return np.array([2e-6, 1e-6, 0.0]) / (1 + ((t - 1.5) / 0.5) ** 2) ** 2.5
     b = running()
@@ -94,14 +94,14 @@ def test_a_target_in_the_beginning_is_not_learnt():
     assert np.abs((b.level(12.0) - EARTH) / SIGMA).max() < 0.6
 
 
-def test_given_background_and_noise_are_ready_at_once():
+def test_a_configured_background_with_noise_is_ready_immediately():
     b = running(background=EARTH, noise_std=SIGMA)
     assert b.ready
     np.testing.assert_array_equal(b.level(0.0), EARTH)
     np.testing.assert_allclose(np.diagonal(b.covariance), SIGMA**2)
 
 
-def test_given_background_without_noise_learns_the_noise():
+def test_a_configured_background_without_noise_learns_the_noise():
     b = running(background=EARTH)
     assert not b.ready
     feed(b, np.arange(0, 5, 0.01))
@@ -114,68 +114,68 @@ def test_given_background_without_noise_learns_the_noise():
     ([0.02, 0.15, -0.49], 'gauss or microtesla'),
     ([2.0, 15.0, -49.0], 'gauss or microtesla'),
 ])
-def test_unusable_fields_are_counted_and_rejected(field, cause):
+def test_invalid_fields_are_counted_and_rejected(field, cause):
     s = stage()
     assert fed(s, sample(1.0, field)) == []
     assert len(rejected(s.counts)) == 1 and cause in next(iter(rejected(s.counts)))
     assert s.counts_of('mag_1')['rejected'] == 1
 
 
-def test_millitesla_are_legitimate_where_the_setting_says_so():
+def test_fields_of_millitesla_pass_with_a_larger_max_field():
     assert len(fed(stage(max_field=0.1), sample(1.0, [0.01, 0.0, 0.0]))) == 1
 
 
-def test_unknown_sensor_is_counted():
+def test_a_reading_of_an_unknown_sensor_is_counted_and_rejected():
     s = stage()
     assert fed(s, sample(1.0, sensor='mag_9')) == []
     assert rejected(s.counts) == {'unknown sensor mag_9': 1}
 
 
-def test_a_missing_axis_is_kept_missing():
+def test_a_missing_axis_stays_missing():
     out = fed(stage(), sample(1.0, [EARTH[0], EARTH[1], np.nan]))
     np.testing.assert_allclose(out[0].field[:2], 0.0, atol=1e-20)
     assert np.isnan(out[0].field[2])
 
 
-def test_duplicate_and_late_stamps_are_counted_and_rejected():
+def test_duplicate_and_out_of_order_timestamps_are_counted_and_rejected():
     s = stage()
     for t in (1.0, 1.0, 0.5, 1.1):
         fed(s, sample(t))
     assert rejected(s.counts) == {'duplicate timestamp': 1, 'out of order': 1}
 
 
-def test_a_restart_is_taken_and_counted():
+def test_a_jump_back_in_time_is_accepted_and_counted():
     s = stage()
     fed(s, sample(100.0))
     assert len(fed(s, sample(1.0))) == 1
     assert s.counts['time jumped back'] == 1
 
 
-def test_covariances():
+def test_implausible_message_covariances_are_overruled_unless_trusted():
     own = np.diag([1e-16, 2e-16, 3e-16])
     s = stage()
     np.testing.assert_array_equal(fed(s, sample(1.0, covariance=own))[0].covariance, own)
-    # Unknown: the configured one.
+    # A missing covariance is replaced by the configured one.
     np.testing.assert_allclose(fed(s, sample(2.0))[0].covariance, 1.44e-16 * np.eye(3))
-    # By rounding, half of the products have no eigenvalue that is not above zero.
+    # Rounding errors make all eigenvalues of half of the rank-one products positive.
     bad = [-own, np.zeros((3, 3)), np.diag([1e-16, 2e-16, np.nan]),
            own + np.triu(np.ones((3, 3)), 1), 100.0 * own, 0.01 * own,
            *(1e-16 * np.outer(v, v) for v in np.random.default_rng(0).standard_normal((20, 3)))]
-    made_up = own.copy()
-    made_up[0, 1] = made_up[1, 0] = 0.99 * np.sqrt(2.0) * 1e-16
-    for k, C in enumerate([*bad, made_up]):
+    correlated = own.copy()
+    correlated[0, 1] = correlated[1, 0] = 0.99 * np.sqrt(2.0) * 1e-16
+    for k, C in enumerate([*bad, correlated]):
         (out,) = fed(s, sample(3.0 + k, covariance=C))
         np.testing.assert_allclose(out.covariance, 1.44e-16 * np.eye(3))
     assert s.counts[OVERRULED] == 27 and not rejected(s.counts)
     s = stage(trust_covariances=True)
-    for k, C in enumerate((100.0 * own, 0.01 * own, made_up)):
+    for k, C in enumerate((100.0 * own, 0.01 * own, correlated)):
         np.testing.assert_array_equal(fed(s, sample(1.0 + k, covariance=C))[0].covariance, C)
     for C in (*bad[:4], *bad[6:]):
         assert fed(s, sample(9.0, covariance=C)) == []
     assert rejected(s.counts) == {'covariance is not positive definite': 24}
 
 
-def test_forget_names_an_unknown_sensor():
+def test_forget_refuses_an_unknown_sensor():
     with pytest.raises(NetworkError, match='mag_9'):
         stage().forget(['mag_9'])
 
@@ -185,7 +185,7 @@ HARD = np.array([4e-6, -3e-6, 7e-6])
 
 
 def corrected(**known):
-    """The stage of a network in which these are known of the second sensor, and its background."""
+    """`Calibrate` for a network with backgrounds and these properties of the second sensor."""
     n = line_network(2)
     known = {key: (None, value) for key, value in known.items() if key != 'clock_offset'} | {
         key: np.array([0.0, known[key]]) for key in known if key == 'clock_offset'}
@@ -193,22 +193,22 @@ def corrected(**known):
     return Calibrate(n, CalibrateSettings())
 
 
-def test_a_clock_that_is_ahead_is_put_back():
+def test_the_clock_offset_is_subtracted_from_timestamps():
     s = corrected(clock_offset=0.0213)
     (first,), (second,) = fed(s, sample(5.0)), fed(s, sample(5.0213, sensor='mag_2'))
     assert first.stamp_ns == second.stamp_ns == 5_000_000_000
     assert s.last_stamp_ns('mag_2') == 5_000_000_000
-    # Of one sensor the order stays.
+    # The samples of a sensor still have to be in order.
     assert fed(s, sample(5.0213, sensor='mag_2')) == []
     assert rejected(s.counts) == {'duplicate timestamp': 1}
 
 
-def test_a_sensors_own_iron_is_taken_away():
+def test_hard_and_soft_iron_of_a_sensor_are_corrected():
     s = corrected(offset=HARD, correction=SOFT)
     B = EARTH + [3e-7, -2e-7, 5e-7]
     (out,) = fed(s, sample(1.0, np.linalg.solve(SOFT, B) + HARD, 'mag_2'))
     np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
-    # The other sensor has none.
+    # The other sensor has no correction.
     (out,) = fed(s, sample(1.0, B))
     np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
     (out,) = fed(corrected(offset=HARD), sample(1.0, B + HARD, 'mag_2'))
@@ -224,7 +224,7 @@ def test_the_covariance_is_that_of_the_corrected_field():
     np.testing.assert_allclose(out.covariance, np.cov(drawn.T), atol=0.03 * 3e-16)
 
 
-def test_an_axis_that_a_correction_needs_is_missed():
+def test_a_reading_without_an_axis_that_the_correction_needs_is_rejected():
     field = [EARTH[0], EARTH[1], np.nan]
     s = corrected(correction=SOFT + 0.01)
     assert fed(s, sample(1.0, field, 'mag_2')) == []
@@ -237,16 +237,16 @@ def test_an_axis_that_a_correction_needs_is_missed():
 
 @pytest.mark.parametrize('C', [np.diag([1.02, 0.97, 1.05]),
                                [[1.02, 0.03, 0.0], [-0.01, 0.97, 0.0], [0.0, 0.0, 1.0]]])
-def test_an_axis_that_a_correction_does_not_need_is_not_missed(C):
-    """Scales of a sensor with two axes."""
+def test_a_reading_without_an_axis_that_the_correction_ignores_passes(C):
+    """Corrections of a sensor with two axes."""
     s, C = corrected(correction=np.array(C)), np.array(C)
     (out,) = fed(s, sample(1.0, [EARTH[0], EARTH[1], np.nan], 'mag_2'))
     np.testing.assert_allclose(out.field[:2], (C[:2, :2] - np.eye(2)) @ EARTH[:2], atol=1e-18)
     assert np.isnan(out.field[2])
 
 
-def test_another_calibration_keeps_a_background_that_a_target_stands_on():
-    """Only clocks and orientations were surveyed: what stands there must not become the level."""
+def test_a_new_calibration_keeps_a_background_that_a_target_has_frozen():
+    """Only the clock offset has changed: the parked car must not become the background."""
     network = line_network(1)
     stage = Calibrate(network, CalibrateSettings())
     rng = np.random.default_rng(3)
@@ -267,12 +267,12 @@ def test_another_calibration_keeps_a_background_that_a_target_stands_on():
     assert stage.backgrounds()['mag_1'].frozen and stage.backgrounds()['mag_1'].n_relearnt == 0
     assert len(out) == 1000
     np.testing.assert_allclose(np.mean([s.field for s in out], axis=0), car, atol=1e-8)
-    # By the new clock, and on the same line in time.
+    # Timestamps follow the new clock offset and are accepted as in order.
     assert out[0].stamp_ns == 1000 * 10**7 - 250_000_000
     assert stage.counts['rejected: out of order'] == 0
 
 
-def test_another_correction_is_learnt_anew():
+def test_a_new_hard_iron_offset_restarts_learning():
     network = line_network(1)
     stage = Calibrate(network, CalibrateSettings())
     for k in range(500):
@@ -285,7 +285,7 @@ def test_another_correction_is_learnt_anew():
 
 
 def ends_of_blocks(phase, times):
-    """(readings, by number, that showed a block to be complete, the background) of `times` [s]."""
+    """Indices of the readings that complete a block, and the background, for `times` [s]."""
     background = FedBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase)
     state = background.sensors
     rng, ends, now = np.random.default_rng(0), [], 0
@@ -299,24 +299,24 @@ def ends_of_blocks(phase, times):
     return ends, background
 
 
-def test_blocks_of_many_sensors_end_one_after_the_other():
-    """Judging one takes a while; those of a hundred sensors at once would hold up the readings.
+def test_blocks_of_many_sensors_end_at_staggered_times():
+    """Evaluating the blocks of a hundred sensors at once would delay the readings.
 
-    Also after a while, when all have had the same jitter of their stamps.
+    The ends stay staggered when all timestamps have the same jitter.
     """
-    n, n_readings, every = 10, 10_000, []
+    n, n_readings, ends_of_all = 10, 10_000, []
     times = (np.arange(n_readings) + np.random.default_rng(1).uniform(0.0, 0.05, n_readings)) / 100
     for j in range(n):
         ends, background = ends_of_blocks(j / n, times)
         assert background.ready
-        # To one reading, by rounding.
+        # Rounding errors amount to one reading.
         np.testing.assert_allclose(np.diff(ends), 25, atol=1.1)
         assert ends[0] == pytest.approx(25 * (1.0 + j / n), abs=1.1)
-        every += ends
-    assert np.bincount(every).max() <= 2
+        ends_of_all += ends
+    assert np.bincount(ends_of_all).max() <= 2
 
 
-def test_without_a_phase_a_block_has_its_whole_length():
+def test_a_block_without_a_phase_has_its_full_length():
     times = np.arange(200) / 100.0 + 0.005 * (np.arange(200) % 25 == 0)
     ends, _ = ends_of_blocks(None, times)
     assert len(ends) > 5 and (np.diff(times[ends]) >= 0.25 - 1e-9).all()

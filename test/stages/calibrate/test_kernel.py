@@ -1,4 +1,4 @@
-"""The rules for one reading: they do not depend on batches, and are those of plain Python."""
+"""Compiled calibration: independent of batches, and equal to an implementation in Python."""
 
 import dataclasses
 
@@ -16,8 +16,8 @@ from support.plain_calibration import PlainCalibration
 from support.samples import MagSample, batch, one, samples_of
 
 
-def samples_alike(found, expected):
-    """Whether two lists of samples are the same, but for rounding."""
+def assert_equal(found, expected):
+    """Assert that two lists of samples are equal except for rounding."""
     assert [(s.stamp_ns, s.sensor) for s in found] == [(s.stamp_ns, s.sensor) for s in expected]
     for name in ('field', 'covariance'):
         a, b = (np.array([getattr(s, name) for s in some]) for some in (found, expected))
@@ -25,14 +25,14 @@ def samples_alike(found, expected):
 
 
 def batches(samples, size, rng):
-    """The same as `Readings` of about `size`."""
+    """Samples as `Readings` of about `size` each."""
     ends = np.cumsum(rng.integers(1, 2 * size, len(samples)))
     return [batch(list(some)) for some in np.split(
         np.array(samples, dtype=object), ends[ends < len(samples)])]
 
 
 def calibrated(stage, items, idles=False):
-    """[MagSample] of batches and of the flush; `idles` now and then, as the node does."""
+    """[MagSample] of batches and of the flush; `idles` calls `idle` in between, as nodes do."""
     out = []
     for k, readings in enumerate(items):
         out += stage.feed(readings)
@@ -41,15 +41,15 @@ def calibrated(stage, items, idles=False):
     return samples_of(*out, *stage.flush())
 
 
-def calibrated_alike(network, samples, size=20, **settings):
-    """The stage, which has given the same as plain Python one by one and in batches."""
-    wanted = CalibrateSettings(**settings)
-    plain, single, many = (PlainCalibration(network, wanted), Calibrate(network, wanted),
-                           Calibrate(network, wanted))
+def checked_stage(network, samples, size=20, **settings):
+    """The stage, whose results of single readings and of batches equal those of plain Python."""
+    chosen = CalibrateSettings(**settings)
+    plain, single, many = (PlainCalibration(network, chosen), Calibrate(network, chosen),
+                           Calibrate(network, chosen))
     expected = [c for s in samples for c in plain.feed(s)] + plain.flush()
-    samples_alike(calibrated(single, map(one, samples), idles=True), expected)
-    samples_alike(calibrated(many, batches(samples, size, np.random.default_rng(0)), idles=True),
-                  expected)
+    assert_equal(calibrated(single, map(one, samples), idles=True), expected)
+    assert_equal(calibrated(many, batches(samples, size, np.random.default_rng(0)), idles=True),
+                 expected)
     for stage in (single, many):
         assert +stage.counts == +plain.counts
         for name in network.names:
@@ -60,16 +60,16 @@ def calibrated_alike(network, samples, size=20, **settings):
 
 @pytest.mark.parametrize('is_large_and_corrected', [False, True])
 @pytest.mark.parametrize('fault', [None, *FAULTS])
-def test_a_pass_with_a_fault(monkeypatch, fault, is_large_and_corrected):
+def test_a_pass_with_a_fault_matches_plain_python(monkeypatch, fault, is_large_and_corrected):
     network, samples, *_ = stream(2, 3, fault)
     if is_large_and_corrected:
         monkeypatch.setattr(calibrate, 'MAX_SYNCHRONOUS', 1)
         network = corrected(network)
-    assert calibrated_alike(network, samples).counts['calibrated'] > 1000
+    assert checked_stage(network, samples).counts['calibrated'] > 1000
 
 
 def corrected(network):
-    """With clocks, offsets and soft iron of all sensors but the first."""
+    """Network with clock offsets, hard iron and soft iron of all sensors except the first."""
     rng, n = np.random.default_rng(5), len(network)
     return dataclasses.replace(
         network, clock_offset=np.array([0.0, *rng.uniform(-0.02, 0.02, n - 1)]),
@@ -78,8 +78,8 @@ def corrected(network):
                             for _ in range(n - 1))))
 
 
-def suspect_ones(samples, rng):
-    """With missing axes, covariances of their own, and sensors that nobody knows."""
+def suspect_samples(samples, rng):
+    """Samples, some with a missing axis, a covariance, an unknown sensor or an old timestamp."""
     for s in samples:
         kind = rng.integers(60)
         field = s.field.copy()
@@ -94,16 +94,16 @@ def suspect_ones(samples, rng):
 @pytest.mark.parametrize('settings', [
     {}, {'reject_stuck': False, 'spike_std': 0.0}, {'decimate_to_hz': 20.0},
     {'trust_covariances': True}])
-def test_corrected_sensors_and_suspect_readings(settings):
+def test_suspect_readings_of_corrected_sensors_match_plain_python(settings):
     network, samples, *_ = stream(4, 7)
-    samples = list(suspect_ones(samples, np.random.default_rng(1)))
-    stage = calibrated_alike(corrected(network), samples, **settings)
+    samples = list(suspect_samples(samples, np.random.default_rng(1)))
+    stage = checked_stage(corrected(network), samples, **settings)
     n = stage.counts['rejected: covariance is not positive definite']
     assert n > 50 if 'trust_covariances' in settings else n == 0
     assert (stage.counts[OVERRULED] > 0) == ('trust_covariances' not in settings)
 
 
-def test_another_calibration_and_learning_again_in_the_middle():
+def test_a_new_calibration_and_relearning_do_not_depend_on_batches():
     network, samples, *_ = stream(2, 9)
     found = []
     for size in (1, 37):
@@ -116,24 +116,24 @@ def test_another_calibration_and_learning_again_in_the_middle():
             for i in range(0, len(part), size):
                 out += stage.feed(batch(part[i:i + size]))
         found.append((samples_of(*out), stage.counts))
-    samples_alike(found[0][0], found[1][0])
+    assert_equal(found[0][0], found[1][0])
     assert found[0][1] == found[1][1]
     assert found[0][1]['held back while learning'] > 2 * 300
 
 
-def test_outputs_do_not_change_later():
+def test_later_readings_do_not_modify_earlier_outputs():
     network, samples, *_ = stream(2, 9)
     stage = Calibrate(network, CalibrateSettings())
-    given = [r for b in batches(samples, 30, np.random.default_rng(0)) for r in stage.feed(b)]
-    kept = [(g.field.copy(), g.covariance.copy()) for g in given]
+    outputs = [r for b in batches(samples, 30, np.random.default_rng(0)) for r in stage.feed(b)]
+    kept = [(g.field.copy(), g.covariance.copy()) for g in outputs]
     stage.feed(batch(samples[-2:]))
-    for g, (field, C) in zip(given, kept, strict=True):
+    for g, (field, C) in zip(outputs, kept, strict=True):
         np.testing.assert_array_equal(g.field, field)
         np.testing.assert_array_equal(g.covariance, C)
 
 
-def test_clean_readings_need_python_once_a_block(monkeypatch):
-    """A block has 25 readings at 100 Hz; only its end needs Python."""
+def test_valid_readings_need_python_once_per_block(monkeypatch):
+    """At 100 Hz a block has 25 readings; only its end needs Python."""
     network, samples, *_ = stream(2, 3)
     stage, reasons, compiled = Calibrate(network, CalibrateSettings()), [], \
         core.calibrate_readings
@@ -147,26 +147,26 @@ def test_clean_readings_need_python_once_a_block(monkeypatch):
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_a_corrected_sensor_that_is_stuck(seed):
-    """Its readings are equal to the last bit after the correction."""
+def test_a_stuck_sensor_is_rejected_after_its_correction(seed):
+    """Its corrected readings are equal to the last bit."""
     rng, network = np.random.default_rng(seed), corrected(line_network(2))
     fields = np.array([2e-6, 1.55e-5, -4.9e-5]) + 1.2e-8 * rng.standard_normal((1600, 3))
     fields[400:] = fields[400]
     samples = [MagSample(10**18 + k * 25_000_000, 'mag_2', f) for k, f in enumerate(fields)]
-    stage = calibrated_alike(network, samples)
+    stage = checked_stage(network, samples)
     assert stage.counts['rejected: stuck sensor (repeated reading)'] > 1100
 
 
-def test_a_background_without_an_axis():
+def test_an_axis_that_appears_later_is_held_back_while_learning():
     network, rng = line_network(1), np.random.default_rng(0)
     fields = np.array([2e-6, 1.55e-5, -4.9e-5]) + 1.2e-8 * rng.standard_normal((1000, 3))
     fields[:600, 1] = np.nan
-    stage = calibrated_alike(network, [MagSample(10**18 + k * 10**7, 'mag_1', f)
-                                       for k, f in enumerate(fields)])
+    stage = checked_stage(network, [MagSample(10**18 + k * 10**7, 'mag_1', f)
+                                    for k, f in enumerate(fields)])
     assert stage.counts['axes held back while learning'] > 20
 
 
-def test_arrays_of_other_kinds_are_readings_too():
+def test_arrays_of_other_types_and_layouts_are_accepted():
     network, samples, *_ = stream(2, 9)
     readings = batch(samples)
     stage, other = (Calibrate(network, CalibrateSettings()) for _ in range(2))
@@ -178,22 +178,22 @@ def test_arrays_of_other_kinds_are_readings_too():
     np.testing.assert_array_equal(found.field, expected.field)
 
 
-def test_no_readings_give_none():
+def test_an_empty_batch_gives_no_output():
     stage = Calibrate(line_network(2), CalibrateSettings())
     assert stage.feed(batch([])) == [] and stage.flush() == [] and not stage.counts
 
 
-def test_coarse_steps_repeat_themselves():
+def test_repeated_readings_of_a_coarse_sensor_match_plain_python():
     network, rng = line_network(1), np.random.default_rng(2)
     fields = np.round(1.2e-8 * rng.standard_normal((2000, 3)) / 1.5e-8) * 1.5e-8 + 1e-5
     assert np.count_nonzero((np.diff(fields, axis=0) == 0.0).all(axis=1)) > 50
-    calibrated_alike(network, [MagSample(10**18 + k * 10**7, 'mag_1', f)
-                               for k, f in enumerate(fields)])
+    checked_stage(network, [MagSample(10**18 + k * 10**7, 'mag_1', f)
+                            for k, f in enumerate(fields)])
 
 
-@pytest.mark.parametrize('is_renewed', [False, True])
-def test_many_thinned_samples_come_at_once(is_renewed):
-    """A decimator measures the rate by 32 samples, and all of them come with the last."""
+@pytest.mark.parametrize('is_recalibrated', [False, True])
+def test_decimated_samples_do_not_depend_on_batches(is_recalibrated):
+    """A decimator measures the rate over 32 samples and returns them together."""
     network = dataclasses.replace(line_network(2), background=(np.zeros(3),) * 2,
                                   noise_std=(np.full(3, 1e-8),) * 2)
     rng = np.random.default_rng(0)
@@ -203,16 +203,16 @@ def test_many_thinned_samples_come_at_once(is_renewed):
     for size in (1, 7, 400):
         stage, out = Calibrate(network, CalibrateSettings(decimate_to_hz=20.0)), []
         for i in range(0, 400, size):
-            if is_renewed and i <= 40 < i + size:
+            if is_recalibrated and i <= 40 < i + size:
                 stage.update_network(dataclasses.replace(network, clock_offset=np.zeros(2)))
             out.append(sum(map(len, stage.feed(batch(samples[i:i + size])))))
         found.append((sum(out), stage.counts['calibrated']))
         assert size > 1 or max(out) == 32
-    assert len(set(found)) == 1 or is_renewed
+    assert len(set(found)) == 1 or is_recalibrated
 
 
 def test_corrupt_timestamps_do_not_confirm_each_other():
-    """Each jumps ahead of good ones; two in a row would be a step of the clock."""
+    """Each jumps ahead of valid ones; two consecutive ones would be a clock step."""
     stage = Calibrate(dataclasses.replace(line_network(1), background=(np.zeros(3),)),
                       CalibrateSettings())
     at_s = [1, 2, 1000, 3, 1001, 4, 1000.5, 5]
@@ -222,7 +222,7 @@ def test_corrupt_timestamps_do_not_confirm_each_other():
     assert stage.counts['calibrated'] == 5
 
 
-def test_a_step_of_the_clock_is_confirmed_once_also_where_a_background_is_offered():
+def test_a_clock_step_is_confirmed_once_also_with_a_stored_background():
     network = dataclasses.replace(line_network(1), background=(np.zeros(3),))
     first = Calibrate(network, CalibrateSettings())
     first.feed(one(MagSample(10**9, 'mag_1', np.full(3, 1e-8))))
@@ -235,7 +235,7 @@ def test_a_step_of_the_clock_is_confirmed_once_also_where_a_background_is_offere
     assert stage.counts['rejected: timestamp too far ahead'] == 1
 
 
-def test_a_flush_forgets_what_all_sensors_were_compared_with():
+def test_flush_clears_the_history_of_spike_screening():
     network = dataclasses.replace(line_network(1), background=(np.zeros(3),))
     stage, rng = Calibrate(network, CalibrateSettings()), np.random.default_rng(0)
 
@@ -248,7 +248,7 @@ def test_a_flush_forgets_what_all_sensors_were_compared_with():
     assert feed(20, 5e-6)
 
 
-def test_an_own_covariance_needs_no_axis_that_the_correction_does_not_need():
+def test_a_covariance_needs_no_axis_that_the_correction_ignores():
     C = np.array([[1.02, 0.03, 0.0], [-0.01, 0.97, 0.0], [0.0, 0.0, 1.0]])
     network = dataclasses.replace(line_network(1), background=(np.zeros(3),), correction=(C,))
     own = np.diag([1e-16, 2e-16, np.nan])

@@ -1,4 +1,4 @@
-"""Screening within the calibration: what is found is counted, and what waits is never lost."""
+"""Screening for spikes and stuck sensors in the calibration; held readings are never lost."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ from support.sensor_noise import EARTH, NS, SIGMA, noise
 
 
 @pytest.mark.parametrize('name', VEHICLES)
-def test_nothing_is_found_in_the_recordings(name, road_network):
+def test_screening_rejects_nothing_in_the_bundled_recordings(name, road_network):
     stage = Calibrate(road_network, CalibrateSettings())
     for s in recorded(SampleReader(Recording(vehicle_path(name)), road_network)):
         fed(stage, s)
@@ -42,71 +42,71 @@ def total(stage):
     return c['accepted'] + c['rejected']
 
 
-def test_spikes_and_repetitions_are_counted_where_they_are():
+def test_spikes_and_repeated_readings_are_rejected_and_counted():
     stage, _ = calibrate()
     y = noise(400)
     y[[100, 150, 151]] += 5e-6
     y[300:330] = y[299]
     out = feed(stage, y)
-    stuck_ones = stage.counts_of('mag_1')['rejected: stuck sensor (repeated reading)']
-    assert rejected(stage.counts) == {'spike': 3, 'stuck sensor (repeated reading)': stuck_ones}
-    assert 24 <= stuck_ones <= 27 and len(out) == 400 - 3 - stuck_ones
+    n_stuck = stage.counts_of('mag_1')['rejected: stuck sensor (repeated reading)']
+    assert rejected(stage.counts) == {'spike': 3, 'stuck sensor (repeated reading)': n_stuck}
+    assert 24 <= n_stuck <= 27 and len(out) == 400 - 3 - n_stuck
     assert np.abs([c.field for c in out]).max() < 6 * SIGMA
     assert (np.diff([c.stamp_ns for c in out]) > 0).all()
     assert total(stage) == 400
 
 
-def test_the_setting_zero_is_never():
+def test_zero_disables_spike_rejection():
     stage, _ = calibrate(spike_std=0.0)
     y = noise(100)
     y[50] += 5e-6
     assert len(feed(stage, y)) == 100 and not rejected(stage.counts)
 
 
-def held_spike(stage):
+def feed_a_spike_that_is_held(stage):
     y = noise(52)
     y[50:] += 5e-6
     assert len(feed(stage, y)) == 50
 
 
-def test_what_is_held_at_the_end_passes_and_is_counted():
+def test_readings_held_at_the_end_pass_and_are_counted():
     stage, _ = calibrate()
-    held_spike(stage)
+    feed_a_spike_that_is_held(stage)
     assert [c.stamp_ns for c in flushed(stage)] == [500_000_000, 510_000_000]
     assert stage.counts_of('mag_1') == {'accepted': 52} and flushed(stage) == []
 
 
-def test_what_is_held_when_time_jumps_back_is_counted():
-    """Once it was lost without a word."""
+def test_readings_held_at_a_jump_back_in_time_are_counted():
+    """They once were lost without being counted."""
     stage, _ = calibrate()
-    held_spike(stage)
+    feed_a_spike_that_is_held(stage)
     assert len(feed(stage, noise(50), first=-1000)) == 50
     assert rejected(stage.counts) == {'possible spike when time jumped back': 2}
     assert total(stage) == 102
 
 
-@pytest.mark.parametrize('what', ['offset', 'correction', 'clock_offset'])
-def test_what_is_held_when_another_calibration_comes_is_counted(what):
-    """It was corrected by the one before."""
+@pytest.mark.parametrize('attribute', ['offset', 'correction', 'clock_offset'])
+def test_readings_held_at_a_new_calibration_are_counted(attribute):
+    """They were corrected with the previous calibration."""
     stage, network = calibrate()
-    held_spike(stage)
+    feed_a_spike_that_is_held(stage)
     new = {'offset': (np.full(3, 1e-6),), 'correction': (1.01 * np.eye(3),),
-           'clock_offset': (0.003,)}[what]
-    stage.update_network(dataclasses.replace(network, **{what: new}))
+           'clock_offset': (0.003,)}[attribute]
+    stage.update_network(dataclasses.replace(network, **{attribute: new}))
     assert rejected(stage.counts) == {'possible spike when the calibration changed': 2}
     out = feed(stage, noise(50), first=100)
     assert len(out) == 50 and total(stage) == 102
 
 
-def test_the_same_calibration_once_more_changes_nothing():
+def test_an_identical_calibration_keeps_held_readings():
     stage, network = calibrate()
-    held_spike(stage)
+    feed_a_spike_that_is_held(stage)
     stage.update_network(dataclasses.replace(network))
     assert len(feed(stage, noise(1), first=52)) == 1
     assert rejected(stage.counts) == {'spike': 2} and total(stage) == 53
 
 
-def test_what_is_held_when_the_background_is_to_be_learnt_again_is_still_judged():
+def test_readings_held_when_relearning_starts_are_still_screened():
     network = line_network(1, noise=SIGMA)
     stage = Calibrate(network, CalibrateSettings())
     y = noise(800)

@@ -1,4 +1,4 @@
-"""Detection: thresholds, measured false alarms and detections, onset, hold and release."""
+"""Detection: thresholds, false alarm and detection rates, onset, hold and release."""
 
 from dataclasses import fields
 
@@ -39,8 +39,8 @@ def detector(network, **changes):
     return Detect(network, replace(DetectSettings(), {**exact, **changes}))
 
 
-def test_thresholds_are_those_of_the_source():
-    """T10 eq. (5.18), (5.19): 11.2 (11.34 exactly), and half detected at SNR 9.2."""
+def test_thresholds_match_the_published_ones():
+    """T10 eq. (5.18), (5.19): threshold 11.2 (11.34 exactly), and half detected at SNR 9.2."""
     h = energy_threshold(0.01, 3)
     assert h == pytest.approx(chi2.isf(0.01, 3), rel=1e-12)
     assert false_alarm_probability(h, 3) == pytest.approx(0.01, rel=1e-12)
@@ -49,34 +49,34 @@ def test_thresholds_are_those_of_the_source():
 
 
 @pytest.mark.parametrize('p', [1e-2, 1e-3])
-def test_measured_false_alarm_rate_is_the_stated_one(p):
+def test_the_false_alarm_rate_is_the_configured_one(p):
     network, rng, n = line_network(2), np.random.default_rng(7), 60_000
     stage = detector(network, false_alarm_probability=p)
     for k in range(n):
         stage.feed(frame(k, SIGMA * rng.standard_normal((2, 3)), network))
     alarms = stage.counts['frames above the threshold']
     low, high = binom.ppf([0.005, 0.995], n, p)
-    print(f'stated {p:g}: measured {alarms / n:.2e}, limits {low / n:.2e} .. {high / n:.2e}')
+    print(f'configured {p:g}: measured {alarms / n:.2e}, limits {low / n:.2e} .. {high / n:.2e}')
     assert low <= alarms <= high
 
 
-@pytest.mark.parametrize('per_frame, said, counted', [
+@pytest.mark.parametrize('per_frame, documented, tested', [
     (1, '3.5e-4 per frame of one sample (12.5 Hz)', 1e-3),
     (8, '1.5e-7 per frame of eight (100 Hz)', 0.05)])
-def test_false_alarm_probability_at_the_defaults_is_the_one_said(per_frame, said, counted):
-    """Noise of 12 nT a sample, `per_frame` samples a frame, and the allowance for backgrounds."""
+def test_the_default_false_alarm_probability_is_as_documented(per_frame, documented, tested):
+    """Noise of 12 nT per sample, `per_frame` samples per frame, and the background allowance."""
     settings, variance = DetectSettings(), SIGMA**2 / per_frame
     wider = 1.0 + settings.background_std**2 / variance
     p = chi2.sf(chi2.isf(settings.false_alarm_probability, 6) * wider, 6)
-    assert float(said.split()[0]) == pytest.approx(p, rel=0.05)
+    assert float(documented.split()[0]) == pytest.approx(p, rel=0.05)
     text, = (f.metadata['doc'] for f in fields(DetectSettings)
              if f.name == 'background_std')
-    assert said in text
-    # The stage itself: at the default, or with eight samples at a level that can be counted.
+    assert documented in text
+    # The stage itself: at the default or, with eight samples, with enough alarms to count.
     network, rng, n = line_network(2), np.random.default_rng(12), 60_000
-    stage = Detect(network, replace(settings, {'false_alarm_probability': counted,
+    stage = Detect(network, replace(settings, {'false_alarm_probability': tested,
                                                'release_probability': 0.05}))
-    p = chi2.sf(chi2.isf(counted, 6) * wider, 6)
+    p = chi2.sf(chi2.isf(tested, 6) * wider, 6)
     C = np.repeat(variance * np.eye(3)[None], 2, axis=0)
     std = np.sqrt(variance)
     for k in range(n):
@@ -84,13 +84,13 @@ def test_false_alarm_probability_at_the_defaults_is_the_one_said(per_frame, said
         stage.feed(FieldFrame(k * 80_000_000, y, C, np.full(2, per_frame), np.zeros(2)))
     alarms = stage.counts['frames above the threshold']
     low, high = binom.ppf([0.005, 0.995], n, p)
-    print(f'{per_frame} a frame: computed {p:.2e}, measured {alarms / n:.2e}')
+    print(f'{per_frame} samples per frame: computed {p:.2e}, measured {alarms / n:.2e}')
     assert low <= alarms <= high
 
 
 @pytest.mark.parametrize('n', studied([40_000, 160_000], [40_000]))
 def test_false_alarm_rate_through_calibration_and_alignment(n):
-    """Raw noise with learnt backgrounds, through the whole way: 100 Hz averaged to 12.5 Hz."""
+    """Raw noise at 100 Hz through calibration with learnt backgrounds and frames at 12.5 Hz."""
     network, rng = line_network(2), np.random.default_rng(8)
     calibrate = Calibrate(network, replace(CalibrateSettings(), {'memory_s': 300.0,
                                                                  'learn_s': 60.0}))
@@ -107,11 +107,11 @@ def test_false_alarm_rate_through_calibration_and_alignment(n):
     for p, stage in detectors.items():
         frames, alarms = stage.counts['frames'], stage.counts['frames above the threshold']
         low, high = binom.ppf([0.005, 0.995], frames, p)
-        print(f'whole way, stated {p:g}: measured {alarms / frames:.2e} of {frames}')
+        print(f'all stages, configured {p:g}: measured {alarms / frames:.2e} of {frames}')
         assert low <= alarms <= high
 
 
-def test_measured_detection_rate_is_the_theoretical_one():
+def test_the_detection_rate_is_the_theoretical_one():
     network, rng, n = line_network(2), np.random.default_rng(9), 20_000
     signal = SIGMA * np.array([[1.0, -2.0, 0.5], [0.0, 1.5, 2.0]])
     snr = float((signal**2).sum() / SIGMA**2)
@@ -123,7 +123,7 @@ def test_measured_detection_rate_is_the_theoretical_one():
     assert low <= stage.counts['frames above the threshold'] <= high
 
 
-def test_energy_of_missing_axes_and_sensors_counts_only_what_is_there():
+def test_the_energy_is_that_of_the_present_axes():
     C = np.repeat((SIGMA**2 * np.array([[2, 1, 0], [1, 2, 0], [0, 0, 1.0]]))[None], 3, axis=0)
     y = SIGMA * np.array([[1.0, 2.0, 3.0], [1.0, np.nan, 2.0], [np.nan] * 3])
     energy, axes = whitened_energy(y, C)
@@ -131,30 +131,30 @@ def test_energy_of_missing_axes_and_sensors_counts_only_what_is_there():
     part = y[1, [0, 2]] @ np.linalg.inv(C[1][np.ix_([0, 2], [0, 2])]) @ y[1, [0, 2]]
     np.testing.assert_allclose(energy, [full, part, 0.0], rtol=1e-12)
     assert axes.tolist() == [3, 2, 0]
-    C[2, 0, 0] = np.nan  # of a sensor that is missing nothing is read
+    C[2, 0, 0] = np.nan  # the covariance of a missing sensor is not used
     np.testing.assert_array_equal(whitened_energy(y, C)[0], energy)
     np.testing.assert_allclose(smallest_pivots(y, C), [0.75, 1.0, 1.0], rtol=1e-12)
     C[1, 0, 0] = -1.0
     with pytest.raises(np.linalg.LinAlgError, match='not positive definite'):
         whitened_energy(y, C)
-    with pytest.raises(ValueError, match='shape'):
+    with pytest.raises(ValueError, match=r'covariances \(n, 3, 3\), got \(3, 3\) and \(2, 3, 3\)'):
         whitened_energy(y, C[:2])
 
 
-def test_the_smallest_pivot_tells_which_covariances_are_none():
-    """Of random ones it has the sign of the smallest eigenvalue, whatever their unit."""
+def test_the_smallest_pivot_identifies_invalid_covariances():
+    """It has the sign of the smallest eigenvalue, in any unit."""
     rng, n = np.random.default_rng(3), 400
     std = 10.0 ** rng.uniform(-12.0, 3.0, (n, 3, 1))
     C = rng.uniform(-1.0, 1.0, (n, 3, 3))
     C = 0.5 * (C + np.swapaxes(C, 1, 2)) + np.eye(3)
     y = np.where(rng.random((n, 3)) < 0.2, np.nan, 1.0)
-    there = ~np.isnan(y)
-    of_present = np.where(there[:, :, None] & there[:, None, :], C, np.eye(3))
-    is_one = np.linalg.eigvalsh(of_present)[:, 0] > 0.0
-    assert 0.1 < is_one.mean() < 0.9
+    present = ~np.isnan(y)
+    of_present = np.where(present[:, :, None] & present[:, None, :], C, np.eye(3))
+    is_valid = np.linalg.eigvalsh(of_present)[:, 0] > 0.0
+    assert 0.1 < is_valid.mean() < 0.9
     C = C * std * np.swapaxes(std, 1, 2)
-    np.testing.assert_array_equal(smallest_pivots(y, C) > 0.0, is_one)
-    # Two axes that go together but for a share of their variance.
+    np.testing.assert_array_equal(smallest_pivots(y, C) > 0.0, is_valid)
+    # Two axes that are almost fully correlated.
     C = np.repeat(np.array([[4.0, 2.0 * (1.0 - 1e-6), 0.0], [0, 1.0, 0], [0, 0, 9.0]])[None], 4, 0)
     C[:, 1, 0] = C[:, 0, 1]
     for k, bad in enumerate((np.nan, np.inf)):
@@ -165,18 +165,18 @@ def test_the_smallest_pivot_tells_which_covariances_are_none():
     assert np.isnan(pivots[1:]).all()
 
 
-@pytest.mark.parametrize('wrong', [-SIGMA**2, np.nan, np.inf])
-def test_a_frame_with_a_covariance_that_is_none_is_counted(wrong):
+@pytest.mark.parametrize('invalid', [-SIGMA**2, np.nan, np.inf])
+def test_a_frame_with_an_invalid_covariance_is_rejected_and_counted(invalid):
     network = line_network(2)
     stage = detector(network, onset_frames=1)
     loud = frame(0, np.full((2, 3), 10 * SIGMA), network)
-    loud.covariance[1] = wrong
+    loud.covariance[1] = invalid
     assert stage.feed(loud) == []
     assert stage.counts['rejected: frame with a covariance that is not positive definite'] == 1
     assert [type(r) for r in stage.feed(frame(1, loud.field, network))] == [Detection, FieldFrame]
 
 
-def test_onset_hold_and_release():
+def test_onset_needs_consecutive_frames_and_the_hold_bridges_gaps():
     network = line_network(2)
     stage = detector(network, onset_frames=3, hold_s=0.4)
     loud, quiet = np.full((2, 3), 10 * SIGMA), np.zeros((2, 3))
@@ -188,12 +188,12 @@ def test_onset_hold_and_release():
                 events.append((k, r.onset, r.id))
             else:
                 present.append(r.target_present)
-    # Two loud frames are no onset, three are; a short silence is bridged by the hold.
+    # Three loud frames are an onset, two are not; the hold bridges a short quiet interval.
     assert events == [(8, True, 1), (19, False, 1)]
     assert present == [8 <= k < 19 for k in range(len(pattern))]
 
 
-def test_time_running_backwards_ends_the_detection():
+def test_a_jump_back_in_time_ends_the_detection():
     network = line_network(2)
     stage = detector(network, onset_frames=1)
     stage.feed(frame(100, np.full((2, 3), 10 * SIGMA), network))

@@ -1,4 +1,4 @@
-"""What one sensor tells of a pass: when, which way, how sure; never in metres."""
+"""Pass events of single sensors: time and direction of a pass, with their uncertainty."""
 
 import csv
 import dataclasses
@@ -30,40 +30,40 @@ ONE_AXIS = 'mag_1'
 
 
 def passing(rng, noise=0.0, height=0.0, left_to_right=True, n=200):
-    """(t (n,), field (n, 3), time of the closest point, time scale) of a dipole on a line.
+    """(t (n,), field (n, 3), time of the CPA, time scale) of a dipole on a straight path.
 
-    The target is north of the sensor and x points east, in units of its lateral distance.
+    The target passes north of the sensor and x points east, in units of its lateral distance.
     """
-    speed, when = rng.uniform(0.5, 3.0), rng.uniform(-1.0, 1.0)
+    speed, t_cpa = rng.uniform(0.5, 3.0), rng.uniform(-1.0, 1.0)
     span = 6.0 * np.hypot(1.0, height) / speed
-    t = np.linspace(when - span, when + span, n)
-    along = speed * (t - when) * (1.0 if left_to_right else -1.0)
+    t = np.linspace(t_cpa - span, t_cpa + span, n)
+    along = speed * (t - t_cpa) * (1.0 if left_to_right else -1.0)
     r = np.column_stack([along, np.ones(n), np.full(n, height)])
     field = dipole_field(-r, rng.standard_normal(3))
     field /= np.abs(field).max()
-    return t, field + noise * rng.standard_normal((n, 3)), when, np.hypot(1.0, height) / speed
+    return t, field + noise * rng.standard_normal((n, 3)), t_cpa, np.hypot(1.0, height) / speed
 
 
 @pytest.mark.parametrize('axes', ['xyz', 'xy', 'x', 'z'])
 @pytest.mark.parametrize('noise', [1e-4, 0.03, 0.1])
-def test_the_closest_point_of_a_dipole_is_found(axes, noise):
+def test_the_time_of_the_cpa_of_a_dipole_is_found(axes, noise):
     rng, ratios, errors = np.random.default_rng(0), [], []
     for _ in range(40):
-        t, field, when, scale = passing(rng, noise, rng.uniform(0.0, 0.5))
+        t, field, t_cpa, scale = passing(rng, noise, rng.uniform(0.0, 0.5))
         field[:, [k for k, a in enumerate('xyz') if a not in axes]] = np.nan
         if np.nanmax(np.abs(field)) < 5.0 * noise:
             continue
         found = closest_point(t, field, np.full(3, noise))
         if np.isfinite(found.time_std):
-            ratios.append((found.time - when) / found.time_std)
-            errors.append(abs(found.time - when) / scale)
-    # A dipole has its magnetic centre in its middle: the deviation is larger than the errors.
+            ratios.append((found.time - t_cpa) / found.time_std)
+            errors.append(abs(found.time - t_cpa) / scale)
+    # The magnetic centre of a dipole is its middle, so the standard deviation is conservative.
     assert len(ratios) > 20 and np.mean(np.abs(ratios) < 3.0) > 0.95
     assert noise > 1e-3 or np.median(errors) < 0.02, np.median(errors)
 
 
 @pytest.mark.parametrize('left_to_right', [True, False])
-def test_the_field_turns_with_the_direction_whatever_the_moment(left_to_right):
+def test_the_rotation_of_the_field_gives_the_direction_for_any_moment(left_to_right):
     rng = np.random.default_rng(1)
     for _ in range(200):
         _, field, _, _ = passing(rng, 1e-6, 0.0, left_to_right)
@@ -74,28 +74,28 @@ def test_the_field_turns_with_the_direction_whatever_the_moment(left_to_right):
 
 @pytest.mark.parametrize('noise', [0.1, 0.3, 0.5])
 def test_the_probability_of_the_direction_is_calibrated(noise):
-    """Among those of the same stated probability, that share is right (PHD15 Paper B)."""
-    rng, said, right = np.random.default_rng(2), [], []
+    """The mean stated probability equals the share of right directions (PHD15 Paper B)."""
+    rng, stated, right = np.random.default_rng(2), [], []
     for _ in range(600):
-        way = bool(rng.integers(2))
-        _, field, _, _ = passing(rng, noise, 0.0, way)
+        direction = bool(rng.integers(2))
+        _, field, _, _ = passing(rng, noise, 0.0, direction)
         p = rotation_of_pass(field[:, :2], noise, 50).left_to_right
-        said.append(max(p, 1.0 - p))
-        right.append((p > 0.5) == way)
-    # 0.05 is the aim of the specification; three standard deviations of the count come on top.
-    assert abs(np.mean(said) - np.mean(right)) < 0.05 + 3.0 * 0.5 / np.sqrt(600)
+        stated.append(max(p, 1.0 - p))
+        right.append((p > 0.5) == direction)
+    # 0.05 is the specified limit, to which three standard deviations of the count are added.
+    assert abs(np.mean(stated) - np.mean(right)) < 0.05 + 3.0 * 0.5 / np.sqrt(600)
 
 
-def test_the_direction_does_not_depend_on_how_the_sensor_is_turned():
+def test_the_direction_does_not_depend_on_the_heading_of_the_sensor():
     rng = np.random.default_rng(3)
     _, field, _, _ = passing(rng, 1e-3)
     c, s = np.cos(1.1), np.sin(1.1)
-    turned = field[:, :2] @ np.array([[c, -s], [s, c]])
-    assert rotation_of_pass(turned, 1e-3, 50) == pytest.approx(
+    rotated = field[:, :2] @ np.array([[c, -s], [s, c]])
+    assert rotation_of_pass(rotated, 1e-3, 50) == pytest.approx(
         rotation_of_pass(field[:, :2], 1e-3, 50))
 
 
-def test_nothing_is_said_of_too_few_readings():
+def test_too_few_readings_give_no_direction_and_no_cpa():
     assert rotation_of_pass(np.zeros((3, 2)), 1.0, 1) is None
     assert rotation_of_pass(np.zeros((50, 2)), 1.0, 10) is None
     assert closest_point(np.arange(5.0), np.ones((5, 3)), np.ones(3)).time_std == np.inf
@@ -117,7 +117,7 @@ def events_of(readings, network=NETWORK, batch=None):
 
 
 def truth_of(name, sensor):
-    """(time of the closest point [ns], whether it went from left to right)."""
+    """(time of the CPA [ns], whether the vehicle passed from left to right)."""
     ((stamps, position, _),) = recorded(name).truth.values()
     r = position - NETWORK.positions[NETWORK.index(sensor)]
     k = int(np.linalg.norm(r, axis=1).argmin())
@@ -127,9 +127,9 @@ def truth_of(name, sensor):
 
 @pytest.mark.parametrize('name', studied(VEHICLES, kept=('straight_car_right',)))
 @pytest.mark.parametrize('sensor', ['mag_1', 'mag_2'])
-def test_one_sensor_tells_when_and_which_way(name, sensor):
-    one = NETWORK.part(np.array([NETWORK.index(sensor)]))
-    (event,) = events_of(spoiler.only_sensor(sensor)(recorded(name).readings), one)
+def test_a_single_sensor_gives_the_time_and_direction_of_a_pass(name, sensor):
+    single = NETWORK.part(np.array([NETWORK.index(sensor)]))
+    (event,) = events_of(spoiler.only_sensor(sensor)(recorded(name).readings), single)
     closest, left_to_right = truth_of(name, sensor)
     assert event.ended and event.number == 1 and event.axes == 'xyz'
     assert abs(event.closest_ns - closest) / 1e9 < 3.0 * event.closest_std
@@ -140,37 +140,37 @@ def test_one_sensor_tells_when_and_which_way(name, sensor):
 
 @pytest.mark.parametrize('name', studied(VEHICLES, kept=('straight_truck_right',)))
 @pytest.mark.parametrize('axis', ['x', 'z'])
-def test_one_axis_of_one_sensor_gives_an_event_without_a_direction(name, axis):
-    """Of the sensor that is nearer to the vehicle; the other may feel nothing on that axis."""
+def test_a_single_axis_gives_an_event_without_a_direction(name, axis):
+    """The sensor nearer to the vehicle is used; the other may measure nothing on that axis."""
     size = {s: np.abs(f - np.median(f, axis=0)).max() for s in NETWORK.names for f in [
         recorded(name).readings.field[np.array(recorded(name).readings.sensor_names()) == s]]}
     sensor = max(size, key=size.get)
-    one = NETWORK.part(np.array([NETWORK.index(sensor)]))
+    single = NETWORK.part(np.array([NETWORK.index(sensor)]))
     readings = spoiler.apply(recorded(name).readings, spoiler.only_sensor(sensor),
                              spoiler.only_axes(axis))
-    events = events_of(readings, one)
+    events = events_of(readings, single)
     event = max(events, key=lambda e: e.energy)
     assert len(events) <= 2 and event.axes == axis and event.left_to_right == 0.5
     assert np.isnan(event.peak).sum() == 2
-    # One axis alone places a long or turning vehicle less well.
+    # With a single axis, the CPA of a long or turning vehicle is less accurate.
     assert abs(event.closest_ns - truth_of(name, sensor)[0]) / 1e9 < 4.0 * event.closest_std
-    result = mt.track(readings, one)
+    result = mt.track(readings, single)
     assert len(result.poses) == 0 and len(result.detections)
 
 
-def test_a_single_sensor_is_tracked_with_a_stated_prior_only_and_never_unique():
-    one = NETWORK.part(np.array([0]))
+def test_a_single_sensor_tracks_only_with_a_prior_and_ambiguously():
+    single = NETWORK.part(np.array([0]))
     readings = spoiler.only_sensor('mag_1')(recorded('straight_car_right').readings)
-    result = mt.track(readings, one)
+    result = mt.track(readings, single)
     assert not len(result.poses)
     assert result.counts['track'][
         'detections not tracked (scale not observable with one sensor)'] > 0
-    result = mt.track(readings, one, settings={'track.single_sensor_prior': True})
+    result = mt.track(readings, single, settings={'track.single_sensor_prior': True})
     assert len(result.poses) and result.poses['ambiguous'].all()
     assert result.smoothed['ambiguous'].all()
 
 
-def test_where_one_sensor_of_two_is_dead_nothing_is_tracked():
+def test_two_sensors_with_one_dead_track_only_with_a_prior():
     readings = spoiler.only_sensor('mag_2')(recorded('straight_car_right').readings)
     result = mt.track(readings, NETWORK)
     assert len(result.detections) and not len(result.poses)
@@ -179,19 +179,19 @@ def test_where_one_sensor_of_two_is_dead_nothing_is_tracked():
     assert len(result.poses) and result.poses['ambiguous'].all()
 
 
-def test_a_track_begins_when_the_second_sensor_is_back_and_is_flagged():
+def test_a_track_that_begins_when_a_sensor_returns_is_ambiguous():
     readings = recorded('straight_car_right').readings
     seconds = (readings.stamp_ns - readings.stamp_ns.min()) / NS
     silent = (np.array(readings.sensor_names()) == 'mag_2') & (seconds > 4.0) & (seconds < 8.5)
     whole = mt.track(readings, NETWORK, settings=LINEARISED_ONCE).poses['stamp_ns'][0]
-    assert whole < readings.stamp_ns[silent].max(), 'nothing passes in that time'
+    assert whole < readings.stamp_ns[silent].max(), 'no track begins during the dropout'
     result = mt.track(readings.part(~silent), NETWORK, settings=LINEARISED_ONCE)
     assert result.counts['track'][ALONE] > 0
     assert len(result.poses) and result.poses['ambiguous'].all()
     assert result.poses['stamp_ns'][0] > readings.stamp_ns[silent].max() - 0.1 * NS
 
 
-def test_the_events_do_not_depend_on_the_batches():
+def test_events_do_not_depend_on_batches():
     readings = recorded('straight_car_right').readings
     whole = events_of(readings)
     for size in (1, 37, 1000):
@@ -206,21 +206,21 @@ def test_the_events_do_not_depend_on_the_batches():
 def test_a_looped_recording_gives_each_event_again(size):
     readings = recorded('straight_car_right').readings
     whole = {e.sensor: e for e in events_of(readings)}
-    # The loop is cut while the car is there.
+    # The second part ends while the car is present.
     t = (readings.stamp_ns - readings.stamp_ns[0]) / 1e9
     joined = Readings.joined([readings, readings.part(t < 8.6), readings])
     events = events_of(joined, batch=size)
     for name, event in whole.items():
-        mine = [e for e in events if e.sensor == name]
-        assert [e.ended for e in mine] == [True, False, True]
-        assert mine[0].left_to_right == event.left_to_right
-        assert mine[0].energy == pytest.approx(event.energy)
-        assert mine[2].left_to_right == event.left_to_right
-        assert mine[1].release_ns > mine[1].onset_ns and mine[1].energy > 0.0
+        of_sensor = [e for e in events if e.sensor == name]
+        assert [e.ended for e in of_sensor] == [True, False, True]
+        assert of_sensor[0].left_to_right == event.left_to_right
+        assert of_sensor[0].energy == pytest.approx(event.energy)
+        assert of_sensor[2].left_to_right == event.left_to_right
+        assert of_sensor[1].release_ns > of_sensor[1].onset_ns and of_sensor[1].energy > 0.0
 
 
 @pytest.mark.parametrize('name', studied(VEHICLES, kept=('straight_car_right',)))
-def test_two_horizontal_axes_tell_the_direction(name):
+def test_two_horizontal_axes_give_the_direction(name):
     events = events_of(spoiler.only_axes('xy')(recorded(name).readings))
     for event in events:
         assert event.axes == 'xy'
@@ -230,24 +230,23 @@ def test_two_horizontal_axes_tell_the_direction(name):
     assert any(abs(e.left_to_right - 0.5) > 0.4 for e in events)
 
 
-def test_a_long_event_does_not_depend_on_the_batches():
-    """A target that stands there for 170 s."""
+def test_a_long_event_does_not_depend_on_batches():
+    """A target stands beside the sensor for 170 s."""
     rng, n = np.random.default_rng(0), 20 * 220
     t = np.arange(n) / 20.0
     size = 1e-6 / ((1.0 + np.exp(-np.clip((t - 20.0) / 0.3, -50, 50))) * (
         1.0 + np.exp(np.clip((t - 190.0) / 0.3, -50, 50))))
     field = np.array([2e-6, 1.5e-5, -4.9e-5]) + size[:, None] + 1e-8 * rng.standard_normal((n, 3))
     readings = mt.readings_from_arrays(['mag_1'] * n, (t * 1e9).astype(np.int64), field)
-    one = NETWORK.part(np.array([0]))
-    found = [events_of(readings, one, batch) for batch in (1, 100, n)]
+    single = NETWORK.part(np.array([0]))
+    found = [events_of(readings, single, batch) for batch in (1, 100, n)]
     for events in found[1:]:
         assert len(events) == len(found[0])
         for a, b in zip(events, found[0], strict=True):
             assert a.energy == b.energy and a.closest_ns == b.closest_ns
 
 
-def test_what_is_no_pass_has_no_closest_point():
-    """A step of the field; and noise."""
+def test_a_field_step_or_noise_gives_a_bounded_time_of_the_cpa():
     t = np.linspace(0.0, 10.0, 200)
     step = 1e-6 * (t > 5.0)[:, None] * np.ones(3)
     for field in (step, 1e-8 * np.random.default_rng(0).standard_normal((200, 3))):
@@ -258,14 +257,14 @@ def test_what_is_no_pass_has_no_closest_point():
         assert np.isnan(found.time_scale) or found.time_scale <= 10.0
 
 
-def test_a_target_that_stays_is_an_event_that_has_not_ended():
+def test_the_event_of_a_target_that_stays_has_not_ended():
     readings = recorded('straight_car_right').readings
     t = (readings.stamp_ns - readings.stamp_ns[0]) / 1e9
     events = events_of(readings.part(t < 8.6))
     assert len(events) == 2 and not any(e.ended for e in events)
 
 
-def test_the_command_counts_and_writes_tables(tmp_path, capsys):
+def test_the_events_command_prints_counts_and_writes_tables(tmp_path, capsys):
     assert main(['events', str(vehicle_path('straight_car_right')), '--network', str(NETWORK_FILE),
                  '--out', str(tmp_path / 'out')]) == 0
     out = capsys.readouterr().out
@@ -280,7 +279,7 @@ def test_the_command_counts_and_writes_tables(tmp_path, capsys):
                  '--out', str(vehicle_path('straight_car_right').parent)]) == 1
 
 
-def test_events_from_python_are_those_of_the_command():
+def test_events_from_python_match_the_command():
     result = mt.events(vehicle_path('straight_car_right'), NETWORK_FILE)
     assert result.counts() == {'mag_1': 1, 'mag_2': 1} and 'EventsResult(2 events' in repr(result)
     content = pass_event_dict(result.events[0])

@@ -1,4 +1,4 @@
-"""Health and the doctor: each fault is found and named, and nothing is found where nothing is."""
+"""Sensor health and `doctor`: each fault is found and named, and valid sensors have none."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ SIGMA = 1.2e-8
 
 
 def readings(n=3000, rate=100.0, seed=0):
-    """(stamps [ns], fields) of a good sensor."""
+    """(timestamps [ns], fields) of a valid sensor."""
     rng = np.random.default_rng(seed)
     return (10**18 + (np.arange(n) * NS / rate).astype(np.int64),
             EARTH + SIGMA * rng.standard_normal((n, 3)))
@@ -43,18 +43,18 @@ def texts(health, **known):
     return [str(f) for f in health.findings('mag_1', **known)]
 
 
-def test_of_a_good_sensor_nothing_is_found():
+def test_a_valid_sensor_has_no_findings():
     stamps, fields = readings()
     health = examined(stamps, fields, stamps + 2_000_000)
     assert texts(health, noise_std=np.full(3, SIGMA)) == []
     assert health.rate == pytest.approx(100.0, rel=1e-6)
-    # Second differences overlap: an eighth as many are independent.
+    # Second differences overlap, so only an eighth of them is independent.
     np.testing.assert_allclose(health.noise_std, SIGMA, rtol=5 / np.sqrt(WINDOW / 2))
     np.testing.assert_allclose(health.field, EARTH, atol=5 * SIGMA / np.sqrt(WINDOW) * 1.3)
     np.testing.assert_allclose(health.delay_s, 2e-3, rtol=1e-6)
 
 
-def test_noise_is_found_through_coarse_steps_and_a_passing_target():
+def test_noise_is_estimated_despite_coarse_steps_or_a_passing_target():
     stamps, fields = readings()
     passing = fields + 3e-6 * np.exp(-0.5 * ((np.arange(3000) - 2750) / 60) ** 2)[:, None]
     np.testing.assert_allclose(examined(stamps, passing).noise_std, SIGMA, rtol=0.3)
@@ -63,44 +63,44 @@ def test_noise_is_found_through_coarse_steps_and_a_passing_target():
     np.testing.assert_allclose(examined(stamps, coarse).noise_std, expected, rtol=0.3)
 
 
-def broken(what):
-    """(stamps, fields, received) of a sensor with a fault."""
+def faulty(fault):
+    """(timestamps, fields, times of receipt) of a sensor with a fault."""
     stamps, fields = readings()
     received = stamps + 1_000_000
-    if what == 'lost':
+    if fault == 'lost':
         keep = np.random.default_rng(1).random(3000) > 0.05
         stamps, fields, received = stamps[keep], fields[keep], received[keep]
-    elif what == 'twice':
+    elif fault == 'twice':
         stamps, fields, received = (np.repeat(a, 2, axis=0) for a in (stamps, fields, received))
-    elif what == 'back':
+    elif fault == 'back':
         stamps[1500:] -= 5 * NS
-    elif what == 'step':
+    elif fault == 'step':
         stamps[1500:] += NS
-    elif what == 'late':
+    elif fault == 'late':
         received = received + (np.random.default_rng(2).random(3000) * 0.12 * NS).astype(np.int64)
-    elif what == 'ahead':
+    elif fault == 'ahead':
         stamps = stamps + 3 * NS
-    elif what == 'stuck':
+    elif fault == 'stuck':
         fields[2000:2400] = fields[2000]
-    elif what == 'saturated':
+    elif fault == 'saturated':
         fields[1000:1200, 1] = np.minimum(1.55e-5 + 1e-6 * np.sin(np.arange(200) / 6.0), 1.6e-5)
         fields[1000:1200, 1] = np.maximum(fields[1000:1200, 1], 1.5e-5)
-    elif what == 'spikes':
+    elif fault == 'spikes':
         fields[::200] += 1e-4
-    elif what == 'dead':
+    elif fault == 'dead':
         fields[:, 0] = fields[0, 0]
-    elif what == 'axis':
+    elif fault == 'axis':
         fields[::10, 2] = np.nan
-    elif what == 'nothing':
+    elif fault == 'nothing':
         fields[::10] = np.nan
-    elif what == 'gauss':
+    elif fault == 'gauss':
         fields = fields * 1e4
-    elif what == 'noisy':
+    elif fault == 'noisy':
         fields[:, 1] += 10 * SIGMA * np.random.default_rng(3).standard_normal(3000)
     return stamps, fields, received
 
 
-@pytest.mark.parametrize('what, serious, said', [
+@pytest.mark.parametrize('fault, serious, message', [
     ('lost', False, 'readings were lost, '),
     ('twice', False, '3000 of 6000 readings repeat the previous timestamp'),
     ('back', True, 'timestamps went back 1 times'),
@@ -116,17 +116,17 @@ def broken(what):
     ('gauss', True, 'a field of 0.514 T is rejected, the limit is 0.001 T'),
     ('noisy', False, 'y is 10 times as noisy as at its calibration'),
 ])
-def test_each_fault_is_named(what, serious, said):
-    health = examined(*broken(what))
+def test_each_fault_is_named(fault, serious, message):
+    health = examined(*faulty(fault))
     found = health.findings('mag_1', noise_std=np.full(3, SIGMA))
-    match = [f for f in found if said in str(f)]
+    match = [f for f in found if message in str(f)]
     assert len(match) == 1 and match[0].serious == serious, [str(f) for f in found]
     assert match[0].subject == 'mag_1' and match[0].advice
-    # A stamp that goes back is also a clock that steps.
-    assert len(found) == 1 + (what == 'back'), [str(f) for f in found]
+    # A timestamp that goes back is a clock step as well.
+    assert len(found) == 1 + (fault == 'back'), [str(f) for f in found]
 
 
-def test_a_sensor_whose_noise_is_below_its_steps_has_no_spikes():
+def test_a_sensor_with_noise_below_its_resolution_has_no_spikes():
     stamps, fields = readings()
     coarse = np.round(fields / 2e-7) * 2e-7
     coarse[::50] += 2e-7
@@ -134,8 +134,8 @@ def test_a_sensor_whose_noise_is_below_its_steps_has_no_spikes():
     assert health.counts['spikes'] == 0 and (health.noise_std > 2e-8).all()
 
 
-def test_a_host_that_stalls_is_no_step_of_a_clock():
-    """What waited meanwhile comes in a burst."""
+def test_a_stalled_host_is_not_a_clock_step():
+    """The delayed readings arrive in a burst."""
     stamps, fields = readings()
     received = stamps + 1_000_000
     for first in range(500, 3000, 500):
@@ -145,56 +145,56 @@ def test_a_host_that_stalls_is_no_step_of_a_clock():
     assert not any('stepped' in text for text in found), found
 
 
-def test_what_is_lost_is_counted():
+def test_lost_readings_are_counted():
     stamps, fields = readings()
     keep = np.ones(3000, dtype=bool)
     keep[[500, 900, 901, 902, 2000]] = False
     assert examined(stamps[keep], fields[keep]).counts['lost'] == 5
-    # One that came late is none, one that came so late has another before it.
-    for late, lost in ((1.4, 0), (1.7, 1)):
+    # An interval of 1.4 periods is a late reading, one of 1.7 periods contains a lost one.
+    for n_periods, lost in ((1.4, 0), (1.7, 1)):
         later = np.array(stamps)
-        later[1500:] += round((late - 1.0) * 1e7)
+        later[1500:] += round((n_periods - 1.0) * 1e7)
         assert examined(later, fields).counts['lost'] == lost
 
 
-def test_a_steep_slope_is_no_spike():
+def test_a_steep_slope_is_not_a_spike():
     stamps, fields = readings()
     fields[1500:1520] += 1e-6 * np.arange(20)[:, None]
     fields[1520:] += 2e-5
     assert examined(stamps, fields).counts['spikes'] == 0
 
 
-def test_what_is_saturated_is_counted_once():
-    stamps, fields, _ = broken('saturated')
+def test_saturated_readings_are_counted_once():
+    stamps, fields, _ = faulty('saturated')
     clipped = np.isin(fields[:, 1], [1.5e-5, 1.6e-5]).sum()
-    # With the neighbours, which are not to be trusted either.
+    # Their neighbours are suspect and counted as well.
     assert clipped <= examined(stamps, fields).counts['saturated'] <= 200 + 12
 
 
 def test_a_stuck_two_axis_sensor_is_found():
-    stamps, fields, _ = broken('stuck')
+    stamps, fields, _ = faulty('stuck')
     fields[:, 2] = np.nan
     assert examined(stamps, fields).counts['stuck readings'] == 299
 
 
-def test_of_an_irregular_sensor_nothing_is_called_lost():
+def test_a_sensor_with_an_irregular_rate_has_no_lost_readings():
     rng = np.random.default_rng(4)
     stamps = 10**18 + np.cumsum(rng.exponential(0.01, 3000) * NS).astype(np.int64)
     assert examined(stamps, readings()[1]).counts['lost'] == 0
 
 
-def test_a_two_axis_sensor_is_no_fault():
+def test_a_two_axis_sensor_has_no_findings():
     stamps, fields = readings()
     fields[:, 2] = np.nan
     assert texts(examined(stamps, fields), noise_std=np.array([SIGMA, SIGMA, SIGMA])) == []
 
 
-def test_a_sensor_that_says_nothing():
+def test_a_sensor_without_readings_is_reported():
     assert ['no reading' in t for t in texts(SensorHealth())] == [True]
 
 
-def doctored(change=lambda k, field: field, seconds=10.0, **settings):
-    """Findings of the doctor on three sensors, the second of which is changed."""
+def doctor_findings(change=lambda k, field: field, seconds=10.0, **settings):
+    """Findings of `Doctor` for three sensors; `change` modifies the fields of the second."""
     network = line_network(3)
     doctor = Doctor(network, settings_for('vehicle', settings))
     rng = np.random.default_rng(5)
@@ -205,32 +205,33 @@ def doctored(change=lambda k, field: field, seconds=10.0, **settings):
                 field = change(k, field)
             doctor.feed(one(MagSample(10**18 + k * 20_000_000, name, field)))
     found = doctor.findings()
-    # The serious ones first.
+    # Serious findings come first.
     assert found == sorted(found, key=lambda f: not f.serious)
     return [str(f) for f in found]
 
 
-def test_a_target_that_stays_is_no_disagreement():
-    """What is compared is the background, which is frozen meanwhile."""
-    assert doctored(lambda k, field: field + 2e-5 * (k > 750), seconds=25.0) == []
+def test_a_target_that_stays_causes_no_findings():
+    """Sensors are compared by their backgrounds, which are frozen during the target."""
+    assert doctor_findings(lambda k, field: field + 2e-5 * (k > 750), seconds=25.0) == []
 
 
-def test_the_doctor_compares_sensors_with_the_earth():
-    assert doctored() == []
-    found = doctored(lambda k, field: field * [1.0, -1.0, 1.0])
-    assert len(found) == 1 and 'mag_2: is' in found[0] and 'y is flipped' in found[0]
-    found = doctored(lambda k, field: field * 1e6)
+def test_the_doctor_compares_sensors_with_the_earth_field():
+    assert doctor_findings() == []
+    found = doctor_findings(lambda k, field: field * [1.0, -1.0, 1.0])
+    assert len(found) == 1 and "mag_2: differs from the Earth's field by" in found[0]
+    assert 'y is flipped' in found[0]
+    found = doctor_findings(lambda k, field: field * 1e6)
     assert any('its unit is microtesla' in text for text in found), found
     assert any(text.startswith('calibrate: 500 readings rejected: above') for text in found)
-    # Not the first of the spikes: of noise nothing is known yet.
-    few = doctored(lambda k, field: field * (1e6 if k % 100 == 1 else 1.0), seconds=20.0)
+    # The first spike is not counted, because the noise is not known yet.
+    few = doctor_findings(lambda k, field: field * (1e6 if k % 100 == 1 else 1.0), seconds=20.0)
     assert 'mag_2: 9 of 1000 readings are spikes' in few[0] and '10 readings rejected' in few[1]
-    # So many rejections are serious, and come first.
-    many = doctored(lambda k, field: field * (1e6 if k % 8 == 1 else 1.0), seconds=20.0)
+    # A large share of rejections is serious and comes first.
+    many = doctor_findings(lambda k, field: field * (1e6 if k % 8 == 1 else 1.0), seconds=20.0)
     assert '125 readings rejected' in many[0] and 'are spikes' in many[1]
 
 
-def test_a_background_in_the_file_does_not_hide_what_the_sensor_says():
+def test_a_background_in_the_file_does_not_hide_a_flipped_axis():
     network = line_network(3)
     given = tuple(network.R_sw[j] @ network.earth_field for j in range(3))
     doctor = Doctor(replace(network, background=given), settings_for('vehicle'))
@@ -241,11 +242,12 @@ def test_a_background_in_the_file_does_not_hide_what_the_sensor_says():
             doctor.feed(one(MagSample(k * 20_000_000, name,
                                       field + SIGMA * rng.standard_normal(3))))
     found = [str(f) for f in doctor.findings()]
-    assert 'mag_3: is' in found[0] and 'z is flipped' in found[0]
+    assert "mag_3: differs from the Earth's field by" in found[0] and 'z is flipped' in found[0]
 
 
 def test_without_an_earth_field_sensors_are_compared_with_each_other():
-    for n, said in ((3, 'mag_2: is'), (2, 'network: sensors were not compared')):
+    for n, message in ((3, "mag_2: differs from the Earth's field by"),
+                       (2, 'network: sensors were not compared')):
         network = replace(line_network(n), earth_field=None)
         doctor = Doctor(network, settings_for('vehicle'))
         rng = np.random.default_rng(7)
@@ -255,11 +257,11 @@ def test_without_an_earth_field_sensors_are_compared_with_each_other():
                 doctor.feed(one(MagSample(k * 20_000_000, name,
                                       field + SIGMA * rng.standard_normal(3))))
         found = [str(f) for f in doctor.findings()]
-        assert len(found) == 1 and found[0].startswith(said), found
+        assert len(found) == 1 and found[0].startswith(message), found
 
 
-def test_clocks_that_are_far_apart_are_named_but_not_those_of_a_replay():
-    for late, n in ((120 * NS, 1), (0, 0)):
+def test_clocks_far_apart_are_named_and_the_age_of_a_replay_is_not():
+    for offset_ns, n in ((120 * NS, 1), (0, 0)):
         network = line_network(2)
         doctor = Doctor(network, settings_for('vehicle'))
         rng = np.random.default_rng(8)
@@ -267,8 +269,8 @@ def test_clocks_that_are_far_apart_are_named_but_not_those_of_a_replay():
             received = 10**18 + k * 20_000_000
             for j, name in enumerate(network.names):
                 field = network.R_sw[j] @ network.earth_field + SIGMA * rng.standard_normal(3)
-                # All of it years ago: a replay.
-                stamp = received - 10**17 - (late if j else 0)
+                # All timestamps are years old, as in a replay.
+                stamp = received - 10**17 - (offset_ns if j else 0)
                 doctor.feed(one(MagSample(stamp, name, field)), received)
         found = [str(f) for f in doctor.findings()]
         assert len(found) == n, found
@@ -276,42 +278,42 @@ def test_clocks_that_are_far_apart_are_named_but_not_those_of_a_replay():
             'mag_2: its timestamps differ by -120 s from those of other')
 
 
-def test_the_doctor_looks_at_backgrounds():
-    # What was seen for a moment only would give way earlier.
-    steps = doctored(lambda k, field: field + 1e-6 * (k > 1000), seconds=75.0)
+def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
+    # A background that was learnt for a short time only would be replaced earlier.
+    steps = doctor_findings(lambda k, field: field + 1e-6 * (k > 1000), seconds=75.0)
     assert len(steps) == 2 and 'its background has been frozen for 5' in steps[1]
     assert 'its background is doubtful' in steps[0]
-    parked = doctored(lambda k, field: field + 1e-6 * (k > 1000), seconds=155.0)
+    parked = doctor_findings(lambda k, field: field + 1e-6 * (k > 1000), seconds=155.0)
     assert len(parked) == 1 and 'became its background 1 times' in parked[0]
-    early = doctored(seconds=2.0)
+    early = doctor_findings(seconds=2.0)
     assert len(early) == 3 and all('no background was learnt' in text for text in early)
 
 
 @pytest.mark.parametrize('name', VEHICLES)
-def test_the_doctor_finds_nothing_in_good_recordings(name, road_network):
+def test_the_doctor_finds_no_faults_in_the_bundled_recordings(name, road_network):
     doctor, lost = examine(Recording(vehicle_path(name)), road_network, settings_for('vehicle'))
     found = [str(f) for f in doctor.findings()]
     if name == 'straight_truck_right':
-        # Its sensors end at 100 uT, and it was that near.
+        # The truck passes so close that a sensor reaches its limit of 100 uT.
         assert found.pop().startswith('mag_2: 9 of 1400 readings are at the end of the range')
     assert not lost and not found
 
 
-def test_saturated_sensors_of_the_corridor(capsys):
-    """Two of its sensors end at 100 uT, and the car came that near."""
+def test_the_doctor_reports_saturated_sensors_of_the_corridor(capsys):
+    """The car passes so close that two sensors reach their limit of 100 uT."""
     folder = DATA / 'corridor'
     assert main(['doctor', str(folder / 'corridor_8_sensors.mcap'), '--network',
                  str(folder / 'network.yaml')]) == 2
-    said = capsys.readouterr().out
-    assert [line.split()[1] for line in said.splitlines() if 'end of the range' in line] == [
+    output = capsys.readouterr().out
+    assert [line.split()[1] for line in output.splitlines() if 'end of the range' in line] == [
         'mag_2:', 'mag_4:']
 
 
-def test_the_command(tmp_path, capsys):
+def test_the_doctor_command_checks_a_recording_and_its_arguments(tmp_path, capsys):
     arguments = ['doctor', '--network', str(NETWORK_FILE)]
     assert main([*arguments, str(vehicle_path('straight_car_right'))]) == 0
-    said = capsys.readouterr().out
-    assert 'no faults found' in said and '100.0 Hz      0 lost' in said
+    output = capsys.readouterr().out
+    assert 'no faults found' in output and '100.0 Hz      0 lost' in output
     assert main(arguments) == 1
     assert main([*arguments, 'x.mcap', '--live', '3']) == 1
     assert capsys.readouterr().err.count('give either RECORDING or --live SECONDS') == 2
@@ -319,7 +321,7 @@ def test_the_command(tmp_path, capsys):
     assert '--live: expected 1 to 86400 s, got 0' in capsys.readouterr().err
 
 
-def test_the_command_on_one_silent_sensor(tmp_path, capsys):
+def test_the_doctor_command_reports_a_silent_sensor(tmp_path, capsys):
     stamps, fields = readings(500)
     network = read_network(NETWORK_FILE)
     with RecordingWriter(tmp_path / 'one.mcap') as writer:
@@ -327,23 +329,23 @@ def test_the_command_on_one_silent_sensor(tmp_path, capsys):
             writer.write('/mag_1/imu/mag', MAGNETIC_FIELD,
                          sample_dict(MagSample(stamp, 'mag_1', field), 'mag_1'), stamp)
     assert main(['doctor', str(tmp_path / 'one.mcap'), '--network', str(NETWORK_FILE)]) == 2
-    said = capsys.readouterr().out
-    assert 'ERROR mag_2: no reading' in said and 'mag_1: ' not in said
+    output = capsys.readouterr().out
+    assert 'ERROR mag_2: no reading' in output and 'mag_1: ' not in output
     assert len(network) == 2
 
 
 @pytest.mark.parametrize('n', [1, 2, 7, 64, 513])
-def test_quantiles_are_those_of_numpy(n):
-    values, shares = np.random.default_rng(n).standard_normal(n), (0.0, 0.05, 0.5, 0.6, 0.95, 1.0)
-    np.testing.assert_allclose(quantiles(values, *shares), np.quantile(values, shares), rtol=1e-12)
+def test_quantiles_match_numpy(n):
+    values, q = np.random.default_rng(n).standard_normal(n), (0.0, 0.05, 0.5, 0.6, 0.95, 1.0)
+    np.testing.assert_allclose(quantiles(values, *q), np.quantile(values, q), rtol=1e-12)
 
 
-def test_there_are_no_quantiles_of_nothing():
+def test_quantiles_of_an_empty_array_are_nan():
     assert np.isnan(quantiles(np.zeros(0), 0.1, 0.5)).tolist() == [True, True]
 
 
-def test_many_at_once_are_the_same_as_one_by_one():
-    """Also where the arrays that they came in are used for others afterwards."""
+def test_batches_give_the_same_health_as_single_readings():
+    """The arrays of a batch may be overwritten afterwards."""
     rng = np.random.default_rng(3)
     stamps = np.arange(700) * NS // 100
     fields = 1e-6 + 1e-8 * rng.standard_normal((700, 3))
@@ -362,34 +364,34 @@ def test_many_at_once_are_the_same_as_one_by_one():
     assert many.delay_s == single.delay_s
 
 
-def test_what_waits_comes_out_as_it_came():
-    """Of each sensor in its order; where there is no more room nothing is taken before there is."""
-    rng, waiting = np.random.default_rng(4), ReadingBuffer(5, 8)
+def test_a_reading_buffer_returns_the_readings_of_each_sensor_in_order():
+    """A full buffer accepts no further readings until it has been emptied."""
+    rng, buffer = np.random.default_rng(4), ReadingBuffer(5, 8)
     rows, stamps = rng.integers(-1, 5, 300), np.arange(300)
     fields, found, i = rng.standard_normal((300, 3)), {j: [] for j in range(5)}, 0
     fields[7, 1] = np.nan
 
-    def take(j):
-        found[j] += [(int(t), f.tolist(), int(r)) for t, f, r in zip(*waiting.pop(j), strict=True)]
+    def collect(j):
+        found[j] += [(int(t), f.tolist(), int(r)) for t, f, r in zip(*buffer.pop(j), strict=True)]
 
-    while (i := waiting.add(rows, stamps, fields, 1000, i)) < len(rows):
-        take(rows[i])
+    while (i := buffer.add(rows, stamps, fields, 1000, i)) < len(rows):
+        collect(rows[i])
     for j in range(5):
-        take(j)
+        collect(j)
         expected = [(k, fields[k].tolist(), 1000) for k in np.flatnonzero(rows == j).tolist()]
         assert repr(found[j]) == repr(expected) and len(expected) > 30
 
 
-def test_counts_do_not_depend_on_how_many_are_looked_at_together():
-    """Also of what happens between the last of one look and the first of the next."""
+def test_counts_do_not_depend_on_the_update_interval():
+    """Events between two updates are counted as well."""
     rng, fields = np.random.default_rng(5), []
     for k in range(3000):
         stuck = k % 900 > 600
         fields.append(fields[-1] if stuck else 1e-5 + 1e-8 * rng.standard_normal(3))
     stamps = np.cumsum([NS // 100 * (40 if k % 256 == 0 else 1) for k in range(3000)])
     found = []
-    for every in (1, 64, 256):
-        health = SensorHealth(every)
+    for update_interval in (1, 64, 256):
+        health = SensorHealth(update_interval)
         for t, f in zip(stamps.tolist(), fields, strict=True):
             health.add(t, f)
         found.append({k: health.counts[k] for k in ('readings', 'lost', 'stuck readings')})

@@ -1,4 +1,4 @@
-"""The survey of a network: orientations and clocks from what sensors felt, and its warnings."""
+"""Survey of a network: orientations, clock offsets and warnings from accelerations and fields."""
 
 from dataclasses import replace
 
@@ -20,63 +20,64 @@ from support.samples import recorded, samples_of
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 DATE = '2026-05-01'
 START = 1_790_000_000_000_000_000
-TURNED = (Rotation.identity(), Rotation.from_euler('zyx', [-3.0, 2.0, 1.5], True),
-          Rotation.from_euler('zyx', [4.0, -1.0, -2.5], True))
+ROTATIONS = (Rotation.identity(), Rotation.from_euler('zyx', [-3.0, 2.0, 1.5], True),
+             Rotation.from_euler('zyx', [4.0, -1.0, -2.5], True))
 CLOCK = np.array([0.0, 0.0213, -0.0087])
 
 
-def stated(n=3, earth=EARTH, **changes):
-    """The network as its installer knows it: all upright, x to the east."""
+def nominal(n=3, earth=EARTH, **changes):
+    """Network as stated by its installer: all sensors upright, x to the east."""
     names = tuple(f'mag_{i + 1}' for i in range(n))
     return SensorNetwork(names, np.arange(3.0 * n).reshape(n, 3), np.tile(np.eye(3), (n, 1, 1)),
                          tuple(f'/{name}/imu/mag' for name in names), earth_field=earth, **changes)
 
 
-def felt(rotation, ahead, knocks=(1.2, 2.1), seed=0, noise=0.02, duration=4.0):
-    """[(stamp_ns, (3,))] of a turned accelerometer."""
+def readings_of(rotation, offset_s, knocks=(1.2, 2.1), seed=0, noise=0.02, duration=4.0):
+    """Accelerations of a rotated sensor as [(timestamp [ns], (3,) [m/s²])]."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, duration, 0.01) + 0.01 * rng.random()
     level = sum((8.0 * np.exp(-np.abs(t - k) / 0.03) for k in knocks), 0.0 * t)
     a = rotation.inv().apply(np.array([0.0, 0.0, 9.81]) + level[:, None] * [0.3, 0.5, -0.4])
     a += noise * rng.standard_normal(a.shape)
-    return [(START + round((s + ahead) * 1e9), v) for s, v in zip(t, a, strict=True)]
+    return [(START + round((s + offset_s) * 1e9), v) for s, v in zip(t, a, strict=True)]
 
 
-def surveyed(network=None, turned=TURNED, change=None, fields=None, settings=None, knocks=None):
-    """(NetworkSurvey, Survey) of what turned sensors feel; `change` spoils {name: readings}."""
-    network = stated(len(turned)) if network is None else network
-    felt_by = {name: felt(R, ahead, (1.2, 2.1) if knocks is None else knocks, seed)
-               for seed, (name, R, ahead) in
-               enumerate(zip(network.names, turned, CLOCK, strict=False))}
+def surveyed(network=None, rotations=ROTATIONS, change=None, fields=None, settings=None,
+             knocks=None):
+    """(NetworkSurvey, Survey) of rotated sensors; `change` modifies {name: readings}."""
+    network = nominal(len(rotations)) if network is None else network
+    readings = {name: readings_of(R, offset_s, (1.2, 2.1) if knocks is None else knocks, seed)
+                for seed, (name, R, offset_s) in
+                enumerate(zip(network.names, rotations, CLOCK, strict=False))}
     if change is not None:
-        change(felt_by)
+        change(readings)
     survey = Survey(network, settings or SurveySettings())
-    for name, readings in felt_by.items():
-        for stamp, a in readings:
+    for name, of_sensor in readings.items():
+        for stamp, a in of_sensor:
             assert survey.feed(AccelerationSample(stamp, name, a)) == []
     if fields is None:
         fields = {name: R.inv().apply(EARTH) for name, R in
-                  zip(network.names, turned, strict=True)}
+                  zip(network.names, rotations, strict=True)}
     return survey.solve(fields, DATE), survey
 
 
 def warnings(found):
-    """{sensor: warnings} of those with any."""
+    """{sensor: warnings} of the sensors that have some."""
     return {s.sensor: s.warnings for s in found.sensors if s.warnings}
 
 
-def test_orientations_and_clocks_are_found():
+def test_orientations_and_clock_offsets_are_found():
     found, survey = surveyed()
     assert survey.flush() == [] and dict(survey.counts) == {'accelerations': 1200}
     assert warnings(found) == {} and found.disagreements == ()
     assert found.reference == 'mag_1' and found.sensors[0].lag is None
-    for j, R in enumerate(TURNED):
+    for j, R in enumerate(ROTATIONS):
         off = Rotation.from_matrix(found.network.R_ws[j] @ R.as_matrix().T).as_rotvec()
-        # The tilt by the scatter of 400 readings; the heading leans to what was stated.
+        # Tilt errors are those of the mean of 400 readings; the heading is drawn to the stated one.
         assert np.abs(off[:2]).max() < 1e-3
         std = found.network.orientation_std[j]
+        # Three sensors that agree make the compass more certain than its prior.
         assert abs(off[2]) < std[2] < np.deg2rad(2.5)
-        # Pooled: what three right sensors show makes the compass surer than was expected.
         np.testing.assert_allclose(std[:2], 0.05 / 9.81, rtol=0.01)
         assert found.network.clock_offset[j] == pytest.approx(CLOCK[j], abs=1e-3)
         done = found.network.calibrated[j]
@@ -87,46 +88,46 @@ def test_orientations_and_clocks_are_found():
     assert len(t) == len(s) == 400 and abs(t[0]) < 0.05 and s.max() > 4.0
 
 
-def test_what_was_stated_counts_as_its_deviation_says():
+def test_the_stated_heading_is_weighted_by_its_standard_deviation():
     for deg, low, high in ((0.06, 0.0, 0.05), (60.0, 3.9, 4.1)):
-        network = stated(orientation_std=(np.deg2rad([5.0, 5.0, deg]),) * 3)
-        turned = (*TURNED[:2], Rotation.from_euler('z', 4.0, True))
-        found, _ = surveyed(network, turned if deg > 1.0 else (TURNED[0],) * 3)
+        network = nominal(orientation_std=(np.deg2rad([5.0, 5.0, deg]),) * 3)
+        rotations = (*ROTATIONS[:2], Rotation.from_euler('z', 4.0, True))
+        found, _ = surveyed(network, rotations if deg > 1.0 else (ROTATIONS[0],) * 3)
         R = found.network.R_ws[2]
         assert low <= abs(np.degrees(np.arctan2(R[1, 0], R[0, 0]))) <= high
         assert np.degrees(found.network.orientation_std[2][2]) < 1.1 * min(deg, 2.3)
 
 
 @pytest.mark.parametrize('yaw', [20.0, 45.0, 90.0, -150.0])
-def test_a_heading_that_nobody_stated_is_found(yaw):
-    """stated_std_deg allows 180 degrees."""
-    turned = (TURNED[0], Rotation.from_euler('z', yaw, True), TURNED[2])
-    found, _ = surveyed(turned=turned, settings=SurveySettings(stated_std_deg=180.0))
+def test_an_unknown_heading_is_found(yaw):
+    """With a stated_std_deg of 180 degrees, the stated heading has no weight."""
+    rotations = (ROTATIONS[0], Rotation.from_euler('z', yaw, True), ROTATIONS[2])
+    found, _ = surveyed(rotations=rotations, settings=SurveySettings(stated_std_deg=180.0))
     R = found.network.R_ws[1]
     assert np.degrees(np.arctan2(R[1, 0], R[0, 0])) == pytest.approx(yaw, abs=0.5)
 
 
 def test_a_survey_without_a_heading_can_be_written(tmp_path):
-    """No field, and nobody stated how the sensors are turned."""
-    found, _ = surveyed(stated(earth=None), settings=SurveySettings(stated_std_deg=180.0))
+    """There is neither an Earth field nor a stated heading."""
+    found, _ = surveyed(nominal(earth=None), settings=SurveySettings(stated_std_deg=180.0))
     write_network(tmp_path / 'network.yaml', found.network)
     assert read_network(tmp_path / 'network.yaml').names == found.network.names
 
 
-def test_without_the_earths_field_tilt_and_clock_are_found():
-    found, _ = surveyed(stated(earth=None))
+def test_tilt_and_clock_offset_are_found_without_an_earth_field():
+    found, _ = surveyed(nominal(earth=None))
     assert warnings(found) == {}
-    for s, R in zip(found.sensors, TURNED, strict=True):
+    for s, R in zip(found.sensors, ROTATIONS, strict=True):
         assert s.by == 'accelerometer, heading as stated'
         np.testing.assert_allclose(s.orientation.R_ws.T[:, 2], R.as_matrix()[2], atol=1e-3)
         assert np.degrees(s.orientation.std[2]) == pytest.approx(5.0)
     assert found.network.clock_offset[1] == pytest.approx(CLOCK[1], abs=1e-3)
-    # Two cannot say which of them is right.
-    found, _ = surveyed(stated(2, earth=None), TURNED[:2])
+    # With two sensors, it is unknown which of them is right.
+    found, _ = surveyed(nominal(2, earth=None), ROTATIONS[:2])
     assert 'three sensors' in found.sensors[0].warnings[0]
 
 
-def test_sensors_without_accelerations_stay_as_stated():
+def test_a_sensor_without_accelerations_keeps_its_stated_orientation():
     found, _ = surveyed(change=lambda readings: readings.pop('mag_2'))
     assert warnings(found) == {
         'mag_2': ('no accelerations; the orientation is not surveyed',)}
@@ -137,43 +138,43 @@ def test_sensors_without_accelerations_stay_as_stated():
     assert 'mag_2' not in found.shocks and found.network.clock_offset[1] == 0.0
 
 
-def test_nothing_at_all_is_a_survey_too():
-    found = Survey(stated(2), SurveySettings()).solve({}, DATE)
+def test_a_survey_without_data_keeps_the_network():
+    found = Survey(nominal(2), SurveySettings()).solve({}, DATE)
     assert found.reference == '' and found.shocks == {} and found.disagreements == ()
     assert set(warnings(found)) == {'mag_1', 'mag_2'}
-    np.testing.assert_array_equal(found.network.R_ws, stated(2).R_ws)
+    np.testing.assert_array_equal(found.network.R_ws, nominal(2).R_ws)
 
 
-def spoiled(name, function):
-    """What spoils the readings of one sensor."""
+def changed(name, function):
+    """`change` that applies a function to the accelerations of one sensor."""
     def change(readings):
         readings[name] = [(stamp, function(a)) for stamp, a in readings[name]]
     return change
 
 
-def test_another_unit_than_metres_per_second_squared_is_named():
-    found, _ = surveyed(change=spoiled('mag_3', lambda a: a / 9.81))
+def test_accelerations_in_g_are_named():
+    found, _ = surveyed(change=changed('mag_3', lambda a: a / 9.81))
     assert list(warnings(found)) == ['mag_3']
     assert 'is its unit g?' in found.sensors[2].warnings[0]
     assert found.sensors[2].orientation is None
-    # How it is shaken still says when.
+    # The knocks still give the clock offset.
     assert found.network.clock_offset[2] == pytest.approx(CLOCK[2], abs=1e-3)
 
 
-def test_without_a_knock_clocks_stay():
-    network = stated(clock_offset=np.array([0.0, 0.5, -0.5]))
+def test_clock_offsets_are_unchanged_without_a_knock():
+    network = nominal(clock_offset=np.array([0.0, 0.5, -0.5]))
     found, _ = surveyed(network, knocks=())
     assert found.reference == ''
-    assert found.warnings() == ['clock offsets are unchanged: the reference felt no knock']
+    assert found.warnings() == ['clock offsets are unchanged: the reference measured no knock']
     np.testing.assert_array_equal(found.network.clock_offset, [0.0, 0.5, -0.5])
     assert np.isnan(found.network.calibrated[1].clock_offset_std)
 
 
-def test_a_sensor_that_did_not_feel_the_knock_is_named():
+def test_a_sensor_that_measured_no_knock_is_named():
     def quiet(readings):
-        readings['mag_1'] = felt(TURNED[0], 0.0, ())
+        readings['mag_1'] = readings_of(ROTATIONS[0], 0.0, ())
     found, _ = surveyed(change=quiet)
-    # Another sensor is the reference then.
+    # Another sensor becomes the reference.
     assert found.reference == 'mag_2'
     assert found.sensors[0].lag.reason == 'the sensor measured no knock'
     assert found.network.clock_offset[2] == pytest.approx(CLOCK[2] - CLOCK[1], abs=1e-3)
@@ -181,28 +182,28 @@ def test_a_sensor_that_did_not_feel_the_knock_is_named():
     assert found.network.calibrated[1].clock_offset_std == 0.0
 
 
-def test_clocks_that_are_known_already_keep_one_zero():
-    """mag_1 cannot be measured again: to the others it has to stay as it was."""
-    network = stated(clock_offset=CLOCK)
+def test_known_clock_offsets_keep_their_common_zero():
+    """mag_1 has no accelerations: its offset relative to the others must not change."""
+    network = nominal(clock_offset=CLOCK)
     found, _ = surveyed(network, change=lambda readings: readings.pop('mag_1'))
     offset = found.network.clock_offset
     np.testing.assert_allclose(offset - offset[0], CLOCK, atol=1e-3)
 
 
 def test_a_tilted_sensor_is_named_and_levelled():
-    turned = (TURNED[0], Rotation.from_euler('x', 30.0, True), TURNED[2])
-    found, _ = surveyed(turned=turned)
+    rotations = (ROTATIONS[0], Rotation.from_euler('x', 30.0, True), ROTATIONS[2])
+    found, _ = surveyed(rotations=rotations)
     assert warnings(found) == {
         'mag_2': ('the tilt differs by 30 degrees from the network file',)}
-    np.testing.assert_allclose(found.network.R_ws[1], turned[1].as_matrix(), atol=0.04)
-    # Compared with the Earth it is as it stands, not as it was stated.
+    np.testing.assert_allclose(found.network.R_ws[1], rotations[1].as_matrix(), atol=0.04)
+    # The Earth field is compared in the surveyed orientation, not in the stated one.
     assert found.disagreements == ()
     assert found.sensors[1].by == 'accelerometer, compass and stated heading'
 
 
-def test_a_compass_far_from_what_was_stated_is_named():
-    turned = (TURNED[0], Rotation.from_euler('z', 25.0, True), TURNED[2])
-    found, _ = surveyed(turned=turned)
+def test_a_compass_heading_far_from_the_stated_one_is_named():
+    rotations = (ROTATIONS[0], Rotation.from_euler('z', 25.0, True), ROTATIONS[2])
+    found, _ = surveyed(rotations=rotations)
     assert warnings(found) == {'mag_2': (
         'the compass heading differs by +25 degrees from the network file; the stated heading is '
         'kept',)}
@@ -211,26 +212,26 @@ def test_a_compass_far_from_what_was_stated_is_named():
     assert found.sensors[1].by == 'accelerometer, heading as stated'
 
 
-def test_a_sensor_that_disagrees_keeps_its_stated_heading():
+def test_a_sensor_with_a_flipped_axis_keeps_its_stated_heading():
     fields = {name: R.inv().apply(EARTH) for name, R in
-              zip(('mag_1', 'mag_2', 'mag_3'), TURNED, strict=True)}
+              zip(('mag_1', 'mag_2', 'mag_3'), ROTATIONS, strict=True)}
     fields['mag_3'] = fields['mag_3'] * [1.0, 1.0, -1.0]
     found, _ = surveyed(fields=fields)
     (d,) = found.disagreements
     assert (d.sensor, d.explanations) == ('mag_3', ('z is flipped',))
     R = found.network.R_ws[2]
     assert abs(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])) < 2e-3
-    # The tilt is its accelerometer's, which is not in doubt.
-    np.testing.assert_allclose(R[2], TURNED[2].as_matrix()[2], atol=1e-3)
+    # The tilt is that of the accelerometer, which is valid.
+    np.testing.assert_allclose(R[2], ROTATIONS[2].as_matrix()[2], atol=1e-3)
     assert found.sensors[2].by == 'accelerometer, heading as stated'
     assert found.sensors[1].by == 'accelerometer, compass and stated heading'
     assert found.bias_std < 6e-7
 
 
-def test_a_field_that_tells_no_heading_is_told_once():
+def test_a_vertical_field_gives_one_warning_per_sensor():
     up = {name: R.inv().apply([0.0, 0.0, -5e-5]) for name, R in
-          zip(('mag_1', 'mag_2', 'mag_3'), TURNED, strict=True)}
-    found, _ = surveyed(stated(earth=np.array([0.0, 0.0, -5e-5])), fields=up)
+          zip(('mag_1', 'mag_2', 'mag_3'), ROTATIONS, strict=True)}
+    found, _ = surveyed(nominal(earth=np.array([0.0, 0.0, -5e-5])), fields=up)
     for s in found.sensors:
         assert s.by == 'accelerometer, heading as stated'
         assert len(s.warnings) == 1 and 'heading is not observable' in s.warnings[0]
@@ -238,24 +239,24 @@ def test_a_field_that_tells_no_heading_is_told_once():
 
 @pytest.mark.parametrize('stated_yaw', [0.0, 165.0, 180.0, 190.0])
 @pytest.mark.parametrize('off', [-3.0, 2.0])
-def test_of_two_headings_that_fit_the_stated_one_is_taken(stated_yaw, off):
-    """A sensor with one level axis across the field: it may as well point the other way."""
+def test_the_stated_heading_decides_between_two_that_fit(stated_yaw, off):
+    """A sensor with a single horizontal axis across the field: another heading fits as well."""
     yaw = stated_yaw + off
-    network = stated()
+    network = nominal()
     network.R_ws[1] = rotation_about_z(np.deg2rad(stated_yaw))
-    turned = (TURNED[0], Rotation.from_euler('z', yaw, True), TURNED[2])
-    fields = {name: R.inv().apply(EARTH) for name, R in zip(network.names, turned, strict=True)}
+    rotations = (ROTATIONS[0], Rotation.from_euler('z', yaw, True), ROTATIONS[2])
+    fields = {name: R.inv().apply(EARTH) for name, R in zip(network.names, rotations, strict=True)}
     fields['mag_2'] = fields['mag_2'] * [1.0, np.nan, np.nan]
-    found, _ = surveyed(network, turned, fields=fields)
+    found, _ = surveyed(network, rotations, fields=fields)
     assert found.sensors[1].by == 'accelerometer, compass and stated heading'
     away = np.degrees(Rotation.from_matrix(
-        found.network.R_ws[1] @ turned[1].as_matrix().T).as_rotvec())
+        found.network.R_ws[1] @ rotations[1].as_matrix().T).as_rotvec())
     assert np.abs(away).max() < 2.0
     assert 'allows another heading' in found.sensors[1].warnings[0]
 
 
-def test_what_cannot_be_used_is_counted():
-    survey = Survey(stated(2), SurveySettings(max_accelerations=100))
+def test_invalid_accelerations_are_counted_and_memory_is_bounded():
+    survey = Survey(nominal(2), SurveySettings(max_accelerations=100))
     for stamp, sensor, a in ((1, 'mag_9', [0, 0, 9.8]), (1, 'mag_1', [0, np.nan, 9.8]),
                              (2, 'mag_1', [0, np.inf, 9.8]), (3, 'mag_1', [0, 0, 9.8]),
                              (3, 'mag_1', [0, 0, 9.8]), (2, 'mag_1', [0, 0, 9.8])):
@@ -269,28 +270,29 @@ def test_what_cannot_be_used_is_counted():
     assert len(survey.solve({}, DATE).shocks['mag_1'][0]) == 100
 
 
-def test_a_restart_begins_anew():
+def test_a_jump_back_in_time_discards_earlier_accelerations():
     def loops(readings):
         readings['mag_2'] = ([(stamp + 60_000_000_000, a + [3.0, 0.0, -0.5])
                               for stamp, a in readings['mag_2']] + readings['mag_2'])
     found, survey = surveyed(change=loops)
     assert survey.counts['time jumped'] == 1
     assert len(found.shocks['mag_2'][0]) == 400
-    np.testing.assert_allclose(found.network.R_ws[1][2], TURNED[1].as_matrix()[2], atol=1e-3)
+    np.testing.assert_allclose(found.network.R_ws[1][2], ROTATIONS[1].as_matrix()[2], atol=1e-3)
     assert found.network.clock_offset[1] == pytest.approx(CLOCK[1], abs=1e-3)
 
 
-def test_a_calibration_of_before_is_replaced_where_it_was_measured():
+def test_calibration_records_are_replaced_for_surveyed_sensors_only():
     before = CalibrationRecord('2025-01-01', 'by hand', np.nan)
-    found, _ = surveyed(stated(calibrated=(before,) * 3),
+    found, _ = surveyed(nominal(calibrated=(before,) * 3),
                         change=lambda readings: readings.pop('mag_3'))
     assert [c.date for c in found.network.calibrated] == [DATE, DATE, '2025-01-01']
     assert found.network.calibrated[2] is before
 
 
 def imu_network(**changes):
-    """The network of the bundled recordings of two sensors."""
-    return replace(stated(2), imu_topics=tuple(f'/mag_{i}/imu/data_raw' for i in (1, 2)), **changes)
+    """Network of the bundled recordings with two sensors."""
+    return replace(nominal(2), imu_topics=tuple(f'/mag_{i}/imu/data_raw' for i in (1, 2)),
+                   **changes)
 
 
 def read(network):
@@ -300,9 +302,9 @@ def read(network):
 
 def test_fields_and_accelerations_are_read_together():
     reader, records = read(imu_network())
-    shaken = [r for r in records if isinstance(r, AccelerationSample)]
-    assert {r.sensor for r in shaken} == {'mag_1', 'mag_2'}
-    assert np.linalg.norm(np.median([r.acceleration for r in shaken], axis=0)) == pytest.approx(
+    samples = [r for r in records if isinstance(r, AccelerationSample)]
+    assert {r.sensor for r in samples} == {'mag_1', 'mag_2'}
+    assert np.linalg.norm(np.median([r.acceleration for r in samples], axis=0)) == pytest.approx(
         9.81, abs=0.1)
     fields = samples_of(*(r for r in records if isinstance(r, Readings)))
     alone = recorded(reader)
@@ -314,37 +316,36 @@ def test_fields_and_accelerations_are_read_together():
 def test_an_accelerometer_that_two_sensors_share_serves_both():
     """Two magnetometers on one board."""
     _, records = read(replace(imu_network(), imu_topics=('/mag_1/imu/data_raw',) * 2))
-    shaken = [r.sensor for r in records if isinstance(r, AccelerationSample)]
-    assert shaken.count('mag_1') == shaken.count('mag_2') > 0
+    samples = [r.sensor for r in records if isinstance(r, AccelerationSample)]
+    assert samples.count('mag_1') == samples.count('mag_2') > 0
 
 
-def test_a_stated_orientation_need_not_be_upright():
-    """Sensors that lie on their side, and are stated so."""
+def test_sensors_on_their_side_are_surveyed():
+    """Their stated orientation is on the side as well."""
     side = Rotation.from_euler('x', 90.0, True)
-    turned = tuple(R * side for R in TURNED)
-    network = replace(stated(), R_ws=np.tile(side.as_matrix(), (3, 1, 1)))
-    found, _ = surveyed(network, turned)
+    rotations = tuple(R * side for R in ROTATIONS)
+    network = replace(nominal(), R_ws=np.tile(side.as_matrix(), (3, 1, 1)))
+    found, _ = surveyed(network, rotations)
     assert warnings(found) == {}
-    for R, truth in zip(found.network.R_ws, turned, strict=True):
+    for R, truth in zip(found.network.R_ws, rotations, strict=True):
         off = Rotation.from_matrix(R @ truth.as_matrix().T).as_rotvec()
         assert np.abs(off[:2]).max() < 1e-3 and abs(off[2]) < np.deg2rad(1.5)
 
 
-def test_the_answer_turns_with_the_world():
-    """Another frame for the same sensors: the same network, turned."""
+def test_the_result_rotates_with_the_world_frame():
     Rz = rotation_about_z(1.1)
-    one, _ = surveyed()
-    network = replace(stated(), R_ws=Rz @ stated().R_ws, earth_field=Rz @ EARTH)
-    turned = tuple(Rotation.from_matrix(Rz @ R.as_matrix()) for R in TURNED)
+    original, _ = surveyed()
+    network = replace(nominal(), R_ws=Rz @ nominal().R_ws, earth_field=Rz @ EARTH)
+    rotations = tuple(Rotation.from_matrix(Rz @ R.as_matrix()) for R in ROTATIONS)
     fields = {name: R.inv().apply(EARTH) for name, R in
-              zip(network.names, TURNED, strict=True)}
-    other, _ = surveyed(network, turned, fields=fields)
-    np.testing.assert_allclose(other.network.R_ws, Rz @ one.network.R_ws, atol=1e-3)
-    np.testing.assert_allclose(other.network.orientation_std, one.network.orientation_std,
+              zip(network.names, ROTATIONS, strict=True)}
+    other, _ = surveyed(network, rotations, fields=fields)
+    np.testing.assert_allclose(other.network.R_ws, Rz @ original.network.R_ws, atol=1e-3)
+    np.testing.assert_allclose(other.network.orientation_std, original.network.orientation_std,
                                rtol=1e-2)
 
 
-def test_clocks_that_are_decades_apart_do_not_fill_the_memory():
+def test_clocks_decades_apart_do_not_fill_the_memory():
     def of_1970(readings):
         readings['mag_2'] = [(stamp - START, a) for stamp, a in readings['mag_2']]
     found, _ = surveyed(change=of_1970)
@@ -353,9 +354,9 @@ def test_clocks_that_are_decades_apart_do_not_fill_the_memory():
     assert found.network.clock_offset[1] == 0.0
 
 
-def test_what_an_earlier_survey_found_is_no_further_evidence():
-    """Surveyed again from its own result, the same readings give the same result."""
-    first, _ = surveyed(stated(orientation_std=(np.deg2rad([4.0, 4.0, 6.0]),) * 3))
+def test_the_result_of_an_earlier_survey_is_not_counted_as_evidence():
+    """The same readings, surveyed from the first result, give that result again."""
+    first, _ = surveyed(nominal(orientation_std=(np.deg2rad([4.0, 4.0, 6.0]),) * 3))
     again, _ = surveyed(first.network)
     for name in ('R_ws', 'clock_offset'):
         np.testing.assert_allclose(getattr(again.network, name), getattr(first.network, name),
@@ -364,11 +365,11 @@ def test_what_an_earlier_survey_found_is_no_further_evidence():
     np.testing.assert_allclose(again.network.calibrated[0].stated_std, np.deg2rad([4, 4, 6]))
 
 
-def test_large_biases_that_are_seen_make_headings_less_certain():
+def test_large_biases_increase_the_heading_uncertainty():
     fields = {f'mag_{j + 1}': R.inv().apply(EARTH) + 2e-6 * R.inv().apply([0.0, 0.0, 1.0])
-              for j, R in enumerate(TURNED)}
-    seen, _ = surveyed(fields=fields)
+              for j, R in enumerate(ROTATIONS)}
+    biased, _ = surveyed(fields=fields)
     usual, _ = surveyed()
-    assert seen.bias_std > 1.3 * usual.bias_std
-    for a, b in zip(seen.network.orientation_std, usual.network.orientation_std, strict=True):
+    assert biased.bias_std > 1.3 * usual.bias_std
+    for a, b in zip(biased.network.orientation_std, usual.network.orientation_std, strict=True):
         assert a[2] > 1.1 * b[2]

@@ -1,4 +1,4 @@
-"""Sensors that are not read at one time: each sees the target where it is at its own."""
+"""Sensors that are read at different times: each measures the target at its own time."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ from support.track_runs import magnet_frames
 
 
 @pytest.mark.parametrize('target', ['vehicle', 'magnet'])
-def test_derivatives_hold_at_every_sensors_own_time(target):
+def test_derivatives_match_finite_differences_at_the_times_of_the_sensors(target):
     network = line_network(3)
     settings = settings_for(target, {
         'track.mounting_std_deg': 3.0, 'track.model_error_time_s': 0.0}).track
@@ -73,17 +73,17 @@ def slow_passes(compensated):
 
 
 @pytest.mark.study
-def test_slow_sensors_out_of_step_are_tracked_honestly():
+def test_tracks_of_slow_asynchronous_sensors_are_consistent():
     with_offsets, without = slow_passes(True), slow_passes(False)
-    print(f'with their times: NEES {with_offsets[0]:.2f}, RMS {with_offsets[1]:.2f} m; '
-          f'as one time: {without[0]:.2f}, {without[1]:.2f} m')
+    print(f'with time offsets: NEES {with_offsets[0]:.2f}, RMS {with_offsets[1]:.2f} m; '
+          f'without: {without[0]:.2f}, {without[1]:.2f} m')
     assert with_offsets[0] < 1.6
     assert with_offsets[0] < 0.5 * without[0]
     assert with_offsets[1] < without[1]
 
 
-def turning_magnet(offset, rate=0.4, n=60, dt=0.27):
-    """(network, frames, positions) of a magnet that circles and turns over a board of nine."""
+def rotating_magnet(offset, rate=0.4, n=60, dt=0.27):
+    """(network, frames, positions) of a magnet that circles and rotates above nine sensors."""
     network, still, _ = magnet_frames(1)
     rng = np.random.default_rng(3)
 
@@ -112,23 +112,24 @@ def errors_of(network, frames, truth):
     return np.linalg.norm(e, axis=1), np.array(nees)
 
 
-def test_a_magnet_that_keeps_turning_keeps_its_size_and_its_place():
-    """Six degrees from frame to frame; first-order turning made it longer by each of them."""
-    error, nees = errors_of(*turning_magnet(np.zeros(9)))
+def test_poses_of_a_rotating_magnet_are_accurate_and_consistent():
+    """Six degrees per frame; a first-order rotation lengthened the moment in every frame."""
+    error, nees = errors_of(*rotating_magnet(np.zeros(9)))
     assert error.max() < 0.5e-3
     assert nees.max() < 3.0
 
 
-def test_a_magnet_over_sensors_that_are_read_in_turn():
-    """One sensor every 30 ms, while the magnet moves 6 mm and turns 6 degrees a round."""
-    network, frames, truth = turning_magnet(0.03 * (np.arange(9) - 4))
+def test_a_magnet_above_sensors_that_are_read_in_turn_is_tracked():
+    """One sensor every 30 ms; per round, the magnet moves by 6 mm and rotates by 6 degrees."""
+    network, frames, truth = rotating_magnet(0.03 * (np.arange(9) - 4))
     error, nees = errors_of(network, frames, truth)
-    as_one, _ = errors_of(
+    without_offsets, _ = errors_of(
         network, [replace(f, time_offset=0.0 * f.time_offset) for f in frames], truth)
-    print(f'median {1e3 * np.median(error):.2f} mm; as one time {1e3 * np.median(as_one):.2f} mm')
+    print(f'median {1e3 * np.median(error):.2f} mm; without time offsets '
+          f'{1e3 * np.median(without_offsets):.2f} mm')
     assert np.median(error) < 0.3e-3
     assert nees.mean() < 1.5
-    assert np.median(error) < 0.2 * np.median(as_one)
+    assert np.median(error) < 0.2 * np.median(without_offsets)
     stage = TrackManager(network, settings_for('magnet').track)
     for frame in frames:
         track = stage.feed(frame)[-1]
@@ -137,9 +138,9 @@ def test_a_magnet_over_sensors_that_are_read_in_turn():
 
 
 @pytest.mark.parametrize('gap_s', [2.0, 5.0, 15.0])
-def test_a_magnet_that_was_not_seen_for_long_is_found_again(gap_s):
-    """Flagged, or ended, while it is wrong; right again by the third frame."""
-    network, frames, truth = turning_magnet(np.zeros(9), n=40 + round(gap_s / 0.1), dt=0.1)
+def test_a_magnet_is_found_again_after_a_long_gap(gap_s):
+    """Wrong poses are ambiguous; after three frames the track is right again."""
+    network, frames, truth = rotating_magnet(np.zeros(9), n=40 + round(gap_s / 0.1), dt=0.1)
     keep = np.r_[0:20, -20:0]
     frames, truth = [frames[k] for k in keep], truth[keep]
     stage = TrackManager(network, settings_for('magnet').track)
@@ -155,7 +156,7 @@ def test_a_magnet_that_was_not_seen_for_long_is_found_again(gap_s):
 
 
 def contradicted(manager, sizes):
-    """`Track`s of a steady field, then of fields that no vehicle makes, of these sizes [T]."""
+    """`Track`s of a steady field, then of random fields of these sizes [T]."""
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
     rng = np.random.default_rng(1)
     records = []
@@ -167,7 +168,7 @@ def contradicted(manager, sizes):
     return [t for t in records if isinstance(t, Track)]
 
 
-def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_started_anew():
+def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_restarted():
     stage = TrackManager(line_network(2), settings_for('vehicle').track)
     tracks = contradicted(stage, [1e-4] * 10 + [1.9e-4] * 10)
     assert stage.counts['tracks ended: target lost'] == 1
@@ -176,8 +177,8 @@ def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_started_anew():
 
 
 @pytest.mark.parametrize('lookback_s', [1.0, 0.0])
-def test_where_a_vehicle_was_lost_one_of_twice_the_field_is_started_and_flagged(lookback_s):
-    """In the tail of a pass the field only falls; what is twice as strong is something else."""
+def test_twice_the_field_of_a_lost_vehicle_starts_an_ambiguous_track(lookback_s):
+    """In the tail of a pass the field only falls, so twice the field is another target."""
     stage = TrackManager(line_network(2), settings_for(
         'vehicle', {'track.lookback_s': lookback_s}).track)
     tracks = contradicted(stage, [1e-4] * 19 + [2.1e-4])

@@ -1,4 +1,4 @@
-"""Settings whose starting hypotheses would fill the memory are refused before a track starts."""
+"""Bank size: settings whose hypotheses would fill the memory are refused before a track starts."""
 
 import numpy as np
 import pytest
@@ -29,20 +29,20 @@ def test_too_many_hypotheses_are_refused_with_their_number(target, changes, prod
     assert str(error.value).startswith(f'track.{target}: ') and product in str(error.value)
 
 
-@pytest.mark.parametrize('changes, told', [
+@pytest.mark.parametrize('changes, message', [
     ({'grid_points': 1_000_000},
      'track.magnet.grid_points: 1000000 points x 90 sensors need 6.48 GB of memory; '
      'the limit is 4.29 GB'),
     ({'starts': 1000},
      'track.magnet: 1000 starting hypotheses, starts (1000), with 822 states each for 90 sensors')])
-def test_so_are_those_of_a_magnet(changes, told):
+def test_too_many_hypotheses_of_a_magnet_are_refused(changes, message):
     changes = {f'track.magnet.{name}': value for name, value in changes.items()}
     settings = settings_for('magnet', {'track.mounting_std_deg': 5.0, 'track.max_sensors': 90,
                                        'track.model_error_time_s': 0.3, **changes})
     Pipeline(line_network(9), settings)
     with pytest.raises(SettingsError) as error:
         Pipeline(line_network(90), settings)
-    assert told in str(error.value)
+    assert message in str(error.value)
 
 
 def bytes_at_start(n, settings):
@@ -59,7 +59,7 @@ def bytes_at_start(n, settings):
 @pytest.mark.parametrize('changes', [
     {}, POINT, {'track.mounting_std_deg': 0.0}, {'track.model_error_time_s': 0.0},
     {'track.vehicle.turn_acceleration': 0.0, 'track.vehicle.speeds': [3.0, 9.0]}])
-def test_the_bound_is_that_of_the_bank_that_is_made(monkeypatch, n, changes):
+def test_the_limit_applies_to_the_size_of_the_actual_bank(monkeypatch, n, changes):
     network, settings = line_network(n), settings_for('vehicle', changes).track
     size = bytes_at_start(n, settings)
     monkeypatch.setattr(bank_size, 'MAX_BYTES', size)
@@ -70,7 +70,7 @@ def test_the_bound_is_that_of_the_bank_that_is_made(monkeypatch, n, changes):
 
 
 @pytest.mark.parametrize('changes', [{}, POINT, {'track.mounting_std_deg': 0.0}])
-def test_a_vehicle_starts_with_as_many_sensors_as_its_hypotheses_allow(monkeypatch, changes):
+def test_the_number_of_sensors_at_the_start_is_limited_by_memory(monkeypatch, changes):
     settings = settings_for('vehicle', changes).track
     model = target_of(settings, line_network(2)).model
     monkeypatch.setattr(bank_size, 'START_BYTES', bytes_at_start(6, settings))
@@ -83,14 +83,14 @@ def test_a_vehicle_starts_with_as_many_sensors_as_its_hypotheses_allow(monkeypat
     assert bank_size.sensors_at_start(settings, line_network(3), model) == 3
 
 
-def test_a_magnet_starts_with_all():
+def test_a_magnet_starts_with_max_sensors():
     settings, network = settings_for('magnet').track, line_network(40)
     model = target_of(settings, network).model
     assert bank_size.sensors_at_start(settings, network, model) == settings.max_sensors
 
 
 @pytest.mark.parametrize('n', [2, 16, 32, 90])
-def test_so_many_are_kept_as_take_no_more_than_they_may(n):
+def test_the_number_of_kept_hypotheses_is_limited_by_memory(n):
     settings, network = settings_for('vehicle').track, line_network(2)
     observation = BankFilter(network, target_of(settings, network).model, settings).observation
     kept, each = bank_size.max_hypotheses(observation, n), 8 * observation.n_states(n)**2
@@ -98,7 +98,7 @@ def test_so_many_are_kept_as_take_no_more_than_they_may(n):
             else kept * each <= bank_size.WIDER_BYTES < (kept + 1) * each)
 
 
-def test_more_sensors_than_the_memory_has_room_for_are_refused():
+def test_more_sensors_than_fit_into_memory_are_refused():
     changes = {'track.max_sensors': 1000}
     Pipeline(line_network(90), settings_for('vehicle', changes))
     with pytest.raises(SettingsError, match=r'track.max_sensors: 100 hypotheses with the '

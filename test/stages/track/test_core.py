@@ -1,4 +1,4 @@
-"""The compiled filters against the same in NumPy, step by step, and what they refuse."""
+"""Compiled filters: comparison with NumPy step by step, and refused arguments."""
 
 import dataclasses
 
@@ -17,11 +17,11 @@ from support.networks import line_network
 from support.plain_filter import PlainFilter
 
 SIGMA = 4e-9
-MANY = 23
-"""With so many sensors the states of every target are enough for updates to change only half of the
-covariance (`HALVED_FROM`)."""
-TOGETHER = {'two rows that turn': 2, 'three points': 3}
-"""{case: vehicles that share a state}."""
+N_LARGE = 23
+"""With this number of sensors, updates of every case change only half of the covariance
+(`HALVED_FROM`)."""
+N_TARGETS = {'two rows that turn': 2, 'three points': 3}
+"""{case: number of vehicles that share a state}."""
 CASES = {
     'two rows that turn': ('vehicle', {}),
     'three points': ('vehicle', POINT),
@@ -44,7 +44,7 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
     settings = settings_for(target, changes).track
     network, rng = line_network(n_sensors), np.random.default_rng(seed)
     model = target_of(settings, network).model
-    n_targets = TOGETHER.get(name, 1)
+    n_targets = N_TARGETS.get(name, 1)
     filters = [of(network, model, settings, n_targets) for of in (BankFilter, PlainFilter)]
     names = model.state_names * n_targets
     size = np.array([{'x': 3.0, 'y': 1.0, 'z': 0.3, 'v': 2.0, 'm': 50.0, 'D': 2.0, 'L': 1.0,
@@ -62,7 +62,7 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
                      (n_hyp, n_targets) if n_targets > 1 else n_hyp)
         if target == 'vehicle' else None)
     if settings.vehicle.turn_acceleration and target == 'vehicle':
-        # Half of them go straight on.
+        # Half of the hypotheses go straight.
         for w in np.flatnonzero(np.isin(names, 'w')):
             bank.x[::2, w] = 0.0
             bank.P[::2, w] = bank.P[::2, :, w] = 0.0
@@ -81,17 +81,17 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
 
 
 def assert_same(a, b, tolerance=1e-9):
-    """States and covariances of two banks, in standard deviations of the second one."""
+    """Compare states and covariances of two banks, in standard deviations of the second one."""
     std = np.sqrt(np.einsum('pii->pi', b.P))
     std = np.where(std > 0.0, std, 1.0)
     assert np.abs((a.x - b.x) / std).max() <= tolerance
     assert np.abs((a.P - b.P) / std[:, :, None] / std[:, None]).max() <= tolerance
 
 
-@pytest.mark.parametrize('n_sensors', [3, MANY])
+@pytest.mark.parametrize('n_sensors', [3, N_LARGE])
 @pytest.mark.parametrize('name', CASES)
-def test_a_bank_moves_through_frames_as_step_by_step(name, n_sensors):
-    """With axes and a sensor missing, and sensors that are read at other times."""
+def test_a_bank_advanced_through_frames_matches_numpy(name, n_sensors):
+    """Some axes and a sensor are missing, and sensors are read at different times."""
     compiled, plain, bank, frames, intervals = case(name, n_sensors)
     other = bank.copy()
     for filter_, b in ((compiled, bank), (plain, other)):
@@ -111,8 +111,8 @@ def test_a_bank_moves_through_frames_as_step_by_step(name, n_sensors):
 @pytest.mark.parametrize('first_is_updated', [False, True])
 @pytest.mark.parametrize('passes, step, rejects_outliers, at_predictions', [
     (1, 0.5, False, False), (3, 0.5, False, False), (2, 1.0, True, True)])
-@pytest.mark.parametrize('name, n_sensors', [*((name, 3) for name in CASES), ('mounting', MANY)])
-def test_paths_are_filtered_and_smoothed_as_step_by_step(
+@pytest.mark.parametrize('name, n_sensors', [*((name, 3) for name in CASES), ('mounting', N_LARGE)])
+def test_filtering_and_smoothing_along_paths_matches_numpy(
         name, n_sensors, passes, step, rejects_outliers, at_predictions, first_is_updated):
     compiled, plain, bank, frames, intervals = case(name, n_sensors, 1 if rejects_outliers else 4)
     paths = np.repeat(bank.x[:, None], len(frames), axis=1)
@@ -135,7 +135,7 @@ def test_paths_are_filtered_and_smoothed_as_step_by_step(
     np.testing.assert_allclose(got.unsettled, expected.unsettled, rtol=1e-5, atol=1e-6)
 
 
-def test_a_hypothesis_on_a_sensor_is_ruled_out_and_the_others_are_not():
+def test_a_hypothesis_at_a_sensor_is_ruled_out_and_the_others_are_not():
     compiled, _, bank, frames, _ = case('point')
     alone = bank.alone(0)
     bank.x[1, :3] = compiled.observation.positions[1]
@@ -151,7 +151,7 @@ def test_a_hypothesis_on_a_sensor_is_ruled_out_and_the_others_are_not():
     np.zeros((3, 3)), np.diag([-1.0, 1.0, 1.0]),
     [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
     [[1.0, 0.0, 2.0], [0.0, 1.0, 0.0], [2.0, 0.0, 1.0]]])
-def test_a_noise_that_is_not_positive_definite_is_refused(bad):
+def test_noise_that_is_not_positive_definite_is_refused(bad):
     compiled, _, bank, frames, intervals = case('point')
     x, paths = bank.x.copy(), np.repeat(bank.x[:, None], 7, axis=1)
     frames[0].covariance[1] = SIGMA**2 * np.array(bad)
@@ -167,7 +167,7 @@ def test_a_noise_that_is_not_positive_definite_is_refused(bad):
     (lambda b: setattr(b, 'x', b.x[:, :-1].copy()), 'x: shape does not match'),
     (lambda b: setattr(b, 'P', b.P[:, :-1].copy()), 'P: shape does not match'),
     (lambda b: setattr(b, 'P', b.P[:-1].copy()), 'P: shape does not match')])
-def test_arrays_of_other_sizes_are_refused(spoil, error):
+def test_arrays_of_wrong_sizes_are_refused(spoil, error):
     compiled, _, bank, frames, _ = case('point')
     spoil(bank)
     with pytest.raises(ValueError, match=error):
@@ -175,7 +175,7 @@ def test_arrays_of_other_sizes_are_refused(spoil, error):
 
 
 @pytest.mark.parametrize('name', CASES)
-def test_a_bank_is_moved_where_it_is_unless_its_prior_is_wanted(name):
+def test_a_bank_is_advanced_in_place_unless_its_prior_is_kept(name):
     compiled, _, bank, frames, intervals = case(name, n_hyp=3)
     before, kept = bank.copy(), bank.copy()
     x, P, kept_x, kept_P = bank.x, bank.P, kept.x, kept.P
@@ -190,8 +190,8 @@ def test_a_bank_is_moved_where_it_is_unless_its_prior_is_wanted(name):
     np.testing.assert_array_equal(kept_P, before.P)
 
 
-def test_no_array_is_copied_that_would_be_written_to():
-    """A copy would take what is written, and nobody would see it."""
+def test_output_arrays_that_would_be_copied_are_refused():
+    """The results would be written to the copy and lost."""
     compiled, _, bank, frames, intervals = case('point')
     paths = np.repeat(bank.x[:, None], 7, axis=1)
     for bad in (np.asfortranarray(paths), paths.astype(np.float32)):
@@ -204,14 +204,14 @@ def test_no_array_is_copied_that_would_be_written_to():
 
 
 @pytest.mark.parametrize('name', ['row that turns', 'point', 'magnet'])
-def test_a_hypothesis_that_is_spoilt_does_not_spoil_the_others(name):
-    """Rounding may make a covariance indefinite; NaN has to stay where it began."""
+def test_an_invalid_hypothesis_does_not_affect_the_others(name):
+    """Rounding errors may make a covariance indefinite; the resulting NaN must not spread."""
     compiled, _, bank, frames, intervals = case(name, n_hyp=4)
     paths = np.repeat(bank.x[:, None], len(frames), axis=1)
     found = []
-    for spoilt in (False, True):
+    for is_invalid in (False, True):
         b, p = bank.copy(), paths.copy()
-        if spoilt:
+        if is_invalid:
             b.P[0] *= -1.0
         along = compiled.run_along(b, frames, intervals, p, passes=3, step=0.5,
                                    first_is_updated=False, wants_covariances=True)
@@ -222,7 +222,7 @@ def test_a_hypothesis_that_is_spoilt_does_not_spoil_the_others(name):
         np.testing.assert_array_equal(got, expected)
 
 
-def test_of_a_path_that_is_nowhere_nothing_is_settled():
+def test_a_path_through_infinity_has_not_converged():
     compiled, _, bank, frames, intervals = case('point', n_hyp=2)
     paths = np.repeat(bank.x[:, None], len(frames), axis=1)
     paths[0, 2] = np.inf
@@ -231,15 +231,15 @@ def test_of_a_path_that_is_nowhere_nothing_is_settled():
     assert np.isnan(along.unsettled[0]) and np.isfinite(along.unsettled[1])
 
 
-def test_vehicles_that_share_a_state_are_a_few():
+def test_the_number_of_vehicles_that_share_a_state_is_bounded():
     for count in (0, core.MAX_TARGETS + 1):
         with pytest.raises(ValueError, match='count: from 1 to 4'):
             core.VehiclesFilter(np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), 0, 0, count, 12,
                                 *ROW)
 
 
-def test_two_vehicles_that_no_sensor_feels_at_once_are_filtered_like_two_alone():
-    """Each passes sensors of its own, far from those of the other."""
+def test_two_vehicles_without_common_sensors_are_filtered_independently():
+    """Each passes its own sensors, far from those of the other."""
     settings = settings_for('vehicle', {**POINT, 'track.background_std': 1e-8}).track
     near, rng = line_network(2), np.random.default_rng(1)
     far = dataclasses.replace(line_network(2), positions=near.positions + [5e4, 0.0, 0.0],
@@ -274,7 +274,7 @@ def test_two_vehicles_that_no_sensor_feels_at_once_are_filtered_like_two_alone()
 
 
 def joined(a, b, n_t):
-    """A bank of the targets of two, one hypothesis each, with their sensors side by side."""
+    """Bank of one hypothesis with the targets and sensors of two banks."""
     n_own = (a.x.shape[1] - n_t) // 2 - 3
     places = [(bank, np.arange(n_t), i * n_t + np.arange(n_t)) for i, bank in enumerate((a, b))]
     for i, bank in enumerate((a, b)):
@@ -300,7 +300,7 @@ ROW = (1, [1.0] * 3, [1.0] * 3, 0.1, 0.1, 0.0, 1.0, 1.0)
     (0, 0, 0, ROW, 'n_states'), (0, 0, 9, (0, *ROW[1:]), 'n_states'),
     (0, 0, 9, (50, *ROW[1:]), 'n_states'),
     (0, 0, 9 + 3 * 90 + 1, (90, *ROW[1:]), 'more states')])
-def test_a_filter_of_a_target_that_cannot_be_is_refused(n_angles, n_errors, n_states, row, error):
+def test_a_filter_with_an_invalid_state_is_refused(n_angles, n_errors, n_states, row, error):
     with pytest.raises(ValueError, match=error):
         core.RowVehicleFilter(np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), n_angles, n_errors,
                               n_states, *row)

@@ -1,4 +1,4 @@
-"""Fields of no target: evidence for them, which of the two they are, and a handover."""
+"""Disturbance model: evidence for fields of no target, uniform or at single sensors; handover."""
 
 import dataclasses
 
@@ -23,13 +23,13 @@ def frames(network, fields, dt=0.08, seed=0):
                        np.ones(n, dtype=int), np.zeros(n)) for k, y in enumerate(seen)]
 
 
-def total(model, some, dt=0.08):
+def density(model, some, dt=0.08):
     none = np.zeros(len(some[0].field))
     return sum(model.log_density(f, dt if k else 0.0, none) or 0.0 for k, f in enumerate(some))
 
 
-def slow(t, network, own):
-    """Fields (n, n_sensors, 3) [T] of slow waves, of each sensor's own or of all."""
+def slow_waves(t, network, own):
+    """Fields (n, n_sensors, 3) [T] of slow waves, of each sensor or common to all."""
     rng = np.random.default_rng(3)
     size = 2e-7 * rng.standard_normal((len(network), 3))
     if not own:
@@ -40,58 +40,58 @@ def slow(t, network, own):
 
 @pytest.mark.parametrize('n_sensors', [2, 4, 10])
 @pytest.mark.parametrize('own', [True, False])
-def test_it_tells_one_field_over_the_network_from_one_at_each_sensor(n_sensors, own):
+def test_a_uniform_field_is_distinguished_from_fields_of_single_sensors(n_sensors, own):
     network = line_network(n_sensors)
     model = DisturbanceModel(network, 2e-8)
-    fields = slow(np.arange(0.0, 8.0, 0.08), network, own)
-    # Backgrounds are known to two deviations.
+    fields = slow_waves(np.arange(0.0, 8.0, 0.08), network, own)
+    # Backgrounds have errors of their stated standard deviation.
     offsets = 2e-8 * np.random.default_rng(1).standard_normal((n_sensors, 3))
-    total(model, frames(network, fields - fields[0] + offsets))
+    density(model, frames(network, fields - fields[0] + offsets))
     assert model.uniform < 1e-3 if own else model.uniform > 0.999
 
 
-def test_a_gradient_over_the_network_is_one_field():
+def test_a_field_with_a_gradient_over_the_network_counts_as_uniform():
     network = line_network(6)
     away = network.positions - network.centre
     G = np.array([[1.0, 0.5, 0.2], [0.5, -1.5, 0.3], [0.2, 0.3, 0.5]])
     wave = np.sin(np.arange(0.0, 8.0, 0.08))[:, None, None]
     shape = 2e-7 * np.array([1.0, -0.5, 0.7]) + 6e-9 * away @ G
     model = DisturbanceModel(network, 2e-8)
-    total(model, frames(network, wave * shape))
+    density(model, frames(network, wave * shape))
     assert model.uniform > 0.999
 
 
-def test_the_faster_a_dipole_passes_the_worse_is_it_explained():
+def test_the_evidence_falls_with_the_speed_of_a_passing_dipole():
     network = line_network(2)
     t = np.arange(-3.0, 3.0, 0.08)
     explained = []
     for speed in (4.0, 8.0, 16.0):
         r = np.stack([speed * t, 0.0 * t - 1.0, 0.0 * t + 0.5], axis=1)
         passing = dipole_field(network.positions - r[:, None], np.array([200.0, 100.0, -300.0]))
-        # Nothing is there at the beginning.
+        # The field is zero at the beginning.
         passing -= passing[0]
-        explained.append(total(DisturbanceModel(network, 2e-8), frames(network, passing)[20:-20]))
+        explained.append(density(DisturbanceModel(network, 2e-8), frames(network, passing)[20:-20]))
     assert -np.diff(explained).max() > np.log(20.0)
 
 
-def test_missing_axes_and_sensors_are_left_out():
+def test_missing_axes_and_sensors_are_ignored():
     network = line_network(2)
-    some = frames(network, slow(np.arange(0.0, 4.0, 0.08), network, True))
+    some = frames(network, slow_waves(np.arange(0.0, 4.0, 0.08), network, True))
     without = [dataclasses.replace(f, field=np.where(
         [[False, False, True], [True, True, True]], np.nan, f.field)) for f in some]
-    of_two_axes = total(DisturbanceModel(network, 2e-8), without)
-    assert np.isfinite(of_two_axes) and of_two_axes < total(DisturbanceModel(network, 2e-8), some)
+    of_two_axes = density(DisturbanceModel(network, 2e-8), without)
+    assert np.isfinite(of_two_axes) and of_two_axes < density(DisturbanceModel(network, 2e-8), some)
     nothing = [dataclasses.replace(f, field=np.full((2, 3), np.nan)) for f in some]
-    assert total(DisturbanceModel(network, 2e-8), nothing) == 0.0
+    assert density(DisturbanceModel(network, 2e-8), nothing) == 0.0
 
 
 def test_the_first_frame_after_a_handover_is_not_compared():
     network = line_network(2)
-    field = 1e-6 + slow(np.arange(0.0, 4.0, 0.08), network, True)
+    field = 1e-6 + slow_waves(np.arange(0.0, 4.0, 0.08), network, True)
     some = frames(network, field)
     model, none = DisturbanceModel(network, 2e-8, is_handover=True), np.zeros(2)
     assert model.log_density(some[0], 0.0, none) is None
-    # Then as if the field had not jumped: within what a fresh rate costs.
+    # Afterwards it is as without the jump, except for the cost of an unknown rate of change.
     rest = sum(model.log_density(f, 0.08, none) for f in some[1:])
     before = DisturbanceModel(network, 2e-8)
     smooth = frames(network, field - 1e-6)
@@ -101,13 +101,13 @@ def test_the_first_frame_after_a_handover_is_not_compared():
 
 
 @pytest.mark.parametrize('gap_s', [2.0, 20.0, 60.0])
-def test_it_stays_finite_over_gaps_where_sensors_are_turned(gap_s):
-    """Each update mixes all components: without mirroring, rounding errors of one half of a
-    covariance grow until it is indefinite."""
+def test_the_evidence_stays_finite_over_gaps_with_rotated_sensors(gap_s):
+    """Each update mixes all components. Unless one half of a covariance is mirrored, rounding
+    errors grow until it is indefinite."""
     network, rng = line_network(4), np.random.default_rng(2)
-    turned = np.linalg.qr(rng.standard_normal((4, 3, 3)))[0]
-    network = dataclasses.replace(network, R_ws=turned * np.sign(np.linalg.det(turned))[:, None,
-                                                                                        None])
+    R = np.linalg.qr(rng.standard_normal((4, 3, 3)))[0]
+    network = dataclasses.replace(
+        network, R_ws=R * np.sign(np.linalg.det(R))[:, None, None])
     other = DisturbanceModel(network, 5e-9)
     C = np.tile(1.6e-17 * np.eye(3), (4, 1, 1))
     for k in range(2500):

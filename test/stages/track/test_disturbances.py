@@ -1,4 +1,4 @@
-"""Disturbances: what is left of tracks that something else explained better."""
+"""Disturbances: fields during tracks that no target explains."""
 
 import dataclasses
 import functools
@@ -17,7 +17,7 @@ from support.track_runs import magnet_frames
 
 
 def outputs(name, simulator='clouds', seed=0, parts=1):
-    """(`Pipeline`, its outputs) of a situation, fed in a number of parts."""
+    """(`Pipeline`, its outputs) of a situation that is fed in `parts` batches."""
     world = made(name, simulator, seed)
     pipeline = Pipeline(world.network, settings_for('vehicle'))
     out = []
@@ -35,7 +35,7 @@ def outputs_of(name, simulator='clouds'):
 def test_a_disturbance_is_found_and_ends(name):
     pipeline, out = outputs_of(name, 'boxes')
     found = [r for r in out if isinstance(r, Disturbance)]
-    # Each is said once when it is found and once when it has ended, or only then.
+    # Each is published when it is found and when it has ended, or only when it has ended.
     assert found and {d.id for d in found if d.ended} == {d.id for d in found}
     tracks = {r.id: r for r in out if isinstance(r, Track)}
     for d in found:
@@ -53,23 +53,23 @@ def test_a_temperature_step_ends_the_track_before_the_field_is_quiet_again():
     assert last.stamp_ns > first.stamp_ns and last.largest >= first.largest
 
 
-def test_a_car_is_no_disturbance():
+def test_a_car_is_not_a_disturbance():
     assert not [r for r in outputs('a car')[1] if isinstance(r, Disturbance)]
 
 
 @pytest.mark.study
-def test_a_car_that_stops_is_no_disturbance():
+def test_a_car_that_stops_is_not_a_disturbance():
     assert not [r for r in outputs('stops for 20 s')[1] if isinstance(r, Disturbance)]
 
 
-def test_disturbances_do_not_depend_on_how_readings_are_split():
+def test_disturbances_do_not_depend_on_batches():
     whole, parts = (outputs('a tram line switched', parts=n)[1] for n in (1, 37))
     assert [dataclasses.astuple(r) for r in whole if isinstance(r, Disturbance)] == [
         dataclasses.astuple(r) for r in parts if isinstance(r, Disturbance)]
 
 
 @pytest.mark.study
-def test_a_storm_is_one_field_and_a_temperature_one_of_each_sensor():
+def test_pulsations_are_uniform_over_the_network_and_slow_ramps_are_not():
     def uniform(name, simulator):
         return [r.uniform for r in outputs_of(name, simulator)[1]
                 if isinstance(r, Disturbance) and r.ended]
@@ -92,7 +92,7 @@ def test_a_disturbance_grows_and_reaches_other_sensors_until_it_ends():
     assert disturbances.end(30) == []
 
 
-def test_a_car_that_is_tracked_in_a_disturbance_does_not_enlarge_it():
+def test_a_car_tracked_during_a_disturbance_does_not_enlarge_it():
     _, out = outputs_of('a temperature step', 'boxes')
     last = [r for r in out if isinstance(r, Disturbance)][-1]
     largest = {False: 0.0, True: 0.0}
@@ -101,11 +101,11 @@ def test_a_car_that_is_tracked_in_a_disturbance_does_not_enlarge_it():
         is_tracked = frame.stamp_ns in tracked
         size = float(np.linalg.norm(frame.field, axis=1).max())
         largest[is_tracked] = max(largest[is_tracked], size)
-    # The frame with which the track of the car begins is still counted.
+    # The frame in which the track of the car starts is still counted.
     assert last.largest < 0.7 * largest[True] and last.ended
 
 
-def test_a_magnet_at_rest_is_sure():
+def test_poses_of_a_magnet_at_rest_are_unambiguous():
     network, frames, _ = magnet_frames(n=1)
     rng = np.random.default_rng(0)
     manager = TrackManager(network, settings_for('magnet').track)
@@ -117,5 +117,5 @@ def test_a_magnet_at_rest_is_sure():
     assert len(poses) == 100 and not any(p.ambiguous for p in poses)
 
 
-def test_a_bicycle_is_felt_by_one_sensor_and_never_sure():
+def test_a_bicycle_has_no_unambiguous_poses():
     assert verdict('a bicycle', 'boxes', 0).n_sure == 0

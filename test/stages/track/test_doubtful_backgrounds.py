@@ -1,4 +1,4 @@
-"""Tracks of frames in which a background is doubtful: ambiguous, and no others."""
+"""Tracks are ambiguous if a background that they use is doubtful."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from support.dense_traffic import after_dense_traffic
 from support.networks import line_network
 from support.samples import one, simulate
 
-SURE_WITHOUT = ('junction_left_to_right', 'junction_left_turns_to_rear')
+CLEAR_WITHOUT_DOUBT = ('junction_left_to_right', 'junction_left_turns_to_rear')
 DOUBTED = 'tracks with a doubtful background'
 SETTINGS = settings_for('vehicle', QUICK)
 """A fast tracker: the doubt does not depend on the model of the target."""
@@ -22,7 +22,7 @@ SETTINGS = settings_for('vehicle', QUICK)
 
 @pytest.fixture(scope='module')
 def passing():
-    """(network, frames with a verdict) of a pass at 10 m/s; the last sensor is 150 m further on."""
+    """(network, frames after detection) of a pass at 10 m/s; the last sensor is 150 m away."""
     network = line_network(3, spacing=150.0, tilt=0.0)
     samples, *_ = simulate(network, random_vehicle(np.random.default_rng(1), length=4.0),
                            Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0,
@@ -32,7 +32,7 @@ def passing():
 
 
 def tracked(passing, times, settings=None):
-    """(TrackManager, poses), with doubtful times of sensors [s]."""
+    """(TrackManager, poses) with doubtful intervals [s] of sensors."""
     network, frames = passing
     manager = TrackManager(network, settings_for('vehicle', {**QUICK, **(settings or {})}).track)
     start = frames[0].stamp_ns
@@ -43,8 +43,8 @@ def tracked(passing, times, settings=None):
                      if isinstance(r, Track) and not r.ended]
 
 
-def test_a_track_of_a_doubtful_background_is_ambiguous(passing):
-    """All of it, also where the doubt ended before the detection, but not before the lookback."""
+def test_a_track_with_a_doubtful_background_is_ambiguous(passing):
+    """The whole track is, also if the doubt ended in the lookback before the detection."""
     _, plain = tracked(passing, {})
     first = (plain[0].stamp_ns - passing[1][0].stamp_ns) / 1e9
     assert not all(t.ambiguous for t in plain)
@@ -57,7 +57,7 @@ def test_a_track_of_a_doubtful_background_is_ambiguous(passing):
     assert manager.counts[DOUBTED] == 0
 
 
-def test_it_is_so_from_where_the_doubt_begins(passing):
+def test_poses_are_ambiguous_from_the_start_of_the_doubt(passing):
     _, plain = tracked(passing, {})
     middle = plain[len(plain) // 2].stamp_ns
     begin = (middle - passing[1][0].stamp_ns) / 1e9
@@ -67,7 +67,7 @@ def test_it_is_so_from_where_the_doubt_begins(passing):
         == [t.ambiguous for t in plain if t.stamp_ns < middle]
 
 
-def test_sensors_that_a_track_does_not_use_are_no_matter(passing):
+def test_doubtful_backgrounds_of_unused_sensors_have_no_effect(passing):
     two = {'track.max_sensors': 2}
     _, plain = tracked(passing, {}, two)
     unused = {name for name in passing[0].names if tracked(
@@ -77,18 +77,18 @@ def test_sensors_that_a_track_does_not_use_are_no_matter(passing):
     assert [t.ambiguous for t in poses] == [t.ambiguous for t in plain]
 
 
-def test_the_state_of_the_calibration_says_it():
-    """As a message would: the latest stretch of each sensor, and nothing of those without."""
+def test_the_calibration_state_message_contains_doubtful_intervals():
+    """The message contains the latest doubtful interval of each sensor that has one."""
     network = read_network(NETWORK_FILE)
     pipeline = Pipeline(network, settings_for('vehicle'))
-    assert said(pipeline) == {name: () for name in network.names}
+    assert times_in_message(pipeline) == {name: () for name in network.names}
     pipeline.feed(after_dense_traffic('straight_small_left', 7.0))
     times = pipeline.calibrate.doubtful_intervals()
     assert times
-    assert said(pipeline) == {name: times.get(name, ())[-1:] for name in network.names}
+    assert times_in_message(pipeline) == {name: times.get(name, ())[-1:] for name in network.names}
 
 
-def said(pipeline):
+def times_in_message(pipeline):
     """`doubtful_times` of the message that a calibration node would publish."""
     def as_object(content):
         if not isinstance(content, dict):
@@ -99,9 +99,9 @@ def said(pipeline):
     return doubtful_times(type('State', (), {'sensors': sensors}))
 
 
-@pytest.mark.parametrize('name', SURE_WITHOUT)
-def test_after_dense_traffic_a_vehicle_is_tracked_and_flagged(name):
-    """Live there is no quiet stretch: nothing may be sure. The batches are no matter."""
+@pytest.mark.parametrize('name', CLEAR_WITHOUT_DOUBT)
+def test_a_vehicle_after_dense_traffic_is_tracked_and_ambiguous(name):
+    """There is no quiet interval in live data, so no pose is unambiguous, for any batches."""
     network, readings = read_network(NETWORK_FILE), after_dense_traffic(name, 7.0)
     pipeline, other = (Pipeline(network, SETTINGS) for _ in range(2))
     tracks = poses_of(pipeline.feed(readings) + pipeline.flush())
@@ -116,27 +116,26 @@ def poses_of(records):
     return [r for r in records if isinstance(r, Track) and not r.ended]
 
 
-@pytest.mark.parametrize('name', SURE_WITHOUT)
-def test_it_was_sure_before_it_knew_of_doubt(name):
-    """Without the doubt many poses are sure, or the test above would show nothing."""
+@pytest.mark.parametrize('name', CLEAR_WITHOUT_DOUBT)
+def test_poses_after_dense_traffic_are_unambiguous_without_the_doubt(name):
+    """Otherwise the test above would show nothing."""
     pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
     pipeline.track.doubt = lambda times: None
     tracks = poses_of(pipeline.feed(after_dense_traffic(name, 7.0)) + pipeline.flush())
     assert sum(not t.ambiguous for t in tracks) > 10
 
 
-def test_poses_of_a_fixed_lag_are_no_surer():
+def test_fixed_lag_poses_after_dense_traffic_are_ambiguous():
     pipeline = Pipeline(read_network(NETWORK_FILE),
                         settings_for('vehicle', {**QUICK, 'track.smoothing_lag_s': 0.5}))
-    records = pipeline.feed(after_dense_traffic(SURE_WITHOUT[0], 7.0)) + pipeline.flush()
+    records = pipeline.feed(after_dense_traffic(CLEAR_WITHOUT_DOUBT[0], 7.0)) + pipeline.flush()
     smoothed = [r for r in records if isinstance(r, SmoothedPose)]
     assert len(smoothed) > 10 and all(s.ambiguous for s in smoothed)
 
 
-def test_the_doubt_of_a_recording_outlasts_a_jump_back():
-    """Played twice in one batch: the frames of the first are tracked when it is known of no more.
-    """
-    readings = after_dense_traffic(SURE_WITHOUT[0], 7.0)
+def test_the_doubt_persists_after_a_jump_back_in_time():
+    """Two copies in one batch: calibration has restarted before the first frames are tracked."""
+    readings = after_dense_traffic(CLEAR_WITHOUT_DOUBT[0], 7.0)
     pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
     tracks = poses_of(pipeline.feed(Readings.joined([readings, readings])) + pipeline.flush())
     assert len(tracks) > 20 and all(t.ambiguous for t in tracks)

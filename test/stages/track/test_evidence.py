@@ -1,4 +1,4 @@
-"""A track's end, doubts about it, and the covariance that is published."""
+"""Evidence of a track: doubts, reasons to end it, and the published covariance."""
 
 from types import SimpleNamespace
 
@@ -28,7 +28,7 @@ def pose(nis=6.0):
     return SimpleNamespace(nis=nis, degrees_of_freedom=6, stamp_ns=0)
 
 
-def test_noise_contradicts_a_track_as_often_as_said():
+def test_noise_contradicts_a_track_with_the_stated_probability():
     rng = np.random.default_rng(0)
     nis = rng.chisquare(6, 3_000_000)
     doubted = 0
@@ -36,7 +36,7 @@ def test_noise_contradicts_a_track_as_often_as_said():
         evidence = TrackEvidence(2)
         evidence.contradicts(value * np.array([0.3, 0.7]), 6)
         doubted += evidence.doubted
-    # A Poisson number with the mean 30.
+    # The number is Poisson distributed with mean 30.
     assert 10 < doubted < 60 and len(nis) * CONTRADICTION == pytest.approx(30.0)
 
 
@@ -47,23 +47,23 @@ def test_a_track_that_was_contradicted_once_stays_doubted():
     assert evidence.doubted
 
 
-def test_a_filter_that_fits_better_than_its_path_is_doubted_as_long_as_the_window():
+def test_a_filter_that_overfits_is_doubted_for_the_length_of_the_window():
     evidence = TrackEvidence(2)
-    said = []
+    doubted = []
     for t, loss in ((0.0, -9.0), (1.0, 0.9), (1.1, 1.1), (3.0, 0.0), (3.2, -9.0)):
-        said.append(evidence.doubts_filter(-loss * OVERFIT_NATS, round(t * NS), 2.0))
-        evidence.note({doubts.OVERFIT} if said[-1] else {doubts.ANOTHER_PLACE}, round(t * NS))
-    assert said == [False, False, True, True, False]
-    # What it says of later poses is up to them: the track itself is not.
+        doubted.append(evidence.doubts_filter(-loss * OVERFIT_NATS, round(t * NS), 2.0))
+        evidence.note({doubts.OVERFIT} if doubted[-1] else {doubts.ANOTHER_PLACE}, round(t * NS))
+    assert doubted == [False, False, True, True, False]
+    # The doubt concerns single poses, not the whole track.
     assert not evidence.doubted
-    # Of its smoothed poses those of the same time are.
+    # Smoothed poses of the same time are doubted as well.
     assert [evidence.was_filter_doubted(round(t * NS)) for t in (1.0, 1.1, 3.0, 3.2)] == [
         False, True, True, False]
 
 
 @pytest.mark.parametrize('nis, doubted', [
     ([60.0, 1.0], True), ([60.0, 2.0, 1.0], False), ([60.0, np.nan, 1.0], False)])
-def test_three_sensors_correct_a_track(nis, doubted):
+def test_a_contradiction_doubts_a_track_of_two_sensors_but_not_of_three(nis, doubted):
     evidence = TrackEvidence(2)
     assert evidence.contradicts(np.array(nis), 3 * np.count_nonzero(~np.isnan(nis)))
     assert evidence.doubted == doubted
@@ -71,7 +71,7 @@ def test_three_sensors_correct_a_track(nis, doubted):
 
 @pytest.mark.parametrize('nis, is_coming, reason', [
     (6.0, False, 'out of reach'), (6.0, True, None), (1e4, False, LOST)])
-def test_a_vehicle_that_comes_is_not_out_of_reach(nis, is_coming, reason):
+def test_an_approaching_vehicle_is_not_out_of_reach(nis, is_coming, reason):
     evidence = TrackEvidence(2)
     assert evidence.reason_to_end(pose(), 2.0, is_coming, SETTINGS) is None
     assert evidence.reason_to_end(pose(nis), 7.0, is_coming, SETTINGS) == reason
@@ -88,8 +88,8 @@ def bank_of(places, weights, std=0.5, lengths=3.0):
     return bank, model
 
 
-def test_hypotheses_at_one_place_are_one_distribution():
-    """Samples of their mixture, about the one that is published."""
+def test_hypotheses_at_one_place_are_merged_in_the_covariance():
+    """Compared with samples of their mixture, about the published hypothesis."""
     bank, model = bank_of([0.0, 1.0, -0.5], [0.5, 0.3, 0.2])
     rng = np.random.default_rng(1)
     which = rng.choice(3, 400_000, p=[0.5, 0.3, 0.2])
@@ -98,14 +98,14 @@ def test_hypotheses_at_one_place_are_one_distribution():
         np.square(samples).mean(), rel=0.01)
 
 
-def test_other_places_make_a_track_ambiguous_but_its_covariance_no_wider():
+def test_hypotheses_at_other_places_do_not_widen_the_covariance():
     bank, model = bank_of([0.0, 40.0], [0.9, 0.1])
     np.testing.assert_allclose(covariance_about(bank, 0, model, bank.apart(0)),
                                0.25 * np.eye(len(model.state_names)))
     assert bank.weight(bank.apart(0)) == pytest.approx(0.1)
 
 
-def test_the_same_row_from_its_other_end_is_as_long():
+def test_the_sign_of_the_row_length_does_not_widen_the_covariance():
     bank, model = bank_of([0.0, 0.0], [0.5, 0.5], lengths=np.array([3.0, -3.0]))
     assert covariance_about(bank, 0, model, bank.apart(0))[-1, -1] == pytest.approx(0.25)
 
@@ -116,7 +116,7 @@ def frame(field, noise=1e-8):
                       np.ones(len(field), dtype=int), np.zeros(len(field)))
 
 
-def test_noise_is_felt_by_no_sensor_and_a_field_by_those_that_measure_it():
+def test_a_field_is_sensed_by_the_sensor_that_measures_it_and_noise_by_none():
     rng = np.random.default_rng(1)
     evidence = TrackEvidence(3)
     for _ in range(50):
@@ -128,43 +128,43 @@ def test_noise_is_felt_by_no_sensor_and_a_field_by_those_that_measure_it():
     assert evidence.largest[0] > 3e-8 and evidence.largest[1] == 0.0
 
 
-def test_smoothed_poses_are_flagged_for_misfits_and_not_for_what_smoothing_settles():
+def test_smoothed_poses_keep_doubts_about_misfits_but_not_about_arrivals():
     evidence = TrackEvidence(2)
     evidence.note({doubts.ANOTHER_ARRIVAL}, 1)
     evidence.note({doubts.DISTURBANCE_MODEL, doubts.ANOTHER_PLACE}, 2)
     assert [evidence.was_filter_doubted(k) for k in (1, 2)] == [False, True]
 
 
-def test_a_track_that_a_target_never_explained_ends_and_one_that_it_did_goes_on():
+def test_a_track_that_no_target_ever_explained_ends():
     def end_of(steps):
         evidence = TrackEvidence(2)
         for k in range(200):
             stamp = round(0.08 * k * NS)
             evidence.bayes_factor.add(steps(k), stamp, SETTINGS.min_bayes_factor)
-            late = pose()
-            late.stamp_ns = stamp
-            reason = evidence.reason_to_end(late, 1.0, False, SETTINGS)
+            latest = pose()
+            latest.stamp_ns = stamp
+            reason = evidence.reason_to_end(latest, 1.0, False, SETTINGS)
             if reason:
                 return reason, 0.08 * k
         return None
 
     reason, after_s = end_of(lambda k: -1.0)
     assert reason == UNEXPLAINED
-    # log(20) is three frames.
+    # It takes three frames to fall by log(20).
     assert after_s == pytest.approx(UNEXPLAINED_S + 0.24, abs=0.17)
     assert end_of(lambda k: 1.0 if k < 5 else -1.0) is None
-    # What cannot be compared is doubted, but not ended.
+    # A track that cannot be compared is doubted, but does not end.
     assert end_of(lambda k: np.nan) is None
 
 
-def test_a_comparison_that_failed_once_is_doubted_for_good():
+def test_a_failed_comparison_removes_the_favour_permanently():
     bayes_factor = TrackEvidence(2).bayes_factor
     for k, value in enumerate([50.0, np.nan, 50.0]):
         bayes_factor.add(value, k, 20.0)
         assert bayes_factor.is_favoured(20.0) == (k == 0)
 
 
-def test_falling_behind_is_forgotten_within_a_second():
+def test_a_recent_loss_of_evidence_is_forgotten_after_a_second():
     bayes_factor = TrackEvidence(2).bayes_factor
     bayes_factor.add(50.0, 0, 20.0)
     bayes_factor.add(-5.0, 2 * NS, 20.0)
@@ -173,37 +173,37 @@ def test_falling_behind_is_forgotten_within_a_second():
     assert bayes_factor.is_favoured(20.0) and not bayes_factor.is_recently_disfavoured(20.0)
 
 
-def test_published_doubts_are_listed_in_one_order_and_each_has_a_meaning():
+def test_published_doubts_are_ordered_and_have_meanings():
     names = [value for name, value in vars(doubts).items()
              if name.isupper() and isinstance(value, str)]
     assert sorted(names) == sorted(doubts.MEANINGS)
     assert doubts.ordered({doubts.HEIGHT, doubts.ANOTHER_PLACE}) == ('another_place', 'height')
 
 
-def test_a_passing_doubt_lasts_for_a_tenth_of_a_second():
-    """Poses that are sure for a single frame are more often wrong than others."""
+def test_a_transient_doubt_persists_for_a_tenth_of_a_second():
+    """Poses that are unambiguous for a single frame are wrong more often than others."""
     evidence = TrackEvidence(2)
     assert evidence.note({doubts.HEIGHT, doubts.ANOTHER_PLACE}, NS) == \
         {doubts.HEIGHT, doubts.ANOTHER_PLACE}
-    # What the bank can decide from one frame to the next does not last.
+    # Doubts that the bank can resolve from one frame to the next do not persist.
     assert evidence.note(set(), NS + round(0.08 * NS)) == {doubts.HEIGHT}
     assert evidence.note({doubts.OVERFIT}, NS + round(0.16 * NS)) == {doubts.OVERFIT}
     assert evidence.note(set(), NS + round(0.24 * NS)) == {doubts.OVERFIT}
     assert evidence.note(set(), NS + round(0.32 * NS)) == set()
-    # The smoothed poses are doubted where the doubt was found.
+    # Smoothed poses are doubted only at the time at which the doubt was found.
     assert not evidence.was_filter_doubted(NS + round(0.32 * NS))
     assert evidence.was_filter_doubted(NS + round(0.16 * NS))
 
 
-def test_poses_before_a_doubt_are_doubted_when_they_are_smoothed():
-    """A long vehicle that was taken for two was wrong before that was seen, too."""
+def test_a_doubt_with_a_past_start_doubts_earlier_smoothed_poses():
+    """A long vehicle that is tracked as two is wrong before that is detected."""
     evidence = TrackEvidence(2)
     evidence.doubt_for(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0, since_ns=3 * NS)
     assert doubts.ANOTHER_VEHICLE in evidence.note(set(), 7 * NS)
     assert doubts.ANOTHER_VEHICLE not in evidence.note(set(), 9 * NS)
     assert [evidence.was_filter_doubted(t * NS) for t in (2, 3, 5, 7, 9)] == [
         False, True, True, True, False]
-    # One that only may be another from now on.
+    # Without a past start, no smoothed pose is doubted.
     evidence = TrackEvidence(2)
     evidence.doubt_for(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0)
     assert not any(evidence.was_filter_doubted(t * NS) for t in range(10))

@@ -1,4 +1,4 @@
-"""The first hypotheses: where they are, how sure they are, which is the heaviest."""
+"""Track initiation: states, covariances and weights of the first hypotheses."""
 
 import dataclasses
 
@@ -24,8 +24,8 @@ def start(frame, network, relative_std=0.0, own_covariance=None):
     return start_magnet(SETTINGS, network, frame, 1e-12, own_covariance, relative_std)
 
 
-def test_the_side_that_fits_better_is_the_heavier():
-    """Without its z axes a flat board cannot tell above from below; one z axis, noisy, can."""
+def test_the_hypothesis_on_the_side_that_fits_better_is_heavier():
+    """A flat board without z axes cannot distinguish above from below; one noisy z axis can."""
     network, frames, truth = magnet_frames(1)
     field = np.einsum('jik,jk->ji', network.R_ws, frames[0].field)
     network = dataclasses.replace(network, R_ws=np.repeat(np.eye(3)[None], 9, axis=0))
@@ -36,13 +36,13 @@ def test_the_side_that_fits_better_is_the_heavier():
     above = np.linalg.norm(bank.x[:, :3] - truth[0, :3], axis=1) < 0.005
     below = np.linalg.norm(bank.x[:, :3] - truth[0, :3] * [1, 1, -1], axis=1) < 0.005
     assert above.sum() == below.sum() == 1
-    # Below it is off by four of its deviations: twice the field over half of it.
+    # Below, z is off by four standard deviations: twice the field over half of it.
     gap = float(bank.log_w[above][0] - bank.log_w[below][0])
     assert gap == pytest.approx(0.5 * 4.0**2, rel=0.1)
 
 
 def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
-    """Hard and soft iron together: what the settings call the moment."""
+    """The moment in the settings is that of hard and soft iron together."""
     vehicle = settings_for('vehicle').track.vehicle
     frame = FieldFrame(0, np.full((2, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], 2, axis=0),
                        np.full(2, 8), np.zeros(2))
@@ -53,7 +53,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     np.testing.assert_allclose(np.linalg.norm(m, axis=1), np.take(vehicle.moments, bank.kind),
                                rtol=1e-9)
     np.testing.assert_array_equal(bank.x[:, length], np.take(vehicle.lengths, bank.kind))
-    # In 50 uT the soft iron of each axis has its share of that moment.
+    # In 50 uT, the soft iron of each axis contributes its share of that moment.
     soft = [model.state_names.index(f'D{axis}') for axis in 'xyz']
     share = bank.x[:, soft] * 5e-5 / MU0 / np.take(vehicle.moments, bank.kind)[:, None]
     np.testing.assert_allclose(share, vehicle.induced_share, rtol=1e-12)
@@ -62,7 +62,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     np.testing.assert_allclose(share_covariance / vehicle.induced_share_std**2 - 1.0,
                                np.tile(np.eye(3), (len(bank), 1, 1)), atol=1e-9)
     assert len(bank) == 3 * 3 * 14 * 3 * 3 * 2
-    # Half of them turn, at first half as fast as the settings say; nobody knows which way.
+    # Half of them turn, with an unknown sign and half the standard deviation of the settings.
     turns = bank.P[:, turn, turn] > 0.0
     assert np.count_nonzero(turns) == len(bank) // 2 and not bank.x[:, turn].any()
     speed = np.hypot(*bank.x[:, 3:5].T)[turns]
@@ -70,18 +70,18 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
                                (0.5 * vehicle.turn_acceleration / speed)**2)
     assert np.exp(bank.log_w[turns]).sum() == pytest.approx(vehicle.turn_share)
     assert len(set(bank.origin)) == len(bank)
-    # What is called a point is one: neither a length nor differences.
+    # A point has neither a length nor differences of its dipoles.
     points = bank.P[bank.kind == 0]
     assert not points[:, length, length].any()
     np.testing.assert_allclose(points[:, 6, 6], points[:, 6, 9], rtol=1e-12)
     for label, heading in enumerate(np.deg2rad(vehicle.arrival_headings_deg)):
         rows = bank.label == label
         along = bank.x[rows, :2] @ [np.cos(heading), np.sin(heading)]
-        assert (along <= 0.0).all()  # all are before the sensors
+        assert (along <= 0.0).all()  # all of them start before the sensors
         speed = np.hypot(*bank.x[rows, 3:5].T)
         np.testing.assert_allclose(bank.x[rows, 3], speed * np.cos(heading), atol=1e-9)
         assert set(np.round(speed, 6)) == set(vehicle.speeds)
-        # As sure of its speed as the settings say, relative to it, along and across.
+        # Standard deviations of the velocity are those of the settings, relative to the speed.
         ahead = np.array([np.cos(heading), np.sin(heading)])
         across = np.array([-ahead[1], ahead[0]])
         for direction, share in ((ahead, vehicle.speed_std), (across, vehicle.cross_speed_std)):
@@ -90,8 +90,8 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
 
 
 @pytest.mark.parametrize('missing', [None, 0])
-def test_a_vehicle_starts_where_its_field_first_has_the_energy_of_the_frame(missing):
-    """Nearer it has more, and at the place before it had less."""
+def test_a_vehicle_starts_where_its_field_first_has_the_frame_energy(missing):
+    """At the previous place on its path it has less."""
     network = line_network(6)
     vehicle = settings_for('vehicle', POINT).track.vehicle
     std = np.array([1e-8, 2e-8, 4e-8])
@@ -99,39 +99,39 @@ def test_a_vehicle_starts_where_its_field_first_has_the_energy_of_the_frame(miss
     if missing is not None:
         field[missing] = np.nan
     C = np.repeat(np.diag(std**2)[None], 6, axis=0)
-    there = ~np.isnan(field)
-    wanted = np.nansum((field / std) ** 2) - there.sum()
+    present = ~np.isnan(field)
+    required = np.nansum((field / std) ** 2) - present.sum()
     bank = start_vehicle(vehicle, network, FieldFrame(0, field, C, np.full(6, 8), np.zeros(6)),
                          2e-8, None)
     model = vehicle_model(vehicle, network)
 
     def energy(back):
-        """Of the hypotheses' fields, as the sensors have them, `back` [m] before their places."""
+        """Energy of the fields of the hypotheses at the sensors, `back` [m] before their places."""
         x = bank.x[:, :model_size].copy()
         x[:, :2] -= back * x[:, 3:5] / np.hypot(*x[:, 3:5].T)[:, None]
         m = model.dipoles(x).m.sum(axis=1)
         B = dipole_field(network.positions - x[:, None, :3], m[:, None])
         h = np.einsum('jsw,njw->njs', np.swapaxes(network.R_ws, 1, 2), B)
-        return np.sum(np.where(there, h / std, 0.0) ** 2, axis=(1, 2))
+        return np.sum(np.where(present, h / std, 0.0) ** 2, axis=(1, 2))
 
     model_size = len(model.state_names)
     ahead = bank.x[:, 3:5] / np.hypot(*bank.x[:, 3:5].T)[:, None]
-    # [m] Before the outermost sensor, as they come.
+    # [m] Distance to the outermost sensor along the path.
     along = ahead @ (network.positions - network.centre)[:, :2].T
     before = along.min(axis=1) - np.sum(ahead * (bank.x[:, :2] - network.centre[:2]), axis=1)
-    reached = energy(0.0) >= wanted * (1.0 - 1e-9)
+    reached = energy(0.0) >= required * (1.0 - 1e-9)
     assert reached.mean() > 0.5
-    # Who never has it starts where the sensors begin.
+    # A vehicle that never reaches the energy starts at the outermost sensor.
     np.testing.assert_allclose(before[~reached], 0.0, atol=1e-9)
     coming = reached & (before < vehicle.max_start_distance - 1e-9)
     assert coming.mean() > 0.5
-    assert (energy(vehicle.max_start_distance / 159.0)[coming] < wanted).all()
+    assert (energy(vehicle.max_start_distance / 159.0)[coming] < required).all()
 
 
-def test_a_start_is_as_sure_as_the_model_is_good():
+def test_a_start_is_as_certain_as_the_model_is_accurate():
     network, frames, truth = magnet_frames(1)
-    sure, doubtful = start(frames[0], network), start(frames[0], network, relative_std=0.05)
-    assert np.trace(doubtful.P[0, :3, :3]) > 100.0 * np.trace(sure.P[0, :3, :3])
+    certain, uncertain = start(frames[0], network), start(frames[0], network, relative_std=0.05)
+    assert np.trace(uncertain.P[0, :3, :3]) > 100.0 * np.trace(certain.P[0, :3, :3])
     rng = np.random.default_rng(2)
     nees = []
     for _ in range(40):
@@ -143,8 +143,8 @@ def test_a_start_is_as_sure_as_the_model_is_good():
     assert 0.4 < np.mean(nees) < 1.6
 
 
-def test_what_a_fit_leaves_over_widens_the_start():
-    """The same errors, unannounced: the residuals tell."""
+def test_residuals_of_the_fit_widen_the_start():
+    """The errors are not stated, but the residuals show them."""
     network, frames, truth = magnet_frames(1)
     rng = np.random.default_rng(3)
     nees = []
@@ -153,11 +153,11 @@ def test_what_a_fit_leaves_over_widens_the_start():
         bank = start(dataclasses.replace(frames[0], field=field), network)
         e = bank.x[bank.best(), :3] - truth[0, :3]
         nees.append(e @ np.linalg.solve(bank.P[bank.best(), :3, :3], e) / 3.0)
-    # Stated is a twentieth of it: without the residuals this would be four hundred.
+    # The stated noise is a twentieth of the errors; without residuals the NEES would be 400.
     assert 0.4 < np.mean(nees) < 2.0
 
 
-def test_a_magnet_may_have_turned_sensors_too():
+def test_a_magnet_track_estimates_mounting_angles():
     network, frames, truth = magnet_frames()
     stage = TrackManager(network, settings_for('magnet', {'track.mounting_std_deg': 2.0}).track)
     tracks = [t for f in frames for t in stage.feed(f)]
@@ -167,8 +167,8 @@ def test_a_magnet_may_have_turned_sensors_too():
     assert (tracks[0].mounting_std > np.deg2rad(0.1)).all()
 
 
-def test_backgrounds_that_wander_are_no_target(road_network):
-    """A frame said to hold a target, but the field only does what backgrounds do."""
+def test_drifting_backgrounds_are_not_a_target(road_network):
+    """The frames are marked as containing a target, but only the backgrounds drift."""
     drift = 3e-8
     settings = settings_for('vehicle', {'track.background_drift': drift}).track
     stage = TrackManager(road_network, settings)
@@ -184,7 +184,7 @@ def test_backgrounds_that_wander_are_no_target(road_network):
     assert len(existence) and existence[-1] < 0.5
 
 
-def test_backgrounds_wander_between_frames_and_angles_do_not(road_network):
+def test_backgrounds_drift_between_frames_and_mounting_angles_do_not(road_network):
     drift, dt = 1e-8, 0.5
     settings = settings_for('vehicle', {'track.background_drift': drift}).track
     stage = TrackManager(road_network, settings)
@@ -196,7 +196,7 @@ def test_backgrounds_wander_between_frames_and_angles_do_not(road_network):
     after, n_t = np.diagonal(stage.bank.P, axis1=1, axis2=2), len(model.state_names)
     own, grown = (a[:, n_t:n_t + 12].reshape(-1, 2, 6) for a in (before, after))
     np.testing.assert_array_equal(grown[:, :, :3], own[:, :, :3])
-    # A model error forgets what was learnt of it, with its time of 0.3 s, and stays of size one.
+    # Model errors return to unit variance with their time constant of 0.3 s.
     np.testing.assert_allclose(1.0 - grown[:, :, 3:],
                                np.exp(-2.0 * dt / 0.3) * (1.0 - own[:, :, 3:]), atol=1e-12)
     assert (own[:, :, 3:] < 1.0 - 1e-6).any()

@@ -1,4 +1,4 @@
-"""What `config/large_network.yaml` leaves out so that a track's cost is bounded."""
+"""Hypotheses that `config/large_network.yaml` drops to bound the cost of a track."""
 
 import numpy as np
 import pytest
@@ -14,13 +14,13 @@ from support.samples import one, simulate
 
 SETTINGS = read_parameter_file(ROOT / 'config' / 'large_network.yaml')
 LOST = [8, 13, 15, 18, 63, 118]
-"""Of the seeds, vehicles that are lost where that bound holds from the first frame on (the first
-four), or where it is 60."""
+"""Seeds of vehicles that are lost if the bound applies from the first frame on (the first four),
+or if it is 60."""
 
 
 @pytest.fixture(scope='module')
 def drive():
-    """A function of a seed and changes: [Track] of a random vehicle past twenty sensors."""
+    """Function of a seed and changes: [Track] of a random vehicle past twenty sensors."""
     network, recordings = line_network(20), {}
 
     def driven(seed, changes):
@@ -37,8 +37,8 @@ def drive():
     return driven
 
 
-def apart(some, others):
-    """(n,) how far apart the poses of two lists of tracks are, in standard deviations."""
+def distances(some, others):
+    """(n,) distances between the poses of two lists of tracks, in standard deviations."""
     at = {t.stamp_ns: t for t in others}
     pairs = [(t, at[t.stamp_ns]) for t in some if t.stamp_ns in at]
     assert len(pairs) == len(some) == len(others) > 0
@@ -46,15 +46,15 @@ def apart(some, others):
                      ((a.position[:2] - b.position[:2], b) for a, b in pairs)])
 
 
-LAST_POSE = {76: 'of four poses the last is 4 deviations from the other; why is unknown'}
+DIFFERING = {76: 'the last of four poses differs by 4 standard deviations; cause unknown'}
 
 
 @pytest.mark.parametrize('seed', studied(range(150), LOST, lambda seed: [
-    pytest.mark.xfail(strict=True, reason=LAST_POSE[seed])] if seed in LAST_POSE else []))
-def test_more_hypotheses_would_tell_nothing_else(drive, seed):
+    pytest.mark.xfail(strict=True, reason=DIFFERING[seed])] if seed in DIFFERING else []))
+def test_more_hypotheses_do_not_change_the_poses(drive, seed):
     bounded = drive(seed, {})
     free = drive(seed, {'track.max_hypotheses': 100_000})
-    d = apart(bounded, free)
-    print(f'{seed}: poses differ by {d.max():.2g} deviations at most, at the end by {d[-1]:.2g}')
+    d = distances(bounded, free)
+    print(f'{seed}: poses differ by {d.max():.2g} std at most, at the end by {d[-1]:.2g} std')
     assert bounded[-1].arrival == free[-1].arrival
     assert d[len(d) // 2:].max() < 0.1

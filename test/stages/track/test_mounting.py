@@ -1,4 +1,4 @@
-"""Sensors turned from what the network says: derivatives, and what it does to a track."""
+"""Mounting errors of sensors: derivatives, estimation by a track, and priors."""
 
 from dataclasses import replace
 from functools import cache
@@ -27,10 +27,10 @@ def case():
             0.2 * rng.standard_normal((5, 3, 3)))
 
 
-def test_no_angle_changes_nothing():
+def test_zero_angles_change_nothing():
     h, H, angles = case()
-    turned, derivative = rotated_fields(h, H, 0.0 * angles)
-    np.testing.assert_array_equal(turned, h)
+    rotated, derivative = rotated_fields(h, H, 0.0 * angles)
+    np.testing.assert_array_equal(rotated, h)
     np.testing.assert_array_equal(derivative[..., :4], H)
 
 
@@ -38,16 +38,16 @@ def test_small_angles_are_a_rotation_to_first_order():
     h, H, angles = case()
     for scale in (1e-1, 1e-2, 1e-3):
         R = rotation_from_quaternion(quaternion_from_rotation_vector(scale * angles))
-        turned, derivative = rotated_fields(h, H, scale * angles)
-        worst = np.linalg.norm(turned - (R @ h[..., None])[..., 0], axis=-1)
+        rotated, derivative = rotated_fields(h, H, scale * angles)
+        worst = np.linalg.norm(rotated - (R @ h[..., None])[..., 0], axis=-1)
         limit = 0.5 * (scale * np.linalg.norm(angles, axis=-1)) ** 2
         assert (worst <= 1.01 * limit * np.linalg.norm(h, axis=-1)).all()
         assert (np.linalg.norm(derivative[..., :4] - R @ H, axis=-2)
                 <= 1.01 * limit[..., None] * np.linalg.norm(H, axis=-2)).all()
 
 
-def test_derivatives_by_state_and_angle():
-    """The field is a linear function of a state here, so that H is its derivative."""
+def test_derivatives_by_state_and_angle_match_finite_differences():
+    """The field is a linear function of the state here, so that H is its derivative."""
     h, H, angles = case()
 
     def field(v):
@@ -61,7 +61,7 @@ def test_derivatives_by_state_and_angle():
         if k < 4:
             np.testing.assert_allclose(derivative[..., k], expected, atol=1e-8)
             continue
-        # The angles of one sensor, and what the others see of them: nothing.
+        # The angles of one sensor do not affect the other sensors.
         j, a = divmod(k - 4, 3)
         np.testing.assert_allclose(derivative[:, j, :, 4 + a], expected[:, j], atol=1e-8)
         assert not np.delete(expected, j, axis=1).any()
@@ -71,8 +71,8 @@ ANGLES = np.deg2rad([[4.0, -3.0, 6.0], [-5.0, 2.0, 3.0]])
 
 
 @pytest.fixture(scope='module')
-def turned_pass():
-    """(network, tracks, {stamp: frame}) of a pass by sensors that are turned by `ANGLES`."""
+def rotated_pass():
+    """(network, tracks, {timestamp: frame}) of a pass by sensors that are rotated by `ANGLES`."""
     network = line_network(2)
     samples, *_ = simulate(network, point_body([600.0, -300.0, 160.0], 5.0, 0.5),
                            Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0,
@@ -82,8 +82,8 @@ def turned_pass():
         **POINT, 'track.field_error': 0.02, 'track.vehicle.near_field_lengths': [0.0]}))
     tracks, frames = [], {}
     for s in samples:
-        turned = R[network.names.index(s.sensor)] @ s.field
-        for record in pipeline.feed(one(replace(s, field=turned))):
+        rotated = R[network.names.index(s.sensor)] @ s.field
+        for record in pipeline.feed(one(replace(s, field=rotated))):
             if isinstance(record, FieldFrame):
                 frames[record.stamp_ns] = record
             elif isinstance(record, Track) and not record.ended:
@@ -91,22 +91,22 @@ def turned_pass():
     return network, tracks, frames
 
 
-def test_the_angles_are_found_within_their_deviations(turned_pass):
-    last = turned_pass[1][-1]
+def test_mounting_angles_are_estimated_within_their_standard_deviations(rotated_pass):
+    last = rotated_pass[1][-1]
     z = (last.mounting - ANGLES) / last.mounting_std
     assert np.abs(z).max() < 3.0
-    # Found, not only doubted: both sensors as a whole are better known than before the pass.
+    # The angles of both sensors together are better known than before the pass.
     assert np.linalg.norm(last.mounting - ANGLES) < 0.5 * np.linalg.norm(ANGLES)
     assert (last.mounting_std < 0.8 * np.deg2rad(5.0)).all()
 
 
-def test_the_predicted_field_is_that_of_the_published_pose(turned_pass):
-    network, tracks, frames = turned_pass
+def test_the_predicted_field_is_that_of_the_published_pose(rotated_pass):
+    network, tracks, frames = rotated_pass
     for t in tracks:
         B_s = np.einsum('jik,jk->ji', network.R_sw,
                         dipole_field(network.positions - t.position, t.moment))
         model = B_s + np.cross(t.mounting, B_s)
-        # What is left is the background; the angles move the field by up to 6e-8 T.
+        # The difference is the background; the angles change the field by up to 6e-8 T.
         assert np.abs(t.predicted - model).max() < 2.5e-8
     near = [t for t in tracks if np.hypot(*t.position[:2]) < 6.0]
     assert len(near) > 5
@@ -117,7 +117,7 @@ def test_the_predicted_field_is_that_of_the_published_pose(turned_pass):
         assert 0.0 < t.nis < 20.0 and t.degrees_of_freedom == 6
 
 
-def test_a_tracker_without_angles_publishes_none():
+def test_a_tracker_without_mounting_angles_publishes_none():
     network = line_network(2)
     tracks, *_ = drive(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
                        Path(np.array([-70.0, -1.2]), 0.0, 10.0),
@@ -128,8 +128,7 @@ def test_a_tracker_without_angles_publishes_none():
 
 @cache
 def passes(n):
-    """{mounting_std_deg: (mean NEES, RMS error [m])} of `n` passes by sensors turned by 5
-    degrees."""
+    """{mounting_std_deg: (mean NEES, RMS error [m])} of `n` passes with tilts of 5 degrees."""
     network = line_network(2, tilt=0.0)
     out = {}
     for mounting in (0.0, 5.0):
@@ -153,7 +152,7 @@ def passes(n):
 
 
 @pytest.mark.study
-def test_estimated_mounting_makes_the_covariance_honest():
+def test_estimated_mounting_angles_make_the_covariance_consistent():
     trusted, estimated = (passes(8)[mounting] for mounting in (0.0, 5.0))
     print(f'mean NEES and RMS error [m]: estimated {estimated}, trusted {trusted}')
     assert estimated[0] < 2.0
@@ -169,26 +168,26 @@ def observation(network, mounting_std_deg=5.0, error_time=0.3):
     return Observation(network, model, np.deg2rad(mounting_std_deg), error_time)
 
 
-def turned_network(*rotations, std):
-    """A network of sensors with these orientations and deviations."""
+def rotated_network(*rotations, std):
+    """Network of sensors with these orientations and standard deviations."""
     network = line_network(len(rotations), tilt=0.0)
     return replace(network, R_ws=np.array([R.as_matrix() for R in rotations]),
                    orientation_std=tuple(std))
 
 
-def test_what_is_known_about_the_worlds_axes_is_turned_into_the_sensors():
+def test_orientation_covariances_are_rotated_into_sensor_frames():
     upright, side = Rotation.identity(), Rotation.from_euler('x', 90.0, True)
     askew = Rotation.from_euler('zyx', [40.0, 20.0, -70.0], True)
-    o = observation(turned_network(upright, side, askew, side, std=(STD, STD, STD, None)))
+    o = observation(rotated_network(upright, side, askew, side, std=(STD, STD, STD, None)))
     P = o.own_covariance
     np.testing.assert_allclose(P[0, :3, :3], np.diag(STD**2), atol=1e-18)
-    # Its y axis is the world's z: about that the heading turns it.
+    # Its y axis is the world's z axis, about which the heading rotates.
     np.testing.assert_allclose(P[1, :3, :3], np.diag(STD[[0, 2, 1]]**2), atol=1e-18)
-    # A turn about the vertical, as the sensor has it, is as likely as the heading.
+    # In the sensor frame, the variance about the vertical is that of the heading.
     up = askew.inv().apply([0.0, 0.0, 1.0])
     assert up @ P[2, :3, :3] @ up == pytest.approx(STD[2]**2)
     assert np.trace(P[2, :3, :3]) == pytest.approx(STD @ STD)
-    # Nothing is known of this one but the setting.
+    # Without a stated uncertainty the setting applies.
     np.testing.assert_allclose(P[3, :3, :3], np.deg2rad(5.0)**2 * np.eye(3), atol=1e-15)
     for block in P:
         np.testing.assert_array_equal(block[3:, 3:], np.eye(3))
@@ -206,23 +205,23 @@ def test_angle_covariances_are_those_of_each_sensor():
         np.testing.assert_array_equal(found[j], P[first:first + 3, first:first + 3])
     x = np.arange(float(n))
     np.testing.assert_array_equal(o.angles(x)[1], x[o.n_target + 6:o.n_target + 9])
-    # Without angles there are none, with new errors in every frame they are all.
+    # Without angles there are none; without lasting model errors there are no other own states.
     assert observation(line_network(3), 0.0).angle_covariances(P).shape == (0, 3, 3)
     bare = observation(line_network(3), error_time=0.0)
     rows = slice(o.n_target + 6, o.n_target + 9)
     np.testing.assert_array_equal(bare.angle_covariances(P)[2], P[rows, rows])
 
 
-def test_a_narrow_prior_stays_narrow():
-    """A sensor that lies on its side, of which all but the heading is known."""
+def test_a_narrow_mounting_prior_stays_narrow():
+    """The first sensor lies on its side, and is well known except for its heading."""
     side = Rotation.from_euler('x', 90.0, True)
-    network = turned_network(side, Rotation.identity(), std=(STD, None))
+    network = rotated_network(side, Rotation.identity(), std=(STD, None))
     tracks, *_ = drive(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
                        Path(np.array([-70.0, -1.2]), 0.0, 10.0), POINT)
     live = [t for t in tracks if not t.ended]
     first, last = live[0].mounting_std, live[-1].mounting_std
     assert (last[0] <= 1.02 * STD[[0, 2, 1]]).all()
-    # Its own y axis is upright: the heading was the least known, and the tracker began with that.
+    # Its y axis is vertical, so the rotation about y starts with the uncertainty of the heading.
     assert first[0, 1] == pytest.approx(STD[2], rel=0.2)
     np.testing.assert_allclose(first[0, [0, 2]], STD[0], rtol=0.2)
     assert last[1].max() > 2.0 * STD[0]

@@ -1,4 +1,4 @@
-"""When another vehicle is sought in the frames of a track, and what becomes of its members."""
+"""Search for new targets in the frames of a track: triggers, doubts and joint tracks."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -28,8 +28,8 @@ from support.busy_worlds import NETWORKS, passing, world
 PERIOD = round(0.08 * NS)
 
 
-def asked(nis, n=20, rejected=False, is_long=False):
-    """[(frame, reason)] for which a track with innovations of this size is compared."""
+def searches(nis, n=20, rejected=False, is_long=False):
+    """[(frame, reason)] of searches in a track with innovations of this size."""
     evidence, found = NewTargetEvidence(), []
     for k in range(n):
         evidence.add(nis, 6, k * PERIOD, rejected, is_long)
@@ -38,26 +38,26 @@ def asked(nis, n=20, rejected=False, is_long=False):
     return found
 
 
-def test_innovations_as_they_should_be_ask_for_nobody():
-    assert asked(6.0) == []
+def test_consistent_innovations_trigger_no_search():
+    assert searches(6.0) == []
 
 
 @pytest.mark.parametrize('given', [{'nis': 30.0}, {'nis': 1.0, 'rejected': True}])
-def test_improbable_innovations_and_rejected_sensors_ask_for_a_newcomer(given):
-    found = asked(**given)
+def test_improbable_innovations_and_rejected_sensors_trigger_a_search(given):
+    found = searches(**given)
     assert {reason for _, reason in found} == {IMPROBABLE}
-    # Not in every frame: a search takes longer than a frame.
+    # A search takes longer than a frame, so it is not triggered in every frame.
     assert np.diff([k for k, _ in found]).min() * PERIOD >= MIN_INTERVAL_S * NS
 
 
-def test_a_long_vehicle_is_compared_less_and_less_often():
-    found = asked(6.0, n=60, is_long=True)
+def test_a_long_vehicle_triggers_searches_at_increasing_intervals():
+    found = searches(6.0, n=60, is_long=True)
     assert {reason for _, reason in found} == {LONG_VEHICLE}
     waits = np.diff([k for k, _ in found]) * PERIOD / NS
     assert waits[0] >= LONG_INTERVAL_S and (np.diff(waits) > 0.0).all()
 
 
-def test_what_is_less_probable_is_believed_the_second_time():
+def test_a_less_probable_target_is_accepted_when_it_is_found_twice():
     evidence, between = NewTargetEvidence(), 0.5 * (REPEATED_NATS + ACCEPT_NATS)
     assert evidence.accepts(ACCEPT_NATS + 0.1)
     assert [evidence.accepts(odds) for odds in (between, between)] == [False, True]
@@ -78,38 +78,38 @@ def joint_of(velocities, odds, replaced=None, adds=True):
 @pytest.mark.parametrize('odds, replaced, doubted', [
     (CONFIDENT_NATS - 1.0, None, (0, 1)), (CONFIDENT_NATS + 1.0, None, ()),
     (CONFIDENT_NATS + 1.0, 0, (0, 1))])
-def test_weak_explanations_are_doubted_and_strong_ones_of_two_in_place_of_one(
+def test_weak_explanations_and_replacements_of_a_vehicle_by_two_are_doubted(
         odds, replaced, doubted):
-    """The two go the same way."""
+    """Both vehicles drive in the same direction."""
     assert joint_of([[10.0, 0.0], [10.0, 0.0]], odds, replaced).doubtful(7) == doubted
 
 
 @pytest.mark.parametrize('new', [[0.0, 10.0], [8.0, 8.0], [19.0, 0.0], [5.0, 0.0]])
 @pytest.mark.parametrize('n_before', [1, 2])
 def test_vehicles_that_cross_or_overtake_too_fast_are_doubted_up_to_sixty_nats(new, n_before):
-    """The number of those before makes no difference."""
+    """The number of earlier vehicles makes no difference."""
     velocities = [[10.0, 0.0], [-9.0, 1.0]][:n_before] + [new]
-    everybody = tuple(range(n_before + 1))
-    assert joint_of(velocities, 59.0).doubtful(7) == everybody
+    all_members = tuple(range(n_before + 1))
+    assert joint_of(velocities, 59.0).doubtful(7) == all_members
     assert joint_of(velocities, 61.0).doubtful(7) == ()
 
 
 @pytest.mark.parametrize('new', [
     [-10.0, 2.0], [14.0, -1.0], [6.0, 0.0], [17.0, 0.0], [9.5, 4.0], [-30.0, 0.0], [-2.0, 0.0]])
 def test_vehicles_that_meet_or_overtake_are_doubted_up_to_fifteen_nats_only(new):
-    """Those that meet may be as fast as they like."""
+    """Vehicles that meet may have any speed."""
     assert joint_of([[10.0, 0.0], new], 14.0).doubtful(7) == (0, 1)
     assert joint_of([[10.0, 0.0], new], 16.0).doubtful(7) == ()
 
 
 @pytest.mark.parametrize('standing', [[0.0, 0.0], [0.3, 0.9], [0.9, 0.0]])
-def test_a_standing_vehicle_goes_nowhere(standing):
+def test_a_standing_vehicle_has_no_direction(standing):
     for velocities in ([standing, [10.0, 0.0]], [[10.0, 0.0], standing], [standing, standing]):
         assert joint_of(velocities, 16.0).doubtful(7) == ()
 
 
-def test_ways_of_those_before_are_not_compared():
-    """Two cross already; one more goes along with each of them at 26 degrees or less."""
+def test_directions_of_earlier_vehicles_are_not_compared():
+    """Two vehicles cross already; the new one is within 26 degrees of both."""
     before, new = [[10.0, 4.8], [10.0, -4.8]], [10.0, 0.0]
     assert joint_of([*before, new], 16.0).doubtful(7) == ()
     assert joint_of([new, *before], 16.0).doubtful(7) == (0, 1, 2)
@@ -118,18 +118,18 @@ def test_ways_of_those_before_are_not_compared():
 @pytest.mark.parametrize('first, second, doubted', [
     ([0.0, 10.0], [10.0, 0.0], (0, 1, 2)), ([10.0, 0.0], [0.0, 10.0], (0, 1, 2)),
     ([-10.0, 0.0], [10.0, 0.0], ()), ([-10.0, 0.0], [-11.0, 0.0], (1, 2))])
-def test_of_two_in_place_of_one_both_are_compared(first, second, doubted):
-    """Beside a third one; the two that came in the place of another are the last."""
+def test_both_vehicles_that_replace_one_are_compared(first, second, doubted):
+    """There is a third vehicle; the two that replace another one are the last."""
     assert joint_of([[12.0, 0.0], first, second], 16.0, 0).doubtful(7) == doubted
 
 
-def test_of_a_vehicle_elsewhere_only_that_one_is_doubted_whichever_way_it_goes():
+def test_a_vehicle_at_another_place_is_doubted_alone():
     for elsewhere in ([0.0, 10.0], [9.0, 0.0]):
         joint = joint_of([[10.0, 0.0], elsewhere], 16.0, 0, adds=False)
         assert joint.doubtful(7) == (1,)
 
 
-def test_the_best_hypothesis_counts():
+def test_the_best_hypothesis_decides_about_doubts():
     joint = joint_of([[10.0, 0.0], [0.0, 10.0]], 16.0)
     bank = joint.bank
     both = FilterBank(np.vstack([bank.x, joint_of([[10.0, 0.0], [11.0, 0.0]], 0.0).bank.x]),
@@ -138,30 +138,30 @@ def test_the_best_hypothesis_counts():
     assert Joint(both, None, None, 16.0, None, True).doubtful(7) == ()
 
 
-def test_vehicles_in_one_lane_may_not_be_in_each_other():
+def test_overlap_of_vehicles_is_measured_along_a_lane():
     path = np.zeros((2, 2 * 7))
     path[:, 3], path[:, 10] = 10.0, 10.0
     path[:, 6], path[:, 13] = 3.0, 5.0
     for ahead, aside, depth in ((20.0, 0.0, 0.0), (3.0, 0.0, 2.0), (3.0, 3.5, 0.0)):
         path[:, 7], path[:, 8] = [20.0, ahead], aside
-        # The rows reach 4 m, and the bodies one more.
+        # Half the lengths of both rows add up to 4 m, and the bodies extend one metre further.
         assert overlap_depth(path, 7, 2, 6) == pytest.approx(depth)
 
 
-def test_a_block_goes_into_a_covariance_without_correlation():
+def test_a_block_is_inserted_into_a_covariance_without_correlation():
     P = inserted(np.full((3, 3), 2.0), np.full((2, 2), 5.0), 1)
     rows = [0, 3, 4]
     assert (P[np.ix_(rows, rows)] == 2.0).all() and (P[1:3, 1:3] == 5.0).all()
     assert not P[np.ix_(rows, [1, 2])].any()
 
 
-def test_pairs_are_put_into_the_order_of_the_first():
+def test_pairs_are_sorted_like_the_first_one():
     first = np.array([[0.0, 0.0], [10.0, 0.0]])
     for pair in (first + 1.0, (first + 1.0)[::-1]):
         np.testing.assert_array_equal(in_order_of(first, pair), first + 1.0)
 
 
-def test_a_member_alone_is_the_marginal_of_all():
+def test_a_single_member_is_the_marginal_of_the_joint_state():
     rng = np.random.default_rng(0)
     root = rng.standard_normal((2, 9, 9))
     bank = FilterBank(rng.standard_normal((2, 9)), root @ np.swapaxes(root, 1, 2),
@@ -170,56 +170,56 @@ def test_a_member_alone_is_the_marginal_of_all():
     for i, others in ((0, 1), (1, 0)):
         columns = [*range(3 * i, 3 * i + 3), 6, 7, 8]
         view, rest = bank.extract_target(i, 3), bank.without_target(others, 3)
-        for one in (view, rest):
-            np.testing.assert_array_equal(one.x, bank.x[:, columns])
-            np.testing.assert_array_equal(one.P, bank.P[:, columns][:, :, columns])
-            np.testing.assert_array_equal(one.label, bank.label[:, i])
-            np.testing.assert_array_equal(one.kind, bank.kind[:, i])
-            np.testing.assert_array_equal(one.log_w, bank.log_w)
+        for part in (view, rest):
+            np.testing.assert_array_equal(part.x, bank.x[:, columns])
+            np.testing.assert_array_equal(part.P, bank.P[:, columns][:, :, columns])
+            np.testing.assert_array_equal(part.label, bank.label[:, i])
+            np.testing.assert_array_equal(part.kind, bank.kind[:, i])
+            np.testing.assert_array_equal(part.log_w, bank.log_w)
 
 
 @pytest.fixture(scope='module')
 def meeting():
     """(`World`, records, pipeline) of two cars that meet at four sensors."""
     rng = np.random.default_rng(3)
-    a_world = world(NETWORKS[4], [passing(rng, 'clouds', 12.0, 1, 12.0),
-                                  passing(rng, 'clouds', 12.4, -1, 15.0)], 20.0, rng, rate=50.0)
-    pipeline = Pipeline(a_world.network, settings_for('vehicle'))
-    return a_world, pipeline.feed(a_world.readings) + pipeline.flush(), pipeline
+    scene = world(NETWORKS[4], [passing(rng, 'clouds', 12.0, 1, 12.0),
+                                passing(rng, 'clouds', 12.4, -1, 15.0)], 20.0, rng, rate=50.0)
+    pipeline = Pipeline(scene.network, settings_for('vehicle'))
+    return scene, pipeline.feed(scene.readings) + pipeline.flush(), pipeline
 
 
-def test_two_that_meet_keep_their_tracks(meeting):
-    a_world, records, pipeline = meeting
+def test_two_vehicles_that_meet_keep_their_tracks(meeting):
+    scene, records, pipeline = meeting
     tracks = [r for r in records if isinstance(r, Track)]
     assert {t.id for t in tracks} == {1, 2} and pipeline.track.counts['tracks of new targets'] == 1
     score = busy_worlds.score([t for t in tracks if not t.ended],
-                              [(a_world.t, p) for p in a_world.positions])
+                              [(scene.t, p) for p in scene.positions])
     assert score.is_found.all() and score.rms.max() <= 1.0, str(score)
     assert sum(t.ended for t in tracks) == 2
 
 
-def test_they_are_smoothed_together(meeting):
-    """Each once, in order, and nearer to the truth than the poses were."""
-    a_world, records, _ = meeting
+def test_two_vehicles_that_meet_are_smoothed_together(meeting):
+    """Each pose is smoothed once and in order, with a mean error of 0.6 m or less."""
+    scene, records, _ = meeting
     for id in (1, 2):
         poses = [r for r in records if isinstance(r, SmoothedPose) and r.id == id]
         stamps = [p.stamp_ns for p in poses]
         assert stamps == sorted(set(stamps)) and len(stamps) > 10
-        error = min(busy_worlds.errors_of(poses, a_world.t, position)[0].mean()
-                    for position in a_world.positions)
+        error = min(busy_worlds.errors_of(poses, scene.t, position)[0].mean()
+                    for position in scene.positions)
         assert error <= 0.6
 
 
-def test_slow_sensors_that_take_turns_find_a_newcomer():
-    """At 5 Hz, and at times of its own, each is in less than half of the frames."""
+def test_slow_sensors_at_staggered_times_find_a_new_target():
+    """At 5 Hz and at its own times, each sensor is in less than half of the frames."""
     rng, n_sensors = np.random.default_rng(3), 4
-    a_world = world(NETWORKS[n_sensors], [passing(rng, 'clouds', 14.0, 1, 9.0),
-                                          passing(rng, 'clouds', 14.5, -1, 9.0)], 24.0, rng,
-                    rate=5.0)
-    readings = a_world.readings
+    scene = world(NETWORKS[n_sensors], [passing(rng, 'clouds', 14.0, 1, 9.0),
+                                        passing(rng, 'clouds', 14.5, -1, 9.0)], 24.0, rng,
+                  rate=5.0)
+    readings = scene.readings
     stamps = readings.stamp_ns + np.round(readings.sensor * 0.2 * NS / n_sensors).astype(np.int64)
     order = np.argsort(stamps, kind='stable')
-    pipeline = Pipeline(a_world.network, settings_for('vehicle'))
+    pipeline = Pipeline(scene.network, settings_for('vehicle'))
     pipeline.feed(replace(readings, sensor=readings.sensor[order], stamp_ns=stamps[order],
                           field=readings.field[order],
                           covariance=None if readings.covariance is None
@@ -228,12 +228,12 @@ def test_slow_sensors_that_take_turns_find_a_newcomer():
     assert pipeline.track.counts['tracks of new targets'] == 1
 
 
-def test_it_does_not_depend_on_how_the_readings_are_split(meeting):
-    a_world, records, _ = meeting
-    pipeline = Pipeline(a_world.network, settings_for('vehicle'))
+def test_joint_tracks_do_not_depend_on_batches(meeting):
+    scene, records, _ = meeting
+    pipeline = Pipeline(scene.network, settings_for('vehicle'))
     again = []
-    for start in range(0, len(a_world.readings), 37):
-        again += pipeline.feed(a_world.readings.part(slice(start, start + 37)))
+    for start in range(0, len(scene.readings), 37):
+        again += pipeline.feed(scene.readings.part(slice(start, start + 37)))
     again += pipeline.flush()
     for kind in (Track, SmoothedPose):
         a, b = ([(r.id, r.stamp_ns, *r.position) for r in found if isinstance(r, kind)]
@@ -243,30 +243,30 @@ def test_it_does_not_depend_on_how_the_readings_are_split(meeting):
 
 @pytest.fixture(scope='module')
 def following():
-    """(`World`, records) of two cars, of which the first is out of reach before the second."""
+    """(`World`, records) of two cars; the first one is out of reach before the second."""
     rng = np.random.default_rng(5)
-    a_world = world(NETWORKS[4], [passing(rng, 'clouds', 12.0, 1, 6.0),
-                                  passing(rng, 'clouds', 15.5, 1, 6.5)], 26.0, rng, rate=50.0)
-    pipeline = Pipeline(a_world.network, settings_for('vehicle'))
-    return a_world, pipeline.feed(a_world.readings) + pipeline.flush()
+    scene = world(NETWORKS[4], [passing(rng, 'clouds', 12.0, 1, 6.0),
+                                passing(rng, 'clouds', 15.5, 1, 6.5)], 26.0, rng, rate=50.0)
+    pipeline = Pipeline(scene.network, settings_for('vehicle'))
+    return scene, pipeline.feed(scene.readings) + pipeline.flush()
 
 
-def test_one_that_leaves_takes_nothing_from_the_other(following):
-    """Neither the states that are smoothed, nor what it was before they shared them."""
-    a_world, records = following
+def test_smoothed_poses_are_complete_after_one_of_two_vehicles_leaves(following):
+    """Also the poses from before the two vehicles shared a state."""
+    scene, records = following
     tracks = [r for r in records if isinstance(r, Track)]
     ends = {t.id: t.stamp_ns for t in tracks if t.ended}
     assert len(ends) == 2 and ends[1] < ends[2] - NS // 2
-    for id, position in zip((1, 2), a_world.positions, strict=True):
+    for id, position in zip((1, 2), scene.positions, strict=True):
         smoothed = [r for r in records if isinstance(r, SmoothedPose) and r.id == id]
         stamps = {s.stamp_ns for s in smoothed}
         assert {t.stamp_ns for t in tracks if t.id == id} <= stamps
-        error, *_, true = busy_worlds.errors_of(smoothed, a_world.t, position)
+        error, *_, true = busy_worlds.errors_of(smoothed, scene.t, position)
         assert error[np.hypot(*true.T) < 8.0].max() <= 1.0
 
 
 @pytest.mark.parametrize('is_first', [True, False])
-def test_of_two_in_place_of_one_that_is_it_which_was_where_it_was(is_first):
+def test_the_replacement_at_the_earlier_place_keeps_the_track(is_first):
     places = np.array([[0.0, 0.0], [30.0, 0.0]])
 
     class Known:
@@ -276,7 +276,7 @@ def test_of_two_in_place_of_one_that_is_it_which_was_where_it_was(is_first):
             return float(np.hypot(*(path - places[0 if is_first else 1]).T).mean())
 
     class Found:
-        """Two vehicles of two states in place of the second of two, at these places."""
+        """Two vehicles of two states that replace the second of two, at these places."""
 
         replaced = 1
         bank = SimpleNamespace(best=lambda: 0)

@@ -1,4 +1,4 @@
-"""The compiled fit of a pass against the same in NumPy, and what it refuses."""
+"""Compiled fit of a pass: comparison with NumPy, and refused arguments."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def samples_of(network, clocks, path=STRAIGHT):
 
 
 def starts_of(path, free, n=3):
-    """(n, n_free) near the true path, farther each."""
+    """(n, n_free) start values at increasing distances from the true path."""
     whole = np.append(path, np.zeros(3))[free]
     away = np.random.default_rng(6).standard_normal((n, len(free))) * [[0.02], [0.05], [0.1]][:n]
     return whole + away * np.where(free >= N_STRAIGHT, 0.1, 1.0)
@@ -31,8 +31,8 @@ def starts_of(path, free, n=3):
     (ROAD, TURNS, (0.0,), np.arange(N_PATH)),
     (ROAD, STRAIGHT, (0.1,), np.append(np.arange(N_STRAIGHT), N_PATH)),
     (FOUR, STRAIGHT, (0.0, 0.1, 0.0), np.append(np.arange(N_STRAIGHT), N_PATH + np.arange(3)))])
-def test_a_pass_is_fitted_as_by_numpy(network, path, clocks, free, n_dipoles):
-    """One start at a time: the fit returns the best one. Iterations amplify rounding errors."""
+def test_the_fit_of_a_pass_matches_numpy(network, path, clocks, free, n_dipoles):
+    """One start per fit, which returns the best one. Iterations amplify rounding errors."""
     data = samples_of(network, clocks, path)
     if n_dipoles == 1:
         # One dipole has no length.
@@ -49,7 +49,7 @@ def test_a_pass_is_fitted_as_by_numpy(network, path, clocks, free, n_dipoles):
         assert np.abs((got_P - P[0]) / np.outer(std, std)).max() < 1e-3
 
 
-def test_the_best_start_is_returned_and_one_of_no_use_costs_infinity():
+def test_the_best_start_is_returned_and_an_invalid_one_costs_infinity():
     data, free = samples_of(ROAD, (0.1,)), np.arange(N_STRAIGHT)
     starts = starts_of(STRAIGHT, free)
     each = [data.fit(3, free, start[None])[1] for start in starts]
@@ -59,8 +59,8 @@ def test_the_best_start_is_returned_and_one_of_no_use_costs_infinity():
     assert cost == np.inf and not P.any()
 
 
-def test_directions_that_nothing_determines_have_no_variance():
-    """The length of a row whose dipoles are one: as the pseudo-inverse has it."""
+def test_undetermined_parameters_have_zero_variance():
+    """The length of a row of one dipole is undetermined; the pseudo-inverse gives zero as well."""
     data = samples_of(ROAD, (0.0,))
     free = np.arange(N_STRAIGHT)
     _, cost, P = data.fit(1, free, STRAIGHT[None, :N_STRAIGHT])
@@ -68,8 +68,8 @@ def test_directions_that_nothing_determines_have_no_variance():
     assert (np.diagonal(P)[:N_STRAIGHT - 1] > 0.0).all()
 
 
-def test_pseudo_inverses_in_the_fit_are_those_of_numpy():
-    """One parameter twice: only the sum of the two is determined."""
+def test_the_pseudo_inverse_of_the_fit_matches_numpy():
+    """One parameter is given twice, so that only the sum of the two is determined."""
     data = samples_of(ROAD, (0.0,))
     free = np.arange(N_STRAIGHT)
     model = SteadyPass(data.t, data.positions, data.M, data.clock, free,
@@ -85,8 +85,8 @@ def test_pseudo_inverses_in_the_fit_are_those_of_numpy():
 
 
 @pytest.mark.parametrize('length', [1e-1, 1e-2, 1e-3])
-def test_dipoles_that_are_almost_at_one_place_are_fitted_as_by_numpy(length):
-    """A start without steps."""
+def test_the_fit_of_almost_coincident_dipoles_matches_numpy(length):
+    """The start is evaluated without any step."""
     data = samples_of(ROAD, (0.0,))
     free = np.array([PATH.index('x'), PATH.index('length')])
     fixed = np.append(STRAIGHT, 0.0)
@@ -103,7 +103,7 @@ def test_dipoles_that_are_almost_at_one_place_are_fitted_as_by_numpy(length):
         linear_rank=LINEAR_RANK_TOLERANCE, rank=PSEUDO_INVERSE_TOLERANCE)
     residual, J = problem.residual_and_jacobian(theta)
     assert cost[0] == pytest.approx(float(residual[0] @ residual[0]), rel=1e-6)
-    # Eigenvalues near the limit are known to a few digits only.
+    # Eigenvalues near the limit are accurate to a few digits only.
     np.testing.assert_allclose(P[0], pseudo_inverse((J[0].T @ J[0])[None])[0], rtol=0.3)
 
 
@@ -118,7 +118,7 @@ def test_dipoles_that_are_almost_at_one_place_are_fitted_as_by_numpy(length):
     ('M', np.zeros((3, 3, 3)), 'M: shape does not match'),
     ('combinations', np.eye(2), 'combinations: shape does not match'),
     ('covariance', np.zeros((1, 3, 3)), 'covariance: shape does not match')])
-def test_arrays_of_other_sizes_are_refused(name, value, error):
+def test_arrays_of_wrong_sizes_are_refused(name, value, error):
     arguments = {
         'theta': np.zeros((1, 2)), 'cost': np.zeros(1), 'covariance': np.zeros((1, 2, 2)),
         'free': np.arange(2), 'fixed': np.zeros(N_PATH + 1), 'places': np.zeros(1),

@@ -1,4 +1,4 @@
-"""Records of a track stay as they were published."""
+"""Published records of a track are not modified later."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
 
 
 def arrays_of(value, depth=0):
-    """The arrays in a record, however deep."""
+    """All arrays in a record and in the objects that it contains."""
     if isinstance(value, np.ndarray):
         yield value
     elif dataclasses.is_dataclass(value):
@@ -26,17 +26,17 @@ def arrays_of(value, depth=0):
 
 
 @pytest.mark.parametrize('lag_s', [0.0, 0.5])
-def test_no_record_has_a_part_of_the_bank(lag_s):
-    """The filter writes into the states and covariances of its bank."""
-    network, n = read_network(NETWORK_FILE), 0
+def test_records_share_no_memory_with_the_bank(lag_s):
+    """The filter modifies the states and covariances of its bank in place."""
+    network, n_records = read_network(NETWORK_FILE), 0
     pipeline = Pipeline(network, settings_for('vehicle', {'track.smoothing_lag_s': lag_s}))
     for readings in SampleReader(Recording(vehicle_path(VEHICLES[0])), network).readings():
         for record in pipeline.feed(readings):
             bank = pipeline.track.bank
             if not isinstance(record, (Track, SmoothedPose)) or bank is None:
                 continue
-            n += 1
+            n_records += 1
             for array in arrays_of(record):
                 assert not np.shares_memory(array, bank.x)
                 assert not np.shares_memory(array, bank.P)
-    assert n > 30
+    assert n_records > 30

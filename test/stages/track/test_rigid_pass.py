@@ -1,4 +1,4 @@
-"""A whole pass at once: clocks that are apart, and what no vehicle on a steady path explains."""
+"""Fit of a steady path to a whole pass: clock offsets, misfits, and differences from tracks."""
 
 from dataclasses import replace
 
@@ -13,122 +13,122 @@ from mag_tracking.units import NS
 from support.steady_frames import FOUR, ROAD, STRAIGHT, TURNS, state_at, steady_frames
 
 
-def found(made, network=ROAD, path=STRAIGHT):
-    """From a start half a metre and a tenth of the speed off."""
+def fitted(frames, network=ROAD, path=STRAIGHT):
+    """`RigidPass` from a start that is off by half a metre and a tenth of the speed."""
     c, s = np.cos(path[4]), np.sin(path[4])
     start = np.array([path[0] + 0.5, path[1], 0.5, 0.9 * path[3] * c, 0.9 * path[3] * s, 0.0])
-    return fit_rigid_pass(network, made, 0, start[None])
+    return fit_rigid_pass(network, frames, 0, start[None])
 
 
 @pytest.mark.parametrize('offset', [0.0, 0.1, -0.2, 0.35])
-def test_the_clock_of_the_other_sensor_is_found(offset):
-    """Within three deviations, which hold a model error that is not there."""
-    said = found(steady_frames(np.random.default_rng(1), clocks=(offset,)))
-    # The second sensor has the stronger field: the clocks are compared to its own.
-    assert said.reference == 1
-    assert abs(said.offset[0] + offset) < 3.0 * said.offset_std[0] < 0.1
-    assert said.is_explained and said.needs_clocks_apart is (offset != 0.0)
+def test_the_clock_offset_of_the_other_sensor_is_found(offset):
+    """Within three standard deviations, which include a model error that is absent here."""
+    fit = fitted(steady_frames(np.random.default_rng(1), clocks=(offset,)))
+    # The second sensor has the stronger field, so it is the reference of the clocks.
+    assert fit.reference == 1
+    assert abs(fit.offset[0] + offset) < 3.0 * fit.offset_std[0] < 0.1
+    assert fit.is_explained and fit.needs_clocks_apart is (offset != 0.0)
 
 
 def test_offsets_have_the_sign_of_a_clock_that_is_ahead():
     for nearer, sign in ((1.0, -1.0), (-1.0, 1.0)):
         path = np.where(np.arange(N_PATH) == 1, nearer, STRAIGHT)
-        said = found(steady_frames(np.random.default_rng(1), path=path, clocks=(0.1,)), path=path)
-        assert said.reference == (1 if nearer > 0.0 else 0)
-        assert np.nansum(said.offset) == pytest.approx(0.1 * sign, abs=0.03)
+        fit = fitted(steady_frames(np.random.default_rng(1), path=path, clocks=(0.1,)), path=path)
+        assert fit.reference == (1 if nearer > 0.0 else 0)
+        assert np.nansum(fit.offset) == pytest.approx(0.1 * sign, abs=0.03)
 
 
-def test_deviations_of_clocks_are_no_smaller_than_errors():
-    """Noise alone: a row that fits has no model error, so that they are too large."""
+def test_standard_deviations_of_clock_offsets_cover_their_errors():
+    """There is noise only: without model errors the standard deviations are too large."""
     rng = np.random.default_rng(2)
     z = []
     for _ in range(30):
-        said = found(steady_frames(rng))
-        z.append(np.nansum(said.offset) / np.nansum(said.offset_std))
+        fit = fitted(steady_frames(rng))
+        z.append(np.nansum(fit.offset) / np.nansum(fit.offset_std))
     print(f'mean squared error of the clock, in variances: {np.mean(np.square(z)):.2f}')
-    # Chi-square with 30 degrees of freedom is larger once in two hundred times.
+    # Chi-square with 30 degrees of freedom exceeds this once in two hundred times.
     assert np.mean(np.square(z)) < 1.8
 
 
-def test_several_clocks_are_compared_at_once_with_a_dead_axis():
+def test_several_clocks_are_compared_despite_a_dead_axis():
     def dead(B):
         B = B.copy()
         B[:, 2, 1] = np.nan
         return B
 
-    said = found(steady_frames(np.random.default_rng(3), FOUR, clocks=(0.0, 0.15, 0.0),
+    fit = fitted(steady_frames(np.random.default_rng(3), FOUR, clocks=(0.0, 0.15, 0.0),
                                change=dead), FOUR)
-    offsets = said.offset - said.offset[0]
+    offsets = fit.offset - fit.offset[0]
     np.testing.assert_allclose(offsets, [0.0, 0.0, 0.15, 0.0], atol=0.02)
-    assert said.needs_clocks_apart
+    assert fit.needs_clocks_apart
 
 
-def test_a_turn_is_no_clock():
-    said = found(steady_frames(np.random.default_rng(4), path=TURNS), path=TURNS)
-    assert not said.needs_clocks_apart and not said.is_straight
-    assert said.misfit < 1.2
+def test_a_turn_is_not_a_clock_offset():
+    fit = fitted(steady_frames(np.random.default_rng(4), path=TURNS), path=TURNS)
+    assert not fit.needs_clocks_apart and not fit.is_straight
+    assert fit.misfit < 1.2
 
 
 @pytest.mark.parametrize('change', [
     lambda B: np.clip(B, -0.3 * np.abs(B).max(), 0.3 * np.abs(B).max()),
     lambda B: B + np.roll(B, 9, axis=0)[:, ::-1],
     lambda B: B * np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])])
-def test_no_steady_path_explains_what_no_vehicle_makes(change):
+def test_no_steady_path_explains_the_field_of_no_vehicle(change):
     """A clipped field, a second vehicle on the other lane, a flipped axis."""
-    said = found(steady_frames(np.random.default_rng(5), change=change))
-    assert said.misfit > 1.5 and not said.needs_clocks_apart
+    fit = fitted(steady_frames(np.random.default_rng(5), change=change))
+    assert fit.misfit > 1.5 and not fit.needs_clocks_apart
 
 
-def test_a_model_error_of_the_stated_size_is_explained():
+def test_a_model_error_of_the_stated_size_is_accepted():
     rng = np.random.default_rng(6)
-    said = found(steady_frames(rng, change=lambda B: B * (1.0 + MODEL_ERROR * rng.standard_normal(
+    fit = fitted(steady_frames(rng, change=lambda B: B * (1.0 + MODEL_ERROR * rng.standard_normal(
         B.shape))))
-    assert said.misfit < 1.3 and not said.needs_clocks_apart
+    assert fit.misfit < 1.3 and not fit.needs_clocks_apart
 
 
 @pytest.mark.parametrize('change', [
     lambda B: np.where(np.arange(2)[:, None] == 0, np.nan, B),
     lambda B: np.full_like(B, np.nan)])
-def test_one_sensor_or_none_compares_no_clocks(change):
-    assert found(steady_frames(np.random.default_rng(7), change=change)) is None
-    assert found(steady_frames(np.random.default_rng(7))[:4]) is None
+def test_a_fit_needs_two_sensors_and_enough_frames(change):
+    assert fitted(steady_frames(np.random.default_rng(7), change=change)) is None
+    assert fitted(steady_frames(np.random.default_rng(7))[:4]) is None
 
 
-def test_the_closest_point_is_that_of_the_nearest_sensor():
-    said = found(steady_frames(np.random.default_rng(8)))
-    away = np.linalg.norm(said.closest(ROAD.positions) - ROAD.positions, axis=1)
+def test_the_cpa_is_that_of_the_nearest_sensor():
+    fit = fitted(steady_frames(np.random.default_rng(8)))
+    away = np.linalg.norm(fit.closest(ROAD.positions) - ROAD.positions, axis=1)
     assert away.min() == pytest.approx(3.5, abs=0.2)
-    assert said.speed == pytest.approx(20.0, rel=0.1)
+    assert fit.speed == pytest.approx(20.0, rel=0.1)
 
 
-def test_the_difference_is_that_from_the_nearest_path_and_horizontal():
-    said = replace(found(steady_frames(np.random.default_rng(9))), straight_paths=np.array(
+def test_the_difference_from_the_nearest_path_is_horizontal():
+    fit = replace(fitted(steady_frames(np.random.default_rng(9))), straight_paths=np.array(
         [[0.0, 1.0, 0.5, 10.0, 0.0, 0.1], [0.0, 5.0, 0.5, 20.0, 0.0, 0.1]]))
     state = np.array([21.0, 2.0, 3.0, 11.0, 0.5, 0.0])
-    np.testing.assert_allclose(said.difference(2 * NS, state), [1.0, 1.0, 0.0, 1.0, 0.5, 0.0])
-    np.testing.assert_allclose(said.difference(NS, state), [1.0, -3.0, 0.0, -9.0, 0.5, 0.0])
-    assert not replace(said, straight_paths=np.zeros((0, 6))).difference(2 * NS, state).any()
+    np.testing.assert_allclose(fit.difference(2 * NS, state), [1.0, 1.0, 0.0, 1.0, 0.5, 0.0])
+    np.testing.assert_allclose(fit.difference(NS, state), [1.0, -3.0, 0.0, -9.0, 0.5, 0.0])
+    assert not replace(fit, straight_paths=np.zeros((0, 6))).difference(2 * NS, state).any()
 
 
-def test_paths_that_may_explain_a_pass_are_where_the_vehicle_was():
-    said = found(steady_frames(np.random.default_rng(9)))
-    assert len(said.straight_paths) == 2
-    for x in said.straight_paths:
+def test_paths_that_explain_a_pass_are_near_the_true_path():
+    fit = fitted(steady_frames(np.random.default_rng(9)))
+    assert len(fit.straight_paths) == 2
+    for x in fit.straight_paths:
         assert np.hypot(*(x - state_at(0.0))[:2]) < 0.5
         assert np.hypot(*(x - state_at(0.0))[3:5]) < 1.0
     # A vehicle that turns is on no straight path.
-    assert not len(found(steady_frames(np.random.default_rng(4), path=TURNS),
-                         path=TURNS).straight_paths)
+    assert not len(fitted(steady_frames(np.random.default_rng(4), path=TURNS),
+                          path=TURNS).straight_paths)
 
 
-@pytest.mark.parametrize('limit, most', [('MAX_DISTANCE', 3.0), ('MAX_SPEED', 15.0)])
-def test_paths_that_are_too_far_or_too_fast_explain_nothing(monkeypatch, limit, most):
+@pytest.mark.parametrize('limit, value', [('MAX_DISTANCE', 3.0), ('MAX_SPEED', 15.0)])
+def test_paths_that_are_too_far_or_too_fast_are_rejected(monkeypatch, limit, value):
     """This vehicle passes one sensor at 3.5 m, the other at 5.5 m, at 20 m/s."""
-    monkeypatch.setattr(rigid_pass, limit, most)
-    said = found(steady_frames(np.random.default_rng(9)))
-    assert said.misfit < 1.3 and not len(said.straight_paths)
+    monkeypatch.setattr(rigid_pass, limit, value)
+    fit = fitted(steady_frames(np.random.default_rng(9)))
+    assert fit.misfit < 1.3 and not len(fit.straight_paths)
 
 
-def test_a_path_that_is_near_to_one_sensor_is_near(monkeypatch):
+def test_a_path_near_one_sensor_is_accepted(monkeypatch):
     monkeypatch.setattr(rigid_pass, 'MAX_DISTANCE', 4.5)
-    assert len(found(steady_frames(np.random.default_rng(9))).straight_paths) == 2
+    assert len(fitted(steady_frames(np.random.default_rng(9))).straight_paths) == 2

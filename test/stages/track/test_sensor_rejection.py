@@ -1,4 +1,4 @@
-"""A sensor that contradicts the others is left out; nothing else is, and nothing is paid for it."""
+"""Rejection of sensors that contradict the others: what is rejected, its limits and its cost."""
 
 import copy
 import dataclasses
@@ -30,7 +30,7 @@ OFF = np.array([3e-5, -2e-5, 4e-5])
 DT = 0.08
 
 
-class Counted(BankFilter):
+class CountingFilter(BankFilter):
     """Counts its updates of whole banks."""
 
     n = 0
@@ -45,7 +45,7 @@ def situation(n=6, seed=0, spread=0.3, n_hyp=5):
     rng = np.random.default_rng(seed)
     network = line_network(n, spacing=4.0, tilt=0.2)
     model = vehicle_model(SETTINGS.vehicle, network)
-    bank_filter = Counted(network, model, SETTINGS)
+    bank_filter = CountingFilter(network, model, SETTINGS)
     state = np.array([*TARGET, 10.0, 0.0, 0.0, *(MOMENT - 4.0 * network.earth_field / MU0),
                       4.0, 4.0, 4.0])
     x = np.tile(state, (n_hyp, 1))
@@ -62,7 +62,7 @@ def situation(n=6, seed=0, spread=0.3, n_hyp=5):
     return bank_filter, bank, frame, network.names
 
 
-def spoilt(frame, *rows, size=1.0):
+def faulty(frame, *rows, size=1.0):
     field = frame.field.copy()
     for k, j in enumerate(rows):
         field[j] += (1.0 + k) * size * OFF
@@ -70,7 +70,7 @@ def spoilt(frame, *rows, size=1.0):
 
 
 def without(frame, *rows):
-    """The frame as the alignment gives it when those sensors are missing."""
+    """The frame as the alignment returns it if those sensors are missing."""
     rows = list(rows)
     field, covariance = frame.field.copy(), frame.covariance.copy()
     n_samples, offset = frame.n_samples.copy(), frame.time_offset.copy()
@@ -90,13 +90,13 @@ def same_frame(a, b):
 
 
 def plain(bank_filter, bank, frame):
-    """(log-likelihood, state) of the update alone."""
+    """(log-likelihood, state) of the update without rejection."""
     bank = copy.deepcopy(bank)
     return bank_filter.advance(bank, frame, DT)[1], state(bank)
 
 
 @pytest.mark.parametrize('n', [1, 2, 3, 6, 12])
-def test_where_all_fits_nothing_changes_and_one_update_is_all_it_costs(n):
+def test_a_frame_that_fits_is_not_changed_and_costs_one_update(n):
     bank_filter, bank, frame, names = situation(n)
     expected, after = plain(bank_filter, bank, frame)
     bank_filter.n = 0
@@ -108,25 +108,25 @@ def test_where_all_fits_nothing_changes_and_one_update_is_all_it_costs(n):
 
 @pytest.mark.parametrize('n', [2, 3, 6])
 @pytest.mark.parametrize('seed', range(3))
-def test_one_that_is_wrong_is_left_out_as_if_it_were_missing(n, seed):
+def test_a_wrong_sensor_is_rejected_as_if_it_were_missing(n, seed):
     bank_filter, bank, frame, names = situation(n, seed)
     for j in range(n) if n > 2 else ():
-        mine = copy.deepcopy(bank)
+        updated = copy.deepcopy(bank)
         expected, after = plain(bank_filter, bank, without(frame, j))
         _, got, used, counts = SensorRejection(names).advance(
-            bank_filter, mine, spoilt(frame, j), DT)
+            bank_filter, updated, faulty(frame, j), DT)
         assert counts == {f'frames in which {names[j]} was rejected': 1}
-        assert got.tobytes() == expected.tobytes() and state(mine) == after
+        assert got.tobytes() == expected.tobytes() and state(updated) == after
         assert same_frame(used, without(frame, j))
     if n == 2:
-        # Which of two it is cannot be told, but one is left out and the other used.
-        *_, used, counts = SensorRejection(names).advance(bank_filter, bank, spoilt(frame, 1), DT)
+        # With two sensors the wrong one is unknown, but one is rejected and the other is used.
+        *_, used, counts = SensorRejection(names).advance(bank_filter, bank, faulty(frame, 1), DT)
         assert sum(counts.values()) == 1 and np.count_nonzero(used.n_samples) == 1
 
 
-def test_the_frame_and_the_prior_are_not_written_into():
+def test_the_frame_and_the_prior_are_not_modified():
     bank_filter, bank, frame, names = situation()
-    wrong = spoilt(frame, 2)
+    wrong = faulty(frame, 2)
     kept = copy.deepcopy(wrong)
     before, prior = (bank.x, bank.P), (bank.x.copy(), bank.P.copy())
     SensorRejection(names).advance(bank_filter, bank, wrong, DT)
@@ -134,26 +134,26 @@ def test_the_frame_and_the_prior_are_not_written_into():
     assert all(np.array_equal(a, b) for a, b in zip(before, prior, strict=True))
 
 
-@pytest.mark.parametrize('n, most', [(2, 1), (6, 1), (15, 1), (16, 2), (24, 3)])
-def test_never_more_than_one_in_eight_but_always_one(n, most):
-    assert most == max(1, n // SENSORS_PER_REJECTION)
-    for wrong in (most, most + 1):
+@pytest.mark.parametrize('n, max_rejected', [(2, 1), (6, 1), (15, 1), (16, 2), (24, 3)])
+def test_one_in_eight_sensors_and_at_least_one_may_be_rejected(n, max_rejected):
+    assert max_rejected == max(1, n // SENSORS_PER_REJECTION)
+    for wrong in (max_rejected, max_rejected + 1):
         bank_filter, bank, frame, names = situation(n, n_hyp=2)
-        # Those that are near: what is far away agrees with everything.
+        # The sensors near the target, because those far away agree with everything.
         near = np.argsort(np.linalg.norm(frame.field, axis=1))[-wrong:].tolist()
-        bad = spoilt(frame, *near)
+        bad = faulty(frame, *near)
         whole, after = plain(bank_filter, bank, bad)
         _, got, used, counts = SensorRejection(names).advance(bank_filter, bank, bad, DT)
-        if wrong == most and n > 2:
+        if wrong == max_rejected and n > 2:
             assert set(counts) == {f'frames in which {names[j]} was rejected' for j in near}
             assert same_frame(used, without(frame, *near))
-        elif wrong > most:
-            # The frame as a whole, bit for bit: it is the track that is lost.
+        elif wrong > max_rejected:
+            # The whole frame is used, bit for bit: the track itself is lost.
             assert not counts and used is bad
             assert got.tobytes() == whole.tobytes() and state(bank) == after
 
 
-def test_all_wrong_is_a_track_that_is_lost():
+def test_no_sensor_is_rejected_if_all_of_them_contradict_the_track():
     bank_filter, bank, frame, names = situation()
     lost = dataclasses.replace(frame, field=-3.0 * frame.field[::-1])
     expected, after = plain(bank_filter, bank, lost)
@@ -164,87 +164,87 @@ def test_all_wrong_is_a_track_that_is_lost():
     assert bank_filter.is_implausible(bank, best, lost)
 
 
-def test_one_sensor_alone_is_never_left_out():
+def test_a_single_present_sensor_is_never_rejected():
     for n in (1, 6):
         bank_filter, bank, frame, names = situation(n)
-        alone = spoilt(without(frame, *range(1, n)), 0)
+        alone = faulty(without(frame, *range(1, n)), 0)
         bank_filter.n = 0
         *_, used, counts = SensorRejection(names).advance(bank_filter, bank, alone, DT)
         assert used is alone and not counts and bank_filter.n == 1
 
 
-def test_of_how_many_counts_who_is_there():
+def test_the_limit_on_rejected_sensors_counts_present_sensors_only():
     bank_filter, bank, frame, names = situation(16, n_hyp=2)
     near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()
-    bad = spoilt(without(frame, near[0]), *near[-2:])
+    bad = faulty(without(frame, near[0]), *near[-2:])
     *_, used, counts = SensorRejection(names).advance(bank_filter, bank, bad, DT)
     assert used is bad and not counts
 
 
-def test_an_axis_that_is_missing_leaves_a_sensor_there():
+def test_a_sensor_with_a_missing_axis_is_rejected_as_well():
     bank_filter, bank, frame, names = situation()
     field = frame.field.copy()
     field[:, 2] = np.nan
-    bad = spoilt(dataclasses.replace(frame, field=field), 3)
+    bad = faulty(dataclasses.replace(frame, field=field), 3)
     *_, used, counts = SensorRejection(names).advance(bank_filter, bank, bad, DT)
     assert counts == {f'frames in which {names[3]} was rejected': 1}
     assert np.isnan(used.field[3]).all() and not np.isnan(used.field[2, :2]).any()
 
 
-def cost(bank_filter, found, bank, frame):
-    """Updates that it takes, and who is left out; the bank stays as it is."""
+def cost(bank_filter, rejection, bank, frame):
+    """(number of updates, rows of unused sensors); the bank is not modified."""
     bank_filter.n = 0
-    *_, used, _ = found.advance(bank_filter, copy.deepcopy(bank), frame, DT)
+    *_, used, _ = rejection.advance(bank_filter, copy.deepcopy(bank), frame, DT)
     return bank_filter.n, np.flatnonzero(used.n_samples == 0).tolist()
 
 
-def test_the_one_of_the_frame_before_is_the_first_suspect():
+def test_the_sensor_rejected_in_the_previous_frame_is_tried_first():
     bank_filter, bank, frame, names = situation()
-    found = SensorRejection(names)
-    assert cost(bank_filter, found, bank, spoilt(frame, 2)) == (1 + 6 + 1, [2])
-    assert cost(bank_filter, found, bank, spoilt(frame, 2)) == (2, [2])
-    # Another one now.
-    assert cost(bank_filter, found, bank, spoilt(frame, 4)) == (1 + 1 + 6 + 1, [4])
-    # A frame that fits, or a track that ends, clears it of suspicion.
-    assert cost(bank_filter, found, bank, frame) == (1, [])
-    assert cost(bank_filter, found, bank, spoilt(frame, 4)) == (8, [4])
-    found.clear()
-    assert cost(bank_filter, found, bank, spoilt(frame, 4)) == (8, [4])
-    # As does one where nothing helped.
-    assert cost(bank_filter, found, bank, spoilt(frame, 2, 4)) == (9, [])
-    assert cost(bank_filter, found, bank, spoilt(frame, 4)) == (8, [4])
-    # Who is missing now is no suspect, and costs nothing.
-    assert cost(bank_filter, found, bank, spoilt(without(frame, 4), 2)) == (1 + 5 + 1, [2, 4])
+    rejection = SensorRejection(names)
+    assert cost(bank_filter, rejection, bank, faulty(frame, 2)) == (1 + 6 + 1, [2])
+    assert cost(bank_filter, rejection, bank, faulty(frame, 2)) == (2, [2])
+    # Now another sensor is wrong.
+    assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (1 + 1 + 6 + 1, [4])
+    # A frame that fits, or the end of a track, clears the suspicion.
+    assert cost(bank_filter, rejection, bank, frame) == (1, [])
+    assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (8, [4])
+    rejection.clear()
+    assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (8, [4])
+    # So does a frame in which no rejection helped.
+    assert cost(bank_filter, rejection, bank, faulty(frame, 2, 4)) == (9, [])
+    assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (8, [4])
+    # A missing sensor is not suspected, and costs no update.
+    assert cost(bank_filter, rejection, bank, faulty(without(frame, 4), 2)) == (1 + 5 + 1, [2, 4])
 
 
-def test_two_suspects_of_the_frame_before_are_too_many_when_fewer_are_there():
+def test_previous_suspects_are_kept_if_too_few_sensors_are_present():
     bank_filter, bank, frame, names = situation(16, n_hyp=2)
     near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()
-    found = SensorRejection(names)
-    assert cost(bank_filter, found, bank, spoilt(frame, *near[-2:]))[1] == sorted(near[-2:])
-    fewer = spoilt(without(frame, near[0]), *near[-2:])
-    assert cost(bank_filter, found, bank, fewer)[1] == [near[0]]
+    rejection = SensorRejection(names)
+    assert cost(bank_filter, rejection, bank, faulty(frame, *near[-2:]))[1] == sorted(near[-2:])
+    fewer = faulty(without(frame, near[0]), *near[-2:])
+    assert cost(bank_filter, rejection, bank, fewer)[1] == [near[0]]
 
 
-def test_of_two_that_are_wrong_the_second_is_sought_among_the_others():
+def test_the_second_of_two_wrong_sensors_is_sought_among_the_others():
     bank_filter, bank, frame, names = situation(16, n_hyp=2)
     near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()[-2:]
-    assert cost(bank_filter, SensorRejection(names), bank, spoilt(frame, *near)) == (
+    assert cost(bank_filter, SensorRejection(names), bank, faulty(frame, *near)) == (
         1 + 16 + 1 + 15 + 1, sorted(near))
 
 
-def test_it_has_to_fit_what_leads_by_its_weight():
-    """Another explains the frame as it is, but was ruled out long ago."""
+def test_the_frame_has_to_fit_the_hypothesis_that_leads_by_weight():
+    """Another hypothesis explains the frame, but its weight is negligible."""
     bank_filter, bank, frame, names = situation(n_hyp=2)
     bank.x[1, bank_filter.observation.n_target + 3 * 2:][:3] = OFF
-    bad = spoilt(frame, 2)
+    bad = faulty(frame, 2)
     assert cost(bank_filter, SensorRejection(names), bank, bad) == (1, [])
     bank.log_w = np.array([0.0, -1e9])
     assert cost(bank_filter, SensorRejection(names), bank, bad) == (8, [2])
 
 
-class Ruled(BankFilter):
-    """Rules all hypotheses out as soon as a certain sensor has something to say."""
+class RulingOutFilter(BankFilter):
+    """Rules out all hypotheses if a given sensor is present."""
 
     def __init__(self, row, *args):
         super().__init__(*args)
@@ -256,22 +256,22 @@ class Ruled(BankFilter):
         return predicted, np.full(len(out), -np.inf) if there else out
 
 
-def test_a_sensor_that_rules_out_every_hypothesis_is_left_out():
+def test_a_sensor_that_rules_out_every_hypothesis_is_rejected():
     plain_filter, bank, frame, names = situation()
     network = line_network(6, spacing=4.0, tilt=0.2)
-    ruled = Ruled(3, network, vehicle_model(SETTINGS.vehicle, network), SETTINGS)
+    ruling_out = RulingOutFilter(3, network, vehicle_model(SETTINGS.vehicle, network), SETTINGS)
     _, after = plain(plain_filter, bank, without(frame, 3))
-    _, got, _, counts = SensorRejection(names).advance(ruled, bank, frame, DT)
+    _, got, _, counts = SensorRejection(names).advance(ruling_out, bank, frame, DT)
     assert counts == {f'frames in which {names[3]} was rejected': 1}
     assert np.isfinite(got).all() and state(bank) == after
 
 
-# In the tracker.
+# Rejection in the tracker.
 
 @functools.cache
 def passing(n_sensors, fault, seed=0, network_at=None, lasting_s=1.0):
-    """(pipeline, live tracks, (begin, end)) of a pass with a fault at mag_2; `network_at` [s] after
-    its begin there is another network."""
+    """(pipeline, live tracks, (begin, end)) of a pass with a fault of mag_2; `network_at` [s] after
+    the begin of the fault, the network is replaced."""
     network, samples, _, times = stream(n_sensors, seed, fault, lasting_s)
     pipeline, tracks = Pipeline(network, settings_for('vehicle', POINT)), []
     for s in samples:
@@ -282,32 +282,32 @@ def passing(n_sensors, fault, seed=0, network_at=None, lasting_s=1.0):
     return pipeline, tracks, times
 
 
-def test_of_two_sensors_the_track_is_flagged_from_then_on():
+def test_a_fault_of_one_of_two_sensors_makes_the_track_ambiguous():
     flags = {}
     for fault in (None, 'swaps axes'):
-        # So short that it is not for having been alone.
+        # The fault is too short for a doubt about a single supporting sensor.
         pipeline, tracks, (begin, _) = passing(
             2, fault, seed=1, lasting_s=MAX_SINGLE_SENSOR_S - 0.2)
         flags[fault] = [t.ambiguous for t in tracks if t.stamp_ns / NS > begin + 0.5]
-        contradicted = [what for what in pipeline.track.counts if 'was rejected' in what]
-        assert bool(contradicted) == bool(fault)
+        rejections = [what for what in pipeline.track.counts if 'was rejected' in what]
+        assert bool(rejections) == bool(fault)
     assert len(flags['swaps axes']) > 10 and all(flags['swaps axes'])
     assert not any(flags[None])
 
 
-MISTAKEN = pytest.param(3, 0, marks=pytest.mark.xfail(strict=True, reason=(
-    'mag_3 is named in 7 of 16 frames: of three sensors, a track can be bent to any two; its poses '
-    'are flagged')))
+WRONG_SENSOR = pytest.param(3, 0, marks=pytest.mark.xfail(strict=True, reason=(
+    'mag_3 is rejected in 7 of 16 frames: of three sensors, a track can fit any two; its poses are '
+    'ambiguous')))
 
 
-@pytest.mark.parametrize('n_sensors, seed', [MISTAKEN, (3, 1), (3, 2), (3, 3), (6, 0)])
-def test_of_more_the_others_are_believed(n_sensors, seed):
+@pytest.mark.parametrize('n_sensors, seed', [WRONG_SENSOR, (3, 1), (3, 2), (3, 3), (6, 0)])
+def test_a_fault_of_one_of_several_sensors_leaves_the_track_unambiguous(n_sensors, seed):
     pipeline, tracks, (begin, end) = passing(n_sensors, 'swaps axes', seed)
     assert pipeline.track.counts['frames in which mag_2 was rejected'] > 3
     assert [what for what in pipeline.track.counts if 'was rejected' in what] == [
         'frames in which mag_2 was rejected']
     assert not any(t.ambiguous for t in tracks if t.stamp_ns / NS > end + 0.3)
-    # The poses say themselves who was used.
+    # The poses report which sensors were used.
     used = [np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in tracks
             if begin < t.stamp_ns / NS < end]
     assert {n_sensors - 1} <= set(used) <= {n_sensors - 1, n_sensors}
@@ -315,43 +315,43 @@ def test_of_more_the_others_are_believed(n_sensors, seed):
                for t in tracks)
 
 
-def test_a_track_that_was_bent_to_the_wrong_two_is_flagged():
+def test_a_track_that_is_fitted_to_the_wrong_two_sensors_is_ambiguous():
     pipeline, tracks, (_, end) = passing(3, 'swaps axes', 0)
     assert [what for what in pipeline.track.counts if 'was rejected' in what]
     after = [t.ambiguous for t in tracks if t.stamp_ns / NS > end + 0.3]
     assert len(after) > 10 and all(after)
 
 
-def test_without_a_fault_nobody_is_suspected():
+def test_no_sensor_is_rejected_without_a_fault():
     pipeline, tracks, _ = passing(3, None)
     assert len(tracks) > 20
     assert not [what for what in pipeline.track.counts if 'was rejected' in what]
 
 
-def test_a_calibration_that_comes_while_one_is_left_out_waits_for_the_end_of_the_track():
+def test_a_new_network_during_a_rejection_waits_for_the_end_of_the_track():
     pipeline, tracks, _ = passing(3, 'swaps axes', network_at=0.5)
     _, expected, _ = passing(3, 'swaps axes')
     assert [(t.stamp_ns, t.position.tobytes(), t.ambiguous) for t in tracks] == [
         (t.stamp_ns, t.position.tobytes(), t.ambiguous) for t in expected]
 
 
-@pytest.mark.parametrize('alone_s, flagged', [(MAX_SINGLE_SENSOR_S - 0.1, False),
-                                              (MAX_SINGLE_SENSOR_S + 0.2, True)])
-def test_one_that_carried_a_track_alone_leaves_it_flagged(alone_s, flagged):
+@pytest.mark.parametrize('dropout_s, flagged', [(MAX_SINGLE_SENSOR_S - 0.1, False),
+                                                (MAX_SINGLE_SENSOR_S + 0.2, True)])
+def test_a_track_supported_by_one_sensor_for_too_long_stays_ambiguous(dropout_s, flagged):
     network, samples, _, (begin, end) = stream(2, 0)
     pipeline, tracks = Pipeline(network, settings_for('vehicle', POINT)), []
     for s in samples:
-        if s.sensor == 'mag_2' and begin <= s.stamp_ns / NS < begin + alone_s:
+        if s.sensor == 'mag_2' and begin <= s.stamp_ns / NS < begin + dropout_s:
             continue
         tracks += [r for r in pipeline.feed(one(s)) if isinstance(r, Track) and not r.ended]
-    live = [t for t in tracks if t.stamp_ns / NS > begin + alone_s + 0.1]
+    live = [t for t in tracks if t.stamp_ns / NS > begin + dropout_s + 0.1]
     alone = [t for t in tracks if np.isnan(t.nis_by_sensor).any()]
     assert len(alone) >= 4 and all(t.ambiguous for t in alone)
     assert live and all(t.ambiguous for t in live) == flagged
 
 
 def first_tracks(n_quiet, stage=None, begin_ns=NS, missing=(), n_present=1):
-    """(stage, tracks) of a target that is there after so many frames without one."""
+    """(stage, tracks) of a target that is present after `n_quiet` frames without one."""
     network = line_network(2, tilt=0.0)
     stage = TrackManager(network, SETTINGS) if stage is None else stage
     B = dipole_field(network.positions - [-8.0, -1.2, 0.5], MOMENT)
@@ -368,8 +368,7 @@ def first_tracks(n_quiet, stage=None, begin_ns=NS, missing=(), n_present=1):
     return stage, tracks
 
 
-def test_the_next_track_begins_with_a_clean_slate():
-    """What one was flagged for says nothing of the next."""
+def test_a_new_track_does_not_inherit_the_doubts_of_the_previous_one():
     stage, before = first_tracks(8, missing=(1,), n_present=8)
     assert before and all(t.ambiguous for t in before)
     stage.flush()
@@ -379,9 +378,8 @@ def test_the_next_track_begins_with_a_clean_slate():
         (t.ambiguous, t.existence, t.weight) for t in fresh]
 
 
-
 @pytest.mark.parametrize('n_quiet', [0, 4])
-def test_a_target_that_was_not_seen_to_come_is_ambiguous(n_quiet):
-    """A restart in the middle of a pass, for instance."""
+def test_a_target_that_was_not_seen_approaching_is_ambiguous(n_quiet):
+    """For example after a restart in the middle of a pass."""
     _, tracks = first_tracks(n_quiet)
     assert tracks and all(t.ambiguous for t in tracks)

@@ -1,4 +1,4 @@
-"""Of a large network a track uses the sensors that are near, and others as it moves on."""
+"""Sensor selection: in a large network, a track uses the nearest sensors as it moves."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ from support.samples import one, simulate
 
 
 def bank_of(rng, n_hyp, n_t, n_own, n_sensors):
-    """Hypotheses whose states all hang together."""
+    """Hypotheses whose states are all correlated."""
     n_x = n_t + (n_own + 3) * n_sensors
     A = rng.standard_normal((n_hyp, n_x, n_x))
     bank = FilterBank.from_targets(np.zeros((n_hyp, n_t)), np.zeros((n_hyp, n_t, n_t)),
@@ -34,7 +34,7 @@ def bank_of(rng, n_hyp, n_t, n_own, n_sensors):
 
 
 @pytest.mark.parametrize('n_own', [0, 3, 6])
-def test_what_is_known_of_sensors_that_stay_is_kept(n_own):
+def test_states_of_sensors_that_stay_are_kept(n_own):
     rng = np.random.default_rng(n_own)
     before, after = np.array([2, 5, 7]), np.array([5, 6, 7, 9])
     bank = bank_of(rng, 4, 8, n_own, 3)
@@ -62,13 +62,13 @@ def test_what_is_known_of_sensors_that_stay_is_kept(n_own):
     np.testing.assert_array_equal(bank.P, np.swapaxes(bank.P, 1, 2))
 
 
-def test_the_nearest_in_the_plane_in_the_networks_order():
+def test_nearest_sensors_are_horizontal_and_in_network_order():
     positions = np.array([[0.0, 0.0, 9.0], [5.0, 0.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 0.5, 0.0]])
     assert nearest_sensors(positions, np.array([0.2, 0.0]), 2).tolist() == [0, 2]
     assert nearest_sensors(positions, np.array([9.0, 0.0]), 3).tolist() == [0, 1, 2]
 
 
-def test_a_part_of_a_network():
+def test_a_part_of_a_network_has_the_properties_of_its_sensors():
     network = dataclasses.replace(line_network(5), clock_offset=np.arange(5.0))
     part = network.part(np.array([1, 4]))
     assert part.names == ('mag_2', 'mag_5') and part.topics == ('/mag_2/imu/mag', '/mag_5/imu/mag')
@@ -79,7 +79,7 @@ def test_a_part_of_a_network():
 
 
 def driven(network, changes, speed=20.0, seed=1):
-    """(records, truth at t) of a point target along the network."""
+    """(records, pipeline, true position at t) of a point target along the network."""
     farthest = float(network.positions[:, 0].max())
     path = Path(np.array([-60.0, -1.5]), 0.0, speed)
     samples, *_ = simulate(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5), path, 50.0,
@@ -89,8 +89,8 @@ def driven(network, changes, speed=20.0, seed=1):
     return records, pipeline, lambda t: path.start + [speed * t, 0.0]
 
 
-def test_a_target_is_followed_along_forty_sensors():
-    """180 m, with six sensors at a time; the error stays inside its covariance all the way."""
+def test_a_target_is_tracked_along_forty_sensors():
+    """180 m with six sensors at a time; the error stays within its covariance."""
     network = line_network(40, tilt=0.02)
     records, pipeline, truth = driven(network, {'track.max_sensors': 6})
     live = [r for r in records if isinstance(r, Track) and not r.ended]
@@ -108,30 +108,30 @@ def test_a_target_is_followed_along_forty_sensors():
         assert t.predicted.shape == (40, 3) and t.mounting.shape == (40, 3)
         used = ~np.isnan(t.nis_by_sensor)
         assert used.sum() <= 6 and (~np.isnan(t.predicted[used])).all()
-        # Those that see the target are among them, unless they have not learnt their background.
-        there = np.flatnonzero(frames[t.stamp_ns].n_samples)
-        nearest = there[np.argsort(np.abs(network.positions[there, 0] - t.position[0]))]
+        # One of the two nearest sensors with a learnt background is used.
+        present = np.flatnonzero(frames[t.stamp_ns].n_samples)
+        nearest = present[np.argsort(np.abs(network.positions[present, 0] - t.position[0]))]
         assert used[nearest[:2]].any()
     assert not [r for r in records if isinstance(r, SmoothedPose) and r.complete]
     assert pipeline.counts()['track']['tracks too long to smooth'] == 1
 
 
-@pytest.mark.parametrize('most', [8, 16])
-def test_many_sensors_come_in_when_the_frames_before_the_detection_are_through(monkeypatch, most):
-    """With all of them from the beginning a start would take seconds and gigabytes."""
+@pytest.mark.parametrize('limit', [8, 16])
+def test_further_sensors_join_after_the_frames_before_the_detection(monkeypatch, limit):
+    """A start with all of them would take seconds and gigabytes."""
     network, runs = line_network(12, tilt=0.02), []
     for n in (1000, 4):
         monkeypatch.setattr(manager, 'sensors_at_start', lambda *_, n=n: n)
-        records, pipeline, truth = driven(network, {'track.max_sensors': most})
+        records, pipeline, truth = driven(network, {'track.max_sensors': limit})
         live = [r for r in records if isinstance(r, Track) and not r.ended]
         inside = [t for t in live if 0.0 < truth(t.stamp_ns / 1e9)[0] < 45.0]
         e = np.array([t.position[:2] - truth(t.stamp_ns / 1e9) for t in inside])
         nees = [v @ np.linalg.solve(t.covariance[:2, :2], v)
                 for v, t in zip(e, inside, strict=True)]
         assert len(inside) > 20 and np.mean(nees) < 4.0
-        assert max(np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in live) == min(most, 12)
+        assert max(np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in live) == min(limit, 12)
         smoothed = [r for r in records if isinstance(r, SmoothedPose) and r.complete]
-        if most == 16:
+        if limit == 16:
             assert pipeline.track.counts['tracks handed over to other sensors'] == 0
             assert [p.stamp_ns for p in smoothed] == [t.stamp_ns for t in live]
             errors = [np.linalg.norm(p.position[:2] - truth(p.stamp_ns / 1e9)) for p in smoothed
@@ -139,10 +139,10 @@ def test_many_sensors_come_in_when_the_frames_before_the_detection_are_through(m
             assert np.sqrt(np.mean(np.square(errors))) < 0.3
         runs.append(inside)
     assert len(runs[0]) == len(runs[1])
-    apart = [(a.position[:2] - b.position[:2]) @ np.linalg.solve(
+    distances = [(a.position[:2] - b.position[:2]) @ np.linalg.solve(
         a.covariance[:2, :2], a.position[:2] - b.position[:2])
-        for a, b in zip(*runs, strict=True)]
-    assert np.mean(apart) < 1.0
+            for a, b in zip(*runs, strict=True)]
+    assert np.mean(distances) < 1.0
 
 
 @pytest.fixture(scope='module')
@@ -154,7 +154,7 @@ def frames():
 
 
 def managed(frames, changes, doubtful=None, start=slice(None)):
-    """(manager, live tracks) of frames alone."""
+    """(manager, live tracks) of frames that are fed to a `TrackManager`."""
     network, every = frames
     tracker, tracks = manager.TrackManager(network, settings_for('vehicle', changes).track), []
     tracker.doubt(doubtful or {})
@@ -163,8 +163,8 @@ def managed(frames, changes, doubtful=None, start=slice(None)):
     return tracker, tracks
 
 
-def test_sensors_that_come_in_and_say_nothing_change_nothing(monkeypatch, frames):
-    """The time of the first frame with all of them is gone through once."""
+def test_sensors_that_join_without_measurements_change_nothing(monkeypatch, frames):
+    """The states are predicted once to the frame in which they join."""
     network, every = frames
     first = next(f for f in every if f.target_present)
     near = nearest_sensors(network.positions, network.positions[
@@ -175,15 +175,15 @@ def test_sensors_that_come_in_and_say_nothing_change_nothing(monkeypatch, frames
         n_samples=np.where(np.isin(np.arange(12), far), 0, f.n_samples)) for f in every]
     monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
     runs = [managed((network, silent), {**POINT, 'track.relinearise_window_s': 0.0,
-                                        'track.max_sensors': most})[1] for most in (4, 12)]
+                                        'track.max_sensors': limit})[1] for limit in (4, 12)]
     for a, b in zip(*(tracks[:3] for tracks in runs), strict=True):
         np.testing.assert_allclose(b.position, a.position, atol=1e-6)
         np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-6, atol=1e-9)
 
 
-def test_where_no_frame_came_before_the_detection_no_hypothesis_is_dropped_for_its_row(
-        monkeypatch, frames):
-    """Nothing tells yet which are better: the other sensors come in later."""
+def test_no_hypothesis_is_dropped_without_frames_before_the_detection(monkeypatch,
+                                                                      frames):
+    """Their ranking is unknown until the other sensors join."""
     monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
     for name, value in (('WIDER_BYTES', 1), ('MIN_HYPOTHESES', 20)):
         monkeypatch.setattr(bank_size, name, value)
@@ -195,18 +195,18 @@ def test_where_no_frame_came_before_the_detection_no_hypothesis_is_dropped_for_i
     assert used[0] <= 4 < max(used)
 
 
-def test_the_approach_is_judged_by_the_same_sensors_all_the_time(monkeypatch, frames):
+def test_the_approach_is_checked_with_the_same_sensors_in_all_frames(monkeypatch, frames):
     monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
-    looked, add = set(), Approach.add
+    n_sensors, add = set(), Approach.add
     monkeypatch.setattr(Approach, 'add', lambda self, frame: (
-        looked.add(len(frame.field)), add(self, frame))[1])
-    for most, expected in ((16, {12}), (8, {8})):
-        looked.clear()
-        managed(frames, {**POINT, 'track.max_sensors': most})
-        assert looked == expected
+        n_sensors.add(len(frame.field)), add(self, frame))[1])
+    for limit, expected in ((16, {12}), (8, {8})):
+        n_sensors.clear()
+        managed(frames, {**POINT, 'track.max_sensors': limit})
+        assert n_sensors == expected
 
 
-def test_the_first_pose_is_doubted_for_a_sensor_that_comes_in_with_it(monkeypatch, frames):
+def test_the_first_pose_is_doubted_for_a_sensor_that_joins_with_it(monkeypatch, frames):
     network, every = frames
     first = next(f for f in every if f.target_present)
     far = network.names[int(np.nanargmin(np.linalg.norm(first.field, axis=1)))]
@@ -217,7 +217,7 @@ def test_the_first_pose_is_doubted_for_a_sensor_that_comes_in_with_it(monkeypatc
         assert tracker.counts['tracks with a doubtful background'] == 1
 
 
-def test_a_network_that_is_not_larger_is_used_whole():
+def test_a_network_of_at_most_max_sensors_is_used_completely():
     network = line_network(6, tilt=0.02)
     some, whole = ([r for r in driven(network, {'track.max_sensors': n})[0]
                     if isinstance(r, Track)] for n in (6, 1000))
@@ -227,7 +227,7 @@ def test_a_network_that_is_not_larger_is_used_whole():
         np.testing.assert_array_equal(a.predicted, b.predicted)
 
 
-def test_a_part_of_a_frame():
+def test_a_part_of_a_frame_has_the_rows_of_its_sensors():
     network = line_network(4)
     _, pipeline, _ = driven(network, {})
     frame = next(r for r in driven(network, {})[0] if hasattr(r, 'n_samples'))

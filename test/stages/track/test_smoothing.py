@@ -1,4 +1,4 @@
-"""Smoothing: against the stacked least-squares solution, and on tracks."""
+"""Smoothing: comparison with a stacked least-squares solution, and smoothed tracks."""
 
 from dataclasses import replace
 from functools import cache
@@ -22,18 +22,18 @@ from support.samples import one, simulate
 
 def stacked(F, Q, H, R, y, x0, P0, missing):
     """Means and covariances of all states given all measurements that are not `missing`, by one
-    least squares."""
+    least-squares solution."""
     n, n_x = len(y), len(x0)
     A, b = [np.linalg.inv(np.linalg.cholesky(P0)) @ np.eye(n_x, n * n_x)], []
     b.append(np.linalg.inv(np.linalg.cholesky(P0)) @ x0)
     L_q = np.linalg.inv(np.linalg.cholesky(Q))
     for k in range(n):
-        there = ~missing[k]
-        L_r = np.linalg.inv(np.linalg.cholesky(R[np.ix_(there, there)]))
-        row = np.zeros((there.sum(), n * n_x))
-        row[:, k * n_x:(k + 1) * n_x] = H[k][there]
+        selected = ~missing[k]
+        L_r = np.linalg.inv(np.linalg.cholesky(R[np.ix_(selected, selected)]))
+        row = np.zeros((selected.sum(), n * n_x))
+        row[:, k * n_x:(k + 1) * n_x] = H[k][selected]
         A.append(L_r @ row)
-        b.append(L_r @ y[k][there])
+        b.append(L_r @ y[k][selected])
         if k + 1 < n:
             row = np.zeros((n_x, n * n_x))
             row[:, k * n_x:(k + 1) * n_x], row[:, (k + 1) * n_x:(k + 2) * n_x] = -F, np.eye(n_x)
@@ -50,7 +50,7 @@ N_X = N_T + (N_OWN + 3) * N_SENSORS
 
 
 def whole_derivative(H):
-    """(3 n_sensors, n_x) of what `plain_kalman.update` takes sensor by sensor."""
+    """(3 n_sensors, n_x) derivative of all sensors; `plain_kalman.update` takes them one by one."""
     out = np.zeros((3 * N_SENSORS, N_X))
     for j in range(N_SENSORS):
         rows = slice(3 * j, 3 * j + 3)
@@ -75,7 +75,7 @@ def problem(seed):
 
 
 def steps_of(F, decay, Q, C, H, y, x, P, without=()):
-    """The filter's `Step`s from the states `x` (n_hyp, n_x) on; no update at times `without`."""
+    """`Step`s of the filter from the states `x` (n_hyp, n_x); no update at the times `without`."""
     steps, n_hyp = [], len(x)
     for k in range(len(y)):
         if k:
@@ -93,8 +93,8 @@ def steps_of(F, decay, Q, C, H, y, x, P, without=()):
 
 
 @pytest.mark.parametrize('unit', [1.0, 1e-8])
-def test_the_backward_pass_gives_what_least_squares_over_all_times_gives(unit):
-    """With axes, sensors and a time missing, also where some states are of the size of teslas."""
+def test_the_backward_pass_matches_least_squares_over_all_times(unit):
+    """Axes, sensors and a time are missing; the unit makes some states as small as fields in T."""
     F, decay, Q, C, H, y = problem(1)
     without = (3,)
     x0, P0 = np.random.default_rng(2).standard_normal((2, N_X)), np.diag(
@@ -104,11 +104,11 @@ def test_the_backward_pass_gives_what_least_squares_over_all_times_gives(unit):
     whole = np.array([whole_derivative(h) for h in H])
     whole[missing] = 0.0
     R = block_diag(*C)
-    # What is missing is cut out of the noise, too: least squares by rows that are there.
+    # Missing rows are removed from the noise as well.
     expected = [stacked(block_diag(F, np.diag(decay)), np.diag(Q), whole, R,
                         np.where(missing, 0.0, y.reshape(N_STEPS, -1)), x, P0, missing)
                 for x in x0]
-    # The other states in another unit, as backgrounds and fields are in teslas.
+    # The states of the sensors are in another unit, like backgrounds and fields in tesla.
     T = np.append(np.ones(N_T), np.full(N_X - N_T, unit))
     H_unit = H.copy()
     H_unit[..., :N_T] *= unit
@@ -122,8 +122,8 @@ def test_the_backward_pass_gives_what_least_squares_over_all_times_gives(unit):
             np.testing.assert_allclose(P[p], P[p].T, rtol=1e-12)
 
 
-def test_what_is_known_exactly_stays_as_it_is():
-    """A state without variance, and two that are one: neither is divided by."""
+def test_exactly_known_states_do_not_change():
+    """One state has no variance and two are identical, so that the covariance is singular."""
     F, decay, Q, C, H, y = problem(4)
     F, Q, P0 = np.eye(N_T), 0.0 * Q, np.diag(np.r_[1.0, 1.0, 0.0, 2.0, np.ones(N_X - N_T)])
     P0[0, 1] = P0[1, 0] = 1.0
@@ -135,13 +135,13 @@ def test_what_is_known_exactly_stays_as_it_is():
         assert not P[0, 2].any()
         assert x[0, 0] == pytest.approx(x[0, 1], abs=1e-12)
         np.testing.assert_allclose(P[0, 0], P[0, 1], atol=1e-12)
-        # Nothing moves: what is known of it is the same at all times.
+        # Without process noise, the estimate is the same at all times.
         np.testing.assert_allclose(x[0, :N_T], steps[-1].x[0, :N_T], atol=1e-10)
         np.testing.assert_allclose(P[0, :N_T, :N_T], steps[-1].P[0, :N_T, :N_T], atol=1e-10)
 
 
 def run(body, changes, seed=0, speed=10.0):
-    """(records, truth: function of stamps) of one simulated straight pass."""
+    """(records, function that returns true positions at timestamps) of a straight pass."""
     network = line_network(2, tilt=0.0)
     samples, t, position, _ = simulate(network, body, Path(np.array([-70.0, -1.2]), 0.0, speed),
                                        100.0, 12.0, np.random.default_rng(seed))
@@ -162,30 +162,30 @@ def errors_of(poses, truth):
 
 
 def near(poses, truth):
-    """[bool] which of the poses are within five metres of the middle between the sensors."""
+    """(n,) whether each pose is within five metres of the middle between the sensors."""
     return np.hypot(*truth([p.stamp_ns for p in poses]).T) < 5.0
 
 
 def smoothing_study(bodies, changes):
-    """Per pass: RMS errors, smoothed over filtered, of the whole track and of what is within 5 m of
-    the middle, and there NEES per axis, smoothed."""
+    """Ratio of smoothed to filtered RMS error of the whole track and within 5 m of the middle, and
+    smoothed NEES per axis there, of each pass."""
     ratios, whole, nees = [], [], []
     for seed, body in enumerate(bodies):
         records, truth = run(body, changes, seed, np.random.default_rng(seed).uniform(8.0, 18.0))
         live = [r for r in records if isinstance(r, Track) and not r.ended]
         smoothed = [r for r in records if isinstance(r, SmoothedPose)]
         assert [s.stamp_ns for s in smoothed] == [t.stamp_ns for t in live]
-        there = near(live, truth)
+        selected = near(live, truth)
         before, (after, z) = errors_of(live, truth)[0], errors_of(smoothed, truth)
         whole.append(np.sqrt(np.mean(after**2) / np.mean(before**2)))
-        ratios.append(np.sqrt(np.mean(after[there] ** 2) / np.mean(before[there] ** 2)))
-        nees.append(z[there].mean())
+        ratios.append(np.sqrt(np.mean(after[selected] ** 2) / np.mean(before[selected] ** 2)))
+        nees.append(z[selected].mean())
     return np.array(whole), np.array(ratios), np.array(nees)
 
 
 @pytest.mark.study
-def test_smoothing_a_matched_target_takes_half_of_the_error_away():
-    """Of the whole track; near the sensors, where the filter already knows nearly all, less."""
+def test_smoothing_reduces_the_error_of_a_matched_target_by_two_fifths():
+    """This is for the whole track; near the sensors, where the filter is accurate, it is less."""
     rng = np.random.default_rng(5)
     bodies = [point_body(rng.uniform(300.0, 500.0) * u / np.linalg.norm(u), 3.0, 0.5)
               for u in rng.standard_normal((40, 3))]
@@ -208,13 +208,13 @@ def clouds(n):
 
 @pytest.mark.study
 @pytest.mark.xfail(strict=True, reason='0.68: 0.59 of the error of a filter that does not '
-                                       'linearise anew, which is larger')
-def test_smoothing_a_car_takes_two_fifths_of_the_error_away():
+                                       'relinearise, which is larger')
+def test_smoothing_reduces_the_error_of_a_car_by_two_fifths():
     assert np.median(clouds(40)[0]) <= 0.6
 
 
 @pytest.mark.parametrize('n', studied([10, 40]))
-def test_smoothed_cars_are_nearer_and_no_surer_than_they_are_right(n):
+def test_smoothed_poses_of_cars_are_more_accurate_and_consistent(n):
     whole, ratios, nees = clouds(n)
     print(f'clouds of 4 m: smoothed over filtered error {np.median(whole):.2f} (median), within '
           f'5 m {np.median(ratios):.2f}, ANEES {nees.mean():.2f}, median {np.median(nees):.2f}')
@@ -222,21 +222,21 @@ def test_smoothed_cars_are_nearer_and_no_surer_than_they_are_right(n):
     assert nees.mean() <= 3.0
 
 
-def test_the_survivor_does_again_what_it_did_in_the_bank(monkeypatch):
-    """Linearised where the filter was, the last smoothed pose is the last filtered one."""
+def test_smoothing_at_the_linearisation_of_the_filter_reproduces_its_pose(monkeypatch):
+    """The last smoothed pose is the last filtered one."""
     monkeypatch.setattr(smooth_module.smoothed_track, '__defaults__', (False, 0))
     records, _ = run(point_body([250.0, -150.0, 80.0], 4.0, 0.5),
                      {'track.relinearise_window_s': 0.0})
     live = [r for r in records if isinstance(r, Track) and not r.ended]
     smoothed = [r for r in records if isinstance(r, SmoothedPose)]
     np.testing.assert_allclose(smoothed[-1].position, live[-1].position, rtol=0, atol=1e-9)
-    # By itself: what is published knows of the other hypotheses at this place, too.
+    # The covariance of the hypothesis alone; the published one includes others at this place.
     own = next(h.covariance for h in live[-1].hypotheses
                if np.array_equal(h.position, live[-1].position))
     np.testing.assert_allclose(smoothed[-1].covariance, own, rtol=1e-7, atol=1e-12)
 
 
-def test_none_is_surer_without_reason():
+def test_smoothing_reduces_the_covariance_of_poses():
     records, _ = run(point_body([250.0, -150.0, 80.0], 4.0, 0.5), POINT)
     live = [r for r in records if isinstance(r, Track) and not r.ended]
     smoothed = [r for r in records if isinstance(r, SmoothedPose)]
@@ -247,7 +247,7 @@ def test_none_is_surer_without_reason():
         assert np.linalg.eigvalsh(s.covariance).min() > -1e-9
 
 
-def test_a_fixed_lag_gives_every_pose_once_when_its_time_has_come():
+def test_fixed_lag_smoothing_returns_every_pose_once_after_the_lag():
     lag = 0.5
     body = point_body([250.0, -150.0, 80.0], 4.0, 0.5)
     records, truth = run(body, {**POINT, 'track.smoothing_lag_s': lag})
@@ -260,11 +260,11 @@ def test_a_fixed_lag_gives_every_pose_once_when_its_time_has_come():
         elif isinstance(r, SmoothedPose) and not r.complete:
             assert ended or 0.0 <= (now - r.stamp_ns) / 1e9 - lag < 0.09
             lagged.append(r)
-    # When the track ends the rest comes, too.
+    # The remaining poses are returned when the track ends.
     assert [r.stamp_ns for r in lagged] == [t.stamp_ns for t in live]
     smoothed_rms, rms = (np.sqrt(np.mean(errors_of(a, truth)[0]**2)) for a in (lagged, live))
     assert smoothed_rms < 0.7 * rms
-    # What is published now does not depend on what is smoothed.
+    # The filtered poses do not depend on smoothing.
     plain = [r for r in run(body, POINT)[0] if isinstance(r, Track) and not r.ended]
     np.testing.assert_array_equal([t.position for t in live], [t.position for t in plain])
 
@@ -276,10 +276,10 @@ def pass_of(body, seed=0):
                               np.random.default_rng(seed))[:3]
 
 
-def test_smoothing_can_be_left_out_and_what_is_too_long_is_counted():
+def test_smoothing_can_be_disabled_and_tracks_that_are_too_long_are_counted():
     body = point_body([250.0, -150.0, 80.0], 4.0, 0.5)
-    none, _ = run(body, {**POINT, 'track.max_smoothing_s': 0.0})
-    assert not [r for r in none if isinstance(r, SmoothedPose)]
+    disabled, _ = run(body, {**POINT, 'track.max_smoothing_s': 0.0})
+    assert not [r for r in disabled if isinstance(r, SmoothedPose)]
     network, samples, _, _ = pass_of(body)
     pipeline = Pipeline(network, settings_for('vehicle', {
         **POINT, 'track.max_smoothing_s': 1.0}))
@@ -289,8 +289,8 @@ def test_smoothing_can_be_left_out_and_what_is_too_long_is_counted():
     assert pipeline.track.counts['tracks too long to smooth'] == 1
 
 
-def test_missing_frames_are_bridged():
-    """Half a second without a measurement in the middle of a pass: smoothed from both sides."""
+def test_smoothing_bridges_missing_frames():
+    """Half a second in the middle of a pass has no measurements."""
     network, samples, t, position = pass_of(point_body([250.0, -150.0, 80.0], 4.0, 0.5))
     pipeline = Pipeline(network, settings_for('vehicle', POINT))
     stage = TrackManager(network, settings_for('vehicle', POINT).track)
@@ -310,9 +310,9 @@ def test_missing_frames_are_bridged():
 
 
 def spiked(stage, frames, at, size, n=1):
-    """Records of `stage` on `frames`, with `size` [T] on an axis of each sensor in `n` of them.
+    """Records of `stage` for `frames`, with `size` [T] on an axis of all sensors in `n` of them.
 
-    On all sensors: one alone that contradicts is taken for missing, and the frame fits.
+    A single sensor that contradicts the others would be rejected.
     """
     out = []
     for k, f in enumerate(frames):
@@ -325,7 +325,7 @@ def spiked(stage, frames, at, size, n=1):
 
 
 def paths_without_and_with_a_spike(size):
-    """Smoothed poses within 6 m of a pass, and with one spike of `size` [T], long after it."""
+    """Smoothed poses within 6 m of a pass, without and with a spike of `size` [T] long after it."""
     network, samples, t, position = pass_of(
         random_vehicle(np.random.default_rng(1), length=4.0), seed=1)
     pipeline = Pipeline(network, settings_for('vehicle'))
@@ -341,28 +341,26 @@ def paths_without_and_with_a_spike(size):
 
 
 @pytest.mark.parametrize('size', studied([1e-6, 1e-5, 1e-3], [1e-5]))
-def test_a_frame_that_contradicts_the_track_does_not_bend_it(size):
-    """What is known of the pass stays as it is. Of hypotheses that say nearly the same another may
-    survive: two standard deviations.
-    """
-    plain, spiked_ = paths_without_and_with_a_spike(size)
-    assert len(plain) == len(spiked_) > 10
-    for p, q in zip(plain, spiked_, strict=True):
+def test_a_frame_that_contradicts_the_track_does_not_distort_it(size):
+    """Another one of nearly equal hypotheses may survive: two standard deviations are allowed."""
+    plain, with_spike = paths_without_and_with_a_spike(size)
+    assert len(plain) == len(with_spike) > 10
+    for p, q in zip(plain, with_spike, strict=True):
         d = q.position - p.position
         assert d @ np.linalg.solve(p.covariance[:3, :3], d) < 2.0**2
 
 
 @pytest.mark.study
 @pytest.mark.xfail(strict=True, reason=(
-    '0.50 m, 1.65 of its deviations: of hypotheses that say nearly the same another survives'))
-def test_a_frame_that_contradicts_the_track_does_not_bend_it_by_a_foot():
-    """The aim, which a row of three dipoles met."""
-    plain, spiked_ = paths_without_and_with_a_spike(1e-5)
-    np.testing.assert_allclose([p.position for p in spiked_], [p.position for p in plain],
+    '0.50 m, 1.65 standard deviations: another one of nearly equal hypotheses survives'))
+def test_a_frame_that_contradicts_the_track_does_not_distort_it_by_30_cm():
+    """The aim, which a row of three dipoles reached."""
+    plain, with_spike = paths_without_and_with_a_spike(1e-5)
+    np.testing.assert_allclose([p.position for p in with_spike], [p.position for p in plain],
                                rtol=0, atol=0.3)
 
 
-def test_a_track_that_was_lost_is_smoothed_with_a_doubt():
+def test_smoothed_poses_of_a_lost_track_are_ambiguous():
     network, samples, _, _ = pass_of(point_body([250.0, -150.0, 80.0], 4.0, 0.5), seed=1)
     pipeline = Pipeline(network, settings_for('vehicle'))
     frames = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, FieldFrame)]
@@ -374,7 +372,7 @@ def test_a_track_that_was_lost_is_smoothed_with_a_doubt():
     assert smoothed and all(r.ambiguous for r in smoothed)
 
 
-def test_long_tracks_of_many_states_are_bounded(monkeypatch):
+def test_long_tracks_of_many_states_are_not_smoothed(monkeypatch):
     monkeypatch.setattr(smooth_module, 'MAX_ELEMENTS', 20 * 35**2)
     records, _ = run(point_body([250.0, -150.0, 80.0], 4.0, 0.5), {})
     assert [r for r in records if isinstance(r, Track)]

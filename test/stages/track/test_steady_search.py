@@ -1,4 +1,4 @@
-"""Vehicles on straight paths that are sought in the frames of a window."""
+"""Search for vehicles on straight paths in the frames of a window."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ MOMENTS = {id(FIRST): [120.0, -90.0, -100.0], id(SECOND): [-60.0, 130.0, -110.0]
 
 
 def field_of(path, network, t):
-    """(n, n_sensors, 3) [T] of a row of three dipoles on a path, time zero at the last frame."""
+    """Field (n, n_sensors, 3) [T] of a row of three dipoles; time zero is at the last frame."""
     n = len(network)
     velocity = path[3] * np.array([np.cos(path[4]), np.sin(path[4]), 0.0])
     model = RowPass(np.repeat(t, n), np.tile(network.positions, (len(t), 1)),
@@ -45,13 +45,13 @@ def search_of(*paths, n_sensors=4, seed=0):
             StartGrid(samples, prior, prior.starts(VEHICLE, network)))
 
 
-def assert_near(path, truth, where=0.5, speed=1.0):
-    assert np.hypot(*(path[:2] - truth[:2])) <= where, (path, truth)
+def assert_near(path, truth, distance=0.5, speed=1.0):
+    assert np.hypot(*(path[:2] - truth[:2])) <= distance, (path, truth)
     assert abs(path[3] - truth[3]) <= speed and abs(np.cos(path[4] - truth[4]) - 1.0) <= 0.02
 
 
 @pytest.mark.parametrize('truth', [FIRST, SECOND])
-def test_a_vehicle_alone_is_found(truth):
+def test_a_single_vehicle_is_found(truth):
     search, grid = search_of(truth)
     best = search.best(grid, 3)
     assert_near(best[0], truth)
@@ -60,7 +60,7 @@ def test_a_vehicle_alone_is_found(truth):
 
 
 @pytest.mark.parametrize('n_sensors', [2, 4])
-def test_two_that_meet_are_found_whichever_comes_first(n_sensors):
+def test_two_vehicles_that_meet_are_found_in_any_order(n_sensors):
     search, grid = search_of(FIRST, SECOND, n_sensors=n_sensors)
     pair = search.pairs(grid, 3, 2)[0]
     pair = pair if pair[0, 0] > pair[1, 0] else pair[::-1]
@@ -68,23 +68,23 @@ def test_two_that_meet_are_found_whichever_comes_first(n_sensors):
     assert_near(pair[1], SECOND, 1.5, 1.5)
 
 
-def test_beside_a_known_one_the_other_is_found():
+def test_another_vehicle_is_found_beside_a_known_one():
     search, grid = search_of(FIRST, SECOND)
     assert_near(search.beside(FIRST).best(grid, 1)[0], SECOND, 1.0, 1.5)
 
 
-def test_what_is_not_known_of_a_known_field_is_not_taken_for_a_vehicle():
-    """Of a vehicle alone that is known, noise is left: no path explains more than another."""
+def test_the_field_of_a_known_vehicle_is_not_another_vehicle():
+    """Only noise is left, and no path explains more than another."""
     search, grid = search_of(FIRST)
     alone, beside = search.cost(grid), search.beside(FIRST).cost(grid)
     assert np.ptp(alone) > 1000.0
-    # The prior of a path and its moments costs up to some dozens.
+    # The priors of paths and moments contribute some dozens.
     assert np.ptp(beside) < 100.0
 
 
 @pytest.mark.parametrize('truths', [[FIRST], [FIRST, SECOND]])
-def test_residuals_have_the_stated_derivative(truths):
-    """With Kaufman's Jacobian the gradient of the cost is exact, of two sought together, too."""
+def test_the_gradient_of_the_cost_is_exact(truths):
+    """Kaufman's Jacobian gives the exact gradient, also for two vehicles together."""
     search, _ = search_of(*truths)
     off = np.array([0.3, 0.2, 0.1, -0.5, 0.02, 0.01, 0.3])
     theta = np.concatenate([truth + off for truth in truths])[None]
@@ -98,8 +98,8 @@ def test_residuals_have_the_stated_derivative(truths):
         assert gradient[k] == pytest.approx((cost[0] - cost[1]) / (2.0 * step), rel=1e-5, abs=1e-3)
 
 
-def test_the_cost_of_the_grid_is_that_of_the_whole_covariance():
-    """Differences of the log-density of a point's Gaussian field, backgrounds and noise."""
+def test_the_cost_of_the_grid_matches_the_full_covariance():
+    """Differences in the log-density of a point with a Gaussian moment, backgrounds and noise."""
     search, grid = search_of(FIRST)
     beside, rows = search.beside(SECOND), np.arange(0, len(grid.theta), 97)
     std = search.prior.moment_std[0] * np.sqrt(3.0)
@@ -115,7 +115,7 @@ def test_the_cost_of_the_grid_is_that_of_the_whole_covariance():
 
 
 @pytest.mark.parametrize('miss', [0.0, 1e-12, 1e-9, 1e-6])
-def test_a_path_through_a_sensor_is_no_error(miss):
+def test_a_path_through_a_sensor_raises_no_error(miss):
     """A step of the search may lead there."""
     search, grid = search_of(FIRST, SECOND)
     at = np.append(search.samples.positions[0] + [0.0, 0.0, miss], FIRST[3:])
@@ -128,7 +128,7 @@ def test_a_path_through_a_sensor_is_no_error(miss):
 
 
 def test_pairs_are_ranked_by_the_density_of_the_frames():
-    """The density counts moments of both rows, backgrounds and noise; all pairs have one order."""
+    """The density includes moments, backgrounds and noise; all pairs are in the same order."""
     search, grid = search_of(FIRST, SECOND)
     pairs = search.pairs(grid, 3, 2)
     model, density = search.samples.straight_model(N_DIPOLES), []
@@ -153,7 +153,7 @@ def test_moments_of_a_pair_are_those_of_its_vehicles():
                                    atol=60.0)
 
 
-def test_pairs_are_those_of_different_minima():
+def test_pairs_belong_to_different_minima():
     search, grid = search_of(FIRST, SECOND)
     pairs = np.array(search.pairs(grid, 3, 2))
     apart = np.abs(pairs[:, None] - pairs)
@@ -161,48 +161,48 @@ def test_pairs_are_those_of_different_minima():
     assert all((apart[i, k] > 0.3).any() for i in range(len(pairs)) for k in range(i))
 
 
-@pytest.mark.parametrize('slow', [0, 1])
-def test_a_pair_of_which_one_stands_is_none(slow):
+@pytest.mark.parametrize('standing', [0, 1])
+def test_a_pair_with_a_standing_vehicle_is_rejected(standing):
     search, _ = search_of(FIRST, SECOND)
     pair = np.array([FIRST, SECOND])
     assert np.isfinite(search.refined(pair.reshape(1, -1), 0)[1]).all()
-    pair[slow, 3] = 0.1
+    pair[standing, 3] = 0.1
     assert np.isinf(search.refined(pair.reshape(1, -1), 0)[1]).all()
 
 
-@pytest.mark.parametrize('away, felt', [
+@pytest.mark.parametrize('away, is_sensed', [
     (0.0, True), (15.0, True), (90.0, False), (300.0, False), (1e23, False), (-1e200, False)])
-def test_a_vehicle_that_nobody_feels_is_not_found(away, felt):
-    """Frames of one vehicle are explained as well with another one anywhere far away."""
+def test_a_vehicle_that_no_sensor_senses_is_rejected(away, is_sensed):
+    """Another vehicle far away does not change how well the frames are explained."""
     search, _ = search_of(FIRST)
     other = np.append(away, SECOND[1:])
     for theta in (other, np.append(FIRST, other), np.append(other, FIRST)):
-        assert np.isfinite(search.refined(theta[None], 0)[1]).all() == felt
+        assert np.isfinite(search.refined(theta[None], 0)[1]).all() == is_sensed
 
 
-def test_pairs_that_a_step_throws_away_are_left_out(monkeypatch):
-    """Squares of their places overflow."""
+def test_pairs_that_diverge_are_discarded(monkeypatch):
+    """The squares of their positions overflow."""
     search, grid = search_of(FIRST, SECOND)
     refined = SteadySearch.refined
 
-    def thrown(self, theta, *args):
+    def diverging(self, theta, *args):
         path, cost = refined(self, theta, *args)
         if theta.shape[1] == 14:
             path[::2], cost[::2] = 1e200, np.inf
         return path, cost
 
-    monkeypatch.setattr(SteadySearch, 'refined', thrown)
+    monkeypatch.setattr(SteadySearch, 'refined', diverging)
     pairs = search.pairs(grid, 3, 2)
     assert pairs and all((np.abs(pair) < 1e3).all() for pair in pairs)
 
 
-def test_where_no_start_can_be_used_nobody_is_found():
+def test_a_search_without_a_valid_start_finds_nothing():
     search, _ = search_of(FIRST)
     at = np.append(search.samples.positions[0], FIRST[3:])
     grid = StartGrid(search.samples, search.prior, at[None])
     assert search.best(grid, 3).shape == (0, 7) and search.pairs(grid, 3, 2) == []
 
 
-def test_what_stands_or_goes_backwards_is_not_found():
+def test_standing_and_reversing_vehicles_are_not_found():
     search, grid = search_of(FIRST)
     assert (search.best(grid, 5)[:, 3] >= 0.2 * min(VEHICLE.speeds)).all()

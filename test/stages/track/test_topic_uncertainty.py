@@ -1,4 +1,4 @@
-"""What messages without a flag say of an ambiguous track: all that is still possible."""
+"""Covariance of ambiguous tracks in messages without a flag: it includes all hypotheses."""
 
 import dataclasses
 
@@ -25,9 +25,8 @@ UNIT = st.floats(-1.0, 1.0)
 VECTORS = st.tuples(UNIT, UNIT, UNIT).map(np.array)
 
 
-def track_of(weights, places, headings, policy=MIXTURE, std=0.5, **more):
-    """The `Track` of a bank of points at places along x that drive at 8 m/s, the first published.
-    """
+def track_of(weights, places, headings, policy=MIXTURE, std=0.5, **extra):
+    """`Track` of a bank of points along x that drive at 8 m/s; the first one is published."""
     n, model = len(places), RowVehicle(np.zeros(3), np.ones(3), n_dipoles=1)
     x = np.zeros((n, 12))
     x[:, 0], x[:, 6] = places, 100.0
@@ -38,11 +37,11 @@ def track_of(weights, places, headings, policy=MIXTURE, std=0.5, **more):
                  'existence': 1.0, 'degrees_of_freedom': 6, 'predicted': np.zeros((2, 3)),
                  'mounting': np.zeros((0, 3)), 'mounting_covariance': np.zeros((0, 3, 3))}
     return published_track(bank, 0, model, VehicleOrientation(), [f'{k}' for k in range(n)],
-                           ('car',), set(), None, ambiguous_poses=policy, **{**arguments, **more})
+                           ('car',), set(), None, ambiguous_poses=policy, **{**arguments, **extra})
 
 
-def test_the_mixture_is_that_of_samples():
-    """Position, heading, and how they hang together, of samples about the published pose."""
+def test_the_covariance_of_the_mixture_matches_samples():
+    """Position, heading and their correlation, about the published pose."""
     weights, places, headings = [0.6, 0.3, 0.1], [0.0, 20.0, -9.0], [0.0, np.pi - 0.2, 0.3]
     track = track_of(weights, places, headings)
     rng = np.random.default_rng(0)
@@ -55,16 +54,16 @@ def test_the_mixture_is_that_of_samples():
     assert C[0, 5] == pytest.approx((x * yaw).mean(), rel=0.01)
     assert C[1, 1] == pytest.approx(0.25)
     assert np.linalg.eigvalsh(C).min() > 0.0
-    # The pose stays one hypothesis, and the track says what that one says.
+    # Pose and covariance of the track are those of a single hypothesis.
     assert track.position[0] == 0.0 and track.covariance[0, 0] == pytest.approx(0.25)
 
 
-def test_it_is_never_narrower_than_the_pose_itself():
-    """Also where the covariance was widened: by innovations, and by a rival path."""
-    for more in ({}, {'excess': 7.0}, {'difference': np.array([3.0, 1.0, 0.0, 0.5, 0.0, 0.0])}):
-        track = track_of([0.7, 0.3], [0.0, 15.0], [0.0, 3.0], **more)
+def test_the_mixture_is_never_narrower_than_the_pose():
+    """Also if its covariance was widened by innovations or by another path."""
+    for extra in ({}, {'excess': 7.0}, {'difference': np.array([3.0, 1.0, 0.0, 0.5, 0.0, 0.0])}):
+        track = track_of([0.7, 0.3], [0.0, 15.0], [0.0, 3.0], **extra)
         wider = track.topic_uncertainty.covariance - track.covariance
-        assert np.linalg.eigvalsh(wider).min() > -1e-9, more
+        assert np.linalg.eigvalsh(wider).min() > -1e-9, extra
         assert wider[0, 0] > 0.3 * 14.0**2
 
 
@@ -72,15 +71,15 @@ def test_it_is_never_narrower_than_the_pose_itself():
     (MIXTURE, [0.99, 0.01], False, True), (MIXTURE, [0.9, 0.1], False, False),
     (HOLD, [0.99, 0.01], False, True), (HOLD, [0.9, 0.1], True, False),
     (BEST, [0.99, 0.01], False, True), (BEST, [0.9, 0.1], False, True)])
-def test_the_policy(policy, weights, held, own):
-    """An unambiguous track is what it was, whatever the policy."""
+def test_ambiguous_poses_are_published_according_to_the_policy(policy, weights, held, own):
+    """An unambiguous track does not depend on the policy."""
     track = track_of(weights, [0.0, 30.0], [0.0, np.pi], policy)
     assert track.ambiguous == (weights[1] > 0.05)
     messages = pose_message_dict(track, 'map'), odometry_dict(track, 'map', 'track_1')
     assert [m is None for m in messages] == [held, held]
     if not held:
-        said = np.array(messages[0]['pose']['covariance']).reshape(6, 6)
-        assert np.array_equal(said, pose_covariance(track)) == own
+        covariance = np.array(messages[0]['pose']['covariance']).reshape(6, 6)
+        assert np.array_equal(covariance, pose_covariance(track)) == own
         twist = np.array(messages[1]['twist']['covariance']).reshape(6, 6)
         assert (twist[0, 0] == pytest.approx(0.25)) == own
 
@@ -109,8 +108,8 @@ def test_the_rotation_between_two_headings_is_about_z():
 
 
 @pytest.mark.study
-def test_errors_of_ambiguous_poses_stay_inside():
-    """ANEES of at most 2 on the topics, of 102 random passes of two simulators."""
+def test_ambiguous_poses_on_the_topics_are_consistent():
+    """ANEES of 2 or less on the topics, over 102 random passes of two simulators."""
     found = [one_random_pass(s, k, seed) for seed in range(17) for s in SIMULATORS for k in KINDS]
     ambiguous = np.concatenate([f.ambiguous for f in found])
     nees = np.concatenate([f.topic_nees for f in found])
@@ -121,6 +120,6 @@ def test_errors_of_ambiguous_poses_stay_inside():
     np.testing.assert_allclose(nees[~ambiguous], plain[~ambiguous], rtol=1e-12)
 
 
-def test_the_record_without_it_sends_nothing():
+def test_a_record_without_topic_uncertainty_gives_no_messages():
     track = dataclasses.replace(track_of([1.0], [0.0], [0.0]), topic_uncertainty=None)
     assert pose_message_dict(track, 'map') is None and odometry_dict(track, 'map', 'x') is None

@@ -1,4 +1,4 @@
-"""The tracking stage: starts, ends, gaps, poses and their doubts."""
+"""Tracking stage: starts and ends of tracks, gaps, poses and their doubts."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ from support.track_runs import drive, magnet_frames
 OVERFITS = 'poses doubted: the filter fits better than its path'
 
 
-def test_a_matched_target_is_tracked_inside_its_covariance():
+def test_a_target_that_matches_the_model_is_tracked_within_its_covariance():
     network = line_network(2)
     tracks, pipeline, truth = drive(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5),
                                     Path(np.array([-70.0, -1.2]), 0.0, 10.0), POINT)
@@ -46,14 +46,14 @@ CAR, TRUCK = {'length': 4.3}, {'length': 11.0, 'width': 2.4, 'height': 2.8, 'mom
     ('small', point_body([30.0, 40.0, 90.0], 1.0, 0.5)),
     *(('car', random_vehicle(np.random.default_rng(seed), **CAR)) for seed in (3, 4, 6)),
     *(('truck', random_vehicle(np.random.default_rng(seed), **TRUCK)) for seed in (4, 5))])
-def test_the_evidence_says_of_which_kind_a_vehicle_is(kind, body):
+def test_the_evidence_identifies_the_kind_of_a_vehicle(kind, body):
     tracks, *_ = drive(line_network(2), body, Path(np.array([-80.0, -1.2]), 0.0, 12.0))
     assert tracks[-1].kind == kind
     assert tracks[-1].kind_weight > 0.95
     if kind == 'small':
         assert tracks[-1].length == tracks[-1].length_std == 0.0
     else:
-        # Most of the iron of the simulated vehicles is seven tenths of their length apart.
+        # Most of the iron of the simulated vehicles spans seven tenths of their length.
         assert 0.4 < tracks[-1].length / {'car': 4.3, 'truck': 11.0}[kind] < 1.0
         assert 0.0 < tracks[-1].length_std < 2.0
     assert sum(h.weight for h in tracks[-1].hypotheses if h.kind == kind) == pytest.approx(
@@ -61,22 +61,22 @@ def test_the_evidence_says_of_which_kind_a_vehicle_is(kind, body):
 
 
 @pytest.mark.study
-def test_most_trucks_are_told_and_of_the_others_it_is_not_sure():
-    """35 of 40 others, seeds 0 to 39, were told with other noise; the limit is the binomial's."""
+def test_most_trucks_are_identified_and_the_others_are_uncertain():
+    """35 of 40 trucks (seeds 0 to 39, other noise) were identified; the limit is binomial."""
     n, ends = 16, []
     for seed in range(n):
         body = random_vehicle(np.random.default_rng(seed), **TRUCK)
         tracks, *_ = drive(line_network(2), body, Path(np.array([-80.0, -1.2]), 0.0, 12.0))
         ends.append(tracks[-1])
-    told = [t.kind == 'truck' for t in ends]
-    print(f'{sum(told)} of {n} trucks are told')
-    assert sum(told) >= binom.ppf(0.01, n, 0.875)
+    identified = [t.kind == 'truck' for t in ends]
+    print(f'{sum(identified)} of {n} trucks are identified')
+    assert sum(identified) >= binom.ppf(0.01, n, 0.875)
     assert all(ok or t.kind_weight < 0.95 or t.ambiguous
-               for ok, t in zip(told, ends, strict=True))
+               for ok, t in zip(identified, ends, strict=True))
 
 
 @pytest.mark.parametrize('heading, arrival', [(0.0, 'left'), (np.pi, 'right')])
-def test_an_extended_target_is_followed(heading, arrival):
+def test_an_extended_target_is_tracked(heading, arrival):
     network = line_network(2, tilt=0.0)
     u = np.array([np.cos(heading), np.sin(heading)])
     tracks, _, truth = drive(
@@ -90,7 +90,7 @@ def test_an_extended_target_is_followed(heading, arrival):
     assert live[int(np.hypot(*truth.T).argmin())].arrival == arrival
 
 
-def test_noise_alone_makes_no_track():
+def test_noise_alone_starts_no_track():
     network = line_network(2)
     far = Path(np.array([1e6, 0.0]), 0.0, 1.0)
     tracks, pipeline, _ = drive(network, point_body([1.0, 0.0, 0.0], 0.0, 0.5), far, duration=60.0)
@@ -99,7 +99,7 @@ def test_noise_alone_makes_no_track():
 
 
 @pytest.mark.parametrize('lost', [None, [2, 5]])
-def test_a_magnet_is_found_anywhere_and_followed(lost):
+def test_a_magnet_is_found_and_tracked(lost):
     network, frames, truth = magnet_frames(lost=lost)
     stage = TrackManager(network, settings_for('magnet').track)
     tracks = [t for f in frames for t in stage.feed(f)]
@@ -112,7 +112,7 @@ def test_a_magnet_is_found_anywhere_and_followed(lost):
     assert tracks[-1].arrival == '' and not tracks[-1].ambiguous
 
 
-def test_the_roll_of_a_dipole_is_flagged_and_not_invented():
+def test_the_roll_of_a_dipole_is_flagged_as_unobservable():
     network, frames, _ = magnet_frames(5)
     stage = TrackManager(network, settings_for('magnet').track)
     track = [t for f in frames for t in stage.feed(f)][-1]
@@ -123,12 +123,12 @@ def test_the_roll_of_a_dipole_is_flagged_and_not_invented():
     C = pose_covariance(track)
     np.testing.assert_allclose(C, C.T)
     assert np.linalg.eigvalsh(C).min() > -1e-12
-    # Across the moment it is known well.
+    # Rotations across the moment are well known.
     across = np.linalg.svd(u[None])[2][1:]
     assert np.abs(across @ track.orientation_covariance @ across.T).max() < 1e-2
 
 
-def test_a_vehicle_has_a_heading_and_no_roll():
+def test_a_vehicle_has_a_heading_and_unobservable_roll_and_pitch():
     tracks, _, _ = drive(line_network(2), point_body([200.0, -150.0, 80.0], 5.0, 0.5),
                          Path(np.array([-70.0, -1.2]), 0.0, 10.0))
     live = [t for t in tracks if not t.ended]
@@ -139,7 +139,7 @@ def test_a_vehicle_has_a_heading_and_no_roll():
     np.testing.assert_allclose(R[:2, 0], v, atol=1e-9)
     C = middle.orientation_covariance
     assert C[0, 0] == C[1, 1] == pytest.approx(np.pi**2)
-    # The variance of the heading is that of the speed across it.
+    # The variance of the heading follows from that of the velocity across it.
     u = np.array([-v[1], v[0]])
     expected = u @ middle.covariance[3:5, 3:5] @ u / (middle.velocity[:2] @ middle.velocity[:2])
     assert C[2, 2] == pytest.approx(expected, rel=1e-9)
@@ -157,7 +157,7 @@ def test_poses_of_a_filter_that_fits_better_than_its_path_are_ambiguous(
     assert bool(pipeline.track.counts[OVERFITS]) == doubted
 
 
-def test_a_magnet_is_not_doubted_for_its_path(monkeypatch):
+def test_a_magnet_is_not_doubted_for_overfitting(monkeypatch):
     monkeypatch.setattr(Relinearisation, 'gain', lambda self, origin: -20.0)
     network, frames, _ = magnet_frames(20)
     stage = TrackManager(network, settings_for('magnet').track)
@@ -176,7 +176,7 @@ def test_gaps_and_backward_jumps_end_a_track():
     assert stage.counts['tracks ended: time jumped back'] == 1
 
 
-def test_a_track_may_be_given_up_and_the_next_is_another():
+def test_an_abandoned_track_ends_and_the_next_has_another_id():
     network, frames, _ = magnet_frames(4)
     stage = TrackManager(network, settings_for('magnet').track)
     assert stage.give_up('no frames received') == []
@@ -187,7 +187,7 @@ def test_a_track_may_be_given_up_and_the_next_is_another():
     assert [(t.id, t.ended) for t in stage.feed(frames[1])] == [(2, False)]
 
 
-def test_a_frame_without_a_measurement_is_coasted_through():
+def test_a_track_coasts_through_a_frame_without_measurements():
     network, frames, _ = magnet_frames(10)
     stage = TrackManager(network, settings_for('magnet').track)
     for f in frames[:5]:
@@ -198,7 +198,7 @@ def test_a_frame_without_a_measurement_is_coasted_through():
     assert (np.diagonal(after.covariance) > np.diagonal(before.covariance)).all()
 
 
-def test_too_few_axes_start_no_magnet():
+def test_too_few_axes_start_no_magnet_track():
     network, frames, _ = magnet_frames(1)
     field = np.full((9, 3), np.nan)
     field[0] = frames[0].field[0]
@@ -207,7 +207,7 @@ def test_too_few_axes_start_no_magnet():
     assert stage.counts['frames without a start'] == 1
 
 
-def test_a_hypothesis_on_a_sensor_is_dropped_and_the_rest_go_on():
+def test_a_hypothesis_at_a_sensor_is_dropped_and_the_others_continue():
     network, frames, _ = magnet_frames(3)
     stage = TrackManager(network, settings_for('magnet', {'track.iterations': 1}).track)
     stage.feed(frames[0])
@@ -218,21 +218,21 @@ def test_a_hypothesis_on_a_sensor_is_dropped_and_the_rest_go_on():
     bank.origin = np.append(bank.origin, len(bank.origin))
     bank.x[-1, :3] = network.positions[0]
     bank.x[-1, 3:6] = 0.0
-    # No field at all: what is lost must not win because it predicts none.
+    # The field is zero: a dropped hypothesis must not win because it predicts none.
     track = stage.feed(dataclasses.replace(frames[1], field=0.0 * frames[1].field))[-1]
     assert np.isfinite(track.position).all() and not track.ended
     assert min(np.linalg.norm(h.position - network.positions[0]) for h in track.hypotheses) > 0.01
 
 
-def test_without_an_earth_field_there_is_no_soft_iron():
+def test_soft_iron_has_no_effect_without_an_earth_field():
     network = dataclasses.replace(line_network(2), earth_field=None)
     model = target_of(settings_for('vehicle').track, network).model
     assert not model.earth_field.any()
 
 
-def test_the_predicted_field_is_without_the_errors_of_the_model():
-    """With them anything would seem to fit: a car that may only be a point shows what is left."""
-    left = {}
+def test_the_predicted_field_excludes_the_model_errors():
+    """With them any target would fit: a car that is tracked as a point has large residuals."""
+    residual = {}
     for name, changes in (('point', {**POINT, 'track.vehicle.near_field_lengths': [2.0]}),
                           ('row', {})):
         network = line_network(2, tilt=0.0)
@@ -244,7 +244,7 @@ def test_the_predicted_field_is_without_the_errors_of_the_model():
         again = Pipeline(network, settings_for('vehicle', changes))
         fields = {r.stamp_ns: r.field for s in samples for r in again.feed(one(s))
                   if hasattr(r, 'target_present')}
-        left[name] = max(np.abs(t.predicted - fields[t.stamp_ns]).max()
-                         for t in tracks if not t.ended)
-    assert left['point'] > 2.0 * left['row']
-    assert left['point'] > 5e-8
+        residual[name] = max(np.abs(t.predicted - fields[t.stamp_ns]).max()
+                             for t in tracks if not t.ended)
+    assert residual['point'] > 2.0 * residual['row']
+    assert residual['point'] > 5e-8

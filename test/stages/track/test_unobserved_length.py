@@ -1,4 +1,4 @@
-"""A long vehicle: where its middle is, before and after all of it has been felt."""
+"""Middle of a long vehicle: its uncertainty before and after the whole vehicle has passed."""
 
 import numpy as np
 import pytest
@@ -22,50 +22,50 @@ def at(place, heading=0.0, speed=8.0):
     return x
 
 
-def off_middle(length, half_std, is_felt, n=400_000):
-    """Samples of where the middle of a truck of 9 +- 3 m is, from that of its row, along it."""
+def off_middle(length, half_std, is_sensed, n=400_000):
+    """Samples of the offset from the middle of a row to that of its truck of 9 +- 3 m."""
     rng = np.random.default_rng(0)
     hidden = 0.5 * (9.0 - length) + half_std * rng.standard_normal(n)
-    return hidden * (rng.uniform(-1.0, 1.0, n) if is_felt else -1.0)
+    return hidden * (rng.uniform(-1.0, 1.0, n) if is_sensed else -1.0)
 
 
 @pytest.mark.parametrize('complete', [True, False])
 @pytest.mark.parametrize('length', [5.0, -5.0])
 def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(complete, length):
-    """Along the heading, by what it is longer than its row; a car as the filter says."""
-    model, x, said = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi), {}
+    """The variance along the heading grows by the excess length; a car keeps its covariance."""
+    model, x, found = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi), {}
     x[18] = length
     for kind, usual, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
-        said[kind] = smoothed_pose(
+        found[kind] = smoothed_pose(
             model, VehicleOrientation(), x, P, unobserved_length=UnobservedLength([usual], [std]),
             difference=np.zeros(6), stamp_ns=0, id=1, kind=0, kinds=(kind,), ambiguous=False,
             complete=complete).covariance - P[:6, :6]
-    assert not said['car'].any()
-    along = said['truck'][1, 1]
+    assert not found['car'].any()
+    along = found['truck'][1, 1]
     assert along == pytest.approx(np.square(off_middle(5.0, 1.5, False)).mean(), rel=0.02)
-    said['truck'][1, 1] = 0.0
-    np.testing.assert_allclose(said['truck'], 0.0, atol=1e-12)
+    found['truck'][1, 1] = 0.0
+    np.testing.assert_allclose(found['truck'], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize('length', [4.0, 8.9])
-def test_a_truck_that_was_felt_has_its_iron_at_either_end(length):
+def test_a_truck_that_has_been_sensed_may_have_its_iron_at_either_end(length):
     unobserved_length = of_vehicles()
     for beyond in (-9.0, 8.0):
         unobserved_length.update(at([beyond, 0.0]), P, np.zeros((1, 3)), True)
         expected = np.square(off_middle(length, 1.5, beyond > 0.0)).mean()
-        said = unobserved_length.covariance(at([beyond, 0.0]), P, length, TRUCK)
-        assert said[0, 0] == pytest.approx(expected, rel=0.02)
+        found = unobserved_length.covariance(at([beyond, 0.0]), P, length, TRUCK)
+        assert found[0, 0] == pytest.approx(expected, rel=0.02)
 
 
-def test_a_row_that_is_longer_than_its_kind_hides_no_more_than_the_spread_of_it():
+def test_a_row_longer_than_its_kind_hides_only_the_spread_of_lengths():
     unobserved_length = of_vehicles()
-    said = [unobserved_length.covariance(at([-9.0, 0.0]), P, length, TRUCK)[0, 0]
-            for length in (9.0, 15.0)]
-    np.testing.assert_allclose(said, 1.5**2)
+    found = [unobserved_length.covariance(at([-9.0, 0.0]), P, length, TRUCK)[0, 0]
+             for length in (9.0, 15.0)]
+    np.testing.assert_allclose(found, 1.5**2)
 
 
-def test_a_car_that_comes_may_be_the_head_of_a_truck():
-    """The law of a mixture: a third of the vehicles have their middle three metres behind."""
+def test_an_approaching_car_may_be_the_front_of_a_truck():
+    """Variance of a mixture: a third of the vehicles have their middle three metres behind."""
     added = of_vehicles().covariance(at([-20.0, 0.0]), P, 3.0, CAR)
     rng = np.random.default_rng(0)
     is_truck = rng.random(400_000) < 1.0 / 3.0
@@ -75,7 +75,7 @@ def test_a_car_that_comes_may_be_the_head_of_a_truck():
 
 
 @pytest.mark.parametrize('heading', [0.0, 2.0, np.pi])
-def test_once_a_truck_would_have_been_felt_a_car_is_one(heading):
+def test_a_car_is_certain_once_a_truck_would_have_been_sensed(heading):
     unobserved_length, forward = of_vehicles(), np.array([np.cos(heading), np.sin(heading)])
     for beyond, is_open in ((-9.0, True), (2.9, True), (3.1, False), (8.0, False)):
         x = at(beyond * forward, heading)
@@ -83,7 +83,7 @@ def test_once_a_truck_would_have_been_felt_a_car_is_one(heading):
         assert unobserved_length.covariance(x, P, 3.0, CAR).any() == is_open
 
 
-def test_round_a_corner_the_way_counts():
+def test_the_distance_along_the_path_counts_around_a_corner():
     unobserved_length = of_vehicles()
     for place, heading, is_open in (([-4.0, 1.0], 0.0, True), ([1.0, 1.0], 0.0, True),
                                     ([2.0, 0.0], -1.5, True), ([2.0, -2.0], -1.5, False)):
@@ -92,17 +92,17 @@ def test_round_a_corner_the_way_counts():
         assert unobserved_length.covariance(x, P, 3.0, CAR).any() == is_open
 
 
-def test_only_a_sensor_that_it_came_near_to_has_felt_it():
+def test_only_a_sensor_near_the_path_confirms_the_length():
     unobserved_length, far = of_vehicles(), np.array([[-100.0, 500.0, 0.0], [0.0, 3.0, 0.0]])
     unobserved_length.update(at([-20.0, 0.0]), P, far, True)
     assert unobserved_length.covariance(at([-20.0, 0.0]), P, 3.0, CAR).any()
     for places, is_certain in ((np.zeros((0, 3)), True), (far, False)):
-        # None measured; or it may as well be elsewhere.
+        # No sensor measured it, or its place is ambiguous.
         unobserved_length.update(at([20.0, 0.0]), P, places, is_certain)
         assert unobserved_length.covariance(at([20.0, 0.0]), P, 3.0, CAR).any()
 
 
-def test_one_that_stops_keeps_its_heading():
+def test_a_vehicle_that_stops_keeps_its_heading():
     unobserved_length = of_vehicles()
     unobserved_length.update(at([-5.0, 0.0]), P, SENSORS, True)
     moving = unobserved_length.covariance(at([-4.0, 0.0]), P, 3.0, CAR)
@@ -112,25 +112,25 @@ def test_one_that_stops_keeps_its_heading():
         np.testing.assert_allclose(unobserved_length.covariance(standing, P, 3.0, CAR), moving)
 
 
-def test_nothing_is_longer_than_the_longest_kind():
+def test_no_vehicle_is_longer_than_the_longest_kind():
     coming, cars = at([-20.0, 0.0]), UnobservedLength([3.0], [1.0])
     for length in (2.0, 3.0, 4.0):
         assert not cars.covariance(coming, P, length, 0).any()
     longest = [UnobservedLength(lengths, [3.0] * len(lengths)).covariance(coming, P, 8.9, -1)
                for lengths in ([9.0], [0.0, 3.0, 9.0])]
-    # Shorter kinds add nothing to what it is itself.
+    # Shorter kinds do not change the result of the longest.
     np.testing.assert_array_equal(*longest)
 
 
-def test_what_is_not_seen_and_where_else_it_may_be_are_covered_together():
-    """Along x: position, velocity and heading of a smoothed pose; jointly it stays a covariance."""
+def test_the_difference_to_another_path_widens_the_joint_covariance():
+    """Position, velocity and heading of a smoothed pose; the joint covariance stays valid."""
     model, x = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi)
-    said = {}
+    found = {}
     for name, difference in (('here', np.zeros(6)), ('apart', np.array([6.0, 0, 0, 2.0, 0, 0]))):
-        said[name] = smoothed_pose(
+        found[name] = smoothed_pose(
             model, VehicleOrientation(), x, P, unobserved_length=None, difference=difference,
             stamp_ns=0, id=1, kind=0, kinds=('car',), ambiguous=False, complete=True)
-    here, apart = said['here'], said['apart']
+    here, apart = found['here'], found['apart']
     assert apart.covariance[0, 0] == pytest.approx(36.0)
     assert here.covariance[0, 0] < 36.0
     assert apart.covariance[3, 3] > here.covariance[3, 3]

@@ -1,4 +1,4 @@
-"""Counting lines: what is counted, when, once, and in order; and what the fields say of it."""
+"""Traffic counting: passages of counting lines, their order, and the check by the fields."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ STEP = 0.1
 
 
 def drive(begin_s, end_s, at_s, v=10.0, y=-1.5, **changes):
-    """{time in steps: [pose]} of a vehicle that is on the line at a time [s]; it ends there."""
+    """{step: [pose]} of a vehicle that crosses the line at `at_s`; the last pose ends the track."""
     steps = range(round(begin_s / STEP), round(end_s / STEP) + 1)
     out = {k: [track_pose(k * STEP, v * (k * STEP - at_s), y, v, **changes)] for k in steps}
     out[steps[-1]].append(replace(out[steps[-1]][0], ended=True))
@@ -33,7 +33,7 @@ def drive(begin_s, end_s, at_s, v=10.0, y=-1.5, **changes):
 
 
 def counted(*drives, settings=None, last_s=30.0, field_at=None, network=NETWORK, first_s=0.0):
-    """(records, `Traffic`) of vehicles in a stretch of frames."""
+    """(records, `Traffic`) of vehicles in consecutive frames."""
     stage, out = Traffic(network, settings or TrafficSettings()), []
     for k in range(round(first_s / STEP), round(last_s / STEP) + 1):
         field = None if field_at is None else field_at(k * STEP)
@@ -51,7 +51,7 @@ def summaries(records):
 
 
 @pytest.mark.parametrize('v', [10.0, -10.0])
-def test_a_vehicle_is_counted_where_and_when_it_crosses(v):
+def test_a_passage_has_the_time_place_and_speed_of_the_crossing(v):
     (p,) = passages(counted(drive(2.0, 6.0, 4.037, v))[0])
     assert p.stamp_ns == pytest.approx(4.037 * NS, abs=1000) and p.forward == (v > 0)
     assert p.position == pytest.approx([0.0, -1.5, 0.5]) and p.lateral == pytest.approx(-1.5)
@@ -64,13 +64,13 @@ def test_a_vehicle_that_does_not_cross_is_not_counted():
     beside = drive(2.0, 6.0, 4.0, y=20.0)
     turns = drive(2.0, 6.0, 4.0)
     turns = {k: [replace(r, position=-np.abs(r.position)) for r in rs] for k, rs in turns.items()}
-    for one in (beside, turns, drive(2.0, 2.5, 4.0)):
-        records, stage = counted(one)
+    for car in (beside, turns, drive(2.0, 2.5, 4.0)):
+        records, stage = counted(car)
         assert passages(records) == []
         assert stage.counts['tracks that crossed no line'] == 1
 
 
-def test_a_crossing_is_extrapolated_only_a_little():
+def test_a_crossing_is_extrapolated_over_a_short_time_only():
     for begin, end in ((2.0, 3.5), (4.4, 6.0)):
         (p,) = passages(counted(drive(begin, end, 4.0))[0])
         assert p.stamp_ns == pytest.approx(4.0 * NS, abs=1000) and p.doubts == (EXTRAPOLATED,)
@@ -78,19 +78,19 @@ def test_a_crossing_is_extrapolated_only_a_little():
     assert passages(counted(drive(5.1, 7.0, 4.0))[0]) == []
 
 
-def test_a_track_that_is_lost_and_begun_again_is_counted_once():
+def test_a_vehicle_whose_track_is_lost_and_restarted_is_counted_once():
     records, stage = counted(drive(2.0, 4.3, 4.0), drive(4.6, 6.0, 4.1, id=2))
     assert len(passages(records)) == 1
     assert stage.counts['repeated crossings after a lost track'] == 1
 
 
-def test_that_holds_where_the_extrapolated_crossing_comes_first():
+def test_a_restarted_track_is_counted_once_after_an_extrapolated_crossing():
     records, stage = counted(drive(2.0, 3.9, 4.1), drive(4.0, 6.0, 4.15, id=2))
     assert len(passages(records)) == 1
     assert stage.counts['repeated crossings after a lost track'] == 1
 
 
-def test_vehicles_in_two_lanes_are_not_one():
+def test_vehicles_in_two_lanes_are_counted_separately():
     records, _ = counted(drive(2.0, 4.3, 4.0), drive(4.6, 6.0, 4.3, y=4.5, id=2))
     assert [p.track_id for p in passages(records)] == [1, 2]
 
@@ -100,39 +100,39 @@ def test_a_vehicle_that_stops_before_the_line_is_not_extrapolated():
 
 
 @pytest.mark.parametrize('ends', [(6.0, 6.0), (6.0, 5.5), (5.5, 6.0), (7.0, 5.0)])
-def test_two_that_meet_are_both_counted(ends):
+def test_two_vehicles_that_meet_are_both_counted(ends):
     records, _ = counted(drive(2.0, ends[0], 4.0), drive(2.0, ends[1], 4.2, -12.0, 1.5, id=2),
                          field_at=field_of(1.0))
     assert [(p.track_id, p.forward) for p in passages(records)] == [(1, True), (2, False)]
-    # Each has a part in the fields of the other.
+    # The fields contain both vehicles, so they confirm no direction.
     assert all(np.isnan(p.direction_error) for p in passages(records))
 
 
-def test_the_smoothed_path_is_the_one_that_counts():
-    one = drive(2.0, 6.0, 4.0)
-    one[60] += [smoothed_pose(t, 12.0 * (t - 3.9), v=12.0) for t in np.arange(2.0, 6.0, STEP)]
-    (p,) = passages(counted(one)[0])
+def test_a_passage_is_that_of_the_smoothed_path():
+    car = drive(2.0, 6.0, 4.0)
+    car[60] += [smoothed_pose(t, 12.0 * (t - 3.9), v=12.0) for t in np.arange(2.0, 6.0, STEP)]
+    (p,) = passages(counted(car)[0])
     assert p.stamp_ns == pytest.approx(3.9 * NS, abs=1000) and p.speed == pytest.approx(12.0)
 
 
-def test_late_poses_of_a_lag_are_not_a_smoothed_path():
-    one = drive(2.0, 6.0, 4.0)
-    one[60] += [smoothed_pose(t, 12.0 * (t - 3.9), v=12.0, complete=False)
+def test_fixed_lag_poses_are_not_used_as_a_smoothed_path():
+    car = drive(2.0, 6.0, 4.0)
+    car[60] += [smoothed_pose(t, 12.0 * (t - 3.9), v=12.0, complete=False)
                 for t in np.arange(2.0, 6.0, STEP)]
-    (p,) = passages(counted(one)[0])
+    (p,) = passages(counted(car)[0])
     assert p.stamp_ns == pytest.approx(4.0 * NS, abs=1000) and p.speed == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize(('at_s', 'speed'), [(4.02, 10.0), (4.08, 11.0)])
-def test_a_passage_has_the_speed_of_the_pose_that_is_closest_in_time(at_s, speed):
-    one = drive(2.0, 6.0, at_s)
+def test_a_passage_has_the_speed_of_the_pose_closest_in_time(at_s, speed):
+    car = drive(2.0, 6.0, at_s)
     after = {k: [replace(r, velocity=1.1 * r.velocity) for r in rs]
-             for k, rs in one.items() if k * STEP > at_s}
-    (p,) = passages(counted({**one, **after})[0])
+             for k, rs in car.items() if k * STEP > at_s}
+    (p,) = passages(counted({**car, **after})[0])
     assert p.speed == pytest.approx(speed)
 
 
-def test_passages_come_in_order_and_have_headways():
+def test_passages_are_in_order_and_have_headways():
     slow = drive(1.0, 12.0, 8.0, 2.0)
     fast = [drive(3.0, 6.0, 4.0, 20.0, id=2), drive(6.0, 11.0, 7.5, -15.0, id=3)]
     records, _ = counted(slow, *fast)
@@ -141,12 +141,12 @@ def test_passages_come_in_order_and_have_headways():
     assert found[2].headway == pytest.approx(4.0) and np.isnan(found[1].headway)
 
 
-def test_an_ambiguous_pose_marks_the_passage():
+def test_an_ambiguous_pose_makes_the_passage_ambiguous():
     (p,) = passages(counted(drive(2.0, 6.0, 4.0, ambiguous=True))[0])
     assert p.ambiguous and p.doubts == (AMBIGUOUS,)
 
 
-def test_several_lines_count_each():
+def test_several_lines_count_separately():
     settings = TrafficSettings(
         line_names=('west', 'east', 'across'), line_headings_deg=(0.0, 180.0, 90.0),
         line_offsets=(-5.0, -5.0, 0.0), line_half_widths=(15.0,) * 3)
@@ -155,25 +155,25 @@ def test_several_lines_count_each():
     assert [p.stamp_ns / NS for p in found] == pytest.approx([3.5, 4.5])
 
 
-def test_a_passage_without_a_frame_to_wait_for_has_no_negative_headway():
-    """Frames stop, and a recording begins again at an earlier time."""
+def test_a_restart_at_an_earlier_time_gives_no_negative_headway():
+    """The frames stop, and the recording starts again at an earlier time."""
     stage, out = Traffic(NETWORK, TrafficSettings()), []
     for shift in (20.0, 0.0):
-        one = drive(2.0, 6.0, 4.0, id=1 + int(shift == 0.0))
+        car = drive(2.0, 6.0, 4.0, id=1 + int(shift == 0.0))
         for k in range(61):
-            records = [replace(r, stamp_ns=r.stamp_ns + round(shift * NS)) for r in one.get(k, [])]
+            records = [replace(r, stamp_ns=r.stamp_ns + round(shift * NS)) for r in car.get(k, [])]
             out += stage.feed(TrackedFrame(frame(shift + k * STEP), records))
         out += stage.feed(TrackedFrame(None, []))
     assert [p.stamp_ns / NS for p in passages(out)] == pytest.approx([24.0, 4.0])
     assert all(np.isnan(p.headway) for p in passages(out))
 
 
-def test_a_jump_back_in_time_begins_again():
+def test_a_jump_back_in_time_restarts_the_counting():
     stage, out = Traffic(NETWORK, TrafficSettings()), []
     for shift in (1000.0, 0.0):
-        one = drive(2.0, 6.0, 4.0, id=1 + int(shift == 0.0))
+        car = drive(2.0, 6.0, 4.0, id=1 + int(shift == 0.0))
         for k in range(70):
-            records = [replace(r, stamp_ns=r.stamp_ns + round(shift * NS)) for r in one.get(k, [])]
+            records = [replace(r, stamp_ns=r.stamp_ns + round(shift * NS)) for r in car.get(k, [])]
             out += stage.feed(TrackedFrame(frame(shift + k * STEP), records))
     out += stage.flush()
     assert [p.stamp_ns / NS for p in passages(out)] == pytest.approx([1004.0, 4.0])
@@ -182,15 +182,15 @@ def test_a_jump_back_in_time_begins_again():
 
 def test_tracks_that_end_without_a_frame_are_counted():
     stage = Traffic(NETWORK, TrafficSettings())
-    one = drive(2.0, 6.0, 4.0)
+    car = drive(2.0, 6.0, 4.0)
     for k in range(20, 60):
-        assert stage.feed(TrackedFrame(frame(k * STEP), one[k])) == []
-    ended = [replace(one[59][0], ended=True)]
+        assert stage.feed(TrackedFrame(frame(k * STEP), car[k])) == []
+    ended = [replace(car[59][0], ended=True)]
     assert len(passages(stage.feed(TrackedFrame(None, ended)))) == 1
 
 
 def field_of(direction):
-    """The field of a dipole that goes along x at 10 m/s and is on the line at 4 s."""
+    """Field of a dipole that moves along x at 10 m/s and crosses the line at 4 s."""
     def at(t):
         r = NETWORK.positions - [direction * 10.0 * (t - 4.0), -1.5, 0.2]
         return dipole_field(r, np.array([300.0, 200.0, -300.0])) + 1e-9 * np.sin(50.0 * t)
@@ -198,14 +198,14 @@ def field_of(direction):
     return at
 
 
-def test_the_fields_confirm_a_direction_or_contradict_it():
+def test_the_fields_confirm_or_contradict_a_direction():
     (p,) = passages(counted(drive(2.0, 6.0, 4.0), field_at=field_of(1.0))[0])
     assert p.direction_error < 0.01 and not p.ambiguous
     (p,) = passages(counted(drive(2.0, 6.0, 4.0), field_at=field_of(-1.0))[0])
     assert p.direction_error > 0.99 and p.doubts == (CONTRADICTED,)
 
 
-def test_a_sensor_in_the_lane_is_not_asked_for_a_direction():
+def test_a_sensor_in_the_lane_confirms_no_direction():
     network = network_of([[0.0, -1.0, 0.0], [30.0, 5.0, 0.0]])
     settings = TrafficSettings(line_offsets=(-15.0,))
     (p,) = passages(counted(drive(2.0, 6.0, 4.0), field_at=field_of(1.0), network=network,
@@ -213,7 +213,7 @@ def test_a_sensor_in_the_lane_is_not_asked_for_a_direction():
     assert np.isnan(p.direction_error)
 
 
-def test_a_vertical_axis_alone_tells_no_direction():
+def test_a_vertical_axis_alone_confirms_no_direction():
     def at(t):
         field = field_of(1.0)(t)
         field[:, :2] = np.nan
@@ -223,7 +223,7 @@ def test_a_vertical_axis_alone_tells_no_direction():
     assert np.isnan(p.direction_error)
 
 
-def test_intervals_hold_all_passages_and_no_other():
+def test_intervals_contain_every_passage_once():
     drives = [drive(begin, begin + 4.0, begin + 2.0, v, id=k)
               for k, (begin, v) in enumerate(((3.0, 10.0), (8.0, -8.0), (16.0, 12.0)), 1)]
     records, _ = counted(*drives, settings=TrafficSettings(interval_s=10.0), last_s=34.0)
@@ -238,17 +238,17 @@ def test_intervals_hold_all_passages_and_no_other():
     assert forward.mean_headway == pytest.approx(13.0) and np.isnan(backward.mean_headway)
 
 
-def test_an_interval_waits_for_the_tracks_that_began_in_it():
+def test_an_interval_waits_for_tracks_that_began_in_it():
     stage, found = Traffic(NETWORK, TrafficSettings(interval_s=10.0)), {}
-    one = drive(5.0, 14.0, 9.0, 2.0)
+    car = drive(5.0, 14.0, 9.0, 2.0)
     for k in range(200):
-        for s in summaries(stage.feed(TrackedFrame(frame(k * STEP), one.get(k, [])))):
+        for s in summaries(stage.feed(TrackedFrame(frame(k * STEP), car.get(k, [])))):
             found[s.begin_ns] = k, sum(c.count for c in s.counts)
     assert found[0] == (140, 1)
 
 
-def test_no_interval_comes_twice():
-    """A crossing may be extrapolated to the interval before."""
+def test_no_interval_is_returned_twice():
+    """A crossing may be extrapolated into the previous interval."""
     late = drive(10.5, 14.0, 9.9)
     records, _ = counted(late, settings=TrafficSettings(interval_s=10.0), last_s=40.0)
     found = summaries(records)
@@ -256,8 +256,8 @@ def test_no_interval_comes_twice():
     assert [sum(c.count for c in s.counts) for s in found] == [1, 0, 0, 0, 0]
 
 
-def test_others_do_not_wait_for_ever_for_a_track():
-    """One that stands for an hour."""
+def test_passages_do_not_wait_indefinitely_for_a_standing_vehicle():
+    """The vehicle stands for 400 s while others pass."""
     stage, n = Traffic(NETWORK, TrafficSettings()), 0
     for k in range(4000):
         records = [track_pose(k * STEP, -8.0, id=99)]
@@ -268,7 +268,7 @@ def test_others_do_not_wait_for_ever_for_a_track():
     assert 25 <= n < 40
 
 
-def test_a_gap_in_the_frames_has_no_intervals():
+def test_a_gap_in_the_frames_gives_no_intervals():
     stage, out = Traffic(NETWORK, TrafficSettings(interval_s=10.0)), []
     for t in [*np.arange(0.0, 15.0, STEP), *np.arange(1003.0, 1012.0, STEP)]:
         out += stage.feed(TrackedFrame(frame(t), []))
@@ -288,6 +288,6 @@ def test_magnets_are_not_counted():
     ({'class_names': ('car', 'car', 'truck')}, 'duplicate names'),
     ({'class_names': ('car', 'unknown', 'truck')}, "'unknown' is not a valid name"),
     ({'line_names': ('',)}, 'is not a valid name')])
-def test_lists_that_do_not_belong_together_are_refused(changes, why):
-    with pytest.raises(SettingsError, match=why):
+def test_lists_of_unequal_length_and_invalid_names_are_refused(changes, message):
+    with pytest.raises(SettingsError, match=message):
         Traffic(NETWORK, TrafficSettings(**changes))
