@@ -150,7 +150,8 @@ def _overview(path: Path, summary: dict[str, Any]) -> str:
     """Name of the recording and number of its tracks, by verdict."""
     verdicts = Counter(t['verdict'] for t in summary['tracks'])
     text = ', '.join(f'{n} {verdict}' for verdict, n in verdicts.most_common())
-    return f'{path.name}: {len(summary["tracks"])} tracks' + (f' ({text})' if text else '')
+    n = len(summary['tracks'])
+    return f'{path.name}: {n} track{"" if n == 1 else "s"}' + (f' ({text})' if text else '')
 
 
 def _print_track(t: dict[str, Any]) -> None:
