@@ -218,7 +218,7 @@ def test_the_wheel_works_without_ros_and_the_source_tree(version, tmp_path, copy
     text = run(bin_folder / 'mag-tracking', 'replay', vehicle_path(NAME), '--network',
                venv / 'share' / 'mag_tracking' / 'config' / 'network.yaml', '--out', home / 'out',
                cwd=home)
-    assert '1 tracks' in text and len(list((home / 'out').glob('*.png'))) == 3
+    assert ': 1 track' in text and len(list((home / 'out').glob('*.png'))) == 3
     assert_same_track(home / 'out', vehicle_replays[NAME][1])
 
     (home / 'site.yaml').write_text(SITE_NETWORK)
