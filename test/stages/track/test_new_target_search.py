@@ -86,7 +86,7 @@ def test_weak_explanations_and_replacements_of_a_vehicle_by_two_are_doubted(
 
 @pytest.mark.parametrize('new', [[0.0, 10.0], [8.0, 8.0], [19.0, 0.0], [5.0, 0.0]])
 @pytest.mark.parametrize('n_before', [1, 2])
-def test_vehicles_that_cross_or_overtake_too_fast_are_doubted_up_to_sixty_nats(new, n_before):
+def test_vehicles_that_cross_or_overtake_fast_are_doubted_up_to_sixty_nats(new, n_before):
     """The number of earlier vehicles makes no difference."""
     velocities = [[10.0, 0.0], [-9.0, 1.0]][:n_before] + [new]
     all_members = tuple(range(n_before + 1))

@@ -252,8 +252,8 @@ class RulingOutFilter(BankFilter):
 
     def advance(self, bank, frame, *args, **kwargs):
         predicted, out = super().advance(bank, frame, *args, **kwargs)
-        there = ~np.isnan(frame.field[self._row]).all()
-        return predicted, np.full(len(out), -np.inf) if there else out
+        valid = ~np.isnan(frame.field[self._row]).all()
+        return predicted, np.full(len(out), -np.inf) if valid else out
 
 
 def test_a_sensor_that_rules_out_every_hypothesis_is_rejected():
@@ -359,11 +359,11 @@ def first_tracks(n_quiet, stage=None, begin_ns=NS, missing=(), n_present=1):
     for k in range(n_quiet):
         assert not stage.feed(FieldFrame(begin_ns + k * NS // 10, 0.0 * field, C, np.full(2, 8),
                                          np.zeros(2), False))
-    there = ~np.isin(np.arange(2), missing)
-    field, C = np.where(there[:, None], field, np.nan), np.where(there[:, None, None], C, np.nan)
+    valid = ~np.isin(np.arange(2), missing)
+    field, C = np.where(valid[:, None], field, np.nan), np.where(valid[:, None, None], C, np.nan)
     tracks = []
     for k in range(n_quiet, n_quiet + n_present):
-        tracks += stage.feed(FieldFrame(begin_ns + k * NS // 10, field, C, np.where(there, 8, 0),
+        tracks += stage.feed(FieldFrame(begin_ns + k * NS // 10, field, C, np.where(valid, 8, 0),
                                         np.zeros(2), True))
     return stage, tracks
 

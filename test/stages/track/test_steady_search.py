@@ -139,9 +139,9 @@ def test_pairs_are_ranked_by_the_density_of_the_frames():
         off = search.prior.residual_and_jacobian(pair)[0]
         density.append(search.samples.y @ np.linalg.solve(S, search.samples.y)
                        + np.linalg.slogdet(S)[1] + (off**2).sum())
-        kept, turned = (np.hypot(*(pair[order, :2] - pairs[0][:, :2]).T).sum()
-                        for order in ([0, 1], [1, 0]))
-        assert kept <= turned
+        kept, swapped = (np.hypot(*(pair[order, :2] - pairs[0][:, :2]).T).sum()
+                         for order in ([0, 1], [1, 0]))
+        assert kept <= swapped
     assert density == sorted(density) and density[0] < density[-1]
 
 

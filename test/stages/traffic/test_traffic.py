@@ -282,7 +282,7 @@ def test_magnets_are_not_counted():
     assert stage.feed(TrackedFrame(frame(0.0), [])) == stage.flush() == []
 
 
-@pytest.mark.parametrize(('changes', 'why'), [
+@pytest.mark.parametrize(('changes', 'message'), [
     ({'line_offsets': (0.0, 1.0)}, r'traffic.line_offsets: expected 1 values'),
     ({'class_lengths': (3.0,)}, r'traffic.class_lengths: expected 3 values'),
     ({'class_names': ('car', 'car', 'truck')}, 'duplicate names'),
