@@ -73,7 +73,8 @@ CASES = {
     'a bag without use_sim_time': (NewUser(behind_ns=3 * YEAR_NS), 'use_sim_time'),
     'use_sim_time without a clock': (
         NewUser(use_sim_time=True), 'no message was received on /clock'),
-    'another time zone': (NewUser(behind_ns=7200 * 1_000_000_000), 'stamps are 7200.')}
+    'another time zone': (NewUser(behind_ns=7200 * 1_000_000_000),
+                          'delay from timestamp to receipt is 7200.')}
 
 
 OF_ANOTHER_TYPE = """

@@ -84,9 +84,9 @@ def check_parameters(command):
 def check_lifecycle(command):
     """The state of the driver node is shown and changed."""
     code, text = command('lifecycle', 'driver_node', *NAMESPACE)
-    assert code == 0 and text.startswith('active; possible: deactivate'), text
+    assert code == 0 and text.startswith('active; available transitions: deactivate'), text
     code, text = command('lifecycle', 'driver_node', 'deactivate', *NAMESPACE)
-    assert code == 0 and text.startswith('inactive; possible: '), text
+    assert code == 0 and text.startswith('inactive; available transitions: '), text
     code, text = command('lifecycle', 'driver_node', 'deactivate', *NAMESPACE)
     assert code == 1 and 'deactivate is not possible in the current state; possible: ' in text, text
 
@@ -108,7 +108,7 @@ def test_a_slow_transition_is_requested_once(command):
     try:
         wait_for(lambda: '/slow/transition_event' in command('topics')[1])
         code, text = command('lifecycle', '/slow', 'configure')
-        assert code == 0 and text.startswith('inactive; possible: '), text
+        assert code == 0 and text.startswith('inactive; available transitions: '), text
     finally:
         process.kill()
         output, _ = process.communicate()
@@ -117,7 +117,8 @@ def test_a_slow_transition_is_requested_once(command):
 
 @pytest.mark.parametrize('words, error', [
     (('echo', 'a b'), 'topic name'), (('param', '/live/bad name'), 'service name'),
-    (('lifecycle', '/1abc', 'activate'), 'service name'), (('echo', '/a', '--count', '0'), '0 is'),
+    (('lifecycle', '/1abc', 'activate'), 'service name'),
+    (('echo', '/a', '--count', '0'), '--count: expected 1 or more, got 0'),
     (('echo', ''), 'topic name'), (('echo', '/nowhere'), '/nowhere has no publisher'),
     (('param', '/nowhere'), 'service /nowhere/list_parameters not found')])
 def test_invalid_or_missing_names_are_reported(command, words, error):

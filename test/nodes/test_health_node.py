@@ -171,7 +171,7 @@ def test_each_sensor_has_a_status(publish_until, statuses):
         assert publish_until(lambda: 'silent for' in status('mag_2').message, silent=('mag_2',))
         assert status('mag_2').level == DiagnosticStatus.ERROR
         assert status('mag_1').level != DiagnosticStatus.ERROR
-        assert publish_until(lambda: 'readings are missing' in status('mag_2').message)
+        assert publish_until(lambda: 'readings were lost' in status('mag_2').message)
     finally:
         codes, outputs = stop([process])
     assert codes == [0], outputs
@@ -257,7 +257,7 @@ def test_a_new_clock_offset_is_no_clock_step():
 
 
 def test_past_faults_expire_after_two_windows(monkeypatch):
-    """A relearnt background, for example of a parked car."""
+    """The fault is a relearnt background, for example of a parked car."""
     now = [0.0]
     monkeypatch.setattr(sensor_health.time, 'monotonic', lambda: now[0])
     network = read_network(NETWORK_FILE)

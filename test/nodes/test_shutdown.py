@@ -112,7 +112,7 @@ def hanging_middleware(tmp_path_factory):
                     reason='only Fast DDS hangs')
 @pytest.mark.parametrize('module, arguments, status, text', [
     ('mag_tracking.cli', ['topics'], 0, '/rosout'),
-    ('mag_tracking.cli', ['doctor', '--live', '1', '--network', NETWORK_FILE], 2, 'WRONG'),
+    ('mag_tracking.cli', ['doctor', '--live', '1', '--network', NETWORK_FILE], 2, 'ERROR mag_1'),
     ('mag_tracking.cli', ['run', '--network', NETWORK_FILE, '--drivers', '/none.yaml'], 1,
      '/none.yaml'),
     ('mag_tracking.nodes.tracker_node', ['--ros-args', '-p', 'network:=/none.yaml'], 1,
