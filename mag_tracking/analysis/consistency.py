@@ -29,7 +29,7 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
     ----------
     network : SensorNetwork
     log : TrackLog
-    truth : (timestamps, positions, quaternions)
+    truth : (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)
         (n,) ns, (n, 3) m, (n, 4).
     acceleration : (3,) array, m²/s³
         Spectral density of the acceleration.

@@ -60,7 +60,7 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
     [TSP14]_ sections III.A and V; [T10]_ Alg. 1.
     """
     if cpa_range is not None and len(data.sensors) > 1:
-        raise ValueError('cpa_range is for one sensor only, the data are of '
+        raise ValueError('cpa_range requires data of a single sensor, got '
                          f'{len(data.sensors)} sensors')
     reason = unusable_reason(data, (n_dipoles,))
     if reason:

@@ -239,7 +239,7 @@ def has_velocity_change(fit: PassFit) -> bool:
 
 
 def contradicts_straight_pass(fit: PassFit) -> bool:
-    """Whether a fit excludes one target on a straight line for every number of dipoles.
+    """Whether a fit rules out a single target on a straight line, whatever its number of dipoles.
 
     Parameters
     ----------

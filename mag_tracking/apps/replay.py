@@ -66,7 +66,7 @@ class Run:
     smoothed: dict[int, SmoothedLog] = field(default_factory=dict)
     """{track id: history of the smoothed track}."""
     truth: dict[str, Truth] = field(default_factory=dict)
-    """{target: (timestamps, positions, quaternions)}."""
+    """{target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}."""
 
 
 def replay(recording: Recording, network: SensorNetwork, settings: Settings,
@@ -240,7 +240,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
     pipeline : Pipeline
         After the whole recording has been processed.
     collector : RunCollector
-    truth : {target: (timestamps, positions, quaternions)}
+    truth : {target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}
     found : Prescan
 
     Returns
@@ -330,7 +330,7 @@ def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
     ----------
     log : TrackLog or SmoothedLog
     pipeline : Configured
-    truth : {target: (timestamps, positions, quaternions)}
+    truth : {target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}
 
     Returns
     -------

@@ -164,7 +164,8 @@ def _device(rest: dict[str, Any]) -> Device:
     """Device described by an entry; removes the keys used from `rest`."""
     if 'device' in rest:
         if 'transport' in rest or 'framing' in rest:
-            raise SettingsError('device excludes transport and framing; remove one or the other')
+            raise SettingsError('device cannot be combined with transport and framing; remove one '
+                                'of them')
         device: Device = _create('device', rest)
         return device
     for role in ('transport', 'framing'):
@@ -194,7 +195,7 @@ def _sensors(rest: dict[str, Any]) -> dict[str, str]:
     """{name at the device: network name}."""
     if 'sensor' in rest:
         if 'sensors' in rest:
-            raise SettingsError('sensor and sensors exclude each other')
+            raise SettingsError('sensor and sensors are mutually exclusive; give only one')
         sensors = {'': rest.pop('sensor')}
     else:
         sensors = rest.pop('sensors', None)

@@ -73,19 +73,19 @@ def detection_probability(snr: float | FloatArray, threshold: float | FloatArray
 
 
 def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray:
-    """Probability that a target is missed: no `run` consecutive frames all detect it.
+    """Probability that a target is never detected in `run` consecutive frames.
 
     Parameters
     ----------
     probability : (n, ...) array
-        Detection probability of each frame, in order of time; the frames are independent.
+        Detection probability of each frame, chronological; frames are assumed independent.
     run : int
         Number of consecutive frames required for an onset.
 
     Returns
     -------
     (...) array
-        Exact, from the distribution of the number of consecutive detections so far.
+        Exact: propagates the distribution of the current number of consecutive detections.
     """
     p = np.asarray(probability, dtype=float)
     waiting = np.zeros((run, *p.shape[1:]))

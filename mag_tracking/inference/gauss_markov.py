@@ -57,12 +57,12 @@ class GaussMarkovVectors:
 
     def log_density(self, vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray,
                     dt: float) -> float:
-        """Update by scalar measurements and return their log-density given the previous ones.
+        """Update with scalar measurements and return their log-density given the previous ones.
 
         Parameters
         ----------
         vector : (n_y,) int array
-            Number of the vector of each measurement, ascending.
+            Index of the vector that each measurement observes, ascending.
         H : (n_y, m) array
             Measurement rows: the measurement is H times the vector.
         y : (n_y,) array

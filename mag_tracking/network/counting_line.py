@@ -47,7 +47,7 @@ class CountingLine:
         return float((position[:2] - self.point) @ self.along)
 
     def lateral(self, position: FloatArray) -> float:
-        """Distance of a position to the left of the line's middle, in the forward direction.
+        """Lateral offset of a position from the middle of the line.
 
         Parameters
         ----------
@@ -56,6 +56,7 @@ class CountingLine:
         Returns
         -------
         float, m
+            Positive to the left, facing forward.
         """
         r = position[:2] - self.point
         return float(self.along[0] * r[1] - self.along[1] * r[0])

@@ -241,7 +241,7 @@ class CalibrationNode(StageNode):
         return calibrated
 
     def _do_deferred_work(self) -> None:
-        """Do idle work of the stages, update the sensor health, and do a step that is due."""
+        """Run the deferred work of the stages, the health checks and a due step of the round."""
         self._stage.idle()
         if self._next_steps is not None:
             self._next_steps[1].idle()

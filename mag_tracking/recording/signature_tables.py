@@ -86,8 +86,8 @@ def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> li
     if not axes:
         raise LabelsError(f'{path}: no column holds a field; expected x, y, z (or x_nt and so on)')
     if not names:
-        raise LabelsError(f'{path}: no column identifies the signature; expected one such as '
-                          'signature')
+        raise LabelsError(f'{path}: no column identifies the signatures; expected a column '
+                          'such as \'signature\'')
     fields = _Fields(path, [(m['axis'], m['unit'] or '', [name]) for name, m in axes.items()])
     found: dict[tuple[str, ...], list[tuple[int, dict[str, str]]]] = {}
     for line, row in lines:

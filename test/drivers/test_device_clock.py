@@ -1,4 +1,4 @@
-"""Clock of a device against simulated links; the limits follow from the law of the delays."""
+"""Device clock on simulated links; the limits follow from the delay distribution."""
 
 import math
 import pickle

@@ -63,7 +63,7 @@ def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
 @pytest.mark.parametrize('content, message', [
     (without('framing'), 'board: framing is missing (one of text, json, binary, xsens)'),
     (without('transport'), 'board: transport is missing (one of serial, udp, mqtt)'),
-    (without(device='i2c'), 'device excludes transport and framing'),
+    (without(device='i2c'), 'device cannot be combined with transport and framing'),
     (without(transport='carrier pigeon'), "transport: expected serial, udp, mqtt or package.mod"),
     (without(framing=['text']), 'framing: expected text'),
     (without(transport='no_such_module:Port'), "no_such_module:Port: ModuleNotFoundError: No"),
@@ -76,7 +76,7 @@ def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
     (without(uint='nT'), 'unknown setting uint; did you mean unit?'),
     (without(binary={'sync': 'A5'}), 'unknown setting binary'),
     (without('sensor'), 'expected `sensor: mag_1`, or `sensors:`'),
-    (without(sensors={'A': 'mag_2'}), 'sensor and sensors exclude each other'),
+    (without(sensors={'A': 'mag_2'}), 'sensor and sensors are mutually exclusive'),
     ('{"\\ud800": {}}', "'\\ud800' is not a device name: it contains a lone surrogate"),
     (without('sensor', sensors={'\ud800': 'a'}), "sensors: '\\ud800' is not a name"),
     (without(text={'fields': ['\udcff']}), "fields: '\\udcff' is not text"),

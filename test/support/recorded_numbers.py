@@ -30,7 +30,7 @@ def started(folder, **arguments):
 
 
 def numbers(path, topic=TOPIC):
-    """(numbers of the messages in a recording in its order, recording)."""
+    """(message numbers in recorded order, recording)."""
     recording = Recording(path)
     return [stamp_ns(decode(m).header.stamp) for m in recording.messages([topic])], recording
 

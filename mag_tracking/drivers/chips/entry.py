@@ -35,7 +35,7 @@ def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor
     Raises
     ------
     SettingsError
-        If an entry is not valid, or two entries exclude each other.
+        If an entry is not valid, or two entries conflict with each other.
     """
     sensors = [parse_sensor(entry, known) for entry in entries]
     multiplexers = {s.place.multiplexer for s in sensors} - {None}
@@ -53,7 +53,7 @@ def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor
 
 
 def _conflict(one: Place, other: Place) -> bool:
-    """Whether two chips answer at once; one directly on the bus is reached with every channel."""
+    """Whether two chips would answer together; one directly on the bus answers on any channel."""
     return one.address == other.address and (
         one == other or None in (one.multiplexer, other.multiplexer))
 

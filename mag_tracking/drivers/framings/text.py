@@ -108,7 +108,7 @@ class Lines:
         ----------
         lines : iterable of bytes
         consumed : int
-            Number of bytes consumed.
+            Number of bytes to report as consumed in the result.
         read : callable
             As in `parse`.
 

@@ -163,8 +163,8 @@ class MTDataLayout:
             if name not in _BLOCKS:
                 raise SettingsError(f'mtdata: unknown block {name!r}; known: {", ".join(_BLOCKS)}')
         if list(blocks) != [name for name in _BLOCKS if name in blocks]:
-            raise SettingsError(f'mtdata: {", ".join(blocks)} is not in the order of the protocol: '
-                                f'{", ".join(_BLOCKS)}, each at most once')
+            raise SettingsError(f'mtdata: expected blocks in protocol order, each at most once '
+                                f'({", ".join(_BLOCKS)}), got {", ".join(blocks)}')
         if len(_ORIENTATIONS.intersection(blocks)) > 1:
             raise SettingsError('mtdata: more than one of ' + ', '.join(sorted(_ORIENTATIONS)))
         if not {'acc', 'mag'}.intersection(blocks):

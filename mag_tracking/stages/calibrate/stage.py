@@ -450,7 +450,7 @@ class Calibrate:
 
 
 def _own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
-    """Whether readings have a valid covariance (n,), and the covariances (n, 3, 3) [T^2]."""
+    """Validity codes (NONE, VALID, INVALID) and covariances (n, 3, 3) [T^2] of the readings."""
     if readings.covariance is None:
         return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
     C = plain(readings.covariance)

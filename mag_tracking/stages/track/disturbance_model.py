@@ -63,7 +63,7 @@ class DisturbanceModel:
         return float(np.exp(self._log_w[1]))
 
     def log_density(self, frame: FieldFrame, dt: float, model_error: FloatArray) -> float | None:
-        """Log-density of a frame given the previous ones.
+        """Update the models with a frame and return its log-density given the previous frames.
 
         Parameters
         ----------
@@ -71,7 +71,7 @@ class DisturbanceModel:
         dt : float, s
             Time since the previous frame.
         model_error : (n_sensors,) array, T²
-            Variance per axis that the model of the target is allowed.
+            Variance per axis allowed for the error of the target model.
 
         Returns
         -------

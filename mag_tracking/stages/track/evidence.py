@@ -236,10 +236,10 @@ class TrackEvidence:
             | {reason for reason, until in self._until_ns.items() if stamp_ns <= until}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
-        """Whether a normalised innovation is too large for any target of the model.
+        """Check whether a normalised innovation is too large for the target model.
 
-        With two sensors, many paths fit the fields, and the whole track is doubted from then on.
-        More sensors correct it.
+        With at most two sensors, a contradiction also marks the rest of the track as doubtful,
+        because many paths fit the fields. With more sensors, later frames correct the track.
 
         Parameters
         ----------

@@ -65,14 +65,14 @@ class VehicleSettings:
     length_stds: tuple[float, ...] = param(
         (0.0, 1.0, 3.0), 'Standard deviation of the length; 0 for points.', 'm', (0.0, 1000.0))
     moments: tuple[float, ...] = param(
-        (120.0, 400.0, 1600.0), 'Initial size of the moment. TSP14 gives 300 to 600 for cars and '
-        'about 1800 for trucks, which moment_stds covers.', 'A m^2', (1e-6, 1e6))
+        (120.0, 400.0, 1600.0), 'Initial magnitude of the moment. TSP14 gives 300 to 600 for cars '
+        'and about 1800 for trucks, which moment_stds covers.', 'A m^2', (1e-6, 1e6))
     moment_stds: tuple[float, ...] = param(
         (45.0, 150.0, 600.0), 'Standard deviation of the total hard iron moment, per axis.',
         'A m^2', (1e-6, 1e6))
     difference_stds: tuple[float, ...] = param(
-        (0.0, 45.0, 240.0), 'Standard deviation of the difference of each dipole of a row from '
-        'their mean, per axis. Engine and axles are not spread evenly.', 'A m^2', (0.0, 1e6))
+        (0.0, 45.0, 240.0), 'Standard deviation of the dipole moments of a row about their '
+        'mean, per axis. The iron of a vehicle is not distributed evenly.', 'A m^2', (0.0, 1e6))
     heights: tuple[float, ...] = param(
         (0.5, 0.5, 1.0), 'Height of the magnetic centre above the plane z = 0 of the sensors.',
         'm', (-100.0, 100.0))
@@ -100,15 +100,15 @@ class VehicleSettings:
         'hypotheses.', 'm/s^2', (0.0, 100.0))
     turn_time: float = param(1.5, 'Correlation time of the turn rate.', 's', (0.01, 1000.0))
     turn_share: float = param(
-        0.5, 'Share of the vehicles that turn near the sensors.', '', (1e-6, 0.999999))
+        0.5, 'Fraction of vehicles that turn near the sensors.', '', (1e-6, 0.999999))
     climb_acceleration: float = param(
         0.1, 'Root spectral density of the vertical acceleration.', 'm/s^1.5', (0.0, 1000.0))
     moment_drift: float = param(
-        0.03, 'Random walk of the hard iron moment, relative to the size of the iron. A vehicle '
-        'has a different effective moment from every side.', '1/s^0.5', (0.0, 1e3))
+        0.03, 'Random walk of the hard iron moment, relative to its magnitude. The effective '
+        'moment of a vehicle depends on the side from which it is seen.', '1/s^0.5', (0.0, 1e3))
     difference_drift: float = param(
-        0.0125, 'Random walk of the difference of each dipole of a row from their mean, relative '
-        'to the size of the iron.', '1/s^0.5', (0.0, 1e3))
+        0.0125, 'Random walk of the dipole moments of a row about their mean, relative to the '
+        'magnitude of the hard iron moment.', '1/s^0.5', (0.0, 1e3))
 
 
 PER_KIND = ('lengths', 'length_stds', 'moments', 'moment_stds', 'difference_stds', 'heights',

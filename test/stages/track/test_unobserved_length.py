@@ -65,7 +65,7 @@ def test_a_row_longer_than_its_kind_hides_only_the_spread_of_lengths():
 
 
 def test_an_approaching_car_may_be_the_front_of_a_truck():
-    """Variance of a mixture: a third of the vehicles have their middle three metres behind."""
+    """Variance of a mixture: one vehicle in three is a truck with its centre 3 m further back."""
     added = of_vehicles().covariance(at([-20.0, 0.0]), P, 3.0, CAR)
     rng = np.random.default_rng(0)
     is_truck = rng.random(400_000) < 1.0 / 3.0
