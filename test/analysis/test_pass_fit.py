@@ -266,7 +266,7 @@ def test_one_sensor_with_a_known_range_yields_all_parameters():
     assert (np.abs(error) < 3.0 * np.sqrt(np.diagonal(fit.covariance)[:9])).all()
     # The range is known to 4 %, hence also the speed.
     assert fit.speed[1] / fit.speed[0] == pytest.approx(0.2 / distance, rel=0.2)
-    with pytest.raises(ValueError, match='for one sensor'):
+    with pytest.raises(ValueError, match='requires data of a single sensor'):
         fit_pass(measured(ROAD, path, moments, np.random.default_rng(1)), 1, (4.0, 0.1))
 
 

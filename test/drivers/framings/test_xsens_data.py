@@ -196,8 +196,8 @@ def test_mtdata_that_does_not_match_the_settings_is_counted():
 @pytest.mark.parametrize('changes, text', [
     ({'mtdata': ['acc', 'mga']}, "unknown block 'mga'; known: temp, acc, gyr, mag"),
     ({'mtdata': ['none', 'mag']}, "unknown block 'none'"),
-    ({'mtdata': ['mag', 'acc']}, 'mag, acc is not in the order'),
-    ({'mtdata': ['mag', 'mag']}, 'mag, mag is not in the order'),
+    ({'mtdata': ['mag', 'acc']}, 'got mag, acc'),
+    ({'mtdata': ['mag', 'mag']}, 'got mag, mag'),
     ({'mtdata': ['mag', 'quaternion', 'euler']}, 'more than one of euler, matrix, quaternion'),
     ({'mtdata': ['temp', 'gyr', 'counter']}, 'acc or mag is required, got temp, gyr, counter'),
     ({'mtdata': ['mag'], 'mtdata_format': 'double'},
