@@ -28,7 +28,7 @@ os.environ['ROS_HOME'] = _HOME.name
 
 LONGEST = ('test_wheel.py', 'test_busy.py', 'test_pass_fit.py', 'test_archive.py',
            'test_archive_faults.py', 'test_traffic.py', 'test_situations.py', 'test_cli.py',
-           'test_nodes.py', 'test_node_faults.py', 'test_leaving.py', 'test_health_node.py')
+           'test_nodes.py', 'test_node_faults.py', 'test_shutdown.py', 'test_health_node.py')
 """Files with the longest run times; those without nodes come first."""
 
 
