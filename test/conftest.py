@@ -26,7 +26,7 @@ _HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')
 os.environ['ROS_HOME'] = _HOME.name
 
 
-LONGEST = ('test_wheel.py', 'test_busy.py', 'test_pass_fit.py', 'test_archive.py',
+LONGEST = ('test_site.py', 'test_wheel.py', 'test_busy.py', 'test_pass_fit.py', 'test_archive.py',
            'test_archive_faults.py', 'test_traffic.py', 'test_situations.py', 'test_cli.py',
            'test_nodes.py', 'test_node_faults.py', 'test_shutdown.py', 'test_health_node.py')
 """Files with the longest run times; those without nodes come first."""
