@@ -61,7 +61,7 @@ def test_a_saturated_segment_is_excluded_from_a_pass_and_reported():
                                            ROAD.names[data.sensor[k]], field[k] + 4e-5)))
     passes += collector.flush()
     (cut, notes), = passes
-    assert any('mag_1' in n and 'saturated' in n and 'left out' in n for n in notes)
+    assert any('mag_1' in n and 'saturated' in n and 'not used' in n for n in notes)
     fit = fit_pass(cut, 1)
     assert not fit.reason
     error = fit.x[:9] - unknowns_at(path, moments, fit.data.stamp_ns / 1e9 - 20.0)
