@@ -80,8 +80,7 @@ def test_every_internal_link_leads_to_a_page_and_an_anchor(site):
 @pytest.mark.timeout(BUILD_S)
 def test_examples_in_the_text_print_what_they_say(site, tmp_path):
     """After the build of the site, whose generated pages and doctrees are not made again."""
-    sphinx('doctest', ROOT / 'docs', tmp_path, '-d', str(site / '.doctrees'), '-D',
-           'plot_gallery=False')
+    sphinx('doctest', ROOT / 'docs', tmp_path, '-d', str(site / '.doctrees'))
     text = (tmp_path / 'output.txt').read_text(encoding='utf-8')
     n, = re.findall(r'(\d+) tests?\n', text)[:1]
     assert int(n) >= 3 and ' 0 failures in tests' in text
