@@ -114,4 +114,5 @@ lock:  ## write constraints.txt with the newest versions (needs LOCK_PYTHON)
 
 clean:  ## remove .venv and everything else that was made
 	rm -rf $(VENV) build install log out *.egg-info msg_defs/build msg_defs/*.egg-info
+	git clean -fdXq docs
 	rm -rf .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis

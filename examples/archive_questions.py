@@ -15,7 +15,8 @@ import duckdb
 import mag_tracking as mt
 from mag_tracking.apps.archive import archive
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.archive_folder import schema_of
+from mag_tracking.recording.archive_tables import TABLES
+from mag_tracking.recording.parquet_table import schema_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -52,7 +53,7 @@ def tables_of(folder):
     for table in ('tracks', 'poses', 'smoothed', 'passes', 'health'):
         if not any((folder / table).glob('**/*.parquet')):
             # No recording had a detection.
-            connection.register(table, schema_of(table).empty_table())
+            connection.register(table, schema_of(TABLES[table]).empty_table())
             continue
         connection.sql(f"CREATE VIEW {table} AS SELECT * FROM read_parquet("
                        f"'{folder}/{table}/**/*.parquet')")

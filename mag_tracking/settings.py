@@ -23,8 +23,23 @@ Value: TypeAlias = Scalar | tuple[Scalar, ...]
 """Type of a setting."""
 
 REPLACED_SETTINGS = {'track.vehicle.soft_iron': 'track.vehicle.induced_share',
-            'track.vehicle.soft_iron_std': 'track.vehicle.induced_share_std'}
-"""Former settings and their replacements."""
+                     'track.vehicle.soft_iron_std': 'track.vehicle.induced_share_std'}
+"""Former settings and their replacements, which have another unit."""
+
+RENAMED_SETTINGS = {
+    'jump_ahead_s': 'max_forward_jump_s', 'jump_back_s': 'max_backward_jump_s',
+    'resume_s': 'max_resume_gap_s', 'ahead_s': 'max_clock_jump_s', 'most_pending': 'max_buffered',
+    'most_sensors': 'max_sensors', 'most_together': 'max_joint_targets',
+    'most_hypotheses': 'max_hypotheses', 'most_at_start': 'max_initial_hypotheses',
+    'relinearise_most': 'relinearise_max_hypotheses', 'smooth_longest_s': 'max_smoothing_s',
+    'explained_ratio': 'min_bayes_factor', 'second_opinion': 'cross_check',
+    'farthest': 'max_start_distance', 'reach': 'start_margin',
+    'longest_clock_offset_s': 'max_clock_offset_s', 'most_accelerations': 'max_accelerations',
+    'longest_retry_s': 'max_retry_s', 'gather_s': 'batch_s', 'silent_s': 'silence_timeout_s',
+    'shortest_delay_s': 'min_delay_s', 'longest_delay_s': 'max_delay_s',
+    'least_step_s': 'min_step_s', 'most_drift_ppm': 'max_drift_ppm', 'longest': 'max_length',
+    'longest_message': 'max_message', 'most_failures': 'max_failures', 'in_turn': 'sequential'}
+"""Former names of settings, within the same group."""
 
 _Class: TypeAlias = type[object]
 _Default = TypeVar('_Default')
@@ -215,8 +230,13 @@ def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
 
 def _suggestion(name: str, known: Iterable[str]) -> str:
     """Suggestion for an unknown setting: its replacement or the closest name, or empty."""
+    known = list(known)
+    group, dot, leaf = name.rpartition('.')
     if name in REPLACED_SETTINGS:
         return f'; it was replaced by {REPLACED_SETTINGS[name]}, which has another unit'
+    renamed = f'{group}{dot}{RENAMED_SETTINGS.get(leaf)}'
+    if renamed in known:
+        return f'; it was renamed to {renamed}'
     near = difflib.get_close_matches(name, known, n=1)
     return f'; did you mean {near[0]}?' if near else ''
 

@@ -5,9 +5,16 @@ import importlib.util
 import pytest
 import yaml
 
+from mag_tracking.drivers.configuration import settings_by_kind
 from mag_tracking.errors import SettingsError
 from mag_tracking.pipeline import Settings, settings_for
-from mag_tracking.settings import flatten, read_parameter_file, replace, to_yaml
+from mag_tracking.settings import (
+    RENAMED_SETTINGS,
+    flatten,
+    read_parameter_file,
+    replace,
+    to_yaml,
+)
 from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import ROOT
 
@@ -37,6 +44,8 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
 
 @pytest.mark.parametrize('changes, message', [
     ({'track.vehicle.soft_iron': 4.0}, 'it was replaced by track.vehicle.induced_share'),
+    ({'track.explained_ratio': 4.0}, 'it was renamed to track.min_bayes_factor'),
+    ({'calibrate.jump_back_s': 4.0}, 'it was renamed to calibrate.max_backward_jump_s'),
     ({'align': {'perod_s': 0.1}}, 'unknown setting align.perod_s; did you mean align.period_s'),
     ({'align.period_s': 'long'}, 'align.period_s: expected float'),
     ({'align.period_s': -1.0}, 'align.period_s: -1.0 is outside'),
@@ -115,3 +124,11 @@ def test_the_default_file_is_plain_yaml_with_floats():
 def test_related_lists_are_checked_against_each_other(road_network, changes, message):
     with pytest.raises(SettingsError, match=message):
         TrackManager(road_network, settings_for('vehicle', changes).track)
+
+
+def test_every_former_name_leads_to_a_setting():
+    """Of the pipeline or of a drivers file."""
+    known = {p.name.rpartition('.')[2] for group in (Settings(), *settings_by_kind().values())
+             for p in flatten(group)}
+    assert set(RENAMED_SETTINGS.values()) - known == set()
+    assert set(RENAMED_SETTINGS) & known == set()

@@ -238,8 +238,7 @@ def _sampling(network: SensorNetwork, settings: Settings, noise_std: float | Non
     """Sampling of the sensors, without the duration of a pass.
 
     An error of the field that persists over many frames is not averaged out; it is represented by
-    correspondingly more noise in each frame. (The tracker models it as a state; see
-    docs/architecture.md.)
+    correspondingly more noise in each frame. The tracker models it as a state.
     """
     track = settings.track
     period = max(frame_period(settings.align, network), 1.0 / _within('rate', rate, 1e-2, 1e5))

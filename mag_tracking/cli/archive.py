@@ -19,7 +19,7 @@ Tracks many or long recordings on several processors or machines. The results eq
 interrupted run continues when the same command is run again; completed recordings are skipped. A
 recording that fails is listed with the reason and does not stop the others.
 
-Parquet files written to DIR (columns: docs/archive.md):
+Parquet files written to DIR:
   tracks/             one row per track
   poses/              one row per pose
   smoothed/           one row per smoothed pose

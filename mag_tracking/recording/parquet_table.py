@@ -14,7 +14,7 @@ from mag_tracking.errors import MissingDependencyError, OutputError
 if TYPE_CHECKING:
     import pyarrow as pa
 
-VERSION = 1
+VERSION = 2
 """Version of the tables. Folders of other versions are rejected: rows would not be comparable."""
 
 MAX_BUFFERED_ROWS = 5000

@@ -72,8 +72,8 @@ def n_events(found):
 
 def cost():
     """Share of the time of a tracked frame for the disturbance model and the tests."""
-    spent = {'_weigh': 0.0, '_doubts': 0.0, 'step': 0.0}
-    owner = {'_weigh': RunningTrack, '_doubts': Member, 'step': RunningTrack}
+    spent = {'_update_evidence': 0.0, '_doubts': 0.0, 'step': 0.0}
+    owner = {'_update_evidence': RunningTrack, '_doubts': Member, 'step': RunningTrack}
 
     def timed(method):
         original = getattr(owner[method], method)
