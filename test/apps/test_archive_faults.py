@@ -60,7 +60,7 @@ def test_an_incompatible_folder_is_refused(tmp_path, recordings, complete_archiv
     shutil.copytree(complete_archive, old)
     head = json.loads((old / 'archive.json').read_text())
     (old / 'archive.json').write_text(json.dumps({**head, 'schema': 0}))
-    with pytest.raises(OutputError, match='tables of version 0; this program writes version 1'):
+    with pytest.raises(OutputError, match='tables of version 0; this program writes version 2'):
         archive(paths, NETWORK_FILE, settings, old)
     (old / 'archive.json').write_text('{"schema"')
     with pytest.raises(OutputError, match='cannot read'):
