@@ -36,7 +36,7 @@ nitpicky = False
 write_pages()
 myst_enable_extensions = ['colon_fence', 'deflist', 'substitution']
 myst_heading_anchors = 3
-# Every number in the text is one of `benchmarks/latest.json`: {{ bench['replay']['...'] }}.
+# Measured figures in the text are those of `benchmarks/latest.json`: {{ bench['replay']['...'] }}.
 myst_substitutions = {'bench': benchmark_figures()}
 
 autodoc_member_order = 'bysource'

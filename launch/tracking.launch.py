@@ -27,6 +27,34 @@ def config(name):
     return PathJoinSubstitution([FindPackageShare('mag_tracking'), 'config', name])
 
 
+def launch_arguments():
+    """Arguments of the launch file.
+
+    Returns
+    -------
+    list of DeclareLaunchArgument
+    """
+    return [
+        DeclareLaunchArgument('network', description='Path of the network file.'),
+        DeclareLaunchArgument('namespace', default_value='', description='Namespace of all nodes.'),
+        DeclareLaunchArgument('use_sim_time', default_value='false',
+                              description='Take the time from /clock, for a replay.'),
+        DeclareLaunchArgument('target', default_value='vehicle',
+                              description='Kind of target: vehicle or magnet.'),
+        DeclareLaunchArgument('params', default_value=config('empty.yaml'),
+                              description='Parameter file of the nodes.'),
+        DeclareLaunchArgument('drivers', default_value='',
+                              description='Drivers file: start driver_node with it.'),
+        DeclareLaunchArgument('batches', default_value='false',
+                              description='Let driver_node publish readings of many sensors in '
+                              'one message.'),
+        DeclareLaunchArgument('recording', default_value='',
+                              description='Recording: start replay_node with it.'),
+        DeclareLaunchArgument('rate', default_value='1.0',
+                              description='Speed of the replay; 1 = as recorded.'),
+    ]
+
+
 def generate_launch_description():
     """Nodes and their launch arguments.
 
@@ -47,23 +75,7 @@ def generate_launch_description():
                'reliable_input': ParameterValue(has_recording, value_type=bool)},
               LaunchConfiguration('params')]
     return LaunchDescription([
-        DeclareLaunchArgument('network', description='Path of the network file.'),
-        DeclareLaunchArgument('namespace', default_value='', description='Namespace of all nodes.'),
-        DeclareLaunchArgument('use_sim_time', default_value='false',
-                              description='Take the time from /clock, for a replay.'),
-        DeclareLaunchArgument('target', default_value='vehicle',
-                              description='Kind of target: vehicle or magnet.'),
-        DeclareLaunchArgument('params', default_value=config('empty.yaml'),
-                              description='Parameter file of the nodes.'),
-        DeclareLaunchArgument('drivers', default_value='',
-                              description='Drivers file: start driver_node with it.'),
-        DeclareLaunchArgument('batches', default_value='false',
-                              description='Let driver_node publish readings of many sensors in '
-                              'one message.'),
-        DeclareLaunchArgument('recording', default_value='',
-                              description='Recording: start replay_node with it.'),
-        DeclareLaunchArgument('rate', default_value='1.0',
-                              description='Speed of the replay; 1 = as recorded.'),
+        *launch_arguments(),
         *(Node(package='mag_tracking', executable=name, namespace=namespace, parameters=common)
           for name in ('calibration_node', 'detection_node', 'tracker_node')),
         # Sources come last, so that their first messages find subscribers.

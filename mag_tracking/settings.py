@@ -89,7 +89,7 @@ class Parameter:
     doc: str
     """Description."""
     unit: str
-    """Unit. Empty if there is none."""
+    """Unit; empty for a dimensionless setting."""
     range: tuple[float, float] | None
     """Inclusive bounds, or None."""
     live: bool

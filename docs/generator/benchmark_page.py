@@ -66,12 +66,11 @@ def benchmark_page():
     n = sum(len(run['figures']) for run in latest.values())
     aims = [f for run in latest.values() for f in run['figures'].values() if f['aim'] is not None]
     lines = ['# Benchmarks', '',
-             f'`make bench` measures these {n} figures and writes them to '
-             f'`benchmarks/latest.json`, from '
-             f'which this page is generated. {sum(map(is_met, aims))} of {len(aims)} figures with '
-             f'an aim '
-             'meet it. An aim is what theory or a user asks for, not what was once reached. '
-             '`benchmarks/history.jsonl` has all earlier runs.', '',
+             f'`make bench` measures these figures and writes them to `benchmarks/latest.json`, '
+             f'from which this page is generated. It has {n} figures at present, each with the '
+             f'commit of its run. {sum(map(is_met, aims))} of {len(aims)} figures with an aim meet '
+             f'it. An aim is what theory or a user asks for, not what was once reached. '
+             '`benchmarks/history.jsonl` has the earlier runs of `make bench`.', '',
              'Simulators: *clouds* are clouds of magnetised points, *boxes* are magnetised sheets '
              'with '
              'imperfect sensors. *Wrong* poses carry no flag, and are more than 2 m and more than '
@@ -86,7 +85,7 @@ def benchmark_page():
         module, text = description_of(name)
         text = text[:1].upper() + text[1:]
         lines += [f'## {name}', '', text, '',
-                  f'`PYTHONPATH=test .venv/bin/python -m bench.{module}`, commit {run["commit"]}, '
+                  f'`{command_of(module, run)}`, commit {run["commit"]}, '
                   f'{run["date"][:10]}, {run["machine"]}, Python {run["python"]}.', '',
                   '| figure | measured | aim | met | remark |', '|---|---|---|---|---|']
         for figure, value in run['figures'].items():
@@ -96,6 +95,12 @@ def benchmark_page():
                 value.get('note', '')))
         lines.append('')
     return '\n'.join(lines)
+
+
+def command_of(module, run):
+    """The command that repeats a run."""
+    return ' '.join(['PYTHONPATH=test .venv/bin/python -m', f'bench.{module}',
+                     *run.get('arguments', [])])
 
 
 def is_met(figure):

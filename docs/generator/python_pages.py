@@ -50,7 +50,7 @@ def folders_of(room):
 
 
 def description_of(folder):
-    """What is in a folder, in one sentence."""
+    """Content of a folder, in one sentence."""
     if folder in ROOMS:
         return ROOMS[folder]
     tree = ast.parse((PACKAGE / folder / '__init__.py').read_text(encoding='utf-8'))

@@ -109,7 +109,7 @@ class Orientation:
     """(3,) [T], sensor frame: measured field minus the Earth's field; NaN for an axis not reported.
     The component across the heading is not included, since it is absorbed by the heading."""
     rival: float
-    """[rad] Difference to another heading that fits as well; NaN if there is none."""
+    """[rad] Difference to another heading that fits equally well; NaN if the heading is unique."""
 
 
 def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatArray,

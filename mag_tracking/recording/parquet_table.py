@@ -30,7 +30,7 @@ class Column(NamedTuple):
     """Type: t = UTC time, i = integer, f = float, s = text, b = boolean, C = (6, 6) matrix,
     row-major."""
     unit: str
-    """Unit. Empty if there is none."""
+    """Unit; empty for a dimensionless column."""
     meaning: str
     """Description."""
 

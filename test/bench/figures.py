@@ -52,7 +52,8 @@ class Figures:
         """Add the figures to `benchmarks/latest.json`; return 1 if an aim is missed, else 0."""
         FOLDER.mkdir(exist_ok=True)
         found = json.loads(LATEST.read_text()) if LATEST.exists() else {}
-        found[self._benchmark] = run_facts() | {'figures': self._figures}
+        found[self._benchmark] = run_facts() | {'arguments': sys.argv[1:],
+                                                'figures': self._figures}
         LATEST.write_text(json.dumps(found, indent=1, sort_keys=True) + '\n')
         return int(self.missed > 0)
 

@@ -207,7 +207,7 @@ def test_shifted_arrivals_shift_the_timestamps_equally(delays, shift, period_ms)
 @given(DELAYS, st.integers(1, 500))
 @settings(derandomize=True, deadline=None)
 def test_timestamps_go_back_by_no_more_than_the_line_moves(delays, period_ms):
-    """That is: the range of the delays, and twice the maximum drift over the remembered time."""
+    """The bound is the range of the delays plus twice the maximum drift over the window."""
     ticks, arrival, time = overtaking_messages(delays, period_ms)
     clock = clock_of(window_s=2.0, max_drift_ppm=20.0)
     stamps = [clock.stamp(*p) for p in zip(ticks, arrival, strict=True)]

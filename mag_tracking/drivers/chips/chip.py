@@ -135,7 +135,7 @@ class Bus:
         Raises
         ------
         OSError
-            If there is none.
+            If no bus is open.
         """
         if self._smbus is None:
             raise OSError(errno.ENODEV, 'the bus is not open')

@@ -137,7 +137,7 @@ class TrackManager:
 
     @property
     def clocks_apart(self) -> str:
-        """Significant clock offset, as a sentence; empty if there is none."""
+        """Significant clock offset, as a sentence; empty if all clocks agree."""
         apart = self._clocks.apart if self._settings.cross_check else None
         return '' if apart is None else apart.text(self._network.names)
 

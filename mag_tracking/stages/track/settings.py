@@ -60,8 +60,8 @@ class TrackSettings:
         'the detection, where smoothing begins in this case, or as the vehicle moves.',
         '', (2, 1000))
     max_joint_targets: int = param(
-        4, 'Maximum number of vehicles with overlapping fields that are tracked jointly. Two take '
-        '2.3 times as long as one (`bench.busy`). 1 = a track always has one vehicle.', '', (1, 4))
+        4, 'Maximum number of vehicles with overlapping fields that are tracked jointly. '
+        'Each one adds computing time. 1 = a track always has one vehicle.', '', (1, 4))
     prune_ratio: float = param(
         1e-12, 'Weight, relative to the heaviest hypothesis, below which a hypothesis is dropped '
         '(T10 Alg. 3).', '', (1e-300, 0.5), live=True)
