@@ -33,7 +33,6 @@ exclude_patterns = ['generator', 'gallery/*.md5', '**/sg_execution_times.rst',
 source_suffix = {'.rst': 'restructuredtext', '.md': 'markdown'}
 nitpicky = False
 
-write_pages()
 myst_enable_extensions = ['colon_fence', 'deflist', 'substitution']
 myst_heading_anchors = 3
 # Measured figures in the text are those of `benchmarks/latest.json`: {{ bench['replay']['...'] }}.
@@ -73,3 +72,15 @@ html_copy_source = False
 copybutton_prompt_text = r'\$ |>>> |\.\.\. '
 copybutton_prompt_is_regexp = True
 linkcheck_anchors = False
+
+
+def clear_alias(_app, _what, _name, _value, _options, lines):
+    """Remove the text that Python gives to fields of named tuples, "Alias for field number 0"."""
+    if lines and lines[0].startswith('Alias for field number'):
+        lines.clear()
+
+
+def setup(app):
+    """Write the generated pages before Sphinx reads the sources."""
+    app.connect('builder-inited', lambda _: write_pages())
+    app.connect('autodoc-process-docstring', clear_alias)

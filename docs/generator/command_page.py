@@ -2,12 +2,25 @@
 
 import argparse
 import contextlib
+import importlib
 import io
 import os
 
 from mag_tracking.cli.commands import COMMANDS, parse
 
 COLUMNS = '100'
+COMMAND_LINE = """# Command line
+
+The help of each command, as `mag-tracking COMMAND --help` prints it. Commands that need ROS 2 say
+so.
+
+| exit status | meaning |
+|---|---|
+| 0 | success |
+| 1 | an error that a message explains; `archive`: at least one recording failed |
+| 2 | a wrong command line; `doctor` and `calibrate`: faults that need an action were found |
+| 130 | stopped with Ctrl-C; results so far are kept |
+"""
 
 
 def help_of(*words):
@@ -28,9 +41,8 @@ def help_of(*words):
 
 def actions_of(command):
     """Names of the sub-commands of a command, such as `classes train`."""
-    made = argparse.ArgumentParser()
-    commands = made.add_subparsers()
-    module = __import__(f'mag_tracking.cli.{COMMANDS[command].module}', fromlist=['add'])
+    commands = argparse.ArgumentParser().add_subparsers()
+    module = importlib.import_module(f'mag_tracking.cli.{COMMANDS[command].module}')
     module.add(commands)
     parser = commands.choices[command]
     return [name for action in parser._actions  # argparse has no public way to list them.
@@ -39,12 +51,7 @@ def actions_of(command):
 
 def command_page():
     """Markdown: the help of every command and sub-command."""
-    lines = ['# Command line', '', 'The help of each command, as `mag-tracking COMMAND --help` '
-                                   'prints '
-             'it. Commands that need ROS 2 say so. The exit status is 0 on success, 1 for an '
-             'error that '
-             'a message explains, 2 for a wrong command line, 130 after Ctrl-C.', '',
-             '```text', help_of(), '```', '']
+    lines = [COMMAND_LINE, '```text', help_of(), '```', '']
     for name in COMMANDS:
         lines += [f'## {name}', '', '```text', help_of(name), '```', '']
         for action in actions_of(name):

@@ -6,34 +6,47 @@ from pathlib import Path
 import mag_tracking
 
 PACKAGE = Path(mag_tracking.__file__).parent
-ROOMS = {
-    'physics': 'Field models and motion models, in arrays.',
-    'inference': 'Filters, evidence, bounds and detection theory. Knows nothing of physics.',
-    'calibration': 'Backgrounds, noise, orientations, clocks and ellipsoid fits of sensors.',
-    'network': 'The sensor network and its file.',
-    'analysis': 'Fits of whole passes, bounds of a network, calibration of a board.',
-    'simulation': 'Worlds with ground truth.',
-    'stages': 'The steps of the pipeline: calibrate, align, detect, track and others.',
-    'drivers': 'Transports, framings, chips and the clock of a device.',
-    'recording': 'Reading and writing of recordings, tables and result folders.',
-    'report': 'Figures, tables and the HTML report.',
-    'apps': 'The use cases behind the commands, callable from Python.'}
-BASE = ('records', 'event_records', 'settings', 'pipeline', 'geometry', 'arrays', 'units', 'errors',
-        'files', 'yaml_file', 'interrupts')
+ELSEWHERE = ('cli', 'nodes')
+"""Folders without a page: the reference of commands, parameters and topics documents them."""
 PRIVATE = ('core', '__main__')
+BASE = 'Records, settings, geometry and errors, for all other modules.'
+INTERFACE = """# Public interface
+
+`import mag_tracking as mt` needs no ROS and imports nothing until a name is used. Units are SI,
+timestamps are integer nanoseconds, positions are in the frame of the network, fields in the frame
+of the sensor. All errors that the package raises on purpose are subclasses of `MagTrackingError`.
+{doc}`/gallery/index` shows the interface at work.
+"""
+OVERVIEW = """# Python API
+
+The [public interface](interface.md) is stable. The other pages document the modules behind it, for
+extensions and for research; they may change with any release.
+
+| page | content |
+|---|---|"""
 
 
 def python_pages():
     """{file name: Markdown}: overview, public interface, base modules, one page per folder."""
     pages = {'python/index.md': overview(), 'python/interface.md': interface(),
-             'python/base.md': page('Base modules', 'Records, settings, geometry and errors, for '
-                                                    'all '
-                                    'other modules.', [f'mag_tracking.{m}' for m in BASE])}
-    for room in ROOMS:
+             'python/base.md': page('Base modules', BASE, base_modules())}
+    for room in rooms():
         for folder, modules in folders_of(room).items():
             pages[f'python/{folder.replace("/", "_")}.md'] = page(
                 folder.replace('/', '.'), description_of(folder), modules)
     return pages
+
+
+def rooms():
+    """Top-level folders of the package that have pages."""
+    return sorted(p.parent.name for p in PACKAGE.glob('*/__init__.py')
+                  if p.parent.name not in ELSEWHERE)
+
+
+def base_modules():
+    """Modules beside the folders."""
+    return [f'mag_tracking.{p.stem}' for p in sorted(PACKAGE.glob('*.py'))
+            if p.stem not in (*PRIVATE, '__init__')]
 
 
 def folders_of(room):
@@ -51,8 +64,6 @@ def folders_of(room):
 
 def description_of(folder):
     """Content of a folder, in one sentence."""
-    if folder in ROOMS:
-        return ROOMS[folder]
     tree = ast.parse((PACKAGE / folder / '__init__.py').read_text(encoding='utf-8'))
     return ast.get_docstring(tree).splitlines()[0]
 
@@ -74,15 +85,7 @@ def page(title, text, modules):
 
 def interface():
     """The names that `import mag_tracking` exports."""
-    lines = ['# Public interface', '', '`import mag_tracking as mt` needs no ROS and imports '
-                                       'nothing until '
-             'a name is used. Units are SI, timestamps are integer nanoseconds, positions are in '
-             'the frame '
-             'of the network, fields in the frame of the sensor. All errors that the package '
-             'raises on '
-             'purpose are subclasses of `MagTrackingError`. {doc}`/gallery/index` shows the '
-             'interface at '
-             'work.', '']
+    lines = [INTERFACE]
     for name in sorted(mag_tracking.__all__, key=lambda n: (n[0].isupper(), n)):
         value = getattr(mag_tracking, name)
         kind = 'autoclass' if isinstance(value, type) else 'autofunction'
@@ -95,17 +98,13 @@ def interface():
 def overview():
     """Table of contents of the Python API."""
     rows = [('interface', 'What `import mag_tracking` exports: start here.'),
-            ('base', 'Records, settings, geometry and errors.')]
+            ('base', BASE)]
     names = ['interface', 'base']
-    for room in ROOMS:
+    for room in rooms():
         for folder in folders_of(room):
             names.append(folder.replace('/', '_'))
             rows.append((names[-1], description_of(folder)))
     return '\n'.join([
-        '# Python API', '',
-        'The [public interface](interface.md) is stable. The other pages document the modules '
-        'behind it, for extensions and for research; they may change with any release.', '',
-        '| page | content |', '|---|---|',
-        *(f'| [{name.replace("_", ".", 1)}]({name}.md) | {text} |'
-          for name, text in rows),
+        OVERVIEW,
+        *(f'| [{name.replace("_", ".", 1)}]({name}.md) | {text} |' for name, text in rows),
         '', '```{toctree}', ':hidden:', ':maxdepth: 1', '', *names, '```', ''])

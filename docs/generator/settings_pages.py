@@ -7,6 +7,41 @@ from mag_tracking.recording.traffic_tables import tables_of
 from mag_tracking.settings import flatten
 from mag_tracking.stages.track.doubts import MEANINGS
 
+PARAMETERS = """# Parameters
+
+Every setting of the pipeline, for parameter files (`--params`), `settings=` in Python and ROS
+parameters. {doc}`/guides/own_recording` shows how to set them. Nodes read them once, when they
+start; those marked *live* may change while a node runs.
+"""
+MAGNET = """## Defaults for a magnet
+
+`target: magnet` (`--target magnet`) changes these defaults.
+
+| parameter | vehicle | magnet |
+|---|---|---|"""
+DRIVERS = """# Drivers file
+
+Every setting of a drivers file. {doc}`/guides/connect_sensors` explains what they are for.
+"""
+DOUBTS = """# Reasons for an ambiguous pose
+
+A pose is `ambiguous` while at least one of these reasons applies. They are listed in the field
+`doubts` of a `Track` message, in the column `doubts` of `poses.csv`, and with the number of poses
+in `summary.json`. {doc}`/concepts/uncertainty` explains what the flag promises.
+
+| reason | meaning |
+|---|---|"""
+ARCHIVE = """# Tables of an archive
+
+Columns of the Parquet tables that `mag-tracking archive` writes ({doc}`/guides/archive`). Unknown
+values are null. The unit and the meaning of each column are also stored in the metadata of the
+files.
+"""
+TRAFFIC = """# Tables of traffic
+
+Columns of the CSV and Parquet files that `mag-tracking traffic` writes ({doc}`/guides/traffic`).
+"""
+
 
 def settings_pages():
     """{file name: Markdown}."""
@@ -16,20 +51,14 @@ def settings_pages():
 
 def parameters():
     """All settings of the pipeline, by stage."""
-    lines = ['# Parameters', '',
-             'Every setting of the pipeline, for parameter files (`--params`), `settings=` in '
-             'Python and '
-             'ROS parameters. {doc}`/guides/own_recording` shows how to set them. Nodes read them '
-             'once, '
-             'when they start; those marked *live* may change while a node runs.', '']
+    lines = [PARAMETERS]
     groups = {}
     for parameter in flatten(Settings()):
         groups.setdefault(parameter.name.rpartition('.')[0], []).append(parameter)
     for group, some in groups.items():
         lines += [f'## {group}', '', *(line for p in some for line in entry(p))]
     default = {p.name: p.value for p in flatten(Settings())}
-    lines += ['## Defaults for a magnet', '', '`target: magnet` (`--target magnet`) changes these '
-              'defaults.', '', '| parameter | vehicle | magnet |', '|---|---|---|']
+    lines.append(MAGNET)
     lines += [f'| `{p.name}` | `{default[p.name]}` | `{p.value}` |'
               for p in flatten(settings_for('magnet')) if p.value != default[p.name]]
     return '\n'.join(lines) + '\n'
@@ -37,9 +66,7 @@ def parameters():
 
 def drivers():
     """All settings of a drivers file, by transport, framing and device."""
-    lines = ['# Drivers file', '', 'Every setting of a drivers file. '
-                                   '{doc}`/guides/connect_sensors` '
-             'explains what they are for.', '']
+    lines = [DRIVERS]
     for group, settings in settings_by_kind().items():
         lines += [f'## {group or "Every device"}', '',
                   *(line for p in flatten(settings) for line in entry(p))]
@@ -58,22 +85,12 @@ def entry(p):
 def doubts():
     """The reasons of an ambiguous pose."""
     return '\n'.join(
-        ['# Reasons for an ambiguous pose', '', 'A pose is `ambiguous` while at least one of these '
-         'reasons applies. They are listed in the field `doubts` of a `Track` message, in the '
-         'column '
-         '`doubts` of `poses.csv`, and with the number of poses in `summary.json`. '
-         '{doc}`/concepts/uncertainty` explains what the flag promises.', '',
-         '| reason | meaning |', '|---|---|',
-         *(f'| `{name}` | {meaning} |' for name, meaning in MEANINGS.items())]) + '\n'
+        [DOUBTS, *(f'| `{name}` | {meaning} |' for name, meaning in MEANINGS.items())]) + '\n'
 
 
 def archive_tables():
     """The columns of an archive."""
-    lines = ['# Tables of an archive', '', 'Columns of the Parquet tables that `mag-tracking '
-                                           'archive` '
-             'writes ({doc}`/guides/archive`). Unknown values are null. The unit and the meaning '
-             'of each '
-             'column are also stored in the metadata of the files.', '']
+    lines = [ARCHIVE]
     for table, columns in TABLES.items():
         lines += [f'## {table}', '', *column_rows(columns), '']
     return '\n'.join(lines)
@@ -81,8 +98,7 @@ def archive_tables():
 
 def traffic_tables():
     """The columns of the results of `mag-tracking traffic`."""
-    lines = ['# Tables of traffic', '', 'Columns of the CSV and Parquet files that `mag-tracking '
-             'traffic` writes ({doc}`/guides/traffic`).', '']
+    lines = [TRAFFIC]
     for table, columns in tables_of(('<class>',), True).items():
         lines += [f'## {table}', '', *column_rows(columns), '']
     return '\n'.join(lines)

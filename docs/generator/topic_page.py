@@ -1,13 +1,12 @@
 """Reference page of topics, services and messages, from the nodes and the message definitions."""
 
-import os
-import re
+import json
+import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-MESSAGES = ROOT / 'msg_defs'
+DOCS = Path(__file__).resolve().parents[1]
+MESSAGES = DOCS.parent / 'msg_defs'
 FRAMES, EVENT = 'one per frame', 'on event'
 RATES = {
     '<sensor>/imu/mag': ('rate of the sensor', 'Readings of a sensor in its own frame, tesla.'),
@@ -19,7 +18,7 @@ RATES = {
     'calibration_state': ('1 Hz and on change',
                           'Background, noise, orientation and clock offset of each sensor.'),
     'network_frame': (FRAMES, 'Samples of all sensors within one period, with the detection '
-    'state.'),
+                              'state.'),
     'detection_node/detections': (EVENT, 'Onset and release of each detection.'),
     'detection_node/events': (EVENT, 'A pass as described by a single sensor.'),
     'tracker_node/pose': (FRAMES + ' and track', 'Published pose of each track.'),
@@ -47,20 +46,21 @@ SERVICES = {
     'survey': 'Estimate orientations and clock offsets; optionally save the network file.',
     'pause': 'Pause the replay.', 'resume': 'Resume the replay.',
     'seek': 'Continue the replay at an offset from its beginning.'}
-STANDARD = re.compile('describe_parameters|get_parameter|list_parameters|set_parameters|'
-                      'change_state|'
-                      'get_state|get_available|get_transition|type_description')
+
+TOPICS = """# Topics, services and messages
+
+Relative names resolve in the namespace of the node; every name can be remapped. `~/pose` of the
+tracker is `tracker_node/pose` below. Inputs are subscribed best-effort (matches both kinds), or
+reliable with the parameter `reliable_input`.
+
+Publishers are reliable; *latched* is the durability `TRANSIENT_LOCAL`, *depth* the length of the
+queue.
+"""
 
 
 def topic_page():
     """Markdown."""
-    lines = ['# Topics, services and messages', '',
-             'Relative names resolve in the namespace of the node; every name can be remapped. '
-             '`~/pose` of the tracker is `tracker_node/pose` below. Inputs are subscribed '
-             'best-effort '
-             '(matches both kinds), or reliable with the parameter `reliable_input`.', '',
-             'Publishers are reliable; *latched* is the durability `TRANSIENT_LOCAL`, *depth* the '
-             'length of the queue.', '']
+    lines = [TOPICS]
     for name, publishers, services in graph():
         lines += [f'## {name}', '', '| publishes | content | rate | QoS |', '|---|---|---|---|']
         lines += [f'| `{topic}`<br>`{kind}` | {RATES[topic][1]} | {RATES[topic][0]} | {qos} |'
@@ -77,49 +77,15 @@ def topic_page():
 
 
 def graph():
-    """[(node, [(topic, type, QoS)], [(service, type)])]; the nodes are created and inspected."""
-    sys.path.insert(0, str(ROOT / 'tools'))
-    from generate_policies import SENSORS, nodes
+    """[(node, [(topic, type, QoS)], [(service, type)])], from a process with all nodes.
 
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
-    from mag_tracking.nodes.middleware import begin
-    begin()
-    found = []
-    with tempfile.TemporaryDirectory() as folder:
-        before = os.environ.get('ROS_HOME')
-        os.environ['ROS_HOME'] = folder
-        for node in nodes(Path(folder), '/'):
-            found.append((node.get_name(), publishers_of(node, SENSORS), services_of(node)))
-            node.destroy_node()
-        os.environ.pop('ROS_HOME') if before is None else os.environ.update(ROS_HOME=before)
-    return found
-
-
-def publishers_of(node, sensors):
-    """[(topic, type, QoS)], one for all sensors; the topics of a recording are left out."""
-    rows = {}
-    for publisher in node.publishers:
-        topic = publisher.topic_name
-        for sensor in sensors:
-            topic = topic.replace(f'/{sensor}/', '/<sensor>/')
-        topic = topic if topic in RATES else topic.removeprefix('/')
-        if topic in ('rosout', 'parameter_events') or topic.endswith('/transition_event') \
-                or node.get_name() == 'replay_node' and topic not in ('/clock', '/diagnostics'):
-            continue
-        qos = publisher.qos_profile
-        assert qos.reliability.name == 'RELIABLE'
-        latched = 'latched, ' if qos.durability.name == 'TRANSIENT_LOCAL' else ''
-        rows[topic] = (topic, type_of(publisher.msg_type), f'{latched}depth {qos.depth}')
-    return sorted(rows.values())
-
-
-def services_of(node):
-    """[(name, type)] of the services that are the package's own."""
-    names = [(s.service_name.rpartition('/')[2], type_of(s.srv_type)) for s in node.services]
-    return sorted((n, kind) for n, kind in names if not STANDARD.search(n))
-
-
-def type_of(message):
-    """The ROS name of a message or service class."""
-    package, *_ = message.__module__.split('.')
-    return f'{package}/{message.__name__}'
+    Raises
+    ------
+    RuntimeError
+        If the nodes cannot be created.
+    """
+    command = [sys.executable, '-m', 'generator.node_graph']
+    run = subprocess.run(command, cwd=DOCS, capture_output=True, text=True, check=False)
+    if run.returncode:
+        raise RuntimeError(f'{" ".join(command)} failed:\n{run.stderr}')
+    return json.loads(run.stdout)
