@@ -76,7 +76,7 @@ linkcheck_anchors = False
 
 def clear_alias(_app, _what, _name, _value, _options, lines):
     """Remove the text that Python gives to fields of named tuples, "Alias for field number 0"."""
-    if lines and lines[0].startswith('Alias for field number'):
+    if any(line.startswith('Alias for field number') for line in lines):
         lines.clear()
 
 
