@@ -1,4 +1,4 @@
-"""Print the topics and services of all nodes as JSON: `python -m generator.node_graph`.
+"""Print topics, services and parameters of all nodes as JSON: `python -m generator.node_graph`.
 
 Runs in a process of its own, because ROS changes the environment, the signal handlers and the
 threads of its process.
@@ -16,17 +16,21 @@ STANDARD = re.compile(
     'describe_parameters|get_parameter|list_parameters|set_parameters|change_state|get_state|'
     'get_available|get_transition|type_description')
 """Services that every node of ROS has."""
+STANDARD_PARAMETERS = ('use_sim_time', 'start_type_description_service')
+DEFAULTS = {'network': '', 'drivers': '', 'recording': '', 'batches': False, 'publish_tf': False}
+"""Defaults of the parameters that `generate_policies.nodes` sets."""
 
 
 def node_graph():
-    """[(node, [(topic, type, QoS)], [(service, type)])]; the nodes are created and inspected."""
+    """Create the nodes and describe them: (name, publishers, services, parameters) of each."""
     from generate_policies import SENSORS, nodes
 
     graph = []
     with tempfile.TemporaryDirectory() as folder:
         os.environ['ROS_HOME'] = folder
         for node in nodes(Path(folder), '/'):
-            graph.append((node.get_name(), publishers_of(node, SENSORS), services_of(node)))
+            graph.append((node.get_name(), publishers_of(node, SENSORS), services_of(node),
+                          parameters_of(node)))
             node.destroy_node()
     return graph
 
@@ -54,6 +58,14 @@ def services_of(node):
     """[(name, type)] of the services that only nodes of this package have."""
     names = [(s.service_name.rpartition('/')[2], type_of(s.srv_type)) for s in node.services]
     return sorted((n, kind) for n, kind in names if not STANDARD.search(n))
+
+
+def parameters_of(node):
+    """[(name, default, description)] of the parameters that are not settings of a stage."""
+    created = node.get_parameters_by_prefix('')
+    return [(name, DEFAULTS.get(name, parameter.value), node.describe_parameter(name).description)
+            for name, parameter in sorted(created.items())
+            if '.' not in name and name not in STANDARD_PARAMETERS]
 
 
 def type_of(message):

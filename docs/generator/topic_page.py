@@ -47,27 +47,30 @@ SERVICES = {
     'pause': 'Pause the replay.', 'resume': 'Resume the replay.',
     'seek': 'Continue the replay at an offset from its beginning.'}
 
-TOPICS = """# Topics, services and messages
+TOPICS = """# Nodes: topics, services, parameters, messages
 
 Relative names resolve in the namespace of the node; every name can be remapped. `~/pose` of the
 tracker is `tracker_node/pose` below. Inputs are subscribed best-effort (matches both kinds), or
 reliable with the parameter `reliable_input`.
 
 Publishers are reliable; *latched* is the durability `TRANSIENT_LOCAL`, *depth* the length of the
-queue.
+queue. The settings of the stages ({doc}`parameters`) are parameters of the
+nodes as well.
 """
 
 
 def topic_page():
     """Markdown."""
     lines = [TOPICS]
-    for name, publishers, services in graph():
+    for name, publishers, services, parameters in graph():
         lines += [f'## {name}', '', '| publishes | content | rate | QoS |', '|---|---|---|---|']
         lines += [f'| `{topic}`<br>`{kind}` | {RATES[topic][1]} | {RATES[topic][0]} | {qos} |'
                   for topic, kind, qos in publishers]
         if services:
             lines += ['', '| service | type | effect |', '|---|---|---|',
                       *(f'| `~/{s}` | `{kind}` | {SERVICES[s]} |' for s, kind in services)]
+        lines += ['', '| parameter | default | meaning |', '|---|---|---|',
+                  *(f'| `{p}` | `{default!r}` | {text} |' for p, default, text in parameters)]
         lines.append('')
     lines += ['## Messages of mag_tracking_msgs', '']
     for path in sorted((MESSAGES / 'msg').glob('*.msg')) + sorted((MESSAGES / 'srv').glob('*.srv')):
@@ -77,7 +80,11 @@ def topic_page():
 
 
 def graph():
-    """[(node, [(topic, type, QoS)], [(service, type)])], from a process with all nodes.
+    """Describe the nodes, from a process that creates them; see `generator.node_graph`.
+
+    Returns
+    -------
+    list of (name, publishers, services, parameters)
 
     Raises
     ------
