@@ -1,5 +1,6 @@
 """Reference page of topics, services and messages, from the nodes and the message definitions."""
 
+import html
 import json
 import subprocess
 import sys
@@ -70,7 +71,8 @@ def topic_page():
             lines += ['', '| service | type | effect |', '|---|---|---|',
                       *(f'| `~/{s}` | `{kind}` | {SERVICES[s]} |' for s, kind in services)]
         lines += ['', '| parameter | default | meaning |', '|---|---|---|',
-                  *(f'| `{p}` | `{default!r}` | {text} |' for p, default, text in parameters)]
+                  *(f'| `{p}` | `{default!r}` | {html.escape(text, quote=False)} |'
+                    for p, default, text in parameters)]
         lines.append('')
     lines += ['## Messages of mag_tracking_msgs', '']
     for path in sorted((MESSAGES / 'msg').glob('*.msg')) + sorted((MESSAGES / 'srv').glob('*.srv')):
