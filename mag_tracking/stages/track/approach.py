@@ -1,4 +1,4 @@
-"""Test whether the field of a track grew like that of a target approaching from afar."""
+"""Approach test: check that the field of a track grew as for a target approaching from afar."""
 
 import numpy as np
 
@@ -11,18 +11,19 @@ SENSED_LEVEL = 2.5
 """RMS of the whitened field above which the target counts as sensed."""
 
 GROWTH_RATIO = 10.0
-"""The growth is examined from `SENSED_LEVEL` up to this multiple of it."""
+"""Ratio of the highest to the lowest field level in the test; the lowest level is
+`SENSED_LEVEL`."""
 
 MIN_LOG2_RATIO = -0.25
-"""Minimum log2 of the ratio of the durations of the first and second half of the growth. In theory
-it is 0.55 for a uniformly decreasing distance and -0.83 for a target that starts from rest beside a
-sensor. A field that jumps gives less."""
+"""Minimum log2 ratio of the durations of the first and the second half of the growth. The
+theoretical value is 0.55 for a uniformly decreasing distance and -0.83 for a target that starts
+from rest next to a sensor. A field that jumps has a smaller value."""
 
 STEADY_SHARE = 0.85
-"""The growth is not steady if the field falls to this share of its previous maximum."""
+"""The growth is not steady if the field falls below this fraction of its previous maximum."""
 
 HALF_FRAME = 0.5
-"""Uncertainty, in frame periods, of the time at which the field reached a level."""
+"""Uncertainty of the time at which the field reached a level, in frame periods."""
 
 MAX_FRAMES = 1000
 """The test is skipped if the field has not grown by `GROWTH_RATIO` within this number of frames."""
@@ -46,8 +47,7 @@ class Approach:
         Returns
         -------
         bool
-            True if this frame completes the test and the field did not grow like that of a target
-            approaching from afar.
+            True if this frame completes the test and the test fails.
         """
         if not self._is_open:
             return False

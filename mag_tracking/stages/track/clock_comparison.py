@@ -12,10 +12,11 @@ SIGNIFICANT_STD = 4.0
 """An offset is reported if it exceeds this number of standard deviations."""
 
 MEMORY_PASSES = 20
-"""Effective number of passes in the estimate; clocks are set and drift."""
+"""Effective number of passes in the estimate. Older passes are forgotten, because clocks drift and
+are adjusted."""
 
 FORGETTING_FACTOR, CONTRADICTED_FACTOR = 1.0 - 1.0 / MEMORY_PASSES, 0.5
-"""Share of the evidence that is kept with each pass, and with a pass that contradicts it."""
+"""Factor on the previous information at each pass, and at a pass that contradicts the estimate."""
 
 PRIOR_STD_S = 1e3
 """Standard deviation of an unknown clock [s]."""
@@ -26,9 +27,9 @@ class ClockOffset:
     """Clock with a significant offset."""
 
     sensor: int
-    """Row of its sensor."""
+    """Index of the sensor in the network."""
     against: int | None
-    """Row of the sensor that it is compared with; None means all others."""
+    """Index of the reference sensor; None if the clock is compared with all other sensors."""
     offset_s: float
     """Time by which the clock is ahead [s]; negative if it is slow."""
     std_s: float
@@ -37,7 +38,7 @@ class ClockOffset:
     """Number of passes in which the clock was compared."""
 
     def text(self, names: Sequence[str]) -> str:
-        """Describe the offset in a sentence, with the correction to make.
+        """Message with the offset and the correction of the network file.
 
         Parameters
         ----------
@@ -49,7 +50,8 @@ class ClockOffset:
         str
         """
         name = names[self.sensor]
-        others = 'those of the others' if self.against is None else f'that of {names[self.against]}'
+        others = 'the other clocks' if self.against is None \
+            else f'the clock of {names[self.against]}'
         where = 'ahead of' if self.offset_s > 0.0 else 'behind'
         more = 'increase' if self.offset_s > 0.0 else 'decrease'
         passes = f'{self.n_passes} passes' if self.n_passes > 1 else 'one pass'
@@ -77,19 +79,19 @@ class ClockComparison:
         self._n_passes = np.zeros(n_sensors, dtype=np.int64)
         # Weighted number of passes, and weighted sum of the inverse of their speeds.
         self._weight, self._slowness = 0.0, 0.0
-        # [s] Significant differences of the clocks, else 0; computed once a pass.
+        # [s] Significant offsets between the clocks, else 0; computed once per pass.
         self._apart: FloatArray = np.zeros((n_sensors, n_sensors))
 
     def apart_s(self, rows: IntArray) -> float:
         """Largest significant offset between two clocks.
 
-        Clocks that were compared in a single pass do not count: that pass may have been of two
+        Clocks that were compared in only one pass are ignored, because this pass may contain two
         vehicles.
 
         Parameters
         ----------
         rows : (n,) int array
-            Sensors to compare.
+            Indices of the sensors in the network.
 
         Returns
         -------
@@ -101,7 +103,7 @@ class ClockComparison:
 
     @property
     def apart(self) -> ClockOffset | None:
-        """Clock with the largest significant offset; None if there is no such clock."""
+        """Clock with the largest significant offset; None if no offset is significant."""
         ahead, behind = map(int, np.unravel_index(np.argmax(self._apart), self._apart.shape))
         if self._apart[ahead, behind] == 0.0:
             return None
@@ -110,7 +112,7 @@ class ClockComparison:
         if len(compared) == 2:
             return ClockOffset(ahead, behind, float(offset[ahead, behind]),
                                float(std[ahead, behind]), int(self._n_passes[compared].min()))
-        # With several clocks, the wrong one is the one that disagrees with most others.
+        # With more than two clocks, the wrong clock disagrees with most other clocks.
         middle = np.median(offset[np.ix_(compared, compared)], axis=1)
         k = int(np.argmax(np.abs(middle)))
         j = int(compared[k])
@@ -120,14 +122,14 @@ class ClockComparison:
     def add(self, found: RigidPass, rows: IntArray) -> None:
         """Add a pass to the estimate.
 
-        A pass that no straight path explains is ignored, and so is one too slow to depend on the
-        clocks.
+        Passes without a straight path that explains them are ignored. Slow passes are ignored, too,
+        because they hardly depend on the clocks.
 
         Parameters
         ----------
         found : RigidPass
         rows : (n,) int array
-            Sensors of the pass, by row in the network.
+            Indices of the sensors of the pass in the network.
         """
         is_slow = found.speed * MAX_OFFSET < MIN_DISTANCE
         if is_slow or not (found.is_explained and found.is_straight):
@@ -148,19 +150,20 @@ class ClockComparison:
         self._weight = 1.0 + kept * self._weight
         self._slowness = 1.0 / found.speed + kept * self._slowness
         offset, std = self._differences()
-        # An offset is harmless if vehicles of the usual speed travel less than a metre in it.
+        # An offset is harmless if a vehicle of average speed travels less than a metre in this
+        # time.
         least = MIN_DISTANCE * self._slowness / self._weight
         self._apart = np.where((offset > SIGNIFICANT_STD * std) & (offset > least), offset, 0.0)
 
     def _contradicts(self, found: RigidPass, rows: IntArray, known: BoolArray) -> bool:
-        """Whether a pass contradicts the previous ones about one of the `known` clocks."""
+        """Whether a pass contradicts the previous passes for one of the `known` clocks."""
         offset, std = self._differences()
         reference = rows[found.reference]
         return any(abs(found.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STD * np.sqrt(
             found.clock_variance(j) + std[rows[j], reference]**2) for j in np.flatnonzero(known))
 
     def _differences(self) -> tuple[FloatArray, FloatArray]:
-        """Time (n, n) [s] by which each clock (row) is ahead of each (column), and its std."""
+        """Offsets (n, n) [s] of each clock (row) ahead of each clock (column), and their stds."""
         # The common offset of all clocks is not observable; the prior fixes it.
         loose = np.eye(len(self._vector)) / PRIOR_STD_S**2
         covariance: FloatArray = np.linalg.inv(self._information + loose).astype(np.float64)

@@ -23,7 +23,7 @@ from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.units import NS
 
 PASSED_SHARE = 0.6
-"""A vehicle has passed when the field is below this share of its maximum."""
+"""A vehicle has passed when the field is below this fraction of its maximum."""
 
 FIRST_CHECK_S = 0.12
 """Delay of the first fit after the maximum of the field [s]."""
@@ -43,7 +43,7 @@ STEADY_S = 1.5
 [s]."""
 
 LATE_MISFIT = 8.0
-"""Limit for the misfit of later fits, when a car may have turned unsteadily."""
+"""Maximum misfit of later fits, in which the turn rate of a car may have changed."""
 
 
 class _FrameSummary(NamedTuple):
@@ -57,7 +57,7 @@ class _FrameSummary(NamedTuple):
 
 
 class CrossCheck:
-    """Frames of a track, and fits of its whole pass.
+    """Cross-check of a track with fits of a steady path to its whole pass.
 
     Parameters
     ----------
@@ -68,8 +68,8 @@ class CrossCheck:
     latest : RigidPass or None
         Latest fit; None before the vehicle has passed.
     difference : (6,) array, m and m/s
-        `RigidPass.difference` of the latest state; after the pass, that of the last state of the
-        pass.
+        `RigidPass.difference` of the latest state; after the pass, the difference of the last state
+        in the pass.
     """
 
     def __init__(self, network: SensorNetwork) -> None:
@@ -86,7 +86,7 @@ class CrossCheck:
         self.difference: FloatArray = np.zeros(6)
 
     def add(self, frame: FieldFrame, state: FloatArray) -> None:
-        """Add a frame.
+        """Add a frame of the track.
 
         Parameters
         ----------
@@ -109,12 +109,12 @@ class CrossCheck:
         self._frames.append(frame)
 
     def _is_of_pass(self, frame: FieldFrame) -> bool:
-        """Whether a frame is within the pass, by its time from the maximum of the field."""
+        """Whether a frame belongs to the pass, by its time relative to the maximum of the field."""
         assert self._peak is not None
         return -BEFORE_S * NS <= frame.stamp_ns - self._peak.stamp_ns <= AFTER_S * NS
 
     def doubts(self, clocks_apart_s: float) -> set[str]:
-        """Return the doubts about the track, after a new fit if one is due.
+        """Fit the pass if a fit is due, and return the doubts about the track.
 
         Parameters
         ----------
@@ -139,12 +139,12 @@ class CrossCheck:
     def differences(self, states: Sequence[TrackState]) -> list[FloatArray]:
         """Differences of smoothed states from the fitted pass.
 
-        States before or after the pass get the difference of its first or last state.
+        For states before or after the pass, the difference of its first or last state is returned.
 
         Parameters
         ----------
         states : sequence of TrackState
-            In order of time.
+            States in chronological order.
 
         Returns
         -------
@@ -161,8 +161,8 @@ class CrossCheck:
     def _covers(self, stamp_ns: int) -> bool:
         """Whether the latest fit determines the position of the vehicle at a time.
 
-        A track that begins at the maximum of the field contains only a part of a pass, which many
-        paths explain.
+        A track that begins at the maximum of the field contains only part of a pass. Many paths
+        would explain it.
         """
         return self.latest is not None and self._has_whole_pass \
             and -BEFORE_S * NS <= stamp_ns - self.latest.stamp_ns <= AFTER_S * NS
@@ -185,7 +185,7 @@ class CrossCheck:
         clocks : ClockComparison
             Updated in place.
         rows : (n,) int array
-            Sensors of the track, by row in the network.
+            Indices of the sensors of the track in the network.
         """
         self._fit_if_due(0.0)
         if self.latest is not None:
@@ -201,7 +201,8 @@ class CrossCheck:
         if since < self._due_s or len(frames) < MIN_FRAMES:
             return
         self._due_s = CHECK_INTERVAL_RATIO * since
-        # Starts: the state now, extrapolated back, and the state at the maximum of the field.
+        # Start values: the current state extrapolated back, and the state at the maximum of the
+        # field.
         back = now.state.copy()
         back[:3] -= since * back[3:]
         step = -(-len(frames) // MAX_FRAMES)

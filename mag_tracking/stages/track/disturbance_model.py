@@ -1,9 +1,9 @@
-"""Alternative to a target: smooth fields, and their evidence for the frames of a track.
+"""Evidence for a disturbance: smooth fields that explain the frames of a track without a target.
 
 Two models of a smooth field compete. In the first, each sensor has an independent field
 (temperature, a knock, a cable). In the second, one field with a gradient covers the network (a
-geomagnetic storm, a power line, a tram). The model error that the tracker allows for its target is
-allowed here as well; otherwise a smooth field would win whenever a target is near.
+geomagnetic storm, a power line, a tram). Both allow for the same model error as the tracker;
+otherwise a smooth field would be favoured whenever a target is near.
 """
 
 import numpy as np
@@ -18,13 +18,15 @@ GRADIENT_SHARE = 0.3
 """Relative change of a common field from the centre of the network to its edge."""
 
 MIN_STD = 1e-15
-"""Minimum noise of a sensor [T]; a network file with less noise is rejected."""
+"""Minimum standard deviation of the noise of a sensor [T]. Network files with less noise are
+rejected."""
 
 UNKNOWN_FIELD_STD = 1e-4
-"""Standard deviation of an unknown field [T]."""
+"""Prior standard deviation of the field after a handover [T]."""
 
 MIN_GRADIENT_SENSORS = 3
-"""With fewer sensors, a uniform field with a gradient can explain any readings."""
+"""Minimum number of sensors for which the common field has a gradient. With fewer sensors, it could
+explain any readings."""
 
 MAX_COMMON_SENSORS = 8
 """Maximum number of sensors in the model of a common field; its cost grows with the cube of their
@@ -40,8 +42,8 @@ class DisturbanceModel:
     background_std : float, T
         Standard deviation of the backgrounds.
     is_handover : bool
-        The model starts during a track, with unknown fields. By default it starts at the first
-        frame of a track, without a field.
+        Whether the model starts during a track, with an unknown field. By default it starts at the
+        first frame of a track, with zero field.
     """
 
     def __init__(self, network: SensorNetwork, background_std: float,
@@ -54,12 +56,12 @@ class DisturbanceModel:
         self._common_H = _common_field_matrix(network.part(chosen) if n > len(chosen) else network)
         self._filters: tuple[GaussMarkovVectors, GaussMarkovVectors, GaussMarkovVectors] | None \
             = None
-        # Log-weights of independent fields, and of one field over the network.
+        # Log-weights of independent fields and of a common field.
         self._log_w = np.log([0.5, 0.5])
 
     @property
     def uniform(self) -> float:
-        """Probability of one field over the network, given that there is no target."""
+        """Probability of a common field over the network, given that there is no target."""
         return float(np.exp(self._log_w[1]))
 
     def log_density(self, frame: FieldFrame, dt: float, model_error: FloatArray) -> float | None:
@@ -102,7 +104,7 @@ class DisturbanceModel:
         return None if is_first else evidence
 
     def _begin(self, noise: float) -> None:
-        """Initialise the filters; `noise` [T²] is the variance of the first measurement."""
+        """Initialise the filters; `noise` [T²] is the median noise variance of the first frame."""
         scale = np.sqrt(self._background_std**2 + noise)
         n = len(self._sensor) // 3
         n_chosen = min(n, MAX_COMMON_SENSORS)

@@ -59,8 +59,8 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
                  ) -> FilterBank | None:
     """Return the hypotheses of a magnet at its first frame, at any position.
 
-    The moment is projected out on a coarse grid. The best grid points are refined, and every
-    distinct optimum becomes a hypothesis, weighted by its fit.
+    The moment is projected out at each point of a coarse grid. The best grid points are refined.
+    Each distinct optimum becomes a hypothesis, weighted by its fit.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     Returns
     -------
     FilterBank or None
-        All labels are 0. None if the frame has fewer than six axes or nothing fits.
+        All labels are 0. None if the frame has fewer than six axes or if no fit has a finite cost.
 
     References
     ----------

@@ -19,8 +19,8 @@ SHARE_FIELD = 5e-5
 """Field for which `VehicleSettings.induced_share` is defined [T]."""
 
 START_TURN_RATIO = 0.5
-"""Initial standard deviation of the turn rate, relative to that of a turning vehicle. A vehicle
-arrives along a line, so it hardly turns at first."""
+"""Initial standard deviation of the turn rate, relative to the standard deviation of a turning
+vehicle. The ratio is below 1, because vehicles arrive along straight lines."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def _n_dipoles(settings: VehicleSettings) -> int:
 
 
 def _soft_iron_per_share(settings: VehicleSettings, kind: int) -> float:
-    """Soft iron [m³] of a kind for a share of one."""
+    """Soft iron [m³] of a kind of vehicle for an induced share of one."""
     return settings.moments[kind] * MU0 / SHARE_FIELD
 
 
@@ -186,12 +186,11 @@ def _earth_field(network: SensorNetwork) -> FloatArray:
 
 
 def moment_directions() -> FloatArray:
-    """Return the axes and the diagonals of a cube, both ways.
+    """Return unit vectors along the axes and diagonals of a cube, with both signs.
 
     Returns
     -------
     (14, 3) array
-        Unit vectors.
     """
     axes = np.vstack([np.eye(3), -np.eye(3)])
     diagonals = np.array([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)])
@@ -203,8 +202,8 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
     """Return the hypotheses of a vehicle at its first frame.
 
     There is one hypothesis for each combination of kind, arrival line, moment direction, lateral
-    offset and speed. It starts at the distance at which its field first has the measured energy as
-    it approaches.
+    offset and speed. Each starts at the first position on its line at which its field has the
+    measured energy.
 
     Parameters
     ----------
@@ -250,7 +249,7 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
 
 
 def _with_turns(bank: FilterBank, model: RowVehicle, share: float) -> FilterBank:
-    """Duplicate each hypothesis, straight and turning; return the bank itself if nothing turns."""
+    """Bank with a straight and a turning copy of each hypothesis, if vehicles turn."""
     if not model.turn_acceleration:
         return bank
     n, w = len(bank), len(model.state_names) - 1
@@ -263,7 +262,7 @@ def _with_turns(bank: FilterBank, model: RowVehicle, share: float) -> FilterBank
 
 
 class _MeasuredEnergy:
-    """Energy of a frame, which determines the distance of the target."""
+    """Energy of a frame, which determines the initial distance of the target."""
 
     def __init__(self, network: SensorNetwork, frame: FieldFrame) -> None:
         present = ~np.isnan(frame.field)
@@ -278,7 +277,7 @@ class _MeasuredEnergy:
 def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
                         measured: _MeasuredEnergy, R: FloatArray, moments: FloatArray,
                         height: float) -> FloatArray:
-    """First position (n_offsets, n_moments, 3) on each line where the field has the energy."""
+    """First position (n_offsets, n_moments, 3) on each line with the measured field energy."""
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(settings.max_start_distance, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])

@@ -1,9 +1,9 @@
 """Search for a new vehicle in the frames of a running track.
 
-The frames of the relinearisation window are explained in another way: with a vehicle beside the
-tracked ones, with two vehicles in place of one (two vehicles may have misled the filter of one), or
-with one of them elsewhere. Each explanation is filtered and smoothed along its path like any
-hypothesis. Its evidence is compared with that of the current track.
+Three other explanations of the relinearisation window are tried: a further vehicle; two vehicles in
+place of one, because two vehicles may have misled the filter of one; and one of the vehicles at
+another position. Each explanation is filtered and smoothed along its path like any hypothesis. Its
+evidence is compared with the evidence of the current track.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,35 +35,35 @@ from mag_tracking.stages.track.window_start import (
 )
 
 PASSES, STEP = 3, 0.5
-"""Number of Gauss-Newton steps along each path, and the share of each step that is taken."""
+"""Number of Gauss-Newton steps along each path, and their damping factor."""
 
 MAX_KNOWN, MAX_FIRST, MAX_SECOND = 2, 3, 2
-"""Maximum number of hypotheses that are tried for a single tracked vehicle (one for several
-vehicles), and of paths of a first and of a second new vehicle for each."""
+"""Maximum number of hypotheses of a single tracked vehicle that are tried, of first new vehicles
+for each hypothesis, and of second new vehicles for each first one. With several tracked vehicles,
+only the best hypothesis is tried."""
 
 NATS_KEPT, MAX_KEPT = 10.0, 12
-"""Maximum difference in log-probability from the best explanation at which another one is kept
-[nats], and maximum number of explanations kept."""
+"""Maximum difference in log-probability between the best and another retained explanation [nats],
+and maximum number of retained explanations."""
 
 LOG_P_ARRIVAL = np.log(0.05)
 """Log-probability that another vehicle arrives during a pass."""
 
 MIN_DISPLACEMENT_M = 2.0
-"""Minimum distance of a vehicle that is found elsewhere from its track [m]. A nearer vehicle was
-tracked correctly."""
+"""Minimum distance from the track at which a vehicle counts as found at another position [m]."""
 
 MAX_RATIO = 5.0
 """Maximum speed and moment of a new vehicle, relative to the largest of the settings."""
 
 LOG_P_LOST = np.log(0.01)
-"""Log-probability that a vehicle has been elsewhere than its track during the whole window."""
+"""Log-probability that the track of a vehicle was at a wrong position during the whole window."""
 
 N_DISTANCES = 10
-"""Number of positions on its line at which a new target may be at the start of the window."""
+"""Number of possible positions of a new target on its line at the start of the window."""
 
 
 class NewTargetSearch:
-    """Explain a window with one more vehicle.
+    """Search for explanations of a window with one more vehicle, or with a vehicle elsewhere.
 
     Parameters
     ----------
@@ -76,8 +76,8 @@ class NewTargetSearch:
         Number of vehicles of the track.
     vehicles : VehicleState
     reason : str
-        Reason from `NewTargetEvidence.due`. If the innovations are not improbable, no vehicle is
-        searched for beside a long one or elsewhere.
+        Reason from `NewTargetEvidence.due`. If the innovations are not improbable, only two
+        vehicles in place of one are searched for.
     may_add : bool
         Whether a vehicle may be added.
     """
@@ -92,14 +92,14 @@ class NewTargetSearch:
         settings = vehicles.settings
         self._n_one = self._filter.observation.n_one
         self._search = WindowSearch(window, vehicles)
-        # First pair that was found in place of each vehicle; it defines the order of the others.
+        # First pair that was found in place of each vehicle; it defines the order of later pairs.
         self._pairs: dict[int, FloatArray] = {}
         self._log_prior = -float(np.log(
             len(settings.arrival_names) * len(settings.lateral_offsets) * len(settings.speeds)
             * len(settings.kinds) * len(moment_directions()) * N_DISTANCES))
 
     def find(self) -> Joint | None:
-        """Return the best explanation with a new target, or with a vehicle elsewhere.
+        """Return the best explanation with a new target, or with a vehicle at another position.
 
         Returns
         -------
@@ -144,8 +144,8 @@ class NewTargetSearch:
     def _current_track(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
         """Leading hypotheses of the current track, along their paths.
 
-        Returns their rows in the bank (n,), log-likelihoods (n,), log-weights with these (n,) and
-        paths (n, n_frames, n_x).
+        Returns their indices in the bank (n,), log-likelihoods (n,), log-weights after these frames
+        (n,) and paths (n, n_frames, n_x).
         """
         window, bank = self._window, self._bank
         order = np.argsort(-bank.log_w, kind='stable')[:window.max_hypotheses]
@@ -162,7 +162,8 @@ class NewTargetSearch:
         return order, of_track, before + of_track, paths
 
     def _leaders(self, rows: IntArray, log_w: FloatArray) -> list[int]:
-        """Indices into `rows` to be tried with a new target: the best of each arrival and kind."""
+        """Indices into `rows` of the best hypothesis of each arrival and kind, up to the
+        maximum."""
         seen: set[tuple[int, ...]] = set()
         most = MAX_KNOWN if self._n_targets == 1 else 1
         chosen: list[int] = []
@@ -183,7 +184,7 @@ class NewTargetSearch:
         return KnownVehicles(before.x[0], before.P[0], path, label, kind, log_w, self._filter)
 
     def _may_be_two(self, known: KnownVehicles, i: int) -> bool:
-        """Whether vehicle `i` is long, or the only one."""
+        """Whether vehicle `i` may be two vehicles: it is long, or the only vehicle."""
         return self._n_targets == 1 or bool(
             self._filter.are_long(np.array([known.kind[i]]))[0])
 
@@ -202,7 +203,7 @@ class NewTargetSearch:
         return bool(np.hypot(*(found[last:last + 2] - before)) > MIN_DISPLACEMENT_M)
 
     def _without(self, known: KnownVehicles, i: int) -> KnownVehicles:
-        """The same without vehicle `i`; without any vehicle, only the states of the sensors."""
+        """Known vehicles without vehicle `i`; only the sensor states if no vehicle remains."""
         n = self._n_one
         if self._n_targets == 1:
             own = self._sensors_at_start()
@@ -215,7 +216,8 @@ class NewTargetSearch:
             known.log_w, self._filter_of(self._n_targets - 1))
 
     def _beside(self, known: KnownVehicles, replaced: int | None = None) -> list[WindowStart]:
-        """Starts of one vehicle beside known ones: a new one, or instead of vehicle `replaced`."""
+        """Starts with a further vehicle beside known ones; it is new or replaces vehicle
+        `replaced`."""
         search = self._search.beside(known)
         return [start for theta in search.best(self._search.grid, MAX_FIRST)
                 for start in self._starts_on(known, theta[None], search.moments(theta), replaced)]
@@ -255,14 +257,14 @@ class NewTargetSearch:
                           std**2 * np.eye(3 * len(observation.positions)))
 
     def _kept(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Starts that explain the frames about as well as the best, with their paths refined."""
+        """Starts that are about as probable as the best start, with refined paths."""
         _, _, log_w, paths = self._run(starts)
         order = np.argsort(-log_w, kind='stable')[:MAX_KEPT]
         return [replace(starts[k], path=paths[k]) for k in order.tolist()
                 if log_w[k] >= log_w.max() - NATS_KEPT]
 
     def _with_turns(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Each start as it is, and with one of the new vehicles turning."""
+        """Starts in which the new vehicles go straight, and in which one of them turns."""
         share = self._vehicles.settings.turn_share
         out = []
         for start in starts:
@@ -276,7 +278,11 @@ class NewTargetSearch:
 
     def _run(self, starts: Sequence[WindowStart]
              ) -> tuple[FilterBank, FloatArray, FloatArray, FloatArray]:
-        """Bank at the end, log-likelihoods (n,), log-weights (n,) and paths (n, n_frames, n_x)."""
+        """Filter and smooth starts along their paths.
+
+        Returns the bank at the last frame, log-likelihoods (n,), log-weights (n,) and paths (n,
+        n_frames, n_x).
+        """
         window, n = self._window, len(starts)
         bank = FilterBank(
             np.array([s.x for s in starts]), np.array([s.P for s in starts]), np.zeros(n),
@@ -298,7 +304,7 @@ class NewTargetSearch:
     def _are_plausible(self, start: WindowStart, x: FloatArray) -> bool:
         """Whether speeds and moments of the new vehicles in the state `x` (n_x,) are plausible.
 
-        A vehicle that stands still is not new.
+        A stationary vehicle is not new.
         """
         settings, n = self._vehicles.settings, self._n_one
         for i in start.new_indices:
@@ -311,7 +317,7 @@ class NewTargetSearch:
 
     def _made(self, starts: Sequence[WindowStart], bank: FilterBank, log_likelihood: FloatArray,
               log_w: FloatArray, paths: FloatArray, log_odds: float) -> Joint | None:
-        """`Joint` of the usable starts; None if there are none."""
+        """`Joint` of the usable starts; None if no start is usable."""
         rows = np.flatnonzero(np.isfinite(log_w))
         if not len(rows):
             return None

@@ -11,8 +11,8 @@ from mag_tracking.physics.mounting import rotated_fields
 from mag_tracking.physics.sources import SourceModel
 
 MAX_ROTATION = np.deg2rad(15.0)
-"""[rad] Maximum standard deviation of a mounting angle; a larger one is limited to this, because
-the angles are of first order. `TrackManager` counts the sensors concerned."""
+"""[rad] Maximum standard deviation of a mounting angle. Larger values are limited, because the
+rotations are of first order. `TrackManager` counts the affected sensors."""
 
 TIME_RESOLUTION_S = 1e-3
 """[s] Samples closer than this are treated as simultaneous: at 20 m/s a target moves two
@@ -46,11 +46,13 @@ class Observation:
 
     The state begins as described in `inference/hypothesis.hpp`: the states of `n_targets` targets
     of one model, one after the other; their fields are added. The states of each sensor follow:
-    three mounting angles [rad] if they are estimated, and three model errors in units of their size
-    if `error_time` is not 0. The model errors represent the field that the target model leaves out
-    near a vehicle. They are first-order Gauss-Markov processes with the correlation time
-    `error_time`, so that their weight does not depend on the frame period. Without `error_time`,
-    the error is independent noise in every frame.
+    three mounting angles [rad] if they are estimated, and three model errors in units of their
+    standard deviation if `error_time` is not 0.
+
+    The model errors represent the field that the target model neglects near a vehicle. They are
+    first-order Gauss-Markov processes with the correlation time `error_time`, so that their weight
+    does not depend on the frame period. Without `error_time`, the error is independent noise in
+    every frame.
 
     Parameters
     ----------
@@ -98,8 +100,7 @@ class Observation:
             self.own_covariance[:, :3, :3] = angle_priors(network, mounting_std)
         self.single_target: Observation = self if n_targets == 1 else Observation(
             network, model, mounting_std, error_time)
-        # Masks for the states after those of the targets: 1 for model errors or backgrounds, else
-        # 0.
+        # Masks for the states of the sensors: 1 for model errors or backgrounds, else 0.
         is_error = np.tile(np.arange(n_own) >= self.n_angles, len(network))
         self._is_error: FloatArray = np.append(is_error, np.zeros(3 * len(network)))
         self._is_background: FloatArray = np.append(0.0 * is_error, np.ones(3 * len(network)))
@@ -123,7 +124,7 @@ class Observation:
         return self.n_target + (self.n_own + 3) * n_sensors
 
     def own(self, x: FloatArray) -> FloatArray:
-        """States of the sensors.
+        """States of each sensor, without the backgrounds.
 
         Parameters
         ----------
@@ -235,7 +236,8 @@ class Observation:
 
     def target_fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fields of the targets without sensor states, each at the time of the sensor's samples.
+        """Target fields at the sampling time of each sensor, without the effects of the sensor
+        states.
 
         Parameters
         ----------
@@ -248,7 +250,8 @@ class Observation:
         h : (n_hyp, n_sensors, 3) array, T, sensor frame
         H : (n_hyp, n_sensors, 3, n_target) array
         variance : (n_hyp, n_sensors) array, T^2
-            Variance of the errors of the models near the targets, which are independent.
+            Variance of the model error near the targets; the errors of different targets are
+            independent.
         """
         h, H, gradients = zip(*(
             self._field_of_one(x[:, first:first + self.n_one], time_offset)
@@ -278,12 +281,13 @@ class Observation:
 
     def field_of(self, x: FloatArray, targets: Iterable[int], time_offset: FloatArray
                  ) -> FloatArray:
-        """Field of some of the targets.
+        """Field of selected targets.
 
         Parameters
         ----------
         x : (n_x,) array
         targets : iterable of int
+            Indices of the targets.
         time_offset : (n_sensors,) array, s
 
         Returns
@@ -303,9 +307,9 @@ class Observation:
                field_error: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Fields at the sensors, without the backgrounds.
 
-        `H` neglects that the size of the model error depends on the state. This is a few per cent
-        of the derivative where the error is large. The size is that of ICASSP11 eq. (9), which
-        models it as noise.
+        `H` neglects that the standard deviation of the model error depends on the state. This
+        dependence is a few per cent of the derivative where the error is large. The standard
+        deviation follows ICASSP11 eq. (9), where the error is noise.
 
         Parameters
         ----------
@@ -360,6 +364,6 @@ class Observation:
 
 
 def _share_of_field(h: FloatArray, field_error: float) -> FloatArray:
-    """Variance (n_hyp, n_sensors) [T^2] of a model error in proportion to the field."""
+    """Variance (n_hyp, n_sensors) [T^2] of a model error that is proportional to the field."""
     variance: FloatArray = field_error**2 * np.einsum('pji,pji->pj', h, h)
     return variance

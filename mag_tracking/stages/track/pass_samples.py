@@ -20,8 +20,7 @@ MODEL_ERROR = 0.04
 """Error of the field of a row of dipoles, relative to the field; treated as noise."""
 
 NEAR_ERROR_LENGTH = 0.2
-"""[m] Near a sensor, the relative error is this length divided by the distance, if that is
-larger."""
+"""[m] Near a sensor, the relative error is at least this length divided by the distance."""
 
 MAX_SENSORS = 4
 """Maximum number of sensors; those with the strongest fields are used."""
@@ -35,7 +34,7 @@ class PassSamples:
     """The frames of a pass as whitened arrays, sorted by frame and sensor."""
 
     compared: IntArray
-    """(k,) Rows of the sensors in the network; the one with the strongest field comes first."""
+    """(k,) Indices of the sensors in the network, beginning with the strongest field."""
     t: FloatArray
     """(n,) [s] Time of each sample."""
     positions: FloatArray
@@ -53,11 +52,12 @@ class PassSamples:
 
     @property
     def n_clocks(self) -> int:
-        """Number of clocks apart from that of the sensor with the strongest field."""
+        """Number of clocks that are compared with the clock of the sensor with the strongest
+        field."""
         return len(self.compared) - 1
 
     def n_free(self, n_dipoles: int) -> int:
-        """Degrees of freedom that backgrounds and moments leave for the path.
+        """Degrees of freedom that remain for the path after backgrounds and moments.
 
         Parameters
         ----------
@@ -102,7 +102,7 @@ class PassSamples:
         network : SensorNetwork
         frames : sequence of FieldFrame
         stamp_ns : int, ns
-            Time zero.
+            Time zero of the samples.
         max_sensors : int, optional
 
         Returns
@@ -134,7 +134,7 @@ class PassSamples:
 
     def fit(self, n_dipoles: int, free: IntArray, starts: FloatArray
             ) -> tuple[FloatArray, float, FloatArray]:
-        """Fit a row of dipoles on a steady path, and return the best minimum.
+        """Fit a row of dipoles on a steady path from each start, and return the best fit.
 
         Parameters
         ----------
@@ -185,6 +185,6 @@ class PassSamples:
 
     @cached_property
     def _projected(self) -> tuple[FloatArray, FloatArray]:
-        """Orthonormal columns of the backgrounds, and the whitened fields without them."""
+        """Orthonormal basis of the backgrounds, and the whitened fields without backgrounds."""
         Q = np.linalg.qr(self.backgrounds)[0]
         return plain(Q), self.y - Q @ (Q.T @ self.y)

@@ -13,12 +13,13 @@ P_MOUNTING = 0.05
 """Probability that correctly mounted sensors need mounting angles as large as the limit."""
 
 P_HEIGHT = 1e-3
-"""Probability that the iron of a vehicle is as far from the height of its kind as the limit."""
+"""Probability that the height of a vehicle differs from the height of its kind by more than the
+limit."""
 
 LANE_STDS, LANE_STDS_LATER = 1.645, 3.0
-"""Limits, in standard deviations, of the distance of a vehicle from the outermost lane of the
-settings: at its closest point to any sensor so far (exceeded by one in twenty vehicles of that
-lane), and at any later time, when it may have turned off."""
+"""Maximum distance of a vehicle from the outermost configured lane, in standard deviations: at its
+closest point to any sensor, and at later times, when it may have turned off. One in twenty vehicles
+on that lane exceeds the first limit."""
 
 MIN_SPEED = 1.0
 """[m/s] The heading of a slower vehicle is undefined."""
@@ -40,20 +41,20 @@ class Plausibility:
 
     def evaluate(self, observation: Observation, bank: FilterBank, best: int,
                  settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
-        """Doubts about the state of a hypothesis; to be called once per frame, in order.
+        """Update the closest points with a frame, and return the doubts about a hypothesis.
 
         Parameters
         ----------
         observation : Observation
         bank : FilterBank
         best : int
-            Row of the published hypothesis.
+            Index of the published hypothesis.
         settings : VehicleSettings
         mounting_std : float, rad
-            Minimum standard deviation of the mounting angles of each sensor. It applies to
-            accurately mounted sensors as well, because a model error rotates the field, too.
+            Minimum standard deviation of the mounting angles of each sensor. It also applies to
+            accurately mounted sensors, because a model error rotates the field, too.
         dt : float, s
-            Length of the frame.
+            Duration of the frame.
 
         Returns
         -------
@@ -92,11 +93,13 @@ def _passes_beside(x: FloatArray, settings: VehicleSettings, positions: FloatArr
                    deviations: float) -> BoolArray:
     """Whether states (n, n_x) pass all sensors (n_sensors, 3) on one side, beyond the lanes.
 
-    There the distance is hardly observable: a train on another line looks like a truck nearby, and
-    a truck beyond a sensor looks like a car on the near side of a sensor with an inverted axis.
-    Lanes are on both sides of the centre of the network. The more a network extends beyond the
-    road, the more it covers an area, and a vehicle may be as close to its outermost sensors as a
-    lane is to the centre.
+    The distance of such a vehicle is hardly observable. A train on another line resembles a truck
+    nearby. A truck beyond a sensor resembles a car on the near side of a sensor with an inverted
+    axis.
+
+    Lanes are on both sides of the centre of the network. A network that extends beyond the road
+    covers an area. A vehicle may then be as far outside the outermost sensors as a lane is from the
+    centre.
     """
     speed = np.maximum(np.hypot(x[:, 3], x[:, 4]), MIN_SPEED)
     away = positions[:, :2, None] - x[:, :2].T
@@ -125,7 +128,7 @@ def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positio
     position : (3,) array, m
     velocity : (3,) array, m/s
     dt : float, s
-        Length of the frame.
+        Duration of the frame.
     positions : (n, 3) array, m
         Positions of the sensors.
 
@@ -139,7 +142,7 @@ def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positio
 
 
 def _needs_rotated_sensors(observation: Observation, x: FloatArray, mounting_std: float) -> bool:
-    """Whether the mounting angles of a state are larger than stated."""
+    """Whether the mounting angles of a state are too large for their standard deviations."""
     angles = observation.angles(x)
     if not angles.size:
         return False

@@ -1,20 +1,21 @@
 """Relinearisation of the leading hypotheses of a running track along their smoothed paths.
 
-An extended Kalman filter linearises each frame at the state predicted at that time. Far ahead of
-the sensors the prediction is metres off, and the filter never loses the certainty that it wrongly
-gained there. Therefore the latest frames are filtered and smoothed again, with motion and field
+An extended Kalman filter linearises each frame at the state predicted at that time. Far from the
+sensors the prediction is metres off. The filter becomes overconfident there and remains so.
+Therefore the latest frames are filtered and smoothed again, with motion and field
 linearised along the smoothed path of each leading hypothesis. These are damped Gauss-Newton steps
 on the path. If they converge, the state at the end of the path replaces that of the filter, with
-the larger of both covariances. If they do not converge, the state is kept, but the filter may be
-overconfident: a filter that is linearised at different states gains information about directions
-that no single path can observe (Julier and Uhlmann 2001 found this for maps). Therefore a larger
-covariance of the path is adopted in this case, too.
+the larger of both covariances. If they do not converge, the state is retained, but a larger
+covariance of the path is adopted. The filter may be overconfident in this case: a filter that is
+linearised at different states gains information about directions that no single path can observe
+(Julier and Uhlmann 2001 found this for maps).
 
 The likelihood of the frames along the path does not measure convergence. The model error and the
 drift of a moment are proportional to the moment, so the steps minimise a different cost. For the
-same reason a path may diverge to moments that explain everything. The path of a long vehicle, whose
+same reason a path may diverge to moments that explain any field. The path of a long vehicle, whose
 model error is largest, is adopted only if it explains the frames no worse than the filter did.
-Weights are not changed, because relinearised hypotheses and others could not be compared.
+Weights are not changed, because the likelihoods of relinearised and other hypotheses are not
+comparable.
 
 The method is the iterated Kalman smoother of Bell 1994.
 """
@@ -33,25 +34,26 @@ from mag_tracking.stages.track.bank_filter import BankFilter, PathResult
 from mag_tracking.units import NS
 
 MAX_LOG_RATIO = np.log(1e3)
-"""A hypothesis is leading if its log-weight is below the largest by no more than this."""
+"""Maximum difference between the largest log-weight and the log-weight of a leading hypothesis."""
 
 PASSES = 3
-"""Number of Gauss-Newton steps each time; the next time continues from the result."""
+"""Number of Gauss-Newton steps per relinearisation. The next relinearisation continues from the
+result."""
 
 STEP_SIZE = 0.5
 """Damping of each step. Undamped steps overshoot where the field is strongly nonlinear, and
 diverge."""
 
 CONVERGED = 0.3
-"""A path has converged if the last step moved it nowhere by more than this, in standard deviations
-of the position."""
+"""Maximum movement of a converged path in the last step, in standard deviations of the position."""
 
 ATTEMPTED, FAILED = 'paths relinearised', 'paths relinearised without success'
 """Keys in the counts."""
 
 MAX_FRAMES = 64
-"""Maximum number of frames; a window begins with at most half of them. At 100 frames per second, a
-window of several seconds would take more than a core."""
+"""Maximum number of frames in a window. When it moves, at most half of them remain. Without this
+limit, a window of several seconds at 100 frames per second would exceed the capacity of one
+core."""
 
 MAX_ELEMENTS = 5_000_000
 """Maximum product of frames, hypotheses and squared number of states. With many sensors, fewer
@@ -70,9 +72,9 @@ class Window:
     intervals: list[float]
     """[s] Time from the previous frame to each frame."""
     paths: list[FloatArray]
-    """(n_hyp, n_x) At each frame: states at which the hypotheses of the anchor are linearised."""
+    """(n_hyp, n_x) States at each frame at which the hypotheses of the anchor are linearised."""
     log_likelihoods: list[FloatArray]
-    """(n_hyp,) Of each frame, in the filter; -inf for dropped hypotheses."""
+    """(n_hyp,) Log-likelihoods of each frame in the filter; -inf for dropped hypotheses."""
     evidence: float
     """Log-evidence, in the filter, of the frames with which the anchor has not been updated."""
     max_hypotheses: int
@@ -102,9 +104,10 @@ class Relinearisation:
         self.clear()
 
     def clear(self) -> None:
-        """Drop everything; no track is running."""
+        """Discard the window."""
         self._anchor: FilterBank | InitialBank | None = None
-        # {origin: log-likelihood along the path minus that in the filter}, at the last update.
+        # {origin: log-likelihood along the path minus log-likelihood in the filter}, at the last
+        # relinearisation.
         self._gain: dict[int, float] = {}
 
     def begin(self, anchor: FilterBank | InitialBank) -> None:
@@ -113,8 +116,8 @@ class Relinearisation:
         Parameters
         ----------
         anchor : FilterBank or InitialBank
-            Bank of the track before the update with its first frame. It must not be modified by the
-            caller afterwards.
+            Bank of the track before the update with its first frame. The caller must not modify it
+            afterwards.
         """
         if not self._window_ns:
             return
@@ -143,8 +146,7 @@ class Relinearisation:
         bank : FilterBank
             Bank after the update.
         predicted : (n_hyp, n_x) array
-            States at which the frame was linearised. If the filter iterates its updates, the last
-            linearisation is elsewhere.
+            States at which the frame was first linearised.
         log_likelihood : (n_hyp,) array
         evidence : float
             Log-density of the frame over all hypotheses.
@@ -188,7 +190,7 @@ class Relinearisation:
         Returns
         -------
         Counter of str
-            Number of relinearised paths, and of those that were rejected.
+            Number of relinearised paths, and number of rejected paths.
         """
         anchor = self._anchor
         if anchor is None or self._last_ns is None \
@@ -221,7 +223,7 @@ class Relinearisation:
 
     @property
     def window(self) -> Window | None:
-        """Frames and paths of the window; None if there are none."""
+        """Frames and paths of the window; None if it is empty."""
         if self._anchor is None or self._stale or not self._frames:
             return None
         begin = int(self._updated)
@@ -239,9 +241,9 @@ class Relinearisation:
         bank : FilterBank
             Bank that includes the target.
         i : int
-            Target.
+            Index of the target.
         n : int
-            Frame from which on the target is not detectable; the window begins there.
+            Index of the first frame in which the target is not detectable. The window begins there.
         """
         if self._anchor is None or self._stale or n >= len(self._frames):
             self.restart()
@@ -269,7 +271,8 @@ class Relinearisation:
         self._last_ns = window.frames[-1].stamp_ns
 
     def gain(self, origin: int) -> float:
-        """Log-likelihood of the latest frames along a path, minus that in the filter.
+        """Log-likelihood of the latest frames along a path, minus their log-likelihood in the
+        filter.
 
         Parameters
         ----------
@@ -279,12 +282,12 @@ class Relinearisation:
         Returns
         -------
         float, nats
-            0 if there is no path, or if it was not part of the last update.
+            0 if the hypothesis was not part of the last relinearisation.
         """
         return self._gain.get(origin, 0.0)
 
     def _leading(self, bank: FilterBank) -> IntArray:
-        """Rows of the heaviest hypotheses, up to the maximum number."""
+        """Indices of the heaviest hypotheses, up to the maximum number."""
         affordable = MAX_ELEMENTS // (len(self._frames) * bank.x.shape[1]**2)
         order = np.argsort(-bank.log_w, kind='stable')
         leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - MAX_LOG_RATIO]
@@ -292,7 +295,7 @@ class Relinearisation:
 
     def _slide(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
                bank: FilterBank) -> FilterBank | InitialBank:
-        """Move the anchor to the start of the window once the frames cover twice the window."""
+        """Shorten the window to its nominal duration once the frames cover twice this duration."""
         now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
         if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MAX_FRAMES:
             return anchor
@@ -302,7 +305,7 @@ class Relinearisation:
 
     def _move_to(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
                  bank: FilterBank, n: int) -> FilterBank:
-        """Move the anchor to frame `n`, where the window begins from now on."""
+        """Move the anchor to frame `n`, the new start of the window."""
         self._keep(anchor, np.isin(anchor.origin, bank.origin))
         moved = self._anchor = anchor.rows(np.arange(len(anchor)))
         self._run_along(bank_filter, moved, np.stack(self._paths[:n + 1], axis=1), 1)
@@ -330,7 +333,7 @@ def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArr
 
 def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
                        nearly_linear: Callable[[FloatArray], FloatArray]) -> None:
-    """Adopt larger covariances of paths, in place, extended by the distance of the states.
+    """Adopt larger covariances of paths, in place, widened by the difference of the states.
 
     Covariances that are too large for the next linear update are not adopted.
     """
@@ -342,5 +345,5 @@ def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: Float
 
 
 def _rows(anchor: FilterBank | InitialBank, bank: FilterBank) -> IntArray:
-    """Rows of the anchor from which the hypotheses of the bank originate."""
+    """Indices in the anchor of the hypotheses of the bank."""
     return np.searchsorted(anchor.origin, bank.origin)

@@ -1,11 +1,11 @@
 """Fit of a steady path to the whole pass of a vehicle.
 
-A filter bends the path of its target until it fits any measurement: clock offsets, a clipped field,
-a second vehicle. A path of steady acceleration and turn rate cannot do so. If it does not explain
-the frames of a pass, they are not those of a single vehicle and fault-free sensors. If a straight
-path explains them only with free clocks, the clocks have offsets.
+A filter bends the path of its target to fit faulty measurements: clock offsets, a clipped field, or
+a second vehicle. A path with steady acceleration and turn rate cannot bend in this way. If no such
+path explains a pass, a sensor is faulty or there are several vehicles. If a straight path explains
+the pass only with free clock offsets, the clocks differ.
 
-The fit of a row of dipoles at constant velocity is that of TSP14 sections III.A and V.
+The fit of a row of dipoles at constant velocity follows TSP14 sections III.A and V.
 """
 
 from collections.abc import Sequence
@@ -42,7 +42,8 @@ TURN = 0.4
 """[rad/s] Start value of the turn rate of a bent path, used with both signs."""
 
 GOOD_MISFIT, MAX_MISFIT = 1.3, 1.5
-"""Reduced chi-square up to which a path explains a pass well, and up to which it may explain it."""
+"""Maximum reduced chi-square of a path that explains a pass well, and of a path that may explain
+it."""
 
 P_CLOCKS, P_BEND = 1e-5, 1e-3
 """Significance levels for clock offsets, and for a bent path: probability that correct clocks, or a
@@ -74,7 +75,7 @@ class RigidPass:
     straight: float
     """Cost of a straight path."""
     bent: float
-    """Cost of a path with acceleration and turn."""
+    """Cost of a path with acceleration and turn rate."""
     apart: float
     """Cost of a straight path at constant speed with free clock offsets."""
     freedom: int
@@ -83,7 +84,7 @@ class RigidPass:
     """Reduced chi-square of a bent path with a short or, if needed, a long row; about 1 if it
     explains the pass."""
     reference: int
-    """Row of the sensor with the strongest field; its clock is the reference."""
+    """Index of the sensor with the strongest field; its clock is the reference."""
     offset: FloatArray
     """(n_sensors,) [s] Time by which each clock is ahead of the reference; NaN = not compared or
     not observable."""
@@ -91,9 +92,10 @@ class RigidPass:
     """(n_sensors,) [s] Standard deviation due to noise and model error alone; 0 for the
     reference."""
     position: FloatArray
-    """(3,) [m] At the time of the strongest field; of the straight path with free clock offsets."""
+    """(3,) [m] Position at the time of the strongest field, on the straight path with free clock
+    offsets."""
     velocity: FloatArray
-    """(3,) [m/s]"""
+    """(3,) [m/s] Velocity on this path."""
     straight_paths: FloatArray
     """(k, 6) [m], [m/s] Positions and velocities at the time of the strongest field, for straight
     paths of a short and of a long row that explain the pass about as well as bent paths."""
@@ -165,7 +167,7 @@ class RigidPass:
         Parameters
         ----------
         sensor : int
-            Row of the sensor.
+            Index of the sensor.
 
         Returns
         -------
@@ -192,7 +194,7 @@ class RigidPass:
 
 def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
                    starts: FloatArray) -> RigidPass | None:
-    """Fit straight paths and bent ones to the frames of a pass.
+    """Fit straight and bent paths to the frames of a pass.
 
     Parameters
     ----------
@@ -264,7 +266,8 @@ class _RowFits(NamedTuple):
 
     @property
     def needs_no_bend(self) -> bool:
-        """Whether the straight path may explain the pass, and the bent one is hardly better."""
+        """Whether the straight path may explain the pass and the bent path is not significantly
+        better."""
         n_more = N_PATH - N_STRAIGHT
         gain = (self.cost - self.cost_bent) / max(self.misfit, 1.0)
         return bool(self.cost <= MAX_MISFIT * (self.freedom + n_more)
@@ -273,7 +276,7 @@ class _RowFits(NamedTuple):
 
 def _long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, thorough: bool
               ) -> _RowFits:
-    """Fits of a long row, starting from the paths of a short one; `thorough` adds starts."""
+    """Fit a long row, starting from the paths of a short row; `thorough` adds starts."""
     near = data.with_near_field_error(bent)
     starts = np.array([straight, bent, straight, bent])
     starts[2:, PATH.index('length')] = LONG_LENGTH

@@ -1,8 +1,8 @@
 """A running track: its members, their published poses, and the evidence for and against them.
 
 A track usually has one target. Targets whose fields overlap at the sensors are members of one track
-and share a state, because a field that is wrongly attributed to one of them is missing in the
-other.
+and share a state, because a field that is attributed to the wrong target is missing in the correct
+target.
 
 Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 """
@@ -37,17 +37,17 @@ from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.units import NS
 
 UNDECIDED_S = 1.0
-"""[s] Poses are in doubt for this time after another explanation was about as probable."""
+"""[s] Duration of the doubt after another explanation was about as probable as the track."""
 
 DOUBTED_S = 3.0
-"""[s] Vehicles of an uncertain explanation are in doubt for this time."""
+"""[s] Duration of the doubt about the vehicles of an uncertain explanation."""
 
 TrackRecord = Track | SmoothedPose | Disturbance
 """Output of the tracker."""
 
 
 class RunningTrack:
-    """One target that is followed, or several that share a state.
+    """Track of a single target, or of several targets that share a state.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class RunningTrack:
     bank_filter : BankFilter
     bank : FilterBank
     counts : Counter of str
-        Counts of the stage, which are updated.
+        Event counts of the stage, updated in place.
     clocks : ClockComparison
     later_sensors : SensorSubset
         Sensors that are used as soon as the bank is small enough.
@@ -69,7 +69,7 @@ class RunningTrack:
     ----------
     counts : Counter of str
     members : list of Member
-        Members that are followed, in the order of their states.
+        Running members, in the order of their states.
     ended : str or None
         Reason why the last member has ended; None while the track runs.
     is_lost : bool
@@ -107,7 +107,7 @@ class RunningTrack:
 
     @property
     def _final_sensors(self) -> SensorSubset:
-        """Sensors that the track uses, or will use."""
+        """Sensors that the track uses once all of its sensors have been added."""
         return self._bank.later_sensors or self._bank.sensors
 
     def configure(self, settings: TrackSettings) -> None:
@@ -124,12 +124,12 @@ class RunningTrack:
                 member.use(self._bank.sensors)
 
     def doubt(self, sensors: Sequence[int]) -> None:
-        """Doubt the track if it uses a sensor whose background is doubtful.
+        """Mark the track as doubtful if it uses a sensor with a doubtful background.
 
         Parameters
         ----------
         sensors : sequence of int
-            Rows of the sensors whose background is doubtful.
+            Indices of the sensors with a doubtful background.
         """
         if not np.isin(self._final_sensors.rows, sensors).any():
             return
@@ -214,13 +214,13 @@ class RunningTrack:
         return [*out, *late, *self._end_if_over(advance.frame)]
 
     def _view(self, i: int, best: int) -> View:
-        """Bank of member `i` alone; `best` is the row of the joint hypothesis."""
+        """Bank of member `i` alone; `best` is the index of the joint hypothesis."""
         bank = self.bank.extract_target(i, self._bank.single_target.n_target)
         row = best if bank is self.bank else bank.best()
         return View(bank, row, self._bank.single_target, self._bank.gain(row))
 
     def _update_evidence(self, advance: Advance) -> bool:
-        """Update the evidence of the members with a frame; False if no hypothesis explains it."""
+        """Update the evidence of the members; return False if no hypothesis explains the frame."""
         frame, dt = advance.frame, advance.dt
         if advance.n_rejected and np.count_nonzero(frame.n_samples) <= advance.n_rejected:
             # Without a majority of sensors, the track itself may be wrong.
@@ -271,7 +271,7 @@ class RunningTrack:
             and not self._bank.sensors.is_approached_by(last)
 
     def _end_if_over(self, frame: FieldFrame) -> list[TrackRecord]:
-        """Closing records of the members that end with their latest poses."""
+        """End the members that are lost or out of reach, and return their closing records."""
         out: list[TrackRecord] = []
         for member in list(self.members):
             reason = member.reason_to_end(self._bank.sensors, self._settings)
@@ -310,7 +310,7 @@ class RunningTrack:
         return [record for i in range(len(self.members)) for record in self._closing(i, reason)]
 
     def _closing(self, i: int, reason: str) -> list[TrackRecord]:
-        """Closing records of member `i`."""
+        """End member `i`, and return its closing records."""
         member = self.members[i]
         member.ended = reason
         if len(self.members) == 1:
@@ -327,7 +327,7 @@ class RunningTrack:
 
     def _smoothed(self, i: int, view: View, complete: bool, states: list[TrackState],
                   doubtful: bool) -> list[SmoothedPose]:
-        """Smoothed poses of member `i`; if complete, also those before it shared its state."""
+        """Smoothed poses of member `i`; if complete, also the poses before it shared its state."""
         member, n = self.members[i], self._bank.single_target.n_target
         mine = member.states_of(member.slot if complete else i, n, states)
         return member.smoothed(view.bank, view.best, complete,
@@ -335,12 +335,12 @@ class RunningTrack:
 
     @property
     def unexplained(self) -> list[UnexplainedField]:
-        """Fields during ended members that a target never explained."""
+        """Fields of the ended members that a target never explained."""
         found = [m.unexplained(self._disturbance_model.uniform) for m in self.members if m.ended]
         return [u for u in found if u is not None]
 
     def new_target(self) -> Joint | None:
-        """Search for another explanation of the latest frames, if they require one.
+        """Search for another explanation of the latest frames, if a search is due.
 
         Returns
         -------
@@ -406,7 +406,7 @@ class RunningTrack:
                 member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, now_ns, DOUBTED_S, begin_ns)
 
     def hand_over(self) -> None:
-        """Switch to the sensors near the predicted position, if they are others."""
+        """Switch to the sensors near the predicted position, if a handover is due."""
         best, self._handover_due = self._handover_due, None
         if best is None or self.ended is not None or len(self.members) > 1:
             return

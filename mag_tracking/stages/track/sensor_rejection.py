@@ -1,8 +1,8 @@
 """Rejection of sensors that contradict the others, frame by frame.
 
-A sensor with swapped axes, a sensor that was knocked over, or one beside another vehicle pulls a
-track away from the measurements of all others. If a frame does not fit the leading hypothesis, but
-does so without one or a few sensors, these are rejected.
+A faulty sensor pulls a track away from the measurements of all other sensors. Its axes may be
+swapped, it may have been knocked over, or it may be near another vehicle. If a frame fits the
+leading hypothesis only without one or a few sensors, these sensors are rejected.
 """
 
 from collections import Counter
@@ -21,12 +21,12 @@ _States: TypeAlias = tuple[FloatArray, FloatArray]
 """States and covariances of a bank."""
 
 SENSORS_PER_REJECTION = 8
-"""Number of sensors for each one that may be rejected; one is always allowed. If more would be
-needed, the track itself is wrong. Sensors far from the target agree with everything."""
+"""One in this number of sensors may be rejected, but at least one. If more rejections are needed,
+the track itself is wrong. Sensors far from the target fit any hypothesis."""
 
 
 class SensorRejection:
-    """Updates a bank with the credible part of each frame.
+    """Update of a bank without the sensors that contradict the others.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ class SensorRejection:
         self.clear()
 
     def clear(self) -> None:
-        """Reset; no track is running."""
+        """Forget the sensors that were rejected in the previous frame."""
         self._rejected: tuple[int, ...] = ()
 
     def advance(self, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame, dt: float
                 ) -> 'tuple[FloatArray, FloatArray, FieldFrame, Counter[str]]':
-        """Move a bank through a frame, without sensors that contradict the others.
+        """Predict and update a bank with a frame, without sensors that contradict the others.
 
         Parameters
         ----------
@@ -62,10 +62,10 @@ class SensorRejection:
         frame : FieldFrame
             The frame that was used, in which rejected sensors are missing.
         counts : Counter of str
-            Number of rejections of each rejected sensor.
+            One rejection for each rejected sensor, by description.
         """
-        # Keeping a copy of all states takes as long as the update. If the leading hypothesis fits
-        # before the update, one that does not fit is unlikely to lead after it.
+        # Copying all states takes as long as the update. If the frame fits the hypothesis that
+        # leads before the update, it usually also fits the hypothesis that leads afterwards.
         may_contradict = not self._fits_leader(bank_filter, bank, frame, dt)
         before = bank.x, bank.P
         predicted, log_likelihood = bank_filter.advance(bank, frame, dt, keeps_prior=may_contradict)
@@ -85,7 +85,7 @@ class SensorRejection:
 
     def _candidates(self, bank_filter: BankFilter, bank: FilterBank, before: _States,
                     frame: FieldFrame, dt: float) -> Iterator[tuple[int, ...]]:
-        """Sets of sensor rows to be rejected, in order of suspicion."""
+        """Sets of sensor indices to be rejected, the most suspect first."""
         present = np.flatnonzero(~np.isnan(frame.field).all(axis=1)).tolist()
         max_rejected = max(1, len(present) // SENSORS_PER_REJECTION) if len(present) > 1 else 0
         # The sensors rejected in the previous frame are tried first.
@@ -94,7 +94,7 @@ class SensorRejection:
             yield again
         found: tuple[int, ...] = ()
         while len(found) < max_rejected:
-            # The next one is the sensor without which the others fit best.
+            # The next candidate is the sensor without which the other sensors fit best.
             misfit: dict[tuple[int, ...], float] = {}
             for j in present:
                 if j not in found:
@@ -108,7 +108,8 @@ class SensorRejection:
     @staticmethod
     def _without(bank_filter: BankFilter, bank: FilterBank, before: _States, frame: FieldFrame,
                  dt: float, rejected: tuple[int, ...]) -> tuple[FloatArray, FieldFrame]:
-        """Update with the frame again, as if some sensors were missing: (log-likelihood, frame)."""
+        """Repeat the update without some sensors; return log-likelihoods and the frame that was
+        used."""
         missing = np.isin(np.arange(len(frame.field)), rejected)
         less = replace(frame, field=np.where(missing[:, None], np.nan, frame.field),
                        covariance=np.where(missing[:, None, None], np.nan, frame.covariance),
@@ -120,7 +121,7 @@ class SensorRejection:
     @classmethod
     def _fits_leader(cls, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,
                      dt: float) -> bool:
-        """Whether the frame will fit the hypothesis that leads before the update."""
+        """Whether the frame fits the hypothesis that leads before the update."""
         leader = bank.alone(int(np.argmax(bank.log_w)))
         return cls._fits(bank_filter, leader, frame, bank_filter.advance(leader, frame, dt)[1])
 
@@ -133,7 +134,8 @@ class SensorRejection:
 
 
 def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:
-    """Row of the heaviest hypothesis after the frame; None if no hypothesis explains it."""
+    """Index of the heaviest hypothesis after the frame; None if no hypothesis explains the
+    frame."""
     log_w = bank.log_w + log_likelihood
     leader = int(np.argmax(log_w))
     return leader if np.isfinite(log_w[leader]) else None

@@ -1,9 +1,9 @@
 """Smoothing of a track with the frames before and after each of its poses.
 
-The hypothesis of the bank that is the best at the end is run forward through the frames again and
-then backward, and relinearised once. Hypotheses are independent, so that one can be run alone.
-Frames that contradict it are left out, because a single one would bend the whole track. The
-smoothed track need not end at the last published pose, since the two are linearised at different
+The best hypothesis at the end of a track is filtered again through all frames, smoothed backward,
+and relinearised once. Hypotheses are independent, so a single one can be smoothed alone. Frames
+that contradict it are excluded, because one such frame would distort the whole track. The last
+smoothed pose may differ from the last published pose, because the two are linearised at different
 states.
 """
 
@@ -30,12 +30,13 @@ TrackState: TypeAlias = tuple[int, FloatArray, FloatArray]
 """Timestamp [ns], state (n_x,) and covariance (n_x, n_x)."""
 
 RELINEARISATIONS = 1
-"""Number of relinearisations of the whole track at the previous result: far ahead of the sensors,
-the filter did not know the states to linearise at. One does not reach convergence. Four improve
-turning cars and trucks, but the car along a corridor is worse."""
+"""Number of relinearisations of the whole track at the previous result. They correct for inaccurate
+predictions far from the sensors. One does not reach convergence. Four improve turning cars and
+trucks, but degrade the car along a corridor."""
 
 MAX_ELEMENTS = 10_000_000
-"""Maximum product of frames and squared number of states: 80 MB, and less than a second."""
+"""Maximum product of frames and squared number of states. It corresponds to 80 MB and less than a
+second."""
 
 
 def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],
@@ -48,7 +49,7 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     ----------
     bank_filter : BankFilter
     bank : FilterBank
-        The hypothesis alone, at the first frame.
+        Bank of this hypothesis alone, at the first frame.
     frames : sequence of FieldFrame
     intervals : sequence of float, s
         Time from the previous frame to each frame.
@@ -61,9 +62,9 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     Returns
     -------
     states : list of (x (n_x,), P (n_x, n_x))
-        One for each frame.
+        Smoothed state at each frame.
     left_out : int
-        Number of frames that contradicted the hypothesis and were left out.
+        Number of frames that were excluded because they contradict the hypothesis.
     """
     paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
     for at, known in zip(paths[0], path, strict=False):
@@ -77,7 +78,7 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
 
 @dataclass
 class _Start:
-    """Start of a track, and the filter that moved it."""
+    """Bank at the start of a track, and its filter."""
 
     bank_filter: BankFilter
     bank: FilterBank | InitialBank
@@ -92,7 +93,7 @@ class _Start:
 
 
 class WholeTrack:
-    """Frames of a running track, with which it is smoothed when it ends.
+    """Stored frames of a running track, for smoothing at its end.
 
     Parameters
     ----------
@@ -110,7 +111,7 @@ class WholeTrack:
         self.clear()
 
     def clear(self) -> None:
-        """Drop everything."""
+        """Discard all stored frames."""
         self._start: _Start | None = None
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
@@ -119,12 +120,12 @@ class WholeTrack:
         self._updated = False
 
     def begin(self, bank: FilterBank | InitialBank, bank_filter: BankFilter) -> None:
-        """Start with a bank before its first frame, and with the present settings.
+        """Start with a bank before its first frame, and with a copy of the current filter.
 
         Parameters
         ----------
-        bank : FilterBank or StartingBank
-            It must not be modified by the caller afterwards.
+        bank : FilterBank or InitialBank
+            The caller must not modify it afterwards.
         bank_filter : BankFilter
         """
         self.clear()
@@ -150,7 +151,7 @@ class WholeTrack:
             self.add(anchor, frame, dt, True)
 
     def abandon(self) -> None:
-        """Drop everything; the track cannot be smoothed as a whole."""
+        """Discard all stored frames; the track cannot be smoothed as a whole."""
         self.clear()
         self.is_too_long = True
 
@@ -186,13 +187,13 @@ class WholeTrack:
         ----------
         bank : FilterBank
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
 
         Returns
         -------
         states : list of TrackState
         left_out : int
-            Number of frames that did not fit.
+            Number of frames that were excluded because they contradict the hypothesis.
         """
         start = self._start
         if start is None or not self._frames:
@@ -216,7 +217,7 @@ class _LaggedFrame(NamedTuple):
     P: FloatArray
 
     def rows(self, mask: BoolArray) -> '_LaggedFrame':
-        """The hypotheses of `mask` (n_hyp,) only."""
+        """Copy with only the hypotheses in `mask` (n_hyp,)."""
         return self._replace(origin=self.origin[mask], x=self.x[mask], P=self.P[mask])
 
 
@@ -246,7 +247,7 @@ class FixedLag:
         bank : FilterBank
             Bank after the update with the frame.
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
         frame : FieldFrame
         dt : float, s
             Time since the previous frame.
@@ -256,7 +257,7 @@ class FixedLag:
         Returns
         -------
         list of TrackState
-            Usually none or one.
+            Usually empty, or one state.
         """
         self._lagged.append(_LaggedFrame(
             frame, dt, published, bank.origin, bank.x.copy(), bank.P.copy()))
@@ -278,7 +279,7 @@ class FixedLag:
         bank_filter : BankFilter
         bank : FilterBank
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
 
         Returns
         -------
@@ -290,7 +291,8 @@ class FixedLag:
             self._lagged, self._states(bank_filter, bank, best), strict=True) if kept.published]
 
     def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
-        """Smoothed states of the stored frames; linearised once, because it is done every frame."""
+        """Smoothed states of the stored frames, without relinearisation to limit the time per
+        frame."""
         oldest = self._lagged[0]
         one, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
         one.x, one.P = oldest.x[row].copy(), oldest.P[row].copy()

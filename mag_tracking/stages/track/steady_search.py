@@ -1,8 +1,8 @@
 """Search for vehicles on straight paths in the frames of a window, beside known vehicles.
 
 All quantities in which the field is linear are Gaussian and are marginalised: the moments of the
-vehicle, the backgrounds, and the uncertainty of known vehicles. The remaining parameters are those
-of the path, which are searched from a grid of starts.
+vehicle, the backgrounds, and the uncertainty of known vehicles. The remaining parameters describe
+the path. They are searched from a grid of start values.
 
 Source: TSP14 sections III.A and V for the row of dipoles; variable projection with priors.
 """
@@ -69,11 +69,11 @@ class PathPrior:
     moment_std: FloatArray
     """(3 d,) [A m^2] Standard deviations of the combinations of moments."""
     min_speed: float
-    """[m/s] A slower vehicle does not arrive; it was there before."""
+    """[m/s] Minimum speed of an arriving vehicle. A slower vehicle was there before."""
 
     @classmethod
     def of(cls, vehicle: VehicleSettings, network: SensorNetwork) -> 'PathPrior':
-        """Prior of all kinds of vehicle in the settings together.
+        """Common prior of all kinds of vehicle in the settings.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class PathPrior:
         -------
         line : (n,) int array
         off : (n,) array, rad
-            Difference of the heading.
+            Heading of the path relative to the line.
         """
         off = (theta[:, 4, None] - self.headings + np.pi) % (2.0 * np.pi) - np.pi
         line: IntArray = np.abs(off).argmin(axis=1)
@@ -198,7 +198,7 @@ class StartGrid:
     gram : (n, 3, 3) array
         A'A of the columns A of each path.
     prior_cost : (n,) array
-        Squared normalised deviation of each path from the prior.
+        Squared normalised difference of each path from the prior.
     """
 
     def __init__(self, samples: PassSamples, prior: PathPrior, theta: FloatArray) -> None:
@@ -212,10 +212,10 @@ class StartGrid:
 
 @dataclass(frozen=True)
 class SteadySearch:
-    """Frames in which vehicles are searched, and the known vehicles.
+    """Search for vehicles in the samples of a window, given the known vehicles.
 
-    The paths of m vehicles that are searched together form one row of 7 m numbers, and their
-    moments one of 9 m. In shapes, n is the number of rows and y the number of whitened
+    In a joint search for m vehicles, a row of 7 m numbers contains their paths, and a row of 9 m
+    numbers their moments. In shapes, n is the number of rows and y the number of whitened
     measurements.
     """
 
@@ -309,8 +309,8 @@ class SteadySearch:
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Refine paths by Levenberg-Marquardt steps.
 
-        Only the field keeps a path near the sensors: a step may move a vehicle that explains
-        nothing to any distance.
+        The prior does not limit the position along a line. A step may therefore move a vehicle that
+        explains no field to any distance.
 
         Parameters
         ----------
@@ -365,7 +365,7 @@ class SteadySearch:
         return moments
 
     def beside(self, path: FloatArray) -> 'SteadySearch':
-        """Search for another vehicle beside one that was found.
+        """Return a search for another vehicle, given a vehicle that was found.
 
         Parameters
         ----------
@@ -417,7 +417,8 @@ class SteadySearch:
             return _log_determinant(self._information_of_moments(theta))
 
     def _are_detectable(self, theta: FloatArray) -> BoolArray:
-        """Whether all vehicles (n,) are expected to be detectable, by the prior of the moments."""
+        """Whether all vehicles of each row (n,) are detectable according to the prior of the
+        moments."""
         with ignoring_overflow():
             energy = np.einsum('nii->ni', self._information_of_moments(theta)) - 1.0
         each = energy.reshape(len(theta), -1, 3 * N_DIPOLES).sum(axis=2)
@@ -425,7 +426,7 @@ class SteadySearch:
         return felt
 
     def _information_of_moments(self, theta: FloatArray) -> FloatArray:
-        """Information (n, 9 m, 9 m) of the moments, in units in which that of the prior is 1."""
+        """Information (n, 9 m, 9 m) of the moments, relative to the prior."""
         std = self._moment_std(theta)
         information: FloatArray = self._solve(theta)[1] * np.outer(std, std)
         return information
@@ -443,13 +444,13 @@ def _n_vehicles(theta: FloatArray) -> int:
 
 
 def _side_by_side(A: FloatArray, m: int) -> FloatArray:
-    """Matrices (n, k, m c) from those (n m, k, c) of m vehicles each."""
+    """Matrices (n, k, m c) that join the matrices (n m, k, c) of m vehicles."""
     n, k, c = len(A) // m, *A.shape[1:]
     return A.reshape(n, m, k, c).swapaxes(1, 2).reshape(n, k, m * c)
 
 
 def _block_diagonal(A: FloatArray, m: int) -> FloatArray:
-    """Block-diagonal matrices (n, m k, m c) from the blocks (n m, k, c) of m vehicles each."""
+    """Block-diagonal matrices (n, m k, m c) of the blocks (n m, k, c) of m vehicles."""
     n, k, c = len(A) // m, *A.shape[1:]
     out = np.zeros((n, m, k, m, c))
     for i in range(m):

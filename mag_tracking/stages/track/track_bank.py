@@ -26,7 +26,7 @@ from mag_tracking.units import NS
 
 @dataclass(frozen=True)
 class Advance:
-    """Result of moving a bank through a frame."""
+    """Result of the prediction and update of a bank with a frame."""
 
     frame: FieldFrame
     """The part of the frame that was used."""
@@ -35,7 +35,7 @@ class Advance:
     predicted: FloatArray
     """(n_hyp, n_x) States before the update."""
     log_likelihood: FloatArray
-    """(n_hyp,)"""
+    """(n_hyp,) Log-likelihood of the frame for each hypothesis."""
     evidence: float
     """Log-density of the frame over all hypotheses; -inf if none explains it."""
     n_rejected: int
@@ -54,7 +54,7 @@ class TrackBank:
     bank_filter : BankFilter
     bank : FilterBank
     counts : Counter of str
-        Counts of the stage, which are updated.
+        Event counts of the stage, updated in place.
     later_sensors : SensorSubset
         Sensors that are used as soon as the bank is small enough.
 
@@ -88,7 +88,7 @@ class TrackBank:
 
     @property
     def window(self) -> Window | None:
-        """The latest frames, with the paths of the hypotheses; None if there are none."""
+        """The latest frames, with the paths of the hypotheses; None if no frame is stored."""
         return self._relinearisation.window
 
     @property
@@ -97,12 +97,13 @@ class TrackBank:
         return self._lag is not None
 
     def gain(self, row: int) -> float:
-        """Log-likelihood of the latest frames along a path, minus that in the filter.
+        """Log-likelihood of the latest frames along a path, minus their log-likelihood in the
+        filter.
 
         Parameters
         ----------
         row : int
-            Row of the hypothesis.
+            Index of the hypothesis.
 
         Returns
         -------
@@ -151,7 +152,7 @@ class TrackBank:
         self._relinearisation.begin(start)
 
     def advance(self, frame: FieldFrame, dt: float) -> Advance:
-        """Move the bank through a frame, and weight the hypotheses.
+        """Predict and update the bank with a frame, and weight the hypotheses.
 
         Parameters
         ----------
@@ -189,12 +190,12 @@ class TrackBank:
         self._whole.add(bank, advance.frame, advance.dt, publish)
 
     def lagged(self, best: int, frame: FieldFrame, dt: float, publish: bool) -> list[TrackState]:
-        """States of the frames that are now older than the fixed lag.
+        """Add a frame to the fixed lag, and return the states of the frames older than the lag.
 
         Parameters
         ----------
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
         frame : FieldFrame
         dt : float, s
             Time since the previous frame.
@@ -214,7 +215,7 @@ class TrackBank:
         Parameters
         ----------
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
 
         Returns
         -------
@@ -228,9 +229,9 @@ class TrackBank:
         Parameters
         ----------
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
         counts : bool, optional
-            Whether frames that were left out are counted.
+            Whether excluded frames are counted.
 
         Returns
         -------
@@ -248,6 +249,7 @@ class TrackBank:
         Parameters
         ----------
         i : int
+            Index of the target.
         """
         best, n_targets = self.bank.best(), self.filter.observation.n_targets
         n = first_weak_frame(self.filter, i, self.window, int(self.bank.origin[best]))
@@ -281,7 +283,7 @@ class TrackBank:
         Parameters
         ----------
         best : int
-            Row of the hypothesis.
+            Index of the hypothesis.
 
         Returns
         -------
@@ -299,9 +301,9 @@ class TrackBank:
         return True
 
     def widen(self, dt: float) -> bool:
-        """Use all later sensors from the next frame on, if few hypotheses are probable by now.
+        """Add the remaining sensors from the next frame on, if few hypotheses are probable.
 
-        Otherwise they are added with a handover.
+        Otherwise a later handover adds these sensors.
 
         Parameters
         ----------

@@ -17,14 +17,14 @@ MIN_SPEED_STDS = 3.0
 class UnobservedLength:
     """Uncertainty of the middle of a vehicle due to the part that no sensor has observed yet.
 
-    Until its rear has passed a sensor, a car may be the engine of a truck: a row of dipoles
-    explains either, and the evidence compares two models that are both inaccurate.
+    Until its rear has passed a sensor, an apparent car may be the engine of a truck. A row of
+    dipoles explains both, and both models are too inaccurate for a reliable comparison.
 
-    The iron of a long vehicle is at its engine, axles and load. The difference between its length
-    and that of its row extends backwards until the rear has been observed, and to either end
-    afterwards; in between, the middle is uniformly distributed.
+    The iron of a long vehicle is at its engine, axles and load, so the row of dipoles is shorter
+    than the vehicle. Until the rear has been observed, the remaining part is assumed behind the
+    row. Afterwards it may be at either end, and the middle is uniformly distributed in between.
 
-    One object serves one track.
+    Each track has its own object.
 
     Parameters
     ----------
@@ -57,7 +57,8 @@ class UnobservedLength:
         if not is_certain or not len(positions):
             return
         if self._distance_past > 0.0:
-            # After the first sensor the path length counts, which also holds for a turn.
+            # After the first sensor the distance along the path is used, which is also valid in a
+            # turn.
             self._distance_past += float(np.linalg.norm(x[:2] - self._place))
         else:
             self._distance_past = float(offset_from_nearest(x[:2], positions) @ self._forward)
@@ -74,9 +75,9 @@ class UnobservedLength:
         length : float, m
             Length of the row of dipoles.
         kind : int
-            Kind of vehicle.
+            Index of the kind of vehicle.
 
-        Returns
+            Returns
         -------
         (2, 2) array, m^2
         """

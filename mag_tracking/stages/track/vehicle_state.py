@@ -23,7 +23,7 @@ MIN_MOMENT = 1e-6
 
 @dataclass(frozen=True)
 class VehicleState:
-    """Converts straight paths (`PATH` of `steady_pass`) to states of `RowVehicle`."""
+    """Conversion of straight paths (`PATH` of `steady_pass`) to states of `RowVehicle`."""
 
     settings: VehicleSettings
     network: SensorNetwork
@@ -49,21 +49,20 @@ class VehicleState:
               ) -> tuple[FloatArray, FloatArray]:
         """Prior of a vehicle that arrives on a given path.
 
-        It is that at the start of a track, except that the direction of the moment is the one that
-        was found.
+        It equals the prior at the start of a track, but the moment has the estimated direction.
 
         Parameters
         ----------
         theta : (7,) array
             Straight path.
         moments : (k, 3) array, A m^2, world frame
-            Moments that were found.
+            Estimated moments.
         t : float, s
             Time on the path.
         kind : int
-            Kind of vehicle.
-        label : int
-            Arrival.
+            Index of the kind of vehicle.
+            label : int
+                Index of the arrival direction.
 
         Returns
         -------
@@ -92,9 +91,9 @@ class VehicleState:
             Moments of a row of k dipoles, from the tail to the head.
         times : (n,) array, s
         kind : int
-            Kind of vehicle.
+            Index of the kind of vehicle.
 
-        Returns
+            Returns
         -------
         (n, n_t) array
         """
@@ -129,7 +128,7 @@ class VehicleState:
         return hard
 
     def turning(self, x: FloatArray, P: FloatArray, target: int) -> FloatArray | None:
-        """Covariance in which one target turns.
+        """Covariance with the initial variance of the turn rate of one target.
 
         Parameters
         ----------
@@ -137,6 +136,7 @@ class VehicleState:
             State of several targets.
         P : (n_x, n_x) array
         target : int
+            Index of the target.
 
         Returns
         -------
@@ -154,7 +154,7 @@ class VehicleState:
 
 
 def _resampled(moments: FloatArray, d: int) -> FloatArray:
-    """Moments (d, 3) of a row of `d` dipoles with the same total and middle as those of (k, 3)."""
+    """Moments (d, 3) of a row of `d` dipoles with the total and the middle of `moments` (k, 3)."""
     if len(moments) == 1 or d == 1:
         return np.tile(moments.sum(axis=0) / d, (d, 1))
     places = np.linspace(0.0, d - 1.0, len(moments))

@@ -13,12 +13,11 @@ from mag_tracking.stages.track.window_start import KnownVehicles
 from mag_tracking.units import NS
 
 MAX_SAMPLES = 320
-"""Maximum number of samples of a search; of more frames, only every second one, or fewer, are
-used."""
+"""Maximum number of samples of a search. Windows with more samples are decimated."""
 
 KNOWN_STD, KNOWN_SHARE = 0.7, 0.3
-"""[m], [m/s] Uncertainty of tracked vehicles while another one is searched; and relative
-uncertainty of their moments."""
+"""[m], [m/s] Uncertainty of the paths of tracked vehicles in a search, and relative uncertainty of
+their moments."""
 
 
 class WindowSearch:
@@ -56,7 +55,7 @@ class WindowSearch:
                          self.prior.starts(self._vehicles.settings, self._vehicles.network))
 
     def beside(self, known: KnownVehicles) -> SteadySearch:
-        """Search for a vehicle beside known ones.
+        """Return a search for a vehicle in addition to known vehicles.
 
         Parameters
         ----------

@@ -10,8 +10,8 @@ from mag_tracking.geometry import overlap
 from mag_tracking.stages.track.bank_filter import BankFilter
 
 WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 1.0
-"""[m] Two vehicles overlap if their lateral distance is less than the first value; the sum of their
-lengths exceeds that of their rows by the second; the third is the uncertainty of their paths."""
+"""[m] Lateral distance below which two vehicles overlap, minimum longitudinal gap between their
+rows of dipoles, and standard deviation of the overlap depth due to uncertain paths."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class PathHypothesis:
     x: FloatArray
     """(n_x,) State at the start of the window."""
     P: FloatArray
-    """(n_x, n_x)"""
+    """(n_x, n_x) Covariance at the start of the window."""
     path: FloatArray
     """(n, n_x) States at the frames of the window."""
     label: tuple[int, ...]
@@ -32,7 +32,7 @@ class PathHypothesis:
 
 @dataclass(frozen=True)
 class WindowStart(PathHypothesis):
-    """Known vehicles and new ones."""
+    """Hypothesis of known and new vehicles."""
 
     n_new: int
     """Number of new vehicles, which are the last ones."""
@@ -47,7 +47,7 @@ class WindowStart(PathHypothesis):
 
 @dataclass(frozen=True)
 class KnownVehicles(PathHypothesis):
-    """Known vehicles beside which others are searched."""
+    """Hypothesis of the known vehicles in a search for others."""
 
     filter: BankFilter | None
     """Filter for this number of vehicles; None if there are none."""
@@ -93,7 +93,7 @@ def in_order_of(first: FloatArray, pair: FloatArray) -> FloatArray:
 
 
 def labels_of(labels: Sequence[tuple[int, ...]]) -> IntArray:
-    """Labels in the form that a `FilterBank` needs.
+    """Labels in the shape required by `FilterBank`.
 
     Parameters
     ----------
