@@ -291,8 +291,7 @@ class TrackEvidence:
         Parameters
         ----------
         gain : float, nats
-            Log-likelihood of the latest frames along the path, minus their log-likelihood in the
-            filter.
+            Log-likelihood gain of the path over the filter, for the latest frames.
         stamp_ns : int, ns
             Timestamp of the latest frame.
         window_s : float, s

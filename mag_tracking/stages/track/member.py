@@ -52,8 +52,8 @@ class View:
     """Index of the published hypothesis."""
     observation: Observation
     gain: float
-    """Log-likelihood of the latest frames along the path of this hypothesis, minus their
-    log-likelihood in the filter [nats]."""
+    """Log-likelihood gain of the path of this hypothesis over the filter, for the latest frames
+    [nats]."""
 
 
 class Member:
@@ -225,8 +225,7 @@ class Member:
             or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
 
     def _doubts(self, update: Update, view: View, alone: bool) -> set[str]:
-        """Update and return the doubts about the best hypothesis; `alone`: only one sensor
-        measured."""
+        """Update and return the doubts about a pose; `alone`: only one sensor measured."""
         bank, best, evidence, settings = view.bank, view.best, self.evidence, update.settings
         found = evidence.doubts | ({doubts.ONE_SENSOR} if alone else set())
         if update.bank_filter.is_implausible(bank, best, update.frame):

@@ -162,8 +162,7 @@ class NewTargetSearch:
         return order, of_track, before + of_track, paths
 
     def _leaders(self, rows: IntArray, log_w: FloatArray) -> list[int]:
-        """Indices into `rows` of the best hypothesis of each arrival and kind, up to the
-        maximum."""
+        """Indices into `rows` of the best hypothesis of each arrival and kind, to be tried."""
         seen: set[tuple[int, ...]] = set()
         most = MAX_KNOWN if self._n_targets == 1 else 1
         chosen: list[int] = []
@@ -216,8 +215,7 @@ class NewTargetSearch:
             known.log_w, self._filter_of(self._n_targets - 1))
 
     def _beside(self, known: KnownVehicles, replaced: int | None = None) -> list[WindowStart]:
-        """Starts with a further vehicle beside known ones; it is new or replaces vehicle
-        `replaced`."""
+        """Starts with a further vehicle, which is new or replaces vehicle `replaced`."""
         search = self._search.beside(known)
         return [start for theta in search.best(self._search.grid, MAX_FIRST)
                 for start in self._starts_on(known, theta[None], search.moments(theta), replaced)]

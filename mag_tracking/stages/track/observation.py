@@ -236,8 +236,7 @@ class Observation:
 
     def target_fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Target fields at the sampling time of each sensor, without the effects of the sensor
-        states.
+        """Target fields at the sampling time of each sensor, without mounting and model errors.
 
         Parameters
         ----------

@@ -52,8 +52,7 @@ class PassSamples:
 
     @property
     def n_clocks(self) -> int:
-        """Number of clocks that are compared with the clock of the sensor with the strongest
-        field."""
+        """Number of clocks that are compared with the reference clock, at the strongest field."""
         return len(self.compared) - 1
 
     def n_free(self, n_dipoles: int) -> int:

@@ -371,7 +371,7 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
     id : int
     kind : int
         Index of the kind of target.
-        kinds : sequence of str
+    kinds : sequence of str
         Name of each kind.
     ambiguous : bool
     complete : bool

@@ -2,13 +2,13 @@
 
 An extended Kalman filter linearises each frame at the state predicted at that time. Far from the
 sensors the prediction is metres off. The filter becomes overconfident there and remains so.
-Therefore the latest frames are filtered and smoothed again, with motion and field
-linearised along the smoothed path of each leading hypothesis. These are damped Gauss-Newton steps
-on the path. If they converge, the state at the end of the path replaces that of the filter, with
-the larger of both covariances. If they do not converge, the state is retained, but a larger
-covariance of the path is adopted. The filter may be overconfident in this case: a filter that is
-linearised at different states gains information about directions that no single path can observe
-(Julier and Uhlmann 2001 found this for maps).
+Therefore the latest frames are filtered and smoothed again, with motion and field linearised along
+the smoothed path of each leading hypothesis. These are damped Gauss-Newton steps on the path. If
+they converge, the state at the end of the path replaces the state of the filter, with the larger of
+both covariances. If they do not converge, the state is retained, but a larger covariance of the
+path is adopted. The filter may be overconfident in this case: a filter that is linearised at
+different states gains information about directions that no single path can observe (Julier and
+Uhlmann 2001 found this for maps).
 
 The likelihood of the frames along the path does not measure convergence. The model error and the
 drift of a moment are proportional to the moment, so the steps minimise a different cost. For the
@@ -106,8 +106,7 @@ class Relinearisation:
     def clear(self) -> None:
         """Discard the window."""
         self._anchor: FilterBank | InitialBank | None = None
-        # {origin: log-likelihood along the path minus log-likelihood in the filter}, at the last
-        # relinearisation.
+        # {origin: log-likelihood gain of the path over the filter}, at the last relinearisation.
         self._gain: dict[int, float] = {}
 
     def begin(self, anchor: FilterBank | InitialBank) -> None:
@@ -271,8 +270,7 @@ class Relinearisation:
         self._last_ns = window.frames[-1].stamp_ns
 
     def gain(self, origin: int) -> float:
-        """Log-likelihood of the latest frames along a path, minus their log-likelihood in the
-        filter.
+        """Log-likelihood gain of a path over the filter, for the latest frames.
 
         Parameters
         ----------

@@ -266,8 +266,7 @@ class _RowFits(NamedTuple):
 
     @property
     def needs_no_bend(self) -> bool:
-        """Whether the straight path may explain the pass and the bent path is not significantly
-        better."""
+        """Whether the straight path may explain the pass and the bent path is hardly better."""
         n_more = N_PATH - N_STRAIGHT
         gain = (self.cost - self.cost_bent) / max(self.misfit, 1.0)
         return bool(self.cost <= MAX_MISFIT * (self.freedom + n_more)

@@ -108,8 +108,7 @@ class SensorRejection:
     @staticmethod
     def _without(bank_filter: BankFilter, bank: FilterBank, before: _States, frame: FieldFrame,
                  dt: float, rejected: tuple[int, ...]) -> tuple[FloatArray, FieldFrame]:
-        """Repeat the update without some sensors; return log-likelihoods and the frame that was
-        used."""
+        """Repeat the update without some sensors; return log-likelihoods and the used frame."""
         missing = np.isin(np.arange(len(frame.field)), rejected)
         less = replace(frame, field=np.where(missing[:, None], np.nan, frame.field),
                        covariance=np.where(missing[:, None, None], np.nan, frame.covariance),
@@ -134,8 +133,7 @@ class SensorRejection:
 
 
 def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:
-    """Index of the heaviest hypothesis after the frame; None if no hypothesis explains the
-    frame."""
+    """Index of the heaviest hypothesis after a frame; None if no hypothesis explains it."""
     log_w = bank.log_w + log_likelihood
     leader = int(np.argmax(log_w))
     return leader if np.isfinite(log_w[leader]) else None

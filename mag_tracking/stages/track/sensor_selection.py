@@ -33,7 +33,7 @@ def nearest_sensors(positions: FloatArray, place: FloatArray, n: int) -> IntArra
     -------
     (n,) int array
         Indices in ascending order.
-        """
+    """
     distance = np.hypot(*(positions[:, :2] - place).T)
     return np.sort(np.argsort(distance, kind='stable')[:n])
 

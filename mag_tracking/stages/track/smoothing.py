@@ -291,8 +291,7 @@ class FixedLag:
             self._lagged, self._states(bank_filter, bank, best), strict=True) if kept.published]
 
     def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
-        """Smoothed states of the stored frames, without relinearisation to limit the time per
-        frame."""
+        """Smoothed states of the stored frames, not relinearised to limit the time per frame."""
         oldest = self._lagged[0]
         one, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
         one.x, one.P = oldest.x[row].copy(), oldest.P[row].copy()

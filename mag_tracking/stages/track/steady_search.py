@@ -417,8 +417,7 @@ class SteadySearch:
             return _log_determinant(self._information_of_moments(theta))
 
     def _are_detectable(self, theta: FloatArray) -> BoolArray:
-        """Whether all vehicles of each row (n,) are detectable according to the prior of the
-        moments."""
+        """Whether the prior of the moments makes all vehicles of each row (n,) detectable."""
         with ignoring_overflow():
             energy = np.einsum('nii->ni', self._information_of_moments(theta)) - 1.0
         each = energy.reshape(len(theta), -1, 3 * N_DIPOLES).sum(axis=2)

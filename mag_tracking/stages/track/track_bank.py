@@ -97,8 +97,7 @@ class TrackBank:
         return self._lag is not None
 
     def gain(self, row: int) -> float:
-        """Log-likelihood of the latest frames along a path, minus their log-likelihood in the
-        filter.
+        """Log-likelihood gain of a path over the filter, for the latest frames.
 
         Parameters
         ----------

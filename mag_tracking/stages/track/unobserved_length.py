@@ -77,7 +77,7 @@ class UnobservedLength:
         kind : int
             Index of the kind of vehicle.
 
-            Returns
+        Returns
         -------
         (2, 2) array, m^2
         """

@@ -61,8 +61,8 @@ class VehicleState:
             Time on the path.
         kind : int
             Index of the kind of vehicle.
-            label : int
-                Index of the arrival direction.
+        label : int
+            Index of the arrival direction.
 
         Returns
         -------
@@ -93,7 +93,7 @@ class VehicleState:
         kind : int
             Index of the kind of vehicle.
 
-            Returns
+        Returns
         -------
         (n, n_t) array
         """

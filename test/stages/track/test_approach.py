@@ -1,4 +1,4 @@
-"""Approach check: whether a field grows like that of a target that comes from afar."""
+"""Approach test: fields that grow like the field of a target from afar, and other fields."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ STD = 1e-8
 
 
 def frames(sizes):
-    """Frames of one sensor with fields of these sizes, in standard deviations of an axis."""
+    """Frames of one sensor with fields of these magnitudes, in standard deviations of an axis."""
     for k, size in enumerate(sizes):
         field = np.array([[size, 0.0, 0.0]]) * STD * np.sqrt(3.0)
         yield FieldFrame(k, field, np.eye(3)[None] * STD**2, np.ones(1, dtype=np.int64),
@@ -26,7 +26,7 @@ def doubted_frames(sizes):
 
 
 def test_a_field_that_grows_with_the_inverse_cube_of_distance_is_accepted():
-    """At all speeds at which it takes two frames or more from the threshold to ten times that."""
+    """At any speed at which the field takes at least two frames to grow tenfold."""
     for step in (0.02, 0.05, 0.1, 0.2):
         distance = np.arange(2.0, 0.2, -step)
         assert not any(doubted_frames(SENSED_LEVEL * GROWTH_RATIO * (0.4 / distance)**3))
@@ -36,7 +36,8 @@ def test_a_field_that_grows_with_the_inverse_cube_of_distance_is_accepted():
     2.0 * GROWTH_RATIO * SENSED_LEVEL * np.linspace(0.0, 1.0, 30)**2,
     np.concatenate([np.full(10, 0.5), np.linspace(0.5, 40.0, 30)])])
 def test_a_field_that_grows_differently_is_doubted_once(sizes):
-    """Of a target that starts beside a sensor; a linear growth, as of a current or temperature."""
+    """One field is of a target that starts next to a sensor. The other grows linearly, as with a
+    current or temperature."""
     assert sum(doubted_frames(sizes)) == 1
 
 

@@ -1,4 +1,4 @@
-"""Bank size: settings whose hypotheses would fill the memory are refused before a track starts."""
+"""Bank size: settings that exceed the memory limits are rejected before a track starts."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,8 @@ def test_too_many_hypotheses_of_a_magnet_are_refused(changes, message):
 
 
 def bytes_at_start(n, settings):
-    """Size of the covariances of all hypotheses of a vehicle that starts with `n` sensors."""
+    """Memory [bytes] of the covariances of all hypotheses of a vehicle that starts with `n`
+    sensors."""
     network = line_network(n)
     target = target_of(settings, network)
     frame = FieldFrame(0, np.full((n, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], n, axis=0),

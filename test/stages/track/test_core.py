@@ -1,4 +1,4 @@
-"""Compiled filters: comparison with NumPy step by step, and refused arguments."""
+"""Compiled filters: step-by-step comparison with NumPy, and rejected arguments."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ from support.plain_filter import PlainFilter
 
 SIGMA = 4e-9
 N_LARGE = 23
-"""With this number of sensors, updates of every case change only half of the covariance
+"""Number of sensors at which the updates of every case process only half of the covariance
 (`HALVED_FROM`)."""
 N_TARGETS = {'two rows that turn': 2, 'three points': 3}
 """{case: number of vehicles that share a state}."""
@@ -62,7 +62,7 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
                      (n_hyp, n_targets) if n_targets > 1 else n_hyp)
         if target == 'vehicle' else None)
     if settings.vehicle.turn_acceleration and target == 'vehicle':
-        # Half of the hypotheses go straight.
+        # Half of the hypotheses do not turn.
         for w in np.flatnonzero(np.isin(names, 'w')):
             bank.x[::2, w] = 0.0
             bank.P[::2, w] = bank.P[::2, :, w] = 0.0
@@ -81,7 +81,7 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
 
 
 def assert_same(a, b, tolerance=1e-9):
-    """Compare states and covariances of two banks, in standard deviations of the second one."""
+    """Compare states and covariances of two banks, in standard deviations of the second bank."""
     std = np.sqrt(np.einsum('pii->pi', b.P))
     std = np.where(std > 0.0, std, 1.0)
     assert np.abs((a.x - b.x) / std).max() <= tolerance
@@ -91,7 +91,7 @@ def assert_same(a, b, tolerance=1e-9):
 @pytest.mark.parametrize('n_sensors', [3, N_LARGE])
 @pytest.mark.parametrize('name', CASES)
 def test_a_bank_advanced_through_frames_matches_numpy(name, n_sensors):
-    """Some axes and a sensor are missing, and sensors are read at different times."""
+    """Some axes and one sensor are missing, and the sensors have different sampling times."""
     compiled, plain, bank, frames, intervals = case(name, n_sensors)
     other = bank.copy()
     for filter_, b in ((compiled, bank), (plain, other)):
@@ -239,7 +239,7 @@ def test_the_number_of_vehicles_that_share_a_state_is_bounded():
 
 
 def test_two_vehicles_without_common_sensors_are_filtered_independently():
-    """Each passes its own sensors, far from those of the other."""
+    """Each vehicle passes its own sensors, far from the sensors of the other vehicle."""
     settings = settings_for('vehicle', {**POINT, 'track.background_std': 1e-8}).track
     near, rng = line_network(2), np.random.default_rng(1)
     far = dataclasses.replace(line_network(2), positions=near.positions + [5e4, 0.0, 0.0],

@@ -1,4 +1,4 @@
-"""Cross-check of a track with a fit to the whole pass: when it runs, doubts and differences."""
+"""Cross-check of a track with fits to the whole pass: schedule, doubts and differences."""
 
 from dataclasses import replace
 
@@ -47,7 +47,7 @@ def test_fits_follow_the_cpa_at_increasing_intervals():
     ({'path': FAST}, FAST, doubts.FRAMES_TOO_LONG),
     ({'change': lambda B: np.clip(B, -3e-7, 3e-7)}, STRAIGHT, doubts.NO_STEADY_PATH)])
 def test_faults_found_in_the_whole_pass_doubt_the_track(of_frames, path, expected):
-    """The doubt begins when the vehicle has passed, and is permanent."""
+    """The doubt begins after the vehicle has passed, and is permanent."""
     check = CrossCheck(ROAD)
     rows = checked(check, steady_frames(np.random.default_rng(2), **of_frames), path)
     assert not rows[15][1]
@@ -93,7 +93,7 @@ def test_a_long_track_is_checked_at_its_cpa():
 
 
 def test_a_fit_stays_valid_if_later_frames_allow_none():
-    """One of two sensors falls silent."""
+    """One of two sensors stops measuring."""
     check = CrossCheck(ROAD)
     frames = steady_frames(np.random.default_rng(7), clocks=(0.3,), until_s=6.0)
     for frame in frames:
@@ -116,7 +116,7 @@ def test_the_cross_check_can_be_disabled():
         records, pipeline = tracks_of(world.readings, world.network,
                                       **{'track.cross_check': on})
         assert any(doubts.CLOCKS_APART in t.doubts for t in records if isinstance(t, Track)) is on
-        # Smoothed poses are doubted for the whole track.
+        # The smoothed poses of the whole track are ambiguous.
         assert all(t.ambiguous for t in records if isinstance(t, SmoothedPose)) is on
 
 
@@ -138,7 +138,7 @@ def test_the_third_car_past_a_wrong_clock_is_doubted_from_its_first_pose():
 
 
 def test_a_track_differs_by_its_distance_from_the_fitted_path():
-    """After the pass the difference stays that at its end."""
+    """After the pass the difference stays constant."""
     check = CrossCheck(ROAD)
     slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
     away, states = [], []
@@ -147,12 +147,12 @@ def test_a_track_differs_by_its_distance_from_the_fitted_path():
         check.add(frame, state_at(t, slow if t > 0.0 else STRAIGHT))
         found = check.doubts(0.0)
         away.append(np.hypot(*check.difference[:2]))
-        # A difference larger than the length of a long vehicle is another place.
+        # A difference larger than the length of a long vehicle means another position.
         assert found == ({doubts.ANOTHER_PLACE} if away[-1] > 8.0 else set())
         if check.latest is None:
             assert away[-1] == 0.0
         elif t < 3.0:
-            # A long row explains the pass at another speed as well; the nearer path counts.
+            # A long row also explains the pass at another speed; the nearer path is used.
             assert 3.0 * t - 1.0 < away[-1] < 6.0 * t + 1.0
         states.append((frame.stamp_ns, state_at(t), np.eye(6)))
     assert away[-1] == away[-20] > 15.0 and check.is_doubtful
@@ -161,7 +161,7 @@ def test_a_track_differs_by_its_distance_from_the_fitted_path():
     assert all(np.hypot(*d[:2]) < 2.0 for d in check.differences(states))
     of_far = [np.hypot(*d[:2]) for d in check.differences(far)]
     assert len(of_far) == len(states) and of_far[0] > 5.0 and of_far[-1] == of_far[-20] > 15.0
-    # If the fit covers none of the states, they have the difference of the filter.
+    # If the fit covers none of the states, the difference of the filter is used.
     assert check.differences(far[-3:]) == [check.difference] * 3
 
 
@@ -175,7 +175,7 @@ def test_smoothed_states_before_the_fitted_pass_differ_as_at_its_start():
 
 
 def test_a_fit_keeps_the_time_of_its_own_peak():
-    """Two further sensors sense the vehicle later and more strongly."""
+    """Two further sensors measure a stronger field later."""
     network = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0], [12.0, -3.5, 0.0], [12.0, 3.5, 0.0]])
     path = np.where(np.arange(10) == 3, 8.0, np.where(np.arange(10) == 4, 0.0, STRAIGHT))
     check, away, peaks = CrossCheck(network), [], set()
@@ -198,7 +198,7 @@ def test_a_pass_that_begins_at_its_peak_gives_no_difference():
 
 
 def test_the_difference_is_included_in_published_covariances(monkeypatch):
-    """Every path is patched to differ by five metres along x."""
+    """The difference of every path is patched to five metres along x."""
     away = np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     monkeypatch.setattr(RigidPass, 'difference', lambda *_: away)
     world = made('a car', 'clouds', 0)
@@ -207,7 +207,7 @@ def test_the_difference_is_included_in_published_covariances(monkeypatch):
         std = np.array([np.sqrt(r.covariance[0, 0]) for r in records if isinstance(r, kind)])
         print(f'{kind.__name__}: {std.round(1)} m')
         assert np.mean(std > 5.0 - 1e-6) >= share
-    # Poses before the pass do not include it.
+    # Poses before the pass do not include the difference.
     assert std.size and min(np.sqrt(r.covariance[0, 0]) for r in records
                             if isinstance(r, Track)) < 2.0
     without, _ = tracks_of(world.readings, world.network, **{'track.cross_check': False})

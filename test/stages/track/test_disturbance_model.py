@@ -1,4 +1,4 @@
-"""Disturbance model: evidence for fields of no target, uniform or at single sensors; handover."""
+"""Disturbance model: evidence for common fields and fields of single sensors, and handovers."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ NOISE = 4e-9
 
 
 def frames(network, fields, dt=0.08, seed=0):
-    """[`FieldFrame`] of fields (n, n_sensors, 3) [T] in the world."""
+    """[`FieldFrame`] of fields (n, n_sensors, 3) [T] in the world frame."""
     rng = np.random.default_rng(seed)
     seen = np.einsum('jik,nji->njk', network.R_ws, fields)
     seen = seen + NOISE * rng.standard_normal(seen.shape)
@@ -29,7 +29,7 @@ def density(model, some, dt=0.08):
 
 
 def slow_waves(t, network, own):
-    """Fields (n, n_sensors, 3) [T] of slow waves, of each sensor or common to all."""
+    """Fields (n, n_sensors, 3) [T] of slow waves, independent at each sensor or common to all."""
     rng = np.random.default_rng(3)
     size = 2e-7 * rng.standard_normal((len(network), 3))
     if not own:
@@ -44,7 +44,7 @@ def test_a_uniform_field_is_distinguished_from_fields_of_single_sensors(n_sensor
     network = line_network(n_sensors)
     model = DisturbanceModel(network, 2e-8)
     fields = slow_waves(np.arange(0.0, 8.0, 0.08), network, own)
-    # Backgrounds have errors of their stated standard deviation.
+    # The backgrounds have errors of the configured standard deviation.
     offsets = 2e-8 * np.random.default_rng(1).standard_normal((n_sensors, 3))
     density(model, frames(network, fields - fields[0] + offsets))
     assert model.uniform < 1e-3 if own else model.uniform > 0.999
@@ -91,7 +91,8 @@ def test_the_first_frame_after_a_handover_is_not_compared():
     some = frames(network, field)
     model, none = DisturbanceModel(network, 2e-8, is_handover=True), np.zeros(2)
     assert model.log_density(some[0], 0.0, none) is None
-    # Afterwards it is as without the jump, except for the cost of an unknown rate of change.
+    # Afterwards the evidence is as without the jump, except for the cost of an unknown rate of
+    # change.
     rest = sum(model.log_density(f, 0.08, none) for f in some[1:])
     before = DisturbanceModel(network, 2e-8)
     smooth = frames(network, field - 1e-6)
@@ -102,8 +103,10 @@ def test_the_first_frame_after_a_handover_is_not_compared():
 
 @pytest.mark.parametrize('gap_s', [2.0, 20.0, 60.0])
 def test_the_evidence_stays_finite_over_gaps_with_rotated_sensors(gap_s):
-    """Each update mixes all components. Unless one half of a covariance is mirrored, rounding
-    errors grow until it is indefinite."""
+    """Each update mixes all components.
+
+    Unless one half of a covariance is mirrored, rounding errors grow until it is indefinite.
+    """
     network, rng = line_network(4), np.random.default_rng(2)
     R = np.linalg.qr(rng.standard_normal((4, 3, 3)))[0]
     network = dataclasses.replace(

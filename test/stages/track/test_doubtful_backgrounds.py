@@ -1,4 +1,4 @@
-"""Tracks are ambiguous if a background that they use is doubtful."""
+"""Doubtful backgrounds make the tracks that use them ambiguous."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from support.samples import one, simulate
 CLEAR_WITHOUT_DOUBT = ('junction_left_to_right', 'junction_left_turns_to_rear')
 DOUBTED = 'tracks with a doubtful background'
 SETTINGS = settings_for('vehicle', QUICK)
-"""A fast tracker: the doubt does not depend on the model of the target."""
+"""Settings of a fast tracker: the doubt does not depend on the target model."""
 
 
 @pytest.fixture(scope='module')
@@ -44,7 +44,8 @@ def tracked(passing, times, settings=None):
 
 
 def test_a_track_with_a_doubtful_background_is_ambiguous(passing):
-    """The whole track is, also if the doubt ended in the lookback before the detection."""
+    """The whole track is ambiguous, even if the doubt ended in the lookback before the
+    detection."""
     _, plain = tracked(passing, {})
     first = (plain[0].stamp_ns - passing[1][0].stamp_ns) / 1e9
     assert not all(t.ambiguous for t in plain)
@@ -101,7 +102,8 @@ def times_in_message(pipeline):
 
 @pytest.mark.parametrize('name', CLEAR_WITHOUT_DOUBT)
 def test_a_vehicle_after_dense_traffic_is_tracked_and_ambiguous(name):
-    """There is no quiet interval in live data, so no pose is unambiguous, for any batches."""
+    """The data contain no quiet interval, so no pose is unambiguous. The batch size does not
+    matter."""
     network, readings = read_network(NETWORK_FILE), after_dense_traffic(name, 7.0)
     pipeline, other = (Pipeline(network, SETTINGS) for _ in range(2))
     tracks = poses_of(pipeline.feed(readings) + pipeline.flush())
@@ -118,7 +120,7 @@ def poses_of(records):
 
 @pytest.mark.parametrize('name', CLEAR_WITHOUT_DOUBT)
 def test_poses_after_dense_traffic_are_unambiguous_without_the_doubt(name):
-    """Otherwise the test above would show nothing."""
+    """Therefore the ambiguity in the previous test is due to the doubt."""
     pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
     pipeline.track.doubt = lambda times: None
     tracks = poses_of(pipeline.feed(after_dense_traffic(name, 7.0)) + pipeline.flush())
@@ -134,7 +136,7 @@ def test_fixed_lag_poses_after_dense_traffic_are_ambiguous():
 
 
 def test_the_doubt_persists_after_a_jump_back_in_time():
-    """Two copies in one batch: calibration has restarted before the first frames are tracked."""
+    """Both copies are in one batch, so calibration restarts before the first frames are tracked."""
     readings = after_dense_traffic(CLEAR_WITHOUT_DOUBT[0], 7.0)
     pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
     tracks = poses_of(pipeline.feed(Readings.joined([readings, readings])) + pipeline.flush())

@@ -1,4 +1,4 @@
-"""Search for new targets in the frames of a track: triggers, doubts and joint tracks."""
+"""Search for new targets during a track: triggers, doubts and joint tracks."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -29,7 +29,7 @@ PERIOD = round(0.08 * NS)
 
 
 def searches(nis, n=20, rejected=False, is_long=False):
-    """[(frame, reason)] of searches in a track with innovations of this size."""
+    """[(frame, reason)] of searches in a track with normalised innovations squared of `nis`."""
     evidence, found = NewTargetEvidence(), []
     for k in range(n):
         evidence.add(nis, 6, k * PERIOD, rejected, is_long)
@@ -119,7 +119,7 @@ def test_directions_of_earlier_vehicles_are_not_compared():
     ([0.0, 10.0], [10.0, 0.0], (0, 1, 2)), ([10.0, 0.0], [0.0, 10.0], (0, 1, 2)),
     ([-10.0, 0.0], [10.0, 0.0], ()), ([-10.0, 0.0], [-11.0, 0.0], (1, 2))])
 def test_both_vehicles_that_replace_one_are_compared(first, second, doubted):
-    """There is a third vehicle; the two that replace another one are the last."""
+    """The first vehicle is unrelated; the last two replace another vehicle."""
     assert joint_of([[12.0, 0.0], first, second], 16.0, 0).doubtful(7) == doubted
 
 
@@ -144,7 +144,7 @@ def test_overlap_of_vehicles_is_measured_along_a_lane():
     path[:, 6], path[:, 13] = 3.0, 5.0
     for ahead, aside, depth in ((20.0, 0.0, 0.0), (3.0, 0.0, 2.0), (3.0, 3.5, 0.0)):
         path[:, 7], path[:, 8] = [20.0, ahead], aside
-        # Half the lengths of both rows add up to 4 m, and the bodies extend one metre further.
+        # Half the lengths of both rows add up to 4 m, and the bodies require one more metre.
         assert overlap_depth(path, 7, 2, 6) == pytest.approx(depth)
 
 
@@ -199,7 +199,7 @@ def test_two_vehicles_that_meet_keep_their_tracks(meeting):
 
 
 def test_two_vehicles_that_meet_are_smoothed_together(meeting):
-    """Each pose is smoothed once and in order, with a mean error of 0.6 m or less."""
+    """Each pose is smoothed once, in chronological order, with a mean error of at most 0.6 m."""
     scene, records, _ = meeting
     for id in (1, 2):
         poses = [r for r in records if isinstance(r, SmoothedPose) and r.id == id]
@@ -211,7 +211,8 @@ def test_two_vehicles_that_meet_are_smoothed_together(meeting):
 
 
 def test_slow_sensors_at_staggered_times_find_a_new_target():
-    """At 5 Hz and at its own times, each sensor is in less than half of the frames."""
+    """Each sensor is sampled at 5 Hz at its own times, so it contributes to less than half of the
+    frames."""
     rng, n_sensors = np.random.default_rng(3), 4
     scene = world(NETWORKS[n_sensors], [passing(rng, 'clouds', 14.0, 1, 9.0),
                                         passing(rng, 'clouds', 14.5, -1, 9.0)], 24.0, rng,
@@ -243,7 +244,7 @@ def test_joint_tracks_do_not_depend_on_batches(meeting):
 
 @pytest.fixture(scope='module')
 def following():
-    """(`World`, records) of two cars; the first one is out of reach before the second."""
+    """(`World`, records) of two cars; the first car is out of reach before the second."""
     rng = np.random.default_rng(5)
     scene = world(NETWORKS[4], [passing(rng, 'clouds', 12.0, 1, 6.0),
                                 passing(rng, 'clouds', 15.5, 1, 6.5)], 26.0, rng, rate=50.0)
@@ -252,7 +253,7 @@ def following():
 
 
 def test_smoothed_poses_are_complete_after_one_of_two_vehicles_leaves(following):
-    """Also the poses from before the two vehicles shared a state."""
+    """Poses from the time before the two vehicles shared a state are included."""
     scene, records = following
     tracks = [r for r in records if isinstance(r, Track)]
     ends = {t.id: t.stamp_ns for t in tracks if t.ended}
@@ -270,13 +271,14 @@ def test_the_replacement_at_the_earlier_place_keeps_the_track(is_first):
     places = np.array([[0.0, 0.0], [30.0, 0.0]])
 
     class Known:
-        """A member whose poses were at one of the places."""
+        """Member whose poses were at one of the positions."""
 
         def distance_from(self, stamps, path):
             return float(np.hypot(*(path - places[0 if is_first else 1]).T).mean())
 
     class Found:
-        """Two vehicles of two states that replace the second of two, at these places."""
+        """Joint explanation in which two vehicles replace the second vehicle, at these
+        positions."""
 
         replaced = 1
         bank = SimpleNamespace(best=lambda: 0)

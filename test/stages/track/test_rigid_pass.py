@@ -1,4 +1,4 @@
-"""Fit of a steady path to a whole pass: clock offsets, misfits, and differences from tracks."""
+"""Fit of a steady path to a whole pass: clock offsets, misfits and differences from tracks."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from support.steady_frames import FOUR, ROAD, STRAIGHT, TURNS, state_at, steady_
 
 
 def fitted(frames, network=ROAD, path=STRAIGHT):
-    """`RigidPass` from a start that is off by half a metre and a tenth of the speed."""
+    """`RigidPass` fitted from a start with errors of half a metre and a tenth of the speed."""
     c, s = np.cos(path[4]), np.sin(path[4])
     start = np.array([path[0] + 0.5, path[1], 0.5, 0.9 * path[3] * c, 0.9 * path[3] * s, 0.0])
     return fit_rigid_pass(network, frames, 0, start[None])
@@ -22,7 +22,8 @@ def fitted(frames, network=ROAD, path=STRAIGHT):
 
 @pytest.mark.parametrize('offset', [0.0, 0.1, -0.2, 0.35])
 def test_the_clock_offset_of_the_other_sensor_is_found(offset):
-    """Within three standard deviations, which include a model error that is absent here."""
+    """The error is within three standard deviations, which include a model error that is absent
+    here."""
     fit = fitted(steady_frames(np.random.default_rng(1), clocks=(offset,)))
     # The second sensor has the stronger field, so it is the reference of the clocks.
     assert fit.reference == 1
@@ -39,14 +40,14 @@ def test_offsets_have_the_sign_of_a_clock_that_is_ahead():
 
 
 def test_standard_deviations_of_clock_offsets_cover_their_errors():
-    """There is noise only: without model errors the standard deviations are too large."""
+    """The data contain noise but no model error, so the standard deviations are too large."""
     rng = np.random.default_rng(2)
     z = []
     for _ in range(30):
         fit = fitted(steady_frames(rng))
         z.append(np.nansum(fit.offset) / np.nansum(fit.offset_std))
     print(f'mean squared error of the clock, in variances: {np.mean(np.square(z)):.2f}')
-    # Chi-square with 30 degrees of freedom exceeds this once in two hundred times.
+    # A chi-square variable with 30 degrees of freedom exceeds this limit once in two hundred times.
     assert np.mean(np.square(z)) < 1.8
 
 
@@ -74,7 +75,7 @@ def test_a_turn_is_not_a_clock_offset():
     lambda B: B + np.roll(B, 9, axis=0)[:, ::-1],
     lambda B: B * np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])])
 def test_no_steady_path_explains_the_field_of_no_vehicle(change):
-    """A clipped field, a second vehicle on the other lane, a flipped axis."""
+    """The fields are: a clipped field, a second vehicle in the other lane, and a flipped axis."""
     fit = fitted(steady_frames(np.random.default_rng(5), change=change))
     assert fit.misfit > 1.5 and not fit.needs_clocks_apart
 
@@ -116,14 +117,14 @@ def test_paths_that_explain_a_pass_are_near_the_true_path():
     for x in fit.straight_paths:
         assert np.hypot(*(x - state_at(0.0))[:2]) < 0.5
         assert np.hypot(*(x - state_at(0.0))[3:5]) < 1.0
-    # A vehicle that turns is on no straight path.
+    # No straight path explains a turning vehicle.
     assert not len(fitted(steady_frames(np.random.default_rng(4), path=TURNS),
                           path=TURNS).straight_paths)
 
 
 @pytest.mark.parametrize('limit, value', [('MAX_DISTANCE', 3.0), ('MAX_SPEED', 15.0)])
 def test_paths_that_are_too_far_or_too_fast_are_rejected(monkeypatch, limit, value):
-    """This vehicle passes one sensor at 3.5 m, the other at 5.5 m, at 20 m/s."""
+    """The vehicle passes one sensor at 3.5 m and the other at 5.5 m, at 20 m/s."""
     monkeypatch.setattr(rigid_pass, limit, value)
     fit = fitted(steady_frames(np.random.default_rng(9)))
     assert fit.misfit < 1.3 and not len(fit.straight_paths)

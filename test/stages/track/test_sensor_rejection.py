@@ -1,4 +1,4 @@
-"""Rejection of sensors that contradict the others: what is rejected, its limits and its cost."""
+"""Rejection of sensors that contradict the others: rejected sensors, limits and cost."""
 
 import copy
 import dataclasses
@@ -31,7 +31,7 @@ DT = 0.08
 
 
 class CountingFilter(BankFilter):
-    """Counts its updates of whole banks."""
+    """Filter that counts its updates of whole banks."""
 
     n = 0
 
@@ -70,7 +70,7 @@ def faulty(frame, *rows, size=1.0):
 
 
 def without(frame, *rows):
-    """The frame as the alignment returns it if those sensors are missing."""
+    """The frame that alignment returns if these sensors are missing."""
     rows = list(rows)
     field, covariance = frame.field.copy(), frame.covariance.copy()
     n_samples, offset = frame.n_samples.copy(), frame.time_offset.copy()
@@ -119,7 +119,7 @@ def test_a_wrong_sensor_is_rejected_as_if_it_were_missing(n, seed):
         assert got.tobytes() == expected.tobytes() and state(updated) == after
         assert same_frame(used, without(frame, j))
     if n == 2:
-        # With two sensors the wrong one is unknown, but one is rejected and the other is used.
+        # With two sensors the faulty sensor is unknown, but one is rejected and the other is used.
         *_, used, counts = SensorRejection(names).advance(bank_filter, bank, faulty(frame, 1), DT)
         assert sum(counts.values()) == 1 and np.count_nonzero(used.n_samples) == 1
 
@@ -139,7 +139,7 @@ def test_one_in_eight_sensors_and_at_least_one_may_be_rejected(n, max_rejected):
     assert max_rejected == max(1, n // SENSORS_PER_REJECTION)
     for wrong in (max_rejected, max_rejected + 1):
         bank_filter, bank, frame, names = situation(n, n_hyp=2)
-        # The sensors near the target, because those far away agree with everything.
+        # Sensors near the target are faulty, because distant sensors fit any hypothesis.
         near = np.argsort(np.linalg.norm(frame.field, axis=1))[-wrong:].tolist()
         bad = faulty(frame, *near)
         whole, after = plain(bank_filter, bank, bad)
@@ -192,7 +192,7 @@ def test_a_sensor_with_a_missing_axis_is_rejected_as_well():
 
 
 def cost(bank_filter, rejection, bank, frame):
-    """(number of updates, rows of unused sensors); the bank is not modified."""
+    """(number of updates, indices of unused sensors); the bank is not modified."""
     bank_filter.n = 0
     *_, used, _ = rejection.advance(bank_filter, copy.deepcopy(bank), frame, DT)
     return bank_filter.n, np.flatnonzero(used.n_samples == 0).tolist()
@@ -203,17 +203,17 @@ def test_the_sensor_rejected_in_the_previous_frame_is_tried_first():
     rejection = SensorRejection(names)
     assert cost(bank_filter, rejection, bank, faulty(frame, 2)) == (1 + 6 + 1, [2])
     assert cost(bank_filter, rejection, bank, faulty(frame, 2)) == (2, [2])
-    # Now another sensor is wrong.
+    # Now another sensor is faulty.
     assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (1 + 1 + 6 + 1, [4])
-    # A frame that fits, or the end of a track, clears the suspicion.
+    # A frame that fits, or the end of a track, clears the suspect.
     assert cost(bank_filter, rejection, bank, frame) == (1, [])
     assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (8, [4])
     rejection.clear()
     assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (8, [4])
-    # So does a frame in which no rejection helped.
+    # A frame in which no rejection helps also clears the suspect.
     assert cost(bank_filter, rejection, bank, faulty(frame, 2, 4)) == (9, [])
     assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (8, [4])
-    # A missing sensor is not suspected, and costs no update.
+    # A missing sensor is not a suspect, and costs no update.
     assert cost(bank_filter, rejection, bank, faulty(without(frame, 4), 2)) == (1 + 5 + 1, [2, 4])
 
 
@@ -244,7 +244,7 @@ def test_the_frame_has_to_fit_the_hypothesis_that_leads_by_weight():
 
 
 class RulingOutFilter(BankFilter):
-    """Rules out all hypotheses if a given sensor is present."""
+    """Filter that rules out all hypotheses if a given sensor is present."""
 
     def __init__(self, row, *args):
         super().__init__(*args)
@@ -270,8 +270,10 @@ def test_a_sensor_that_rules_out_every_hypothesis_is_rejected():
 
 @functools.cache
 def passing(n_sensors, fault, seed=0, network_at=None, lasting_s=1.0):
-    """(pipeline, live tracks, (begin, end)) of a pass with a fault of mag_2; `network_at` [s] after
-    the begin of the fault, the network is replaced."""
+    """(pipeline, live tracks, (begin, end) of the fault) of a pass with a fault of mag_2.
+
+    The network is replaced `network_at` [s] after the fault begins.
+    """
     network, samples, _, times = stream(n_sensors, seed, fault, lasting_s)
     pipeline, tracks = Pipeline(network, settings_for('vehicle', POINT)), []
     for s in samples:
@@ -285,7 +287,7 @@ def passing(n_sensors, fault, seed=0, network_at=None, lasting_s=1.0):
 def test_a_fault_of_one_of_two_sensors_makes_the_track_ambiguous():
     flags = {}
     for fault in (None, 'swaps axes'):
-        # The fault is too short for a doubt about a single supporting sensor.
+        # The fault is too short for the doubt that only one sensor supports the track.
         pipeline, tracks, (begin, _) = passing(
             2, fault, seed=1, lasting_s=MAX_SINGLE_SENSOR_S - 0.2)
         flags[fault] = [t.ambiguous for t in tracks if t.stamp_ns / NS > begin + 0.5]
@@ -296,8 +298,8 @@ def test_a_fault_of_one_of_two_sensors_makes_the_track_ambiguous():
 
 
 WRONG_SENSOR = pytest.param(3, 0, marks=pytest.mark.xfail(strict=True, reason=(
-    'mag_3 is rejected in 7 of 16 frames: of three sensors, a track can fit any two; its poses are '
-    'ambiguous')))
+    'mag_3 is rejected in 7 of 16 frames, because a track can fit any two of three sensors; '
+        'its poses are ambiguous')))
 
 
 @pytest.mark.parametrize('n_sensors, seed', [WRONG_SENSOR, (3, 1), (3, 2), (3, 3), (6, 0)])
@@ -380,6 +382,6 @@ def test_a_new_track_does_not_inherit_the_doubts_of_the_previous_one():
 
 @pytest.mark.parametrize('n_quiet', [0, 4])
 def test_a_target_that_was_not_seen_approaching_is_ambiguous(n_quiet):
-    """For example after a restart in the middle of a pass."""
+    """This happens after a restart in the middle of a pass."""
     _, tracks = first_tracks(n_quiet)
     assert tracks and all(t.ambiguous for t in tracks)

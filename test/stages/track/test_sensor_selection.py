@@ -90,7 +90,7 @@ def driven(network, changes, speed=20.0, seed=1):
 
 
 def test_a_target_is_tracked_along_forty_sensors():
-    """180 m with six sensors at a time; the error stays within its covariance."""
+    """At any time six of the sensors over 180 m are used. The error stays within its covariance."""
     network = line_network(40, tilt=0.02)
     records, pipeline, truth = driven(network, {'track.max_sensors': 6})
     live = [r for r in records if isinstance(r, Track) and not r.ended]
@@ -108,7 +108,7 @@ def test_a_target_is_tracked_along_forty_sensors():
         assert t.predicted.shape == (40, 3) and t.mounting.shape == (40, 3)
         used = ~np.isnan(t.nis_by_sensor)
         assert used.sum() <= 6 and (~np.isnan(t.predicted[used])).all()
-        # One of the two nearest sensors with a learnt background is used.
+        # One of the two nearest sensors with an estimated background is used.
         present = np.flatnonzero(frames[t.stamp_ns].n_samples)
         nearest = present[np.argsort(np.abs(network.positions[present, 0] - t.position[0]))]
         assert used[nearest[:2]].any()
@@ -118,7 +118,7 @@ def test_a_target_is_tracked_along_forty_sensors():
 
 @pytest.mark.parametrize('limit', [8, 16])
 def test_further_sensors_join_after_the_frames_before_the_detection(monkeypatch, limit):
-    """A start with all of them would take seconds and gigabytes."""
+    """A start with all sensors would take seconds and gigabytes."""
     network, runs = line_network(12, tilt=0.02), []
     for n in (1000, 4):
         monkeypatch.setattr(manager, 'sensors_at_start', lambda *_, n=n: n)
@@ -154,7 +154,7 @@ def frames():
 
 
 def managed(frames, changes, doubtful=None, start=slice(None)):
-    """(manager, live tracks) of frames that are fed to a `TrackManager`."""
+    """(`TrackManager`, live tracks) after the frames have been fed."""
     network, every = frames
     tracker, tracks = manager.TrackManager(network, settings_for('vehicle', changes).track), []
     tracker.doubt(doubtful or {})
@@ -183,7 +183,7 @@ def test_sensors_that_join_without_measurements_change_nothing(monkeypatch, fram
 
 def test_no_hypothesis_is_dropped_without_frames_before_the_detection(monkeypatch,
                                                                       frames):
-    """Their ranking is unknown until the other sensors join."""
+    """The ranking of the hypotheses is unknown until the other sensors join."""
     monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
     for name, value in (('WIDER_BYTES', 1), ('MIN_HYPOTHESES', 20)):
         monkeypatch.setattr(bank_size, name, value)

@@ -31,7 +31,7 @@ def field_of(path, network, t):
 
 
 def search_of(*paths, n_sensors=4, seed=0):
-    """`SteadySearch` in two seconds of frames with these vehicles, and its grid."""
+    """(`SteadySearch`, its grid) for two seconds of frames with these vehicles."""
     network, rng = NETWORKS[n_sensors], np.random.default_rng(seed)
     t = np.arange(-24, 1) * 0.08
     field = sum(field_of(path, network, t) for path in paths)
@@ -74,11 +74,11 @@ def test_another_vehicle_is_found_beside_a_known_one():
 
 
 def test_the_field_of_a_known_vehicle_is_not_another_vehicle():
-    """Only noise is left, and no path explains more than another."""
+    """Only noise remains, which no path explains better than another."""
     search, grid = search_of(FIRST)
     alone, beside = search.cost(grid), search.beside(FIRST).cost(grid)
     assert np.ptp(alone) > 1000.0
-    # The priors of paths and moments contribute some dozens.
+    # The priors of paths and moments contribute a few dozen.
     assert np.ptp(beside) < 100.0
 
 
@@ -99,7 +99,8 @@ def test_the_gradient_of_the_cost_is_exact(truths):
 
 
 def test_the_cost_of_the_grid_matches_the_full_covariance():
-    """Differences in the log-density of a point with a Gaussian moment, backgrounds and noise."""
+    """Cost differences match the log-density of a point with a Gaussian moment, backgrounds and
+    noise."""
     search, grid = search_of(FIRST)
     beside, rows = search.beside(SECOND), np.arange(0, len(grid.theta), 97)
     std = search.prior.moment_std[0] * np.sqrt(3.0)
@@ -116,7 +117,7 @@ def test_the_cost_of_the_grid_matches_the_full_covariance():
 
 @pytest.mark.parametrize('miss', [0.0, 1e-12, 1e-9, 1e-6])
 def test_a_path_through_a_sensor_raises_no_error(miss):
-    """A step of the search may lead there."""
+    """A step of the search may lead through a sensor."""
     search, grid = search_of(FIRST, SECOND)
     at = np.append(search.samples.positions[0] + [0.0, 0.0, miss], FIRST[3:])
     pair = np.append(at, SECOND)
@@ -181,7 +182,7 @@ def test_a_vehicle_that_no_sensor_senses_is_rejected(away, is_sensed):
 
 
 def test_pairs_that_diverge_are_discarded(monkeypatch):
-    """The squares of their positions overflow."""
+    """The squares of the diverged positions overflow."""
     search, grid = search_of(FIRST, SECOND)
     refined = SteadySearch.refined
 

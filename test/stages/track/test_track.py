@@ -19,7 +19,7 @@ from support.networks import line_network
 from support.samples import one, simulate
 from support.track_runs import drive, magnet_frames
 
-OVERFITS = 'poses doubted: the filter fits better than its path'
+OVERFITS = 'doubtful poses: the filter fits better than its path'
 
 
 def test_a_target_that_matches_the_model_is_tracked_within_its_covariance():
@@ -53,7 +53,7 @@ def test_the_evidence_identifies_the_kind_of_a_vehicle(kind, body):
     if kind == 'small':
         assert tracks[-1].length == tracks[-1].length_std == 0.0
     else:
-        # Most of the iron of the simulated vehicles spans seven tenths of their length.
+        # Most of the iron of the simulated vehicles extends over seven tenths of their length.
         assert 0.4 < tracks[-1].length / {'car': 4.3, 'truck': 11.0}[kind] < 1.0
         assert 0.0 < tracks[-1].length_std < 2.0
     assert sum(h.weight for h in tracks[-1].hypotheses if h.kind == kind) == pytest.approx(
@@ -62,7 +62,7 @@ def test_the_evidence_identifies_the_kind_of_a_vehicle(kind, body):
 
 @pytest.mark.study
 def test_most_trucks_are_identified_and_the_others_are_uncertain():
-    """35 of 40 trucks (seeds 0 to 39, other noise) were identified; the limit is binomial."""
+    """With other noise, 35 of 40 trucks (seeds 0 to 39) were identified. The limit is binomial."""
     n, ends = 16, []
     for seed in range(n):
         body = random_vehicle(np.random.default_rng(seed), **TRUCK)
@@ -218,7 +218,7 @@ def test_a_hypothesis_at_a_sensor_is_dropped_and_the_others_continue():
     bank.origin = np.append(bank.origin, len(bank.origin))
     bank.x[-1, :3] = network.positions[0]
     bank.x[-1, 3:6] = 0.0
-    # The field is zero: a dropped hypothesis must not win because it predicts none.
+    # The field is zero. A dropped hypothesis must not lead because it predicts no field.
     track = stage.feed(dataclasses.replace(frames[1], field=0.0 * frames[1].field))[-1]
     assert np.isfinite(track.position).all() and not track.ended
     assert min(np.linalg.norm(h.position - network.positions[0]) for h in track.hypotheses) > 0.01
@@ -231,7 +231,8 @@ def test_soft_iron_has_no_effect_without_an_earth_field():
 
 
 def test_the_predicted_field_excludes_the_model_errors():
-    """With them any target would fit: a car that is tracked as a point has large residuals."""
+    """Any target would fit with the model errors. Without them, a car that is tracked as a point
+    has large residuals."""
     residual = {}
     for name, changes in (('point', {**POINT, 'track.vehicle.near_field_lengths': [2.0]}),
                           ('row', {})):

@@ -1,4 +1,4 @@
-"""Middle of a long vehicle: its uncertainty before and after the whole vehicle has passed."""
+"""Uncertainty of the middle of a long vehicle, before and after the whole vehicle has passed."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def at(place, heading=0.0, speed=8.0):
 
 
 def off_middle(length, half_std, is_sensed, n=400_000):
-    """Samples of the offset from the middle of a row to that of its truck of 9 +- 3 m."""
+    """Samples of the offset from the middle of a row to the middle of its truck of 9 ± 3 m."""
     rng = np.random.default_rng(0)
     hidden = 0.5 * (9.0 - length) + half_std * rng.standard_normal(n)
     return hidden * (rng.uniform(-1.0, 1.0, n) if is_sensed else -1.0)
@@ -65,7 +65,8 @@ def test_a_row_longer_than_its_kind_hides_only_the_spread_of_lengths():
 
 
 def test_an_approaching_car_may_be_the_front_of_a_truck():
-    """Variance of a mixture: one vehicle in three is a truck with its centre 3 m further back."""
+    """The variance is of a mixture in which one vehicle in three is a truck, with its middle 3 m
+    further back."""
     added = of_vehicles().covariance(at([-20.0, 0.0]), P, 3.0, CAR)
     rng = np.random.default_rng(0)
     is_truck = rng.random(400_000) < 1.0 / 3.0
@@ -97,7 +98,7 @@ def test_only_a_sensor_near_the_path_confirms_the_length():
     unobserved_length.update(at([-20.0, 0.0]), P, far, True)
     assert unobserved_length.covariance(at([-20.0, 0.0]), P, 3.0, CAR).any()
     for places, is_certain in ((np.zeros((0, 3)), True), (far, False)):
-        # No sensor measured it, or its place is ambiguous.
+        # No sensor measured the vehicle, or its position is ambiguous.
         unobserved_length.update(at([20.0, 0.0]), P, places, is_certain)
         assert unobserved_length.covariance(at([20.0, 0.0]), P, 3.0, CAR).any()
 
@@ -118,12 +119,13 @@ def test_no_vehicle_is_longer_than_the_longest_kind():
         assert not cars.covariance(coming, P, length, 0).any()
     longest = [UnobservedLength(lengths, [3.0] * len(lengths)).covariance(coming, P, 8.9, -1)
                for lengths in ([9.0], [0.0, 3.0, 9.0])]
-    # Shorter kinds do not change the result of the longest.
+    # Shorter kinds do not change the result for the longest kind.
     np.testing.assert_array_equal(*longest)
 
 
 def test_the_difference_to_another_path_widens_the_joint_covariance():
-    """Position, velocity and heading of a smoothed pose; the joint covariance stays valid."""
+    """It widens position, velocity and heading of a smoothed pose. The joint covariance stays
+    valid."""
     model, x = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi)
     found = {}
     for name, difference in (('here', np.zeros(6)), ('apart', np.array([6.0, 0, 0, 2.0, 0, 0]))):
