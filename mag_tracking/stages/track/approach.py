@@ -19,10 +19,10 @@ MIN_LOG2_RATIO = -0.25
 theoretical value is 0.55 for a uniformly decreasing distance and -0.83 for a target that starts
 from rest next to a sensor. A field that jumps has a smaller value."""
 
-STEADY_SHARE = 0.85
+STEADY_FRACTION = 0.85
 """The growth is not steady if the field falls below this fraction of its previous maximum."""
 
-HALF_FRAME = 0.5
+LEVEL_TIME_STD = 0.5
 """Uncertainty of the time at which the field reached a level, in frame periods."""
 
 MAX_FRAMES = 1000
@@ -34,7 +34,7 @@ class Approach:
 
     def __init__(self) -> None:
         self._times: list[float] = []
-        self._sizes: list[float] = []
+        self._levels: list[float] = []
         self._is_open = True
 
     def add(self, frame: FieldFrame) -> bool:
@@ -54,18 +54,18 @@ class Approach:
         self._times.append(frame.stamp_ns / NS)
         energy, n_axes = whitened_energy(frame.field, frame.covariance)
         # The RMS of pure noise is 1; smaller values carry no information.
-        self._sizes.append(float(np.sqrt(max(energy.sum() / max(n_axes.sum(), 1), 1.0))))
-        self._is_open = self._sizes[-1] <= GROWTH_RATIO * SENSED_LEVEL \
-            and len(self._sizes) < MAX_FRAMES
+        self._levels.append(float(np.sqrt(max(energy.sum() / max(n_axes.sum(), 1), 1.0))))
+        self._is_open = self._levels[-1] <= GROWTH_RATIO * SENSED_LEVEL \
+            and len(self._levels) < MAX_FRAMES
         return not self._is_open and self._is_doubtful()
 
     def _is_doubtful(self) -> bool:
         """Whether the growth contradicts a target approaching from afar."""
-        time, sizes = np.array(self._times), np.array(self._sizes)
-        growth = growth_of(time, sizes, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
+        time, levels = np.array(self._times), np.array(self._levels)
+        growth = growth_of(time, levels, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
         # A field that falls in between belongs to a target that has passed its first sensor.
-        falls = sizes < STEADY_SHARE * np.maximum.accumulate(sizes)
-        if growth is None or (falls & (sizes > SENSED_LEVEL)).any():
+        is_falling = levels < STEADY_FRACTION * np.maximum.accumulate(levels)
+        if growth is None or (is_falling & (levels > SENSED_LEVEL)).any():
             return False
-        half = HALF_FRAME * float(np.median(np.diff(time)))
-        return bool(np.log2((growth.early + half) / (growth.late + half)) < MIN_LOG2_RATIO)
+        std = LEVEL_TIME_STD * float(np.median(np.diff(time)))
+        return bool(np.log2((growth.early + std) / (growth.late + std)) < MIN_LOG2_RATIO)

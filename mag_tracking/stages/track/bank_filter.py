@@ -17,11 +17,11 @@ from mag_tracking.stages.track.observation import TIME_RESOLUTION_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.unobserved_length import MAX_CAR_ROW
 
-LINEAR_SHARE = 0.25
+LINEAR_FRACTION = 0.25
 """Displacement over which the field is approximately linear, as a fraction of the distance to the
 nearest sensor. The cube of that distance then changes by a factor of two."""
 
-SAME_TIME_SHARE = 0.05
+SAME_TIME_FRACTION = 0.05
 """A frame whose samples span less than this fraction of the interval since the previous frame is
 treated as simultaneous. The first frame of a track is always treated as simultaneous, because
 differences between frames determine velocities better than differences within a frame."""
@@ -57,11 +57,11 @@ def compiled_filter(model: SourceModel, observation: Observation
     sensors = (observation.positions, observation.R_sw, observation.n_angles,
                observation.n_own - observation.n_angles)
     if isinstance(model, RowVehicle):
-        one = partial(core.RowVehicleFilter, *sensors) if observation.n_targets == 1 \
+        create = partial(core.RowVehicleFilter, *sensors) if observation.n_targets == 1 \
             else partial(core.VehiclesFilter, *sensors, observation.n_targets)
-        return one(len(model.state_names), model.n_dipoles, list(model.acceleration_density),
-                   list(model.induction), model.moment_drift, model.difference_drift,
-                   model.turn_acceleration, model.turn_time, MAX_TURN_RATE)
+        return create(len(model.state_names), model.n_dipoles, list(model.acceleration_density),
+                      list(model.induction), model.moment_drift, model.difference_drift,
+                      model.turn_acceleration, model.turn_time, MAX_TURN_RATE)
     assert isinstance(model, Magnet) and observation.n_targets == 1
     return core.MagnetFilter(*sensors, list(model.acceleration_density), model.angular_density)
 
@@ -86,7 +86,7 @@ class BankFilter:
     def __init__(self, network: SensorNetwork, model: SourceModel, settings: TrackSettings,
                  n_targets: int = 1) -> None:
         self._n_sensors = len(network)
-        self._no_offset = np.zeros(len(network))
+        self._zero_offset = np.zeros(len(network))
         self.observation = Observation(network, model, np.deg2rad(settings.mounting_std_deg),
                                        settings.model_error_time_s, n_targets)
         self._compiled = compiled_filter(model, self.observation)
@@ -104,7 +104,7 @@ class BankFilter:
         self._near_field_lengths: FloatArray = np.atleast_1d(
             settings.vehicle.near_field_lengths if is_vehicle
             else settings.magnet.near_field_length).astype(float)
-        self._are_long: BoolArray = np.array(
+        self._is_long_kind: BoolArray = np.array(
             settings.vehicle.lengths if is_vehicle else [0.0]) > MAX_CAR_ROW
 
     def move(self, bank: FilterBank, dt: float) -> None:
@@ -117,9 +117,9 @@ class BankFilter:
             Negative values move the bank backwards in time, without process noise.
         """
         n = self._n_sensors
-        nowhere = FieldFrame(0, np.full((n, 3), np.nan), np.tile(np.eye(3), (n, 1, 1)),
-                             np.zeros(n, dtype=np.int64), np.zeros(n))
-        self._advance(bank, nowhere, dt, True, 0)
+        empty_frame = FieldFrame(0, np.full((n, 3), np.nan), np.tile(np.eye(3), (n, 1, 1)),
+                                 np.zeros(n, dtype=np.int64), np.zeros(n))
+        self._advance(bank, empty_frame, dt, True, 0)
 
     def advance(self, bank: FilterBank, frame: FieldFrame, dt: float, keeps_prior: bool = False
                 ) -> tuple[FloatArray, FloatArray]:
@@ -243,8 +243,8 @@ class BankFilter:
             Multiples of `SAME_TIME_S`; 0 for a frame that is treated as simultaneous.
         """
         offset: FloatArray = frame.time_offset
-        if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_SHARE * dt:
-            return self._no_offset
+        if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_FRACTION * dt:
+            return self._zero_offset
         return np.round(offset / TIME_RESOLUTION_S) * TIME_RESOLUTION_S
 
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
@@ -267,8 +267,8 @@ class BankFilter:
         error = self.observation.model_error(
             bank.x[i], self._lengths(bank.kind[i:i + 1])[0], self._settings.field_error)
         time = self._settings.model_error_time_s
-        share = -np.expm1(-2.0 * dt / time) if time else 1.0
-        return share * np.nan_to_num(error, posinf=0.0)
+        fraction = -np.expm1(-2.0 * dt / time) if time else 1.0
+        return fraction * np.nan_to_num(error, posinf=0.0)
 
     def predicted_field(self, bank: FilterBank, i: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
@@ -358,7 +358,7 @@ class BankFilter:
         -------
         (n,) bool array
         """
-        are_long: BoolArray = np.any(self._are_long[kind].reshape(len(kind), -1), axis=1)
+        are_long: BoolArray = np.any(self._is_long_kind[kind].reshape(len(kind), -1), axis=1)
         return are_long
 
     def nearly_linear(self, x: FloatArray) -> FloatArray:
@@ -372,7 +372,7 @@ class BankFilter:
         -------
         (n_hyp,) array, m
         """
-        return LINEAR_SHARE * self.observation.distance_to_nearest(x)
+        return LINEAR_FRACTION * self.observation.distance_to_nearest(x)
 
     def is_implausible(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
         """Whether the normalised innovation of a hypothesis exceeds `end_nis` per axis.
@@ -425,18 +425,19 @@ class NoTarget:
         float
         """
         self._P += background_drift**2 * dt * np.eye(3)
-        there = ~np.isnan(frame.field)
-        both = there[:, :, None] & there[:, None, :]
+        is_present = ~np.isnan(frame.field)
+        both_present = is_present[:, :, None] & is_present[:, None, :]
         # A missing axis has zero innovation and an independent unit variance.
-        u = np.where(there, frame.field - self._x, 0.0)
-        S = np.where(both, self._P + frame.covariance, np.eye(3))
+        u = np.where(is_present, frame.field - self._x, 0.0)
+        S = np.where(both_present, self._P + frame.covariance, np.eye(3))
         L = np.linalg.cholesky(S)
         whitened = np.linalg.solve(L, np.concatenate(
-            [u[:, :, None], np.where(there[:, :, None], self._P, 0.0)], axis=2))
+            [u[:, :, None], np.where(is_present[:, :, None], self._P, 0.0)], axis=2))
         z, G = whitened[:, :, 0], whitened[:, :, 1:]
         self._x += np.einsum('jai,ja->ji', G, z)
         self._P -= np.swapaxes(G, 1, 2) @ G
-        return float(-0.5 * (np.square(z).sum() + np.count_nonzero(there) * np.log(2.0 * np.pi))
+        return float(-0.5 * (np.square(z).sum()
+                             + np.count_nonzero(is_present) * np.log(2.0 * np.pi))
                      - np.log(np.einsum('jaa->ja', L)).sum())
 
 

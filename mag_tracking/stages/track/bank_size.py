@@ -23,7 +23,7 @@ WIDER_BYTES = 100_000_000
 """Maximum memory of the covariances after the remaining sensors have been added [bytes]."""
 MIN_HYPOTHESES = 100
 """Minimum number of retained hypotheses, even if they exceed `WIDER_BYTES`."""
-WEIGHT_KEPT = 0.999
+MIN_WEIGHT = 0.999
 """Minimum total weight of the retained hypotheses when the remaining sensors are added. With a
 smaller weight, the track would appear more certain than the frames justify."""
 _FLOAT_BYTES = 8
@@ -51,8 +51,8 @@ def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
         len(model.state_names) + _states_per_sensor(settings) * n)**2
     if size > MAX_BYTES:
         raise SettingsError(f'track.max_sensors: {MIN_HYPOTHESES} hypotheses with the states of '
-                            f'{n} sensors need {_gigabytes(size)} of memory; the limit is '
-                            f'{_gigabytes(MAX_BYTES)}. Reduce track.max_sensors')
+                            f'{n} sensors need {_in_gigabytes(size)} of memory; the limit is '
+                            f'{_in_gigabytes(MAX_BYTES)}. Reduce track.max_sensors')
 
 
 def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
@@ -77,11 +77,11 @@ def sensors_at_start(settings: TrackSettings, network: SensorNetwork, model: Sou
     -------
     int
     """
-    most = _n_sensors(settings, network)
+    n_max = _n_sensors(settings, network)
     if settings.target != 'vehicle':
-        return most
-    return min(most, _affordable(math.prod(_vehicle_factors(settings).values()),
-                                 len(model.state_names), _states_per_sensor(settings)))
+        return n_max
+    return min(n_max, _max_affordable_sensors(math.prod(_vehicle_factors(settings).values()),
+                                              len(model.state_names), _states_per_sensor(settings)))
 
 
 def max_sensors(observation: Observation, n_hyp: int) -> int:
@@ -97,10 +97,10 @@ def max_sensors(observation: Observation, n_hyp: int) -> int:
     -------
     int
     """
-    return _affordable(n_hyp, observation.n_target, observation.n_own + 3)
+    return _max_affordable_sensors(n_hyp, observation.n_target, observation.n_own + 3)
 
 
-def _affordable(n_hyp: int, n_target: int, n_of_sensor: int) -> int:
+def _max_affordable_sensors(n_hyp: int, n_target: int, n_of_sensor: int) -> int:
     """Maximum number of sensors within `START_BYTES`, but at least `MIN_SENSORS_AT_START`."""
     n_states = math.isqrt(START_BYTES // (_FLOAT_BYTES * n_hyp))
     return max((n_states - n_target) // n_of_sensor, MIN_SENSORS_AT_START)
@@ -143,8 +143,8 @@ def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
     size = magnet.grid_points * n * 9 * _FLOAT_BYTES
     if size > MAX_BYTES:
         raise SettingsError(f'track.magnet.grid_points: {magnet.grid_points} points x {n} sensors '
-                            f'need {_gigabytes(size)} of memory; the limit is '
-                            f'{_gigabytes(MAX_BYTES)}. Reduce track.magnet.grid_points or '
+                            f'need {_in_gigabytes(size)} of memory; the limit is '
+                            f'{_in_gigabytes(MAX_BYTES)}. Reduce track.magnet.grid_points or '
                             'track.max_sensors')
     _check_bank('track.magnet', {'starts': magnet.starts}, settings, n, model)
 
@@ -159,8 +159,8 @@ def _check_bank(group: str, factors: Mapping[str, int], settings: TrackSettings,
         product = ' x '.join(f'{name} ({number})' for name, number in factors.items())
         raise SettingsError(
             f'{group}: {n_hyp} starting hypotheses, {product}, with {n_x} states each for {n} '
-            f'sensors (track.max_sensors) need {_gigabytes(size)} of memory; the limit is '
-            f'{_gigabytes(MAX_BYTES)}. Reduce one of these numbers')
+            f'sensors (track.max_sensors) need {_in_gigabytes(size)} of memory; the limit is '
+            f'{_in_gigabytes(MAX_BYTES)}. Reduce one of these numbers')
 
 
 def _n_sensors(settings: TrackSettings, network: SensorNetwork) -> int:
@@ -173,6 +173,6 @@ def _states_per_sensor(settings: TrackSettings) -> int:
     return 3 * (1 + bool(settings.mounting_std_deg) + bool(settings.model_error_time_s))
 
 
-def _gigabytes(size: int) -> str:
+def _in_gigabytes(size: int) -> str:
     """Format a number of bytes in decimal gigabytes."""
     return f'{size / 1e9:.3g} GB'

@@ -121,5 +121,5 @@ def field_magnitudes(frame: FieldFrame) -> FloatArray:
     (n_sensors,) array, T
         0 if the reading is missing.
     """
-    size: FloatArray = np.sqrt(np.nansum(np.square(frame.field), axis=1))
-    return size
+    magnitude: FloatArray = np.sqrt(np.nansum(np.square(frame.field), axis=1))
+    return magnitude

@@ -38,7 +38,7 @@ OVERFIT_NATS = float(np.log(1e4))
 same hypothesis [nats]. An extended Kalman filter linearises each frame at another state. It may
 therefore fit the frames better than any single path can."""
 
-MIN_OBSERVED_SHARE = 0.5
+MIN_OBSERVED_FRACTION = 0.5
 """A track is ambiguous if the frames before its detection cover less than this fraction of the
 lookback."""
 
@@ -82,15 +82,15 @@ class TrackEvidence:
         self._doubts: set[str] = set()
         self._log_odds = 0.0
         self._single_sensor_s = 0.0
-        self._n_misfits = 0
-        self._doubts_filter_until_ns = -1
+        self._n_consecutive_misfits = 0
+        self._overfit_expiry_ns = -1
         self._doubtful_times: DoubtfulTimes = ()
         # Latest timestamp of each transient doubt.
-        self._found_ns: dict[str, int] = {}
+        self._last_found_ns: dict[str, int] = {}
         # Expiry of each other doubt with a limited duration.
-        self._until_ns: dict[str, int] = {}
+        self._expiry_ns: dict[str, int] = {}
         # Segments in which smoothed poses are also doubtful.
-        self._segments: list[tuple[int, int]] = []
+        self._smoothed_segments: list[tuple[int, int]] = []
         self._min_spread = np.inf
         # Per sensor: whitened energy of its fields in excess of noise, and number of axes.
         self._energy, self._n_axes = np.zeros(n_sensors), np.zeros(n_sensors)
@@ -131,8 +131,8 @@ class TrackEvidence:
         self._doubts -= {doubts.CONTRADICTION, doubts.INNOVATIONS, doubts.SENSORS_CONTRADICT,
                          *doubts.PERMANENT}
         self.innovations = InnovationConsistency(len(self.largest))
-        self._n_misfits, self._doubts_filter_until_ns = 0, -1
-        self._found_ns.clear()
+        self._n_consecutive_misfits, self._overfit_expiry_ns = 0, -1
+        self._last_found_ns.clear()
 
     def doubt_start(self, approach_unobserved: bool, network: SensorNetwork, starts_anywhere: bool
                     ) -> None:
@@ -170,9 +170,9 @@ class TrackEvidence:
             Earlier time from which smoothed poses are also doubtful. By default, no smoothed pose
             is.
         """
-        self._until_ns[reason] = until_ns = stamp_ns + round(seconds * NS)
+        self._expiry_ns[reason] = until_ns = stamp_ns + round(seconds * NS)
         if since_ns is not None:
-            self._segments.append((since_ns, until_ns))
+            self._smoothed_segments.append((since_ns, until_ns))
 
     def check_approach(self, frame: FieldFrame) -> None:
         """Mark the track as doubtful if its field did not grow as for an approaching target.
@@ -200,9 +200,9 @@ class TrackEvidence:
         self._energy[rows] += energy - n_axes
         self._n_axes[rows] += n_axes
         self.largest[rows] = np.maximum(self.largest[rows], field_magnitudes(frame))
-        of_all, axes_of_all = np.full(len(self.largest), np.nan), np.zeros(len(self.largest))
-        of_all[rows], axes_of_all[rows] = nis, n_axes
-        self.innovations.add(of_all, axes_of_all, frame.stamp_ns)
+        network_nis, network_axes = np.full(len(self.largest), np.nan), np.zeros(len(self.largest))
+        network_nis[rows], network_axes[rows] = nis, n_axes
+        self.innovations.add(network_nis, network_axes, frame.stamp_ns)
 
     @property
     def sensed(self) -> BoolArray:
@@ -229,12 +229,13 @@ class TrackEvidence:
         set of str
             Doubts of this frame and earlier doubts that persist.
         """
-        passing = found.intersection(TRANSIENT_DOUBTS)
-        self._doubtful_times = updated(self._doubtful_times, stamp_ns, bool(passing), MAX_SEGMENTS)
-        self._found_ns |= dict.fromkeys(passing, stamp_ns)
-        return found | {reason for reason, when in self._found_ns.items()
+        transient = found.intersection(TRANSIENT_DOUBTS)
+        self._doubtful_times = updated(
+            self._doubtful_times, stamp_ns, bool(transient), MAX_SEGMENTS)
+        self._last_found_ns |= dict.fromkeys(transient, stamp_ns)
+        return found | {reason for reason, when in self._last_found_ns.items()
                         if (stamp_ns - when) / NS <= TRANSIENT_S} \
-            | {reason for reason, until in self._until_ns.items() if stamp_ns <= until}
+            | {reason for reason, until in self._expiry_ns.items() if stamp_ns <= until}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
         """Check whether a normalised innovation is too large for the target model.
@@ -252,10 +253,10 @@ class TrackEvidence:
         -------
         bool
         """
-        contradicted = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
-        if contradicted and len(nis) <= 2:
+        is_contradiction = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
+        if is_contradiction and len(nis) <= 2:
             self.doubt(doubts.CONTRADICTION)
-        return contradicted
+        return is_contradiction
 
     def vehicle_doubts(self, nis: FloatArray, degrees_of_freedom: int, ratio: float) -> set[str]:
         """Update and return the doubts that follow from the measurements of a vehicle.
@@ -272,18 +273,18 @@ class TrackEvidence:
         -------
         set of str
         """
-        found = set()
+        reasons = set()
         if self.bayes_factor.is_recently_disfavoured(ratio):
-            found.add(doubts.DISTURBANCE_MODEL)
+            reasons.add(doubts.DISTURBANCE_MODEL)
         if self.contradicts(nis, degrees_of_freedom):
-            found.add(doubts.CONTRADICTION)
+            reasons.add(doubts.CONTRADICTION)
         if self.is_sensed_by_one:
-            found.add(doubts.FELT_BY_ONE_SENSOR)
+            reasons.add(doubts.FELT_BY_ONE_SENSOR)
         if self.innovations.excess > 1.0:
-            found.add(doubts.INNOVATIONS)
+            reasons.add(doubts.INNOVATIONS)
         if self.innovations.fails:
             self.doubt(doubts.INNOVATIONS)
-        return found
+        return reasons
 
     def doubts_filter(self, gain: float, stamp_ns: int, window_s: float) -> bool:
         """Update and return whether the filter fits the frames much better than its path.
@@ -302,8 +303,8 @@ class TrackEvidence:
         bool
         """
         if gain < -OVERFIT_NATS:
-            self._doubts_filter_until_ns = stamp_ns + round(window_s * NS)
-        return stamp_ns <= self._doubts_filter_until_ns
+            self._overfit_expiry_ns = stamp_ns + round(window_s * NS)
+        return stamp_ns <= self._overfit_expiry_ns
 
     def was_filter_doubted(self, stamp_ns: int) -> bool:
         """Whether the filter was doubtful at an earlier time.
@@ -316,7 +317,7 @@ class TrackEvidence:
         -------
         bool
         """
-        return are_doubtful((*self._doubtful_times, *self._segments), stamp_ns)
+        return are_doubtful((*self._doubtful_times, *self._smoothed_segments), stamp_ns)
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
         """Count the time for which only one of several sensors supported the track.
@@ -343,7 +344,7 @@ class TrackEvidence:
     @property
     def ends_in_misfit(self) -> bool:
         """Whether the latest field contradicted the track."""
-        return self._n_misfits > 0
+        return self._n_consecutive_misfits > 0
 
     def reason_to_end(self, track: Track, spread: float, is_coming: bool,
                       settings: TrackSettings) -> str | None:
@@ -370,8 +371,8 @@ class TrackEvidence:
         if self.bayes_factor.disfavoured_s(track.stamp_ns) > UNEXPLAINED_S:
             return UNEXPLAINED
         misfit = track.nis > settings.end_nis * track.degrees_of_freedom
-        self._n_misfits = self._n_misfits + 1 if misfit else 0
-        if self._n_misfits > 1:
+        self._n_consecutive_misfits = self._n_consecutive_misfits + 1 if misfit else 0
+        if self._n_consecutive_misfits > 1:
             return LOST
         if spread > settings.end_std > self._min_spread and not is_coming:
             return LOST if misfit else OUT_OF_REACH

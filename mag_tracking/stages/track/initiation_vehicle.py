@@ -236,7 +236,7 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
             velocities = np.array(settings.speeds)[:, None] * R[:, 0]
             starts = _matching_positions(settings, network, measured, R, moments,
                                          settings.heights[kind])
-            states.append(_states(settings, kind, starts, velocities, hard))
+            states.append(_initial_states(settings, kind, starts, velocities, hard))
             by_speed = np.array([
                 starting_covariance(settings, kind, R, v, settings.moment_stds[kind])
                 for v in settings.speeds])
@@ -245,32 +245,32 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
             kinds += [kind] * len(states[-1])
     bank = FilterBank.from_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
                                  len(network), background_std, own_covariance, np.array(kinds))
-    return _with_turns(bank, vehicle_model(settings, network), settings.turn_share)
+    return _add_turning_hypotheses(bank, vehicle_model(settings, network), settings.turn_share)
 
 
-def _with_turns(bank: FilterBank, model: RowVehicle, share: float) -> FilterBank:
+def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float) -> FilterBank:
     """Bank with a straight and a turning copy of each hypothesis, if vehicles turn."""
     if not model.turn_acceleration:
         return bank
     n, w = len(bank), len(model.state_names) - 1
-    both = bank.rows(np.tile(np.arange(n), 2))
-    both.origin = np.arange(2 * n)
-    both.log_w = np.log(np.repeat([1.0 - share, share], n) / n)
-    both.P[n:, w, w] = START_TURN_RATIO**2 * model.turn_variance(np.hypot(bank.x[:, 3],
+    doubled = bank.rows(np.tile(np.arange(n), 2))
+    doubled.origin = np.arange(2 * n)
+    doubled.log_w = np.log(np.repeat([1.0 - fraction, fraction], n) / n)
+    doubled.P[n:, w, w] = START_TURN_RATIO**2 * model.turn_variance(np.hypot(bank.x[:, 3],
                                                                         bank.x[:, 4]))
-    return both
+    return doubled
 
 
 class _MeasuredEnergy:
     """Energy of a frame, which determines the initial distance of the target."""
 
     def __init__(self, network: SensorNetwork, frame: FieldFrame) -> None:
-        present = ~np.isnan(frame.field)
+        is_present = ~np.isnan(frame.field)
         energy = float(whitened_energy(frame.field, frame.covariance)[0].sum())
         # The expected energy of noise is one per axis.
-        self.energy = max(energy - np.count_nonzero(present), 1.0)
+        self.energy = max(energy - np.count_nonzero(is_present), 1.0)
         std = np.sqrt(np.einsum('jii->ji', frame.covariance))
-        self.whitening = network.R_sw / np.where(present, std, np.inf)[:, :, None]
+        self.whitening = network.R_sw / np.where(is_present, std, np.inf)[:, :, None]
         """Matrix (n_sensors, 3, 3) [1/T] from the field (world frame) to units of the noise."""
 
 
@@ -287,13 +287,13 @@ def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
     _, field_of_moment = dipole_jacobians(network.positions - points[:, :, None], np.zeros(3))
     A = (measured.whitening @ field_of_moment).reshape(*points.shape[:2], -1, 3)
     energy = np.einsum('lpmk,mk->lpm', moments @ (np.swapaxes(A, 2, 3) @ A), moments)
-    reached = energy >= measured.energy
-    first = np.where(reached.any(axis=1), reached.argmax(axis=1), len(distance) - 1)
+    is_reached = energy >= measured.energy
+    first = np.where(is_reached.any(axis=1), is_reached.argmax(axis=1), len(distance) - 1)
     return np.take_along_axis(points, first[:, :, None], axis=1)
 
 
-def _states(settings: VehicleSettings, kind: int, positions: FloatArray, velocities: FloatArray,
-            hard: FloatArray) -> FloatArray:
+def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
+                    velocities: FloatArray, hard: FloatArray) -> FloatArray:
     """States (n_offsets n_speeds n_moments, n_t) of `RowVehicle`.
 
     The inputs are `positions` (n_offsets, n_moments, 3), `velocities` (n_speeds, 3) and the total
@@ -329,9 +329,9 @@ def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, spe
     (n_t, n_t) array
     """
     d = _n_dipoles(settings)
-    hard = 6 + 3 * d
+    soft = 6 + 3 * d
     soft_iron_std = settings.induced_share_std * _soft_iron_per_share(settings, kind)
-    n_t = hard + 2 + min(d, 2) + int(settings.turn_acceleration > 0.0)
+    n_t = soft + 2 + min(d, 2) + int(settings.turn_acceleration > 0.0)
     P = np.zeros((n_t, n_t))
     P[:3, :3] = R @ np.diag([settings.along_std**2, settings.lateral_std**2,
                              settings.height_stds[kind]**2]) @ R.T
@@ -339,9 +339,9 @@ def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, spe
                                (settings.cross_speed_std * speed) ** 2,
                                settings.climb_std**2]) @ R.T
     mean = np.full((d, d), 1.0 / d)
-    P[6:hard, 6:hard] = np.kron(moment_std**2 / d * mean
+    P[6:soft, 6:soft] = np.kron(moment_std**2 / d * mean
                                 + settings.difference_stds[kind]**2 * (np.eye(d) - mean), np.eye(3))
-    P[hard:hard + 3, hard:hard + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
+    P[soft:soft + 3, soft:soft + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
     if d > 1:
-        P[hard + 3, hard + 3] = settings.length_stds[kind]**2
+        P[soft + 3, soft + 3] = settings.length_stds[kind]**2
     return P

@@ -78,15 +78,15 @@ class TrackManager:
         self._max_energy = 0.0
         # [T^2] After a lost target, a track starts only if the energy of the field exceeds this
         # limit; None if no target was lost in the present detection.
-        self._tail_until: float | None = None
+        self._restart_energy: float | None = None
         self._next_network: SensorNetwork | None = None
         self._disturbances = Disturbances(network.names)
         self._doubtful_times: Mapping[str, DoubtfulTimes] = {}
-        self._doubtful: dict[int, DoubtfulTimes] = {}
-        uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
-                        for s in network.orientation_std)
-        if uncertain:
-            self.counts['sensors whose orientation is hardly known'] = uncertain
+        self._doubtful_by_sensor: dict[int, DoubtfulTimes] = {}
+        n_uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
+                          for s in network.orientation_std)
+        if n_uncertain:
+            self.counts['sensors whose orientation is hardly known'] = n_uncertain
 
     def use_network(self, network: SensorNetwork) -> None:
         """Apply another calibration of the same sensors as soon as no track is running.
@@ -128,18 +128,18 @@ class TrackManager:
         """
         if times != self._doubtful_times:
             self._doubtful_times = times
-            self._doubtful = {self._network.index(name): t for name, t in times.items()}
+            self._doubtful_by_sensor = {self._network.index(name): t for name, t in times.items()}
 
     def _doubtful_sensors(self, *frames: FieldFrame) -> list[int]:
         """Indices of the sensors whose backgrounds are doubtful in one of the frames."""
-        return [j for j, times in self._doubtful.items()
+        return [j for j, times in self._doubtful_by_sensor.items()
                 if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
 
     @property
     def clocks_apart(self) -> str:
         """Message about a significant clock offset; empty if all clocks agree."""
-        apart = self._clocks.apart if self._settings.cross_check else None
-        return '' if apart is None else apart.text(self._network.names)
+        offset = self._clocks.apart if self._settings.cross_check else None
+        return '' if offset is None else offset.text(self._network.names)
 
     @property
     def bank(self) -> FilterBank | None:
@@ -169,11 +169,11 @@ class TrackManager:
             self._disturbances.feed(frame)
         if not frame.target_present:
             out += self._end_all('released', frame.stamp_ns)
-            self._tail_until = None
-            self._remember(frame)
+            self._restart_energy = None
+            self._store_frame(frame)
         elif self._tracks and previous is not None:
             out += self._maintain(frame, (frame.stamp_ns - previous) / NS)
-        elif self._tail_until is None or _energy(frame) > self._tail_until:
+        elif self._restart_energy is None or _energy(frame) > self._restart_energy:
             out += self._initiate(frame)
         return out
 
@@ -200,7 +200,7 @@ class TrackManager:
         list of TrackRecord
         """
         self._recent.clear()
-        self._tail_until = None
+        self._restart_energy = None
         return self._end_all(reason, self._last_ns)
 
     def flush(self) -> list[TrackRecord]:
@@ -253,11 +253,11 @@ class TrackManager:
                                 stamp_ns)
         # A vehicle that restarts in the tail of its detection would be placed on the wrong line.
         if any(track.is_lost for track in self._tracks) and not self._target.starts_anywhere:
-            self._tail_until = RESTART_ENERGY_RATIO * self._max_energy
+            self._restart_energy = RESTART_ENERGY_RATIO * self._max_energy
         self._tracks = [track for track in self._tracks if track.ended is None]
         return out
 
-    def _remember(self, frame: FieldFrame) -> None:
+    def _store_frame(self, frame: FieldFrame) -> None:
         """Store a frame for the lookback of a later track."""
         self._recent.append(frame)
         oldest = frame.stamp_ns - self._settings.lookback_s * NS
@@ -268,18 +268,19 @@ class TrackManager:
         """Start a track and run it through the frames before the detection."""
         if len(self._network) == 1 and not self._settings.single_sensor_prior:
             self.counts[NO_SCALE] += 1
-            self._tail_until = np.inf
+            self._restart_energy = np.inf
             return []
         s = self._settings
         recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
         if not (s.single_sensor_prior or self._target.starts_anywhere) \
                 and _n_sensors(frame, *recent) < 2:
             self.counts[ALONE] += 1
-            self._remember(frame)
+            self._store_frame(frame)
             return []
-        later = self._sensors_at(frame, s.max_sensors)
+        later_sensors = self._sensors_at(frame, s.max_sensors)
         n_at_start = sensors_at_start(s, self._network, self._target.model)
-        sensors = later if n_at_start >= len(later.rows) else self._sensors_at(frame, n_at_start)
+        sensors = later_sensors if n_at_start >= len(later_sensors.rows) \
+            else self._sensors_at(frame, n_at_start)
         bank_filter = BankFilter(sensors.network, self._target.model, s)
         bank = self._target.start(s, sensors.network, sensors.part_of(frame),
                                   bank_filter.observation.own_covariance)
@@ -288,17 +289,18 @@ class TrackManager:
             self.counts['frames without a start'] += 1
             return []
         self.counts['tracks'] += 1
-        in_tail = self._tail_until is not None
-        if in_tail:
+        is_in_tail = self._restart_energy is not None
+        if is_in_tail:
             self.counts[STARTED_IN_TAIL] += 1
-        self._tail_until, self._max_energy = None, _energy(frame)
+        self._restart_energy, self._max_energy = None, _energy(frame)
         track = RunningTrack(self._next_id, self._target, s, sensors, bank_filter, bank,
-                             self.counts, self._clocks, later)
+                             self.counts, self._clocks, later_sensors)
         self._next_id += 1
         self._tracks.append(track)
         track.doubt(self._doubtful_sensors(*recent, frame))
-        out = track.begin(frame, recent,
-                          approach_unobserved=in_tail or bool(recent) and _n_sensors(*recent) < 2)
+        out = track.begin(
+            frame, recent,
+            approach_unobserved=is_in_tail or bool(recent) and _n_sensors(*recent) < 2)
         return out + self._delete_ended(frame.stamp_ns)
 
     def _sensors_at(self, frame: FieldFrame, n: int) -> SensorSubset:

@@ -101,7 +101,7 @@ class Member:
         self.is_lost = False
         self.early: list[TrackState] = []
         self.slot = 0
-        self._spread = np.inf
+        self._position_std = np.inf
         self._unobserved_length = target.unobserved_length()
         self._was_unambiguous = False
         # Timestamps and positions of the latest published poses.
@@ -160,10 +160,10 @@ class Member:
         float, m
             0 if no position was published at these timestamps.
         """
-        at = dict(zip(stamps_ns, path, strict=True))
-        away = [float(np.hypot(*(place - at[stamp_ns])))
-                for stamp_ns, place in self._recent_positions if stamp_ns in at]
-        return float(np.mean(away)) if away else 0.0
+        position_at = dict(zip(stamps_ns, path, strict=True))
+        distances = [float(np.hypot(*(place - position_at[stamp_ns])))
+                     for stamp_ns, place in self._recent_positions if stamp_ns in position_at]
+        return float(np.mean(distances)) if distances else 0.0
 
     def publish(self, update: Update, view: View) -> Track:
         """Create and store the record of a frame.
@@ -177,31 +177,31 @@ class Member:
         -------
         Track
         """
-        self.last = self._published(update, view)
-        self._spread = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
+        self.last = self._create_record(update, view)
+        self._position_std = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
         self._was_unambiguous |= not self.last.ambiguous
         self._recent_positions.append((self.last.stamp_ns, self.last.position[:2]))
         self._counts['poses'] += 1
         return self.last
 
-    def _published(self, update: Update, view: View) -> Track:
+    def _create_record(self, update: Update, view: View) -> Track:
         """Update the evidence with a frame, and return its `Track`."""
         frame, dt, sensors, best = update.frame, update.dt, update.sensors, view.best
         measured: BoolArray = ~np.isnan(frame.field)
-        by = np.flatnonzero(measured.any(axis=1))
-        alone = len(sensors.network) > 1 and len(by) == 1
-        self.evidence.support(alone, dt)
+        measuring = np.flatnonzero(measured.any(axis=1))
+        is_single_sensor = len(sensors.network) > 1 and len(measuring) == 1
+        self.evidence.support(is_single_sensor, dt)
         if self._unobserved_length is not None:
             self._unobserved_length.update(
-                view.bank.x[best], view.bank.P[best], sensors.network.positions[by],
+                view.bank.x[best], view.bank.P[best], sensors.network.positions[measuring],
                 self.last is not None and (self.evidence.doubted or not self.last.ambiguous))
-        found = self.evidence.note(self._doubts(update, view, alone), frame.stamp_ns)
+        reasons = self.evidence.note(self._doubts(update, view, is_single_sensor), frame.stamp_ns)
         excess = 1.0 if self._target.starts_anywhere else self.evidence.innovations.excess
         return sensors.for_whole_network(published_track(
             view.bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self.evidence.existence, degrees_of_freedom=int(measured.sum()),
-            found=found, excess=excess, unobserved_length=self._unobserved_length,
+            found=reasons, excess=excess, unobserved_length=self._unobserved_length,
             difference=self.cross_check.difference,
             ambiguous_poses=update.settings.ambiguous_poses,
             predicted=update.bank_filter.predicted_field(update.bank, best, frame, dt),
@@ -224,29 +224,29 @@ class Member:
             or not self.evidence.bayes_factor.is_favoured(settings.min_bayes_factor) \
             or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
 
-    def _doubts(self, update: Update, view: View, alone: bool) -> set[str]:
-        """Update and return the doubts about a pose; `alone`: only one sensor measured."""
+    def _doubts(self, update: Update, view: View, is_single_sensor: bool) -> set[str]:
+        """Update and return the doubts about a pose."""
         bank, best, evidence, settings = view.bank, view.best, self.evidence, update.settings
-        found = evidence.doubts | ({doubts.ONE_SENSOR} if alone else set())
+        reasons = evidence.doubts | ({doubts.ONE_SENSOR} if is_single_sensor else set())
         if update.bank_filter.is_implausible(bank, best, update.frame):
-            found.add(doubts.MISFIT)
+            reasons.add(doubts.MISFIT)
         if not evidence.bayes_factor.is_favoured(settings.min_bayes_factor):
-            found.add(doubts.DISTURBANCE_MODEL)
+            reasons.add(doubts.DISTURBANCE_MODEL)
         # The field of a magnet at rest is as smooth as a disturbance, but its pose is correct.
         if self._target.starts_anywhere:
-            return found
-        found |= evidence.vehicle_doubts(
+            return reasons
+        reasons |= evidence.vehicle_doubts(
             bank.nis[best], int(np.count_nonzero(~np.isnan(update.frame.field))),
             settings.min_bayes_factor)
         if self._overfits(update, view):
-            found.add(doubts.OVERFIT)
-        found |= self.cross_check.doubts(self._clocks.apart_s(update.sensors.rows))
-        found |= self._plausibility.evaluate(
+            reasons.add(doubts.OVERFIT)
+        reasons |= self.cross_check.doubts(self._clocks.apart_s(update.sensors.rows))
+        reasons |= self._plausibility.evaluate(
             view.observation, bank, best, settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), update.dt)
-        for reason in found & doubts.PERMANENT:
+        for reason in reasons & doubts.PERMANENT:
             evidence.doubt(reason)
-        return found | evidence.doubts
+        return reasons | evidence.doubts
 
     def _overfits(self, update: Update, view: View) -> bool:
         """Update and return whether the filter fits the frames much better than its path."""
@@ -271,7 +271,7 @@ class Member:
         """
         assert self.last is not None
         is_coming = not self._target.starts_anywhere and sensors.is_approached_by(self.last)
-        return self.evidence.reason_to_end(self.last, self._spread, is_coming, settings)
+        return self.evidence.reason_to_end(self.last, self._position_std, is_coming, settings)
 
     def unexplained(self, uniform: float) -> UnexplainedField | None:
         """Field of the track, if a target never explained it.
@@ -373,5 +373,5 @@ def members_in_order(members: Sequence[Member], new: Member | None, joint: Joint
     first = n_one * len(others)
     paths = np.array([path[joint.bank.best(), first:] for path in joint.window.paths])
     stamps = [frame.stamp_ns for frame in joint.window.frames]
-    away = [old.distance_from(stamps, paths[:, k * n_one:k * n_one + 2]) for k in (0, 1)]
-    return [*others, old, new] if away[0] <= away[1] else [*others, new, old]
+    distances = [old.distance_from(stamps, paths[:, k * n_one:k * n_one + 2]) for k in (0, 1)]
+    return [*others, old, new] if distances[0] <= distances[1] else [*others, new, old]

@@ -34,10 +34,10 @@ class NewTargetEvidence:
 
     def __init__(self) -> None:
         self._latest = SlidingSum(WINDOW_S)
-        self._last_ns: int | None = None
+        self._last_comparison_ns: int | None = None
         self._was_probable = False
         self._was_rejected = self._is_long = False
-        self._long_wait_s = LONG_INTERVAL_S
+        self._long_interval_s = LONG_INTERVAL_S
 
     def add(self, nis: float, degrees_of_freedom: int, stamp_ns: int, rejected: bool,
             is_long: bool) -> None:
@@ -71,15 +71,16 @@ class NewTargetEvidence:
             `IMPROBABLE` or `LONG_VEHICLE`; None if no comparison is due.
         """
         total, freedom = self._latest.total
-        since = np.inf if self._last_ns is None else (stamp_ns - self._last_ns) / NS
+        elapsed_s = np.inf if self._last_comparison_ns is None \
+            else (stamp_ns - self._last_comparison_ns) / NS
         reason = None
         if self._was_rejected or chdtrc(max(freedom, 1.0), total) <= FALSE_ALARM:
-            reason = IMPROBABLE if since >= MIN_INTERVAL_S else None
-        elif self._is_long and since >= self._long_wait_s:
+            reason = IMPROBABLE if elapsed_s >= MIN_INTERVAL_S else None
+        elif self._is_long and elapsed_s >= self._long_interval_s:
             reason = LONG_VEHICLE
-            self._long_wait_s *= INTERVAL_GROWTH
+            self._long_interval_s *= INTERVAL_GROWTH
         if reason is not None:
-            self._last_ns = stamp_ns
+            self._last_comparison_ns = stamp_ns
         return reason
 
     def accepts(self, log_odds: float) -> bool:

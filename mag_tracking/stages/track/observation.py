@@ -194,8 +194,8 @@ class Observation:
         -------
         (n_hyp,) array, m
         """
-        away = np.linalg.norm(self.target_positions(x)[:, :, None] - self.positions, axis=3)
-        nearest: FloatArray = away.min(axis=(1, 2))
+        distances = np.linalg.norm(self.target_positions(x)[:, :, None] - self.positions, axis=3)
+        nearest: FloatArray = distances.min(axis=(1, 2))
         return nearest
 
     def target_positions(self, x: FloatArray) -> FloatArray:
@@ -209,9 +209,9 @@ class Observation:
         -------
         (n_hyp, n_targets, 3) array, m, world frame
         """
-        places: FloatArray = x[:, :self.n_target].reshape(
+        positions: FloatArray = x[:, :self.n_target].reshape(
             len(x), self.n_targets, self.n_one)[:, :, :3]
-        return places
+        return positions
 
     def drift(self, dt: FloatArray, background_density: float) -> tuple[FloatArray, FloatArray]:
         """Decay and process noise of the states of the sensors.
@@ -229,10 +229,10 @@ class Observation:
         variance : (..., (n_own + 3) n_sensors) array
             Added variance of each state.
         """
-        fading = np.exp(-np.abs(dt) / self._error_time) if self._error_time else np.ones(dt.shape)
-        variance: FloatArray = np.multiply.outer(1.0 - fading**2, self._is_error) \
+        decay = np.exp(-np.abs(dt) / self._error_time) if self._error_time else np.ones(dt.shape)
+        variance: FloatArray = np.multiply.outer(1.0 - decay**2, self._is_error) \
             + np.multiply.outer(background_density**2 * np.maximum(dt, 0.0), self._is_background)
-        return 1.0 - np.multiply.outer(1.0 - fading, self._is_error), variance
+        return 1.0 - np.multiply.outer(1.0 - decay, self._is_error), variance
 
     def target_fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -253,7 +253,7 @@ class Observation:
             independent.
         """
         h, H, gradients = zip(*(
-            self._field_of_one(x[:, first:first + self.n_one], time_offset)
+            self._single_target_field(x[:, first:first + self.n_one], time_offset)
             for first in range(0, self.n_target, self.n_one)), strict=True)
         # NaN if a dipole is at a sensor, like the field there, even if the length is zero.
         with np.errstate(invalid='ignore'):
@@ -261,7 +261,7 @@ class Observation:
                 near_field_length.T, gradients, strict=True))
         return sum(h[1:], h[0]), np.concatenate(H, axis=3), np.asarray(variance)
 
-    def _field_of_one(self, x: FloatArray, time_offset: FloatArray
+    def _single_target_field(self, x: FloatArray, time_offset: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Field of one target with states (n_hyp, n_one); see `sensor_fields`."""
         n_hyp, n, n_t = len(x), len(self.positions), self.n_one
@@ -296,7 +296,7 @@ class Observation:
         n = self.n_one
         h, H = np.zeros((1, *self.positions.shape)), np.zeros((1, *self.positions.shape, 0))
         for target in targets:
-            h = h + self._field_of_one(x[None, target * n:(target + 1) * n], time_offset)[0]
+            h = h + self._single_target_field(x[None, target * n:(target + 1) * n], time_offset)[0]
         if self.n_angles:
             h, _ = rotated_fields(h, H, np.ascontiguousarray(self.own(x[None])[..., :3]))
         field: FloatArray = h[0]
@@ -330,15 +330,15 @@ class Observation:
         [ICASSP11]_ eq. (9).
         """
         h, H, variance = self.target_fields(x, time_offset, near_field_length)
-        variance = variance + _share_of_field(h, field_error)
+        variance = variance + _proportional_variance(h, field_error)
         own = self.own(x)
         if self.n_angles:
             h, H = rotated_fields(h, H, np.ascontiguousarray(own[..., :3]))
         if not self._error_time:
             return h, H, variance
-        size = np.sqrt(variance)[:, :, None]
-        h = h + size * own[..., -3:]
-        H = np.concatenate([H, size[..., None] * np.eye(3)], axis=3)
+        std = np.sqrt(variance)[:, :, None]
+        h = h + std * own[..., -3:]
+        H = np.concatenate([H, std[..., None] * np.eye(3)], axis=3)
         return h, H, np.zeros_like(variance)
 
     def model_error(self, x: FloatArray, near_field_length: FloatArray, field_error: float
@@ -359,10 +359,10 @@ class Observation:
         """
         h, _, variance = self.target_fields(x[None], np.zeros(len(self.positions)),
                                             near_field_length[None])
-        return np.asarray(variance[0] + _share_of_field(h, field_error)[0])
+        return np.asarray(variance[0] + _proportional_variance(h, field_error)[0])
 
 
-def _share_of_field(h: FloatArray, field_error: float) -> FloatArray:
+def _proportional_variance(h: FloatArray, field_error: float) -> FloatArray:
     """Variance (n_hyp, n_sensors) [T^2] of a model error that is proportional to the field."""
     variance: FloatArray = field_error**2 * np.einsum('pji,pji->pj', h, h)
     return variance

@@ -81,12 +81,12 @@ class PassSamples:
         PassSamples
         """
         c, s = np.cos(path[4]), np.sin(path[4])
-        way = self.t[:, None] * np.array([c * path[3], s * path[3], path[5]])
-        share = np.maximum(MODEL_ERROR, NEAR_ERROR_LENGTH / np.linalg.norm(
-            self.positions - path[:3] - way, axis=1))
+        displacement = self.t[:, None] * np.array([c * path[3], s * path[3], path[5]])
+        relative_error = np.maximum(MODEL_ERROR, NEAR_ERROR_LENGTH / np.linalg.norm(
+            self.positions - path[:3] - displacement, axis=1))
         # The noise that whitens the signal already includes the smaller model error.
         signal = np.square(np.linalg.norm(self.y.reshape(-1, 3), axis=1))
-        weight = 1.0 / np.sqrt(1.0 + (share**2 - MODEL_ERROR**2) * signal)
+        weight = 1.0 / np.sqrt(1.0 + (relative_error**2 - MODEL_ERROR**2) * signal)
         rows = np.repeat(weight, 3)
         return replace(self, M=self.M * weight[:, None, None], y=self.y * rows,
                        backgrounds=self.backgrounds * rows[:, None])
@@ -118,18 +118,18 @@ class PassSamples:
         C = np.array([known_covariance(f.covariance)[compared] for f in frames]).reshape(-1, 3, 3)
         t = np.array([(f.stamp_ns - stamp_ns) / NS + f.time_offset[compared] for f in frames])
         y = field[:, compared].reshape(-1, 3)
-        there = ~np.isnan(y)
+        is_present = ~np.isnan(y)
         of_sensor = np.tile(np.arange(n), len(frames))
         error = MODEL_ERROR**2 * energy[:, compared].ravel()
         W = np.linalg.inv(np.linalg.cholesky(C + error[:, None, None] * np.eye(3)))
-        W = W * there[:, :, None] * there[:, None, :]
-        level = np.zeros((len(y), 3, n, 3))
-        level[np.arange(len(y)), :, of_sensor] = W
-        columns = level.reshape(3 * len(y), 3 * n)
+        W = W * is_present[:, :, None] * is_present[:, None, :]
+        background_columns = np.zeros((len(y), 3, n, 3))
+        background_columns[np.arange(len(y)), :, of_sensor] = W
+        columns = background_columns.reshape(3 * len(y), 3 * n)
         return cls(compared, np.nan_to_num(t).ravel(), network.positions[compared][of_sensor],
                    W @ network.R_sw[compared][of_sensor], of_sensor - 1,
                    np.einsum('nij,nj->ni', W, np.nan_to_num(y)).ravel(),
-                   columns[:, columns.any(axis=0)], int(np.count_nonzero(there)))
+                   columns[:, columns.any(axis=0)], int(np.count_nonzero(is_present)))
 
     def fit(self, n_dipoles: int, free: IntArray, starts: FloatArray
             ) -> tuple[FloatArray, float, FloatArray]:

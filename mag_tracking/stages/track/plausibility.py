@@ -37,7 +37,7 @@ class Plausibility:
         # Per origin of a hypothesis: smallest distance to a sensor so far, and whether the path was
         # off the road there.
         self._nearest: FloatArray = np.zeros(0)
-        self._was_beside: BoolArray = np.zeros(0, dtype=bool)
+        self._was_off_road: BoolArray = np.zeros(0, dtype=bool)
 
     def evaluate(self, observation: Observation, bank: FilterBank, best: int,
                  settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
@@ -62,35 +62,35 @@ class Plausibility:
         """
         x, kind = bank.x[best], int(bank.kind[best])
         self._update_road_check(bank, settings, observation.positions)
-        found = set()
+        reasons = set()
         if _needs_rotated_sensors(observation, x, mounting_std):
-            found.add(doubts.SENSORS_ROTATED)
-        off = abs(float(x[2]) - settings.heights[kind])
-        if off > -ndtri(P_HEIGHT / 2.0) * settings.height_stds[kind]:
-            found.add(doubts.HEIGHT)
-        if self._was_beside[bank.origin[best]] or _passes_beside(
+            reasons.add(doubts.SENSORS_ROTATED)
+        height_error = abs(float(x[2]) - settings.heights[kind])
+        if height_error > -ndtri(P_HEIGHT / 2.0) * settings.height_stds[kind]:
+            reasons.add(doubts.HEIGHT)
+        if self._was_off_road[bank.origin[best]] or _is_off_road(
                 x[None], settings, observation.positions, LANE_STDS_LATER)[0]:
-            found.add(doubts.OFF_THE_ROAD)
+            reasons.add(doubts.OFF_THE_ROAD)
         if moves_too_far(x[:3], x[3:6], dt, observation.positions):
-            found.add(doubts.FRAMES_TOO_LONG)
-        return found
+            reasons.add(doubts.FRAMES_TOO_LONG)
+        return reasons
 
     def _update_road_check(self, bank: FilterBank, settings: VehicleSettings,
                            positions: FloatArray) -> None:
         """Update the closest point of each hypothesis, and whether it was off the road there."""
-        more = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
-        self._nearest = np.append(self._nearest, np.full(more, np.inf))
-        self._was_beside = np.append(self._was_beside, np.zeros(more, dtype=bool))
+        n_added = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
+        self._nearest = np.append(self._nearest, np.full(n_added, np.inf))
+        self._was_off_road = np.append(self._was_off_road, np.zeros(n_added, dtype=bool))
         distance = np.hypot(*(positions[:, :2, None] - bank.x[:, :2].T).transpose(1, 0, 2))
         nearest = distance.min(axis=0)
-        is_nearest = (nearest <= self._nearest[bank.origin]) & _moves(bank.x)
-        beside = _passes_beside(bank.x[is_nearest], settings, positions, LANE_STDS)
-        of_those = bank.origin[is_nearest]
-        self._nearest[of_those], self._was_beside[of_those] = nearest[is_nearest], beside
+        is_nearest = (nearest <= self._nearest[bank.origin]) & _is_moving(bank.x)
+        is_off_road = _is_off_road(bank.x[is_nearest], settings, positions, LANE_STDS)
+        origins = bank.origin[is_nearest]
+        self._nearest[origins], self._was_off_road[origins] = nearest[is_nearest], is_off_road
 
 
-def _passes_beside(x: FloatArray, settings: VehicleSettings, positions: FloatArray,
-                   deviations: float) -> BoolArray:
+def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray,
+                 n_stds: float) -> BoolArray:
     """Whether states (n, n_x) pass all sensors (n_sensors, 3) on one side, beyond the lanes.
 
     The distance of such a vehicle is hardly observable. A train on another line resembles a truck
@@ -102,21 +102,21 @@ def _passes_beside(x: FloatArray, settings: VehicleSettings, positions: FloatArr
     centre.
     """
     speed = np.maximum(np.hypot(x[:, 3], x[:, 4]), MIN_SPEED)
-    away = positions[:, :2, None] - x[:, :2].T
-    aside = (x[:, 3] * away[:, 1] - x[:, 4] * away[:, 0]) / speed
+    offsets = positions[:, :2, None] - x[:, :2].T
+    lateral = (x[:, 3] * offsets[:, 1] - x[:, 4] * offsets[:, 0]) / speed
     outermost = max(map(abs, settings.lateral_offsets))
-    half_width = np.ptp(aside, axis=0) / 2.0
-    edge = np.maximum(outermost + deviations * settings.lateral_std,
+    half_width = np.ptp(lateral, axis=0) / 2.0
+    edge = np.maximum(outermost + n_stds * settings.lateral_std,
                       half_width + np.minimum(outermost, half_width - outermost))
-    on_one_side = (aside > 0.0).all(axis=0) | (aside < 0.0).all(axis=0)
-    beside: BoolArray = on_one_side & (np.abs(aside.mean(axis=0)) > edge) & _moves(x)
-    return beside
+    on_one_side = (lateral > 0.0).all(axis=0) | (lateral < 0.0).all(axis=0)
+    is_off_road: BoolArray = on_one_side & (np.abs(lateral.mean(axis=0)) > edge) & _is_moving(x)
+    return is_off_road
 
 
-def _moves(x: FloatArray) -> BoolArray:
+def _is_moving(x: FloatArray) -> BoolArray:
     """Whether states (n, n_x) are fast enough to have a heading."""
-    moves: BoolArray = np.hypot(x[:, 3], x[:, 4]) >= MIN_SPEED
-    return moves
+    is_moving: BoolArray = np.hypot(x[:, 3], x[:, 4]) >= MIN_SPEED
+    return is_moving
 
 
 def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray
@@ -136,9 +136,9 @@ def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positio
     -------
     bool
     """
-    away = np.sort(np.linalg.norm(position - positions, axis=1))
-    way = float(np.hypot(velocity[0], velocity[1])) * dt
-    return len(away) > 1 and bool(way > MAX_RELATIVE_MOVE * away[1])
+    distances = np.sort(np.linalg.norm(position - positions, axis=1))
+    displacement = float(np.hypot(velocity[0], velocity[1])) * dt
+    return len(distances) > 1 and bool(displacement > MAX_RELATIVE_MOVE * distances[1])
 
 
 def _needs_rotated_sensors(observation: Observation, x: FloatArray, mounting_std: float) -> bool:

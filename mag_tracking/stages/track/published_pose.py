@@ -306,12 +306,12 @@ def mixture_uncertainty(bank: FilterBank, best: int, apart: BoolArray, model: So
     weight = np.exp(log_w[rows])
     rotations = rotation_vectors_between(published['orientation'],
                                          orientation.quaternions(bank.x[rows, :n_t]))
-    moved = bank.x[rows, :3] - bank.x[best, :3]
+    displacement = bank.x[rows, :3] - bank.x[best, :3]
     return PoseUncertainty(
         covariance, published['orientation_covariance']
         + np.einsum('n,ni,nj->ij', weight, rotations, rotations),
         (1.0 - weight.sum()) * published['position_orientation_covariance']
-        + np.einsum('n,ni,nj->ij', weight, moved, rotations))
+        + np.einsum('n,ni,nj->ij', weight, displacement, rotations))
 
 
 def pose_uncertainty(fields: PoseFields) -> PoseUncertainty:
@@ -344,12 +344,12 @@ def ambiguities(bank: FilterBank, best: int, apart: BoolArray) -> set[str]:
     -------
     set of str
     """
-    found = set()
+    reasons = set()
     if bank.weight(apart) > AMBIGUOUS_WEIGHT:
-        found.add(doubts.ANOTHER_PLACE)
+        reasons.add(doubts.ANOTHER_PLACE)
     if 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > AMBIGUOUS_WEIGHT:
-        found.add(doubts.ANOTHER_ARRIVAL)
-    return found
+        reasons.add(doubts.ANOTHER_ARRIVAL)
+    return reasons
 
 
 def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray, *,
@@ -400,9 +400,9 @@ def _pose_fields(model: SourceModel, orientation: Orientation, x: FloatArray, P:
         # A negative length describes the same row from its other end.
         length, length_std = abs(float(x[L])), float(np.sqrt(max(P[L, L], 0.0)))
     if unobserved_length is not None:
-        of_middle = unobserved_length.covariance(x, P, length, kind)
+        middle_covariance = unobserved_length.covariance(x, P, length, kind)
         P = P.copy()
-        P[:2, :2] += of_middle
+        P[:2, :2] += middle_covariance
     P = inflated_to_cover(P, difference)
     q, T, unobserved, flags = orientation(x, P)
     return {'position': x[:3].copy(), 'velocity': x[3:6].copy(), 'covariance': P[:6, :6].copy(),

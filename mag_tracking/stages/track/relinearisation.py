@@ -120,7 +120,7 @@ class Relinearisation:
         """
         if not self._window_ns:
             return
-        self._anchor, self._updated = anchor, False
+        self._anchor, self._is_updated = anchor, False
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
         # For each frame and each hypothesis of the anchor: state of the linearisation, and
@@ -129,12 +129,12 @@ class Relinearisation:
         self._log_likelihoods: list[FloatArray] = []
         self._evidence: list[float] = []
         self._last_ns: int | None = None
-        self._stale = False
+        self._is_stale = False
         self._gain = {}
 
     def restart(self) -> None:
         """Start a new window at the next frame, because the filter has changed."""
-        self._stale = self._anchor is not None
+        self._is_stale = self._anchor is not None
 
     def add(self, bank: FilterBank, predicted: FloatArray, log_likelihood: FloatArray,
             evidence: float, frame: FieldFrame, dt: float) -> None:
@@ -155,11 +155,11 @@ class Relinearisation:
         """
         if self._anchor is None:
             return
-        if self._stale:
+        if self._is_stale:
             self.begin(bank.copy())
-            self._updated = True
+            self._is_updated = True
         if len(bank) < len(self._anchor) // 2:
-            self._keep(self._anchor, np.isin(self._anchor.origin, bank.origin))
+            self._keep_hypotheses(self._anchor, np.isin(self._anchor.origin, bank.origin))
         rows = _rows(self._anchor, bank)
         path, of_frame = self._anchor.x.copy(), np.full(len(self._anchor), -np.inf)
         path[rows], of_frame[rows] = predicted, log_likelihood
@@ -171,7 +171,7 @@ class Relinearisation:
         if self._last_ns is None:
             self._last_ns = frame.stamp_ns
 
-    def _keep(self, anchor: FilterBank | InitialBank, mask: BoolArray) -> None:
+    def _keep_hypotheses(self, anchor: FilterBank | InitialBank, mask: BoolArray) -> None:
         """Keep only the hypotheses of the anchor in `mask`."""
         anchor.keep(mask)
         self._paths = [path[mask] for path in self._paths]
@@ -196,37 +196,38 @@ class Relinearisation:
                 or self._frames[-1].stamp_ns - self._last_ns < self._interval_ns:
             return Counter()
         self._last_ns = self._frames[-1].stamp_ns
-        anchor = self._slide(bank_filter, anchor, bank)
-        if self._updated and len(self._frames) == 1:
+        anchor = self._move_window(bank_filter, anchor, bank)
+        if self._is_updated and len(self._frames) == 1:
             return Counter()
-        leading = self._leading(bank)
+        leading = self._leading_rows(bank)
         rows = _rows(anchor, bank)[leading]
-        last = anchor.rows(rows)
+        ends = anchor.rows(rows)
         paths = np.stack([path[rows] for path in self._paths], axis=1)
-        along = self._run_along(bank_filter, last, paths, PASSES)
-        finite = np.isfinite(along.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
+        along = self._run_along(bank_filter, ends, paths, PASSES)
+        is_finite = np.isfinite(along.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
         for path, improved in zip(self._paths, np.swapaxes(paths, 0, 1), strict=True):
-            path[rows[finite]] = improved[finite]
-        filtered = np.sum(self._log_likelihoods[int(self._updated):], axis=0)[rows]
-        gain = np.subtract(along.log_likelihood, filtered, where=finite,
+            path[rows[is_finite]] = improved[is_finite]
+        filtered = np.sum(self._log_likelihoods[int(self._is_updated):], axis=0)[rows]
+        gain = np.subtract(along.log_likelihood, filtered, where=is_finite,
                            out=np.full(len(rows), -np.inf))
-        self._gain = dict(zip(anchor.origin[rows[finite]].tolist(), gain[finite].tolist(),
+        self._gain = dict(zip(anchor.origin[rows[is_finite]].tolist(), gain[is_finite].tolist(),
                               strict=True))
         converged = along.unsettled <= CONVERGED
-        accepted = finite & converged & ((gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
-        _replace_states(bank, leading[accepted], last.x[accepted], last.P[accepted])
-        rest = finite & ~accepted
-        _widen_covariances(bank, leading[rest], last.x[rest], last.P[rest],
+        is_accepted = is_finite & converged & (
+            (gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
+        _replace_states(bank, leading[is_accepted], ends.x[is_accepted], ends.P[is_accepted])
+        is_rejected = is_finite & ~is_accepted
+        _widen_covariances(bank, leading[is_rejected], ends.x[is_rejected], ends.P[is_rejected],
                            bank_filter.nearly_linear)
-        return Counter({ATTEMPTED: len(accepted), FAILED: int(np.count_nonzero(~accepted))})
+        return Counter({ATTEMPTED: len(is_accepted), FAILED: int(np.count_nonzero(~is_accepted))})
 
     @property
     def window(self) -> Window | None:
         """Frames and paths of the window; None if it is empty."""
-        if self._anchor is None or self._stale or not self._frames:
+        if self._anchor is None or self._is_stale or not self._frames:
             return None
-        begin = int(self._updated)
-        return Window(self._anchor, self._updated, self._frames, self._intervals, self._paths,
+        begin = int(self._is_updated)
+        return Window(self._anchor, self._is_updated, self._frames, self._intervals, self._paths,
                       self._log_likelihoods, float(sum(self._evidence[begin:])),
                       self._max_hypotheses)
 
@@ -244,7 +245,7 @@ class Relinearisation:
         n : int
             Index of the first frame in which the target is not detectable. The window begins there.
         """
-        if self._anchor is None or self._stale or n >= len(self._frames):
+        if self._anchor is None or self._is_stale or n >= len(self._frames):
             self.restart()
             return
         anchor = self._move_to(bank_filter, self._anchor, bank, n)
@@ -262,7 +263,7 @@ class Relinearisation:
         window : Window
         """
         self.begin(window.anchor)
-        self._updated = window.is_updated
+        self._is_updated = window.is_updated
         self._frames, self._intervals = list(window.frames), list(window.intervals)
         self._paths, self._log_likelihoods = list(window.paths), list(window.log_likelihoods)
         n = len(window.frames)
@@ -284,15 +285,15 @@ class Relinearisation:
         """
         return self._gain.get(origin, 0.0)
 
-    def _leading(self, bank: FilterBank) -> IntArray:
+    def _leading_rows(self, bank: FilterBank) -> IntArray:
         """Indices of the heaviest hypotheses, up to the maximum number."""
-        affordable = MAX_ELEMENTS // (len(self._frames) * bank.x.shape[1]**2)
+        n_affordable = MAX_ELEMENTS // (len(self._frames) * bank.x.shape[1]**2)
         order = np.argsort(-bank.log_w, kind='stable')
         leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - MAX_LOG_RATIO]
-        return leading[:max(1, min(self._max_hypotheses, affordable))]
+        return leading[:max(1, min(self._max_hypotheses, n_affordable))]
 
-    def _slide(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
-               bank: FilterBank) -> FilterBank | InitialBank:
+    def _move_window(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
+                     bank: FilterBank) -> FilterBank | InitialBank:
         """Shorten the window to its nominal duration once the frames cover twice this duration."""
         now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
         if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MAX_FRAMES:
@@ -304,13 +305,13 @@ class Relinearisation:
     def _move_to(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
                  bank: FilterBank, n: int) -> FilterBank:
         """Move the anchor to frame `n`, the new start of the window."""
-        self._keep(anchor, np.isin(anchor.origin, bank.origin))
+        self._keep_hypotheses(anchor, np.isin(anchor.origin, bank.origin))
         moved = self._anchor = anchor.rows(np.arange(len(anchor)))
         self._run_along(bank_filter, moved, np.stack(self._paths[:n + 1], axis=1), 1)
         self._frames, self._intervals = self._frames[n:], self._intervals[n:]
         self._paths, self._log_likelihoods = self._paths[n:], self._log_likelihoods[n:]
         self._evidence = self._evidence[n:]
-        self._updated = True
+        self._is_updated = True
         return moved
 
     def _run_along(self, bank_filter: BankFilter, bank: FilterBank, paths: FloatArray,
@@ -319,14 +320,14 @@ class Relinearisation:
         n = paths.shape[1]
         return bank_filter.run_along(
             bank, self._frames[:n], self._intervals[:n], paths, passes=passes, step=STEP_SIZE,
-            first_is_updated=self._updated)
+            first_is_updated=self._is_updated)
 
 
 def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
     """Replace states of the bank, in place; each keeps the larger of its covariance and `P`."""
-    own, path = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
+    bank_variance, path_variance = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
     bank.x[rows] = x
-    bank.P[rows[path > own]] = P[path > own]
+    bank.P[rows[path_variance > bank_variance]] = P[path_variance > bank_variance]
 
 
 def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
@@ -336,10 +337,11 @@ def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: Float
     Covariances that are too large for the next linear update are not adopted.
     """
     difference = x - bank.x[rows]
-    apart = P + difference[:, :, None] * difference[:, None]
-    own, path, both = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P, apart))
-    wider = (path > own) & (both < np.square(nearly_linear(bank.x[rows])))
-    bank.P[rows[wider]] = apart[wider]
+    wide_P = P + difference[:, :, None] * difference[:, None]
+    own_variance, path_variance, total = (
+        np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P, wide_P))
+    is_wider = (path_variance > own_variance) & (total < np.square(nearly_linear(bank.x[rows])))
+    bank.P[rows[is_wider]] = wide_P[is_wider]
 
 
 def _rows(anchor: FilterBank | InitialBank, bank: FilterBank) -> IntArray:

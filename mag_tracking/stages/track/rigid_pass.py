@@ -122,9 +122,9 @@ class RigidPass:
         -------
         (3,) array, m
         """
-        away = positions - self.position
+        offsets = positions - self.position
         square = max(float(self.velocity @ self.velocity), 1e-12)
-        places = self.position + (away @ self.velocity / square)[:, None] * self.velocity
+        places = self.position + (offsets @ self.velocity / square)[:, None] * self.velocity
         nearest: FloatArray = places[np.argmin(np.linalg.norm(places - positions, axis=1))]
         return nearest
 
@@ -182,8 +182,8 @@ class RigidPass:
         if not self.is_explained or offset > MAX_OFFSET or offset * self.speed < MIN_DISTANCE:
             return False
         gains = np.array([self.straight - self.apart, self.bent - self.apart]) / self.widening
-        improbable = float(np.nansum(np.square(self.offset / OFFSET_STD)))
-        return bool((gains - improbable > chdtri(self.n_clocks, [P_CLOCKS, P_BEND])).all())
+        prior_cost = float(np.nansum(np.square(self.offset / OFFSET_STD)))
+        return bool((gains - prior_cost > chdtri(self.n_clocks, [P_CLOCKS, P_BEND])).all())
 
     @property
     def is_straight(self) -> bool:
@@ -219,17 +219,17 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
                       np.arctan2(starts[:, 4], starts[:, 3]), starts[:, 5],
                       np.full(len(starts), LENGTH)], axis=1)
     straight, cost, _ = data.fit(N_SHORT, _STRAIGHT, first)
-    bends, apart_from = straight[None, _BENT], [(straight[_STRAIGHT], SMALL_OFFSET)]
+    bends, offset_starts = straight[None, _BENT], [(straight[_STRAIGHT], SMALL_OFFSET)]
     if cost > GOOD_MISFIT * (data.n_free(N_SHORT) - N_STRAIGHT):
         # If the vehicle turned, or if the clock offsets are large, the straight path is misleading.
         bends = np.vstack([bends, [np.append(first[0], [0.0, turn, 0.0])
                                    for turn in (-TURN, TURN)]])
-        apart_from.append((first[0], LARGE_OFFSET))
+        offset_starts.append((first[0], LARGE_OFFSET))
     clocks = np.array([np.append(p, np.full(n_clocks, sign * offset))
-                       for p, offset in apart_from for sign in (-1.0, 1.0)])
+                       for p, offset in offset_starts for sign in (-1.0, 1.0)])
     path, bent, _ = data.fit(N_SHORT, _BENT, bends)
     short = _RowFits(_state_at_zero(straight), cost, bent, data.n_free(N_SHORT) - N_PATH)
-    long = _long_row(data, straight, path, short.misfit > GOOD_MISFIT)
+    long = _fit_long_row(data, straight, path, short.misfit > GOOD_MISFIT)
     misfit = short.misfit if short.misfit <= GOOD_MISFIT else min(short.misfit, long.misfit)
     straight_paths = [f.straight for f in (short, long) if f.needs_no_bend
                       and _is_of_vehicle(f.straight, data.positions)]
@@ -240,9 +240,9 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     offset, std = np.full(len(network), np.nan), np.full(len(network), np.nan)
     # An unobservable offset has zero variance in a pseudo-inverse.
     variance = np.diagonal(P)[N_STRAIGHT:]
-    known = np.append(True, variance > 0.0)
-    offset[data.compared[known]] = np.append(0.0, path[N_PATH:])[known]
-    std[data.compared[known]] = np.sqrt(np.append(0.0, variance))[known]
+    is_known = np.append(True, variance > 0.0)
+    offset[data.compared[is_known]] = np.append(0.0, path[N_PATH:])[is_known]
+    std[data.compared[is_known]] = np.sqrt(np.append(0.0, variance))[is_known]
     x = _state_at_zero(path)
     return RigidPass(stamp_ns, cost, bent, apart, data.n_free(N_SHORT) - len(free), misfit,
                      int(data.compared[0]), offset, std, x[:3], x[3:],
@@ -273,15 +273,15 @@ class _RowFits(NamedTuple):
                     and gain <= chdtri(n_more, P_BEND))
 
 
-def _long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, thorough: bool
+def _fit_long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, adds_starts: bool
               ) -> _RowFits:
-    """Fit a long row, starting from the paths of a short row; `thorough` adds starts."""
+    """Fit a long row, starting from the paths of a short row; `adds_starts` adds starts."""
     near = data.with_near_field_error(bent)
     starts = np.array([straight, bent, straight, bent])
     starts[2:, PATH.index('length')] = LONG_LENGTH
     path, cost, _ = near.fit(N_LONG, _STRAIGHT, starts[::2, _STRAIGHT])
-    also = starts[[0, 1, 3]] if thorough else starts[:0]
-    _, cost_bent, _ = near.fit(N_LONG, _BENT, np.vstack([path[None, _BENT], also[:, _BENT]]))
+    extra = starts[[0, 1, 3]] if adds_starts else starts[:0]
+    _, cost_bent, _ = near.fit(N_LONG, _BENT, np.vstack([path[None, _BENT], extra[:, _BENT]]))
     return _RowFits(_state_at_zero(path), cost, cost_bent, data.n_free(N_LONG) - N_PATH)
 
 

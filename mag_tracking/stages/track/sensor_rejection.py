@@ -67,55 +67,57 @@ class SensorRejection:
         # Copying all states takes as long as the update. If the frame fits the hypothesis that
         # leads before the update, it usually also fits the hypothesis that leads afterwards.
         may_contradict = not self._fits_leader(bank_filter, bank, frame, dt)
-        before = bank.x, bank.P
+        prior = bank.x, bank.P
         predicted, log_likelihood = bank_filter.advance(bank, frame, dt, keeps_prior=may_contradict)
         if not may_contradict or self._fits(bank_filter, bank, frame, log_likelihood):
             self._rejected = ()
             return predicted, log_likelihood, frame, Counter()
-        whole = bank.x, bank.P, bank.nis, log_likelihood
-        for rejected in self._candidates(bank_filter, bank, before, frame, dt):
-            log_likelihood, less = self._without(bank_filter, bank, before, frame, dt, rejected)
-            if self._fits(bank_filter, bank, less, log_likelihood):
+        full_update = bank.x, bank.P, bank.nis, log_likelihood
+        for rejected in self._candidates(bank_filter, bank, prior, frame, dt):
+            log_likelihood, reduced = self._update_without(
+                bank_filter, bank, prior, frame, dt, rejected)
+            if self._fits(bank_filter, bank, reduced, log_likelihood):
                 self._rejected = rejected
-                return predicted, log_likelihood, less, Counter(
+                return predicted, log_likelihood, reduced, Counter(
                     {f'frames in which {self._names[j]} was rejected': 1 for j in rejected})
         self._rejected = ()
-        bank.x, bank.P, bank.nis, log_likelihood = whole
+        bank.x, bank.P, bank.nis, log_likelihood = full_update
         return predicted, log_likelihood, frame, Counter()
 
-    def _candidates(self, bank_filter: BankFilter, bank: FilterBank, before: _States,
+    def _candidates(self, bank_filter: BankFilter, bank: FilterBank, prior: _States,
                     frame: FieldFrame, dt: float) -> Iterator[tuple[int, ...]]:
         """Sets of sensor indices to be rejected, the most suspect first."""
         present = np.flatnonzero(~np.isnan(frame.field).all(axis=1)).tolist()
         max_rejected = max(1, len(present) // SENSORS_PER_REJECTION) if len(present) > 1 else 0
         # The sensors rejected in the previous frame are tried first.
-        again = tuple(j for j in self._rejected if j in present)
-        if again and len(again) <= max_rejected:
-            yield again
-        found: tuple[int, ...] = ()
-        while len(found) < max_rejected:
+        previous = tuple(j for j in self._rejected if j in present)
+        if previous and len(previous) <= max_rejected:
+            yield previous
+        rejected: tuple[int, ...] = ()
+        while len(rejected) < max_rejected:
             # The next candidate is the sensor without which the other sensors fit best.
             misfit: dict[tuple[int, ...], float] = {}
             for j in present:
-                if j not in found:
-                    tried = (*found, j)
-                    log_likelihood, less = self._without(
-                        bank_filter, bank, before, frame, dt, tried)
-                    misfit[tried] = _misfit(bank, less, log_likelihood)
-            found = min(misfit, key=misfit.__getitem__)
-            yield found
+                if j not in rejected:
+                    candidate = (*rejected, j)
+                    log_likelihood, reduced = self._update_without(
+                        bank_filter, bank, prior, frame, dt, candidate)
+                    misfit[candidate] = _misfit(bank, reduced, log_likelihood)
+            rejected = min(misfit, key=misfit.__getitem__)
+            yield rejected
 
     @staticmethod
-    def _without(bank_filter: BankFilter, bank: FilterBank, before: _States, frame: FieldFrame,
-                 dt: float, rejected: tuple[int, ...]) -> tuple[FloatArray, FieldFrame]:
+    def _update_without(bank_filter: BankFilter, bank: FilterBank, prior: _States,
+                        frame: FieldFrame, dt: float, rejected: tuple[int, ...]
+                        ) -> tuple[FloatArray, FieldFrame]:
         """Repeat the update without some sensors; return log-likelihoods and the used frame."""
-        missing = np.isin(np.arange(len(frame.field)), rejected)
-        less = replace(frame, field=np.where(missing[:, None], np.nan, frame.field),
-                       covariance=np.where(missing[:, None, None], np.nan, frame.covariance),
-                       n_samples=np.where(missing, 0, frame.n_samples),
-                       time_offset=np.where(missing, 0.0, frame.time_offset))
-        bank.x, bank.P = before
-        return bank_filter.advance(bank, less, dt, keeps_prior=True)[1], less
+        is_missing = np.isin(np.arange(len(frame.field)), rejected)
+        reduced = replace(frame, field=np.where(is_missing[:, None], np.nan, frame.field),
+                          covariance=np.where(is_missing[:, None, None], np.nan, frame.covariance),
+                          n_samples=np.where(is_missing, 0, frame.n_samples),
+                          time_offset=np.where(is_missing, 0.0, frame.time_offset))
+        bank.x, bank.P = prior
+        return bank_filter.advance(bank, reduced, dt, keeps_prior=True)[1], reduced
 
     @classmethod
     def _fits_leader(cls, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,

@@ -50,8 +50,8 @@ def offset_from_nearest(place: FloatArray, positions: FloatArray) -> FloatArray:
     -------
     (2,) array, m
     """
-    away: FloatArray = place - positions[nearest_sensors(positions, place, 1)[0], :2]
-    return away
+    offset: FloatArray = place - positions[nearest_sensors(positions, place, 1)[0], :2]
+    return offset
 
 
 def part_of_frame(frame: FieldFrame, rows: IntArray) -> FieldFrame:
@@ -142,8 +142,8 @@ class SensorSubset:
             The same object if it contains the nearer half of these sensors.
         """
         place = state[:2] + PREDICTION_S * state[3:5]
-        serve = np.isin(nearest_sensors(self.whole.positions, place, n // 2), self.rows).all()
-        return self if serve else SensorSubset.near(self.whole, place, n)
+        is_enough = np.isin(nearest_sensors(self.whole.positions, place, n // 2), self.rows).all()
+        return self if is_enough else SensorSubset.near(self.whole, place, n)
 
     def is_approached_by(self, track: Track) -> bool:
         """Whether a track moves towards its nearest sensor.
@@ -156,8 +156,8 @@ class SensorSubset:
         -------
         bool
         """
-        away = offset_from_nearest(track.position[:2], self.network.positions)
-        return bool(away @ track.velocity[:2] < 0.0)
+        offset = offset_from_nearest(track.position[:2], self.network.positions)
+        return bool(offset @ track.velocity[:2] < 0.0)
 
     def for_whole_network(self, track: Track, settings: TrackSettings) -> Track:
         """Extend a track of these sensors to the whole network.
@@ -195,12 +195,12 @@ def exchange_sensor_states(bank: FilterBank, before: IntArray, after: IntArray,
     n_own = own_covariance.shape[1]
     n_t = bank.x.shape[1] - (n_own + 3) * len(before)
     old, new = [_state_columns(n_t, n_own, len(rows)) for rows in (before, after)]
-    kept = [(list(before).index(row), k) for k, row in enumerate(after) if row in before]
-    source = np.concatenate([np.arange(n_t), *(old[j] for j, _ in kept)])
-    target = np.concatenate([np.arange(n_t), *(new[k] for _, k in kept)])
+    common = [(list(before).index(row), k) for k, row in enumerate(after) if row in before]
+    source = np.concatenate([np.arange(n_t), *(old[j] for j, _ in common)])
+    target = np.concatenate([np.arange(n_t), *(new[k] for _, k in common)])
     n_x = n_t + (n_own + 3) * len(after)
     x, P = np.zeros((len(bank), n_x)), np.zeros((len(bank), n_x, n_x))
-    for k in set(range(len(after))) - {k for _, k in kept}:
+    for k in set(range(len(after))) - {k for _, k in common}:
         own, background = new[k][:n_own], new[k][n_own:]
         P[:, own[:, None], own] = own_covariance[k]
         P[:, background, background] = background_std**2

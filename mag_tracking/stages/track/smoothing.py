@@ -77,7 +77,7 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
 
 
 @dataclass
-class _Start:
+class _TrackStart:
     """Bank at the start of a track, and its filter."""
 
     bank_filter: BankFilter
@@ -112,12 +112,12 @@ class WholeTrack:
 
     def clear(self) -> None:
         """Discard all stored frames."""
-        self._start: _Start | None = None
+        self._start: _TrackStart | None = None
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
-        self._published: list[bool] = []
-        self._length_s, self.is_too_long = 0.0, False
-        self._updated = False
+        self._is_published: list[bool] = []
+        self._duration_s, self.is_too_long = 0.0, False
+        self._is_updated = False
 
     def begin(self, bank: FilterBank | InitialBank, bank_filter: BankFilter) -> None:
         """Start with a bank before its first frame, and with a copy of the current filter.
@@ -130,7 +130,7 @@ class WholeTrack:
         """
         self.clear()
         if self._max_duration_s:
-            self._start = _Start(copy(bank_filter), bank)
+            self._start = _TrackStart(copy(bank_filter), bank)
 
     def resume(self, window: Window, bank_filter: BankFilter) -> None:
         """Continue from a window of another filter; all of its frames count as published.
@@ -146,7 +146,7 @@ class WholeTrack:
             # The paths are copied, because the window modifies them.
             self._start = replace(self._start, origin=anchor.origin.copy(),
                                   paths=tuple(path.copy() for path in window.paths))
-        self._updated = window.is_updated
+        self._is_updated = window.is_updated
         for frame, dt in zip(window.frames, window.intervals, strict=True):
             self.add(anchor, frame, dt, True)
 
@@ -169,14 +169,14 @@ class WholeTrack:
         """
         if self._start is None:
             return
-        self._length_s += dt
-        n_numbers = (len(self._frames) + 1) * bank.x.shape[1]**2
-        if self._length_s > self._max_duration_s or n_numbers > MAX_ELEMENTS:
+        self._duration_s += dt
+        n_elements = (len(self._frames) + 1) * bank.x.shape[1]**2
+        if self._duration_s > self._max_duration_s or n_elements > MAX_ELEMENTS:
             self.abandon()
             return
         self._frames.append(frame)
         self._intervals.append(dt)
-        self._published.append(published)
+        self._is_published.append(published)
         if len(bank) < len(self._start.bank) // 2:
             self._start.bank.keep(np.isin(self._start.bank.origin, bank.origin))
 
@@ -201,9 +201,9 @@ class WholeTrack:
         origin = int(bank.origin[best])
         one = start.bank.rows(np.flatnonzero(start.bank.origin == origin))
         states, left_out = smoothed_track(start.bank_filter, one, self._frames, self._intervals,
-                                          self._updated, path=start.path_of(origin))
+                                          self._is_updated, path=start.path_of(origin))
         return [(frame.stamp_ns, x, P) for frame, (x, P), published in zip(
-            self._frames, states, self._published, strict=True) if published], left_out
+            self._frames, states, self._is_published, strict=True) if published], left_out
 
 
 class _LaggedFrame(NamedTuple):
@@ -231,11 +231,11 @@ class FixedLag:
 
     def __init__(self, lag_s: float) -> None:
         self._lag_s = lag_s
-        self._lagged: deque[_LaggedFrame] = deque()
+        self._frames: deque[_LaggedFrame] = deque()
 
     def clear(self) -> None:
         """Drop all frames."""
-        self._lagged.clear()
+        self._frames.clear()
 
     def smoothed(self, bank_filter: BankFilter, bank: FilterBank, best: int, frame: FieldFrame,
                  dt: float, published: bool) -> list[TrackState]:
@@ -259,16 +259,16 @@ class FixedLag:
         list of TrackState
             Usually empty, or one state.
         """
-        self._lagged.append(_LaggedFrame(
+        self._frames.append(_LaggedFrame(
             frame, dt, published, bank.origin, bank.x.copy(), bank.P.copy()))
-        if len(bank) < len(self._lagged[0].origin) // 2:
-            self._lagged = deque(k.rows(np.isin(k.origin, bank.origin)) for k in self._lagged)
+        if len(bank) < len(self._frames[0].origin) // 2:
+            self._frames = deque(k.rows(np.isin(k.origin, bank.origin)) for k in self._frames)
         out: list[TrackState] = []
-        while (frame.stamp_ns - self._lagged[0].frame.stamp_ns) / NS >= self._lag_s:
-            if self._lagged[0].published:
-                out.append((self._lagged[0].frame.stamp_ns,
+        while (frame.stamp_ns - self._frames[0].frame.stamp_ns) / NS >= self._lag_s:
+            if self._frames[0].published:
+                out.append((self._frames[0].frame.stamp_ns,
                             *self._states(bank_filter, bank, best)[0]))
-            self._lagged.popleft()
+            self._frames.popleft()
         return out
 
     def remaining(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[TrackState]:
@@ -285,15 +285,15 @@ class FixedLag:
         -------
         list of TrackState
         """
-        if not self._lagged:
+        if not self._frames:
             return []
-        return [(kept.frame.stamp_ns, *state) for kept, state in zip(
-            self._lagged, self._states(bank_filter, bank, best), strict=True) if kept.published]
+        return [(lagged.frame.stamp_ns, *state) for lagged, state in zip(
+            self._frames, self._states(bank_filter, bank, best), strict=True) if lagged.published]
 
     def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
         """Smoothed states of the stored frames, not relinearised to limit the time per frame."""
-        oldest = self._lagged[0]
+        oldest = self._frames[0]
         one, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
         one.x, one.P = oldest.x[row].copy(), oldest.P[row].copy()
-        return smoothed_track(bank_filter, one, [k.frame for k in self._lagged],
-                              [k.dt for k in self._lagged], updated=True, relinearisations=0)[0]
+        return smoothed_track(bank_filter, one, [k.frame for k in self._frames],
+                              [k.dt for k in self._frames], updated=True, relinearisations=0)[0]

@@ -248,7 +248,7 @@ class SteadySearch:
         The inverse is NaN or meaningless for a path through a sensor.
         """
         basis = self._model.basis(theta.reshape(-1, N_STRAIGHT))
-        A = self._marginal(_side_by_side(basis, _n_vehicles(theta)))
+        A = self._marginal(_joined_columns(basis, _n_vehicles(theta)))
         At = np.swapaxes(A, 1, 2)
         information = At @ A + np.diag(self._moment_std(theta)**-2.0)
         inverse = pseudo_inverse(information)
@@ -299,7 +299,7 @@ class SteadySearch:
         paths = theta.reshape(-1, N_STRAIGHT)
         A, _, inverse, p = self._solve(theta)
         derivative = self._model.derivative(paths, p.reshape(len(paths), -1))
-        D = self._marginal(_side_by_side(derivative, m))
+        D = self._marginal(_joined_columns(derivative, m))
         moved = inverse @ (np.swapaxes(A, 1, 2) @ D)
         off, off_J = self.prior.residual_and_jacobian(paths)
         return (np.hstack([self._y - np.einsum('nyi,ni->ny', A, p), -p / std, off.reshape(n, -1)]),
@@ -344,8 +344,9 @@ class SteadySearch:
         (n, 7) array
             The best path first.
         """
-        path, cost = self.refined(_usable(grid.theta, self.cost(grid), START_TOLERANCE, N_STARTS))
-        return _usable(path, cost, PATH_TOLERANCE, most)
+        path, cost = self.refined(
+            _best_distinct(grid.theta, self.cost(grid), START_TOLERANCE, N_STARTS))
+        return _best_distinct(path, cost, PATH_TOLERANCE, most)
 
     def moments(self, theta: FloatArray) -> FloatArray:
         """Moments of the rows of dipoles on given paths.
@@ -401,14 +402,14 @@ class SteadySearch:
                   for second in self.beside(first).best(grid, most_second)]
         pairs, cost = self.refined(np.array(starts).reshape(-1, 2 * N_STRAIGHT))
         cost = cost + self._log_determinant_of_moments(pairs)
-        usable = np.isfinite(cost)
-        if not usable.any():
+        is_usable = np.isfinite(cost)
+        if not is_usable.any():
             return []
         # Unusable pairs are dropped first, because squares of their positions may overflow.
-        pairs, cost = pairs[usable], cost[usable]
+        pairs, cost = pairs[is_usable], cost[is_usable]
         best = pairs[np.argmin(cost)].reshape(2, -1)
         pairs = np.array([in_order_of(best, pair.reshape(2, -1)).ravel() for pair in pairs])
-        return list(_usable(pairs, cost, np.tile(PATH_TOLERANCE, 2), len(pairs)).reshape(
+        return list(_best_distinct(pairs, cost, np.tile(PATH_TOLERANCE, 2), len(pairs)).reshape(
             -1, 2, N_STRAIGHT))
 
     def _log_determinant_of_moments(self, theta: FloatArray) -> FloatArray:
@@ -420,9 +421,9 @@ class SteadySearch:
         """Whether the prior of the moments makes all vehicles of each row (n,) detectable."""
         with ignoring_overflow():
             energy = np.einsum('nii->ni', self._information_of_moments(theta)) - 1.0
-        each = energy.reshape(len(theta), -1, 3 * N_DIPOLES).sum(axis=2)
-        felt: BoolArray = (each > DETECTABLE_ENERGY).all(axis=1)
-        return felt
+        vehicle_energy = energy.reshape(len(theta), -1, 3 * N_DIPOLES).sum(axis=2)
+        are_detectable: BoolArray = (vehicle_energy > DETECTABLE_ENERGY).all(axis=1)
+        return are_detectable
 
     def _information_of_moments(self, theta: FloatArray) -> FloatArray:
         """Information (n, 9 m, 9 m) of the moments, relative to the prior."""
@@ -442,7 +443,7 @@ def _n_vehicles(theta: FloatArray) -> int:
     return theta.shape[1] // N_STRAIGHT
 
 
-def _side_by_side(A: FloatArray, m: int) -> FloatArray:
+def _joined_columns(A: FloatArray, m: int) -> FloatArray:
     """Matrices (n, k, m c) that join the matrices (n m, k, c) of m vehicles."""
     n, k, c = len(A) // m, *A.shape[1:]
     return A.reshape(n, m, k, c).swapaxes(1, 2).reshape(n, k, m * c)
@@ -457,8 +458,9 @@ def _block_diagonal(A: FloatArray, m: int) -> FloatArray:
     return out.reshape(n, m * k, m * c)
 
 
-def _usable(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> FloatArray:
+def _best_distinct(theta: FloatArray, cost: FloatArray, tolerance: FloatArray, n_max: int
+                   ) -> FloatArray:
     """The best distinct paths (n, 7) with a finite cost."""
-    usable = np.isfinite(cost)
-    paths: FloatArray = theta[usable]
-    return paths[distinct(paths, cost[usable], apart, most)]
+    is_usable = np.isfinite(cost)
+    paths: FloatArray = theta[is_usable]
+    return paths[distinct(paths, cost[is_usable], tolerance, n_max)]

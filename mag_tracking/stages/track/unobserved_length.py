@@ -36,8 +36,8 @@ class UnobservedLength:
     def __init__(self, lengths: Sequence[float], length_stds: Sequence[float]) -> None:
         self._lengths, self._stds = np.array(lengths), np.array(length_stds)
         self._forward: FloatArray = np.zeros(2)
-        self._distance_past = -np.inf
-        self._place: FloatArray = np.zeros(2)
+        self._distance_travelled = -np.inf
+        self._last_position: FloatArray = np.zeros(2)
 
     def update(self, x: FloatArray, P: FloatArray, positions: FloatArray, is_certain: bool) -> None:
         """Update the direction of travel and, if the position is certain, the distance travelled.
@@ -56,13 +56,13 @@ class UnobservedLength:
         self._forward = self._direction(x, P)
         if not is_certain or not len(positions):
             return
-        if self._distance_past > 0.0:
+        if self._distance_travelled > 0.0:
             # After the first sensor the distance along the path is used, which is also valid in a
             # turn.
-            self._distance_past += float(np.linalg.norm(x[:2] - self._place))
+            self._distance_travelled += float(np.linalg.norm(x[:2] - self._last_position))
         else:
-            self._distance_past = float(offset_from_nearest(x[:2], positions) @ self._forward)
-        self._place = x[:2].copy()
+            self._distance_travelled = float(offset_from_nearest(x[:2], positions) @ self._forward)
+        self._last_position = x[:2].copy()
 
     def covariance(self, x: FloatArray, P: FloatArray, length: float, kind: int) -> FloatArray:
         """Covariance to be added to that of the horizontal position.
@@ -81,15 +81,15 @@ class UnobservedLength:
         -------
         (2, 2) array, m^2
         """
-        behind = 0.5 * (self._lengths - length)
-        square = np.maximum(behind, 0.0)**2 + 0.25 * self._stds**2
+        hidden = 0.5 * (self._lengths - length)
+        square = np.maximum(hidden, 0.0)**2 + 0.25 * self._stds**2
         # A longer vehicle would have been observed once its middle has passed a sensor.
-        possible = ((self._lengths > self._lengths[kind]) & (behind > 0.0)
-                    & (self._distance_past < behind))
-        variance = square[possible].sum() / len(self._lengths)
+        is_possible = ((self._lengths > self._lengths[kind]) & (hidden > 0.0)
+                       & (self._distance_travelled < hidden))
+        variance = square[is_possible].sum() / len(self._lengths)
         if self._lengths[kind] > MAX_CAR_ROW:
-            is_felt = self._distance_past >= behind[kind]
-            variance += square[kind] / (3.0 if is_felt else 1.0)
+            is_sensed = self._distance_travelled >= hidden[kind]
+            variance += square[kind] / (3.0 if is_sensed else 1.0)
         forward = self._direction(x, P)
         covariance: FloatArray = variance * np.outer(forward, forward)
         return covariance
@@ -97,5 +97,5 @@ class UnobservedLength:
     def _direction(self, x: FloatArray, P: FloatArray) -> FloatArray:
         """Unit vector (2,) of the motion; the previous one if the target hardly moves."""
         speed = float(np.hypot(x[3], x[4]))
-        moves = speed > MIN_SPEED_STDS * np.sqrt(max(0.0, P[3, 3] + P[4, 4]))
-        return x[3:5] / speed if moves else self._forward
+        is_moving = speed > MIN_SPEED_STDS * np.sqrt(max(0.0, P[3, 3] + P[4, 4]))
+        return x[3:5] / speed if is_moving else self._forward

@@ -71,8 +71,8 @@ class VehicleState:
         """
         s = self.settings
         R = rotation_about_z(float(np.deg2rad(s.arrival_headings_deg[label])))
-        found = moments.sum(axis=0)
-        mean = s.moments[kind] * found / max(float(np.linalg.norm(found)), MIN_MOMENT)
+        total = moments.sum(axis=0)
+        mean = s.moments[kind] * total / max(float(np.linalg.norm(total)), MIN_MOMENT)
         x = self.along(theta, mean[None], np.array([t]), kind)[0]
         x[2], x[5] = s.heights[kind], 0.0
         if self._n_dipoles > 1:
@@ -100,15 +100,15 @@ class VehicleState:
         d, s, length = self._n_dipoles, self.settings, float(theta[6])
         heading = float(theta[4])
         R = rotation_about_z(heading)
-        soft = soft_iron(s, kind)
+        soft_D = soft_iron(s, kind)
         x = np.zeros((len(times), len(self._model.state_names)))
         velocity = np.array([theta[3] * np.cos(heading), theta[3] * np.sin(heading), theta[5]])
         x[:, :3], x[:, 3:6] = theta[:3] + times[:, None] * velocity, velocity
         ordered = moments[::-1] if length < 0.0 else moments
         is_point = s.length_stds[kind] == 0.0
         each = np.tile(moments.sum(axis=0) / d, (d, 1)) if is_point else _resampled(ordered, d)
-        x[:, 6:6 + 3 * d] = (each @ R - soft * self._model.induction @ R / d).ravel()
-        x[:, 6 + 3 * d:9 + 3 * d] = soft
+        x[:, 6:6 + 3 * d] = (each @ R - soft_D * self._model.induction @ R / d).ravel()
+        x[:, 6 + 3 * d:9 + 3 * d] = soft_D
         if d > 1:
             x[:, 9 + 3 * d] = s.lengths[kind] if is_point else abs(length)
         return x
@@ -158,6 +158,6 @@ def _resampled(moments: FloatArray, d: int) -> FloatArray:
     if len(moments) == 1 or d == 1:
         return np.tile(moments.sum(axis=0) / d, (d, 1))
     places = np.linspace(0.0, d - 1.0, len(moments))
-    share = np.maximum(1.0 - np.abs(places - np.arange(d)[:, None]), 0.0)
-    spread: FloatArray = share @ moments
-    return spread
+    weights = np.maximum(1.0 - np.abs(places - np.arange(d)[:, None]), 0.0)
+    resampled: FloatArray = weights @ moments
+    return resampled

@@ -88,8 +88,8 @@ def in_order_of(first: FloatArray, pair: FloatArray) -> FloatArray:
     -------
     (2, 7) array
     """
-    away = np.linalg.norm(pair[:, None, :2] - first[:, :2], axis=2)
-    return pair if away[0, 0] + away[1, 1] <= away[0, 1] + away[1, 0] else pair[::-1].copy()
+    d = np.linalg.norm(pair[:, None, :2] - first[:, :2], axis=2)
+    return pair if d[0, 0] + d[1, 1] <= d[0, 1] + d[1, 0] else pair[::-1].copy()
 
 
 def labels_of(labels: Sequence[tuple[int, ...]]) -> IntArray:
@@ -128,8 +128,8 @@ def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length: int | No
     depth = 0.0
     for i in range(n_targets):
         for k in range(i):
-            need = OVERHANG + (0.0 if length is None else
-                               0.5 * (np.abs(x[:, i, length]) + np.abs(x[:, k, length])))
+            gap = OVERHANG + (0.0 if length is None else
+                              0.5 * (np.abs(x[:, i, length]) + np.abs(x[:, k, length])))
             pair = x[:, [i, k]].swapaxes(0, 1)
-            depth = max(depth, float(overlap(pair[:, :, :2], pair[:, :, 3:5], need, WIDTH).max()))
+            depth = max(depth, float(overlap(pair[:, :, :2], pair[:, :, 3:5], gap, WIDTH).max()))
     return depth

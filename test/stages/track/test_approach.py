@@ -20,7 +20,7 @@ def frames(sizes):
                          np.zeros(1))
 
 
-def doubted_frames(sizes):
+def approach_flags(sizes):
     approach = Approach()
     return [approach.add(frame) for frame in frames(sizes)]
 
@@ -29,33 +29,33 @@ def test_a_field_that_grows_with_the_inverse_cube_of_distance_is_accepted():
     """At any speed at which the field takes at least two frames to grow tenfold."""
     for step in (0.02, 0.05, 0.1, 0.2):
         distance = np.arange(2.0, 0.2, -step)
-        assert not any(doubted_frames(SENSED_LEVEL * GROWTH_RATIO * (0.4 / distance)**3))
+        assert not any(approach_flags(SENSED_LEVEL * GROWTH_RATIO * (0.4 / distance)**3))
 
 
 @pytest.mark.parametrize('sizes', [
     2.0 * GROWTH_RATIO * SENSED_LEVEL * np.linspace(0.0, 1.0, 30)**2,
     np.concatenate([np.full(10, 0.5), np.linspace(0.5, 40.0, 30)])])
-def test_a_field_that_grows_differently_is_doubted_once(sizes):
+def test_a_field_that_grows_differently_is_flagged_once(sizes):
     """One field is of a target that starts next to a sensor. The other grows linearly, as with a
     current or temperature."""
-    assert sum(doubted_frames(sizes)) == 1
+    assert sum(approach_flags(sizes)) == 1
 
 
 def test_a_sudden_jump_and_an_intermediate_drop_are_accepted():
     jump = np.where(np.arange(30) < 12, 0.5, 30.0 * SENSED_LEVEL)
     rises = 2.0 * GROWTH_RATIO * SENSED_LEVEL * np.linspace(0.0, 1.0, 30)**2
     falls = np.where(np.arange(30) == 15, 0.5 * rises, rises)
-    assert not any(doubted_frames(jump)) and not any(doubted_frames(falls))
+    assert not any(approach_flags(jump)) and not any(approach_flags(falls))
 
 
 def test_a_field_that_starts_large_or_stays_small_is_accepted():
-    assert not any(doubted_frames(np.linspace(2.0 * SENSED_LEVEL, 30.0 * SENSED_LEVEL, 20)))
-    assert not any(doubted_frames(np.full(20, 2.0 * SENSED_LEVEL)))
+    assert not any(approach_flags(np.linspace(2.0 * SENSED_LEVEL, 30.0 * SENSED_LEVEL, 20)))
+    assert not any(approach_flags(np.full(20, 2.0 * SENSED_LEVEL)))
 
 
 @pytest.mark.parametrize('name, is_expected', [('there at the start, leaves', True),
                                                ('a car', False)])
-def test_a_car_that_leaves_its_place_is_doubted_and_a_passing_car_is_not(name, is_expected):
+def test_a_car_that_leaves_its_place_is_flagged_and_a_passing_car_is_not(name, is_expected):
     world = made(name, 'clouds', 0)
     pipeline = Pipeline(world.network, settings_for('vehicle'))
     poses = [r for r in pipeline.feed(world.readings) + pipeline.flush() if isinstance(r, Track)]

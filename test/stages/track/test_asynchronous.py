@@ -121,7 +121,7 @@ def test_poses_of_a_rotating_magnet_are_accurate_and_consistent():
     assert nees.max() < 3.0
 
 
-def test_a_magnet_above_sensors_that_are_read_in_turn_is_tracked():
+def test_a_magnet_above_sensors_that_are_read_sequentially_is_tracked():
     """A sensor is read every 30 ms. In a frame of nine readings the magnet moves by 6 mm and
     rotates by 6 degrees."""
     network, frames, truth = rotating_magnet(0.03 * (np.arange(9) - 4))
@@ -158,7 +158,7 @@ def test_a_magnet_is_found_again_after_a_long_gap(gap_s):
     assert stage.counts['frames'] == 40
 
 
-def contradicted(manager, sizes):
+def tracks_with_contradiction(manager, sizes):
     """`Track`s of a constant field, followed by random fields of these RMS values [T]."""
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
     rng = np.random.default_rng(1)
@@ -173,7 +173,7 @@ def contradicted(manager, sizes):
 
 def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_restarted():
     stage = TrackManager(line_network(2), settings_for('vehicle').track)
-    tracks = contradicted(stage, [1e-4] * 10 + [1.9e-4] * 10)
+    tracks = tracks_with_contradiction(stage, [1e-4] * 10 + [1.9e-4] * 10)
     assert stage.counts['tracks ended: target lost'] == 1
     assert tracks[-1].ended and tracks[-2].ambiguous
     assert stage.counts['tracks'] == 1 and stage.bank is None
@@ -184,7 +184,7 @@ def test_twice_the_field_of_a_lost_vehicle_starts_an_ambiguous_track(lookback_s)
     """In the tail of a pass the field only decreases, so twice the field is another target."""
     stage = TrackManager(line_network(2), settings_for(
         'vehicle', {'track.lookback_s': lookback_s}).track)
-    tracks = contradicted(stage, [1e-4] * 19 + [2.1e-4])
+    tracks = tracks_with_contradiction(stage, [1e-4] * 19 + [2.1e-4])
     assert stage.counts['tracks'] == 2
     assert stage.counts['tracks started in the tail of a lost track, in a larger field'] == 1
     assert tracks[-1].id == 2 and tracks[-1].ambiguous

@@ -21,7 +21,7 @@ from support.steady_frames import ROAD, STRAIGHT, state_at, steady_frames
 FAST = np.where(np.arange(10) == 3, 60.0, STRAIGHT)
 
 
-def checked(check, frames, path=STRAIGHT):
+def run_check(check, frames, path=STRAIGHT):
     """[(time [s], doubts, number of fits so far)] after each frame."""
     out, n, latest = [], 0, None
     for frame in frames:
@@ -34,7 +34,7 @@ def checked(check, frames, path=STRAIGHT):
 
 
 def test_fits_follow_the_cpa_at_increasing_intervals():
-    rows = checked(CrossCheck(ROAD), steady_frames(np.random.default_rng(1)))
+    rows = run_check(CrossCheck(ROAD), steady_frames(np.random.default_rng(1)))
     times = [t for (t, _, n), (_, _, before) in zip(rows[1:], rows[:-1], strict=True) if n > before]
     print(f'fits at {times} s')
     assert min(times) > 0.0 and 2 <= len(times) <= 6
@@ -46,15 +46,15 @@ def test_fits_follow_the_cpa_at_increasing_intervals():
     ({'clocks': (0.3,)}, STRAIGHT, doubts.CLOCKS_APART),
     ({'path': FAST}, FAST, doubts.FRAMES_TOO_LONG),
     ({'change': lambda B: np.clip(B, -3e-7, 3e-7)}, STRAIGHT, doubts.NO_STEADY_PATH)])
-def test_faults_found_in_the_whole_pass_doubt_the_track(of_frames, path, expected):
+def test_faults_found_in_the_whole_pass_flag_the_track(of_frames, path, expected):
     """The doubt begins after the vehicle has passed, and is permanent."""
     check = CrossCheck(ROAD)
-    rows = checked(check, steady_frames(np.random.default_rng(2), **of_frames), path)
+    rows = run_check(check, steady_frames(np.random.default_rng(2), **of_frames), path)
     assert not rows[15][1]
     assert all(expected in found for _, found, _ in rows[-8:]) and check.is_doubtful
 
 
-def test_clock_offsets_of_earlier_passes_doubt_a_track_from_its_first_frame():
+def test_clock_offsets_of_earlier_passes_flag_a_track_from_its_first_frame():
     check = CrossCheck(ROAD)
     frame = steady_frames(np.random.default_rng(3))[0]
     check.add(frame, state_at(frame.stamp_ns / 1e9))
@@ -65,14 +65,14 @@ def test_clock_offsets_of_earlier_passes_doubt_a_track_from_its_first_frame():
 
 def test_the_end_of_a_track_updates_the_clock_comparison():
     clocks, check = ClockComparison(2), CrossCheck(ROAD)
-    checked(check, steady_frames(np.random.default_rng(4), clocks=(0.3,)))
+    run_check(check, steady_frames(np.random.default_rng(4), clocks=(0.3,)))
     for _ in range(2):
         check.conclude(clocks, np.arange(2))
     assert clocks.apart.sensor == 1
     assert clocks.apart_s(np.arange(2)) == pytest.approx(0.3, abs=0.05)
 
 
-def test_no_frames_give_no_doubts():
+def test_a_check_without_frames_has_no_doubts():
     check = CrossCheck(ROAD)
     assert check.doubts(1.0) == set()
     clocks = ClockComparison(2)
@@ -120,7 +120,7 @@ def test_the_cross_check_can_be_disabled():
         assert all(t.ambiguous for t in records if isinstance(t, SmoothedPose)) is on
 
 
-def test_the_third_car_past_a_wrong_clock_is_doubted_from_its_first_pose():
+def test_the_third_car_past_a_wrong_clock_is_flagged_from_its_first_pose():
     rng = np.random.default_rng(5)
     world = ambient_world(rng, 'clouds', None, 75.0, cars=3)
     readings = spoiler.apply(world.readings, spoiler.delayed('mag_2', 0.25))
@@ -137,7 +137,7 @@ def test_the_third_car_past_a_wrong_clock_is_doubted_from_its_first_pose():
     assert pipeline.track.clocks_apart == ''
 
 
-def test_a_track_differs_by_its_distance_from_the_fitted_path():
+def test_the_difference_of_a_track_is_its_distance_from_the_fitted_path():
     """After the pass the difference stays constant."""
     check = CrossCheck(ROAD)
     slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
@@ -165,9 +165,9 @@ def test_a_track_differs_by_its_distance_from_the_fitted_path():
     assert check.differences(far[-3:]) == [check.difference] * 3
 
 
-def test_smoothed_states_before_the_fitted_pass_differ_as_at_its_start():
+def test_smoothed_states_before_the_fitted_pass_have_the_difference_of_its_start():
     check = CrossCheck(ROAD)
-    checked(check, steady_frames(np.random.default_rng(9)))
+    run_check(check, steady_frames(np.random.default_rng(9)))
     slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
     states = [(round(t * 1e9), state_at(t, slow), np.eye(6)) for t in (-6.0, -4.5, -3.9, -3.0)]
     first, second, third, fourth = check.differences(states)
@@ -190,10 +190,10 @@ def test_a_fit_keeps_the_time_of_its_own_peak():
     assert len(peaks) > 1 and max(away) < 1.5
 
 
-def test_a_pass_that_begins_at_its_peak_gives_no_difference():
+def test_a_pass_that_begins_at_its_peak_has_no_difference():
     check = CrossCheck(ROAD)
     late = [f for f in steady_frames(np.random.default_rng(2), until_s=3.0) if f.stamp_ns > 3e8]
-    assert not any(found for _, found, _ in checked(check, late))
+    assert not any(found for _, found, _ in run_check(check, late))
     assert len(check.latest.straight_paths) and not check.difference.any()
 
 

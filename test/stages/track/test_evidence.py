@@ -28,7 +28,7 @@ def pose(nis=6.0):
     return SimpleNamespace(nis=nis, degrees_of_freedom=6, stamp_ns=0)
 
 
-def test_noise_contradicts_a_track_with_the_stated_probability():
+def test_noise_contradicts_a_track_with_the_nominal_probability():
     rng = np.random.default_rng(0)
     nis = rng.chisquare(6, 3_000_000)
     doubted = 0
@@ -40,14 +40,14 @@ def test_noise_contradicts_a_track_with_the_stated_probability():
     assert 10 < doubted < 60 and len(nis) * CONTRADICTION == pytest.approx(30.0)
 
 
-def test_a_track_that_was_contradicted_once_stays_doubted():
+def test_a_track_that_was_contradicted_once_stays_doubtful():
     evidence = TrackEvidence(2)
     for nis in (6.0, 60.0, 6.0):
         assert evidence.contradicts(np.array([nis, 0.0]), 6) == (nis > 50.0)
     assert evidence.doubted
 
 
-def test_a_filter_that_overfits_is_doubted_for_the_length_of_the_window():
+def test_a_filter_that_overfits_is_flagged_for_the_duration_of_the_window():
     evidence = TrackEvidence(2)
     doubted = []
     for t, loss in ((0.0, -9.0), (1.0, 0.9), (1.1, 1.1), (3.0, 0.0), (3.2, -9.0)):
@@ -63,7 +63,7 @@ def test_a_filter_that_overfits_is_doubted_for_the_length_of_the_window():
 
 @pytest.mark.parametrize('nis, doubted', [
     ([60.0, 1.0], True), ([60.0, 2.0, 1.0], False), ([60.0, np.nan, 1.0], False)])
-def test_a_contradiction_doubts_a_track_of_two_sensors_but_not_of_three(nis, doubted):
+def test_a_contradiction_flags_a_track_of_two_sensors_but_not_of_three(nis, doubted):
     evidence = TrackEvidence(2)
     assert evidence.contradicts(np.array(nis), 3 * np.count_nonzero(~np.isnan(nis)))
     assert evidence.doubted == doubted
@@ -195,7 +195,7 @@ def test_a_transient_doubt_persists_for_a_tenth_of_a_second():
     assert evidence.was_filter_doubted(NS + round(0.16 * NS))
 
 
-def test_a_doubt_with_a_past_start_doubts_earlier_smoothed_poses():
+def test_a_doubt_with_a_past_start_flags_earlier_smoothed_poses():
     """A long vehicle that is tracked as two has wrong poses before this is detected."""
     evidence = TrackEvidence(2)
     evidence.doubt_for(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0, since_ns=3 * NS)

@@ -42,9 +42,9 @@ def test_consistent_innovations_trigger_no_search():
     assert searches(6.0) == []
 
 
-@pytest.mark.parametrize('given', [{'nis': 30.0}, {'nis': 1.0, 'rejected': True}])
-def test_improbable_innovations_and_rejected_sensors_trigger_a_search(given):
-    found = searches(**given)
+@pytest.mark.parametrize('innovations', [{'nis': 30.0}, {'nis': 1.0, 'rejected': True}])
+def test_improbable_innovations_and_rejected_sensors_trigger_a_search(innovations):
+    found = searches(**innovations)
     assert {reason for _, reason in found} == {IMPROBABLE}
     # A search takes longer than a frame, so it is not triggered in every frame.
     assert np.diff([k for k, _ in found]).min() * PERIOD >= MIN_INTERVAL_S * NS
@@ -75,18 +75,18 @@ def joint_of(velocities, odds, replaced=None, adds=True):
     return Joint(bank, None, None, odds, replaced, adds)
 
 
-@pytest.mark.parametrize('odds, replaced, doubted', [
+@pytest.mark.parametrize('odds, replaced, flagged', [
     (CONFIDENT_NATS - 1.0, None, (0, 1)), (CONFIDENT_NATS + 1.0, None, ()),
     (CONFIDENT_NATS + 1.0, 0, (0, 1))])
-def test_weak_explanations_and_replacements_of_a_vehicle_by_two_are_doubted(
-        odds, replaced, doubted):
+def test_weak_explanations_and_replacements_of_a_vehicle_by_two_are_flagged(
+        odds, replaced, flagged):
     """Both vehicles drive in the same direction."""
-    assert joint_of([[10.0, 0.0], [10.0, 0.0]], odds, replaced).doubtful(7) == doubted
+    assert joint_of([[10.0, 0.0], [10.0, 0.0]], odds, replaced).doubtful(7) == flagged
 
 
 @pytest.mark.parametrize('new', [[0.0, 10.0], [8.0, 8.0], [19.0, 0.0], [5.0, 0.0]])
 @pytest.mark.parametrize('n_before', [1, 2])
-def test_vehicles_that_cross_or_overtake_fast_are_doubted_up_to_sixty_nats(new, n_before):
+def test_vehicles_that_cross_or_overtake_fast_are_flagged_up_to_sixty_nats(new, n_before):
     """The number of earlier vehicles makes no difference."""
     velocities = [[10.0, 0.0], [-9.0, 1.0]][:n_before] + [new]
     all_members = tuple(range(n_before + 1))
@@ -96,14 +96,14 @@ def test_vehicles_that_cross_or_overtake_fast_are_doubted_up_to_sixty_nats(new, 
 
 @pytest.mark.parametrize('new', [
     [-10.0, 2.0], [14.0, -1.0], [6.0, 0.0], [17.0, 0.0], [9.5, 4.0], [-30.0, 0.0], [-2.0, 0.0]])
-def test_vehicles_that_meet_or_overtake_are_doubted_up_to_fifteen_nats_only(new):
+def test_vehicles_that_meet_or_overtake_are_flagged_up_to_fifteen_nats_only(new):
     """Vehicles that meet may have any speed."""
     assert joint_of([[10.0, 0.0], new], 14.0).doubtful(7) == (0, 1)
     assert joint_of([[10.0, 0.0], new], 16.0).doubtful(7) == ()
 
 
 @pytest.mark.parametrize('standing', [[0.0, 0.0], [0.3, 0.9], [0.9, 0.0]])
-def test_a_standing_vehicle_has_no_direction(standing):
+def test_a_stationary_vehicle_has_no_direction(standing):
     for velocities in ([standing, [10.0, 0.0]], [[10.0, 0.0], standing], [standing, standing]):
         assert joint_of(velocities, 16.0).doubtful(7) == ()
 
@@ -115,21 +115,21 @@ def test_directions_of_earlier_vehicles_are_not_compared():
     assert joint_of([new, *before], 16.0).doubtful(7) == (0, 1, 2)
 
 
-@pytest.mark.parametrize('first, second, doubted', [
+@pytest.mark.parametrize('first, second, flagged', [
     ([0.0, 10.0], [10.0, 0.0], (0, 1, 2)), ([10.0, 0.0], [0.0, 10.0], (0, 1, 2)),
     ([-10.0, 0.0], [10.0, 0.0], ()), ([-10.0, 0.0], [-11.0, 0.0], (1, 2))])
-def test_both_vehicles_that_replace_one_are_compared(first, second, doubted):
+def test_both_vehicles_that_replace_one_are_compared(first, second, flagged):
     """The first vehicle is unrelated; the last two replace another vehicle."""
-    assert joint_of([[12.0, 0.0], first, second], 16.0, 0).doubtful(7) == doubted
+    assert joint_of([[12.0, 0.0], first, second], 16.0, 0).doubtful(7) == flagged
 
 
-def test_a_vehicle_at_another_place_is_doubted_alone():
+def test_only_a_vehicle_at_another_position_is_flagged():
     for elsewhere in ([0.0, 10.0], [9.0, 0.0]):
         joint = joint_of([[10.0, 0.0], elsewhere], 16.0, 0, adds=False)
         assert joint.doubtful(7) == (1,)
 
 
-def test_the_best_hypothesis_decides_about_doubts():
+def test_the_best_hypothesis_determines_the_doubts():
     joint = joint_of([[10.0, 0.0], [0.0, 10.0]], 16.0)
     bank = joint.bank
     both = FilterBank(np.vstack([bank.x, joint_of([[10.0, 0.0], [11.0, 0.0]], 0.0).bank.x]),

@@ -120,7 +120,7 @@ def test_the_fit_of_almost_coincident_dipoles_matches_numpy(length):
     ('M', np.zeros((3, 3, 3)), 'M: shape does not match'),
     ('combinations', np.eye(2), 'combinations: shape does not match'),
     ('covariance', np.zeros((1, 3, 3)), 'covariance: shape does not match')])
-def test_arrays_of_wrong_sizes_are_refused(name, value, error):
+def test_invalid_arrays_are_rejected(name, value, error):
     arguments = {
         'theta': np.zeros((1, 2)), 'cost': np.zeros(1), 'covariance': np.zeros((1, 2, 2)),
         'free': np.arange(2), 'fixed': np.zeros(N_PATH + 1), 'places': np.zeros(1),

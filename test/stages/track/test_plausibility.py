@@ -49,7 +49,7 @@ def doubts_in_state(mounting=MOUNTING, dt=0.08, **of_state):
     # stationary vehicles.
     ({'at': (0.0, 6.4)}, set()), ({'at': (0.0, 6.5)}, {doubts.OFF_THE_ROAD}),
     ({'at': (30.0, -6.5)}, {doubts.OFF_THE_ROAD}), ({'at': (0.0, 6.5), 'speed': 0.9}, set())])
-def test_implausible_states_are_doubted(of_state, expected):
+def test_implausible_states_are_flagged(of_state, expected):
     assert doubts_in_state(**of_state) == expected
 
 
@@ -73,7 +73,7 @@ def test_a_path_is_evaluated_where_it_is_nearest_to_a_sensor(y, after, expected)
         assert standing == (expected if y else set())
 
 
-def test_the_path_of_each_hypothesis_is_kept():
+def test_the_path_of_each_hypothesis_is_stored():
     """The path is retained while another hypothesis is published."""
     plausibility, observation = Plausibility(), observation_of()
     paths = {5: ((0.0, 7.0), (4.0, 0.0)), 2: ((0.0, 1.0), (4.0, 7.0))}

@@ -68,7 +68,7 @@ class LinearFilter(StepByStep):
         return log_likelihood + bonus, gains
 
 
-def compared_with_plain(filter_, relinearisation, n=40, restarts_at=(), prune=True):
+def compare_with_plain(filter_, relinearisation, n=40, restarts_at=(), prune=True):
     """(bank, bank without relinearisation, Counter) after `n` frames with a gap."""
     rng, counts, stamp_ns = np.random.default_rng(0), Counter(), 0
     bank = FilterBank.from_targets(rng.standard_normal((12, N_T)), np.tile(np.eye(N_T), (12, 1, 1)),
@@ -113,7 +113,7 @@ def test_relinearisation_does_not_change_a_linear_target(
     converge."""
     monkeypatch.setattr(relinearise, 'PASSES', passes)
     filter_ = LinearFilter()
-    _, _, counts = compared_with_plain(
+    _, _, counts = compare_with_plain(
         filter_, Relinearisation(interval_s, window_s, 5), restarts_at=restarts_at)
     if window_s > 0.1 and passes == 8:
         assert counts[relinearise.ATTEMPTED] > counts[relinearise.FAILED] == 0
@@ -126,7 +126,7 @@ def test_the_path_of_a_long_vehicle_is_accepted_unless_it_fits_worse(
     monkeypatch.setattr(relinearise, 'PASSES', 8)
     filter_ = LinearFilter()
     filter_.long, filter_.bonus = long, bonus
-    _, _, counts = compared_with_plain(filter_, Relinearisation(0.0, 0.5, 5))
+    _, _, counts = compare_with_plain(filter_, Relinearisation(0.0, 0.5, 5))
     assert counts[relinearise.ATTEMPTED] > 50
     assert counts[relinearise.FAILED] == (0 if is_accepted else counts[relinearise.ATTEMPTED])
 
@@ -144,7 +144,7 @@ class LessCertainFilter(LinearFilter):
         return found
 
 
-def less_certain(extra, linear):
+def bank_after_one_frame(extra, linear):
     """(filter, bank, Relinearisation) after one frame."""
     filter_, rng = LessCertainFilter(), np.random.default_rng(0)
     filter_.extra, filter_.linear = extra, linear
@@ -161,8 +161,8 @@ def less_certain(extra, linear):
 
 
 @pytest.mark.parametrize('extra, is_wider', [(0.5, True), (-1e-3, False)])
-def test_a_converged_path_gives_the_state_and_the_wider_covariance(extra, is_wider):
-    filter_, bank, relinearisation = less_certain(extra, np.inf)
+def test_a_converged_path_determines_the_state_and_the_wider_covariance(extra, is_wider):
+    filter_, bank, relinearisation = bank_after_one_frame(extra, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
     assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 0
     np.testing.assert_allclose(bank.x[0], x[0] + 0.1 * np.eye(6)[1], atol=1e-9)
@@ -175,7 +175,7 @@ def test_a_converged_path_gives_the_state_and_the_wider_covariance(extra, is_wid
 def test_an_unconverged_path_only_widens_the_covariance(monkeypatch, extra, linear, is_wider):
     """The convergence limit is patched so that no path converges."""
     monkeypatch.setattr(relinearise, 'CONVERGED', -1.0)
-    filter_, bank, relinearisation = less_certain(extra, linear)
+    filter_, bank, relinearisation = bank_after_one_frame(extra, linear)
     x, P = bank.x.copy(), bank.P.copy()
     assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 1
     np.testing.assert_array_equal(bank.x, x)
@@ -187,7 +187,7 @@ def test_an_unconverged_path_only_widens_the_covariance(monkeypatch, extra, line
 
 @pytest.mark.parametrize('bonus', [-12.0, 3.0])
 def test_the_gain_is_the_log_likelihood_ratio_of_the_path(bonus):
-    filter_, bank, relinearisation = less_certain(0.0, np.inf)
+    filter_, bank, relinearisation = bank_after_one_frame(0.0, np.inf)
     filter_.bonus = bonus
     assert relinearisation.gain(0) == 0.0
     relinearisation.improve(filter_, bank)
@@ -201,7 +201,7 @@ def test_the_gain_is_the_log_likelihood_ratio_of_the_path(bonus):
 
 def test_a_path_with_an_invalid_covariance_is_rejected():
     """Rounding errors above a sensor can cause this. State and covariance do not change."""
-    filter_, bank, relinearisation = less_certain(-3.0, np.inf)
+    filter_, bank, relinearisation = bank_after_one_frame(-3.0, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
     assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 1
     np.testing.assert_array_equal(bank.x, x)
@@ -214,7 +214,7 @@ def test_relinearisation_covers_twice_the_window_at_most(monkeypatch, window_s, 
     the frames."""
     monkeypatch.setattr(relinearise, 'MAX_FRAMES', max_frames)
     filter_ = LinearFilter()
-    compared_with_plain(filter_, Relinearisation(0.0, window_s, 5), n=90)
+    compare_with_plain(filter_, Relinearisation(0.0, window_s, 5), n=90)
     frames = min(2 * round(window_s / 0.05), max_frames) + 1
     assert relinearise.PASSES * 5 < max(filter_.lengths) <= (relinearise.PASSES + 1) * frames
 
@@ -224,7 +224,7 @@ def test_only_the_heaviest_hypotheses_are_relinearised(monkeypatch, n_max, max_e
     """Many states reduce their number: here to one hypothesis over forty frames."""
     monkeypatch.setattr(relinearise, 'MAX_ELEMENTS', max_elements)
     filter_ = LinearFilter()
-    bank, *_ = compared_with_plain(filter_, Relinearisation(60.0, 60.0, n_max), prune=False)
+    bank, *_ = compare_with_plain(filter_, Relinearisation(60.0, 60.0, n_max), prune=False)
     relinearisation = Relinearisation(0.0, 60.0, n_max)
     relinearisation.begin(bank.copy())
     assert not filter_.origins
@@ -235,15 +235,15 @@ def test_only_the_heaviest_hypotheses_are_relinearised(monkeypatch, n_max, max_e
     assert filter_.origins == {bank.origin[np.argmax(bank.log_w)]}
 
 
-STILL = {**matched.TARGETS['point'], 'track.vehicle.acceleration': 0.0,
-         'track.vehicle.climb_acceleration': 0.0, 'track.vehicle.moment_drift': 0.0,
-         'track.background_drift': 0.0, 'track.vehicle.speeds': [10.0]}
+DETERMINISTIC = {**matched.TARGETS['point'], 'track.vehicle.acceleration': 0.0,
+                 'track.vehicle.climb_acceleration': 0.0, 'track.vehicle.moment_drift': 0.0,
+                 'track.background_drift': 0.0, 'track.vehicle.speeds': [10.0]}
 
 
 def fields_along(model, network, x0, n):
     """Fields (n, n_sensors, 3) [T] of frames from a state `x0` (n_x,) and backgrounds."""
     n_t, out = len(model.state_names), []
-    filter_ = BankFilter(network, model, settings_for('vehicle', STILL).track)
+    filter_ = BankFilter(network, model, settings_for('vehicle', DETERMINISTIC).track)
     for k in range(n):
         x = model.propagate(x0[None, :n_t], k * PERIOD)[0]
         h, _, _ = filter_.observation.target_fields(x, np.zeros(len(network)), np.zeros((1, 1)))
@@ -268,14 +268,14 @@ def counts_after(filter_, bank, y, relinearisation):
     return counts[relinearise.ATTEMPTED], counts[relinearise.FAILED]
 
 
-TURNS = {**STILL, 'track.vehicle.turn_acceleration': 1e-4, 'track.vehicle.turn_time': 1e3}
+TURNS = {**DETERMINISTIC, 'track.vehicle.turn_acceleration': 1e-4, 'track.vehicle.turn_time': 1e3}
 """Settings of a target with a constant turn rate."""
 
 
-def still_target(n, turns=False):
+def deterministic_target(n, turns=False):
     """(filter, function that creates a bank, measurements (n, 2, 3), last state fitted by
     SciPy)."""
-    settings = settings_for('vehicle', TURNS if turns else STILL).track
+    settings = settings_for('vehicle', TURNS if turns else DETERMINISTIC).track
     rng, model = np.random.default_rng(4), vehicle_model(settings.vehicle, matched.NETWORK)
     n_t = len(model.state_names)
     mean, P0 = matched.prior_of(settings, n_t - turns)
@@ -303,7 +303,7 @@ def still_target(n, turns=False):
 def test_relinearisation_converges_to_a_batch_fit(turns):
     """Without process noise the first state determines the path. SciPy fits it with the same
     prior."""
-    filter_, bank_of, y, expected = still_target(24, turns)
+    filter_, bank_of, y, expected = deterministic_target(24, turns)
     bank, plain = bank_of(1), bank_of(1)
     assert counts_after(filter_, bank, y, Relinearisation(0.0, 60.0, 1)) == (1, 0)
     std = np.sqrt(np.diagonal(bank.P[0]))
@@ -315,7 +315,7 @@ def test_relinearisation_converges_to_a_batch_fit(turns):
 
 @pytest.mark.parametrize('turns', [False, True])
 def test_the_smoother_converges_to_a_batch_fit(turns):
-    filter_, bank_of, y, expected = still_target(24, turns)
+    filter_, bank_of, y, expected = deterministic_target(24, turns)
     states, left_out = smoothed_track(filter_, bank_of(1), frames_of(y),
                                       [0.0] + [PERIOD] * (len(y) - 1), relinearisations=9)
     x, P = states[-1]
@@ -325,7 +325,7 @@ def test_the_smoother_converges_to_a_batch_fit(turns):
 
 def test_a_path_that_has_not_converged_is_not_accepted(monkeypatch):
     """One pass from the linearisation of the filter does not suffice; eight passes do."""
-    filter_, bank_of, y, _ = still_target(24)
+    filter_, bank_of, y, _ = deterministic_target(24)
     expected, bank = bank_of(1), bank_of(1)
     counts_after(filter_, expected, y, Relinearisation(60.0, 60.0, 1))
     for passes, n_failed in ((1, 1), (8, 0)):
@@ -338,7 +338,7 @@ def test_a_path_that_has_not_converged_is_not_accepted(monkeypatch):
 def test_a_path_through_a_sensor_is_rejected(monkeypatch):
     """A dipole at a sensor has no valid field; the other hypotheses are not affected."""
     monkeypatch.setattr(relinearise, 'PASSES', 8)
-    filter_, bank_of, y, _ = still_target(12)
+    filter_, bank_of, y, _ = deterministic_target(12)
     alone, bank = bank_of(1), bank_of(2)
     bank.x[1, :6], bank.P[1, :6, :6] = 0.0, 0.0
     bank.x[1, 1] = -4.5

@@ -20,7 +20,7 @@ from support.plain_smoother import Step, smoothed_covariances, smoothed_states
 from support.samples import one, simulate
 
 
-def stacked(F, Q, H, R, y, x0, P0, missing):
+def batch_solution(F, Q, H, R, y, x0, P0, missing):
     """Means and covariances of all states from one least-squares solution.
 
     Measurements marked in `missing` are excluded.
@@ -110,8 +110,8 @@ def test_the_backward_pass_matches_least_squares_over_all_times(unit):
     whole[missing] = 0.0
     R = block_diag(*C)
     # Missing rows are removed from the noise as well.
-    expected = [stacked(block_diag(F, np.diag(decay)), np.diag(Q), whole, R,
-                        np.where(missing, 0.0, y.reshape(N_STEPS, -1)), x, P0, missing)
+    expected = [batch_solution(block_diag(F, np.diag(decay)), np.diag(Q), whole, R,
+                               np.where(missing, 0.0, y.reshape(N_STEPS, -1)), x, P0, missing)
                 for x in x0]
     # The states of the sensors are in another unit, like backgrounds and fields in tesla.
     T = np.append(np.ones(N_T), np.full(N_X - N_T, unit))
@@ -210,7 +210,7 @@ def test_smoothing_reduces_the_error_of_a_matched_target_by_two_fifths():
 
 
 @cache
-def clouds(n):
+def smoothing_study_of_cars(n):
     """`smoothing_study` of `n` cars of 4 m."""
     return smoothing_study(
         [random_vehicle(np.random.default_rng(100 + k), length=4.0) for k in range(n)], {})
@@ -220,12 +220,12 @@ def clouds(n):
 @pytest.mark.xfail(strict=True, reason='0.68: 0.59 of the error of a filter that does not '
                                        'relinearise, which is larger')
 def test_smoothing_reduces_the_error_of_a_car_by_two_fifths():
-    assert np.median(clouds(40)[0]) <= 0.6
+    assert np.median(smoothing_study_of_cars(40)[0]) <= 0.6
 
 
 @pytest.mark.parametrize('n', studied([10, 40]))
 def test_smoothed_poses_of_cars_are_more_accurate_and_consistent(n):
-    whole, ratios, nees = clouds(n)
+    whole, ratios, nees = smoothing_study_of_cars(n)
     print(f'clouds of 4 m: smoothed over filtered error {np.median(whole):.2f} (median), within '
           f'5 m {np.median(ratios):.2f}, ANEES {nees.mean():.2f}, median {np.median(nees):.2f}')
     assert np.median(ratios) <= 0.7
@@ -320,7 +320,7 @@ def test_smoothing_bridges_missing_frames():
         assert np.hypot(*(r.position[:2] - q)) < 0.3
 
 
-def spiked(stage, frames, at, size, n=1):
+def records_with_spike(stage, frames, at, size, n=1):
     """Records of `stage` for `frames`, with `size` [T] added to an axis of all sensors in `n`
     frames.
 
@@ -346,7 +346,7 @@ def paths_without_and_with_a_spike(size):
                         for f in frames]))
     for spike in (0.0, size):
         stage = TrackManager(network, settings_for('vehicle').track)
-        out = spiked(stage, frames, at, spike)
+        out = records_with_spike(stage, frames, at, spike)
         poses = [r for r in out if isinstance(r, SmoothedPose) and r.id == 1]
         assert stage.counts['frames left out of smoothing'] == (1 if spike else 0)
         yield [p for p in poses if abs(np.interp(p.stamp_ns / 1e9, t, position[:, 0])) < 6.0]
@@ -379,7 +379,7 @@ def test_smoothed_poses_of_a_lost_track_are_ambiguous():
     frames = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, FieldFrame)]
     first = next(k for k, f in enumerate(frames) if f.target_present)
     stage = TrackManager(network, settings_for('vehicle').track)
-    out = spiked(stage, frames, first + 15, 1e-4, n=2)
+    out = records_with_spike(stage, frames, first + 15, 1e-4, n=2)
     assert stage.counts['tracks ended: target lost'] == 1
     smoothed = [r for r in out if isinstance(r, SmoothedPose)]
     assert smoothed and all(r.ambiguous for r in smoothed)

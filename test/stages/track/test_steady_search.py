@@ -162,12 +162,12 @@ def test_pairs_belong_to_different_minima():
     assert all((apart[i, k] > 0.3).any() for i in range(len(pairs)) for k in range(i))
 
 
-@pytest.mark.parametrize('standing', [0, 1])
-def test_a_pair_with_a_standing_vehicle_is_rejected(standing):
+@pytest.mark.parametrize('stationary', [0, 1])
+def test_a_pair_with_a_stationary_vehicle_is_rejected(stationary):
     search, _ = search_of(FIRST, SECOND)
     pair = np.array([FIRST, SECOND])
     assert np.isfinite(search.refined(pair.reshape(1, -1), 0)[1]).all()
-    pair[standing, 3] = 0.1
+    pair[stationary, 3] = 0.1
     assert np.isinf(search.refined(pair.reshape(1, -1), 0)[1]).all()
 
 
@@ -204,6 +204,6 @@ def test_a_search_without_a_valid_start_finds_nothing():
     assert search.best(grid, 3).shape == (0, 7) and search.pairs(grid, 3, 2) == []
 
 
-def test_standing_and_reversing_vehicles_are_not_found():
+def test_stationary_and_reversing_vehicles_are_not_found():
     search, grid = search_of(FIRST)
     assert (search.best(grid, 5)[:, 3] >= 0.2 * min(VEHICLE.speeds)).all()

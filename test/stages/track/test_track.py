@@ -145,19 +145,19 @@ def test_a_vehicle_has_a_heading_and_unobservable_roll_and_pitch():
     assert C[2, 2] == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize('gain, doubted', [(-20.0, True), (0.0, False)])
+@pytest.mark.parametrize('gain, is_flagged', [(-20.0, True), (0.0, False)])
 def test_poses_of_a_filter_that_fits_better_than_its_path_are_ambiguous(
-        monkeypatch, gain, doubted):
+        monkeypatch, gain, is_flagged):
     monkeypatch.setattr(Relinearisation, 'gain', lambda self, origin: gain)
     tracks, pipeline, truth = drive(line_network(2), point_body([200.0, -150.0, 80.0], 5.0, 0.5),
                                     Path(np.array([-70.0, -1.2]), 0.0, 10.0), POINT)
     live = [t for t in tracks if not t.ended]
     near = [t.ambiguous for t, place in zip(live, truth, strict=True) if np.hypot(*place) < 5.0]
-    assert len(near) > 8 and set(near) == {doubted}
-    assert bool(pipeline.track.counts[OVERFITS]) == doubted
+    assert len(near) > 8 and set(near) == {is_flagged}
+    assert bool(pipeline.track.counts[OVERFITS]) == is_flagged
 
 
-def test_a_magnet_is_not_doubted_for_overfitting(monkeypatch):
+def test_a_magnet_is_not_flagged_for_overfitting(monkeypatch):
     monkeypatch.setattr(Relinearisation, 'gain', lambda self, origin: -20.0)
     network, frames, _ = magnet_frames(20)
     stage = TrackManager(network, settings_for('magnet').track)
