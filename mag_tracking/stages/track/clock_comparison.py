@@ -64,8 +64,8 @@ class ClockOffset:
 class ClockComparison:
     """Clock offsets of several passes, combined by recursive least squares.
 
-    A wrong sensor position has the same effect as a wrong clock as long as all vehicles pass in the
-    same direction at the same speed.
+    A wrong sensor position has the same effect as a wrong clock if all vehicles pass in the same
+    direction at the same speed.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ class ClockComparison:
             (offset > SIGNIFICANT_STD * std) & (offset > min_offset), offset, 0.0)
 
     def _contradicts(self, fit: RigidPass, rows: IntArray, is_known: BoolArray) -> bool:
-        """Whether a pass contradicts the previous passes for one of the `is_known` clocks."""
+        """Whether a pass contradicts the previous estimate for a clock in `is_known`."""
         offset, std = self._offsets()
         reference = rows[fit.reference]
         return any(abs(fit.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STD * np.sqrt(

@@ -1,4 +1,4 @@
-"""Check of a running track against a fit of its whole pass, see `rigid_pass`."""
+"""Cross-check of a running track with a fit of its whole pass; see `rigid_pass`."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -47,7 +47,7 @@ LATE_MISFIT = 8.0
 
 
 class _FrameSummary(NamedTuple):
-    """Summary of a frame of the track."""
+    """Time, field and target state of a frame."""
 
     stamp_ns: int
     magnitude: float

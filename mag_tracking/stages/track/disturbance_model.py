@@ -74,7 +74,7 @@ class DisturbanceModel:
         dt : float, s
             Time since the previous frame.
         model_error : (n_sensors,) array, T²
-            Variance per axis allowed for the error of the target model.
+            Variance per axis of the model error that the tracker assumes.
 
         Returns
         -------

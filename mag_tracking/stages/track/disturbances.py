@@ -11,7 +11,7 @@ from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.records import FieldFrame
 
 FALSE_ALARM = 1e-6
-"""Probability that noise alone marks a sensor as affected, per frame."""
+"""Probability per frame that noise alone marks a sensor as affected."""
 
 
 @dataclass(frozen=True)

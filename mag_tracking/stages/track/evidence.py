@@ -240,8 +240,8 @@ class TrackEvidence:
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
         """Check whether a normalised innovation is too large for the target model.
 
-        With at most two sensors, a contradiction also marks the rest of the track as doubtful,
-        because many paths fit the fields. With more sensors, later frames correct the track.
+        With at most two sensors, a contradiction also marks the track as doubtful, because many
+        paths fit the fields. With more sensors, later frames correct the track.
 
         Parameters
         ----------
@@ -320,7 +320,7 @@ class TrackEvidence:
         return are_doubtful((*self._doubtful_times, *self._smoothed_segments), stamp_ns)
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
-        """Count the time for which only one of several sensors supported the track.
+        """Add to the time for which only one of several sensors supported the track.
 
         A single sensor determines neither the scale nor the mirror image, and the other sensors do
         not always correct the error when they return.

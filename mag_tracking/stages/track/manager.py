@@ -231,7 +231,7 @@ class TrackManager:
         return [*out, *self._unexplained(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
 
     def _unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
-        """Start the disturbances that ended tracks reveal, and return their records."""
+        """Start disturbances for the unexplained fields of `tracks`, and return their records."""
         out: list[TrackRecord] = []
         for found in (found for track in tracks for found in track.unexplained):
             self.counts[DISTURBANCE_TRACKS] += 1
@@ -239,7 +239,7 @@ class TrackManager:
         return out
 
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
-        """Update every running track with the frame, and delete those that end."""
+        """Update every running track with the frame, and delete the tracks that end."""
         doubtful = self._doubtful_sensors(frame)
         self._max_energy = max(self._max_energy, _energy(frame))
         for track in self._tracks:
@@ -248,7 +248,7 @@ class TrackManager:
         return out + self._delete_ended(frame.stamp_ns)
 
     def _delete_ended(self, stamp_ns: int) -> list[TrackRecord]:
-        """Delete the ended tracks, and return the records of the disturbances that they reveal."""
+        """Delete the tracks that ended, and return the records of their disturbances."""
         out = self._unexplained([track for track in self._tracks if track.ended is not None],
                                 stamp_ns)
         # A vehicle that restarts in the tail of its detection would be placed on the wrong line.
@@ -314,8 +314,8 @@ class TrackManager:
 def _energy(frame: FieldFrame) -> float:
     """Sum of the squared field of all sensors [T²].
 
-    It is not weighted with the noise, because the noise that the detector allows for grows during a
-    detection.
+    The energy is not weighted with the noise, because the noise assumed by the detector increases
+    during a detection.
     """
     return float(np.nansum(np.square(frame.field)))
 

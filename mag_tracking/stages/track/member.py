@@ -130,7 +130,7 @@ class Member:
         self._plausibility = Plausibility()
 
     def start_alongside(self, first: 'Member', stamp_ns: int, ratio: float) -> None:
-        """Start as a new target beside the first member of a track.
+        """Start as a new target of a track, in addition to its first member.
 
         The new target inherits the first member's doubt about the approach, and its evidence
         against a disturbance.
@@ -294,7 +294,7 @@ class Member:
 
     def states_of(self, slot: int, n_one: int, states: Iterable[TrackState],
                   end_ns: float = np.inf) -> list[TrackState]:
-        """States of the target among those of all members, within its lifetime.
+        """States of the target, extracted from the states of all members within its lifetime.
 
         Parameters
         ----------

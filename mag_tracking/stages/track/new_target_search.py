@@ -63,7 +63,7 @@ N_DISTANCES = 10
 
 
 class NewTargetSearch:
-    """Search for explanations of a window with one more vehicle, or with a vehicle elsewhere.
+    """Search for explanations of a window with a further vehicle or a vehicle elsewhere.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class NewTargetSearch:
         Returns
         -------
         Joint or None
-            None if there is no such explanation.
+            None if no such explanation is usable.
         """
         if not len(self._search.samples.t):
             return None
@@ -193,7 +193,7 @@ class NewTargetSearch:
             self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
 
     def _is_elsewhere(self, joint: Joint) -> bool:
-        """Whether a vehicle that was searched for elsewhere was found far from its track."""
+        """Whether the vehicle that was searched for again was found far from its track."""
         n, now = self._n_one, self._bank.x[self._bank.best()]
         assert joint.replaced is not None
         found = joint.bank.x[joint.bank.best()]
@@ -232,7 +232,7 @@ class NewTargetSearch:
 
     def _starts_on(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
                  replaced: int | None) -> list[WindowStart]:
-        """Starts of known vehicles and new ones on `paths` (k, 7) with moments (k, 3, 3)."""
+        """Starts of known vehicles and new vehicles on `paths` (k, 7) with moments (k, 3, 3)."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
         labels = self._search.prior.nearest_line(paths)[0].tolist()
         starts = []

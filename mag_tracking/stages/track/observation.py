@@ -35,7 +35,7 @@ def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
     """
     std = [np.full(3, mounting_std) if s is None else np.minimum(s, MAX_ROTATION)
            for s in network.orientation_std]
-    # The angles are about the axes of the sensor, `orientation_std` is about those of the world.
+    # The angles are about the axes of the sensor, but `orientation_std` is about the world axes.
     priors: FloatArray = np.einsum('jik,jk,jlk->jil', network.R_sw, np.square(std), network.R_sw)
     # Exact symmetry is preserved by all later operations.
     return 0.5 * (priors + np.swapaxes(priors, 1, 2))

@@ -23,7 +23,7 @@ NEAR_ERROR_LENGTH = 0.2
 """[m] Near a sensor, the relative error is at least this length divided by the distance."""
 
 MAX_SENSORS = 4
-"""Maximum number of sensors; those with the strongest fields are used."""
+"""Maximum number of sensors. The sensors with the strongest fields are used."""
 
 N_STEPS, TOLERANCE = 30, 1e-3
 """Maximum number of steps, and the relative improvement of the cost below which the search ends."""
@@ -52,7 +52,7 @@ class PassSamples:
 
     @property
     def n_clocks(self) -> int:
-        """Number of clocks that are compared with the reference clock, at the strongest field."""
+        """Number of clocks that are compared with the reference clock."""
         return len(self.compared) - 1
 
     def n_free(self, n_dipoles: int) -> int:

@@ -77,7 +77,7 @@ class Plausibility:
 
     def _update_road_check(self, bank: FilterBank, settings: VehicleSettings,
                            positions: FloatArray) -> None:
-        """Update the closest point of each hypothesis, and whether it was off the road there."""
+        """Update for each hypothesis its closest point, and whether it was off the road there."""
         n_added = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
         self._nearest = np.append(self._nearest, np.full(n_added, np.inf))
         self._was_off_road = np.append(self._was_off_road, np.zeros(n_added, dtype=bool))

@@ -185,7 +185,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     ambiguous_poses : str, optional
         Setting `track.ambiguous_poses`.
     difference : (6,) array, m and m/s
-        Offset of another possible position and velocity, which the covariance has to cover.
+        Difference to another possible position and velocity, which the covariance must cover.
     stamp_ns : int, ns
         This and the following parameters are fields of `Track`.
     id : int
@@ -297,7 +297,7 @@ def mixture_uncertainty(bank: FilterBank, best: int, apart: BoolArray, model: So
     n_t = len(model.state_names)
     widening = published['covariance'] - excess * P_unwidened[:6, :6]
     covariance = widening + excess * _second_moment(bank, best, model, bank.log_w)[:6, :6]
-    # Headings may be opposite, which is too far apart for a derivative.
+    # Headings may be opposite, for which a linearisation is invalid.
     log_w = np.where(apart, bank.log_w, -np.inf)
     rows = np.flatnonzero(log_w >= bank.log_w.max() + np.log(NEGLIGIBLE_WEIGHT))
     if not len(rows):
@@ -391,7 +391,7 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
 def _pose_fields(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray,
                  kind: int, unobserved_length: UnobservedLength | None, difference: FloatArray
                  ) -> tuple[PoseFields, Flags]:
-    """Fields of a record from a target state, and which rotations are unobservable."""
+    """Fields of a record from a target state, and flags of the unobservable rotations."""
     dipoles = model.dipoles(x[None])
     dm_dx = dipoles.dm_dx[0].sum(axis=0)
     length, length_std = 0.0, 0.0

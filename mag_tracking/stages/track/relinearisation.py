@@ -48,7 +48,7 @@ CONVERGED = 0.3
 """Maximum movement of a converged path in the last step, in standard deviations of the position."""
 
 ATTEMPTED, FAILED = 'paths relinearised', 'paths relinearised without success'
-"""Keys in the counts."""
+"""Keys of the event counts."""
 
 MAX_FRAMES = 64
 """Maximum number of frames in a window. When it moves, at most half of them remain. Without this
@@ -232,7 +232,7 @@ class Relinearisation:
                       self._max_hypotheses)
 
     def without_target(self, bank_filter: BankFilter, bank: FilterBank, i: int, n: int) -> None:
-        """Remove one of several targets from the window.
+        """Remove a target from the window.
 
         Parameters
         ----------
@@ -256,7 +256,7 @@ class Relinearisation:
         self._gain = {}
 
     def resume(self, window: Window) -> None:
-        """Continue from another window, whose hypotheses replace those of the track.
+        """Continue with another window, whose hypotheses replace the hypotheses of the track.
 
         Parameters
         ----------

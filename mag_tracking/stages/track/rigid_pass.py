@@ -141,7 +141,7 @@ class RigidPass:
         Returns
         -------
         (6,) array, m and m/s
-            Zero if there are no such paths.
+            Zero if `straight_paths` is empty.
         """
         if not len(self.straight_paths):
             return np.zeros(6)

@@ -285,7 +285,7 @@ class RunningTrack:
         return out
 
     def _end_member(self, member: Member, reason: str) -> list[TrackRecord]:
-        """End one member; the others continue without its states."""
+        """End one member, and remove its states from the joint state."""
         if len(self.members) == 1:
             self.is_lost = member.is_lost
             return self.end(reason)

@@ -72,7 +72,7 @@ def part_of_frame(frame: FieldFrame, rows: IntArray) -> FieldFrame:
 
 
 class SensorSubset:
-    """The sensors that a track uses: all sensors of a network, or some of a large one.
+    """Sensors that a track uses: all sensors of a network, or a selection in a large network.
 
     Parameters
     ----------
@@ -176,9 +176,9 @@ class SensorSubset:
 
 def exchange_sensor_states(bank: FilterBank, before: IntArray, after: IntArray,
                            own_covariance: FloatArray, background_std: float) -> None:
-    """Replace the sensor states of a bank, in place, by those of other sensors.
+    """Replace the sensor states of a bank, in place, by the states of other sensors.
 
-    Sensors that are in both sets keep their states and correlations.
+    The states and correlations of sensors in both sets are retained.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def _state_columns(n_t: int, n_own: int, n_sensors: int) -> IntArray:
 
 def for_whole_network(track: Track, rows: IntArray, network: SensorNetwork,
                       settings: TrackSettings) -> Track:
-    """Extend a track of some sensors to the whole network.
+    """Extend a track from its sensors to the whole network.
 
     Parameters
     ----------

@@ -272,7 +272,7 @@ class FixedLag:
         return out
 
     def remaining(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[TrackState]:
-        """Smoothed states of all remaining frames at the end of a track.
+        """Return the smoothed states of the frames that remain at the end of a track.
 
         Parameters
         ----------
@@ -291,7 +291,7 @@ class FixedLag:
             self._frames, self._states(bank_filter, bank, best), strict=True) if lagged.published]
 
     def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
-        """Smoothed states of the stored frames, not relinearised to limit the time per frame."""
+        """Smoothed states of the stored frames; relinearisation would take too long per frame."""
         oldest = self._frames[0]
         one, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
         one.x, one.P = oldest.x[row].copy(), oldest.P[row].copy()

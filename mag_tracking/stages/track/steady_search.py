@@ -1,4 +1,4 @@
-"""Search for vehicles on straight paths in the frames of a window, beside known vehicles.
+"""Search for vehicles on straight paths in the frames of a window, given known vehicles.
 
 All quantities in which the field is linear are Gaussian and are marginalised: the moments of the
 vehicle, the backgrounds, and the uncertainty of known vehicles. The remaining parameters describe

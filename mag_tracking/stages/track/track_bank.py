@@ -37,7 +37,7 @@ class Advance:
     log_likelihood: FloatArray
     """(n_hyp,) Log-likelihood of the frame for each hypothesis."""
     evidence: float
-    """Log-density of the frame over all hypotheses; -inf if none explains it."""
+    """Log-density of the frame over all hypotheses; -inf if no hypothesis explains it."""
     n_rejected: int
     """Number of rejected sensors."""
 
@@ -244,7 +244,7 @@ class TrackBank:
         return states
 
     def without_target(self, i: int) -> None:
-        """Remove one of several targets.
+        """Remove a target from the state.
 
         Parameters
         ----------
@@ -328,7 +328,7 @@ class TrackBank:
         return True
 
     def _switch_sensors(self, sensors: SensorSubset) -> None:
-        """Replace the sensor states of the hypotheses by those of other sensors."""
+        """Replace the sensor states of the hypotheses by the states of other sensors."""
         before, self.sensors = self.sensors.rows, sensors
         self.filter = self.filter_of(1)
         self._rejection = SensorRejection(sensors.network.names)

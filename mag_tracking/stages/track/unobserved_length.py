@@ -1,4 +1,4 @@
-"""Uncertainty of the middle of a vehicle whose whole length has not been observed."""
+"""Uncertainty of the middle of a vehicle due to the length that has not been observed."""
 
 from collections.abc import Sequence
 
@@ -65,7 +65,7 @@ class UnobservedLength:
         self._last_position = x[:2].copy()
 
     def covariance(self, x: FloatArray, P: FloatArray, length: float, kind: int) -> FloatArray:
-        """Covariance to be added to that of the horizontal position.
+        """Covariance to be added to the covariance of the horizontal position.
 
         Parameters
         ----------

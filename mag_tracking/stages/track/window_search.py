@@ -1,4 +1,4 @@
-"""Samples of a window for the search for vehicles, without the fields of known vehicles."""
+"""Samples of a window for the search for vehicles, given the fields of known vehicles."""
 
 from functools import cached_property
 
@@ -87,7 +87,7 @@ class WindowSearch:
         return self._vehicles.background_std * self.samples.backgrounds
 
     def _columns(self, H: FloatArray, x: FloatArray, t: FloatArray, n_one: int) -> FloatArray:
-        """Fields (n, n_sensors, 3, q) of one standard deviation of the errors of known vehicles.
+        """Fields (n, n_sensors, 3, q) of errors of known vehicles by one standard deviation.
 
         `H` (n, n_sensors, 3, n_t) are the derivatives along a path that ends with the state `x`
         (n_x,), at times `t` (n,) [s] before its end.

@@ -1,4 +1,4 @@
-"""Hypotheses at the start of a window: known vehicles and new ones."""
+"""Hypotheses at the start of a window: known and new vehicles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class KnownVehicles(PathHypothesis):
     """Hypothesis of the known vehicles in a search for others."""
 
     filter: BankFilter | None
-    """Filter for this number of vehicles; None if there are none."""
+    """Filter for this number of vehicles; None if no vehicle is known."""
 
 
 def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:

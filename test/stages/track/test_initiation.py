@@ -54,7 +54,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     np.testing.assert_allclose(np.linalg.norm(m, axis=1), np.take(vehicle.moments, bank.kind),
                                rtol=1e-9)
     np.testing.assert_array_equal(bank.x[:, length], np.take(vehicle.lengths, bank.kind))
-    # In 50 uT, the soft iron of each axis contributes its share of that moment.
+    # In 50 uT, the soft iron of each axis contributes the induced share of this moment.
     soft = [model.state_names.index(f'D{axis}') for axis in 'xyz']
     share = bank.x[:, soft] * 5e-5 / MU0 / np.take(vehicle.moments, bank.kind)[:, None]
     np.testing.assert_allclose(share, vehicle.induced_share, rtol=1e-12)

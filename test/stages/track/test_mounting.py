@@ -184,7 +184,7 @@ def test_orientation_covariances_are_rotated_into_sensor_frames():
     np.testing.assert_allclose(P[0, :3, :3], np.diag(STD**2), atol=1e-18)
     # The sensor's y axis is the world's z axis, about which the heading rotates.
     np.testing.assert_allclose(P[1, :3, :3], np.diag(STD[[0, 2, 1]]**2), atol=1e-18)
-    # In the sensor frame, the variance about the vertical is that of the heading.
+    # In the sensor frame, the variance about the vertical equals the variance of the heading.
     up = askew.inv().apply([0.0, 0.0, 1.0])
     assert up @ P[2, :3, :3] @ up == pytest.approx(STD[2]**2)
     assert np.trace(P[2, :3, :3]) == pytest.approx(STD @ STD)

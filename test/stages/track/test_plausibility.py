@@ -42,7 +42,7 @@ def doubts_in_state(mounting=MOUNTING, dt=0.08, **of_state):
     ({'angles_deg': 6.0}, set()), ({'angles_deg': 8.0}, {doubts.SENSORS_ROTATED}),
     ({'angles_deg': -8.0}, {doubts.SENSORS_ROTATED}),
     ({'mounting': 0.0}, set()),
-    # At 4.5 m from both sensors, or above one of them.
+    # The vehicle is 4.5 m from both sensors, or above one of them.
     ({'speed': 40.0}, set()), ({'speed': 45.0}, {doubts.FRAMES_TOO_LONG}),
     ({'speed': 45.0, 'dt': 0.04}, set()), ({'speed': 40.0, 'at': (0.0, 4.4)}, set()),
     # The limit is 1.645 standard deviations of 1.5 m beyond the outermost lane at 4 m, except for

@@ -23,7 +23,7 @@ from support.samples import one, simulate
 
 
 def bank_of(rng, n_hyp, n_t, n_own, n_sensors):
-    """Hypotheses whose states are all correlated."""
+    """`FilterBank` of random hypotheses in which all states are correlated."""
     n_x = n_t + (n_own + 3) * n_sensors
     A = rng.standard_normal((n_hyp, n_x, n_x))
     bank = FilterBank.from_targets(np.zeros((n_hyp, n_t)), np.zeros((n_hyp, n_t, n_t)),

@@ -109,7 +109,7 @@ def test_the_backward_pass_matches_least_squares_over_all_times(unit):
     whole = np.array([whole_derivative(h) for h in H])
     whole[missing] = 0.0
     R = block_diag(*C)
-    # Missing rows are removed from the noise as well.
+    # Missing rows are also removed from the noise.
     expected = [batch_solution(block_diag(F, np.diag(decay)), np.diag(Q), whole, R,
                                np.where(missing, 0.0, y.reshape(N_STEPS, -1)), x, P0, missing)
                 for x in x0]

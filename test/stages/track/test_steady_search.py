@@ -84,7 +84,7 @@ def test_the_field_of_a_known_vehicle_is_not_another_vehicle():
 
 @pytest.mark.parametrize('truths', [[FIRST], [FIRST, SECOND]])
 def test_the_gradient_of_the_cost_is_exact(truths):
-    """Kaufman's Jacobian gives the exact gradient, also for two vehicles together."""
+    """Kaufman's Jacobian yields the exact gradient, also for two vehicles together."""
     search, _ = search_of(*truths)
     off = np.array([0.3, 0.2, 0.1, -0.5, 0.02, 0.01, 0.3])
     theta = np.concatenate([truth + off for truth in truths])[None]
@@ -174,7 +174,7 @@ def test_a_pair_with_a_stationary_vehicle_is_rejected(stationary):
 @pytest.mark.parametrize('away, is_sensed', [
     (0.0, True), (15.0, True), (90.0, False), (300.0, False), (1e23, False), (-1e200, False)])
 def test_a_vehicle_that_no_sensor_senses_is_rejected(away, is_sensed):
-    """Another vehicle far away does not change how well the frames are explained."""
+    """A distant vehicle does not improve the fit of the frames."""
     search, _ = search_of(FIRST)
     other = np.append(away, SECOND[1:])
     for theta in (other, np.append(FIRST, other), np.append(other, FIRST)):

@@ -123,7 +123,7 @@ def test_the_roll_of_a_dipole_is_flagged_as_unobservable():
     C = pose_covariance(track)
     np.testing.assert_allclose(C, C.T)
     assert np.linalg.eigvalsh(C).min() > -1e-12
-    # Rotations across the moment are well known.
+    # Rotations about axes across the moment are observable.
     across = np.linalg.svd(u[None])[2][1:]
     assert np.abs(across @ track.orientation_covariance @ across.T).max() < 1e-2
 
@@ -139,7 +139,7 @@ def test_a_vehicle_has_a_heading_and_unobservable_roll_and_pitch():
     np.testing.assert_allclose(R[:2, 0], v, atol=1e-9)
     C = middle.orientation_covariance
     assert C[0, 0] == C[1, 1] == pytest.approx(np.pi**2)
-    # The variance of the heading follows from that of the velocity across it.
+    # The variance of the heading follows from the variance of the velocity across the heading.
     u = np.array([-v[1], v[0]])
     expected = u @ middle.covariance[3:5, 3:5] @ u / (middle.velocity[:2] @ middle.velocity[:2])
     assert C[2, 2] == pytest.approx(expected, rel=1e-9)

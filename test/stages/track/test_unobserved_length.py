@@ -32,7 +32,8 @@ def middle_offsets(length, half_std, is_sensed, n=400_000):
 @pytest.mark.parametrize('complete', [True, False])
 @pytest.mark.parametrize('length', [5.0, -5.0])
 def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(complete, length):
-    """The variance along the heading grows by the excess length; a car keeps its covariance."""
+    """The variance along the heading grows by the excess length. The covariance of a car is
+    unchanged."""
     model, x, found = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi), {}
     x[18] = length
     for kind, usual, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
