@@ -83,8 +83,8 @@ class VehicleSettings:
         'from the modelled dipoles. Near a vehicle, the model error is the first neglected '
         'multipole term.', 'm', (0.0, 1000.0))
     induced_share: float = param(
-        0.4, 'Share of the initial moment that a field of 50 uT would induce: soft iron D = share '
-        'x moment x mu0 / 50 uT along each axis of the vehicle, m = Rz (m0 + D Rz^T B0/mu0). '
+        0.4, 'Fraction of the initial moment that a field of 50 uT would induce: soft iron D = '
+        'share x moment x mu0 / 50 uT along each axis of the vehicle, m = Rz (m0 + D Rz^T B0/mu0). '
         'TSP14 Tables V and VI give 0.26 for a car (its D times three); T10 Table 6.9, as fitted '
         'here, gives 0.42. No effect without an earth field.', '', (0.0, 10.0))
     induced_share_std: float = param(
@@ -96,7 +96,7 @@ class VehicleSettings:
         1.0, 'Root spectral density of the horizontal acceleration.', 'm/s^1.5', (0.0, 1000.0))
     turn_acceleration: float = param(
         3.0, 'Standard deviation of the lateral acceleration of turning hypotheses; each straight '
-        'hypothesis has a turning one beside it. 0 = no turning hypotheses, half the number of '
+        'hypothesis has a turning counterpart. 0 = no turning hypotheses, half the number of '
         'hypotheses.', 'm/s^2', (0.0, 100.0))
     turn_time: float = param(1.5, 'Correlation time of the turn rate.', 's', (0.01, 1000.0))
     turn_share: float = param(
@@ -105,7 +105,7 @@ class VehicleSettings:
         0.1, 'Root spectral density of the vertical acceleration.', 'm/s^1.5', (0.0, 1000.0))
     moment_drift: float = param(
         0.03, 'Random walk of the hard iron moment, relative to its magnitude. The effective '
-        'moment of a vehicle depends on the side from which it is seen.', '1/s^0.5', (0.0, 1e3))
+        'moment of a vehicle depends on the side that faces the sensor.', '1/s^0.5', (0.0, 1e3))
     difference_drift: float = param(
         0.0125, 'Random walk of the dipole moments of a row about their mean, relative to the '
         'magnitude of the hard iron moment.', '1/s^0.5', (0.0, 1e3))
