@@ -1,4 +1,4 @@
-"""Test whether the field of a track grew like that of a target approaching from afar."""
+"""Approach test: check that the field of a track grew as for a target approaching from afar."""
 
 import numpy as np
 
@@ -11,18 +11,19 @@ SENSED_LEVEL = 2.5
 """RMS of the whitened field above which the target counts as sensed."""
 
 GROWTH_RATIO = 10.0
-"""The growth is examined from `SENSED_LEVEL` up to this multiple of it."""
+"""Ratio of the highest to the lowest field level in the test; the lowest level is
+`SENSED_LEVEL`."""
 
 MIN_LOG2_RATIO = -0.25
-"""Minimum log2 of the ratio of the durations of the first and second half of the growth. In theory
-it is 0.55 for a uniformly decreasing distance and -0.83 for a target that starts from rest beside a
-sensor. A field that jumps gives less."""
+"""Minimum log2 ratio of the durations of the first and the second half of the growth. The
+theoretical value is 0.55 for a uniformly decreasing distance and -0.83 for a target that starts
+from rest next to a sensor. A field that jumps has a smaller value."""
 
-STEADY_SHARE = 0.85
-"""The growth is not steady if the field falls to this share of its previous maximum."""
+STEADY_FRACTION = 0.85
+"""The growth is not steady if the field falls below this fraction of its previous maximum."""
 
-HALF_FRAME = 0.5
-"""Uncertainty, in frame periods, of the time at which the field reached a level."""
+LEVEL_TIME_STD = 0.5
+"""Uncertainty of the time at which the field reached a level, in frame periods."""
 
 MAX_FRAMES = 1000
 """The test is skipped if the field has not grown by `GROWTH_RATIO` within this number of frames."""
@@ -33,7 +34,7 @@ class Approach:
 
     def __init__(self) -> None:
         self._times: list[float] = []
-        self._sizes: list[float] = []
+        self._levels: list[float] = []
         self._is_open = True
 
     def add(self, frame: FieldFrame) -> bool:
@@ -46,26 +47,25 @@ class Approach:
         Returns
         -------
         bool
-            True if this frame completes the test and the field did not grow like that of a target
-            approaching from afar.
+            True if this frame completes the test and the test fails.
         """
         if not self._is_open:
             return False
         self._times.append(frame.stamp_ns / NS)
         energy, n_axes = whitened_energy(frame.field, frame.covariance)
         # The RMS of pure noise is 1; smaller values carry no information.
-        self._sizes.append(float(np.sqrt(max(energy.sum() / max(n_axes.sum(), 1), 1.0))))
-        self._is_open = self._sizes[-1] <= GROWTH_RATIO * SENSED_LEVEL \
-            and len(self._sizes) < MAX_FRAMES
+        self._levels.append(float(np.sqrt(max(energy.sum() / max(n_axes.sum(), 1), 1.0))))
+        self._is_open = self._levels[-1] <= GROWTH_RATIO * SENSED_LEVEL \
+            and len(self._levels) < MAX_FRAMES
         return not self._is_open and self._is_doubtful()
 
     def _is_doubtful(self) -> bool:
         """Whether the growth contradicts a target approaching from afar."""
-        time, sizes = np.array(self._times), np.array(self._sizes)
-        growth = growth_of(time, sizes, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
+        time, levels = np.array(self._times), np.array(self._levels)
+        growth = growth_of(time, levels, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
         # A field that falls in between belongs to a target that has passed its first sensor.
-        falls = sizes < STEADY_SHARE * np.maximum.accumulate(sizes)
-        if growth is None or (falls & (sizes > SENSED_LEVEL)).any():
+        is_falling = levels < STEADY_FRACTION * np.maximum.accumulate(levels)
+        if growth is None or (is_falling & (levels > SENSED_LEVEL)).any():
             return False
-        half = HALF_FRAME * float(np.median(np.diff(time)))
-        return bool(np.log2((growth.early + half) / (growth.late + half)) < MIN_LOG2_RATIO)
+        std = LEVEL_TIME_STD * float(np.median(np.diff(time)))
+        return bool(np.log2((growth.early + std) / (growth.late + std)) < MIN_LOG2_RATIO)

@@ -64,8 +64,8 @@ INLINE void advance_all(const Target& target, const Sensors& sensors, const Size
     }
 }
 
-// Largest distance of smoothed positions from those of a path `at`, both (n, n_x), in standard
-// deviations `deviation` (n). NaN propagates: such a path has not converged.
+// Largest distance between smoothed positions and a path `at`, both (n, n_x), in units of the
+// standard deviations `deviation` (n). NaN propagates: such a path has not converged.
 INLINE double farthest(const double* smoothed, const double* at, const double* deviation,
                        int n, int n_x) {
     double farthest = 0.0;

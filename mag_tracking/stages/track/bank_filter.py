@@ -17,14 +17,14 @@ from mag_tracking.stages.track.observation import TIME_RESOLUTION_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.unobserved_length import MAX_CAR_ROW
 
-LINEAR_SHARE = 0.25
-"""The field is approximately linear in the position within this share of the distance to the
+LINEAR_FRACTION = 0.25
+"""Displacement over which the field is approximately linear, as a fraction of the distance to the
 nearest sensor. The cube of that distance then changes by a factor of two."""
 
-SAME_TIME_SHARE = 0.05
-"""A frame that spans less than this share of the interval since the previous frame is treated as
-simultaneous. So is the first frame of a track: velocities are better estimated between frames than
-within one."""
+SAME_TIME_FRACTION = 0.05
+"""A frame whose samples span less than this fraction of the interval since the previous frame is
+treated as simultaneous. The first frame of a track is always treated as simultaneous, because
+differences between frames determine velocities better than differences within a frame."""
 
 
 class PathResult(NamedTuple):
@@ -57,24 +57,24 @@ def compiled_filter(model: SourceModel, observation: Observation
     sensors = (observation.positions, observation.R_sw, observation.n_angles,
                observation.n_own - observation.n_angles)
     if isinstance(model, RowVehicle):
-        one = partial(core.RowVehicleFilter, *sensors) if observation.n_targets == 1 \
+        create = partial(core.RowVehicleFilter, *sensors) if observation.n_targets == 1 \
             else partial(core.VehiclesFilter, *sensors, observation.n_targets)
-        return one(len(model.state_names), model.n_dipoles, list(model.acceleration_density),
-                   list(model.induction), model.moment_drift, model.difference_drift,
-                   model.turn_acceleration, model.turn_time, MAX_TURN_RATE)
+        return create(len(model.state_names), model.n_dipoles, list(model.acceleration_density),
+                      list(model.induction), model.moment_drift, model.difference_drift,
+                      model.turn_acceleration, model.turn_time, MAX_TURN_RATE)
     assert isinstance(model, Magnet) and observation.n_targets == 1
     return core.MagnetFilter(*sensors, list(model.acceleration_density), model.angular_density)
 
 
 class BankFilter:
-    """Predict and update a `FilterBank`; the filter itself keeps no state between calls.
+    """Stateless prediction and update of a `FilterBank`.
 
     Parameters
     ----------
     network : SensorNetwork
     model : SourceModel
     settings : TrackSettings
-        The live settings may be changed by `configure`.
+        `configure` may change the live settings.
     n_targets : int
         Number of targets that share a state; their fields add up.
 
@@ -86,7 +86,7 @@ class BankFilter:
     def __init__(self, network: SensorNetwork, model: SourceModel, settings: TrackSettings,
                  n_targets: int = 1) -> None:
         self._n_sensors = len(network)
-        self._no_offset = np.zeros(len(network))
+        self._zero_offset = np.zeros(len(network))
         self.observation = Observation(network, model, np.deg2rad(settings.mounting_std_deg),
                                        settings.model_error_time_s, n_targets)
         self._compiled = compiled_filter(model, self.observation)
@@ -104,11 +104,11 @@ class BankFilter:
         self._near_field_lengths: FloatArray = np.atleast_1d(
             settings.vehicle.near_field_lengths if is_vehicle
             else settings.magnet.near_field_length).astype(float)
-        self._are_long: BoolArray = np.array(
+        self._is_long_kind: BoolArray = np.array(
             settings.vehicle.lengths if is_vehicle else [0.0]) > MAX_CAR_ROW
 
     def move(self, bank: FilterBank, dt: float) -> None:
-        """Time update of a bank in place, without a measurement.
+        """Predict a bank in place, without a measurement update.
 
         Parameters
         ----------
@@ -117,15 +117,15 @@ class BankFilter:
             Negative values move the bank backwards in time, without process noise.
         """
         n = self._n_sensors
-        nowhere = FieldFrame(0, np.full((n, 3), np.nan), np.tile(np.eye(3), (n, 1, 1)),
-                             np.zeros(n, dtype=np.int64), np.zeros(n))
-        self._advance(bank, nowhere, dt, True, 0)
+        empty_frame = FieldFrame(0, np.full((n, 3), np.nan), np.tile(np.eye(3), (n, 1, 1)),
+                                 np.zeros(n, dtype=np.int64), np.zeros(n))
+        self._advance(bank, empty_frame, dt, True, 0)
 
     def advance(self, bank: FilterBank, frame: FieldFrame, dt: float, keeps_prior: bool = False
                 ) -> tuple[FloatArray, FloatArray]:
-        """Time update of a bank to a frame, and measurement update with it.
+        """Predict a bank to the time of a frame, and update it with the measurements.
 
-        The update is linearised `iterations` times (a setting).
+        The setting `iterations` is the number of linearisations of the measurement update.
 
         Parameters
         ----------
@@ -135,8 +135,8 @@ class BankFilter:
         dt : float, s
             Time since the previous frame.
         keeps_prior : bool
-            Leave the arrays that were `bank.x` and `bank.P` unchanged, which is slower. By default
-            they are overwritten.
+            Write the states and covariances to new arrays, which is slower. By default the arrays
+            `bank.x` and `bank.P` are overwritten.
 
         Returns
         -------
@@ -149,7 +149,10 @@ class BankFilter:
 
     def _advance(self, bank: FilterBank, frame: FieldFrame, dt: float, moves: bool,
                  iterations: int, keeps_prior: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Predicted states (n_hyp, n_x) and log-likelihoods (n_hyp,); 0 iterations only predict."""
+        """Advance a bank, and return predicted states (n_hyp, n_x) and log-likelihoods (n_hyp,).
+
+        With 0 iterations, the bank is only predicted.
+        """
         n_hyp = len(bank)
         decay, variance = self.observation.drift(np.asarray(dt), self._settings.background_drift)
         # With a thousand hypotheses the speed is limited by memory: writing to new arrays takes
@@ -175,7 +178,7 @@ class BankFilter:
         Parameters
         ----------
         bank : FilterBank
-            State at the first frame; replaced by the state at the last one.
+            Bank at the first frame; replaced by the bank at the last frame.
         frames : list of FieldFrame
             The n frames of the path.
         intervals : list of float, s
@@ -186,8 +189,8 @@ class BankFilter:
         passes : int
             Number of passes; each is linearised along the path of the previous one.
         step : float
-            Share of the difference from the path to its smoothed states by which each pass moves
-            it.
+            Fraction of the difference between smoothed states and path by which each pass moves the
+            path.
         first_is_updated : bool
             The bank has already been updated with the first frame.
         rejects_outliers : bool
@@ -240,12 +243,12 @@ class BankFilter:
             Multiples of `SAME_TIME_S`; 0 for a frame that is treated as simultaneous.
         """
         offset: FloatArray = frame.time_offset
-        if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_SHARE * dt:
-            return self._no_offset
+        if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_FRACTION * dt:
+            return self._zero_offset
         return np.round(offset / TIME_RESOLUTION_S) * TIME_RESOLUTION_S
 
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
-        """Variance of the model error of the field of a hypothesis.
+        """Variance of the model error in the field of a hypothesis.
 
         Only the part that is uncorrelated with the previous frame is returned.
 
@@ -253,7 +256,7 @@ class BankFilter:
         ----------
         bank : FilterBank
         i : int
-            Row of the hypothesis.
+            Index of the hypothesis.
         dt : float, s
             Time since the previous frame.
 
@@ -264,20 +267,20 @@ class BankFilter:
         error = self.observation.model_error(
             bank.x[i], self._lengths(bank.kind[i:i + 1])[0], self._settings.field_error)
         time = self._settings.model_error_time_s
-        share = -np.expm1(-2.0 * dt / time) if time else 1.0
-        return share * np.nan_to_num(error, posinf=0.0)
+        fraction = -np.expm1(-2.0 * dt / time) if time else 1.0
+        return fraction * np.nan_to_num(error, posinf=0.0)
 
     def predicted_field(self, bank: FilterBank, i: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
-        """Field of a frame predicted by a hypothesis, with backgrounds.
+        """Field that a hypothesis predicts for a frame, including backgrounds.
 
-        The estimated model errors are left out: with them, almost any field would fit.
+        The estimated model errors are excluded, because almost any field would fit with them.
 
         Parameters
         ----------
         bank : FilterBank
         i : int
-            Row of the hypothesis.
+            Index of the hypothesis.
         frame : FieldFrame
         dt : float, s
             Time since the previous frame.
@@ -295,9 +298,9 @@ class BankFilter:
 
     def fields_at(self, x: FloatArray, kind: IntArray, frame: FieldFrame, dt: float
                   ) -> tuple[FloatArray, FloatArray]:
-        """Fields of the targets of a state at the sampling times of a frame, and their derivatives.
+        """Target fields of a state at the sampling times of a frame, and their derivatives.
 
-        Backgrounds and model errors are left out.
+        Backgrounds and model errors are excluded.
 
         Parameters
         ----------
@@ -320,15 +323,15 @@ class BankFilter:
 
     def field_of_others(self, bank: FilterBank, i: int, target: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
-        """Field of all targets of a hypothesis but one, at the sampling times of a frame.
+        """Field of all targets of a hypothesis except one, at the sampling times of a frame.
 
         Parameters
         ----------
         bank : FilterBank
         i : int
-            Row of the hypothesis.
+            Index of the hypothesis.
         target : int
-            The target to leave out.
+            Index of the excluded target.
         frame : FieldFrame
         dt : float, s
             Time since the previous frame.
@@ -355,11 +358,11 @@ class BankFilter:
         -------
         (n,) bool array
         """
-        are_long: BoolArray = np.any(self._are_long[kind].reshape(len(kind), -1), axis=1)
+        are_long: BoolArray = np.any(self._is_long_kind[kind].reshape(len(kind), -1), axis=1)
         return are_long
 
     def nearly_linear(self, x: FloatArray) -> FloatArray:
-        """Distance from the position within which the field is approximately linear in it.
+        """Displacement of a target over which the field is approximately linear.
 
         Parameters
         ----------
@@ -369,7 +372,7 @@ class BankFilter:
         -------
         (n_hyp,) array, m
         """
-        return LINEAR_SHARE * self.observation.distance_to_nearest(x)
+        return LINEAR_FRACTION * self.observation.distance_to_nearest(x)
 
     def is_implausible(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
         """Whether the normalised innovation of a hypothesis exceeds `end_nis` per axis.
@@ -377,9 +380,9 @@ class BankFilter:
         Parameters
         ----------
         bank : FilterBank
-            Just updated with `frame`.
+            Bank after the update with `frame`.
         i : int
-            Row of the hypothesis.
+            Index of the hypothesis.
         frame : FieldFrame
 
         Returns
@@ -391,7 +394,7 @@ class BankFilter:
 
 
 class NoTarget:
-    """Filter of the hypothesis that there is no target, only drifting backgrounds.
+    """Filter of the hypothesis without a target, in which only the backgrounds drift.
 
     Its log-density is the reference for the evidence of a target.
 
@@ -422,23 +425,24 @@ class NoTarget:
         float
         """
         self._P += background_drift**2 * dt * np.eye(3)
-        there = ~np.isnan(frame.field)
-        both = there[:, :, None] & there[:, None, :]
+        is_present = ~np.isnan(frame.field)
+        both_present = is_present[:, :, None] & is_present[:, None, :]
         # A missing axis has zero innovation and an independent unit variance.
-        u = np.where(there, frame.field - self._x, 0.0)
-        S = np.where(both, self._P + frame.covariance, np.eye(3))
+        u = np.where(is_present, frame.field - self._x, 0.0)
+        S = np.where(both_present, self._P + frame.covariance, np.eye(3))
         L = np.linalg.cholesky(S)
         whitened = np.linalg.solve(L, np.concatenate(
-            [u[:, :, None], np.where(there[:, :, None], self._P, 0.0)], axis=2))
+            [u[:, :, None], np.where(is_present[:, :, None], self._P, 0.0)], axis=2))
         z, G = whitened[:, :, 0], whitened[:, :, 1:]
         self._x += np.einsum('jai,ja->ji', G, z)
         self._P -= np.swapaxes(G, 1, 2) @ G
-        return float(-0.5 * (np.square(z).sum() + np.count_nonzero(there) * np.log(2.0 * np.pi))
+        return float(-0.5 * (np.square(z).sum()
+                             + np.count_nonzero(is_present) * np.log(2.0 * np.pi))
                      - np.log(np.einsum('jaa->ja', L)).sum())
 
 
 def known_covariance(covariance: FloatArray) -> FloatArray:
-    """Covariances of frames with the missing axes filled in.
+    """Frame covariances with the identity in place of missing axes.
 
     Parameters
     ----------

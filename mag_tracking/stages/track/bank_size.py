@@ -1,4 +1,4 @@
-"""Memory that the start of a track needs, limited before anything is allocated."""
+"""Memory limits for the hypotheses of a track, checked before allocation."""
 
 import math
 from collections.abc import Mapping
@@ -11,27 +11,27 @@ from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.settings import TrackSettings
 
 MAX_BYTES = 4 << 30
-"""Limit for the covariances of all starting hypotheses, and for the grid of a magnet. The peak
-memory is 1.5 times as large."""
+"""Maximum memory of the covariances of all starting hypotheses, and of the grid of a magnet
+[bytes]. The peak memory is 1.5 times as large."""
 START_BYTES = 250_000_000
-"""Limit for the covariances of all starting hypotheses of a track. If it requires fewer sensors,
-the others are added when the track has run through the frames before its detection."""
+"""Maximum memory of the covariances of all starting hypotheses of a track [bytes]. If it does not
+suffice for all sensors, the remaining sensors are added after the frames before the detection."""
 MIN_SENSORS_AT_START = 4
-"""Minimum number of sensors at the start of a track: those nearest to the sensor with the strongest
-field."""
+"""Minimum number of sensors at the start of a track. The sensors nearest to the strongest field are
+used."""
 WIDER_BYTES = 100_000_000
-"""Limit for the covariances of the hypotheses that are kept when the other sensors are added."""
+"""Maximum memory of the covariances after the remaining sensors have been added [bytes]."""
 MIN_HYPOTHESES = 100
-"""Minimum number of hypotheses kept, even if they exceed `WIDER_BYTES`."""
-WEIGHT_KEPT = 0.999
-"""The other sensors are added only if the hypotheses that are kept have this share of the weight.
-With less, the track would appear more certain than the frames allow."""
+"""Minimum number of retained hypotheses, even if they exceed `WIDER_BYTES`."""
+MIN_WEIGHT = 0.999
+"""Minimum total weight of the retained hypotheses when the remaining sensors are added. With a
+smaller weight, the track would appear more certain than the frames justify."""
 _FLOAT_BYTES = 8
 
 
 def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
                        model: SourceModel) -> None:
-    """Check the memory that the hypotheses of a vehicle need.
+    """Check the memory required by the hypotheses of a vehicle.
 
     Parameters
     ----------
@@ -51,8 +51,8 @@ def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
         len(model.state_names) + _states_per_sensor(settings) * n)**2
     if size > MAX_BYTES:
         raise SettingsError(f'track.max_sensors: {MIN_HYPOTHESES} hypotheses with the states of '
-                            f'{n} sensors need {_gigabytes(size)} of memory; the limit is '
-                            f'{_gigabytes(MAX_BYTES)}')
+                            f'{n} sensors need {_in_gigabytes(size)} of memory; the limit is '
+                            f'{_in_gigabytes(MAX_BYTES)}. Reduce track.max_sensors')
 
 
 def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
@@ -77,15 +77,15 @@ def sensors_at_start(settings: TrackSettings, network: SensorNetwork, model: Sou
     -------
     int
     """
-    most = _n_sensors(settings, network)
+    n_max = _n_sensors(settings, network)
     if settings.target != 'vehicle':
-        return most
-    return min(most, _affordable(math.prod(_vehicle_factors(settings).values()),
-                                 len(model.state_names), _states_per_sensor(settings)))
+        return n_max
+    return min(n_max, _max_affordable_sensors(math.prod(_vehicle_factors(settings).values()),
+                                              len(model.state_names), _states_per_sensor(settings)))
 
 
 def max_sensors(observation: Observation, n_hyp: int) -> int:
-    """Maximum number of sensors for a bank of a given size, within `START_BYTES`.
+    """Maximum number of sensors for which a bank stays within `START_BYTES`.
 
     Parameters
     ----------
@@ -97,17 +97,17 @@ def max_sensors(observation: Observation, n_hyp: int) -> int:
     -------
     int
     """
-    return _affordable(n_hyp, observation.n_target, observation.n_own + 3)
+    return _max_affordable_sensors(n_hyp, observation.n_target, observation.n_own + 3)
 
 
-def _affordable(n_hyp: int, n_target: int, n_of_sensor: int) -> int:
-    """Number of sensors within `START_BYTES`, by the numbers of states of target and sensor."""
+def _max_affordable_sensors(n_hyp: int, n_target: int, n_of_sensor: int) -> int:
+    """Maximum number of sensors within `START_BYTES`, but at least `MIN_SENSORS_AT_START`."""
     n_states = math.isqrt(START_BYTES // (_FLOAT_BYTES * n_hyp))
     return max((n_states - n_target) // n_of_sensor, MIN_SENSORS_AT_START)
 
 
 def max_hypotheses(observation: Observation, n_sensors: int) -> int:
-    """Maximum number of hypotheses that are kept when a track changes to `n_sensors` sensors.
+    """Maximum number of hypotheses that a track retains when it changes to `n_sensors` sensors.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def max_hypotheses(observation: Observation, n_sensors: int) -> int:
 
 def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
                       model: SourceModel) -> None:
-    """Check the memory that the grid and the hypotheses of a magnet need.
+    """Check the memory required by the grid and the hypotheses of a magnet.
 
     Parameters
     ----------
@@ -143,8 +143,9 @@ def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
     size = magnet.grid_points * n * 9 * _FLOAT_BYTES
     if size > MAX_BYTES:
         raise SettingsError(f'track.magnet.grid_points: {magnet.grid_points} points x {n} sensors '
-                            f'need {_gigabytes(size)} of memory; the limit is '
-                            f'{_gigabytes(MAX_BYTES)}')
+                            f'need {_in_gigabytes(size)} of memory; the limit is '
+                            f'{_in_gigabytes(MAX_BYTES)}. Reduce track.magnet.grid_points or '
+                            'track.max_sensors')
     _check_bank('track.magnet', {'starts': magnet.starts}, settings, n, model)
 
 
@@ -158,8 +159,8 @@ def _check_bank(group: str, factors: Mapping[str, int], settings: TrackSettings,
         product = ' x '.join(f'{name} ({number})' for name, number in factors.items())
         raise SettingsError(
             f'{group}: {n_hyp} starting hypotheses, {product}, with {n_x} states each for {n} '
-            f'sensors (track.max_sensors) need {_gigabytes(size)} of memory; the limit is '
-            f'{_gigabytes(MAX_BYTES)}. Reduce one of these numbers')
+            f'sensors (track.max_sensors) need {_in_gigabytes(size)} of memory; the limit is '
+            f'{_in_gigabytes(MAX_BYTES)}. Reduce one of these numbers')
 
 
 def _n_sensors(settings: TrackSettings, network: SensorNetwork) -> int:
@@ -172,6 +173,6 @@ def _states_per_sensor(settings: TrackSettings) -> int:
     return 3 * (1 + bool(settings.mounting_std_deg) + bool(settings.model_error_time_s))
 
 
-def _gigabytes(size: int) -> str:
-    """Size in decimal gigabytes, as text."""
+def _in_gigabytes(size: int) -> str:
+    """Format a number of bytes in decimal gigabytes."""
     return f'{size / 1e9:.3g} GB'

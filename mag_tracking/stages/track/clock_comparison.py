@@ -12,10 +12,11 @@ SIGNIFICANT_STD = 4.0
 """An offset is reported if it exceeds this number of standard deviations."""
 
 MEMORY_PASSES = 20
-"""Effective number of passes in the estimate; clocks are set and drift."""
+"""Effective number of passes in the estimate. Older passes are forgotten, because clocks drift and
+are adjusted."""
 
 FORGETTING_FACTOR, CONTRADICTED_FACTOR = 1.0 - 1.0 / MEMORY_PASSES, 0.5
-"""Share of the evidence that is kept with each pass, and with a pass that contradicts it."""
+"""Factor on the previous information at each pass, and at a pass that contradicts the estimate."""
 
 PRIOR_STD_S = 1e3
 """Standard deviation of an unknown clock [s]."""
@@ -26,9 +27,9 @@ class ClockOffset:
     """Clock with a significant offset."""
 
     sensor: int
-    """Row of its sensor."""
+    """Index of the sensor in the network."""
     against: int | None
-    """Row of the sensor that it is compared with; None means all others."""
+    """Index of the reference sensor; None if the clock is compared with all other sensors."""
     offset_s: float
     """Time by which the clock is ahead [s]; negative if it is slow."""
     std_s: float
@@ -37,7 +38,7 @@ class ClockOffset:
     """Number of passes in which the clock was compared."""
 
     def text(self, names: Sequence[str]) -> str:
-        """Describe the offset in a sentence, with the correction to make.
+        """Message with the offset and the correction of the network file.
 
         Parameters
         ----------
@@ -49,21 +50,22 @@ class ClockOffset:
         str
         """
         name = names[self.sensor]
-        others = 'those of the others' if self.against is None else f'that of {names[self.against]}'
-        where = 'ahead of' if self.offset_s > 0.0 else 'behind'
-        more = 'increase' if self.offset_s > 0.0 else 'decrease'
+        reference = 'the other clocks' if self.against is None \
+            else f'the clock of {names[self.against]}'
+        relation = 'ahead of' if self.offset_s > 0.0 else 'behind'
+        correction = 'increase' if self.offset_s > 0.0 else 'decrease'
         passes = f'{self.n_passes} passes' if self.n_passes > 1 else 'one pass'
-        return (f'the clock of {name} is {1e3 * abs(self.offset_s):.0f} ms {where} {others} '
+        return (f'the clock of {name} is {1e3 * abs(self.offset_s):.0f} ms {relation} {reference} '
                 f'(standard deviation {1e3 * self.std_s:.0f} ms, from {passes}), or a sensor '
                 'position in the network file is wrong. Tracks are ambiguous until this is fixed: '
-                f'{more} clock_offset of {name} by {abs(self.offset_s):.3f} s')
+                f'{correction} clock_offset of {name} by {abs(self.offset_s):.3f} s')
 
 
 class ClockComparison:
     """Clock offsets of several passes, combined by recursive least squares.
 
-    A wrong sensor position has the same effect as a wrong clock as long as all vehicles pass in the
-    same direction at the same speed.
+    A wrong sensor position has the same effect as a wrong clock if all vehicles pass in the same
+    direction at the same speed.
 
     Parameters
     ----------
@@ -77,19 +79,19 @@ class ClockComparison:
         self._n_passes = np.zeros(n_sensors, dtype=np.int64)
         # Weighted number of passes, and weighted sum of the inverse of their speeds.
         self._weight, self._slowness = 0.0, 0.0
-        # [s] Significant differences of the clocks, else 0; computed once a pass.
-        self._apart: FloatArray = np.zeros((n_sensors, n_sensors))
+        # [s] Significant offsets between the clocks, else 0; computed once per pass.
+        self._offset_s: FloatArray = np.zeros((n_sensors, n_sensors))
 
     def apart_s(self, rows: IntArray) -> float:
         """Largest significant offset between two clocks.
 
-        Clocks that were compared in a single pass do not count: that pass may have been of two
+        Clocks that were compared in only one pass are ignored, because this pass may contain two
         vehicles.
 
         Parameters
         ----------
         rows : (n,) int array
-            Sensors to compare.
+            Indices of the sensors in the network.
 
         Returns
         -------
@@ -97,76 +99,80 @@ class ClockComparison:
             0 if no offset is significant.
         """
         repeated = rows[self._n_passes[rows] > 1]
-        return float(self._apart[np.ix_(repeated, repeated)].max(initial=0.0))
+        return float(self._offset_s[np.ix_(repeated, repeated)].max(initial=0.0))
 
     @property
     def apart(self) -> ClockOffset | None:
-        """Clock with the largest significant offset; None if there is no such clock."""
-        ahead, behind = map(int, np.unravel_index(np.argmax(self._apart), self._apart.shape))
-        if self._apart[ahead, behind] == 0.0:
+        """Clock with the largest significant offset; None if no offset is significant."""
+        ahead, behind = map(int, np.unravel_index(np.argmax(self._offset_s), self._offset_s.shape))
+        if self._offset_s[ahead, behind] == 0.0:
             return None
-        offset, std = self._differences()
+        offset, std = self._offsets()
         compared = np.flatnonzero(self._n_passes)
         if len(compared) == 2:
             return ClockOffset(ahead, behind, float(offset[ahead, behind]),
                                float(std[ahead, behind]), int(self._n_passes[compared].min()))
-        # With several clocks, the wrong one is the one that disagrees with most others.
-        middle = np.median(offset[np.ix_(compared, compared)], axis=1)
-        k = int(np.argmax(np.abs(middle)))
+        # With more than two clocks, the wrong clock disagrees with most other clocks.
+        median = np.median(offset[np.ix_(compared, compared)], axis=1)
+        k = int(np.argmax(np.abs(median)))
         j = int(compared[k])
-        other = behind if j == ahead else ahead
-        return ClockOffset(j, None, float(middle[k]), float(std[j, other]), int(self._n_passes[j]))
+        behind_k = behind if j == ahead else ahead
+        return ClockOffset(j, None, float(median[k]), float(std[j, behind_k]),
+                           int(self._n_passes[j]))
 
     def add(self, found: RigidPass, rows: IntArray) -> None:
         """Add a pass to the estimate.
 
-        A pass that no straight path explains is ignored, and so is one too slow to depend on the
-        clocks.
+        Passes without a straight path that explains them are ignored. Slow passes are ignored, too,
+        because they hardly depend on the clocks.
 
         Parameters
         ----------
         found : RigidPass
         rows : (n,) int array
-            Sensors of the pass, by row in the network.
+            Indices of the sensors of the pass in the network.
         """
         is_slow = found.speed * MAX_OFFSET < MIN_DISTANCE
         if is_slow or not (found.is_explained and found.is_straight):
             return
-        known = np.abs(found.offset) <= MAX_OFFSET
-        known[found.reference] = False
-        kept = CONTRADICTED_FACTOR if self._contradicts(found, rows, known) else FORGETTING_FACTOR
-        self._information *= kept
-        self._vector *= kept
-        for j in np.flatnonzero(known):
+        is_known = np.abs(found.offset) <= MAX_OFFSET
+        is_known[found.reference] = False
+        factor = CONTRADICTED_FACTOR if self._contradicts(found, rows, is_known) \
+            else FORGETTING_FACTOR
+        self._information *= factor
+        self._vector *= factor
+        for j in np.flatnonzero(is_known):
             direction = np.zeros(len(self._vector))
             direction[rows[j]], direction[rows[found.reference]] = 1.0, -1.0
             self._information += np.outer(direction, direction) / found.clock_variance(j)
             self._vector += direction * found.offset[j] / found.clock_variance(j)
-        if known.any():
-            self._n_passes[rows[known]] += 1
+        if is_known.any():
+            self._n_passes[rows[is_known]] += 1
             self._n_passes[rows[found.reference]] += 1
-        self._weight = 1.0 + kept * self._weight
-        self._slowness = 1.0 / found.speed + kept * self._slowness
-        offset, std = self._differences()
-        # An offset is harmless if vehicles of the usual speed travel less than a metre in it.
-        least = MIN_DISTANCE * self._slowness / self._weight
-        self._apart = np.where((offset > SIGNIFICANT_STD * std) & (offset > least), offset, 0.0)
+        self._weight = 1.0 + factor * self._weight
+        self._slowness = 1.0 / found.speed + factor * self._slowness
+        offset, std = self._offsets()
+        # An offset is harmless if a vehicle of average speed travels less than a metre in this
+        # time.
+        min_offset = MIN_DISTANCE * self._slowness / self._weight
+        self._offset_s = np.where(
+            (offset > SIGNIFICANT_STD * std) & (offset > min_offset), offset, 0.0)
 
-    def _contradicts(self, found: RigidPass, rows: IntArray, known: BoolArray) -> bool:
-        """Whether a pass contradicts the previous ones about one of the `known` clocks."""
-        offset, std = self._differences()
-        reference = rows[found.reference]
-        return any(abs(found.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STD * np.sqrt(
-            found.clock_variance(j) + std[rows[j], reference]**2) for j in np.flatnonzero(known))
+    def _contradicts(self, fit: RigidPass, rows: IntArray, is_known: BoolArray) -> bool:
+        """Whether a pass contradicts the previous estimate for a clock in `is_known`."""
+        offset, std = self._offsets()
+        reference = rows[fit.reference]
+        return any(abs(fit.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STD * np.sqrt(
+            fit.clock_variance(j) + std[rows[j], reference]**2) for j in np.flatnonzero(is_known))
 
-    def _differences(self) -> tuple[FloatArray, FloatArray]:
-        """Time (n, n) [s] by which each clock (row) is ahead of each (column), and its std."""
+    def _offsets(self) -> tuple[FloatArray, FloatArray]:
+        """Offsets (n, n) [s] of each clock (row) ahead of each clock (column), and their stds."""
         # The common offset of all clocks is not observable; the prior fixes it.
-        loose = np.eye(len(self._vector)) / PRIOR_STD_S**2
-        covariance: FloatArray = np.linalg.inv(self._information + loose).astype(np.float64)
+        prior = np.eye(len(self._vector)) / PRIOR_STD_S**2
+        covariance: FloatArray = np.linalg.inv(self._information + prior).astype(np.float64)
         offset = covariance @ self._vector
         variance = np.diagonal(covariance)
-        square = variance[:, None] + variance[None, :] - 2.0 * covariance
-        np.fill_diagonal(square, np.inf)
-        return offset[:, None] - offset[None, :], np.sqrt(square)
+        variance_of_difference = variance[:, None] + variance[None, :] - 2.0 * covariance
+        np.fill_diagonal(variance_of_difference, np.inf)
+        return offset[:, None] - offset[None, :], np.sqrt(variance_of_difference)
 

@@ -27,9 +27,9 @@ class CompiledFilter {
         positions_.assign(p, p + 3 * n);
         R_sw_.assign(r, r + 9 * n);
         if ((n_angles != 0 && n_angles != 3) || (n_errors != 0 && n_errors != 3))
-            throw py::value_error("a sensor has no own angles and errors, or three");
+            throw py::value_error("n_angles and n_errors: expected 0 or three states");
         if (target.n() > MAX_TARGET_STATES)
-            throw py::value_error("more states of a target than " +
+            throw py::value_error("n_states: more states than the maximum of " +
                                   std::to_string(MAX_TARGET_STATES));
     }
 
@@ -152,12 +152,13 @@ void fit_steady_pass(Array theta, Array cost, Array covariance, Integers free, A
     const Size n_whole = length_of(fixed, "fixed", 1), q = (length_of(nuisance, "nuisance", 2),
                                                             nuisance.shape(1));
     const std::int64_t *clocks = input_of(clock, "clock", {n_t}), *columns = free.data();
-    if (n_whole < N_PATH) throw py::value_error("fixed: not path and clocks");
+    if (n_whole < N_PATH) throw py::value_error("fixed: fewer elements than a path");
     for (Size i = 0; i < n_t; ++i)
         if (clocks[i] < -1 || clocks[i] >= n_whole - N_PATH)
-            throw py::value_error("clock: no such clock");
+            throw py::value_error("clock: index out of range");
     for (Size i = 0; i < k; ++i)
-        if (columns[i] < 0 || columns[i] >= n_whole) throw py::value_error("free: no such column");
+        if (columns[i] < 0 || columns[i] >= n_whole)
+            throw py::value_error("free: index out of range");
     const Samples samples{n_t, t.data(), input_of(positions, "positions", {n_t, 3}),
                           input_of(M, "M", {n_t, 3, 3})};
     SteadyModel model({int(d), places.data()}, input_of(combinations, "combinations", {d, d}),
@@ -181,7 +182,7 @@ RowVehicle row_vehicle(int n_states, int n_dipoles, Vector density, Vector induc
                        double moment_drift, double difference_drift, double turn_acceleration,
                        double turn_time, double max_turn_rate) {
     if (n_dipoles < 1 || n_states != 9 + 3 * n_dipoles + (n_dipoles > 1) + (turn_acceleration != 0.0))
-        throw py::value_error("n_states: not those of a row of so many dipoles");
+        throw py::value_error("n_states: does not match the number of dipoles");
     return {n_states, n_dipoles, {density[0], density[1], density[2]},
             {induction[0], induction[1], induction[2]}, moment_drift, difference_drift,
             turn_acceleration, turn_time, max_turn_rate};

@@ -1,4 +1,4 @@
-"""Check of a running track against a fit of its whole pass, see `rigid_pass`."""
+"""Cross-check of a running track with a fit of its whole pass; see `rigid_pass`."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -22,8 +22,8 @@ from mag_tracking.stages.track.rigid_pass import (
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.units import NS
 
-PASSED_SHARE = 0.6
-"""A vehicle has passed when the field is below this share of its maximum."""
+PASSED_FRACTION = 0.6
+"""A vehicle has passed when the field is below this fraction of its maximum."""
 
 FIRST_CHECK_S = 0.12
 """Delay of the first fit after the maximum of the field [s]."""
@@ -43,21 +43,21 @@ STEADY_S = 1.5
 [s]."""
 
 LATE_MISFIT = 8.0
-"""Limit for the misfit of later fits, when a car may have turned unsteadily."""
+"""Maximum misfit of later fits, in which the turn rate of a car may have changed."""
 
 
 class _FrameSummary(NamedTuple):
-    """Summary of a frame of the track."""
+    """Time, field and target state of a frame."""
 
     stamp_ns: int
-    size: float
+    magnitude: float
     """Largest field of any sensor [T]."""
     state: FloatArray
     """Position and velocity (6,) at that time, as published."""
 
 
 class CrossCheck:
-    """Frames of a track, and fits of its whole pass.
+    """Cross-check of a track with fits of a steady path to its whole pass.
 
     Parameters
     ----------
@@ -68,8 +68,8 @@ class CrossCheck:
     latest : RigidPass or None
         Latest fit; None before the vehicle has passed.
     difference : (6,) array, m and m/s
-        `RigidPass.difference` of the latest state; after the pass, that of the last state of the
-        pass.
+        `RigidPass.difference` of the latest state; after the pass, the difference of the last state
+        in the pass.
     """
 
     def __init__(self, network: SensorNetwork) -> None:
@@ -77,16 +77,16 @@ class CrossCheck:
         self._network = network
         self._frames: list[FieldFrame] = []
         self._peak: _FrameSummary | None = None
-        self._now: _FrameSummary | None = None
+        self._current: _FrameSummary | None = None
         self._period_s = np.inf
         self._due_s = FIRST_CHECK_S
         self._is_misfit = False
-        self._smallest = np.inf
-        self._has_risen, self._has_whole_pass = False, False
+        self._min_magnitude = np.inf
+        self._has_risen, self._is_whole_pass = False, False
         self.difference: FloatArray = np.zeros(6)
 
     def add(self, frame: FieldFrame, state: FloatArray) -> None:
-        """Add a frame.
+        """Add a frame of the track.
 
         Parameters
         ----------
@@ -94,27 +94,27 @@ class CrossCheck:
         state : (n_x,) array
             State of the best hypothesis.
         """
-        size = float(field_magnitudes(frame).max(initial=0.0))
-        if self._now is not None:
+        magnitude = float(field_magnitudes(frame).max(initial=0.0))
+        if self._current is not None:
             # The minimum excludes gaps.
-            self._period_s = min(self._period_s, (frame.stamp_ns - self._now.stamp_ns) / NS)
-        self._now = _FrameSummary(frame.stamp_ns, size, state[:6].copy())
-        if self._peak is None or size > self._peak.size:
-            self._peak, self._due_s = self._now, FIRST_CHECK_S
-            self._has_risen = self._smallest <= PASSED_SHARE * size
-        self._smallest = min(self._smallest, size)
+            self._period_s = min(self._period_s, (frame.stamp_ns - self._current.stamp_ns) / NS)
+        self._current = _FrameSummary(frame.stamp_ns, magnitude, state[:6].copy())
+        if self._peak is None or magnitude > self._peak.magnitude:
+            self._peak, self._due_s = self._current, FIRST_CHECK_S
+            self._has_risen = self._min_magnitude <= PASSED_FRACTION * magnitude
+        self._min_magnitude = min(self._min_magnitude, magnitude)
         # Drop frames that belong neither to this pass nor to a later one.
         earliest = frame.stamp_ns - BEFORE_S * NS
-        self._frames = [f for f in self._frames if f.stamp_ns >= earliest or self._is_of_pass(f)]
+        self._frames = [f for f in self._frames if f.stamp_ns >= earliest or self._is_in_pass(f)]
         self._frames.append(frame)
 
-    def _is_of_pass(self, frame: FieldFrame) -> bool:
-        """Whether a frame is within the pass, by its time from the maximum of the field."""
+    def _is_in_pass(self, frame: FieldFrame) -> bool:
+        """Whether a frame belongs to the pass, by its time relative to the maximum of the field."""
         assert self._peak is not None
         return -BEFORE_S * NS <= frame.stamp_ns - self._peak.stamp_ns <= AFTER_S * NS
 
     def doubts(self, clocks_apart_s: float) -> set[str]:
-        """Return the doubts about the track, after a new fit if one is due.
+        """Fit the pass if a fit is due, and return the doubts about the track.
 
         Parameters
         ----------
@@ -125,26 +125,26 @@ class CrossCheck:
         -------
         set of str
         """
-        if self._now is None:
+        if self._current is None:
             return set()
-        self._fit_if_due(self._now.size)
-        if self._covers(self._now.stamp_ns):
-            self.difference = self._difference_at(self._now.stamp_ns, self._now.state)
-        found = self._pass_doubts()
-        speed = float(np.hypot(self._now.state[3], self._now.state[4]))
+        self._fit_if_due(self._current.magnitude)
+        if self._covers(self._current.stamp_ns):
+            self.difference = self._difference_at(self._current.stamp_ns, self._current.state)
+        reasons = self._pass_doubts()
+        speed = float(np.hypot(self._current.state[3], self._current.state[4]))
         if clocks_apart_s * speed > MIN_DISTANCE:
-            found.add(doubts.CLOCKS_APART)
-        return found
+            reasons.add(doubts.CLOCKS_APART)
+        return reasons
 
     def differences(self, states: Sequence[TrackState]) -> list[FloatArray]:
         """Differences of smoothed states from the fitted pass.
 
-        States before or after the pass get the difference of its first or last state.
+        For states before or after the pass, the difference of its first or last state is returned.
 
         Parameters
         ----------
         states : sequence of TrackState
-            In order of time.
+            States in chronological order.
 
         Returns
         -------
@@ -155,16 +155,17 @@ class CrossCheck:
         if not covered:
             return [self.difference] * len(states)
         first, last = covered[0], covered[-1]
-        inside = [self._difference_at(stamp_ns, x[:6]) for stamp_ns, x, _ in states[first:last + 1]]
-        return [inside[min(max(k, first), last) - first] for k in range(len(states))]
+        in_pass = [self._difference_at(stamp_ns, x[:6])
+                   for stamp_ns, x, _ in states[first:last + 1]]
+        return [in_pass[min(max(k, first), last) - first] for k in range(len(states))]
 
     def _covers(self, stamp_ns: int) -> bool:
         """Whether the latest fit determines the position of the vehicle at a time.
 
-        A track that begins at the maximum of the field contains only a part of a pass, which many
-        paths explain.
+        A track that begins at the maximum of the field contains only part of a pass. Many paths
+        would explain it.
         """
-        return self.latest is not None and self._has_whole_pass \
+        return self.latest is not None and self._is_whole_pass \
             and -BEFORE_S * NS <= stamp_ns - self.latest.stamp_ns <= AFTER_S * NS
 
     def _difference_at(self, stamp_ns: int, state: FloatArray) -> FloatArray:
@@ -185,50 +186,52 @@ class CrossCheck:
         clocks : ClockComparison
             Updated in place.
         rows : (n,) int array
-            Sensors of the track, by row in the network.
+            Indices of the sensors of the track in the network.
         """
         self._fit_if_due(0.0)
         if self.latest is not None:
             clocks.add(self.latest, rows)
 
-    def _fit_if_due(self, size: float) -> None:
-        """Fit the pass if a fit is due; `size` [T] is the current field."""
-        now, peak = self._now, self._peak
-        if now is None or peak is None or self._due_s > AFTER_S or size > PASSED_SHARE * peak.size:
+    def _fit_if_due(self, magnitude: float) -> None:
+        """Fit the pass if a fit is due; `magnitude` [T] is the current field."""
+        current, peak = self._current, self._peak
+        if current is None or peak is None or self._due_s > AFTER_S \
+                or magnitude > PASSED_FRACTION * peak.magnitude:
             return
-        since = (now.stamp_ns - peak.stamp_ns) / NS
-        frames = [f for f in self._frames if self._is_of_pass(f)]
-        if since < self._due_s or len(frames) < MIN_FRAMES:
+        elapsed_s = (current.stamp_ns - peak.stamp_ns) / NS
+        frames = [f for f in self._frames if self._is_in_pass(f)]
+        if elapsed_s < self._due_s or len(frames) < MIN_FRAMES:
             return
-        self._due_s = CHECK_INTERVAL_RATIO * since
-        # Starts: the state now, extrapolated back, and the state at the maximum of the field.
-        back = now.state.copy()
-        back[:3] -= since * back[3:]
+        self._due_s = CHECK_INTERVAL_RATIO * elapsed_s
+        # Start values: the current state extrapolated back, and the state at the maximum of the
+        # field.
+        extrapolated = current.state.copy()
+        extrapolated[:3] -= elapsed_s * extrapolated[3:]
         step = -(-len(frames) // MAX_FRAMES)
-        found = fit_rigid_pass(self._network, frames[::step], peak.stamp_ns,
-                               np.array([back, peak.state]))
-        if found is None:
+        rigid_pass = fit_rigid_pass(self._network, frames[::step], peak.stamp_ns,
+                                    np.array([extrapolated, peak.state]))
+        if rigid_pass is None:
             return
-        self.latest, self._has_whole_pass = found, self._has_risen
-        if since <= STEADY_S:
-            self._is_misfit = found.misfit > MAX_MISFIT
+        self.latest, self._is_whole_pass = rigid_pass, self._has_risen
+        if elapsed_s <= STEADY_S:
+            self._is_misfit = rigid_pass.misfit > MAX_MISFIT
 
     def _pass_doubts(self) -> set[str]:
         """Doubts from the latest fit."""
-        found: set[str] = set()
+        reasons: set[str] = set()
         latest = self.latest
         if latest is None:
-            return found
+            return reasons
         # The middle of a long vehicle is uncertain by up to its length.
         if np.hypot(self.difference[0], self.difference[1]) > LONG_LENGTH:
-            found.add(doubts.ANOTHER_PLACE)
+            reasons.add(doubts.ANOTHER_PLACE)
         if self._is_misfit or latest.misfit > LATE_MISFIT:
-            found.add(doubts.NO_STEADY_PATH)
+            reasons.add(doubts.NO_STEADY_PATH)
         if not latest.is_explained:
-            return found
+            return reasons
         if latest.needs_clocks_apart:
-            found.add(doubts.CLOCKS_APART)
+            reasons.add(doubts.CLOCKS_APART)
         if moves_too_far(latest.closest(self._network.positions), latest.velocity,
                          self._period_s, self._network.positions):
-            found.add(doubts.FRAMES_TOO_LONG)
-        return found
+            reasons.add(doubts.FRAMES_TOO_LONG)
+        return reasons

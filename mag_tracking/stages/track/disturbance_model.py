@@ -1,9 +1,9 @@
-"""Alternative to a target: smooth fields, and their evidence for the frames of a track.
+"""Evidence for a disturbance: smooth fields that explain the frames of a track without a target.
 
 Two models of a smooth field compete. In the first, each sensor has an independent field
 (temperature, a knock, a cable). In the second, one field with a gradient covers the network (a
-geomagnetic storm, a power line, a tram). The model error that the tracker allows for its target is
-allowed here as well; otherwise a smooth field would win whenever a target is near.
+geomagnetic storm, a power line, a tram). Both allow for the same model error as the tracker;
+otherwise a smooth field would be favoured whenever a target is near.
 """
 
 import numpy as np
@@ -14,17 +14,19 @@ from mag_tracking.inference.gauss_markov import GaussMarkovVectors
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 
-GRADIENT_SHARE = 0.3
+GRADIENT_RATIO = 0.3
 """Relative change of a common field from the centre of the network to its edge."""
 
 MIN_STD = 1e-15
-"""Minimum noise of a sensor [T]; a network file with less noise is rejected."""
+"""Minimum standard deviation of the noise of a sensor [T]. Network files with less noise are
+rejected."""
 
 UNKNOWN_FIELD_STD = 1e-4
-"""Standard deviation of an unknown field [T]."""
+"""Prior standard deviation of the field after a handover [T]."""
 
 MIN_GRADIENT_SENSORS = 3
-"""With fewer sensors, a uniform field with a gradient can explain any readings."""
+"""Minimum number of sensors for which the common field has a gradient. With fewer sensors, it could
+explain any readings."""
 
 MAX_COMMON_SENSORS = 8
 """Maximum number of sensors in the model of a common field; its cost grows with the cube of their
@@ -40,8 +42,8 @@ class DisturbanceModel:
     background_std : float, T
         Standard deviation of the backgrounds.
     is_handover : bool
-        The model starts during a track, with unknown fields. By default it starts at the first
-        frame of a track, without a field.
+        Whether the model starts during a track, with an unknown field. By default it starts at the
+        first frame of a track, with zero field.
     """
 
     def __init__(self, network: SensorNetwork, background_std: float,
@@ -50,16 +52,17 @@ class DisturbanceModel:
         self._background_std, self._is_handover = background_std, is_handover
         self._sensor, self._own_H = np.repeat(np.arange(n), 3), np.tile(np.eye(3), (n, 1))
         # The common field covers the first sensors; the others have independent fields.
-        chosen = np.arange(min(n, MAX_COMMON_SENSORS))
-        self._common_H = _common_field_matrix(network.part(chosen) if n > len(chosen) else network)
+        covered = np.arange(min(n, MAX_COMMON_SENSORS))
+        self._common_H = _common_field_matrix(
+            network.part(covered) if n > len(covered) else network)
         self._filters: tuple[GaussMarkovVectors, GaussMarkovVectors, GaussMarkovVectors] | None \
             = None
-        # Log-weights of independent fields, and of one field over the network.
+        # Log-weights of independent fields and of a common field.
         self._log_w = np.log([0.5, 0.5])
 
     @property
     def uniform(self) -> float:
-        """Probability of one field over the network, given that there is no target."""
+        """Probability of a common field over the network, given that there is no target."""
         return float(np.exp(self._log_w[1]))
 
     def log_density(self, frame: FieldFrame, dt: float, model_error: FloatArray) -> float | None:
@@ -71,49 +74,50 @@ class DisturbanceModel:
         dt : float, s
             Time since the previous frame.
         model_error : (n_sensors,) array, T²
-            Variance per axis allowed for the error of the target model.
+            Variance per axis of the model error that the tracker assumes.
 
         Returns
         -------
         float or None
             None for the first frame after a handover.
         """
-        present = np.isfinite(frame.field.ravel())
+        is_present = np.isfinite(frame.field.ravel())
         noise = np.einsum('jii->ji', frame.covariance)
-        variance = np.maximum(noise + model_error[:, None], MIN_STD**2).ravel()[present]
-        y = frame.field.ravel()[present]
+        variance = np.maximum(noise + model_error[:, None], MIN_STD**2).ravel()[is_present]
+        y = frame.field.ravel()[is_present]
         is_first = self._filters is None and self._is_handover
         if self._filters is None:
             if not len(y):
                 return 0.0
-            self._begin(float(np.median(noise.ravel()[present])))
+            self._initialise(float(np.median(noise.ravel()[is_present])))
         assert self._filters is not None
-        own, rest, common = self._filters
-        sensor, H = self._sensor[present], self._own_H[present]
+        covered, remaining, common = self._filters
+        sensor, H = self._sensor[is_present], self._own_H[is_present]
         k = int(np.searchsorted(sensor, MAX_COMMON_SENSORS))
-        of_rest = rest.log_density(sensor[k:] - MAX_COMMON_SENSORS, H[k:], y[k:], variance[k:], dt)
-        joint = self._log_w + of_rest + [
-            own.log_density(sensor[:k], H[:k], y[:k], variance[:k], dt),
+        remaining_density = remaining.log_density(
+            sensor[k:] - MAX_COMMON_SENSORS, H[k:], y[k:], variance[k:], dt)
+        joint = self._log_w + remaining_density + [
+            covered.log_density(sensor[:k], H[:k], y[:k], variance[:k], dt),
             common.log_density(np.zeros(k, dtype=np.int64),
-                               self._common_H[present[:len(self._common_H)]], y[:k],
+                               self._common_H[is_present[:len(self._common_H)]], y[:k],
                                variance[:k], dt)]
         evidence = float(log_sum_exp(joint))
         self._log_w = joint - evidence
         return None if is_first else evidence
 
-    def _begin(self, noise: float) -> None:
-        """Initialise the filters; `noise` [T²] is the variance of the first measurement."""
+    def _initialise(self, noise: float) -> None:
+        """Initialise the filters; `noise` [T²] is the median noise variance of the first frame."""
         scale = np.sqrt(self._background_std**2 + noise)
         n = len(self._sensor) // 3
-        n_chosen = min(n, MAX_COMMON_SENSORS)
-        n_field = self._common_H.shape[1] - 3 * n_chosen
+        n_covered = min(n, MAX_COMMON_SENSORS)
+        n_field = self._common_H.shape[1] - 3 * n_covered
         std = UNKNOWN_FIELD_STD if self._is_handover else self._background_std
         # The backgrounds follow the field in the state, and do not drift.
-        scales = scale * np.concatenate([np.ones(3), np.full(n_field - 3, GRADIENT_SHARE),
-                                         np.zeros(3 * n_chosen)])
-        each = np.full(3, scale)
-        self._filters = (GaussMarkovVectors(n_chosen, each, std),
-                         GaussMarkovVectors(n - n_chosen, each, std),
+        scales = scale * np.concatenate([np.ones(3), np.full(n_field - 3, GRADIENT_RATIO),
+                                         np.zeros(3 * n_covered)])
+        scale_per_axis = np.full(3, scale)
+        self._filters = (GaussMarkovVectors(n_covered, scale_per_axis, std),
+                         GaussMarkovVectors(n - n_covered, scale_per_axis, std),
                          GaussMarkovVectors(1, scales, std))
 
 
@@ -126,9 +130,9 @@ def _common_field_matrix(network: SensorNetwork) -> FloatArray:
     n, R_sw = len(network), network.R_sw
     field = np.tile(np.eye(3), (n, 1, 1))
     if n >= MIN_GRADIENT_SENSORS:
-        away = network.positions - network.centre
-        radius = np.linalg.norm(away, axis=1).max()
-        x, y, z = (away / (radius or 1.0)).T
+        offsets = network.positions - network.centre
+        radius = np.linalg.norm(offsets, axis=1).max()
+        x, y, z = (offsets / (radius or 1.0)).T
         zero = np.zeros(n)
         # Columns: Gxx, Gyy, Gxy, Gxz, Gyz; Gzz = -Gxx - Gyy.
         gradient = np.stack([np.stack([x, zero, y, z, zero], axis=1),

@@ -1,4 +1,4 @@
-"""Disturbances: fields during tracks that no target explained."""
+"""Disturbances: fields that started a track but that no target explains."""
 
 from dataclasses import dataclass, replace
 
@@ -11,12 +11,12 @@ from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.records import FieldFrame
 
 FALSE_ALARM = 1e-6
-"""Probability that noise alone marks a sensor as affected, per frame."""
+"""Probability per frame that noise alone marks a sensor as affected."""
 
 
 @dataclass(frozen=True)
 class UnexplainedField:
-    """Field during a track that no target explained."""
+    """Field of a track that no target explains."""
 
     track_id: int
     """Identifier of the track."""
@@ -27,11 +27,11 @@ class UnexplainedField:
     sensed: BoolArray
     """Whether each sensor sensed the field, (n_sensors,)."""
     uniform: float
-    """Probability of one field over the network."""
+    """Probability of a common field over the network."""
 
 
 class Disturbances:
-    """Follow one disturbance at a time, from the end of its first track to the release.
+    """Disturbance in progress, from the end of its first track to the release of the detection.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Disturbances:
         self._sensed: BoolArray = np.zeros(len(names), dtype=bool)
 
     def begin(self, found: UnexplainedField, stamp_ns: int) -> list[Disturbance]:
-        """Start a disturbance after a track that no target explained, or extend the current one.
+        """Start a disturbance after an unexplained track, or extend the current disturbance.
 
         Parameters
         ----------
@@ -74,7 +74,7 @@ class Disturbances:
     def feed(self, frame: FieldFrame) -> None:
         """Update the current disturbance with a frame without a track.
 
-        The field may become stronger and reach other sensors.
+        Its field may increase and reach further sensors.
 
         Parameters
         ----------
@@ -86,7 +86,7 @@ class Disturbances:
             self._sensed |= energy > chdtri(np.maximum(n_axes, 1), FALSE_ALARM)
 
     def end(self, stamp_ns: int) -> list[Disturbance]:
-        """End the current disturbance, at the release or when the frames are interrupted.
+        """End the current disturbance, at the release of the detection or at a gap in the frames.
 
         Parameters
         ----------
@@ -95,7 +95,7 @@ class Disturbances:
         Returns
         -------
         list of Disturbance
-            Closing record; empty without a disturbance.
+            Closing record; empty if no disturbance is in progress.
         """
         if self._current is None:
             return []
@@ -121,5 +121,5 @@ def field_magnitudes(frame: FieldFrame) -> FloatArray:
     (n_sensors,) array, T
         0 if the reading is missing.
     """
-    size: FloatArray = np.sqrt(np.nansum(np.square(frame.field), axis=1))
-    return size
+    magnitude: FloatArray = np.sqrt(np.nansum(np.square(frame.field), axis=1))
+    return magnitude

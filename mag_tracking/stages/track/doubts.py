@@ -1,4 +1,4 @@
-"""Doubts: the reasons why a pose is ambiguous, as published, and their meanings."""
+"""Doubts: the published reasons why a pose is ambiguous, and their meanings."""
 
 from collections.abc import Set
 
@@ -24,7 +24,7 @@ NO_STEADY_PATH = 'no_steady_path'
 ANOTHER_VEHICLE = 'another_vehicle'
 
 PERMANENT = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
-"""Doubts that persist to the end of a track, because its path was distorted. Other implausible
+"""Doubts that persist until the end of a track, because its path was distorted. Other implausible
 states may be corrected by later frames."""
 
 MEANINGS = {
@@ -34,7 +34,7 @@ MEANINGS = {
                           'the track began in the tail of a lost track',
     SENSORS_AT_ONE_PLACE: 'the network has one sensor, or all sensors are within two metres: range '
                           'and size are not observable and follow from the settings',
-    ONE_SENSOR: 'only one of several sensors measures, or did so for too long',
+    ONE_SENSOR: 'only one of several sensors provides readings, or did for too long',
     FELT_BY_ONE_SENSOR: 'only one sensor senses the target: range and size are not observable and '
                         'follow from the settings',
     DOUBTFUL_BACKGROUND: 'the background of a sensor is doubtful',
@@ -42,13 +42,14 @@ MEANINGS = {
     MISFIT: 'the field does not fit the best hypothesis',
     CONTRADICTION: 'the probability of the field given the best hypothesis is below 1e-5',
     OVERFIT: 'the filter fits the latest frames much better than the path of its hypothesis does',
-    DISTURBANCE_MODEL: 'a smooth field without a target explains the frames about as well',
-    INNOVATIONS: 'the innovations of the latest frames, or of the track, exceed their covariance',
-    SENSORS_ROTATED: 'the track requires mounting errors larger than stated',
+    DISTURBANCE_MODEL: 'a smooth field without a target explains the frames about as well as '
+                       'the target',
+    INNOVATIONS: 'the innovations of the latest frames or of the track exceed their covariance',
+    SENSORS_ROTATED: 'the track requires larger mounting errors than configured',
     HEIGHT: 'the height of the source is implausible for its kind of vehicle',
-    OFF_THE_ROAD: 'the target passes all sensors on one side, outside the lanes of the settings',
+    OFF_THE_ROAD: 'the target passes all sensors on one side, outside the configured lanes',
     FRAMES_TOO_LONG: 'the target moves too far within one frame',
-    CLOCKS_APART: 'the clocks of the sensors appear to differ, in this pass or in earlier ones',
+    CLOCKS_APART: 'the clocks of the sensors appear to differ in this or an earlier pass',
     ANOTHER_VEHICLE: 'the number of vehicles, or the position of one of them, is still uncertain',
     NO_STEADY_PATH: 'no path with steady acceleration and turning explains the whole pass',
 }

@@ -17,8 +17,8 @@ from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 MAX_SINGLE_SENSOR_S = 0.5
-"""Maximum time for which only one of several sensors may support a track; after that it stays
-ambiguous [s]."""
+"""Maximum time for which only one of several sensors may support a track [s]. After this time the
+track stays ambiguous."""
 
 LOST = 'target lost'
 OUT_OF_REACH = 'out of reach'
@@ -26,36 +26,36 @@ UNEXPLAINED = 'unexplained'
 """Reasons for the end of a track."""
 
 UNEXPLAINED_S = 3.0
-"""A track ends when a disturbance has explained it better for this time, and a target never did
-[s]."""
+"""A track ends when a disturbance has explained it better than a target for this time [s], unless a
+target explained it better before."""
 
 CONTRADICTION = 1e-5
-"""A field less probable than this contradicts the track of a vehicle. The filter is still updated
-with it, and may afterwards be wrong and yet agree with all later frames."""
+"""Probability below which a field contradicts the track of a vehicle. The filter is still updated
+with such a field. It may then follow a wrong path that agrees with all later frames."""
 
 OVERFIT_NATS = float(np.log(1e4))
-"""An extended filter linearises each frame at another state, and may fit the frames better than any
-single path can. The filter is doubted if the frames are less probable along the path of the same
-hypothesis by this log-ratio."""
+"""Maximum excess of the log-likelihood in the filter over the log-likelihood along the path of the
+same hypothesis [nats]. An extended Kalman filter linearises each frame at another state. It may
+therefore fit the frames better than any single path can."""
 
-MIN_OBSERVED_SHARE = 0.5
-"""A track is ambiguous if the frames before its detection cover less than this share of the
+MIN_OBSERVED_FRACTION = 0.5
+"""A track is ambiguous if the frames before its detection cover less than this fraction of the
 lookback."""
 
 SENSED_LEVEL = 4.0
-"""A sensor has sensed the target if the energy of its fields exceeds that of its noise by this
-number of standard deviations."""
+"""A sensor has sensed the target if the energy of its fields exceeds the expected energy of its
+noise by this number of standard deviations."""
 
 TRANSIENT_DOUBTS = (doubts.OVERFIT, doubts.DISTURBANCE_MODEL, doubts.INNOVATIONS, doubts.MISFIT,
                   doubts.HEIGHT, doubts.OFF_THE_ROAD, doubts.NO_STEADY_PATH)
-"""Doubts about the filter at one time, which smoothing removes only in part."""
+"""Doubts about the filter at a single time. Smoothing resolves them only in part."""
 
 TRANSIENT_S = 0.1
 """Time for which a transient doubt persists after the frame in which it was found [s]. A doubt that
 is absent from a single frame may reappear in the next."""
 
 MAX_SEGMENTS = 5000
-"""Maximum number of segments of doubtful poses that are kept: more than a smoothed track has."""
+"""Maximum number of stored segments of doubtful poses. A smoothed track has fewer."""
 
 
 class TrackEvidence:
@@ -82,15 +82,15 @@ class TrackEvidence:
         self._doubts: set[str] = set()
         self._log_odds = 0.0
         self._single_sensor_s = 0.0
-        self._n_misfits = 0
-        self._doubts_filter_until_ns = -1
+        self._n_consecutive_misfits = 0
+        self._overfit_expiry_ns = -1
         self._doubtful_times: DoubtfulTimes = ()
         # Latest timestamp of each transient doubt.
-        self._found_ns: dict[str, int] = {}
-        # End of the other doubts of limited time.
-        self._until_ns: dict[str, int] = {}
-        # Segments in which smoothed poses are doubted as well.
-        self._segments: list[tuple[int, int]] = []
+        self._last_found_ns: dict[str, int] = {}
+        # Expiry of each other doubt with a limited duration.
+        self._expiry_ns: dict[str, int] = {}
+        # Segments in which smoothed poses are also doubtful.
+        self._smoothed_segments: list[tuple[int, int]] = []
         self._min_spread = np.inf
         # Per sensor: whitened energy of its fields in excess of noise, and number of axes.
         self._energy, self._n_axes = np.zeros(n_sensors), np.zeros(n_sensors)
@@ -98,7 +98,7 @@ class TrackEvidence:
 
     @property
     def doubted(self) -> bool:
-        """Whether the whole track is doubted."""
+        """Whether the whole track is doubtful."""
         return bool(self._doubts)
 
     @property
@@ -112,17 +112,17 @@ class TrackEvidence:
         Parameters
         ----------
         log_likelihood_ratio : float, nats
-            Log-likelihood of the frame with the target, minus that without a target.
+            Log-likelihood ratio of the frame, with versus without a target.
         """
         self._log_odds += log_likelihood_ratio
 
     def doubt(self, reason: str) -> None:
-        """Doubt the whole track from now on.
+        """Mark the whole track as doubtful.
 
         Parameters
         ----------
         reason : str
-            One of `doubts`.
+            Name from `doubts`.
         """
         self._doubts.add(reason)
 
@@ -131,50 +131,51 @@ class TrackEvidence:
         self._doubts -= {doubts.CONTRADICTION, doubts.INNOVATIONS, doubts.SENSORS_CONTRADICT,
                          *doubts.PERMANENT}
         self.innovations = InnovationConsistency(len(self.largest))
-        self._n_misfits, self._doubts_filter_until_ns = 0, -1
-        self._found_ns.clear()
+        self._n_consecutive_misfits, self._overfit_expiry_ns = 0, -1
+        self._last_found_ns.clear()
 
     def doubt_start(self, approach_unobserved: bool, network: SensorNetwork, starts_anywhere: bool
                     ) -> None:
-        """Doubt a track whose target was not seen approaching, or whose range is not observable.
+        """Mark the track as doubtful if its start was not observed or its range is not observable.
 
         Parameters
         ----------
         approach_unobserved : bool
-            The frames before the detection do not show the target approaching.
+            Whether the frames before the detection do not show the approach of the target.
         network : SensorNetwork
         starts_anywhere : bool
-            `Target.starts_anywhere`.
+            As in `Target`.
         """
         # A target that was not seen approaching may already have passed.
         if approach_unobserved and not starts_anywhere:
             self.doubt(doubts.NOT_SEEN_APPROACHING)
-        # With a single sensor the range follows from the settings. With a few sensors at one place
-        # the range of a vehicle follows from errors of its field model.
+        # With a single sensor, the settings determine the range. With a few sensors at one place,
+        # errors of the field model determine the range of a vehicle.
         if len(network) == 1 or network.is_compact and not starts_anywhere:
             self.doubt(doubts.SENSORS_AT_ONE_PLACE)
 
     def doubt_for(self, reason: str, stamp_ns: int, seconds: float,
                   since_ns: int | None = None) -> None:
-        """Doubt the poses of a limited time.
+        """Mark the poses of a limited time as doubtful.
 
         Parameters
         ----------
         reason : str
-            One of `doubts`.
+            Name from `doubts`.
         stamp_ns : int, ns
             Start of the doubt.
         seconds : float, s
             Duration of the doubt.
         since_ns : int, ns, optional
-            Smoothed poses since this earlier time are doubted as well.
+            Earlier time from which smoothed poses are also doubtful. By default, no smoothed pose
+            is.
         """
-        self._until_ns[reason] = until_ns = stamp_ns + round(seconds * NS)
+        self._expiry_ns[reason] = until_ns = stamp_ns + round(seconds * NS)
         if since_ns is not None:
-            self._segments.append((since_ns, until_ns))
+            self._smoothed_segments.append((since_ns, until_ns))
 
     def check_approach(self, frame: FieldFrame) -> None:
-        """Doubt the track if its field did not grow like that of a target approaching from afar.
+        """Mark the track as doubtful if its field did not grow as for an approaching target.
 
         Parameters
         ----------
@@ -191,7 +192,7 @@ class TrackEvidence:
         frame : FieldFrame
             Readings of the sensors that the track uses.
         rows : (n,) int array
-            Rows of these sensors in the network.
+            Indices of these sensors in the network.
         nis : (n,) array
             Normalised innovation squared of the published hypothesis, per sensor.
         """
@@ -199,9 +200,9 @@ class TrackEvidence:
         self._energy[rows] += energy - n_axes
         self._n_axes[rows] += n_axes
         self.largest[rows] = np.maximum(self.largest[rows], field_magnitudes(frame))
-        of_all, axes_of_all = np.full(len(self.largest), np.nan), np.zeros(len(self.largest))
-        of_all[rows], axes_of_all[rows] = nis, n_axes
-        self.innovations.add(of_all, axes_of_all, frame.stamp_ns)
+        network_nis, network_axes = np.full(len(self.largest), np.nan), np.zeros(len(self.largest))
+        network_nis[rows], network_axes[rows] = nis, n_axes
+        self.innovations.add(network_nis, network_axes, frame.stamp_ns)
 
     @property
     def sensed(self) -> BoolArray:
@@ -226,20 +227,21 @@ class TrackEvidence:
         Returns
         -------
         set of str
-            These doubts and the earlier ones that persist.
+            Doubts of this frame and earlier doubts that persist.
         """
-        passing = found.intersection(TRANSIENT_DOUBTS)
-        self._doubtful_times = updated(self._doubtful_times, stamp_ns, bool(passing), MAX_SEGMENTS)
-        self._found_ns |= dict.fromkeys(passing, stamp_ns)
-        return found | {reason for reason, when in self._found_ns.items()
+        transient = found.intersection(TRANSIENT_DOUBTS)
+        self._doubtful_times = updated(
+            self._doubtful_times, stamp_ns, bool(transient), MAX_SEGMENTS)
+        self._last_found_ns |= dict.fromkeys(transient, stamp_ns)
+        return found | {reason for reason, when in self._last_found_ns.items()
                         if (stamp_ns - when) / NS <= TRANSIENT_S} \
-            | {reason for reason, until in self._until_ns.items() if stamp_ns <= until}
+            | {reason for reason, until in self._expiry_ns.items() if stamp_ns <= until}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
         """Check whether a normalised innovation is too large for the target model.
 
-        With at most two sensors, a contradiction also marks the rest of the track as doubtful,
-        because many paths fit the fields. With more sensors, later frames correct the track.
+        With at most two sensors, a contradiction also marks the track as doubtful, because many
+        paths fit the fields. With more sensors, later frames correct the track.
 
         Parameters
         ----------
@@ -251,62 +253,61 @@ class TrackEvidence:
         -------
         bool
         """
-        contradicted = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
-        if contradicted and len(nis) <= 2:
+        is_contradiction = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
+        if is_contradiction and len(nis) <= 2:
             self.doubt(doubts.CONTRADICTION)
-        return contradicted
+        return is_contradiction
 
     def vehicle_doubts(self, nis: FloatArray, degrees_of_freedom: int, ratio: float) -> set[str]:
-        """Doubts about the pose of a vehicle from the measurements so far.
+        """Update and return the doubts that follow from the measurements of a vehicle.
 
         Parameters
         ----------
         nis : (n_sensors,) array
-            Normalised innovation squared of the frame, as for `contradicts`.
+            Normalised innovation squared of each sensor in the frame; NaN if missing.
         degrees_of_freedom : int
         ratio : float
-            Bayes factor by which a target must explain the frames better than a disturbance.
+            Minimum Bayes factor of a target against a disturbance.
 
         Returns
         -------
         set of str
         """
-        found = set()
+        reasons = set()
         if self.bayes_factor.is_recently_disfavoured(ratio):
-            found.add(doubts.DISTURBANCE_MODEL)
+            reasons.add(doubts.DISTURBANCE_MODEL)
         if self.contradicts(nis, degrees_of_freedom):
-            found.add(doubts.CONTRADICTION)
+            reasons.add(doubts.CONTRADICTION)
         if self.is_sensed_by_one:
-            found.add(doubts.FELT_BY_ONE_SENSOR)
+            reasons.add(doubts.FELT_BY_ONE_SENSOR)
         if self.innovations.excess > 1.0:
-            found.add(doubts.INNOVATIONS)
+            reasons.add(doubts.INNOVATIONS)
         if self.innovations.fails:
             self.doubt(doubts.INNOVATIONS)
-        return found
+        return reasons
 
     def doubts_filter(self, gain: float, stamp_ns: int, window_s: float) -> bool:
-        """Whether the filter fits the frames much better than the path of its hypothesis does.
-
-        The doubt persists for `window_s`, the age of the frames that are compared.
+        """Update and return whether the filter fits the frames much better than its path.
 
         Parameters
         ----------
         gain : float, nats
-            Log-likelihood of the latest frames along the path, minus that in the filter.
+            Log-likelihood gain of the path over the filter, for the latest frames.
         stamp_ns : int, ns
             Timestamp of the latest frame.
         window_s : float, s
+            Duration of the compared frames, for which the doubt persists.
 
         Returns
         -------
         bool
         """
         if gain < -OVERFIT_NATS:
-            self._doubts_filter_until_ns = stamp_ns + round(window_s * NS)
-        return stamp_ns <= self._doubts_filter_until_ns
+            self._overfit_expiry_ns = stamp_ns + round(window_s * NS)
+        return stamp_ns <= self._overfit_expiry_ns
 
     def was_filter_doubted(self, stamp_ns: int) -> bool:
-        """Whether the filter was doubted at an earlier time.
+        """Whether the filter was doubtful at an earlier time.
 
         Parameters
         ----------
@@ -316,10 +317,10 @@ class TrackEvidence:
         -------
         bool
         """
-        return are_doubtful((*self._doubtful_times, *self._segments), stamp_ns)
+        return are_doubtful((*self._doubtful_times, *self._smoothed_segments), stamp_ns)
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
-        """Count the time for which only one of several sensors supported the track.
+        """Add to the time for which only one of several sensors supported the track.
 
         A single sensor determines neither the scale nor the mirror image, and the other sensors do
         not always correct the error when they return.
@@ -327,7 +328,9 @@ class TrackEvidence:
         Parameters
         ----------
         by_one_sensor : bool
+            Whether only one of several sensors measured.
         dt : float, s
+            Time since the previous frame.
         """
         self._single_sensor_s += dt if by_one_sensor else 0.0
         if self._single_sensor_s > MAX_SINGLE_SENSOR_S:
@@ -341,33 +344,35 @@ class TrackEvidence:
     @property
     def ends_in_misfit(self) -> bool:
         """Whether the latest field contradicted the track."""
-        return self._n_misfits > 0
+        return self._n_consecutive_misfits > 0
 
     def reason_to_end(self, track: Track, spread: float, is_coming: bool,
                       settings: TrackSettings) -> str | None:
-        """Why the track ends after a pose; None if it continues.
+        """Update the end conditions with a pose, and return the reason to end the track.
 
         Parameters
         ----------
         track : Track
             The latest pose.
         spread : float, m
-            Standard deviation of the horizontal position of its hypothesis alone. If several
-            hypotheses explain the field, their differences do not measure the distance of the
+            Standard deviation of the horizontal position of its hypothesis alone. Differences
+            between hypotheses are excluded, because they do not depend on the distance of the
             target.
         is_coming : bool
-            The target is approaching the sensors. It is then not out of reach, however uncertain.
+            Whether the target is approaching the sensors. An approaching target is not out of
+            reach, however uncertain its position.
         settings : TrackSettings
 
         Returns
         -------
         str or None
+            None if the track continues.
         """
         if self.bayes_factor.disfavoured_s(track.stamp_ns) > UNEXPLAINED_S:
             return UNEXPLAINED
         misfit = track.nis > settings.end_nis * track.degrees_of_freedom
-        self._n_misfits = self._n_misfits + 1 if misfit else 0
-        if self._n_misfits > 1:
+        self._n_consecutive_misfits = self._n_consecutive_misfits + 1 if misfit else 0
+        if self._n_consecutive_misfits > 1:
             return LOST
         if spread > settings.end_std > self._min_spread and not is_coming:
             return LOST if misfit else OUT_OF_REACH

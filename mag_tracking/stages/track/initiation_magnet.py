@@ -59,8 +59,8 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
                  ) -> FilterBank | None:
     """Return the hypotheses of a magnet at its first frame, at any position.
 
-    The moment is projected out on a coarse grid. The best grid points are refined, and every
-    distinct optimum becomes a hypothesis, weighted by its fit.
+    The moment is projected out at each point of a coarse grid. The best grid points are refined.
+    Each distinct optimum becomes a hypothesis, weighted by its fit.
 
     Parameters
     ----------
@@ -76,19 +76,19 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     Returns
     -------
     FilterBank or None
-        All labels are 0. None if the frame has fewer than six axes or nothing fits.
+        All labels are 0. None if the frame has fewer than six axes or if no fit has a finite cost.
 
     References
     ----------
     [PHD15]_ Paper A eq. (3).
     """
-    present = ~np.isnan(frame.field)
-    if np.count_nonzero(present) < 6:
+    is_present = ~np.isnan(frame.field)
+    if np.count_nonzero(is_present) < 6:
         return None
-    size = np.sqrt(np.nansum(frame.field**2, axis=1))
+    magnitude = np.sqrt(np.nansum(frame.field**2, axis=1))
     std = np.sqrt(np.einsum('jii->ji', frame.covariance) + background_std**2
-                  + (relative_std * size[:, None]) ** 2)
-    y = (frame.field / std)[present]
+                  + (relative_std * magnitude[:, None]) ** 2)
+    y = (frame.field / std)[is_present]
     low, high = network.positions.min(axis=0), network.positions.max(axis=0)
     extent = high - low + 2.0 * settings.start_margin
     step = float((np.prod(extent) / settings.grid_points) ** (1.0 / 3.0))
@@ -98,13 +98,13 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     # The Jacobian with respect to the moment does not depend on the moment.
     dB_dm = dipole_jacobians(network.positions[None] - grid[:, None], np.zeros(3))[1]
     A = np.einsum('jik,gjkl->gjil', network.R_sw, dB_dm) / std[:, :, None]
-    A = A[:, present]
-    usable = np.isfinite(A).all(axis=(1, 2))
-    moments, residual, _ = project_out_linear(A[usable], y)
+    A = A[:, is_present]
+    is_usable = np.isfinite(A).all(axis=(1, 2))
+    moments, residual, _ = project_out_linear(A[is_usable], y)
     cost = np.einsum('gy,gy->g', residual, residual)
     best = np.argsort(cost, kind='stable')[:settings.starts]
-    start = np.hstack([grid[usable][best], moments[best]])
-    state, P, cost = _distinct_optima(settings, network, start, y, std, present)
+    start = np.hstack([grid[is_usable][best], moments[best]])
+    state, P, cost = _distinct_optima(settings, network, start, y, std, is_present)
     if not len(cost):
         return None
     bank = FilterBank.from_targets(state, P, np.zeros(len(cost), dtype=int), len(network),
@@ -114,7 +114,7 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
 
 
 def _distinct_optima(settings: MagnetSettings, network: SensorNetwork, start: FloatArray,
-                     y: FloatArray, std: FloatArray, present: BoolArray
+                     y: FloatArray, std: FloatArray, is_present: BoolArray
                      ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """States, covariances and costs of the distinct optima after refinement; may be empty."""
     identity = np.zeros((len(start), 1, 3, 6))
@@ -127,25 +127,25 @@ def _distinct_optima(settings: MagnetSettings, network: SensorNetwork, start: Fl
                                 np.ascontiguousarray(x[:, None, :3]),
                                 np.ascontiguousarray(x[:, None, 3:]), dr_dx[:len(x)],
                                 dm_dx[:len(x)])
-        return y - (h / std)[:, present], (H / std[:, :, None])[:, present]
+        return y - (h / std)[:, is_present], (H / std[:, :, None])[:, is_present]
 
     x, cost, covariance, _ = refine(residual_and_jacobian, start)
-    keep: list[int] = []
+    selected: list[int] = []
     for i in np.argsort(cost, kind='stable'):
         if not np.isfinite(cost[i]) or cost[i] - cost.min() > 60.0:
             break
-        apart = [np.linalg.norm(x[i, :3] - x[k, :3])
-                 > 3.0 * np.sqrt(np.trace(covariance[k][:3, :3])) for k in keep]
-        if all(apart):
-            keep.append(i)
-    n = len(keep)
+        is_distinct = [np.linalg.norm(x[i, :3] - x[k, :3])
+                       > 3.0 * np.sqrt(np.trace(covariance[k][:3, :3])) for k in selected]
+        if all(is_distinct):
+            selected.append(i)
+    n = len(selected)
     state = np.zeros((n, 12))
-    state[:, :3], state[:, 6:9] = x[keep, :3], x[keep, 3:]
+    state[:, :3], state[:, 6:9] = x[selected, :3], x[selected, 3:]
     P = np.zeros((n, 12, 12))
     rm = np.r_[0:3, 6:9]
     # Residuals larger than the noise widen the covariance.
-    excess = np.maximum(1.0, cost[keep] / max(1, len(y) - 6))
-    P[np.ix_(range(n), rm, rm)] = covariance[keep] * excess[:, None, None]
+    excess = np.maximum(1.0, cost[selected] / max(1, len(y) - 6))
+    P[np.ix_(range(n), rm, rm)] = covariance[selected] * excess[:, None, None]
     P[:, [3, 4, 5], [3, 4, 5]] = settings.speed_std**2
     P[:, [9, 10, 11], [9, 10, 11]] = settings.spin_std**2
-    return state, P, cost[keep]
+    return state, P, cost[selected]

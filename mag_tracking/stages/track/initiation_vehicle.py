@@ -19,8 +19,8 @@ SHARE_FIELD = 5e-5
 """Field for which `VehicleSettings.induced_share` is defined [T]."""
 
 START_TURN_RATIO = 0.5
-"""Initial standard deviation of the turn rate, relative to that of a turning vehicle. A vehicle
-arrives along a line, so it hardly turns at first."""
+"""Initial standard deviation of the turn rate, relative to the standard deviation of a turning
+vehicle. The ratio is below 1, because vehicles arrive along straight lines."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class VehicleSettings:
         'from the modelled dipoles. Near a vehicle, the model error is the first neglected '
         'multipole term.', 'm', (0.0, 1000.0))
     induced_share: float = param(
-        0.4, 'Share of the initial moment that a field of 50 uT would induce: soft iron D = share '
-        'x moment x mu0 / 50 uT along each axis of the vehicle, m = Rz (m0 + D Rz^T B0/mu0). '
+        0.4, 'Fraction of the initial moment that a field of 50 uT would induce: soft iron D = '
+        'share x moment x mu0 / 50 uT along each axis of the vehicle, m = Rz (m0 + D Rz^T B0/mu0). '
         'TSP14 Tables V and VI give 0.26 for a car (its D times three); T10 Table 6.9, as fitted '
         'here, gives 0.42. No effect without an earth field.', '', (0.0, 10.0))
     induced_share_std: float = param(
@@ -96,7 +96,7 @@ class VehicleSettings:
         1.0, 'Root spectral density of the horizontal acceleration.', 'm/s^1.5', (0.0, 1000.0))
     turn_acceleration: float = param(
         3.0, 'Standard deviation of the lateral acceleration of turning hypotheses; each straight '
-        'hypothesis has a turning one beside it. 0 = no turning hypotheses, half the number of '
+        'hypothesis has a turning counterpart. 0 = no turning hypotheses, half the number of '
         'hypotheses.', 'm/s^2', (0.0, 100.0))
     turn_time: float = param(1.5, 'Correlation time of the turn rate.', 's', (0.01, 1000.0))
     turn_share: float = param(
@@ -105,7 +105,7 @@ class VehicleSettings:
         0.1, 'Root spectral density of the vertical acceleration.', 'm/s^1.5', (0.0, 1000.0))
     moment_drift: float = param(
         0.03, 'Random walk of the hard iron moment, relative to its magnitude. The effective '
-        'moment of a vehicle depends on the side from which it is seen.', '1/s^0.5', (0.0, 1e3))
+        'moment of a vehicle depends on the side that faces the sensor.', '1/s^0.5', (0.0, 1e3))
     difference_drift: float = param(
         0.0125, 'Random walk of the dipole moments of a row about their mean, relative to the '
         'magnitude of the hard iron moment.', '1/s^0.5', (0.0, 1e3))
@@ -160,7 +160,7 @@ def _n_dipoles(settings: VehicleSettings) -> int:
 
 
 def _soft_iron_per_share(settings: VehicleSettings, kind: int) -> float:
-    """Soft iron [m³] of a kind for a share of one."""
+    """Soft iron [m³] of a kind of vehicle for an induced share of one."""
     return settings.moments[kind] * MU0 / SHARE_FIELD
 
 
@@ -186,12 +186,11 @@ def _earth_field(network: SensorNetwork) -> FloatArray:
 
 
 def moment_directions() -> FloatArray:
-    """Return the axes and the diagonals of a cube, both ways.
+    """Return unit vectors along the axes and diagonals of a cube, with both signs.
 
     Returns
     -------
     (14, 3) array
-        Unit vectors.
     """
     axes = np.vstack([np.eye(3), -np.eye(3)])
     diagonals = np.array([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)])
@@ -203,8 +202,8 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
     """Return the hypotheses of a vehicle at its first frame.
 
     There is one hypothesis for each combination of kind, arrival line, moment direction, lateral
-    offset and speed. It starts at the distance at which its field first has the measured energy as
-    it approaches.
+    offset and speed. Each starts at the first position on its line at which its field has the
+    measured energy.
 
     Parameters
     ----------
@@ -237,7 +236,7 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
             velocities = np.array(settings.speeds)[:, None] * R[:, 0]
             starts = _matching_positions(settings, network, measured, R, moments,
                                          settings.heights[kind])
-            states.append(_states(settings, kind, starts, velocities, hard))
+            states.append(_initial_states(settings, kind, starts, velocities, hard))
             by_speed = np.array([
                 starting_covariance(settings, kind, R, v, settings.moment_stds[kind])
                 for v in settings.speeds])
@@ -246,39 +245,39 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
             kinds += [kind] * len(states[-1])
     bank = FilterBank.from_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
                                  len(network), background_std, own_covariance, np.array(kinds))
-    return _with_turns(bank, vehicle_model(settings, network), settings.turn_share)
+    return _add_turning_hypotheses(bank, vehicle_model(settings, network), settings.turn_share)
 
 
-def _with_turns(bank: FilterBank, model: RowVehicle, share: float) -> FilterBank:
-    """Duplicate each hypothesis, straight and turning; return the bank itself if nothing turns."""
+def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float) -> FilterBank:
+    """Bank with a straight and a turning copy of each hypothesis, if vehicles turn."""
     if not model.turn_acceleration:
         return bank
     n, w = len(bank), len(model.state_names) - 1
-    both = bank.rows(np.tile(np.arange(n), 2))
-    both.origin = np.arange(2 * n)
-    both.log_w = np.log(np.repeat([1.0 - share, share], n) / n)
-    both.P[n:, w, w] = START_TURN_RATIO**2 * model.turn_variance(np.hypot(bank.x[:, 3],
+    doubled = bank.rows(np.tile(np.arange(n), 2))
+    doubled.origin = np.arange(2 * n)
+    doubled.log_w = np.log(np.repeat([1.0 - fraction, fraction], n) / n)
+    doubled.P[n:, w, w] = START_TURN_RATIO**2 * model.turn_variance(np.hypot(bank.x[:, 3],
                                                                         bank.x[:, 4]))
-    return both
+    return doubled
 
 
 class _MeasuredEnergy:
-    """Energy of a frame, which determines the distance of the target."""
+    """Energy of a frame, which determines the initial distance of the target."""
 
     def __init__(self, network: SensorNetwork, frame: FieldFrame) -> None:
-        present = ~np.isnan(frame.field)
+        is_present = ~np.isnan(frame.field)
         energy = float(whitened_energy(frame.field, frame.covariance)[0].sum())
         # The expected energy of noise is one per axis.
-        self.energy = max(energy - np.count_nonzero(present), 1.0)
+        self.energy = max(energy - np.count_nonzero(is_present), 1.0)
         std = np.sqrt(np.einsum('jii->ji', frame.covariance))
-        self.whitening = network.R_sw / np.where(present, std, np.inf)[:, :, None]
+        self.whitening = network.R_sw / np.where(is_present, std, np.inf)[:, :, None]
         """Matrix (n_sensors, 3, 3) [1/T] from the field (world frame) to units of the noise."""
 
 
 def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
                         measured: _MeasuredEnergy, R: FloatArray, moments: FloatArray,
                         height: float) -> FloatArray:
-    """First position (n_offsets, n_moments, 3) on each line where the field has the energy."""
+    """First position (n_offsets, n_moments, 3) on each line with the measured field energy."""
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(settings.max_start_distance, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])
@@ -288,13 +287,13 @@ def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
     _, field_of_moment = dipole_jacobians(network.positions - points[:, :, None], np.zeros(3))
     A = (measured.whitening @ field_of_moment).reshape(*points.shape[:2], -1, 3)
     energy = np.einsum('lpmk,mk->lpm', moments @ (np.swapaxes(A, 2, 3) @ A), moments)
-    reached = energy >= measured.energy
-    first = np.where(reached.any(axis=1), reached.argmax(axis=1), len(distance) - 1)
+    is_reached = energy >= measured.energy
+    first = np.where(is_reached.any(axis=1), is_reached.argmax(axis=1), len(distance) - 1)
     return np.take_along_axis(points, first[:, :, None], axis=1)
 
 
-def _states(settings: VehicleSettings, kind: int, positions: FloatArray, velocities: FloatArray,
-            hard: FloatArray) -> FloatArray:
+def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
+                    velocities: FloatArray, hard: FloatArray) -> FloatArray:
     """States (n_offsets n_speeds n_moments, n_t) of `RowVehicle`.
 
     The inputs are `positions` (n_offsets, n_moments, 3), `velocities` (n_speeds, 3) and the total
@@ -330,9 +329,9 @@ def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, spe
     (n_t, n_t) array
     """
     d = _n_dipoles(settings)
-    hard = 6 + 3 * d
+    soft = 6 + 3 * d
     soft_iron_std = settings.induced_share_std * _soft_iron_per_share(settings, kind)
-    n_t = hard + 2 + min(d, 2) + int(settings.turn_acceleration > 0.0)
+    n_t = soft + 2 + min(d, 2) + int(settings.turn_acceleration > 0.0)
     P = np.zeros((n_t, n_t))
     P[:3, :3] = R @ np.diag([settings.along_std**2, settings.lateral_std**2,
                              settings.height_stds[kind]**2]) @ R.T
@@ -340,9 +339,9 @@ def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, spe
                                (settings.cross_speed_std * speed) ** 2,
                                settings.climb_std**2]) @ R.T
     mean = np.full((d, d), 1.0 / d)
-    P[6:hard, 6:hard] = np.kron(moment_std**2 / d * mean
+    P[6:soft, 6:soft] = np.kron(moment_std**2 / d * mean
                                 + settings.difference_stds[kind]**2 * (np.eye(d) - mean), np.eye(3))
-    P[hard:hard + 3, hard:hard + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
+    P[soft:soft + 3, soft:soft + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
     if d > 1:
-        P[hard + 3, hard + 3] = settings.length_stds[kind]**2
+        P[soft + 3, soft + 3] = settings.length_stds[kind]**2
     return P

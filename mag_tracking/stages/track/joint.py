@@ -1,4 +1,4 @@
-"""Joint explanation of the latest frames of a track by its vehicles and a new one."""
+"""Joint explanation of the latest frames of a track by its vehicles and a new vehicle."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,14 @@ from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, field_energies
 from mag_tracking.stages.track.relinearisation import Window
 
 CONFIDENT_NATS = 15.0
-"""A weaker explanation is flagged as doubtful for a limited time [nats]. The evidence treats model
-errors as independent between frames, and is therefore overconfident."""
+"""Explanations with lower log-odds are marked as doubtful for a limited time [nats]. The limit is
+high, because the evidence treats model errors as independent between frames and is
+overconfident."""
 
 IMPLAUSIBLE_NATS = 60.0
-"""The same limit if two vehicles cross, or if one overtakes another at a speed ratio above
-`OVERTAKING_RATIO` [nats]. In traffic this is rarer than a flipped axis or a train that resembles
-it."""
+"""The same limit for two vehicles that cross, or that overtake at a speed ratio above
+`OVERTAKING_RATIO` [nats]. Such traffic is rarer than a flipped axis or a train with a similar
+field."""
 
 CROSSING_COSINE = 0.9
 """Two vehicles cross if the cosine of the angle between their velocities is smaller than this in
@@ -27,13 +28,13 @@ OVERTAKING_RATIO = 1.8
 """Maximum usual speed ratio of two vehicles moving in the same direction."""
 
 MIN_MOVING_SPEED = 1.0
-"""Vehicles slower than this are not compared with others, because their heading is unknown
-[m/s]."""
+"""Minimum speed of vehicles whose directions are compared [m/s]. The heading of slower vehicles is
+unknown."""
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Joint hypotheses of the tracked vehicles and a new one, whose state comes last."""
+    """Joint hypotheses of the tracked vehicles and a new vehicle, whose states come last."""
 
     bank: FilterBank
     """Hypotheses at the latest frame of the window."""
@@ -44,18 +45,19 @@ class Joint:
     log_odds: float
     """Log-odds of this explanation against the current track [nats]."""
     replaced: int | None
-    """Index of the vehicle of the track that was searched for again. It is now the last vehicle, or
-    one of the last two."""
+    """Index in the track of the vehicle that the last vehicle, or the last two vehicles, replace.
+    None if no vehicle is replaced."""
     adds: bool
     """Whether the explanation has one vehicle more than the track."""
 
     def doubtful(self, n_one: int) -> tuple[int, ...]:
         """Indices of the vehicles that may be wrong.
 
-        These are: a vehicle that was found elsewhere; two vehicles that replace one and move in the
-        same direction, because a long vehicle with large model errors resembles two; and all
-        vehicles of a weak explanation, with the limit `IMPLAUSIBLE_NATS` if vehicles cross or one
-        is much faster.
+        - All vehicles of an explanation below `CONFIDENT_NATS`, or below `IMPLAUSIBLE_NATS` if
+          vehicles cross or one is much faster.
+        - A vehicle that was found at another position.
+        - Two vehicles that replace one and move in the same direction, because a long vehicle with
+          large model errors resembles them.
 
         Parameters
         ----------
@@ -96,9 +98,9 @@ def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
 
 
 def are_sensed_by_two(joint: Joint) -> bool:
-    """Whether two sensors sense each of the new vehicles.
+    """Whether at least two sensors sense each new vehicle.
 
-    A field that only one sensor senses may be a fault of that sensor.
+    A field at only one sensor may be a fault of this sensor.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Track management: initiation, maintenance and deletion of tracks.
 
-The manager turns frames with a detection verdict into tracks. A track starts with a detection, is
-maintained by each frame, and ends with the release or when its target is lost.
+The manager turns frames with a detection verdict into tracks. A track starts with a detection and
+is updated with each frame. It ends with the release of the detection, or when its target is lost.
 """
 
 from collections import Counter, deque
@@ -31,32 +31,32 @@ ALONE = 'frames without a start (scale not observable with one sensor)'
 
 DISTURBANCE_TRACKS = 'tracks explained by a disturbance'
 
-STARTED_IN_TAIL = 'tracks started in a larger field than that of a lost track'
+STARTED_IN_TAIL = 'tracks started in the tail of a lost track, in a larger field'
 
 RESTART_ENERGY_RATIO = 4.0
-"""After a target was lost, a new track is started only in a frame with more than this multiple of
-the energy of any frame of the lost track (twice its field). In the tail of a pass the field only
-decreases."""
+"""Minimum energy of the first frame after a lost track, relative to the maximum energy of the lost
+track (twice its field). In the tail of a pass the field only decreases."""
 
 
 class TrackManager:
-    """Turn frames with a detection verdict into tracks.
+    """Track management: turns frames with a detection verdict into tracks.
 
-    There is one `Track` per frame and target while a target is present. In addition there are
-    smoothed poses: those of a fixed lag during the track, and those of the complete track at its
-    end. Other vehicles that appear during a track become members of it.
+    While a target is present, there is one `Track` per frame and target. Smoothed poses follow:
+    with a fixed lag during the track, and for the complete track at its end. Vehicles that appear
+    during a track become its members.
 
     Parameters
     ----------
     network : SensorNetwork
     settings : TrackSettings
     clocks : ClockComparison, optional
-        Comparison of earlier passes, which is continued.
+        Clock comparison with earlier passes, which is continued. By default, a new comparison
+        starts.
 
     Attributes
     ----------
     counts : Counter
-        Counted events, by description.
+        Number of events, by description.
 
     Raises
     ------
@@ -74,19 +74,19 @@ class TrackManager:
         self._next_id = 1
         self._recent: deque[FieldFrame] = deque()
         self._last_ns: int | None = None
-        # [T^2] Largest energy of the field since the start of a track.
+        # [T^2] Maximum energy of the field since the start of the latest track.
         self._max_energy = 0.0
-        # No track is started in the tail of the detection of a lost target, while the energy does
-        # not exceed this limit. None: there is no such tail.
-        self._tail_until: float | None = None
+        # [T^2] After a lost target, a track starts only if the energy of the field exceeds this
+        # limit; None if no target was lost in the present detection.
+        self._restart_energy: float | None = None
         self._next_network: SensorNetwork | None = None
         self._disturbances = Disturbances(network.names)
         self._doubtful_times: Mapping[str, DoubtfulTimes] = {}
-        self._doubtful: dict[int, DoubtfulTimes] = {}
-        uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
-                        for s in network.orientation_std)
-        if uncertain:
-            self.counts['sensors whose orientation is hardly known'] = uncertain
+        self._doubtful_by_sensor: dict[int, DoubtfulTimes] = {}
+        n_uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
+                          for s in network.orientation_std)
+        if n_uncertain:
+            self.counts['sensors whose orientation is hardly known'] = n_uncertain
 
     def use_network(self, network: SensorNetwork) -> None:
         """Apply another calibration of the same sensors as soon as no track is running.
@@ -101,8 +101,8 @@ class TrackManager:
             If the sensors differ.
         """
         if network.names != self._network.names:
-            raise NetworkError(f'calibration of other sensors: {", ".join(network.names)}; the '
-                               f'tracker uses {", ".join(self._network.names)}')
+            raise NetworkError(f'the calibration is for other sensors: {", ".join(network.names)}; '
+                               f'the tracker uses {", ".join(self._network.names)}')
         self._next_network = network
 
     def configure(self, settings: TrackSettings) -> None:
@@ -119,27 +119,27 @@ class TrackManager:
     def doubt(self, times: Mapping[str, DoubtfulTimes]) -> None:
         """Set the times at which the backgrounds of the sensors are doubtful.
 
-        All tracks with frames at these times are doubted.
+        Tracks with frames at these times are marked as doubtful.
 
         Parameters
         ----------
         times : dict of str to DoubtfulTimes
-            Intervals of each sensor; they replace those set before.
+            Doubtful intervals by sensor name; they replace all previous intervals.
         """
         if times != self._doubtful_times:
             self._doubtful_times = times
-            self._doubtful = {self._network.index(name): t for name, t in times.items()}
+            self._doubtful_by_sensor = {self._network.index(name): t for name, t in times.items()}
 
     def _doubtful_sensors(self, *frames: FieldFrame) -> list[int]:
-        """Rows of the sensors whose backgrounds are doubtful in one of the frames."""
-        return [j for j, times in self._doubtful.items()
+        """Indices of the sensors whose backgrounds are doubtful in one of the frames."""
+        return [j for j, times in self._doubtful_by_sensor.items()
                 if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
 
     @property
     def clocks_apart(self) -> str:
-        """Significant clock offset, as a sentence; empty if all clocks agree."""
-        apart = self._clocks.apart if self._settings.cross_check else None
-        return '' if apart is None else apart.text(self._network.names)
+        """Message about a significant clock offset; empty if all clocks agree."""
+        offset = self._clocks.apart if self._settings.cross_check else None
+        return '' if offset is None else offset.text(self._network.names)
 
     @property
     def bank(self) -> FilterBank | None:
@@ -147,7 +147,7 @@ class TrackManager:
         return self._tracks[0].bank if self._tracks else None
 
     def feed(self, frame: FieldFrame) -> list[TrackRecord]:
-        """Process a frame.
+        """Update the tracks with a frame.
 
         Parameters
         ----------
@@ -169,16 +169,16 @@ class TrackManager:
             self._disturbances.feed(frame)
         if not frame.target_present:
             out += self._end_all('released', frame.stamp_ns)
-            self._tail_until = None
-            self._remember(frame)
+            self._restart_energy = None
+            self._store_frame(frame)
         elif self._tracks and previous is not None:
             out += self._maintain(frame, (frame.stamp_ns - previous) / NS)
-        elif self._tail_until is None or _energy(frame) > self._tail_until:
+        elif self._restart_energy is None or _energy(frame) > self._restart_energy:
             out += self._initiate(frame)
         return out
 
     def idle(self) -> None:
-        """Do the work that was deferred until the latest records are published."""
+        """Complete the deferred work: handovers and searches for new targets."""
         for track in self._tracks:
             track.hand_over()
             joint = track.new_target()
@@ -189,7 +189,7 @@ class TrackManager:
                 self._next_id += joint.adds
 
     def give_up(self, reason: str) -> list[TrackRecord]:
-        """End all tracks and forget the recent frames after an interruption of the frames.
+        """End all tracks and discard the recent frames, after an interruption of the frames.
 
         Parameters
         ----------
@@ -200,11 +200,11 @@ class TrackManager:
         list of TrackRecord
         """
         self._recent.clear()
-        self._tail_until = None
+        self._restart_energy = None
         return self._end_all(reason, self._last_ns)
 
     def flush(self) -> list[TrackRecord]:
-        """End all tracks.
+        """End all tracks at the end of the input.
 
         Returns
         -------
@@ -213,7 +213,7 @@ class TrackManager:
         return self._end_all('input ended', self._last_ns)
 
     def _end_at_gap(self, frame: FieldFrame) -> list[TrackRecord]:
-        """End everything if time jumped back or the gap before the frame is too long."""
+        """End all tracks if time jumped back or the gap before the frame is too long."""
         if self._last_ns is None:
             return []
         dt = (frame.stamp_ns - self._last_ns) / NS
@@ -231,7 +231,7 @@ class TrackManager:
         return [*out, *self._unexplained(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
 
     def _unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
-        """Records of the disturbances that ended tracks reveal."""
+        """Start disturbances for the unexplained fields of `tracks`, and return their records."""
         out: list[TrackRecord] = []
         for found in (found for track in tracks for found in track.unexplained):
             self.counts[DISTURBANCE_TRACKS] += 1
@@ -239,7 +239,7 @@ class TrackManager:
         return out
 
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
-        """Update every running track with the frame, and delete those that end."""
+        """Update every running track with the frame, and delete the tracks that end."""
         doubtful = self._doubtful_sensors(frame)
         self._max_energy = max(self._max_energy, _energy(frame))
         for track in self._tracks:
@@ -248,17 +248,17 @@ class TrackManager:
         return out + self._delete_ended(frame.stamp_ns)
 
     def _delete_ended(self, stamp_ns: int) -> list[TrackRecord]:
-        """Delete the ended tracks; return the records of the disturbances that they reveal."""
+        """Delete the tracks that ended, and return the records of their disturbances."""
         out = self._unexplained([track for track in self._tracks if track.ended is not None],
                                 stamp_ns)
-        # In the tail of its own detection, a vehicle would start on the wrong line.
+        # A vehicle that restarts in the tail of its detection would be placed on the wrong line.
         if any(track.is_lost for track in self._tracks) and not self._target.starts_anywhere:
-            self._tail_until = RESTART_ENERGY_RATIO * self._max_energy
+            self._restart_energy = RESTART_ENERGY_RATIO * self._max_energy
         self._tracks = [track for track in self._tracks if track.ended is None]
         return out
 
-    def _remember(self, frame: FieldFrame) -> None:
-        """Keep a frame for the lookback of a later track."""
+    def _store_frame(self, frame: FieldFrame) -> None:
+        """Store a frame for the lookback of a later track."""
         self._recent.append(frame)
         oldest = frame.stamp_ns - self._settings.lookback_s * NS
         while self._recent and self._recent[0].stamp_ns < oldest:
@@ -268,18 +268,19 @@ class TrackManager:
         """Start a track and run it through the frames before the detection."""
         if len(self._network) == 1 and not self._settings.single_sensor_prior:
             self.counts[NO_SCALE] += 1
-            self._tail_until = np.inf
+            self._restart_energy = np.inf
             return []
         s = self._settings
         recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
         if not (s.single_sensor_prior or self._target.starts_anywhere) \
                 and _n_sensors(frame, *recent) < 2:
             self.counts[ALONE] += 1
-            self._remember(frame)
+            self._store_frame(frame)
             return []
-        later = self._sensors_at(frame, s.max_sensors)
+        later_sensors = self._sensors_at(frame, s.max_sensors)
         n_at_start = sensors_at_start(s, self._network, self._target.model)
-        sensors = later if n_at_start >= len(later.rows) else self._sensors_at(frame, n_at_start)
+        sensors = later_sensors if n_at_start >= len(later_sensors.rows) \
+            else self._sensors_at(frame, n_at_start)
         bank_filter = BankFilter(sensors.network, self._target.model, s)
         bank = self._target.start(s, sensors.network, sensors.part_of(frame),
                                   bank_filter.observation.own_covariance)
@@ -288,21 +289,22 @@ class TrackManager:
             self.counts['frames without a start'] += 1
             return []
         self.counts['tracks'] += 1
-        in_tail = self._tail_until is not None
-        if in_tail:
+        is_in_tail = self._restart_energy is not None
+        if is_in_tail:
             self.counts[STARTED_IN_TAIL] += 1
-        self._tail_until, self._max_energy = None, _energy(frame)
+        self._restart_energy, self._max_energy = None, _energy(frame)
         track = RunningTrack(self._next_id, self._target, s, sensors, bank_filter, bank,
-                             self.counts, self._clocks, later)
+                             self.counts, self._clocks, later_sensors)
         self._next_id += 1
         self._tracks.append(track)
         track.doubt(self._doubtful_sensors(*recent, frame))
-        out = track.begin(frame, recent,
-                          approach_unobserved=in_tail or bool(recent) and _n_sensors(*recent) < 2)
+        out = track.begin(
+            frame, recent,
+            approach_unobserved=is_in_tail or bool(recent) and _n_sensors(*recent) < 2)
         return out + self._delete_ended(frame.stamp_ns)
 
     def _sensors_at(self, frame: FieldFrame, n: int) -> SensorSubset:
-        """Up to `n` sensors for a new track; in a large network those nearest to the strongest."""
+        """Up to `n` sensors for a new track: the sensors nearest to the strongest field."""
         if len(self._network) <= n:
             return SensorSubset(self._network)
         strongest = int(np.argmax(whitened_energy(frame.field, frame.covariance)[0]))
@@ -312,8 +314,8 @@ class TrackManager:
 def _energy(frame: FieldFrame) -> float:
     """Sum of the squared field of all sensors [T²].
 
-    It is not weighted with the noise, because the noise that the detector allows for grows during a
-    detection.
+    The energy is not weighted with the noise, because the noise assumed by the detector increases
+    during a detection.
     """
     return float(np.nansum(np.square(frame.field)))
 

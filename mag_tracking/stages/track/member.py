@@ -25,7 +25,7 @@ from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
 
 MAX_POSITIONS = 64
-"""Number of recent positions of a target that are kept to distinguish it from another one."""
+"""Number of stored recent positions, which distinguish a target from another target."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Update:
     """Bank of a running track after a frame."""
 
     frame: FieldFrame
-    """Readings that were used, of the sensors of the track."""
+    """Readings used for the update, from the sensors of the track."""
     dt: float
     """Time since the previous frame [s]."""
     bank: FilterBank
@@ -49,11 +49,11 @@ class View:
 
     bank: FilterBank
     best: int
-    """Row of the published hypothesis."""
+    """Index of the published hypothesis."""
     observation: Observation
     gain: float
-    """Log-likelihood of the latest frames along the path of that hypothesis, minus that in the
-    filter [nats]."""
+    """Log-likelihood gain of the path of this hypothesis over the filter, for the latest frames
+    [nats]."""
 
 
 class Member:
@@ -66,7 +66,7 @@ class Member:
     sensors : SensorSubset
         Sensors that the track uses.
     counts : Counter
-        Counted events of the track manager, updated in place.
+        Event counts of the track manager, updated in place.
     clocks : ClockComparison
     begin_ns : int, ns
         Start of the track.
@@ -83,11 +83,11 @@ class Member:
     ended : str or None
         Reason for the end; None while the target is tracked.
     is_lost : bool
-        The track ended while the target was still detected.
+        Whether the track ended while the target was still detected.
     early : list of TrackState
-        Smoothed states before the target shared its state with others.
+        Smoothed states of the time before the target shared its state with other targets.
     slot : int
-        Index of its states among those of the frames that are kept for smoothing.
+        Index of the target in the joint states that are stored for smoothing.
     """
 
     def __init__(self, id: int, target: Target, sensors: SensorSubset, counts: 'Counter[str]',
@@ -101,14 +101,14 @@ class Member:
         self.is_lost = False
         self.early: list[TrackState] = []
         self.slot = 0
-        self._spread = np.inf
+        self._position_std = np.inf
         self._unobserved_length = target.unobserved_length()
         self._was_unambiguous = False
         # Timestamps and positions of the latest published poses.
         self._recent_positions: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_POSITIONS)
 
     def use(self, sensors: SensorSubset) -> None:
-        """Change the sensors that measure the target.
+        """Switch to other sensors, and restart the cross-check.
 
         Parameters
         ----------
@@ -118,7 +118,7 @@ class Member:
         self.cross_check = CrossCheck(sensors.network)
 
     def restart(self, sensors: SensorSubset) -> None:
-        """Drop the doubts that were caused by the field of another vehicle.
+        """Drop the doubts caused by the field of another vehicle, and restart the checks.
 
         Parameters
         ----------
@@ -130,9 +130,9 @@ class Member:
         self._plausibility = Plausibility()
 
     def start_alongside(self, first: 'Member', stamp_ns: int, ratio: float) -> None:
-        """Start as a new target beside the first member of a track.
+        """Start as a new target of a track, in addition to its first member.
 
-        The new target inherits the doubts about the approach of the first member, and its evidence
+        The new target inherits the first member's doubt about the approach, and its evidence
         against a disturbance.
 
         Parameters
@@ -140,7 +140,7 @@ class Member:
         first : Member
         stamp_ns : int, ns
         ratio : float
-            Bayes factor by which a target must explain the frames better than a disturbance.
+            Minimum Bayes factor of a target against a disturbance.
         """
         self.evidence.doubt_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
                                   self._sensors.whole, False)
@@ -160,13 +160,13 @@ class Member:
         float, m
             0 if no position was published at these timestamps.
         """
-        at = dict(zip(stamps_ns, path, strict=True))
-        away = [float(np.hypot(*(place - at[stamp_ns])))
-                for stamp_ns, place in self._recent_positions if stamp_ns in at]
-        return float(np.mean(away)) if away else 0.0
+        position_at = dict(zip(stamps_ns, path, strict=True))
+        distances = [float(np.hypot(*(place - position_at[stamp_ns])))
+                     for stamp_ns, place in self._recent_positions if stamp_ns in position_at]
+        return float(np.mean(distances)) if distances else 0.0
 
     def publish(self, update: Update, view: View) -> Track:
-        """Return the record of a frame.
+        """Create and store the record of a frame.
 
         Parameters
         ----------
@@ -177,31 +177,31 @@ class Member:
         -------
         Track
         """
-        self.last = self._published(update, view)
-        self._spread = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
+        self.last = self._create_record(update, view)
+        self._position_std = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
         self._was_unambiguous |= not self.last.ambiguous
         self._recent_positions.append((self.last.stamp_ns, self.last.position[:2]))
         self._counts['poses'] += 1
         return self.last
 
-    def _published(self, update: Update, view: View) -> Track:
-        """`Track` of a frame, after the evidence of the sensors has been updated."""
+    def _create_record(self, update: Update, view: View) -> Track:
+        """Update the evidence with a frame, and return its `Track`."""
         frame, dt, sensors, best = update.frame, update.dt, update.sensors, view.best
         measured: BoolArray = ~np.isnan(frame.field)
-        by = np.flatnonzero(measured.any(axis=1))
-        alone = len(sensors.network) > 1 and len(by) == 1
-        self.evidence.support(alone, dt)
+        measuring = np.flatnonzero(measured.any(axis=1))
+        is_single_sensor = len(sensors.network) > 1 and len(measuring) == 1
+        self.evidence.support(is_single_sensor, dt)
         if self._unobserved_length is not None:
             self._unobserved_length.update(
-                view.bank.x[best], view.bank.P[best], sensors.network.positions[by],
+                view.bank.x[best], view.bank.P[best], sensors.network.positions[measuring],
                 self.last is not None and (self.evidence.doubted or not self.last.ambiguous))
-        found = self.evidence.note(self._doubts(update, view, alone), frame.stamp_ns)
+        reasons = self.evidence.note(self._doubts(update, view, is_single_sensor), frame.stamp_ns)
         excess = 1.0 if self._target.starts_anywhere else self.evidence.innovations.excess
         return sensors.for_whole_network(published_track(
             view.bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self.evidence.existence, degrees_of_freedom=int(measured.sum()),
-            found=found, excess=excess, unobserved_length=self._unobserved_length,
+            found=reasons, excess=excess, unobserved_length=self._unobserved_length,
             difference=self.cross_check.difference,
             ambiguous_poses=update.settings.ambiguous_poses,
             predicted=update.bank_filter.predicted_field(update.bank, best, frame, dt),
@@ -210,7 +210,7 @@ class Member:
             update.settings)
 
     def is_doubted(self, settings: TrackSettings) -> bool:
-        """Whether the whole track is doubted at present.
+        """Whether the whole track is currently doubtful.
 
         Parameters
         ----------
@@ -224,40 +224,40 @@ class Member:
             or not self.evidence.bayes_factor.is_favoured(settings.min_bayes_factor) \
             or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
 
-    def _doubts(self, update: Update, view: View, alone: bool) -> set[str]:
-        """Doubts about the pose of the best hypothesis; `alone`: only one sensor measured."""
+    def _doubts(self, update: Update, view: View, is_single_sensor: bool) -> set[str]:
+        """Update and return the doubts about a pose."""
         bank, best, evidence, settings = view.bank, view.best, self.evidence, update.settings
-        found = evidence.doubts | ({doubts.ONE_SENSOR} if alone else set())
+        reasons = evidence.doubts | ({doubts.ONE_SENSOR} if is_single_sensor else set())
         if update.bank_filter.is_implausible(bank, best, update.frame):
-            found.add(doubts.MISFIT)
+            reasons.add(doubts.MISFIT)
         if not evidence.bayes_factor.is_favoured(settings.min_bayes_factor):
-            found.add(doubts.DISTURBANCE_MODEL)
-        # A magnet may rest: its field is then as smooth as a disturbance, and its pose is right.
+            reasons.add(doubts.DISTURBANCE_MODEL)
+        # The field of a magnet at rest is as smooth as a disturbance, but its pose is correct.
         if self._target.starts_anywhere:
-            return found
-        found |= evidence.vehicle_doubts(
+            return reasons
+        reasons |= evidence.vehicle_doubts(
             bank.nis[best], int(np.count_nonzero(~np.isnan(update.frame.field))),
             settings.min_bayes_factor)
         if self._overfits(update, view):
-            found.add(doubts.OVERFIT)
-        found |= self.cross_check.doubts(self._clocks.apart_s(update.sensors.rows))
-        found |= self._plausibility.evaluate(
+            reasons.add(doubts.OVERFIT)
+        reasons |= self.cross_check.doubts(self._clocks.apart_s(update.sensors.rows))
+        reasons |= self._plausibility.evaluate(
             view.observation, bank, best, settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), update.dt)
-        for reason in found & doubts.PERMANENT:
+        for reason in reasons & doubts.PERMANENT:
             evidence.doubt(reason)
-        return found | evidence.doubts
+        return reasons | evidence.doubts
 
     def _overfits(self, update: Update, view: View) -> bool:
-        """Whether the filter fits the frames much better than the path of its hypothesis."""
+        """Update and return whether the filter fits the frames much better than its path."""
         overfits = self.evidence.doubts_filter(view.gain, update.frame.stamp_ns,
                                                update.settings.relinearise_window_s)
         if overfits:
-            self._counts['poses doubted: the filter fits better than its path'] += 1
+            self._counts['doubtful poses: the filter fits better than its path'] += 1
         return overfits
 
     def reason_to_end(self, sensors: SensorSubset, settings: TrackSettings) -> str | None:
-        """Why the track of the target ends with its latest record; None if it continues.
+        """Update the end conditions with the latest record, and return the reason to end the track.
 
         Parameters
         ----------
@@ -267,22 +267,24 @@ class Member:
         Returns
         -------
         str or None
+            None if the track continues.
         """
         assert self.last is not None
         is_coming = not self._target.starts_anywhere and sensors.is_approached_by(self.last)
-        return self.evidence.reason_to_end(self.last, self._spread, is_coming, settings)
+        return self.evidence.reason_to_end(self.last, self._position_std, is_coming, settings)
 
     def unexplained(self, uniform: float) -> UnexplainedField | None:
-        """Field during the track, if a target never explained it.
+        """Field of the track, if a target never explained it.
 
         Parameters
         ----------
         uniform : float
-            Probability of one field over the network.
+            Probability of a common field over the network.
 
         Returns
         -------
         UnexplainedField or None
+            None if a target explained it.
         """
         if self._was_unambiguous or self.last is None \
                 or self.evidence.bayes_factor.disfavoured_s(self.last.stamp_ns) <= 0.0:
@@ -292,7 +294,7 @@ class Member:
 
     def states_of(self, slot: int, n_one: int, states: Iterable[TrackState],
                   end_ns: float = np.inf) -> list[TrackState]:
-        """States of the target among those of all members, within its lifetime.
+        """States of the target, extracted from the states of all members within its lifetime.
 
         Parameters
         ----------
@@ -324,12 +326,12 @@ class Member:
         bank : FilterBank
             Bank of this member.
         best : int
-            Row of the hypothesis.
+            Index of the hypothesis.
         complete : bool
-            The states are those of the complete track.
+            Whether the states cover the complete track.
         states : list of TrackState
         doubtful : bool
-            All poses are ambiguous.
+            Whether all poses are marked as ambiguous.
 
         Returns
         -------
@@ -371,5 +373,5 @@ def members_in_order(members: Sequence[Member], new: Member | None, joint: Joint
     first = n_one * len(others)
     paths = np.array([path[joint.bank.best(), first:] for path in joint.window.paths])
     stamps = [frame.stamp_ns for frame in joint.window.frames]
-    away = [old.distance_from(stamps, paths[:, k * n_one:k * n_one + 2]) for k in (0, 1)]
-    return [*others, old, new] if away[0] <= away[1] else [*others, new, old]
+    distances = [old.distance_from(stamps, paths[:, k * n_one:k * n_one + 2]) for k in (0, 1)]
+    return [*others, old, new] if distances[0] <= distances[1] else [*others, new, old]

@@ -1,4 +1,4 @@
-"""Decision when to compare a track with other explanations of its frames, and which to accept."""
+"""Triggers for comparing a track with other explanations of its frames, and their acceptance."""
 
 import numpy as np
 from scipy.special import chdtrc
@@ -7,37 +7,37 @@ from mag_tracking.inference.sliding_sum import SlidingSum
 from mag_tracking.units import NS
 
 FALSE_ALARM = 1e-3
-"""A new target is searched for if noise explains the latest innovations with a lower
-probability."""
+"""Significance level of the latest innovations below which a new target is searched for."""
 
 WINDOW_S, MIN_INTERVAL_S = 0.25, 0.15
-"""Length of the latest frames, and minimum interval between two searches [s]."""
+"""Duration of the latest frames that are tested, and minimum interval between two searches [s]."""
 
 LONG_INTERVAL_S, INTERVAL_GROWTH = 0.3, 1.5
-"""Interval after which a long vehicle is compared with two vehicles [s], and the factor by which it
-grows with each comparison."""
+"""Interval after which a long vehicle is compared with two vehicles [s], and factor by which this
+interval grows with each comparison."""
 
 ACCEPT_NATS, REPEATED_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
-"""Limits for the log-odds of another explanation [nats]: accepted at once, accepted in two
-successive comparisons, and, if not accepted, minimum for the track to be doubted."""
+"""Minimum log-odds of another explanation [nats]: to be accepted at once, to be accepted in two
+successive comparisons, and to mark the track as doubtful if it is not accepted."""
 
 IMPROBABLE, LONG_VEHICLE = 'improbable innovations', 'a long vehicle'
 """Reasons to compare a track with other explanations."""
 
 
 class NewTargetEvidence:
-    """Decide when to compare a track with an explanation that has one more vehicle.
+    """Decision when to compare a track with an explanation that has one more vehicle.
 
-    The comparison is due when the latest innovations are improbable. A long vehicle explains two
-    short ones without improbable innovations, so it is also compared at intervals.
+    A comparison is due when the latest innovations are improbable. A model of one long vehicle may
+    explain two short vehicles without improbable innovations. Long vehicles are therefore also
+    compared at intervals.
     """
 
     def __init__(self) -> None:
         self._latest = SlidingSum(WINDOW_S)
-        self._last_ns: int | None = None
+        self._last_comparison_ns: int | None = None
         self._was_probable = False
         self._was_rejected = self._is_long = False
-        self._long_wait_s = LONG_INTERVAL_S
+        self._long_interval_s = LONG_INTERVAL_S
 
     def add(self, nis: float, degrees_of_freedom: int, stamp_ns: int, rejected: bool,
             is_long: bool) -> None:
@@ -50,16 +50,16 @@ class NewTargetEvidence:
         degrees_of_freedom : int
         stamp_ns : int, ns
         rejected : bool
-            One of two sensors was rejected, which counts like a large innovation. With more sensors
-            that agree, the rejected sensor is the one that is wrong.
+            Whether one of two sensors was rejected, which counts like a large innovation. With more
+            sensors, the majority shows that the rejected sensor is faulty.
         is_long : bool
-            The best hypothesis is a long vehicle.
+            Whether the best hypothesis is a long vehicle.
         """
         self._latest.add(stamp_ns, [nis, degrees_of_freedom])
         self._was_rejected, self._is_long = rejected, is_long
 
     def due(self, stamp_ns: int) -> str | None:
-        """Return the reason for a comparison now.
+        """Return the reason for a comparison if one is due, and restart the interval.
 
         Parameters
         ----------
@@ -71,19 +71,20 @@ class NewTargetEvidence:
             `IMPROBABLE` or `LONG_VEHICLE`; None if no comparison is due.
         """
         total, freedom = self._latest.total
-        since = np.inf if self._last_ns is None else (stamp_ns - self._last_ns) / NS
+        elapsed_s = np.inf if self._last_comparison_ns is None \
+            else (stamp_ns - self._last_comparison_ns) / NS
         reason = None
         if self._was_rejected or chdtrc(max(freedom, 1.0), total) <= FALSE_ALARM:
-            reason = IMPROBABLE if since >= MIN_INTERVAL_S else None
-        elif self._is_long and since >= self._long_wait_s:
+            reason = IMPROBABLE if elapsed_s >= MIN_INTERVAL_S else None
+        elif self._is_long and elapsed_s >= self._long_interval_s:
             reason = LONG_VEHICLE
-            self._long_wait_s *= INTERVAL_GROWTH
+            self._long_interval_s *= INTERVAL_GROWTH
         if reason is not None:
-            self._last_ns = stamp_ns
+            self._last_comparison_ns = stamp_ns
         return reason
 
     def accepts(self, log_odds: float) -> bool:
-        """Whether another explanation is accepted, given the previous comparisons.
+        """Update and return whether another explanation is accepted.
 
         Parameters
         ----------

@@ -1,9 +1,9 @@
 """Search for a new vehicle in the frames of a running track.
 
-The frames of the relinearisation window are explained in another way: with a vehicle beside the
-tracked ones, with two vehicles in place of one (two vehicles may have misled the filter of one), or
-with one of them elsewhere. Each explanation is filtered and smoothed along its path like any
-hypothesis. Its evidence is compared with that of the current track.
+Three other explanations of the relinearisation window are tried: a further vehicle; two vehicles in
+place of one, because two vehicles may have misled the filter of one; and one of the vehicles at
+another position. Each explanation is filtered and smoothed along its path like any hypothesis. Its
+evidence is compared with the evidence of the current track.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,35 +35,35 @@ from mag_tracking.stages.track.window_start import (
 )
 
 PASSES, STEP = 3, 0.5
-"""Number of Gauss-Newton steps along each path, and the share of each step that is taken."""
+"""Number of Gauss-Newton steps along each path, and their damping factor."""
 
 MAX_KNOWN, MAX_FIRST, MAX_SECOND = 2, 3, 2
-"""Maximum number of hypotheses that are tried for a single tracked vehicle (one for several
-vehicles), and of paths of a first and of a second new vehicle for each."""
+"""Maximum number of hypotheses of a single tracked vehicle that are tried, of first new vehicles
+for each hypothesis, and of second new vehicles for each first one. With several tracked vehicles,
+only the best hypothesis is tried."""
 
-NATS_KEPT, MAX_KEPT = 10.0, 12
-"""Maximum difference in log-probability from the best explanation at which another one is kept
-[nats], and maximum number of explanations kept."""
+MAX_LOSS_NATS, MAX_EXPLANATIONS = 10.0, 12
+"""Maximum difference in log-probability between the best and another retained explanation [nats],
+and maximum number of retained explanations."""
 
 LOG_P_ARRIVAL = np.log(0.05)
 """Log-probability that another vehicle arrives during a pass."""
 
 MIN_DISPLACEMENT_M = 2.0
-"""Minimum distance of a vehicle that is found elsewhere from its track [m]. A nearer vehicle was
-tracked correctly."""
+"""Minimum distance from the track at which a vehicle counts as found at another position [m]."""
 
 MAX_RATIO = 5.0
 """Maximum speed and moment of a new vehicle, relative to the largest of the settings."""
 
 LOG_P_LOST = np.log(0.01)
-"""Log-probability that a vehicle has been elsewhere than its track during the whole window."""
+"""Log-probability that the track of a vehicle was at a wrong position during the whole window."""
 
 N_DISTANCES = 10
-"""Number of positions on its line at which a new target may be at the start of the window."""
+"""Number of possible positions of a new target on its line at the start of the window."""
 
 
 class NewTargetSearch:
-    """Explain a window with one more vehicle.
+    """Search for explanations of a window with a further vehicle or a vehicle elsewhere.
 
     Parameters
     ----------
@@ -76,8 +76,8 @@ class NewTargetSearch:
         Number of vehicles of the track.
     vehicles : VehicleState
     reason : str
-        Reason from `NewTargetEvidence.due`. If the innovations are not improbable, no vehicle is
-        searched for beside a long one or elsewhere.
+        Reason from `NewTargetEvidence.due`. If the innovations are not improbable, only two
+        vehicles in place of one are searched for.
     may_add : bool
         Whether a vehicle may be added.
     """
@@ -92,60 +92,60 @@ class NewTargetSearch:
         settings = vehicles.settings
         self._n_one = self._filter.observation.n_one
         self._search = WindowSearch(window, vehicles)
-        # First pair that was found in place of each vehicle; it defines the order of the others.
+        # First pair that was found in place of each vehicle; it defines the order of later pairs.
         self._pairs: dict[int, FloatArray] = {}
         self._log_prior = -float(np.log(
             len(settings.arrival_names) * len(settings.lateral_offsets) * len(settings.speeds)
             * len(settings.kinds) * len(moment_directions()) * N_DISTANCES))
 
     def find(self) -> Joint | None:
-        """Return the best explanation with a new target, or with a vehicle elsewhere.
+        """Return the best explanation with a new target, or with a vehicle at another position.
 
         Returns
         -------
         Joint or None
-            None if there is no such explanation.
+            None if no such explanation is usable.
         """
         if not len(self._search.samples.t):
             return None
-        rows, of_track, log_w, paths = self._current_track()
+        rows, track_log_likelihood, log_w, paths = self._current_track()
         # Keys: number of vehicles, and the replaced vehicle of the track.
         explanations: dict[tuple[int, int | None], list[WindowStart]] = {}
-        for k in self._leaders(rows, log_w):
-            known = self._known(rows[k], log_w[k] - of_track[k], paths[k])
-            for start in self._starts_with(known):
+        for k in self._leading_indices(rows, log_w):
+            known = self._known_vehicles(rows[k], log_w[k] - track_log_likelihood[k], paths[k])
+            for start in self._all_starts(known):
                 explanations.setdefault((len(start.kind), start.replaced), []).append(start)
-        alone = float(log_sum_exp(log_w))
-        found = [self._best_of(starts, alone) for starts in explanations.values()]
-        return max((joint for joint in found if joint is not None
+        track_evidence = float(log_sum_exp(log_w))
+        joints = [self._best_of(starts, track_evidence) for starts in explanations.values()]
+        return max((joint for joint in joints if joint is not None
                     and (are_sensed_by_two(joint) if joint.adds
                          else self._is_elsewhere(joint))),
                    key=lambda joint: joint.log_odds, default=None)
 
-    def _starts_with(self, known: KnownVehicles) -> list[WindowStart]:
+    def _all_starts(self, known: KnownVehicles) -> list[WindowStart]:
         """Starts of all explanations that are based on one hypothesis of the track."""
-        starts = self._beside(known) if self._may_add and self._is_improbable else []
+        starts = self._starts_beside(known) if self._may_add and self._is_improbable else []
         for i in range(self._n_targets):
-            others = self._without(known, i)
+            others = self._remove_vehicle(known, i)
             if self._is_improbable and self._is_sensed(known, i):
-                starts += self._beside(others, i)
+                starts += self._starts_beside(others, i)
             if self._may_add and self._may_be_two(known, i):
-                starts += self._pair_in_place_of(others, i)
+                starts += self._pair_starts(others, i)
         return starts
 
-    def _best_of(self, starts: Sequence[WindowStart], alone: float) -> Joint | None:
-        """`Joint` of one explanation; `alone` is the log-evidence of the current track."""
-        kept = self._with_turns(self._kept(starts))
-        prior = LOG_P_ARRIVAL if len(kept[0].kind) > self._n_targets else LOG_P_LOST
-        bank, log_likelihood, log_w, paths = self._run(kept)
-        return self._made(kept, bank, log_likelihood, log_w, paths,
-                          float(log_sum_exp(log_w)) + prior - alone)
+    def _best_of(self, starts: Sequence[WindowStart], track_evidence: float) -> Joint | None:
+        """`Joint` of one explanation; `track_evidence` is the log-evidence of the current track."""
+        refined = self._add_turning_starts(self._refine_starts(starts))
+        prior = LOG_P_ARRIVAL if len(refined[0].kind) > self._n_targets else LOG_P_LOST
+        bank, log_likelihood, log_w, paths = self._run_starts(refined)
+        return self._joint_of(refined, bank, log_likelihood, log_w, paths,
+                              float(log_sum_exp(log_w)) + prior - track_evidence)
 
     def _current_track(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
         """Leading hypotheses of the current track, along their paths.
 
-        Returns their rows in the bank (n,), log-likelihoods (n,), log-weights with these (n,) and
-        paths (n, n_frames, n_x).
+        Returns their indices in the bank (n,), log-likelihoods (n,), log-weights after these frames
+        (n,) and paths (n, n_frames, n_x).
         """
         window, bank = self._window, self._bank
         order = np.argsort(-bank.log_w, kind='stable')[:window.max_hypotheses]
@@ -157,24 +157,24 @@ class NewTargetSearch:
         along = self._filter.run_along(anchor, window.frames, window.intervals, paths,
                                        passes=PASSES, step=STEP,
                                        first_is_updated=window.is_updated)
-        usable = np.isfinite(along.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
-        of_track = np.where(usable, along.log_likelihood, -np.inf)
-        return order, of_track, before + of_track, paths
+        is_usable = np.isfinite(along.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
+        track_log_likelihood = np.where(is_usable, along.log_likelihood, -np.inf)
+        return order, track_log_likelihood, before + track_log_likelihood, paths
 
-    def _leaders(self, rows: IntArray, log_w: FloatArray) -> list[int]:
-        """Indices into `rows` to be tried with a new target: the best of each arrival and kind."""
-        seen: set[tuple[int, ...]] = set()
-        most = MAX_KNOWN if self._n_targets == 1 else 1
+    def _leading_indices(self, rows: IntArray, log_w: FloatArray) -> list[int]:
+        """Indices into `rows` of the best hypothesis of each arrival and kind, to be tried."""
+        tried: set[tuple[int, ...]] = set()
+        n_max = MAX_KNOWN if self._n_targets == 1 else 1
         chosen: list[int] = []
         for k in np.argsort(-log_w, kind='stable').tolist():
-            what = (*np.ravel(self._bank.label[rows[k]]).tolist(),
-                    *np.ravel(self._bank.kind[rows[k]]).tolist())
-            if np.isfinite(log_w[k]) and what not in seen and len(chosen) < most:
-                seen.add(what)
+            combination = (*np.ravel(self._bank.label[rows[k]]).tolist(),
+                           *np.ravel(self._bank.kind[rows[k]]).tolist())
+            if np.isfinite(log_w[k]) and combination not in tried and len(chosen) < n_max:
+                tried.add(combination)
                 chosen.append(k)
         return chosen
 
-    def _known(self, row: int, log_w: float, path: FloatArray) -> KnownVehicles:
+    def _known_vehicles(self, row: int, log_w: float, path: FloatArray) -> KnownVehicles:
         """Vehicles of a hypothesis of the track, with its log-weight at the anchor."""
         at = np.searchsorted(self._window.anchor.origin, self._bank.origin[[row]])
         before = self._window.anchor.rows(at)
@@ -183,7 +183,7 @@ class NewTargetSearch:
         return KnownVehicles(before.x[0], before.P[0], path, label, kind, log_w, self._filter)
 
     def _may_be_two(self, known: KnownVehicles, i: int) -> bool:
-        """Whether vehicle `i` is long, or the only one."""
+        """Whether vehicle `i` may be two vehicles: it is long, or the only vehicle."""
         return self._n_targets == 1 or bool(
             self._filter.are_long(np.array([known.kind[i]]))[0])
 
@@ -193,7 +193,7 @@ class NewTargetSearch:
             self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
 
     def _is_elsewhere(self, joint: Joint) -> bool:
-        """Whether a vehicle that was searched for elsewhere was found far from its track."""
+        """Whether the vehicle that was searched for again was found far from its track."""
         n, now = self._n_one, self._bank.x[self._bank.best()]
         assert joint.replaced is not None
         found = joint.bank.x[joint.bank.best()]
@@ -201,26 +201,27 @@ class NewTargetSearch:
         before = now[joint.replaced * n:joint.replaced * n + 2]
         return bool(np.hypot(*(found[last:last + 2] - before)) > MIN_DISPLACEMENT_M)
 
-    def _without(self, known: KnownVehicles, i: int) -> KnownVehicles:
-        """The same without vehicle `i`; without any vehicle, only the states of the sensors."""
+    def _remove_vehicle(self, known: KnownVehicles, i: int) -> KnownVehicles:
+        """Known vehicles without vehicle `i`; only the sensor states if no vehicle remains."""
         n = self._n_one
         if self._n_targets == 1:
-            own = self._sensors_at_start()
-            nowhere = np.zeros((len(self._search.times), len(own)))
-            return KnownVehicles(nowhere[0], own, nowhere, (), (), 0.0, None)
+            sensor_P = self._sensors_at_start()
+            nowhere = np.zeros((len(self._search.times), len(sensor_P)))
+            return KnownVehicles(nowhere[0], sensor_P, nowhere, (), (), 0.0, None)
         rows = np.delete(np.arange(known.path.shape[1]), np.arange(i * n, (i + 1) * n))
         return KnownVehicles(
             known.x[rows], known.P[np.ix_(rows, rows)], known.path[:, rows],
             known.label[:i] + known.label[i + 1:], known.kind[:i] + known.kind[i + 1:],
             known.log_w, self._filter_of(self._n_targets - 1))
 
-    def _beside(self, known: KnownVehicles, replaced: int | None = None) -> list[WindowStart]:
-        """Starts of one vehicle beside known ones: a new one, or instead of vehicle `replaced`."""
+    def _starts_beside(self, known: KnownVehicles, replaced: int | None = None
+                       ) -> list[WindowStart]:
+        """Starts with a further vehicle, which is new or replaces vehicle `replaced`."""
         search = self._search.beside(known)
         return [start for theta in search.best(self._search.grid, MAX_FIRST)
                 for start in self._starts_on(known, theta[None], search.moments(theta), replaced)]
 
-    def _pair_in_place_of(self, others: KnownVehicles, i: int) -> list[WindowStart]:
+    def _pair_starts(self, others: KnownVehicles, i: int) -> list[WindowStart]:
         """Starts of two vehicles in place of vehicle `i`."""
         search = self._search.beside(others)
         starts: list[WindowStart] = []
@@ -231,7 +232,7 @@ class NewTargetSearch:
 
     def _starts_on(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
                  replaced: int | None) -> list[WindowStart]:
-        """Starts of known vehicles and new ones on `paths` (k, 7) with moments (k, 3, 3)."""
+        """Starts of known vehicles and new vehicles on `paths` (k, 7) with moments (k, 3, 3)."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
         labels = self._search.prior.nearest_line(paths)[0].tolist()
         starts = []
@@ -254,29 +255,33 @@ class NewTargetSearch:
         return block_diag(*observation.own_covariance,
                           std**2 * np.eye(3 * len(observation.positions)))
 
-    def _kept(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Starts that explain the frames about as well as the best, with their paths refined."""
-        _, _, log_w, paths = self._run(starts)
-        order = np.argsort(-log_w, kind='stable')[:MAX_KEPT]
+    def _refine_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
+        """Starts that are about as probable as the best start, with refined paths."""
+        _, _, log_w, paths = self._run_starts(starts)
+        order = np.argsort(-log_w, kind='stable')[:MAX_EXPLANATIONS]
         return [replace(starts[k], path=paths[k]) for k in order.tolist()
-                if log_w[k] >= log_w.max() - NATS_KEPT]
+                if log_w[k] >= log_w.max() - MAX_LOSS_NATS]
 
-    def _with_turns(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Each start as it is, and with one of the new vehicles turning."""
-        share = self._vehicles.settings.turn_share
+    def _add_turning_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
+        """Starts in which the new vehicles go straight, and in which one of them turns."""
+        fraction = self._vehicles.settings.turn_share
         out = []
         for start in starts:
             turning = [P for P in (self._vehicles.turning(start.x, start.P, i)
                                    for i in start.new_indices) if P is not None]
-            out.append(replace(start, log_w=start.log_w + float(np.log(1.0 - share))
+            out.append(replace(start, log_w=start.log_w + float(np.log(1.0 - fraction))
                                if turning else start.log_w))
-            out += [replace(start, P=P, log_w=start.log_w + float(np.log(share / len(turning))))
+            out += [replace(start, P=P, log_w=start.log_w + float(np.log(fraction / len(turning))))
                     for P in turning]
         return out
 
-    def _run(self, starts: Sequence[WindowStart]
+    def _run_starts(self, starts: Sequence[WindowStart]
              ) -> tuple[FilterBank, FloatArray, FloatArray, FloatArray]:
-        """Bank at the end, log-likelihoods (n,), log-weights (n,) and paths (n, n_frames, n_x)."""
+        """Filter and smooth starts along their paths.
+
+        Returns the bank at the last frame, log-likelihoods (n,), log-weights (n,) and paths (n,
+        n_frames, n_x).
+        """
         window, n = self._window, len(starts)
         bank = FilterBank(
             np.array([s.x for s in starts]), np.array([s.P for s in starts]), np.zeros(n),
@@ -286,10 +291,10 @@ class NewTargetSearch:
         along = self._filter_of(len(starts[0].kind)).run_along(
             bank, window.frames, window.intervals, paths, passes=PASSES, step=STEP,
             first_is_updated=window.is_updated)
-        usable: BoolArray = np.isfinite(along.log_likelihood) \
+        is_usable: BoolArray = np.isfinite(along.log_likelihood) \
             & np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(bank.x).all(axis=1) \
             & [self._are_plausible(s, x) for s, x in zip(starts, bank.x, strict=True)]
-        log_likelihood = np.where(usable, along.log_likelihood, -np.inf)
+        log_likelihood = np.where(is_usable, along.log_likelihood, -np.inf)
         log_w = log_likelihood + [s.log_w for s in starts] - 0.5 * np.square(
             [overlap_depth(path, self._n_one, len(s.kind), self._vehicles.length_column) / DEPTH_STD
              for s, path in zip(starts, paths, strict=True)])
@@ -298,7 +303,7 @@ class NewTargetSearch:
     def _are_plausible(self, start: WindowStart, x: FloatArray) -> bool:
         """Whether speeds and moments of the new vehicles in the state `x` (n_x,) are plausible.
 
-        A vehicle that stands still is not new.
+        A stationary vehicle is not new.
         """
         settings, n = self._vehicles.settings, self._n_one
         for i in start.new_indices:
@@ -309,9 +314,9 @@ class NewTargetSearch:
                 return False
         return True
 
-    def _made(self, starts: Sequence[WindowStart], bank: FilterBank, log_likelihood: FloatArray,
-              log_w: FloatArray, paths: FloatArray, log_odds: float) -> Joint | None:
-        """`Joint` of the usable starts; None if there are none."""
+    def _joint_of(self, starts: Sequence[WindowStart], bank: FilterBank, log_likelihood: FloatArray,
+                  log_w: FloatArray, paths: FloatArray, log_odds: float) -> Joint | None:
+        """`Joint` of the usable starts; None if no start is usable."""
         rows = np.flatnonzero(np.isfinite(log_w))
         if not len(rows):
             return None

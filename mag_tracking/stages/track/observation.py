@@ -11,8 +11,8 @@ from mag_tracking.physics.mounting import rotated_fields
 from mag_tracking.physics.sources import SourceModel
 
 MAX_ROTATION = np.deg2rad(15.0)
-"""[rad] Maximum standard deviation of a mounting angle; a larger one is limited to this, because
-the angles are of first order. `TrackManager` counts the sensors concerned."""
+"""[rad] Maximum standard deviation of a mounting angle. Larger values are limited, because the
+rotations are of first order. `TrackManager` counts the affected sensors."""
 
 TIME_RESOLUTION_S = 1e-3
 """[s] Samples closer than this are treated as simultaneous: at 20 m/s a target moves two
@@ -35,7 +35,7 @@ def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
     """
     std = [np.full(3, mounting_std) if s is None else np.minimum(s, MAX_ROTATION)
            for s in network.orientation_std]
-    # The angles are about the axes of the sensor, `orientation_std` is about those of the world.
+    # The angles are about the axes of the sensor, but `orientation_std` is about the world axes.
     priors: FloatArray = np.einsum('jik,jk,jlk->jil', network.R_sw, np.square(std), network.R_sw)
     # Exact symmetry is preserved by all later operations.
     return 0.5 * (priors + np.swapaxes(priors, 1, 2))
@@ -46,11 +46,13 @@ class Observation:
 
     The state begins as described in `inference/hypothesis.hpp`: the states of `n_targets` targets
     of one model, one after the other; their fields are added. The states of each sensor follow:
-    three mounting angles [rad] if they are estimated, and three model errors in units of their size
-    if `error_time` is not 0. The model errors represent the field that the target model leaves out
-    near a vehicle. They are first-order Gauss-Markov processes with the correlation time
-    `error_time`, so that their weight does not depend on the frame period. Without `error_time`,
-    the error is independent noise in every frame.
+    three mounting angles [rad] if they are estimated, and three model errors in units of their
+    standard deviation if `error_time` is not 0.
+
+    The model errors represent the field that the target model neglects near a vehicle. They are
+    first-order Gauss-Markov processes with the correlation time `error_time`, so that their weight
+    does not depend on the frame period. Without `error_time`, the error is independent noise in
+    every frame.
 
     Parameters
     ----------
@@ -98,8 +100,7 @@ class Observation:
             self.own_covariance[:, :3, :3] = angle_priors(network, mounting_std)
         self.single_target: Observation = self if n_targets == 1 else Observation(
             network, model, mounting_std, error_time)
-        # Masks for the states after those of the targets: 1 for model errors or backgrounds, else
-        # 0.
+        # Masks for the states of the sensors: 1 for model errors or backgrounds, else 0.
         is_error = np.tile(np.arange(n_own) >= self.n_angles, len(network))
         self._is_error: FloatArray = np.append(is_error, np.zeros(3 * len(network)))
         self._is_background: FloatArray = np.append(0.0 * is_error, np.ones(3 * len(network)))
@@ -123,7 +124,7 @@ class Observation:
         return self.n_target + (self.n_own + 3) * n_sensors
 
     def own(self, x: FloatArray) -> FloatArray:
-        """States of the sensors.
+        """States of each sensor, without the backgrounds.
 
         Parameters
         ----------
@@ -193,8 +194,8 @@ class Observation:
         -------
         (n_hyp,) array, m
         """
-        away = np.linalg.norm(self.target_positions(x)[:, :, None] - self.positions, axis=3)
-        nearest: FloatArray = away.min(axis=(1, 2))
+        distances = np.linalg.norm(self.target_positions(x)[:, :, None] - self.positions, axis=3)
+        nearest: FloatArray = distances.min(axis=(1, 2))
         return nearest
 
     def target_positions(self, x: FloatArray) -> FloatArray:
@@ -208,9 +209,9 @@ class Observation:
         -------
         (n_hyp, n_targets, 3) array, m, world frame
         """
-        places: FloatArray = x[:, :self.n_target].reshape(
+        positions: FloatArray = x[:, :self.n_target].reshape(
             len(x), self.n_targets, self.n_one)[:, :, :3]
-        return places
+        return positions
 
     def drift(self, dt: FloatArray, background_density: float) -> tuple[FloatArray, FloatArray]:
         """Decay and process noise of the states of the sensors.
@@ -228,14 +229,14 @@ class Observation:
         variance : (..., (n_own + 3) n_sensors) array
             Added variance of each state.
         """
-        fading = np.exp(-np.abs(dt) / self._error_time) if self._error_time else np.ones(dt.shape)
-        variance: FloatArray = np.multiply.outer(1.0 - fading**2, self._is_error) \
+        decay = np.exp(-np.abs(dt) / self._error_time) if self._error_time else np.ones(dt.shape)
+        variance: FloatArray = np.multiply.outer(1.0 - decay**2, self._is_error) \
             + np.multiply.outer(background_density**2 * np.maximum(dt, 0.0), self._is_background)
-        return 1.0 - np.multiply.outer(1.0 - fading, self._is_error), variance
+        return 1.0 - np.multiply.outer(1.0 - decay, self._is_error), variance
 
     def target_fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fields of the targets without sensor states, each at the time of the sensor's samples.
+        """Target fields at the sampling time of each sensor, without mounting and model errors.
 
         Parameters
         ----------
@@ -248,10 +249,11 @@ class Observation:
         h : (n_hyp, n_sensors, 3) array, T, sensor frame
         H : (n_hyp, n_sensors, 3, n_target) array
         variance : (n_hyp, n_sensors) array, T^2
-            Variance of the errors of the models near the targets, which are independent.
+            Variance of the model error near the targets; the errors of different targets are
+            independent.
         """
         h, H, gradients = zip(*(
-            self._field_of_one(x[:, first:first + self.n_one], time_offset)
+            self._single_target_field(x[:, first:first + self.n_one], time_offset)
             for first in range(0, self.n_target, self.n_one)), strict=True)
         # NaN if a dipole is at a sensor, like the field there, even if the length is zero.
         with np.errstate(invalid='ignore'):
@@ -259,7 +261,7 @@ class Observation:
                 near_field_length.T, gradients, strict=True))
         return sum(h[1:], h[0]), np.concatenate(H, axis=3), np.asarray(variance)
 
-    def _field_of_one(self, x: FloatArray, time_offset: FloatArray
+    def _single_target_field(self, x: FloatArray, time_offset: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Field of one target with states (n_hyp, n_one); see `sensor_fields`."""
         n_hyp, n, n_t = len(x), len(self.positions), self.n_one
@@ -278,12 +280,13 @@ class Observation:
 
     def field_of(self, x: FloatArray, targets: Iterable[int], time_offset: FloatArray
                  ) -> FloatArray:
-        """Field of some of the targets.
+        """Field of selected targets.
 
         Parameters
         ----------
         x : (n_x,) array
         targets : iterable of int
+            Indices of the targets.
         time_offset : (n_sensors,) array, s
 
         Returns
@@ -293,7 +296,7 @@ class Observation:
         n = self.n_one
         h, H = np.zeros((1, *self.positions.shape)), np.zeros((1, *self.positions.shape, 0))
         for target in targets:
-            h = h + self._field_of_one(x[None, target * n:(target + 1) * n], time_offset)[0]
+            h = h + self._single_target_field(x[None, target * n:(target + 1) * n], time_offset)[0]
         if self.n_angles:
             h, _ = rotated_fields(h, H, np.ascontiguousarray(self.own(x[None])[..., :3]))
         field: FloatArray = h[0]
@@ -303,9 +306,9 @@ class Observation:
                field_error: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Fields at the sensors, without the backgrounds.
 
-        `H` neglects that the size of the model error depends on the state. This is a few per cent
-        of the derivative where the error is large. The size is that of ICASSP11 eq. (9), which
-        models it as noise.
+        `H` neglects that the standard deviation of the model error depends on the state. This
+        dependence is a few per cent of the derivative where the error is large. The standard
+        deviation follows ICASSP11 eq. (9), where the error is noise.
 
         Parameters
         ----------
@@ -327,15 +330,15 @@ class Observation:
         [ICASSP11]_ eq. (9).
         """
         h, H, variance = self.target_fields(x, time_offset, near_field_length)
-        variance = variance + _share_of_field(h, field_error)
+        variance = variance + _proportional_variance(h, field_error)
         own = self.own(x)
         if self.n_angles:
             h, H = rotated_fields(h, H, np.ascontiguousarray(own[..., :3]))
         if not self._error_time:
             return h, H, variance
-        size = np.sqrt(variance)[:, :, None]
-        h = h + size * own[..., -3:]
-        H = np.concatenate([H, size[..., None] * np.eye(3)], axis=3)
+        std = np.sqrt(variance)[:, :, None]
+        h = h + std * own[..., -3:]
+        H = np.concatenate([H, std[..., None] * np.eye(3)], axis=3)
         return h, H, np.zeros_like(variance)
 
     def model_error(self, x: FloatArray, near_field_length: FloatArray, field_error: float
@@ -356,10 +359,10 @@ class Observation:
         """
         h, _, variance = self.target_fields(x[None], np.zeros(len(self.positions)),
                                             near_field_length[None])
-        return np.asarray(variance[0] + _share_of_field(h, field_error)[0])
+        return np.asarray(variance[0] + _proportional_variance(h, field_error)[0])
 
 
-def _share_of_field(h: FloatArray, field_error: float) -> FloatArray:
-    """Variance (n_hyp, n_sensors) [T^2] of a model error in proportion to the field."""
+def _proportional_variance(h: FloatArray, field_error: float) -> FloatArray:
+    """Variance (n_hyp, n_sensors) [T^2] of a model error that is proportional to the field."""
     variance: FloatArray = field_error**2 * np.einsum('pji,pji->pj', h, h)
     return variance

@@ -20,11 +20,10 @@ MODEL_ERROR = 0.04
 """Error of the field of a row of dipoles, relative to the field; treated as noise."""
 
 NEAR_ERROR_LENGTH = 0.2
-"""[m] Near a sensor, the relative error is this length divided by the distance, if that is
-larger."""
+"""[m] Near a sensor, the relative error is at least this length divided by the distance."""
 
 MAX_SENSORS = 4
-"""Maximum number of sensors; those with the strongest fields are used."""
+"""Maximum number of sensors. The sensors with the strongest fields are used."""
 
 N_STEPS, TOLERANCE = 30, 1e-3
 """Maximum number of steps, and the relative improvement of the cost below which the search ends."""
@@ -35,7 +34,7 @@ class PassSamples:
     """The frames of a pass as whitened arrays, sorted by frame and sensor."""
 
     compared: IntArray
-    """(k,) Rows of the sensors in the network; the one with the strongest field comes first."""
+    """(k,) Indices of the sensors in the network, beginning with the strongest field."""
     t: FloatArray
     """(n,) [s] Time of each sample."""
     positions: FloatArray
@@ -53,11 +52,11 @@ class PassSamples:
 
     @property
     def n_clocks(self) -> int:
-        """Number of clocks apart from that of the sensor with the strongest field."""
+        """Number of clocks that are compared with the reference clock."""
         return len(self.compared) - 1
 
     def n_free(self, n_dipoles: int) -> int:
-        """Degrees of freedom that backgrounds and moments leave for the path.
+        """Degrees of freedom that remain for the path after backgrounds and moments.
 
         Parameters
         ----------
@@ -82,12 +81,12 @@ class PassSamples:
         PassSamples
         """
         c, s = np.cos(path[4]), np.sin(path[4])
-        way = self.t[:, None] * np.array([c * path[3], s * path[3], path[5]])
-        share = np.maximum(MODEL_ERROR, NEAR_ERROR_LENGTH / np.linalg.norm(
-            self.positions - path[:3] - way, axis=1))
+        displacement = self.t[:, None] * np.array([c * path[3], s * path[3], path[5]])
+        relative_error = np.maximum(MODEL_ERROR, NEAR_ERROR_LENGTH / np.linalg.norm(
+            self.positions - path[:3] - displacement, axis=1))
         # The noise that whitens the signal already includes the smaller model error.
         signal = np.square(np.linalg.norm(self.y.reshape(-1, 3), axis=1))
-        weight = 1.0 / np.sqrt(1.0 + (share**2 - MODEL_ERROR**2) * signal)
+        weight = 1.0 / np.sqrt(1.0 + (relative_error**2 - MODEL_ERROR**2) * signal)
         rows = np.repeat(weight, 3)
         return replace(self, M=self.M * weight[:, None, None], y=self.y * rows,
                        backgrounds=self.backgrounds * rows[:, None])
@@ -102,7 +101,7 @@ class PassSamples:
         network : SensorNetwork
         frames : sequence of FieldFrame
         stamp_ns : int, ns
-            Time zero.
+            Time zero of the samples.
         max_sensors : int, optional
 
         Returns
@@ -119,22 +118,22 @@ class PassSamples:
         C = np.array([known_covariance(f.covariance)[compared] for f in frames]).reshape(-1, 3, 3)
         t = np.array([(f.stamp_ns - stamp_ns) / NS + f.time_offset[compared] for f in frames])
         y = field[:, compared].reshape(-1, 3)
-        there = ~np.isnan(y)
+        is_present = ~np.isnan(y)
         of_sensor = np.tile(np.arange(n), len(frames))
         error = MODEL_ERROR**2 * energy[:, compared].ravel()
         W = np.linalg.inv(np.linalg.cholesky(C + error[:, None, None] * np.eye(3)))
-        W = W * there[:, :, None] * there[:, None, :]
-        level = np.zeros((len(y), 3, n, 3))
-        level[np.arange(len(y)), :, of_sensor] = W
-        columns = level.reshape(3 * len(y), 3 * n)
+        W = W * is_present[:, :, None] * is_present[:, None, :]
+        background_columns = np.zeros((len(y), 3, n, 3))
+        background_columns[np.arange(len(y)), :, of_sensor] = W
+        columns = background_columns.reshape(3 * len(y), 3 * n)
         return cls(compared, np.nan_to_num(t).ravel(), network.positions[compared][of_sensor],
                    W @ network.R_sw[compared][of_sensor], of_sensor - 1,
                    np.einsum('nij,nj->ni', W, np.nan_to_num(y)).ravel(),
-                   columns[:, columns.any(axis=0)], int(np.count_nonzero(there)))
+                   columns[:, columns.any(axis=0)], int(np.count_nonzero(is_present)))
 
     def fit(self, n_dipoles: int, free: IntArray, starts: FloatArray
             ) -> tuple[FloatArray, float, FloatArray]:
-        """Fit a row of dipoles on a steady path, and return the best minimum.
+        """Fit a row of dipoles on a steady path from each start, and return the best fit.
 
         Parameters
         ----------
@@ -185,6 +184,6 @@ class PassSamples:
 
     @cached_property
     def _projected(self) -> tuple[FloatArray, FloatArray]:
-        """Orthonormal columns of the backgrounds, and the whitened fields without them."""
+        """Orthonormal basis of the backgrounds, and the whitened fields without backgrounds."""
         Q = np.linalg.qr(self.backgrounds)[0]
         return plain(Q), self.y - Q @ (Q.T @ self.y)

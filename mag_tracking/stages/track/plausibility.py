@@ -13,12 +13,13 @@ P_MOUNTING = 0.05
 """Probability that correctly mounted sensors need mounting angles as large as the limit."""
 
 P_HEIGHT = 1e-3
-"""Probability that the iron of a vehicle is as far from the height of its kind as the limit."""
+"""Probability that the height of a vehicle differs from the height of its kind by more than the
+limit."""
 
 LANE_STDS, LANE_STDS_LATER = 1.645, 3.0
-"""Limits, in standard deviations, of the distance of a vehicle from the outermost lane of the
-settings: at its closest point to any sensor so far (exceeded by one in twenty vehicles of that
-lane), and at any later time, when it may have turned off."""
+"""Maximum distance of a vehicle from the outermost configured lane, in standard deviations: at its
+closest point to any sensor, and at later times, when it may have turned off. One in twenty vehicles
+on that lane exceeds the first limit."""
 
 MIN_SPEED = 1.0
 """[m/s] The heading of a slower vehicle is undefined."""
@@ -36,24 +37,24 @@ class Plausibility:
         # Per origin of a hypothesis: smallest distance to a sensor so far, and whether the path was
         # off the road there.
         self._nearest: FloatArray = np.zeros(0)
-        self._was_beside: BoolArray = np.zeros(0, dtype=bool)
+        self._was_off_road: BoolArray = np.zeros(0, dtype=bool)
 
     def evaluate(self, observation: Observation, bank: FilterBank, best: int,
                  settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
-        """Doubts about the state of a hypothesis; to be called once per frame, in order.
+        """Update the closest points with a frame, and return the doubts about a hypothesis.
 
         Parameters
         ----------
         observation : Observation
         bank : FilterBank
         best : int
-            Row of the published hypothesis.
+            Index of the published hypothesis.
         settings : VehicleSettings
         mounting_std : float, rad
-            Minimum standard deviation of the mounting angles of each sensor. It applies to
-            accurately mounted sensors as well, because a model error rotates the field, too.
+            Minimum standard deviation of the mounting angles of each sensor. It also applies to
+            accurately mounted sensors, because a model error rotates the field, too.
         dt : float, s
-            Length of the frame.
+            Duration of the frame.
 
         Returns
         -------
@@ -61,59 +62,61 @@ class Plausibility:
         """
         x, kind = bank.x[best], int(bank.kind[best])
         self._update_road_check(bank, settings, observation.positions)
-        found = set()
+        reasons = set()
         if _needs_rotated_sensors(observation, x, mounting_std):
-            found.add(doubts.SENSORS_ROTATED)
-        off = abs(float(x[2]) - settings.heights[kind])
-        if off > -ndtri(P_HEIGHT / 2.0) * settings.height_stds[kind]:
-            found.add(doubts.HEIGHT)
-        if self._was_beside[bank.origin[best]] or _passes_beside(
+            reasons.add(doubts.SENSORS_ROTATED)
+        height_error = abs(float(x[2]) - settings.heights[kind])
+        if height_error > -ndtri(P_HEIGHT / 2.0) * settings.height_stds[kind]:
+            reasons.add(doubts.HEIGHT)
+        if self._was_off_road[bank.origin[best]] or _is_off_road(
                 x[None], settings, observation.positions, LANE_STDS_LATER)[0]:
-            found.add(doubts.OFF_THE_ROAD)
+            reasons.add(doubts.OFF_THE_ROAD)
         if moves_too_far(x[:3], x[3:6], dt, observation.positions):
-            found.add(doubts.FRAMES_TOO_LONG)
-        return found
+            reasons.add(doubts.FRAMES_TOO_LONG)
+        return reasons
 
     def _update_road_check(self, bank: FilterBank, settings: VehicleSettings,
                            positions: FloatArray) -> None:
-        """Update the closest point of each hypothesis, and whether it was off the road there."""
-        more = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
-        self._nearest = np.append(self._nearest, np.full(more, np.inf))
-        self._was_beside = np.append(self._was_beside, np.zeros(more, dtype=bool))
+        """Update for each hypothesis its closest point, and whether it was off the road there."""
+        n_added = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
+        self._nearest = np.append(self._nearest, np.full(n_added, np.inf))
+        self._was_off_road = np.append(self._was_off_road, np.zeros(n_added, dtype=bool))
         distance = np.hypot(*(positions[:, :2, None] - bank.x[:, :2].T).transpose(1, 0, 2))
         nearest = distance.min(axis=0)
-        is_nearest = (nearest <= self._nearest[bank.origin]) & _moves(bank.x)
-        beside = _passes_beside(bank.x[is_nearest], settings, positions, LANE_STDS)
-        of_those = bank.origin[is_nearest]
-        self._nearest[of_those], self._was_beside[of_those] = nearest[is_nearest], beside
+        is_nearest = (nearest <= self._nearest[bank.origin]) & _is_moving(bank.x)
+        is_off_road = _is_off_road(bank.x[is_nearest], settings, positions, LANE_STDS)
+        origins = bank.origin[is_nearest]
+        self._nearest[origins], self._was_off_road[origins] = nearest[is_nearest], is_off_road
 
 
-def _passes_beside(x: FloatArray, settings: VehicleSettings, positions: FloatArray,
-                   deviations: float) -> BoolArray:
+def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray,
+                 n_stds: float) -> BoolArray:
     """Whether states (n, n_x) pass all sensors (n_sensors, 3) on one side, beyond the lanes.
 
-    There the distance is hardly observable: a train on another line looks like a truck nearby, and
-    a truck beyond a sensor looks like a car on the near side of a sensor with an inverted axis.
-    Lanes are on both sides of the centre of the network. The more a network extends beyond the
-    road, the more it covers an area, and a vehicle may be as close to its outermost sensors as a
-    lane is to the centre.
+    The distance of such a vehicle is hardly observable. A train on another line resembles a truck
+    nearby. A truck beyond a sensor resembles a car on the near side of a sensor with an inverted
+    axis.
+
+    Lanes are on both sides of the centre of the network. A network that extends beyond the road
+    covers an area. A vehicle may then be as far outside the outermost sensors as a lane is from the
+    centre.
     """
     speed = np.maximum(np.hypot(x[:, 3], x[:, 4]), MIN_SPEED)
-    away = positions[:, :2, None] - x[:, :2].T
-    aside = (x[:, 3] * away[:, 1] - x[:, 4] * away[:, 0]) / speed
+    offsets = positions[:, :2, None] - x[:, :2].T
+    lateral = (x[:, 3] * offsets[:, 1] - x[:, 4] * offsets[:, 0]) / speed
     outermost = max(map(abs, settings.lateral_offsets))
-    half_width = np.ptp(aside, axis=0) / 2.0
-    edge = np.maximum(outermost + deviations * settings.lateral_std,
+    half_width = np.ptp(lateral, axis=0) / 2.0
+    edge = np.maximum(outermost + n_stds * settings.lateral_std,
                       half_width + np.minimum(outermost, half_width - outermost))
-    on_one_side = (aside > 0.0).all(axis=0) | (aside < 0.0).all(axis=0)
-    beside: BoolArray = on_one_side & (np.abs(aside.mean(axis=0)) > edge) & _moves(x)
-    return beside
+    on_one_side = (lateral > 0.0).all(axis=0) | (lateral < 0.0).all(axis=0)
+    is_off_road: BoolArray = on_one_side & (np.abs(lateral.mean(axis=0)) > edge) & _is_moving(x)
+    return is_off_road
 
 
-def _moves(x: FloatArray) -> BoolArray:
+def _is_moving(x: FloatArray) -> BoolArray:
     """Whether states (n, n_x) are fast enough to have a heading."""
-    moves: BoolArray = np.hypot(x[:, 3], x[:, 4]) >= MIN_SPEED
-    return moves
+    is_moving: BoolArray = np.hypot(x[:, 3], x[:, 4]) >= MIN_SPEED
+    return is_moving
 
 
 def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray
@@ -125,7 +128,7 @@ def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positio
     position : (3,) array, m
     velocity : (3,) array, m/s
     dt : float, s
-        Length of the frame.
+        Duration of the frame.
     positions : (n, 3) array, m
         Positions of the sensors.
 
@@ -133,13 +136,13 @@ def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positio
     -------
     bool
     """
-    away = np.sort(np.linalg.norm(position - positions, axis=1))
-    way = float(np.hypot(velocity[0], velocity[1])) * dt
-    return len(away) > 1 and bool(way > MAX_RELATIVE_MOVE * away[1])
+    distances = np.sort(np.linalg.norm(position - positions, axis=1))
+    displacement = float(np.hypot(velocity[0], velocity[1])) * dt
+    return len(distances) > 1 and bool(displacement > MAX_RELATIVE_MOVE * distances[1])
 
 
 def _needs_rotated_sensors(observation: Observation, x: FloatArray, mounting_std: float) -> bool:
-    """Whether the mounting angles of a state are larger than stated."""
+    """Whether the mounting angles of a state are too large for their standard deviations."""
     angles = observation.angles(x)
     if not angles.size:
         return False

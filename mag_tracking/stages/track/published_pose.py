@@ -26,10 +26,11 @@ UNOBSERVED_VARIANCE = np.pi**2
 """[rad^2] Variance of an angle that is not observable from the field."""
 
 NEGLIGIBLE_WEIGHT = 1e-6
-"""Hypotheses lighter than the heaviest by this ratio do not contribute to a covariance."""
+"""Weight relative to the heaviest hypothesis below which a hypothesis is excluded from
+covariances."""
 
 AMBIGUOUS_WEIGHT = 0.05
-"""A track is ambiguous if other places, or other arrivals, have more weight than this."""
+"""A track is ambiguous if other positions, or other arrival directions, exceed this weight."""
 
 
 Flags: TypeAlias = tuple[bool, bool, bool]
@@ -44,7 +45,7 @@ class Orientation(Protocol):
     """Interface for the orientation of a target from its state; see `VehicleOrientation`."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Quaternion, derivative, variance of the unobservable part, and flags."""
+        """Return quaternion, derivative, variance of the unobservable part, and flags."""
 
     def quaternions(self, x: FloatArray) -> FloatArray:
         """Quaternions of several states.
@@ -168,23 +169,23 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     ----------
     bank : FilterBank
     best : int
-        Row of the hypothesis to be published.
+        Index of the hypothesis to be published.
     model : SourceModel
     orientation : Orientation
     names : sequence of str
-        Arrival of each label.
+        Name of the arrival direction for each label.
     kinds : sequence of str
         Name of each kind of target.
     found : set of str
-        Doubts about the pose; the ambiguity of the bank is added.
+        Doubts about the pose, without the ambiguities of the bank.
     unobserved_length : UnobservedLength or None
-        Effect of the length of a vehicle on its middle; None for a small target.
+        Uncertainty of the middle of a vehicle due to its length; None for a small target.
     excess : float, optional
         Ratio of the actual to the expected innovations; it scales the covariance.
     ambiguous_poses : str, optional
         Setting `track.ambiguous_poses`.
     difference : (6,) array, m and m/s
-        Offset of another possible position and velocity, which the covariance has to cover.
+        Difference to another possible position and velocity, which the covariance must cover.
     stamp_ns : int, ns
         This and the following parameters are fields of `Track`.
     id : int
@@ -232,16 +233,16 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
 
 def covariance_about(bank: FilterBank, best: int, model: SourceModel, apart: BoolArray
                      ) -> FloatArray:
-    """Covariance about the state of a hypothesis, of all hypotheses that are not apart from it.
+    """Covariance about the state of a hypothesis, from all hypotheses at the same position.
 
-    These hypotheses differ in their linearisation, kind of target and motion; the difference is
-    part of the error. Hypotheses that are apart make the track ambiguous instead.
+    These hypotheses differ in their linearisation, kind of target and motion. Their differences are
+    part of the error. Hypotheses at other positions make the track ambiguous instead.
 
     Parameters
     ----------
     bank : FilterBank
     best : int
-        Row of the hypothesis.
+        Index of the hypothesis.
     model : SourceModel
     apart : (n_hyp,) bool array
         `FilterBank.apart` of the hypothesis.
@@ -255,14 +256,14 @@ def covariance_about(bank: FilterBank, best: int, model: SourceModel, apart: Boo
 
 def _second_moment(bank: FilterBank, best: int, model: SourceModel,
                    log_w: FloatArray) -> FloatArray:
-    """Covariance about hypothesis `best`, of all hypotheses with log-weights (n_hyp,)."""
+    """Covariance about hypothesis `best`, from all hypotheses with the log-weights (n_hyp,)."""
     n_t = len(model.state_names)
     weight = np.exp(log_w - log_w.max())
     rows = np.flatnonzero(weight >= NEGLIGIBLE_WEIGHT)
     x = bank.x[rows, :n_t]
     difference = x - bank.x[best, :n_t]
     if 'L' in model.state_names:
-        # A negative length is the same row, seen from its other end.
+        # A negative length describes the same row from its other end.
         L = model.state_names.index('L')
         difference[:, L] = np.abs(x[:, L]) - abs(bank.x[best, L])
     return second_moment(weight[rows], difference, bank.P[rows, :n_t, :n_t])
@@ -271,21 +272,21 @@ def _second_moment(bank: FilterBank, best: int, model: SourceModel,
 def mixture_uncertainty(bank: FilterBank, best: int, apart: BoolArray, model: SourceModel,
                         orientation: Orientation, published: PoseFields, P_unwidened: FloatArray,
                         excess: float = 1.0) -> PoseUncertainty:
-    """Uncertainty about the pose of a hypothesis if any of the hypotheses may be right.
+    """Uncertainty of a pose if any of the hypotheses may be correct.
 
     Parameters
     ----------
     bank : FilterBank
     best : int
-        Row of the hypothesis.
+        Index of the hypothesis.
     apart : (n_hyp,) bool array
         `FilterBank.apart` of the hypothesis.
     model : SourceModel
     orientation : Orientation
     published : PoseFields
-        Published pose, from the hypotheses that are not apart.
+        Published pose, from the hypotheses at the same position.
     P_unwidened : (n_t, n_t) array
-        `covariance_about`, before it was widened to that of `published`.
+        Result of `covariance_about`; `published` has a wider covariance.
     excess : float, optional
         As for `published_track`.
 
@@ -296,7 +297,7 @@ def mixture_uncertainty(bank: FilterBank, best: int, apart: BoolArray, model: So
     n_t = len(model.state_names)
     widening = published['covariance'] - excess * P_unwidened[:6, :6]
     covariance = widening + excess * _second_moment(bank, best, model, bank.log_w)[:6, :6]
-    # Headings may be opposite, which is too far apart for a derivative.
+    # Headings may be opposite, for which a linearisation is invalid.
     log_w = np.where(apart, bank.log_w, -np.inf)
     rows = np.flatnonzero(log_w >= bank.log_w.max() + np.log(NEGLIGIBLE_WEIGHT))
     if not len(rows):
@@ -305,12 +306,12 @@ def mixture_uncertainty(bank: FilterBank, best: int, apart: BoolArray, model: So
     weight = np.exp(log_w[rows])
     rotations = rotation_vectors_between(published['orientation'],
                                          orientation.quaternions(bank.x[rows, :n_t]))
-    moved = bank.x[rows, :3] - bank.x[best, :3]
+    displacement = bank.x[rows, :3] - bank.x[best, :3]
     return PoseUncertainty(
         covariance, published['orientation_covariance']
         + np.einsum('n,ni,nj->ij', weight, rotations, rotations),
         (1.0 - weight.sum()) * published['position_orientation_covariance']
-        + np.einsum('n,ni,nj->ij', weight, moved, rotations))
+        + np.einsum('n,ni,nj->ij', weight, displacement, rotations))
 
 
 def pose_uncertainty(fields: PoseFields) -> PoseUncertainty:
@@ -329,13 +330,13 @@ def pose_uncertainty(fields: PoseFields) -> PoseUncertainty:
 
 
 def ambiguities(bank: FilterBank, best: int, apart: BoolArray) -> set[str]:
-    """Doubts because another place or another arrival is possible.
+    """Doubts about the position and the arrival direction of the best hypothesis.
 
     Parameters
     ----------
     bank : FilterBank
     best : int
-        Row of the hypothesis.
+        Index of the hypothesis.
     apart : (n_hyp,) bool array
         `FilterBank.apart` of the hypothesis.
 
@@ -343,12 +344,12 @@ def ambiguities(bank: FilterBank, best: int, apart: BoolArray) -> set[str]:
     -------
     set of str
     """
-    found = set()
+    reasons = set()
     if bank.weight(apart) > AMBIGUOUS_WEIGHT:
-        found.add(doubts.ANOTHER_PLACE)
+        reasons.add(doubts.ANOTHER_PLACE)
     if 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > AMBIGUOUS_WEIGHT:
-        found.add(doubts.ANOTHER_ARRIVAL)
-    return found
+        reasons.add(doubts.ANOTHER_ARRIVAL)
+    return reasons
 
 
 def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray, *,
@@ -369,7 +370,7 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
     stamp_ns : int, ns
     id : int
     kind : int
-        Kind of target.
+        Index of the kind of target.
     kinds : sequence of str
         Name of each kind.
     ambiguous : bool
@@ -390,18 +391,18 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
 def _pose_fields(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray,
                  kind: int, unobserved_length: UnobservedLength | None, difference: FloatArray
                  ) -> tuple[PoseFields, Flags]:
-    """Fields of a record from a target state, and which rotations are unobservable."""
+    """Fields of a record from a target state, and flags of the unobservable rotations."""
     dipoles = model.dipoles(x[None])
     dm_dx = dipoles.dm_dx[0].sum(axis=0)
     length, length_std = 0.0, 0.0
     if 'L' in model.state_names:
         L = model.state_names.index('L')
-        # A negative length is the same row, seen from its other end.
+        # A negative length describes the same row from its other end.
         length, length_std = abs(float(x[L])), float(np.sqrt(max(P[L, L], 0.0)))
     if unobserved_length is not None:
-        of_middle = unobserved_length.covariance(x, P, length, kind)
+        middle_covariance = unobserved_length.covariance(x, P, length, kind)
         P = P.copy()
-        P[:2, :2] += of_middle
+        P[:2, :2] += middle_covariance
     P = inflated_to_cover(P, difference)
     q, T, unobserved, flags = orientation(x, P)
     return {'position': x[:3].copy(), 'velocity': x[3:6].copy(), 'covariance': P[:6, :6].copy(),

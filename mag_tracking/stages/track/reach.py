@@ -13,9 +13,10 @@ NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
 which it does not disturb other targets."""
 
 DETECTABLE_ENERGY = 4.0
-"""Minimum field energy, in units of the noise, of a detectable target. It applies to the last frame
-for a vehicle whose track is searched again, to all frames of a window at one sensor, and to all
-frames at all sensors, as expected from the prior of the moments, for a vehicle in a search."""
+"""Minimum field energy of a detectable target, in units of the noise. For a tracked vehicle, it
+applies to the last frame. For a new vehicle, it applies to the sum over a window at each sensor.
+For a path in a search, it applies to the energy in the window that the prior of the moments
+predicts."""
 
 
 def field_energies(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame
@@ -26,6 +27,7 @@ def field_energies(bank_filter: BankFilter, target: int, state: FloatArray, fram
     ----------
     bank_filter : BankFilter
     target : int
+        Index of the target.
     state : (n_x,) array
     frame : FieldFrame
 
@@ -45,6 +47,7 @@ def field_energy(bank_filter: BankFilter, target: int, state: FloatArray, frame:
     ----------
     bank_filter : BankFilter
     target : int
+        Index of the target.
     state : (n_x,) array
     frame : FieldFrame
 
@@ -57,15 +60,16 @@ def field_energy(bank_filter: BankFilter, target: int, state: FloatArray, frame:
 
 def first_weak_frame(bank_filter: BankFilter, target: int, window: Window | None, origin: int
                      ) -> int:
-    """Index of the frame of a window from which on a target is barely detectable.
+    """Index of the first frame of a window from which a target is no longer detectable.
 
     Parameters
     ----------
     bank_filter : BankFilter
     target : int
+        Index of the target.
     window : Window or None
     origin : int
-        Hypothesis whose path is used.
+        Origin of the hypothesis whose path is used.
 
     Returns
     -------

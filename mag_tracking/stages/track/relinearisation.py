@@ -1,20 +1,21 @@
 """Relinearisation of the leading hypotheses of a running track along their smoothed paths.
 
-An extended Kalman filter linearises each frame at the state predicted at that time. Far ahead of
-the sensors the prediction is metres off, and the filter never loses the certainty that it wrongly
-gained there. Therefore the latest frames are filtered and smoothed again, with motion and field
-linearised along the smoothed path of each leading hypothesis. These are damped Gauss-Newton steps
-on the path. If they converge, the state at the end of the path replaces that of the filter, with
-the larger of both covariances. If they do not converge, the state is kept, but the filter may be
-overconfident: a filter that is linearised at different states gains information about directions
-that no single path can observe (Julier and Uhlmann 2001 found this for maps). Therefore a larger
-covariance of the path is adopted in this case, too.
+An extended Kalman filter linearises each frame at the state predicted at that time. Far from the
+sensors the prediction is metres off. The filter becomes overconfident there and remains so.
+Therefore the latest frames are filtered and smoothed again, with motion and field linearised along
+the smoothed path of each leading hypothesis. These are damped Gauss-Newton steps on the path. If
+they converge, the state at the end of the path replaces the state of the filter, with the larger of
+both covariances. If they do not converge, the state is retained, but a larger covariance of the
+path is adopted. The filter may be overconfident in this case: a filter that is linearised at
+different states gains information about directions that no single path can observe (Julier and
+Uhlmann 2001 found this for maps).
 
 The likelihood of the frames along the path does not measure convergence. The model error and the
 drift of a moment are proportional to the moment, so the steps minimise a different cost. For the
-same reason a path may diverge to moments that explain everything. The path of a long vehicle, whose
+same reason a path may diverge to moments that explain any field. The path of a long vehicle, whose
 model error is largest, is adopted only if it explains the frames no worse than the filter did.
-Weights are not changed, because relinearised hypotheses and others could not be compared.
+Weights are not changed, because the likelihoods of relinearised and other hypotheses are not
+comparable.
 
 The method is the iterated Kalman smoother of Bell 1994.
 """
@@ -33,25 +34,26 @@ from mag_tracking.stages.track.bank_filter import BankFilter, PathResult
 from mag_tracking.units import NS
 
 MAX_LOG_RATIO = np.log(1e3)
-"""A hypothesis is leading if its log-weight is below the largest by no more than this."""
+"""Maximum difference between the largest log-weight and the log-weight of a leading hypothesis."""
 
 PASSES = 3
-"""Number of Gauss-Newton steps each time; the next time continues from the result."""
+"""Number of Gauss-Newton steps per relinearisation. The next relinearisation continues from the
+result."""
 
 STEP_SIZE = 0.5
 """Damping of each step. Undamped steps overshoot where the field is strongly nonlinear, and
 diverge."""
 
 CONVERGED = 0.3
-"""A path has converged if the last step moved it nowhere by more than this, in standard deviations
-of the position."""
+"""Maximum movement of a converged path in the last step, in standard deviations of the position."""
 
 ATTEMPTED, FAILED = 'paths relinearised', 'paths relinearised without success'
-"""Keys in the counts."""
+"""Keys of the event counts."""
 
 MAX_FRAMES = 64
-"""Maximum number of frames; a window begins with at most half of them. At 100 frames per second, a
-window of several seconds would take more than a core."""
+"""Maximum number of frames in a window. When it moves, at most half of them remain. Without this
+limit, a window of several seconds at 100 frames per second would exceed the capacity of one
+core."""
 
 MAX_ELEMENTS = 5_000_000
 """Maximum product of frames, hypotheses and squared number of states. With many sensors, fewer
@@ -70,9 +72,9 @@ class Window:
     intervals: list[float]
     """[s] Time from the previous frame to each frame."""
     paths: list[FloatArray]
-    """(n_hyp, n_x) At each frame: states at which the hypotheses of the anchor are linearised."""
+    """(n_hyp, n_x) States at each frame at which the hypotheses of the anchor are linearised."""
     log_likelihoods: list[FloatArray]
-    """(n_hyp,) Of each frame, in the filter; -inf for dropped hypotheses."""
+    """(n_hyp,) Log-likelihoods of each frame in the filter; -inf for dropped hypotheses."""
     evidence: float
     """Log-evidence, in the filter, of the frames with which the anchor has not been updated."""
     max_hypotheses: int
@@ -102,9 +104,9 @@ class Relinearisation:
         self.clear()
 
     def clear(self) -> None:
-        """Drop everything; no track is running."""
+        """Discard the window."""
         self._anchor: FilterBank | InitialBank | None = None
-        # {origin: log-likelihood along the path minus that in the filter}, at the last update.
+        # {origin: log-likelihood gain of the path over the filter}, at the last relinearisation.
         self._gain: dict[int, float] = {}
 
     def begin(self, anchor: FilterBank | InitialBank) -> None:
@@ -113,12 +115,12 @@ class Relinearisation:
         Parameters
         ----------
         anchor : FilterBank or InitialBank
-            Bank of the track before the update with its first frame. It must not be modified by the
-            caller afterwards.
+            Bank of the track before the update with its first frame. The caller must not modify it
+            afterwards.
         """
         if not self._window_ns:
             return
-        self._anchor, self._updated = anchor, False
+        self._anchor, self._is_updated = anchor, False
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
         # For each frame and each hypothesis of the anchor: state of the linearisation, and
@@ -127,12 +129,12 @@ class Relinearisation:
         self._log_likelihoods: list[FloatArray] = []
         self._evidence: list[float] = []
         self._last_ns: int | None = None
-        self._stale = False
+        self._is_stale = False
         self._gain = {}
 
     def restart(self) -> None:
         """Start a new window at the next frame, because the filter has changed."""
-        self._stale = self._anchor is not None
+        self._is_stale = self._anchor is not None
 
     def add(self, bank: FilterBank, predicted: FloatArray, log_likelihood: FloatArray,
             evidence: float, frame: FieldFrame, dt: float) -> None:
@@ -143,8 +145,7 @@ class Relinearisation:
         bank : FilterBank
             Bank after the update.
         predicted : (n_hyp, n_x) array
-            States at which the frame was linearised. If the filter iterates its updates, the last
-            linearisation is elsewhere.
+            States at which the frame was first linearised.
         log_likelihood : (n_hyp,) array
         evidence : float
             Log-density of the frame over all hypotheses.
@@ -154,11 +155,11 @@ class Relinearisation:
         """
         if self._anchor is None:
             return
-        if self._stale:
+        if self._is_stale:
             self.begin(bank.copy())
-            self._updated = True
+            self._is_updated = True
         if len(bank) < len(self._anchor) // 2:
-            self._keep(self._anchor, np.isin(self._anchor.origin, bank.origin))
+            self._keep_hypotheses(self._anchor, np.isin(self._anchor.origin, bank.origin))
         rows = _rows(self._anchor, bank)
         path, of_frame = self._anchor.x.copy(), np.full(len(self._anchor), -np.inf)
         path[rows], of_frame[rows] = predicted, log_likelihood
@@ -170,7 +171,7 @@ class Relinearisation:
         if self._last_ns is None:
             self._last_ns = frame.stamp_ns
 
-    def _keep(self, anchor: FilterBank | InitialBank, mask: BoolArray) -> None:
+    def _keep_hypotheses(self, anchor: FilterBank | InitialBank, mask: BoolArray) -> None:
         """Keep only the hypotheses of the anchor in `mask`."""
         anchor.keep(mask)
         self._paths = [path[mask] for path in self._paths]
@@ -188,49 +189,50 @@ class Relinearisation:
         Returns
         -------
         Counter of str
-            Number of relinearised paths, and of those that were rejected.
+            Number of relinearised paths, and number of rejected paths.
         """
         anchor = self._anchor
         if anchor is None or self._last_ns is None \
                 or self._frames[-1].stamp_ns - self._last_ns < self._interval_ns:
             return Counter()
         self._last_ns = self._frames[-1].stamp_ns
-        anchor = self._slide(bank_filter, anchor, bank)
-        if self._updated and len(self._frames) == 1:
+        anchor = self._move_window(bank_filter, anchor, bank)
+        if self._is_updated and len(self._frames) == 1:
             return Counter()
-        leading = self._leading(bank)
+        leading = self._leading_rows(bank)
         rows = _rows(anchor, bank)[leading]
-        last = anchor.rows(rows)
+        ends = anchor.rows(rows)
         paths = np.stack([path[rows] for path in self._paths], axis=1)
-        along = self._run_along(bank_filter, last, paths, PASSES)
-        finite = np.isfinite(along.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
+        along = self._run_along(bank_filter, ends, paths, PASSES)
+        is_finite = np.isfinite(along.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
         for path, improved in zip(self._paths, np.swapaxes(paths, 0, 1), strict=True):
-            path[rows[finite]] = improved[finite]
-        filtered = np.sum(self._log_likelihoods[int(self._updated):], axis=0)[rows]
-        gain = np.subtract(along.log_likelihood, filtered, where=finite,
+            path[rows[is_finite]] = improved[is_finite]
+        filtered = np.sum(self._log_likelihoods[int(self._is_updated):], axis=0)[rows]
+        gain = np.subtract(along.log_likelihood, filtered, where=is_finite,
                            out=np.full(len(rows), -np.inf))
-        self._gain = dict(zip(anchor.origin[rows[finite]].tolist(), gain[finite].tolist(),
+        self._gain = dict(zip(anchor.origin[rows[is_finite]].tolist(), gain[is_finite].tolist(),
                               strict=True))
         converged = along.unsettled <= CONVERGED
-        accepted = finite & converged & ((gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
-        _replace_states(bank, leading[accepted], last.x[accepted], last.P[accepted])
-        rest = finite & ~accepted
-        _widen_covariances(bank, leading[rest], last.x[rest], last.P[rest],
+        is_accepted = is_finite & converged & (
+            (gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
+        _replace_states(bank, leading[is_accepted], ends.x[is_accepted], ends.P[is_accepted])
+        is_rejected = is_finite & ~is_accepted
+        _widen_covariances(bank, leading[is_rejected], ends.x[is_rejected], ends.P[is_rejected],
                            bank_filter.nearly_linear)
-        return Counter({ATTEMPTED: len(accepted), FAILED: int(np.count_nonzero(~accepted))})
+        return Counter({ATTEMPTED: len(is_accepted), FAILED: int(np.count_nonzero(~is_accepted))})
 
     @property
     def window(self) -> Window | None:
-        """Frames and paths of the window; None if there are none."""
-        if self._anchor is None or self._stale or not self._frames:
+        """Frames and paths of the window; None if it is empty."""
+        if self._anchor is None or self._is_stale or not self._frames:
             return None
-        begin = int(self._updated)
-        return Window(self._anchor, self._updated, self._frames, self._intervals, self._paths,
+        begin = int(self._is_updated)
+        return Window(self._anchor, self._is_updated, self._frames, self._intervals, self._paths,
                       self._log_likelihoods, float(sum(self._evidence[begin:])),
                       self._max_hypotheses)
 
     def without_target(self, bank_filter: BankFilter, bank: FilterBank, i: int, n: int) -> None:
-        """Remove one of several targets from the window.
+        """Remove a target from the window.
 
         Parameters
         ----------
@@ -239,11 +241,11 @@ class Relinearisation:
         bank : FilterBank
             Bank that includes the target.
         i : int
-            Target.
+            Index of the target.
         n : int
-            Frame from which on the target is not detectable; the window begins there.
+            Index of the first frame in which the target is not detectable. The window begins there.
         """
-        if self._anchor is None or self._stale or n >= len(self._frames):
+        if self._anchor is None or self._is_stale or n >= len(self._frames):
             self.restart()
             return
         anchor = self._move_to(bank_filter, self._anchor, bank, n)
@@ -254,14 +256,14 @@ class Relinearisation:
         self._gain = {}
 
     def resume(self, window: Window) -> None:
-        """Continue from another window, whose hypotheses replace those of the track.
+        """Continue with another window, whose hypotheses replace the hypotheses of the track.
 
         Parameters
         ----------
         window : Window
         """
         self.begin(window.anchor)
-        self._updated = window.is_updated
+        self._is_updated = window.is_updated
         self._frames, self._intervals = list(window.frames), list(window.intervals)
         self._paths, self._log_likelihoods = list(window.paths), list(window.log_likelihoods)
         n = len(window.frames)
@@ -269,7 +271,7 @@ class Relinearisation:
         self._last_ns = window.frames[-1].stamp_ns
 
     def gain(self, origin: int) -> float:
-        """Log-likelihood of the latest frames along a path, minus that in the filter.
+        """Log-likelihood gain of a path over the filter, for the latest frames.
 
         Parameters
         ----------
@@ -279,20 +281,20 @@ class Relinearisation:
         Returns
         -------
         float, nats
-            0 if there is no path, or if it was not part of the last update.
+            0 if the hypothesis was not part of the last relinearisation.
         """
         return self._gain.get(origin, 0.0)
 
-    def _leading(self, bank: FilterBank) -> IntArray:
-        """Rows of the heaviest hypotheses, up to the maximum number."""
-        affordable = MAX_ELEMENTS // (len(self._frames) * bank.x.shape[1]**2)
+    def _leading_rows(self, bank: FilterBank) -> IntArray:
+        """Indices of the heaviest hypotheses, up to the maximum number."""
+        n_affordable = MAX_ELEMENTS // (len(self._frames) * bank.x.shape[1]**2)
         order = np.argsort(-bank.log_w, kind='stable')
         leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - MAX_LOG_RATIO]
-        return leading[:max(1, min(self._max_hypotheses, affordable))]
+        return leading[:max(1, min(self._max_hypotheses, n_affordable))]
 
-    def _slide(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
-               bank: FilterBank) -> FilterBank | InitialBank:
-        """Move the anchor to the start of the window once the frames cover twice the window."""
+    def _move_window(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
+                     bank: FilterBank) -> FilterBank | InitialBank:
+        """Shorten the window to its nominal duration once the frames cover twice this duration."""
         now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
         if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MAX_FRAMES:
             return anchor
@@ -302,14 +304,14 @@ class Relinearisation:
 
     def _move_to(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
                  bank: FilterBank, n: int) -> FilterBank:
-        """Move the anchor to frame `n`, where the window begins from now on."""
-        self._keep(anchor, np.isin(anchor.origin, bank.origin))
+        """Move the anchor to frame `n`, the new start of the window."""
+        self._keep_hypotheses(anchor, np.isin(anchor.origin, bank.origin))
         moved = self._anchor = anchor.rows(np.arange(len(anchor)))
         self._run_along(bank_filter, moved, np.stack(self._paths[:n + 1], axis=1), 1)
         self._frames, self._intervals = self._frames[n:], self._intervals[n:]
         self._paths, self._log_likelihoods = self._paths[n:], self._log_likelihoods[n:]
         self._evidence = self._evidence[n:]
-        self._updated = True
+        self._is_updated = True
         return moved
 
     def _run_along(self, bank_filter: BankFilter, bank: FilterBank, paths: FloatArray,
@@ -318,29 +320,30 @@ class Relinearisation:
         n = paths.shape[1]
         return bank_filter.run_along(
             bank, self._frames[:n], self._intervals[:n], paths, passes=passes, step=STEP_SIZE,
-            first_is_updated=self._updated)
+            first_is_updated=self._is_updated)
 
 
 def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
     """Replace states of the bank, in place; each keeps the larger of its covariance and `P`."""
-    own, path = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
+    bank_variance, path_variance = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
     bank.x[rows] = x
-    bank.P[rows[path > own]] = P[path > own]
+    bank.P[rows[path_variance > bank_variance]] = P[path_variance > bank_variance]
 
 
 def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
                        nearly_linear: Callable[[FloatArray], FloatArray]) -> None:
-    """Adopt larger covariances of paths, in place, extended by the distance of the states.
+    """Adopt larger covariances of paths, in place, widened by the difference of the states.
 
     Covariances that are too large for the next linear update are not adopted.
     """
     difference = x - bank.x[rows]
-    apart = P + difference[:, :, None] * difference[:, None]
-    own, path, both = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P, apart))
-    wider = (path > own) & (both < np.square(nearly_linear(bank.x[rows])))
-    bank.P[rows[wider]] = apart[wider]
+    wide_P = P + difference[:, :, None] * difference[:, None]
+    own_variance, path_variance, total = (
+        np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P, wide_P))
+    is_wider = (path_variance > own_variance) & (total < np.square(nearly_linear(bank.x[rows])))
+    bank.P[rows[is_wider]] = wide_P[is_wider]
 
 
 def _rows(anchor: FilterBank | InitialBank, bank: FilterBank) -> IntArray:
-    """Rows of the anchor from which the hypotheses of the bank originate."""
+    """Indices in the anchor of the hypotheses of the bank."""
     return np.searchsorted(anchor.origin, bank.origin)

@@ -1,11 +1,11 @@
 """Fit of a steady path to the whole pass of a vehicle.
 
-A filter bends the path of its target until it fits any measurement: clock offsets, a clipped field,
-a second vehicle. A path of steady acceleration and turn rate cannot do so. If it does not explain
-the frames of a pass, they are not those of a single vehicle and fault-free sensors. If a straight
-path explains them only with free clocks, the clocks have offsets.
+A filter bends the path of its target to fit faulty measurements: clock offsets, a clipped field, or
+a second vehicle. A path with steady acceleration and turn rate cannot bend in this way. If no such
+path explains a pass, a sensor is faulty or there are several vehicles. If a straight path explains
+the pass only with free clock offsets, the clocks differ.
 
-The fit of a row of dipoles at constant velocity is that of TSP14 sections III.A and V.
+The fit of a row of dipoles at constant velocity follows TSP14 sections III.A and V.
 """
 
 from collections.abc import Sequence
@@ -42,7 +42,8 @@ TURN = 0.4
 """[rad/s] Start value of the turn rate of a bent path, used with both signs."""
 
 GOOD_MISFIT, MAX_MISFIT = 1.3, 1.5
-"""Reduced chi-square up to which a path explains a pass well, and up to which it may explain it."""
+"""Maximum reduced chi-square of a path that explains a pass well, and of a path that may explain
+it."""
 
 P_CLOCKS, P_BEND = 1e-5, 1e-3
 """Significance levels for clock offsets, and for a bent path: probability that correct clocks, or a
@@ -74,7 +75,7 @@ class RigidPass:
     straight: float
     """Cost of a straight path."""
     bent: float
-    """Cost of a path with acceleration and turn."""
+    """Cost of a path with acceleration and turn rate."""
     apart: float
     """Cost of a straight path at constant speed with free clock offsets."""
     freedom: int
@@ -83,7 +84,7 @@ class RigidPass:
     """Reduced chi-square of a bent path with a short or, if needed, a long row; about 1 if it
     explains the pass."""
     reference: int
-    """Row of the sensor with the strongest field; its clock is the reference."""
+    """Index of the sensor with the strongest field; its clock is the reference."""
     offset: FloatArray
     """(n_sensors,) [s] Time by which each clock is ahead of the reference; NaN = not compared or
     not observable."""
@@ -91,9 +92,10 @@ class RigidPass:
     """(n_sensors,) [s] Standard deviation due to noise and model error alone; 0 for the
     reference."""
     position: FloatArray
-    """(3,) [m] At the time of the strongest field; of the straight path with free clock offsets."""
+    """(3,) [m] Position at the time of the strongest field, on the straight path with free clock
+    offsets."""
     velocity: FloatArray
-    """(3,) [m/s]"""
+    """(3,) [m/s] Velocity on this path."""
     straight_paths: FloatArray
     """(k, 6) [m], [m/s] Positions and velocities at the time of the strongest field, for straight
     paths of a short and of a long row that explain the pass about as well as bent paths."""
@@ -120,9 +122,9 @@ class RigidPass:
         -------
         (3,) array, m
         """
-        away = positions - self.position
+        offsets = positions - self.position
         square = max(float(self.velocity @ self.velocity), 1e-12)
-        places = self.position + (away @ self.velocity / square)[:, None] * self.velocity
+        places = self.position + (offsets @ self.velocity / square)[:, None] * self.velocity
         nearest: FloatArray = places[np.argmin(np.linalg.norm(places - positions, axis=1))]
         return nearest
 
@@ -139,7 +141,7 @@ class RigidPass:
         Returns
         -------
         (6,) array, m and m/s
-            Zero if there are no such paths.
+            Zero if `straight_paths` is empty.
         """
         if not len(self.straight_paths):
             return np.zeros(6)
@@ -165,7 +167,7 @@ class RigidPass:
         Parameters
         ----------
         sensor : int
-            Row of the sensor.
+            Index of the sensor.
 
         Returns
         -------
@@ -180,8 +182,8 @@ class RigidPass:
         if not self.is_explained or offset > MAX_OFFSET or offset * self.speed < MIN_DISTANCE:
             return False
         gains = np.array([self.straight - self.apart, self.bent - self.apart]) / self.widening
-        improbable = float(np.nansum(np.square(self.offset / OFFSET_STD)))
-        return bool((gains - improbable > chdtri(self.n_clocks, [P_CLOCKS, P_BEND])).all())
+        prior_cost = float(np.nansum(np.square(self.offset / OFFSET_STD)))
+        return bool((gains - prior_cost > chdtri(self.n_clocks, [P_CLOCKS, P_BEND])).all())
 
     @property
     def is_straight(self) -> bool:
@@ -192,7 +194,7 @@ class RigidPass:
 
 def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
                    starts: FloatArray) -> RigidPass | None:
-    """Fit straight paths and bent ones to the frames of a pass.
+    """Fit straight and bent paths to the frames of a pass.
 
     Parameters
     ----------
@@ -217,17 +219,17 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
                       np.arctan2(starts[:, 4], starts[:, 3]), starts[:, 5],
                       np.full(len(starts), LENGTH)], axis=1)
     straight, cost, _ = data.fit(N_SHORT, _STRAIGHT, first)
-    bends, apart_from = straight[None, _BENT], [(straight[_STRAIGHT], SMALL_OFFSET)]
+    bends, offset_starts = straight[None, _BENT], [(straight[_STRAIGHT], SMALL_OFFSET)]
     if cost > GOOD_MISFIT * (data.n_free(N_SHORT) - N_STRAIGHT):
         # If the vehicle turned, or if the clock offsets are large, the straight path is misleading.
         bends = np.vstack([bends, [np.append(first[0], [0.0, turn, 0.0])
                                    for turn in (-TURN, TURN)]])
-        apart_from.append((first[0], LARGE_OFFSET))
+        offset_starts.append((first[0], LARGE_OFFSET))
     clocks = np.array([np.append(p, np.full(n_clocks, sign * offset))
-                       for p, offset in apart_from for sign in (-1.0, 1.0)])
+                       for p, offset in offset_starts for sign in (-1.0, 1.0)])
     path, bent, _ = data.fit(N_SHORT, _BENT, bends)
     short = _RowFits(_state_at_zero(straight), cost, bent, data.n_free(N_SHORT) - N_PATH)
-    long = _long_row(data, straight, path, short.misfit > GOOD_MISFIT)
+    long = _fit_long_row(data, straight, path, short.misfit > GOOD_MISFIT)
     misfit = short.misfit if short.misfit <= GOOD_MISFIT else min(short.misfit, long.misfit)
     straight_paths = [f.straight for f in (short, long) if f.needs_no_bend
                       and _is_of_vehicle(f.straight, data.positions)]
@@ -238,9 +240,9 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     offset, std = np.full(len(network), np.nan), np.full(len(network), np.nan)
     # An unobservable offset has zero variance in a pseudo-inverse.
     variance = np.diagonal(P)[N_STRAIGHT:]
-    known = np.append(True, variance > 0.0)
-    offset[data.compared[known]] = np.append(0.0, path[N_PATH:])[known]
-    std[data.compared[known]] = np.sqrt(np.append(0.0, variance))[known]
+    is_known = np.append(True, variance > 0.0)
+    offset[data.compared[is_known]] = np.append(0.0, path[N_PATH:])[is_known]
+    std[data.compared[is_known]] = np.sqrt(np.append(0.0, variance))[is_known]
     x = _state_at_zero(path)
     return RigidPass(stamp_ns, cost, bent, apart, data.n_free(N_SHORT) - len(free), misfit,
                      int(data.compared[0]), offset, std, x[:3], x[3:],
@@ -264,22 +266,22 @@ class _RowFits(NamedTuple):
 
     @property
     def needs_no_bend(self) -> bool:
-        """Whether the straight path may explain the pass, and the bent one is hardly better."""
+        """Whether the straight path may explain the pass and the bent path is hardly better."""
         n_more = N_PATH - N_STRAIGHT
         gain = (self.cost - self.cost_bent) / max(self.misfit, 1.0)
         return bool(self.cost <= MAX_MISFIT * (self.freedom + n_more)
                     and gain <= chdtri(n_more, P_BEND))
 
 
-def _long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, thorough: bool
+def _fit_long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, adds_starts: bool
               ) -> _RowFits:
-    """Fits of a long row, starting from the paths of a short one; `thorough` adds starts."""
+    """Fit a long row, starting from the paths of a short row; `adds_starts` adds starts."""
     near = data.with_near_field_error(bent)
     starts = np.array([straight, bent, straight, bent])
     starts[2:, PATH.index('length')] = LONG_LENGTH
     path, cost, _ = near.fit(N_LONG, _STRAIGHT, starts[::2, _STRAIGHT])
-    also = starts[[0, 1, 3]] if thorough else starts[:0]
-    _, cost_bent, _ = near.fit(N_LONG, _BENT, np.vstack([path[None, _BENT], also[:, _BENT]]))
+    extra = starts[[0, 1, 3]] if adds_starts else starts[:0]
+    _, cost_bent, _ = near.fit(N_LONG, _BENT, np.vstack([path[None, _BENT], extra[:, _BENT]]))
     return _RowFits(_state_at_zero(path), cost, cost_bent, data.n_free(N_LONG) - N_PATH)
 
 

@@ -1,8 +1,8 @@
 """A running track: its members, their published poses, and the evidence for and against them.
 
 A track usually has one target. Targets whose fields overlap at the sensors are members of one track
-and share a state, because a field that is wrongly attributed to one of them is missing in the
-other.
+and share a state, because a field that is attributed to the wrong target is missing in the correct
+target.
 
 Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 """
@@ -22,7 +22,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
 from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.disturbance_model import DisturbanceModel
 from mag_tracking.stages.track.disturbances import UnexplainedField
-from mag_tracking.stages.track.evidence import MIN_OBSERVED_SHARE, OUT_OF_REACH
+from mag_tracking.stages.track.evidence import MIN_OBSERVED_FRACTION, OUT_OF_REACH
 from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.member import Member, Update, View, members_in_order
 from mag_tracking.stages.track.new_target_evidence import UNDECIDED_NATS, NewTargetEvidence
@@ -37,17 +37,17 @@ from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.units import NS
 
 UNDECIDED_S = 1.0
-"""[s] Poses are in doubt for this time after another explanation was about as probable."""
+"""[s] Duration of the doubt after another explanation was about as probable as the track."""
 
 DOUBTED_S = 3.0
-"""[s] Vehicles of an uncertain explanation are in doubt for this time."""
+"""[s] Duration of the doubt about the vehicles of an uncertain explanation."""
 
 TrackRecord = Track | SmoothedPose | Disturbance
 """Output of the tracker."""
 
 
 class RunningTrack:
-    """One target that is followed, or several that share a state.
+    """Track of a single target, or of several targets that share a state.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class RunningTrack:
     bank_filter : BankFilter
     bank : FilterBank
     counts : Counter of str
-        Counts of the stage, which are updated.
+        Event counts of the stage, updated in place.
     clocks : ClockComparison
     later_sensors : SensorSubset
         Sensors that are used as soon as the bank is small enough.
@@ -69,7 +69,7 @@ class RunningTrack:
     ----------
     counts : Counter of str
     members : list of Member
-        Members that are followed, in the order of their states.
+        Running members, in the order of their states.
     ended : str or None
         Reason why the last member has ended; None while the track runs.
     is_lost : bool
@@ -85,13 +85,13 @@ class RunningTrack:
         self._target, self._settings = target, settings
         self._bank = TrackBank(target, settings, sensors, bank_filter, bank, counts, later_sensors)
         self.members = [Member(id, target, sensors, counts, clocks, 0)]
-        self._newcomers = NewTargetEvidence()
+        self._new_target_evidence = NewTargetEvidence()
         # Whether the last search could not add a member, because there are too many.
-        self._is_full = False
+        self._is_at_limit = False
         self._handover_due: int | None = None
-        self._use(False)
+        self._use_bank_sensors(False)
 
-    def _use(self, is_handover: bool) -> None:
+    def _use_bank_sensors(self, is_handover: bool) -> None:
         """Switch to the sensors of the bank."""
         sensors = self._bank.sensors
         self._no_target = NoTarget(len(sensors.network), self._settings.background_std)
@@ -107,7 +107,7 @@ class RunningTrack:
 
     @property
     def _final_sensors(self) -> SensorSubset:
-        """Sensors that the track uses, or will use."""
+        """Sensors that the track uses once all of its sensors have been added."""
         return self._bank.later_sensors or self._bank.sensors
 
     def configure(self, settings: TrackSettings) -> None:
@@ -124,12 +124,12 @@ class RunningTrack:
                 member.use(self._bank.sensors)
 
     def doubt(self, sensors: Sequence[int]) -> None:
-        """Doubt the track if it uses a sensor whose background is doubtful.
+        """Mark the track as doubtful if it uses a sensor with a doubtful background.
 
         Parameters
         ----------
         sensors : sequence of int
-            Rows of the sensors whose background is doubtful.
+            Indices of the sensors with a doubtful background.
         """
         if not np.isin(self._final_sensors.rows, sensors).any():
             return
@@ -155,10 +155,11 @@ class RunningTrack:
         -------
         list of Track, SmoothedPose or Disturbance
         """
-        watched_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
+        observed_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
         first = self.members[0]
         first.evidence.doubt_start(
-            approach_unobserved or watched_ns < MIN_OBSERVED_SHARE * self._settings.lookback_s * NS,
+            approach_unobserved
+            or observed_ns < MIN_OBSERVED_FRACTION * self._settings.lookback_s * NS,
             self._final_sensors.whole, self._target.starts_anywhere)
         first.begin_ns = frame.stamp_ns
         self._bank.begin(recent[0] if recent else frame, frame)
@@ -170,7 +171,7 @@ class RunningTrack:
             before_rows = self._bank.sensors.rows
             if self._bank.widen(dt):
                 first.cross_check.conclude(self._clocks, before_rows)
-                self._use(True)
+                self._use_bank_sensors(True)
         return self.step(frame, dt)
 
     def step(self, frame: FieldFrame, dt: float, publish: bool = True) -> list[TrackRecord]:
@@ -197,12 +198,12 @@ class RunningTrack:
             return self.end('no hypothesis explains the field')
         self._bank.keep(advance, publish)
         best = self.bank.best()
-        self._update_newcomers(advance, best)
+        self._update_new_target_evidence(advance, best)
         if not publish and not self._bank.is_lagged:
             return []
         views = [self._view(i, best) for i in range(len(self.members))]
         lagged = self._bank.lagged(best, advance.frame, dt, publish)
-        late = [pose for i, view in enumerate(views) for pose in self._smoothed(
+        lagged_poses = [pose for i, view in enumerate(views) for pose in self._smoothed(
             i, view, False, lagged, self.members[i].is_doubted(self._settings))]
         if not publish:
             return []
@@ -211,16 +212,16 @@ class RunningTrack:
         out: list[TrackRecord] = [member.publish(update, view)
                                   for member, view in zip(self.members, views, strict=True)]
         self._handover_due = best if self._bank.sensors.is_part else None
-        return [*out, *late, *self._end_if_over(advance.frame)]
+        return [*out, *lagged_poses, *self._end_lost_members(advance.frame)]
 
     def _view(self, i: int, best: int) -> View:
-        """Bank of member `i` alone; `best` is the row of the joint hypothesis."""
+        """Bank of member `i` alone; `best` is the index of the joint hypothesis."""
         bank = self.bank.extract_target(i, self._bank.single_target.n_target)
         row = best if bank is self.bank else bank.best()
         return View(bank, row, self._bank.single_target, self._bank.gain(row))
 
     def _update_evidence(self, advance: Advance) -> bool:
-        """Update the evidence of the members with a frame; False if no hypothesis explains it."""
+        """Update the evidence of the members; return False if no hypothesis explains the frame."""
         frame, dt = advance.frame, advance.dt
         if advance.n_rejected and np.count_nonzero(frame.n_samples) <= advance.n_rejected:
             # Without a majority of sensors, the track itself may be wrong.
@@ -239,18 +240,18 @@ class RunningTrack:
                 member.evidence.bayes_factor.add(
                     advance.evidence - disturbance_model, frame.stamp_ns,
                     self._settings.min_bayes_factor)
-            mine, first = self._member_frame(i, best, frame, dt), \
+            own_frame, first = self._member_frame(i, best, frame, dt), \
                 i * self._bank.single_target.n_target
-            member.evidence.add_frame(mine, self._bank.sensors.rows, self.bank.nis[best])
+            member.evidence.add_frame(own_frame, self._bank.sensors.rows, self.bank.nis[best])
             if self._settings.cross_check and not self._target.starts_anywhere:
                 member.cross_check.add(
-                    mine, self.bank.x[best, first:first + self._bank.single_target.n_target])
+                    own_frame, self.bank.x[best, first:first + self._bank.single_target.n_target])
         return True
 
-    def _update_newcomers(self, advance: Advance, best: int) -> None:
+    def _update_new_target_evidence(self, advance: Advance, best: int) -> None:
         """Update the evidence for new targets with the fit of hypothesis `best`."""
         bank, frame = self.bank, advance.frame
-        self._newcomers.add(
+        self._new_target_evidence.add(
             float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
             frame.stamp_ns, advance.n_rejected > 0 and len(frame.field) == 2,
             bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
@@ -267,11 +268,11 @@ class RunningTrack:
         last = self.members[i].last
         assert last is not None
         energy = field_energy(self._bank.filter, i, self.bank.x[self.bank.best()], frame)
-        return energy < (WEAK_ENERGY if self._is_full else NEGLIGIBLE_ENERGY) \
+        return energy < (WEAK_ENERGY if self._is_at_limit else NEGLIGIBLE_ENERGY) \
             and not self._bank.sensors.is_approached_by(last)
 
-    def _end_if_over(self, frame: FieldFrame) -> list[TrackRecord]:
-        """Closing records of the members that end with their latest poses."""
+    def _end_lost_members(self, frame: FieldFrame) -> list[TrackRecord]:
+        """End the members that are lost or out of reach, and return their closing records."""
         out: list[TrackRecord] = []
         for member in list(self.members):
             reason = member.reason_to_end(self._bank.sensors, self._settings)
@@ -284,12 +285,12 @@ class RunningTrack:
         return out
 
     def _end_member(self, member: Member, reason: str) -> list[TrackRecord]:
-        """End one member; the others continue without its states."""
+        """End one member, and remove its states from the joint state."""
         if len(self.members) == 1:
             self.is_lost = member.is_lost
             return self.end(reason)
         i = self.members.index(member)
-        out = self._closing(i, reason)
+        out = self._close_member(i, reason)
         self._bank.without_target(i)
         del self.members[i]
         return out
@@ -307,10 +308,11 @@ class RunningTrack:
             For each member its last record, marked as ended, and its smoothed poses.
         """
         self.ended = reason
-        return [record for i in range(len(self.members)) for record in self._closing(i, reason)]
+        return [record for i in range(len(self.members))
+                for record in self._close_member(i, reason)]
 
-    def _closing(self, i: int, reason: str) -> list[TrackRecord]:
-        """Closing records of member `i`."""
+    def _close_member(self, i: int, reason: str) -> list[TrackRecord]:
+        """End member `i`, and return its closing records."""
         member = self.members[i]
         member.ended = reason
         if len(self.members) == 1:
@@ -327,20 +329,20 @@ class RunningTrack:
 
     def _smoothed(self, i: int, view: View, complete: bool, states: list[TrackState],
                   doubtful: bool) -> list[SmoothedPose]:
-        """Smoothed poses of member `i`; if complete, also those before it shared its state."""
+        """Smoothed poses of member `i`; if complete, also the poses before it shared its state."""
         member, n = self.members[i], self._bank.single_target.n_target
-        mine = member.states_of(member.slot if complete else i, n, states)
+        own_states = member.states_of(member.slot if complete else i, n, states)
         return member.smoothed(view.bank, view.best, complete,
-                               [*member.early, *mine] if complete else mine, doubtful)
+                               [*member.early, *own_states] if complete else own_states, doubtful)
 
     @property
     def unexplained(self) -> list[UnexplainedField]:
-        """Fields during ended members that a target never explained."""
+        """Fields of the ended members that a target never explained."""
         found = [m.unexplained(self._disturbance_model.uniform) for m in self.members if m.ended]
         return [u for u in found if u is not None]
 
     def new_target(self) -> Joint | None:
-        """Search for another explanation of the latest frames, if they require one.
+        """Search for another explanation of the latest frames, if a search is due.
 
         Returns
         -------
@@ -351,25 +353,25 @@ class RunningTrack:
         if self.ended is not None or self._target.starts_anywhere or window is None \
                 or self.members[0].last is None:
             return None
-        if (reason := self._newcomers.due(window.frames[-1].stamp_ns)) is None:
+        if (reason := self._new_target_evidence.due(window.frames[-1].stamp_ns)) is None:
             return None
-        self._is_full = n >= self._settings.max_joint_targets
+        self._is_at_limit = n >= self._settings.max_joint_targets
         self.counts['searches for new targets'] += 1
-        if self._is_full:
+        if self._is_at_limit:
             self.counts['new targets not added: too many vehicles at once'] += 1
-        found = NewTargetSearch(
+        joint = NewTargetSearch(
             self.bank, window, self._bank.filter_of, n, VehicleState(
                 self._settings.vehicle, self._bank.sensors.network,
-                self._settings.background_std), reason, not self._is_full).find()
+                self._settings.background_std), reason, not self._is_at_limit).find()
         # A field that a disturbance explains is not evidence for another vehicle.
-        if self._newcomers.accepts(found.log_odds if found and all(
+        if self._new_target_evidence.accepts(joint.log_odds if joint and all(
                 m.evidence.bayes_factor.would_be_favoured(
-                    found.log_odds, self._settings.min_bayes_factor)
+                    joint.log_odds, self._settings.min_bayes_factor)
                 for m in self.members) else -np.inf):
-            return found
-        if found is not None and found.log_odds > UNDECIDED_NATS:
+            return joint
+        if joint is not None and joint.log_odds > UNDECIDED_NATS:
             for i, member in enumerate(self.members):
-                if found.replaced in (None, i):
+                if joint.replaced in (None, i):
                     member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, window.frames[-1].stamp_ns,
                                               UNDECIDED_S)
         return None
@@ -397,7 +399,7 @@ class RunningTrack:
             new.start_alongside(self.members[0], now_ns, ratio)
         doubtful = joint.doubtful(n)
         self._bank.resume(joint)
-        self.members, self._is_full = members_in_order(self.members, new, joint, n), False
+        self.members, self._is_at_limit = members_in_order(self.members, new, joint, n), False
         for slot, member in enumerate(self.members):
             member.slot = slot
             member.evidence.add(joint.log_odds)
@@ -406,11 +408,11 @@ class RunningTrack:
                 member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, now_ns, DOUBTED_S, begin_ns)
 
     def hand_over(self) -> None:
-        """Switch to the sensors near the predicted position, if they are others."""
+        """Switch to the sensors near the predicted position, if a handover is due."""
         best, self._handover_due = self._handover_due, None
         if best is None or self.ended is not None or len(self.members) > 1:
             return
         rows = self._bank.sensors.rows
         if self._bank.hand_over(best):
             self.members[0].cross_check.conclude(self._clocks, rows)
-            self._use(True)
+            self._use_bank_sensors(True)

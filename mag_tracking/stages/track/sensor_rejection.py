@@ -1,8 +1,8 @@
 """Rejection of sensors that contradict the others, frame by frame.
 
-A sensor with swapped axes, a sensor that was knocked over, or one beside another vehicle pulls a
-track away from the measurements of all others. If a frame does not fit the leading hypothesis, but
-does so without one or a few sensors, these are rejected.
+A faulty sensor pulls a track away from the measurements of all other sensors. Its axes may be
+swapped, it may have been knocked over, or it may be near another vehicle. If a frame fits the
+leading hypothesis only without one or a few sensors, these sensors are rejected.
 """
 
 from collections import Counter
@@ -21,12 +21,12 @@ _States: TypeAlias = tuple[FloatArray, FloatArray]
 """States and covariances of a bank."""
 
 SENSORS_PER_REJECTION = 8
-"""Number of sensors for each one that may be rejected; one is always allowed. If more would be
-needed, the track itself is wrong. Sensors far from the target agree with everything."""
+"""One in this number of sensors may be rejected, but at least one. If more rejections are needed,
+the track itself is wrong. Sensors far from the target fit any hypothesis."""
 
 
 class SensorRejection:
-    """Updates a bank with the credible part of each frame.
+    """Update of a bank without the sensors that contradict the others.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ class SensorRejection:
         self.clear()
 
     def clear(self) -> None:
-        """Reset; no track is running."""
+        """Forget the sensors that were rejected in the previous frame."""
         self._rejected: tuple[int, ...] = ()
 
     def advance(self, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame, dt: float
                 ) -> 'tuple[FloatArray, FloatArray, FieldFrame, Counter[str]]':
-        """Move a bank through a frame, without sensors that contradict the others.
+        """Predict and update a bank with a frame, without sensors that contradict the others.
 
         Parameters
         ----------
@@ -62,65 +62,67 @@ class SensorRejection:
         frame : FieldFrame
             The frame that was used, in which rejected sensors are missing.
         counts : Counter of str
-            Number of rejections of each rejected sensor.
+            One rejection for each rejected sensor, by description.
         """
-        # Keeping a copy of all states takes as long as the update. If the leading hypothesis fits
-        # before the update, one that does not fit is unlikely to lead after it.
+        # Copying all states takes as long as the update. If the frame fits the hypothesis that
+        # leads before the update, it usually also fits the hypothesis that leads afterwards.
         may_contradict = not self._fits_leader(bank_filter, bank, frame, dt)
-        before = bank.x, bank.P
+        prior = bank.x, bank.P
         predicted, log_likelihood = bank_filter.advance(bank, frame, dt, keeps_prior=may_contradict)
         if not may_contradict or self._fits(bank_filter, bank, frame, log_likelihood):
             self._rejected = ()
             return predicted, log_likelihood, frame, Counter()
-        whole = bank.x, bank.P, bank.nis, log_likelihood
-        for rejected in self._candidates(bank_filter, bank, before, frame, dt):
-            log_likelihood, less = self._without(bank_filter, bank, before, frame, dt, rejected)
-            if self._fits(bank_filter, bank, less, log_likelihood):
+        full_update = bank.x, bank.P, bank.nis, log_likelihood
+        for rejected in self._candidates(bank_filter, bank, prior, frame, dt):
+            log_likelihood, reduced = self._update_without(
+                bank_filter, bank, prior, frame, dt, rejected)
+            if self._fits(bank_filter, bank, reduced, log_likelihood):
                 self._rejected = rejected
-                return predicted, log_likelihood, less, Counter(
+                return predicted, log_likelihood, reduced, Counter(
                     {f'frames in which {self._names[j]} was rejected': 1 for j in rejected})
         self._rejected = ()
-        bank.x, bank.P, bank.nis, log_likelihood = whole
+        bank.x, bank.P, bank.nis, log_likelihood = full_update
         return predicted, log_likelihood, frame, Counter()
 
-    def _candidates(self, bank_filter: BankFilter, bank: FilterBank, before: _States,
+    def _candidates(self, bank_filter: BankFilter, bank: FilterBank, prior: _States,
                     frame: FieldFrame, dt: float) -> Iterator[tuple[int, ...]]:
-        """Sets of sensor rows to be rejected, in order of suspicion."""
+        """Sets of sensor indices to be rejected, the most suspect first."""
         present = np.flatnonzero(~np.isnan(frame.field).all(axis=1)).tolist()
         max_rejected = max(1, len(present) // SENSORS_PER_REJECTION) if len(present) > 1 else 0
         # The sensors rejected in the previous frame are tried first.
-        again = tuple(j for j in self._rejected if j in present)
-        if again and len(again) <= max_rejected:
-            yield again
-        found: tuple[int, ...] = ()
-        while len(found) < max_rejected:
-            # The next one is the sensor without which the others fit best.
+        previous = tuple(j for j in self._rejected if j in present)
+        if previous and len(previous) <= max_rejected:
+            yield previous
+        rejected: tuple[int, ...] = ()
+        while len(rejected) < max_rejected:
+            # The next candidate is the sensor without which the other sensors fit best.
             misfit: dict[tuple[int, ...], float] = {}
             for j in present:
-                if j not in found:
-                    tried = (*found, j)
-                    log_likelihood, less = self._without(
-                        bank_filter, bank, before, frame, dt, tried)
-                    misfit[tried] = _misfit(bank, less, log_likelihood)
-            found = min(misfit, key=misfit.__getitem__)
-            yield found
+                if j not in rejected:
+                    candidate = (*rejected, j)
+                    log_likelihood, reduced = self._update_without(
+                        bank_filter, bank, prior, frame, dt, candidate)
+                    misfit[candidate] = _misfit(bank, reduced, log_likelihood)
+            rejected = min(misfit, key=misfit.__getitem__)
+            yield rejected
 
     @staticmethod
-    def _without(bank_filter: BankFilter, bank: FilterBank, before: _States, frame: FieldFrame,
-                 dt: float, rejected: tuple[int, ...]) -> tuple[FloatArray, FieldFrame]:
-        """Update with the frame again, as if some sensors were missing: (log-likelihood, frame)."""
-        missing = np.isin(np.arange(len(frame.field)), rejected)
-        less = replace(frame, field=np.where(missing[:, None], np.nan, frame.field),
-                       covariance=np.where(missing[:, None, None], np.nan, frame.covariance),
-                       n_samples=np.where(missing, 0, frame.n_samples),
-                       time_offset=np.where(missing, 0.0, frame.time_offset))
-        bank.x, bank.P = before
-        return bank_filter.advance(bank, less, dt, keeps_prior=True)[1], less
+    def _update_without(bank_filter: BankFilter, bank: FilterBank, prior: _States,
+                        frame: FieldFrame, dt: float, rejected: tuple[int, ...]
+                        ) -> tuple[FloatArray, FieldFrame]:
+        """Repeat the update without some sensors; return log-likelihoods and the used frame."""
+        is_missing = np.isin(np.arange(len(frame.field)), rejected)
+        reduced = replace(frame, field=np.where(is_missing[:, None], np.nan, frame.field),
+                          covariance=np.where(is_missing[:, None, None], np.nan, frame.covariance),
+                          n_samples=np.where(is_missing, 0, frame.n_samples),
+                          time_offset=np.where(is_missing, 0.0, frame.time_offset))
+        bank.x, bank.P = prior
+        return bank_filter.advance(bank, reduced, dt, keeps_prior=True)[1], reduced
 
     @classmethod
     def _fits_leader(cls, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,
                      dt: float) -> bool:
-        """Whether the frame will fit the hypothesis that leads before the update."""
+        """Whether the frame fits the hypothesis that leads before the update."""
         leader = bank.alone(int(np.argmax(bank.log_w)))
         return cls._fits(bank_filter, leader, frame, bank_filter.advance(leader, frame, dt)[1])
 
@@ -133,7 +135,7 @@ class SensorRejection:
 
 
 def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:
-    """Row of the heaviest hypothesis after the frame; None if no hypothesis explains it."""
+    """Index of the heaviest hypothesis after a frame; None if no hypothesis explains it."""
     log_w = bank.log_w + log_likelihood
     leader = int(np.argmax(log_w))
     return leader if np.isfinite(log_w[leader]) else None

@@ -1,8 +1,7 @@
-"""Selection of the sensors of a large network that a track uses; it changes as the target moves.
+"""Selection of the sensors that a track uses in a large network, as the target moves.
 
 A state has up to nine elements per sensor, and the cost of an update is cubic in the number of
-sensors. Distant sensors do not measure the target; the little information that they would add is
-given up.
+sensors. Distant sensors would add little information and are not used.
 """
 
 from dataclasses import replace
@@ -21,7 +20,7 @@ PREDICTION_S = 0.5
 
 
 def nearest_sensors(positions: FloatArray, place: FloatArray, n: int) -> IntArray:
-    """Sensors nearest to a place.
+    """Indices of the sensors nearest to a position.
 
     Parameters
     ----------
@@ -33,14 +32,14 @@ def nearest_sensors(positions: FloatArray, place: FloatArray, n: int) -> IntArra
     Returns
     -------
     (n,) int array
-        Rows in ascending order.
+        Indices in ascending order.
     """
     distance = np.hypot(*(positions[:, :2] - place).T)
     return np.sort(np.argsort(distance, kind='stable')[:n])
 
 
 def offset_from_nearest(place: FloatArray, positions: FloatArray) -> FloatArray:
-    """Vector from the nearest sensor to a place.
+    """Horizontal vector from the nearest sensor to a position.
 
     Parameters
     ----------
@@ -51,17 +50,18 @@ def offset_from_nearest(place: FloatArray, positions: FloatArray) -> FloatArray:
     -------
     (2,) array, m
     """
-    away: FloatArray = place - positions[nearest_sensors(positions, place, 1)[0], :2]
-    return away
+    offset: FloatArray = place - positions[nearest_sensors(positions, place, 1)[0], :2]
+    return offset
 
 
 def part_of_frame(frame: FieldFrame, rows: IntArray) -> FieldFrame:
-    """Frame of some sensors only.
+    """Part of a frame with the readings of some sensors.
 
     Parameters
     ----------
     frame : FieldFrame
     rows : (n,) int array
+        Indices of the sensors.
 
     Returns
     -------
@@ -72,13 +72,13 @@ def part_of_frame(frame: FieldFrame, rows: IntArray) -> FieldFrame:
 
 
 class SensorSubset:
-    """The sensors that a track uses: all sensors of a network, or some of a large one.
+    """Sensors that a track uses: all sensors of a network, or a selection in a large network.
 
     Parameters
     ----------
     whole : SensorNetwork
     rows : (n,) int array, optional
-        Rows in ascending order; all sensors by default.
+        Indices of the sensors in ascending order; all sensors by default.
 
     Attributes
     ----------
@@ -86,6 +86,7 @@ class SensorSubset:
     is_part : bool
         Whether the sensors are a selection.
     rows : (n,) int array
+        Indices of the sensors.
     network : SensorNetwork
         Network of the selected sensors.
     """
@@ -98,7 +99,7 @@ class SensorSubset:
 
     @classmethod
     def near(cls, whole: SensorNetwork, place: FloatArray, n: int) -> 'SensorSubset':
-        """The sensors nearest to a place.
+        """The sensors nearest to a position.
 
         Parameters
         ----------
@@ -114,7 +115,7 @@ class SensorSubset:
         return cls(whole, nearest_sensors(whole.positions, place, n))
 
     def part_of(self, frame: FieldFrame) -> FieldFrame:
-        """Part of a frame of the whole network that these sensors measured.
+        """Readings of these sensors from a frame of the whole network.
 
         Parameters
         ----------
@@ -138,11 +139,11 @@ class SensorSubset:
         Returns
         -------
         SensorSubset
-            The same object if it contains the nearer half of those sensors.
+            The same object if it contains the nearer half of these sensors.
         """
         place = state[:2] + PREDICTION_S * state[3:5]
-        serve = np.isin(nearest_sensors(self.whole.positions, place, n // 2), self.rows).all()
-        return self if serve else SensorSubset.near(self.whole, place, n)
+        is_enough = np.isin(nearest_sensors(self.whole.positions, place, n // 2), self.rows).all()
+        return self if is_enough else SensorSubset.near(self.whole, place, n)
 
     def is_approached_by(self, track: Track) -> bool:
         """Whether a track moves towards its nearest sensor.
@@ -155,8 +156,8 @@ class SensorSubset:
         -------
         bool
         """
-        away = offset_from_nearest(track.position[:2], self.network.positions)
-        return bool(away @ track.velocity[:2] < 0.0)
+        offset = offset_from_nearest(track.position[:2], self.network.positions)
+        return bool(offset @ track.velocity[:2] < 0.0)
 
     def for_whole_network(self, track: Track, settings: TrackSettings) -> Track:
         """Extend a track of these sensors to the whole network.
@@ -175,32 +176,31 @@ class SensorSubset:
 
 def exchange_sensor_states(bank: FilterBank, before: IntArray, after: IntArray,
                            own_covariance: FloatArray, background_std: float) -> None:
-    """Replace the sensor states of a bank, in place, by those of other sensors.
+    """Replace the sensor states of a bank, in place, by the states of other sensors.
 
-    Sensors that are in both sets keep their states and correlations.
+    The states and correlations of sensors in both sets are retained.
 
     Parameters
     ----------
     bank : FilterBank
     before : (n_before,) int array
-        Rows of the present sensors in the network.
+        Indices of the current sensors in the network.
     after : (n_after,) int array
-        Rows of the new sensors in the network.
+        Indices of the new sensors in the network.
     own_covariance : (n_after, n_own, n_own) array
-        Covariance of the states of each new sensor, which are between those of the target and the
-        backgrounds.
+        Initial covariance of the mounting angles and model errors of each new sensor.
     background_std : float, T
         Standard deviation of the background of a new sensor.
     """
     n_own = own_covariance.shape[1]
     n_t = bank.x.shape[1] - (n_own + 3) * len(before)
     old, new = [_state_columns(n_t, n_own, len(rows)) for rows in (before, after)]
-    kept = [(list(before).index(row), k) for k, row in enumerate(after) if row in before]
-    source = np.concatenate([np.arange(n_t), *(old[j] for j, _ in kept)])
-    target = np.concatenate([np.arange(n_t), *(new[k] for _, k in kept)])
+    common = [(list(before).index(row), k) for k, row in enumerate(after) if row in before]
+    source = np.concatenate([np.arange(n_t), *(old[j] for j, _ in common)])
+    target = np.concatenate([np.arange(n_t), *(new[k] for _, k in common)])
     n_x = n_t + (n_own + 3) * len(after)
     x, P = np.zeros((len(bank), n_x)), np.zeros((len(bank), n_x, n_x))
-    for k in set(range(len(after))) - {k for _, k in kept}:
+    for k in set(range(len(after))) - {k for _, k in common}:
         own, background = new[k][:n_own], new[k][n_own:]
         P[:, own[:, None], own] = own_covariance[k]
         P[:, background, background] = background_std**2
@@ -219,20 +219,20 @@ def _state_columns(n_t: int, n_own: int, n_sensors: int) -> IntArray:
 
 def for_whole_network(track: Track, rows: IntArray, network: SensorNetwork,
                       settings: TrackSettings) -> Track:
-    """Extend a track of some sensors to the whole network.
+    """Extend a track from its sensors to the whole network.
 
     Parameters
     ----------
     track : Track
     rows : (n,) int array
-        Rows of its sensors.
+        Indices of its sensors in the network.
     network : SensorNetwork
     settings : TrackSettings
 
     Returns
     -------
     Track
-        Values of the other sensors are NaN; their mounting angles are those of the prior.
+        Values of the other sensors are NaN, except for the prior of their mounting angles.
     """
     n_sensors = len(network)
     predicted, nis = np.full((n_sensors, 3), np.nan), np.full(n_sensors, np.nan)

@@ -25,10 +25,10 @@ class TrackSettings:
             MIXTURE, HOLD, BEST))
     single_sensor_prior: bool = param(
         False, 'Track with a single sensor (a network of one, or the only sensor that measures). '
-        'The scale is not observable from one sensor: size and range follow from the configured '
+        'The scale is not observable from one sensor: moment and range follow from the configured '
         'moments, heights and offsets alone. Such tracks are always ambiguous.')
     field_error: float = param(
-        0.04, 'Error of the predicted field relative to its size (gains, axes, shape).',
+        0.04, 'Error of the predicted field relative to its magnitude (gains, axes, shape).',
         '', (0.0, 10.0), live=True)
     model_error_time_s: float = param(
         0.3, 'Correlation time of the model error near the target (first-order Gauss-Markov states '
@@ -47,8 +47,8 @@ class TrackSettings:
     min_bayes_factor: float = param(
         20.0, 'Minimum Bayes factor of a target against a disturbance: a smooth field at each '
         'sensor (temperature, a knock) or over the network (a storm, a power line). The pose is '
-        'ambiguous if the frames of the track do not reach it, or if the target falls behind by '
-        'this factor within a second.', '', (1.0, 1e12), live=True)
+        'ambiguous if the frames of the track do not reach it, or if the factor decreases by '
+        'this ratio within a second.', '', (1.0, 1e12), live=True)
     iterations: int = param(
         1, 'Number of linearisations per update. More than one helps if the field is far more '
         'informative than the prediction (magnets); for vehicles it converges to the wrong side.',
@@ -66,7 +66,8 @@ class TrackSettings:
         1e-12, 'Weight, relative to the heaviest hypothesis, below which a hypothesis is dropped '
         '(T10 Alg. 3).', '', (1e-300, 0.5), live=True)
     max_hypotheses: int = param(
-        1200, 'Maximum number of hypotheses. The heaviest are kept.', '', (1, 100000), live=True)
+        1200, 'Maximum number of hypotheses. The heaviest are retained.', '', (1, 100000),
+        live=True)
     max_initial_hypotheses: int = param(
         1200, 'Maximum number of hypotheses in the frames before the detection, if larger than '
         'max_hypotheses. These frames contain little information about the origin of a target, so '

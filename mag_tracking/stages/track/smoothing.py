@@ -1,9 +1,9 @@
 """Smoothing of a track with the frames before and after each of its poses.
 
-The hypothesis of the bank that is the best at the end is run forward through the frames again and
-then backward, and relinearised once. Hypotheses are independent, so that one can be run alone.
-Frames that contradict it are left out, because a single one would bend the whole track. The
-smoothed track need not end at the last published pose, since the two are linearised at different
+The best hypothesis at the end of a track is filtered again through all frames, smoothed backward,
+and relinearised once. Hypotheses are independent, so a single one can be smoothed alone. Frames
+that contradict it are excluded, because one such frame would distort the whole track. The last
+smoothed pose may differ from the last published pose, because the two are linearised at different
 states.
 """
 
@@ -30,12 +30,13 @@ TrackState: TypeAlias = tuple[int, FloatArray, FloatArray]
 """Timestamp [ns], state (n_x,) and covariance (n_x, n_x)."""
 
 RELINEARISATIONS = 1
-"""Number of relinearisations of the whole track at the previous result: far ahead of the sensors,
-the filter did not know the states to linearise at. One does not reach convergence. Four improve
-turning cars and trucks, but the car along a corridor is worse."""
+"""Number of relinearisations of the whole track at the previous result. They correct for inaccurate
+predictions far from the sensors. One does not reach convergence. Four improve turning cars and
+trucks, but degrade the car along a corridor."""
 
 MAX_ELEMENTS = 10_000_000
-"""Maximum product of frames and squared number of states: 80 MB, and less than a second."""
+"""Maximum product of frames and squared number of states. It corresponds to 80 MB and less than a
+second."""
 
 
 def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],
@@ -48,7 +49,7 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     ----------
     bank_filter : BankFilter
     bank : FilterBank
-        The hypothesis alone, at the first frame.
+        Bank of this hypothesis alone, at the first frame.
     frames : sequence of FieldFrame
     intervals : sequence of float, s
         Time from the previous frame to each frame.
@@ -61,9 +62,9 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     Returns
     -------
     states : list of (x (n_x,), P (n_x, n_x))
-        One for each frame.
+        Smoothed state at each frame.
     left_out : int
-        Number of frames that contradicted the hypothesis and were left out.
+        Number of frames that were excluded because they contradict the hypothesis.
     """
     paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
     for at, known in zip(paths[0], path, strict=False):
@@ -76,8 +77,8 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
 
 
 @dataclass
-class _Start:
-    """Start of a track, and the filter that moved it."""
+class _TrackStart:
+    """Bank at the start of a track, and its filter."""
 
     bank_filter: BankFilter
     bank: FilterBank | InitialBank
@@ -92,7 +93,7 @@ class _Start:
 
 
 class WholeTrack:
-    """Frames of a running track, with which it is smoothed when it ends.
+    """Stored frames of a running track, for smoothing at its end.
 
     Parameters
     ----------
@@ -110,26 +111,26 @@ class WholeTrack:
         self.clear()
 
     def clear(self) -> None:
-        """Drop everything."""
-        self._start: _Start | None = None
+        """Discard all stored frames."""
+        self._start: _TrackStart | None = None
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
-        self._published: list[bool] = []
-        self._length_s, self.is_too_long = 0.0, False
-        self._updated = False
+        self._is_published: list[bool] = []
+        self._duration_s, self.is_too_long = 0.0, False
+        self._is_updated = False
 
     def begin(self, bank: FilterBank | InitialBank, bank_filter: BankFilter) -> None:
-        """Start with a bank before its first frame, and with the present settings.
+        """Start with a bank before its first frame, and with a copy of the current filter.
 
         Parameters
         ----------
-        bank : FilterBank or StartingBank
-            It must not be modified by the caller afterwards.
+        bank : FilterBank or InitialBank
+            The caller must not modify it afterwards.
         bank_filter : BankFilter
         """
         self.clear()
         if self._max_duration_s:
-            self._start = _Start(copy(bank_filter), bank)
+            self._start = _TrackStart(copy(bank_filter), bank)
 
     def resume(self, window: Window, bank_filter: BankFilter) -> None:
         """Continue from a window of another filter; all of its frames count as published.
@@ -145,12 +146,12 @@ class WholeTrack:
             # The paths are copied, because the window modifies them.
             self._start = replace(self._start, origin=anchor.origin.copy(),
                                   paths=tuple(path.copy() for path in window.paths))
-        self._updated = window.is_updated
+        self._is_updated = window.is_updated
         for frame, dt in zip(window.frames, window.intervals, strict=True):
             self.add(anchor, frame, dt, True)
 
     def abandon(self) -> None:
-        """Drop everything; the track cannot be smoothed as a whole."""
+        """Discard all stored frames; the track cannot be smoothed as a whole."""
         self.clear()
         self.is_too_long = True
 
@@ -168,14 +169,14 @@ class WholeTrack:
         """
         if self._start is None:
             return
-        self._length_s += dt
-        n_numbers = (len(self._frames) + 1) * bank.x.shape[1]**2
-        if self._length_s > self._max_duration_s or n_numbers > MAX_ELEMENTS:
+        self._duration_s += dt
+        n_elements = (len(self._frames) + 1) * bank.x.shape[1]**2
+        if self._duration_s > self._max_duration_s or n_elements > MAX_ELEMENTS:
             self.abandon()
             return
         self._frames.append(frame)
         self._intervals.append(dt)
-        self._published.append(published)
+        self._is_published.append(published)
         if len(bank) < len(self._start.bank) // 2:
             self._start.bank.keep(np.isin(self._start.bank.origin, bank.origin))
 
@@ -186,13 +187,13 @@ class WholeTrack:
         ----------
         bank : FilterBank
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
 
         Returns
         -------
         states : list of TrackState
         left_out : int
-            Number of frames that did not fit.
+            Number of frames that were excluded because they contradict the hypothesis.
         """
         start = self._start
         if start is None or not self._frames:
@@ -200,9 +201,9 @@ class WholeTrack:
         origin = int(bank.origin[best])
         one = start.bank.rows(np.flatnonzero(start.bank.origin == origin))
         states, left_out = smoothed_track(start.bank_filter, one, self._frames, self._intervals,
-                                          self._updated, path=start.path_of(origin))
+                                          self._is_updated, path=start.path_of(origin))
         return [(frame.stamp_ns, x, P) for frame, (x, P), published in zip(
-            self._frames, states, self._published, strict=True) if published], left_out
+            self._frames, states, self._is_published, strict=True) if published], left_out
 
 
 class _LaggedFrame(NamedTuple):
@@ -216,7 +217,7 @@ class _LaggedFrame(NamedTuple):
     P: FloatArray
 
     def rows(self, mask: BoolArray) -> '_LaggedFrame':
-        """The hypotheses of `mask` (n_hyp,) only."""
+        """Copy with only the hypotheses in `mask` (n_hyp,)."""
         return self._replace(origin=self.origin[mask], x=self.x[mask], P=self.P[mask])
 
 
@@ -230,11 +231,11 @@ class FixedLag:
 
     def __init__(self, lag_s: float) -> None:
         self._lag_s = lag_s
-        self._lagged: deque[_LaggedFrame] = deque()
+        self._frames: deque[_LaggedFrame] = deque()
 
     def clear(self) -> None:
         """Drop all frames."""
-        self._lagged.clear()
+        self._frames.clear()
 
     def smoothed(self, bank_filter: BankFilter, bank: FilterBank, best: int, frame: FieldFrame,
                  dt: float, published: bool) -> list[TrackState]:
@@ -246,7 +247,7 @@ class FixedLag:
         bank : FilterBank
             Bank after the update with the frame.
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
         frame : FieldFrame
         dt : float, s
             Time since the previous frame.
@@ -256,43 +257,43 @@ class FixedLag:
         Returns
         -------
         list of TrackState
-            Usually none or one.
+            Usually empty, or one state.
         """
-        self._lagged.append(_LaggedFrame(
+        self._frames.append(_LaggedFrame(
             frame, dt, published, bank.origin, bank.x.copy(), bank.P.copy()))
-        if len(bank) < len(self._lagged[0].origin) // 2:
-            self._lagged = deque(k.rows(np.isin(k.origin, bank.origin)) for k in self._lagged)
+        if len(bank) < len(self._frames[0].origin) // 2:
+            self._frames = deque(k.rows(np.isin(k.origin, bank.origin)) for k in self._frames)
         out: list[TrackState] = []
-        while (frame.stamp_ns - self._lagged[0].frame.stamp_ns) / NS >= self._lag_s:
-            if self._lagged[0].published:
-                out.append((self._lagged[0].frame.stamp_ns,
+        while (frame.stamp_ns - self._frames[0].frame.stamp_ns) / NS >= self._lag_s:
+            if self._frames[0].published:
+                out.append((self._frames[0].frame.stamp_ns,
                             *self._states(bank_filter, bank, best)[0]))
-            self._lagged.popleft()
+            self._frames.popleft()
         return out
 
     def remaining(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[TrackState]:
-        """Smoothed states of all remaining frames at the end of a track.
+        """Return the smoothed states of the frames that remain at the end of a track.
 
         Parameters
         ----------
         bank_filter : BankFilter
         bank : FilterBank
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
 
         Returns
         -------
         list of TrackState
         """
-        if not self._lagged:
+        if not self._frames:
             return []
-        return [(kept.frame.stamp_ns, *state) for kept, state in zip(
-            self._lagged, self._states(bank_filter, bank, best), strict=True) if kept.published]
+        return [(lagged.frame.stamp_ns, *state) for lagged, state in zip(
+            self._frames, self._states(bank_filter, bank, best), strict=True) if lagged.published]
 
     def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
-        """Smoothed states of the stored frames; linearised once, because it is done every frame."""
-        oldest = self._lagged[0]
+        """Smoothed states of the stored frames; relinearisation would take too long per frame."""
+        oldest = self._frames[0]
         one, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
         one.x, one.P = oldest.x[row].copy(), oldest.P[row].copy()
-        return smoothed_track(bank_filter, one, [k.frame for k in self._lagged],
-                              [k.dt for k in self._lagged], updated=True, relinearisations=0)[0]
+        return smoothed_track(bank_filter, one, [k.frame for k in self._frames],
+                              [k.dt for k in self._frames], updated=True, relinearisations=0)[0]

@@ -1,8 +1,8 @@
-"""Search for vehicles on straight paths in the frames of a window, beside known vehicles.
+"""Search for vehicles on straight paths in the frames of a window, given known vehicles.
 
 All quantities in which the field is linear are Gaussian and are marginalised: the moments of the
-vehicle, the backgrounds, and the uncertainty of known vehicles. The remaining parameters are those
-of the path, which are searched from a grid of starts.
+vehicle, the backgrounds, and the uncertainty of known vehicles. The remaining parameters describe
+the path. They are searched from a grid of start values.
 
 Source: TSP14 sections III.A and V for the row of dipoles; variable projection with priors.
 """
@@ -69,11 +69,11 @@ class PathPrior:
     moment_std: FloatArray
     """(3 d,) [A m^2] Standard deviations of the combinations of moments."""
     min_speed: float
-    """[m/s] A slower vehicle does not arrive; it was there before."""
+    """[m/s] Minimum speed of an arriving vehicle. A slower vehicle was there before."""
 
     @classmethod
     def of(cls, vehicle: VehicleSettings, network: SensorNetwork) -> 'PathPrior':
-        """Prior of all kinds of vehicle in the settings together.
+        """Common prior of all kinds of vehicle in the settings.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class PathPrior:
         -------
         line : (n,) int array
         off : (n,) array, rad
-            Difference of the heading.
+            Heading of the path relative to the line.
         """
         off = (theta[:, 4, None] - self.headings + np.pi) % (2.0 * np.pi) - np.pi
         line: IntArray = np.abs(off).argmin(axis=1)
@@ -198,7 +198,7 @@ class StartGrid:
     gram : (n, 3, 3) array
         A'A of the columns A of each path.
     prior_cost : (n,) array
-        Squared normalised deviation of each path from the prior.
+        Squared normalised difference of each path from the prior.
     """
 
     def __init__(self, samples: PassSamples, prior: PathPrior, theta: FloatArray) -> None:
@@ -212,10 +212,10 @@ class StartGrid:
 
 @dataclass(frozen=True)
 class SteadySearch:
-    """Frames in which vehicles are searched, and the known vehicles.
+    """Search for vehicles in the samples of a window, given the known vehicles.
 
-    The paths of m vehicles that are searched together form one row of 7 m numbers, and their
-    moments one of 9 m. In shapes, n is the number of rows and y the number of whitened
+    In a joint search for m vehicles, a row of 7 m numbers contains their paths, and a row of 9 m
+    numbers their moments. In shapes, n is the number of rows and y the number of whitened
     measurements.
     """
 
@@ -248,7 +248,7 @@ class SteadySearch:
         The inverse is NaN or meaningless for a path through a sensor.
         """
         basis = self._model.basis(theta.reshape(-1, N_STRAIGHT))
-        A = self._marginal(_side_by_side(basis, _n_vehicles(theta)))
+        A = self._marginal(_joined_columns(basis, _n_vehicles(theta)))
         At = np.swapaxes(A, 1, 2)
         information = At @ A + np.diag(self._moment_std(theta)**-2.0)
         inverse = pseudo_inverse(information)
@@ -299,7 +299,7 @@ class SteadySearch:
         paths = theta.reshape(-1, N_STRAIGHT)
         A, _, inverse, p = self._solve(theta)
         derivative = self._model.derivative(paths, p.reshape(len(paths), -1))
-        D = self._marginal(_side_by_side(derivative, m))
+        D = self._marginal(_joined_columns(derivative, m))
         moved = inverse @ (np.swapaxes(A, 1, 2) @ D)
         off, off_J = self.prior.residual_and_jacobian(paths)
         return (np.hstack([self._y - np.einsum('nyi,ni->ny', A, p), -p / std, off.reshape(n, -1)]),
@@ -309,8 +309,8 @@ class SteadySearch:
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Refine paths by Levenberg-Marquardt steps.
 
-        Only the field keeps a path near the sensors: a step may move a vehicle that explains
-        nothing to any distance.
+        The prior does not limit the position along a line. A step may therefore move a vehicle that
+        explains no field to any distance.
 
         Parameters
         ----------
@@ -344,8 +344,9 @@ class SteadySearch:
         (n, 7) array
             The best path first.
         """
-        path, cost = self.refined(_usable(grid.theta, self.cost(grid), START_TOLERANCE, N_STARTS))
-        return _usable(path, cost, PATH_TOLERANCE, most)
+        path, cost = self.refined(
+            _best_distinct(grid.theta, self.cost(grid), START_TOLERANCE, N_STARTS))
+        return _best_distinct(path, cost, PATH_TOLERANCE, most)
 
     def moments(self, theta: FloatArray) -> FloatArray:
         """Moments of the rows of dipoles on given paths.
@@ -365,7 +366,7 @@ class SteadySearch:
         return moments
 
     def beside(self, path: FloatArray) -> 'SteadySearch':
-        """Search for another vehicle beside one that was found.
+        """Return a search for another vehicle, given a vehicle that was found.
 
         Parameters
         ----------
@@ -401,14 +402,14 @@ class SteadySearch:
                   for second in self.beside(first).best(grid, most_second)]
         pairs, cost = self.refined(np.array(starts).reshape(-1, 2 * N_STRAIGHT))
         cost = cost + self._log_determinant_of_moments(pairs)
-        usable = np.isfinite(cost)
-        if not usable.any():
+        is_usable = np.isfinite(cost)
+        if not is_usable.any():
             return []
         # Unusable pairs are dropped first, because squares of their positions may overflow.
-        pairs, cost = pairs[usable], cost[usable]
+        pairs, cost = pairs[is_usable], cost[is_usable]
         best = pairs[np.argmin(cost)].reshape(2, -1)
         pairs = np.array([in_order_of(best, pair.reshape(2, -1)).ravel() for pair in pairs])
-        return list(_usable(pairs, cost, np.tile(PATH_TOLERANCE, 2), len(pairs)).reshape(
+        return list(_best_distinct(pairs, cost, np.tile(PATH_TOLERANCE, 2), len(pairs)).reshape(
             -1, 2, N_STRAIGHT))
 
     def _log_determinant_of_moments(self, theta: FloatArray) -> FloatArray:
@@ -417,15 +418,15 @@ class SteadySearch:
             return _log_determinant(self._information_of_moments(theta))
 
     def _are_detectable(self, theta: FloatArray) -> BoolArray:
-        """Whether all vehicles (n,) are expected to be detectable, by the prior of the moments."""
+        """Whether the prior of the moments makes all vehicles of each row (n,) detectable."""
         with ignoring_overflow():
             energy = np.einsum('nii->ni', self._information_of_moments(theta)) - 1.0
-        each = energy.reshape(len(theta), -1, 3 * N_DIPOLES).sum(axis=2)
-        felt: BoolArray = (each > DETECTABLE_ENERGY).all(axis=1)
-        return felt
+        vehicle_energy = energy.reshape(len(theta), -1, 3 * N_DIPOLES).sum(axis=2)
+        are_detectable: BoolArray = (vehicle_energy > DETECTABLE_ENERGY).all(axis=1)
+        return are_detectable
 
     def _information_of_moments(self, theta: FloatArray) -> FloatArray:
-        """Information (n, 9 m, 9 m) of the moments, in units in which that of the prior is 1."""
+        """Information (n, 9 m, 9 m) of the moments, relative to the prior."""
         std = self._moment_std(theta)
         information: FloatArray = self._solve(theta)[1] * np.outer(std, std)
         return information
@@ -442,14 +443,14 @@ def _n_vehicles(theta: FloatArray) -> int:
     return theta.shape[1] // N_STRAIGHT
 
 
-def _side_by_side(A: FloatArray, m: int) -> FloatArray:
-    """Matrices (n, k, m c) from those (n m, k, c) of m vehicles each."""
+def _joined_columns(A: FloatArray, m: int) -> FloatArray:
+    """Matrices (n, k, m c) that join the matrices (n m, k, c) of m vehicles."""
     n, k, c = len(A) // m, *A.shape[1:]
     return A.reshape(n, m, k, c).swapaxes(1, 2).reshape(n, k, m * c)
 
 
 def _block_diagonal(A: FloatArray, m: int) -> FloatArray:
-    """Block-diagonal matrices (n, m k, m c) from the blocks (n m, k, c) of m vehicles each."""
+    """Block-diagonal matrices (n, m k, m c) of the blocks (n m, k, c) of m vehicles."""
     n, k, c = len(A) // m, *A.shape[1:]
     out = np.zeros((n, m, k, m, c))
     for i in range(m):
@@ -457,8 +458,9 @@ def _block_diagonal(A: FloatArray, m: int) -> FloatArray:
     return out.reshape(n, m * k, m * c)
 
 
-def _usable(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> FloatArray:
+def _best_distinct(theta: FloatArray, cost: FloatArray, tolerance: FloatArray, n_max: int
+                   ) -> FloatArray:
     """The best distinct paths (n, 7) with a finite cost."""
-    usable = np.isfinite(cost)
-    paths: FloatArray = theta[usable]
-    return paths[distinct(paths, cost[usable], apart, most)]
+    is_usable = np.isfinite(cost)
+    paths: FloatArray = theta[is_usable]
+    return paths[distinct(paths, cost[is_usable], tolerance, n_max)]

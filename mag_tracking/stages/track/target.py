@@ -35,9 +35,10 @@ class Target:
     kinds: Sequence[str]
     """Name of each kind of target."""
     unobserved_length: Callable[[], UnobservedLength | None]
-    """Factory for each track: effect of the length on the middle; None for a small target."""
+    """Factory of the uncertainty of the middle due to the length, called for each track; returns
+    None for a small target."""
     starts_anywhere: bool
-    """Whether a track may start anywhere: a lost magnet may be found at any place, but a vehicle
+    """Whether a track may start anywhere. A lost magnet may be found at any position, but a vehicle
     starts on an arrival line."""
     start: Callable[[TrackSettings, SensorNetwork, FieldFrame, FloatArray], FilterBank | None]
     """First hypotheses from the settings, a network, a frame and the covariances (n_sensors, n_own,
@@ -45,7 +46,7 @@ class Target:
 
 
 def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
-    """Target that the settings select.
+    """Target selected by the settings.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.initial_bank import InitialBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.bank_size import WEIGHT_KEPT, max_hypotheses, max_sensors
+from mag_tracking.stages.track.bank_size import MIN_WEIGHT, max_hypotheses, max_sensors
 from mag_tracking.stages.track.joint import Joint
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.reach import first_weak_frame
@@ -26,7 +26,7 @@ from mag_tracking.units import NS
 
 @dataclass(frozen=True)
 class Advance:
-    """Result of moving a bank through a frame."""
+    """Result of the prediction and update of a bank with a frame."""
 
     frame: FieldFrame
     """The part of the frame that was used."""
@@ -35,9 +35,9 @@ class Advance:
     predicted: FloatArray
     """(n_hyp, n_x) States before the update."""
     log_likelihood: FloatArray
-    """(n_hyp,)"""
+    """(n_hyp,) Log-likelihood of the frame for each hypothesis."""
     evidence: float
-    """Log-density of the frame over all hypotheses; -inf if none explains it."""
+    """Log-density of the frame over all hypotheses; -inf if no hypothesis explains it."""
     n_rejected: int
     """Number of rejected sensors."""
 
@@ -54,7 +54,7 @@ class TrackBank:
     bank_filter : BankFilter
     bank : FilterBank
     counts : Counter of str
-        Counts of the stage, which are updated.
+        Event counts of the stage, updated in place.
     later_sensors : SensorSubset
         Sensors that are used as soon as the bank is small enough.
 
@@ -78,8 +78,8 @@ class TrackBank:
         self._relinearisation = Relinearisation(
             settings.relinearise_interval_s, settings.relinearise_window_s,
             settings.relinearise_max_hypotheses)
-        self._whole = WholeTrack(settings.max_smoothing_s)
-        self._lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
+        self._whole_track = WholeTrack(settings.max_smoothing_s)
+        self._fixed_lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
 
     @property
     def single_target(self) -> Observation:
@@ -88,21 +88,21 @@ class TrackBank:
 
     @property
     def window(self) -> Window | None:
-        """The latest frames, with the paths of the hypotheses; None if there are none."""
+        """The latest frames, with the paths of the hypotheses; None if no frame is stored."""
         return self._relinearisation.window
 
     @property
     def is_lagged(self) -> bool:
         """Whether poses are smoothed with a fixed lag."""
-        return self._lag is not None
+        return self._fixed_lag is not None
 
     def gain(self, row: int) -> float:
-        """Log-likelihood of the latest frames along a path, minus that in the filter.
+        """Log-likelihood gain of a path over the filter, for the latest frames.
 
         Parameters
         ----------
         row : int
-            Row of the hypothesis.
+            Index of the hypothesis.
 
         Returns
         -------
@@ -147,11 +147,11 @@ class TrackBank:
         if first is not now:
             self.filter.move(self.bank, (first.stamp_ns - now.stamp_ns) / NS)
         start = InitialBank.of(self.bank, self.filter.observation.n_target)
-        self._whole.begin(copy(start), self.filter)
+        self._whole_track.begin(copy(start), self.filter)
         self._relinearisation.begin(start)
 
     def advance(self, frame: FieldFrame, dt: float) -> Advance:
-        """Move the bank through a frame, and weight the hypotheses.
+        """Predict and update the bank with a frame, and weight the hypotheses.
 
         Parameters
         ----------
@@ -186,15 +186,15 @@ class TrackBank:
             -np.log(s.prune_ratio),
             s.max_hypotheses if publish else max(s.max_hypotheses, s.max_initial_hypotheses))
         self._counts.update(self._relinearisation.improve(self.filter, bank))
-        self._whole.add(bank, advance.frame, advance.dt, publish)
+        self._whole_track.add(bank, advance.frame, advance.dt, publish)
 
     def lagged(self, best: int, frame: FieldFrame, dt: float, publish: bool) -> list[TrackState]:
-        """States of the frames that are now older than the fixed lag.
+        """Add a frame to the fixed lag, and return the states of the frames older than the lag.
 
         Parameters
         ----------
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
         frame : FieldFrame
         dt : float, s
             Time since the previous frame.
@@ -205,8 +205,8 @@ class TrackBank:
         -------
         list of TrackState
         """
-        return [] if self._lag is None else self._lag.smoothed(self.filter, self.bank, best, frame,
-                                                               dt, publish)
+        return [] if self._fixed_lag is None else self._fixed_lag.smoothed(
+            self.filter, self.bank, best, frame, dt, publish)
 
     def remaining_lagged(self, best: int) -> list[TrackState]:
         """States of the remaining frames of the fixed lag at the end of the track.
@@ -214,13 +214,14 @@ class TrackBank:
         Parameters
         ----------
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
 
         Returns
         -------
         list of TrackState
         """
-        return [] if self._lag is None else self._lag.remaining(self.filter, self.bank, best)
+        return [] if self._fixed_lag is None else self._fixed_lag.remaining(
+            self.filter, self.bank, best)
 
     def smoothed(self, best: int, counts: bool = True) -> list[TrackState]:
         """Smoothed states of all stored frames.
@@ -228,26 +229,27 @@ class TrackBank:
         Parameters
         ----------
         best : int
-            Row of the hypothesis to be smoothed.
+            Index of the hypothesis to be smoothed.
         counts : bool, optional
-            Whether frames that were left out are counted.
+            Whether excluded frames are counted.
 
         Returns
         -------
         list of TrackState
         """
-        states, left_out = self._whole.smoothed(self.bank, best)
+        states, left_out = self._whole_track.smoothed(self.bank, best)
         if counts:
             self._counts['frames left out of smoothing'] += left_out
-            self._counts['tracks too long to smooth'] += self._whole.is_too_long
+            self._counts['tracks too long to smooth'] += self._whole_track.is_too_long
         return states
 
     def without_target(self, i: int) -> None:
-        """Remove one of several targets.
+        """Remove a target from the state.
 
         Parameters
         ----------
         i : int
+            Index of the target.
         """
         best, n_targets = self.bank.best(), self.filter.observation.n_targets
         n = first_weak_frame(self.filter, i, self.window, int(self.bank.origin[best]))
@@ -266,14 +268,14 @@ class TrackBank:
         """
         self.bank, self.filter = joint.bank, joint.bank_filter
         self._relinearisation.resume(joint.window)
-        self._whole.resume(joint.window, self.filter)
+        self._whole_track.resume(joint.window, self.filter)
         self._rejection.clear()
         self._clear_lag()
 
     def _clear_lag(self) -> None:
         """Drop the frames of the fixed lag, because the layout of the states has changed."""
-        if self._lag is not None:
-            self._lag.clear()
+        if self._fixed_lag is not None:
+            self._fixed_lag.clear()
 
     def hand_over(self, best: int) -> bool:
         """Switch to the sensors near the predicted position of a hypothesis.
@@ -281,7 +283,7 @@ class TrackBank:
         Parameters
         ----------
         best : int
-            Row of the hypothesis.
+            Index of the hypothesis.
 
         Returns
         -------
@@ -293,15 +295,15 @@ class TrackBank:
         if sensors is self.sensors:
             return False
         self._switch_sensors(sensors)
-        self._whole.abandon()
+        self._whole_track.abandon()
         self._relinearisation.restart()
         self._counts['tracks handed over to other sensors'] += 1
         return True
 
     def widen(self, dt: float) -> bool:
-        """Use all later sensors from the next frame on, if few hypotheses are probable by now.
+        """Add the remaining sensors from the next frame on, if few hypotheses are probable.
 
-        Otherwise they are added with a handover.
+        Otherwise a later handover adds these sensors.
 
         Parameters
         ----------
@@ -314,19 +316,19 @@ class TrackBank:
             Whether the sensors have changed.
         """
         sensors, self.later_sensors = self.later_sensors or self.sensors, None
-        n, most = len(sensors.rows), max_hypotheses(self.filter.observation, len(sensors.rows))
-        if n == len(self.sensors.rows) or not self.bank.is_concentrated_in(most, WEIGHT_KEPT):
+        n, n_hyp = len(sensors.rows), max_hypotheses(self.filter.observation, len(sensors.rows))
+        if n == len(self.sensors.rows) or not self.bank.is_concentrated_in(n_hyp, MIN_WEIGHT):
             return False
-        self._counts['hypotheses dropped'] += self.bank.prune(np.inf, most)
+        self._counts['hypotheses dropped'] += self.bank.prune(np.inf, n_hyp)
         self._switch_sensors(sensors)
         anchor = self.bank.copy()
         self.filter.move(anchor, dt)
-        self._whole.begin(anchor, self.filter)
+        self._whole_track.begin(anchor, self.filter)
         self._relinearisation.begin(anchor.copy())
         return True
 
     def _switch_sensors(self, sensors: SensorSubset) -> None:
-        """Replace the sensor states of the hypotheses by those of other sensors."""
+        """Replace the sensor states of the hypotheses by the states of other sensors."""
         before, self.sensors = self.sensors.rows, sensors
         self.filter = self.filter_of(1)
         self._rejection = SensorRejection(sensors.network.names)

@@ -1,4 +1,4 @@
-"""Uncertainty of the middle of a vehicle whose whole length has not been observed."""
+"""Uncertainty of the middle of a vehicle due to the length that has not been observed."""
 
 from collections.abc import Sequence
 
@@ -17,14 +17,14 @@ MIN_SPEED_STDS = 3.0
 class UnobservedLength:
     """Uncertainty of the middle of a vehicle due to the part that no sensor has observed yet.
 
-    Until its rear has passed a sensor, a car may be the engine of a truck: a row of dipoles
-    explains either, and the evidence compares two models that are both inaccurate.
+    Until its rear has passed a sensor, an apparent car may be the engine of a truck. A row of
+    dipoles explains both, and both models are too inaccurate for a reliable comparison.
 
-    The iron of a long vehicle is at its engine, axles and load. The difference between its length
-    and that of its row extends backwards until the rear has been observed, and to either end
-    afterwards; in between, the middle is uniformly distributed.
+    The iron of a long vehicle is at its engine, axles and load, so the row of dipoles is shorter
+    than the vehicle. Until the rear has been observed, the remaining part is assumed behind the
+    row. Afterwards it may be at either end, and the middle is uniformly distributed in between.
 
-    One object serves one track.
+    Each track has its own object.
 
     Parameters
     ----------
@@ -36,8 +36,8 @@ class UnobservedLength:
     def __init__(self, lengths: Sequence[float], length_stds: Sequence[float]) -> None:
         self._lengths, self._stds = np.array(lengths), np.array(length_stds)
         self._forward: FloatArray = np.zeros(2)
-        self._distance_past = -np.inf
-        self._place: FloatArray = np.zeros(2)
+        self._distance_travelled = -np.inf
+        self._last_position: FloatArray = np.zeros(2)
 
     def update(self, x: FloatArray, P: FloatArray, positions: FloatArray, is_certain: bool) -> None:
         """Update the direction of travel and, if the position is certain, the distance travelled.
@@ -56,15 +56,16 @@ class UnobservedLength:
         self._forward = self._direction(x, P)
         if not is_certain or not len(positions):
             return
-        if self._distance_past > 0.0:
-            # After the first sensor the path length counts, which also holds for a turn.
-            self._distance_past += float(np.linalg.norm(x[:2] - self._place))
+        if self._distance_travelled > 0.0:
+            # After the first sensor the distance along the path is used, which is also valid in a
+            # turn.
+            self._distance_travelled += float(np.linalg.norm(x[:2] - self._last_position))
         else:
-            self._distance_past = float(offset_from_nearest(x[:2], positions) @ self._forward)
-        self._place = x[:2].copy()
+            self._distance_travelled = float(offset_from_nearest(x[:2], positions) @ self._forward)
+        self._last_position = x[:2].copy()
 
     def covariance(self, x: FloatArray, P: FloatArray, length: float, kind: int) -> FloatArray:
-        """Covariance to be added to that of the horizontal position.
+        """Covariance to be added to the covariance of the horizontal position.
 
         Parameters
         ----------
@@ -74,21 +75,21 @@ class UnobservedLength:
         length : float, m
             Length of the row of dipoles.
         kind : int
-            Kind of vehicle.
+            Index of the kind of vehicle.
 
         Returns
         -------
         (2, 2) array, m^2
         """
-        behind = 0.5 * (self._lengths - length)
-        square = np.maximum(behind, 0.0)**2 + 0.25 * self._stds**2
+        hidden = 0.5 * (self._lengths - length)
+        square = np.maximum(hidden, 0.0)**2 + 0.25 * self._stds**2
         # A longer vehicle would have been observed once its middle has passed a sensor.
-        possible = ((self._lengths > self._lengths[kind]) & (behind > 0.0)
-                    & (self._distance_past < behind))
-        variance = square[possible].sum() / len(self._lengths)
+        is_possible = ((self._lengths > self._lengths[kind]) & (hidden > 0.0)
+                       & (self._distance_travelled < hidden))
+        variance = square[is_possible].sum() / len(self._lengths)
         if self._lengths[kind] > MAX_CAR_ROW:
-            is_felt = self._distance_past >= behind[kind]
-            variance += square[kind] / (3.0 if is_felt else 1.0)
+            is_sensed = self._distance_travelled >= hidden[kind]
+            variance += square[kind] / (3.0 if is_sensed else 1.0)
         forward = self._direction(x, P)
         covariance: FloatArray = variance * np.outer(forward, forward)
         return covariance
@@ -96,5 +97,5 @@ class UnobservedLength:
     def _direction(self, x: FloatArray, P: FloatArray) -> FloatArray:
         """Unit vector (2,) of the motion; the previous one if the target hardly moves."""
         speed = float(np.hypot(x[3], x[4]))
-        moves = speed > MIN_SPEED_STDS * np.sqrt(max(0.0, P[3, 3] + P[4, 4]))
-        return x[3:5] / speed if moves else self._forward
+        is_moving = speed > MIN_SPEED_STDS * np.sqrt(max(0.0, P[3, 3] + P[4, 4]))
+        return x[3:5] / speed if is_moving else self._forward

@@ -23,7 +23,7 @@ MIN_MOMENT = 1e-6
 
 @dataclass(frozen=True)
 class VehicleState:
-    """Converts straight paths (`PATH` of `steady_pass`) to states of `RowVehicle`."""
+    """Conversion of straight paths (`PATH` of `steady_pass`) to states of `RowVehicle`."""
 
     settings: VehicleSettings
     network: SensorNetwork
@@ -49,21 +49,20 @@ class VehicleState:
               ) -> tuple[FloatArray, FloatArray]:
         """Prior of a vehicle that arrives on a given path.
 
-        It is that at the start of a track, except that the direction of the moment is the one that
-        was found.
+        It equals the prior at the start of a track, but the moment has the estimated direction.
 
         Parameters
         ----------
         theta : (7,) array
             Straight path.
         moments : (k, 3) array, A m^2, world frame
-            Moments that were found.
+            Estimated moments.
         t : float, s
             Time on the path.
         kind : int
-            Kind of vehicle.
+            Index of the kind of vehicle.
         label : int
-            Arrival.
+            Index of the arrival direction.
 
         Returns
         -------
@@ -72,8 +71,8 @@ class VehicleState:
         """
         s = self.settings
         R = rotation_about_z(float(np.deg2rad(s.arrival_headings_deg[label])))
-        found = moments.sum(axis=0)
-        mean = s.moments[kind] * found / max(float(np.linalg.norm(found)), MIN_MOMENT)
+        total = moments.sum(axis=0)
+        mean = s.moments[kind] * total / max(float(np.linalg.norm(total)), MIN_MOMENT)
         x = self.along(theta, mean[None], np.array([t]), kind)[0]
         x[2], x[5] = s.heights[kind], 0.0
         if self._n_dipoles > 1:
@@ -92,7 +91,7 @@ class VehicleState:
             Moments of a row of k dipoles, from the tail to the head.
         times : (n,) array, s
         kind : int
-            Kind of vehicle.
+            Index of the kind of vehicle.
 
         Returns
         -------
@@ -101,15 +100,15 @@ class VehicleState:
         d, s, length = self._n_dipoles, self.settings, float(theta[6])
         heading = float(theta[4])
         R = rotation_about_z(heading)
-        soft = soft_iron(s, kind)
+        soft_D = soft_iron(s, kind)
         x = np.zeros((len(times), len(self._model.state_names)))
         velocity = np.array([theta[3] * np.cos(heading), theta[3] * np.sin(heading), theta[5]])
         x[:, :3], x[:, 3:6] = theta[:3] + times[:, None] * velocity, velocity
         ordered = moments[::-1] if length < 0.0 else moments
         is_point = s.length_stds[kind] == 0.0
         each = np.tile(moments.sum(axis=0) / d, (d, 1)) if is_point else _resampled(ordered, d)
-        x[:, 6:6 + 3 * d] = (each @ R - soft * self._model.induction @ R / d).ravel()
-        x[:, 6 + 3 * d:9 + 3 * d] = soft
+        x[:, 6:6 + 3 * d] = (each @ R - soft_D * self._model.induction @ R / d).ravel()
+        x[:, 6 + 3 * d:9 + 3 * d] = soft_D
         if d > 1:
             x[:, 9 + 3 * d] = s.lengths[kind] if is_point else abs(length)
         return x
@@ -129,7 +128,7 @@ class VehicleState:
         return hard
 
     def turning(self, x: FloatArray, P: FloatArray, target: int) -> FloatArray | None:
-        """Covariance in which one target turns.
+        """Covariance with the initial variance of the turn rate of one target.
 
         Parameters
         ----------
@@ -137,6 +136,7 @@ class VehicleState:
             State of several targets.
         P : (n_x, n_x) array
         target : int
+            Index of the target.
 
         Returns
         -------
@@ -154,10 +154,10 @@ class VehicleState:
 
 
 def _resampled(moments: FloatArray, d: int) -> FloatArray:
-    """Moments (d, 3) of a row of `d` dipoles with the same total and middle as those of (k, 3)."""
+    """Moments (d, 3) of a row of `d` dipoles with the total and the middle of `moments` (k, 3)."""
     if len(moments) == 1 or d == 1:
         return np.tile(moments.sum(axis=0) / d, (d, 1))
     places = np.linspace(0.0, d - 1.0, len(moments))
-    share = np.maximum(1.0 - np.abs(places - np.arange(d)[:, None]), 0.0)
-    spread: FloatArray = share @ moments
-    return spread
+    weights = np.maximum(1.0 - np.abs(places - np.arange(d)[:, None]), 0.0)
+    resampled: FloatArray = weights @ moments
+    return resampled

@@ -1,4 +1,4 @@
-"""Samples of a window for the search for vehicles, without the fields of known vehicles."""
+"""Samples of a window for the search for vehicles, given the fields of known vehicles."""
 
 from functools import cached_property
 
@@ -13,12 +13,11 @@ from mag_tracking.stages.track.window_start import KnownVehicles
 from mag_tracking.units import NS
 
 MAX_SAMPLES = 320
-"""Maximum number of samples of a search; of more frames, only every second one, or fewer, are
-used."""
+"""Maximum number of samples of a search. Windows with more samples are decimated."""
 
-KNOWN_STD, KNOWN_SHARE = 0.7, 0.3
-"""[m], [m/s] Uncertainty of tracked vehicles while another one is searched; and relative
-uncertainty of their moments."""
+KNOWN_STD, KNOWN_MOMENT_RATIO = 0.7, 0.3
+"""[m], [m/s] Uncertainty of the paths of tracked vehicles in a search, and relative uncertainty of
+their moments."""
 
 
 class WindowSearch:
@@ -44,9 +43,9 @@ class WindowSearch:
         self.times: FloatArray = np.array([(f.stamp_ns - frames[-1].stamp_ns) / NS
                                            for f in frames])
         step = -(-len(frames) * len(network) // MAX_SAMPLES)
-        self._thinned = np.arange(len(frames))[::-1][::step][::-1]
+        self._frame_indices = np.arange(len(frames))[::-1][::step][::-1]
         self.prior = PathPrior.of(vehicles.settings, network)
-        self.samples = PassSamples.of(network, [frames[k] for k in self._thinned],
+        self.samples = PassSamples.of(network, [frames[k] for k in self._frame_indices],
                                       frames[-1].stamp_ns, len(network))
 
     @cached_property
@@ -56,7 +55,7 @@ class WindowSearch:
                          self.prior.starts(self._vehicles.settings, self._vehicles.network))
 
     def beside(self, known: KnownVehicles) -> SteadySearch:
-        """Search for a vehicle beside known ones.
+        """Return a search for a vehicle in addition to known vehicles.
 
         Parameters
         ----------
@@ -69,11 +68,11 @@ class WindowSearch:
         samples = self.samples
         if known.filter is None:
             return SteadySearch(samples, self.prior, np.zeros(len(samples.y)), self._backgrounds())
-        path, t = known.path[self._thinned], self.times[self._thinned]
+        path, t = known.path[self._frame_indices], self.times[self._frame_indices]
         n, kind = len(path), np.array([known.kind])
         fields = [known.filter.fields_at(path[k], kind, self._window.frames[i],
                                          self._window.intervals[i])
-                  for k, i in enumerate(self._thinned.tolist())]
+                  for k, i in enumerate(self._frame_indices.tolist())]
         h, H = (np.array(part) for part in zip(*fields, strict=True))
         W = samples.M @ np.swapaxes(
             np.tile(self._vehicles.network.R_sw[samples.compared], (n, 1, 1)), 1, 2)
@@ -88,18 +87,18 @@ class WindowSearch:
         return self._vehicles.background_std * self.samples.backgrounds
 
     def _columns(self, H: FloatArray, x: FloatArray, t: FloatArray, n_one: int) -> FloatArray:
-        """Fields (n, n_sensors, 3, q) of one standard deviation of the errors of known vehicles.
+        """Fields (n, n_sensors, 3, q) of errors of known vehicles by one standard deviation.
 
         `H` (n, n_sensors, 3, n_t) are the derivatives along a path that ends with the state `x`
         (n_x,), at times `t` (n,) [s] before its end.
         """
         out = []
         for first in range(0, H.shape[-1], n_one):
-            part = H[..., first:first + n_one]
-            by_velocity = part[..., 3:6] + t[:, None, None, None] * part[..., :3]
+            H_one = H[..., first:first + n_one]
+            by_velocity = H_one[..., 3:6] + t[:, None, None, None] * H_one[..., :3]
             hard = self._vehicles.hard_moments(x[first:first + n_one])
-            of_moment = part[..., 6:6 + hard.size].reshape(*part.shape[:3], -1, 3).mean(axis=3)
-            size = float(np.linalg.norm(hard.sum(axis=0)))
-            out += [KNOWN_STD * part[..., :3], KNOWN_STD * by_velocity,
-                    KNOWN_SHARE * size * of_moment]
+            of_moment = H_one[..., 6:6 + hard.size].reshape(*H_one.shape[:3], -1, 3).mean(axis=3)
+            magnitude = float(np.linalg.norm(hard.sum(axis=0)))
+            out += [KNOWN_STD * H_one[..., :3], KNOWN_STD * by_velocity,
+                    KNOWN_MOMENT_RATIO * magnitude * of_moment]
         return np.concatenate(out, axis=3)

@@ -1,4 +1,4 @@
-"""Hypotheses at the start of a window: known vehicles and new ones."""
+"""Hypotheses at the start of a window: known and new vehicles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from mag_tracking.geometry import overlap
 from mag_tracking.stages.track.bank_filter import BankFilter
 
 WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 1.0
-"""[m] Two vehicles overlap if their lateral distance is less than the first value; the sum of their
-lengths exceeds that of their rows by the second; the third is the uncertainty of their paths."""
+"""[m] Lateral distance below which two vehicles overlap, minimum longitudinal gap between their
+rows of dipoles, and standard deviation of the overlap depth due to uncertain paths."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class PathHypothesis:
     x: FloatArray
     """(n_x,) State at the start of the window."""
     P: FloatArray
-    """(n_x, n_x)"""
+    """(n_x, n_x) Covariance at the start of the window."""
     path: FloatArray
     """(n, n_x) States at the frames of the window."""
     label: tuple[int, ...]
@@ -32,7 +32,7 @@ class PathHypothesis:
 
 @dataclass(frozen=True)
 class WindowStart(PathHypothesis):
-    """Known vehicles and new ones."""
+    """Hypothesis of known and new vehicles."""
 
     n_new: int
     """Number of new vehicles, which are the last ones."""
@@ -47,10 +47,10 @@ class WindowStart(PathHypothesis):
 
 @dataclass(frozen=True)
 class KnownVehicles(PathHypothesis):
-    """Known vehicles beside which others are searched."""
+    """Hypothesis of the known vehicles in a search for others."""
 
     filter: BankFilter | None
-    """Filter for this number of vehicles; None if there are none."""
+    """Filter for this number of vehicles; None if no vehicle is known."""
 
 
 def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
@@ -88,12 +88,12 @@ def in_order_of(first: FloatArray, pair: FloatArray) -> FloatArray:
     -------
     (2, 7) array
     """
-    away = np.linalg.norm(pair[:, None, :2] - first[:, :2], axis=2)
-    return pair if away[0, 0] + away[1, 1] <= away[0, 1] + away[1, 0] else pair[::-1].copy()
+    d = np.linalg.norm(pair[:, None, :2] - first[:, :2], axis=2)
+    return pair if d[0, 0] + d[1, 1] <= d[0, 1] + d[1, 0] else pair[::-1].copy()
 
 
 def labels_of(labels: Sequence[tuple[int, ...]]) -> IntArray:
-    """Labels in the form that a `FilterBank` needs.
+    """Labels in the shape required by `FilterBank`.
 
     Parameters
     ----------
@@ -128,8 +128,8 @@ def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length: int | No
     depth = 0.0
     for i in range(n_targets):
         for k in range(i):
-            need = OVERHANG + (0.0 if length is None else
-                               0.5 * (np.abs(x[:, i, length]) + np.abs(x[:, k, length])))
+            gap = OVERHANG + (0.0 if length is None else
+                              0.5 * (np.abs(x[:, i, length]) + np.abs(x[:, k, length])))
             pair = x[:, [i, k]].swapaxes(0, 1)
-            depth = max(depth, float(overlap(pair[:, :, :2], pair[:, :, 3:5], need, WIDTH).max()))
+            depth = max(depth, float(overlap(pair[:, :, :2], pair[:, :, 3:5], gap, WIDTH).max()))
     return depth

@@ -1,4 +1,4 @@
-"""Approach check: whether a field grows like that of a target that comes from afar."""
+"""Approach test: fields that grow like the field of a target from afar, and other fields."""
 
 import numpy as np
 import pytest
@@ -13,48 +13,49 @@ STD = 1e-8
 
 
 def frames(sizes):
-    """Frames of one sensor with fields of these sizes, in standard deviations of an axis."""
+    """Frames of one sensor with fields of these magnitudes, in standard deviations of an axis."""
     for k, size in enumerate(sizes):
         field = np.array([[size, 0.0, 0.0]]) * STD * np.sqrt(3.0)
         yield FieldFrame(k, field, np.eye(3)[None] * STD**2, np.ones(1, dtype=np.int64),
                          np.zeros(1))
 
 
-def doubted_frames(sizes):
+def approach_flags(sizes):
     approach = Approach()
     return [approach.add(frame) for frame in frames(sizes)]
 
 
 def test_a_field_that_grows_with_the_inverse_cube_of_distance_is_accepted():
-    """At all speeds at which it takes two frames or more from the threshold to ten times that."""
+    """At any speed at which the field takes at least two frames to grow tenfold."""
     for step in (0.02, 0.05, 0.1, 0.2):
         distance = np.arange(2.0, 0.2, -step)
-        assert not any(doubted_frames(SENSED_LEVEL * GROWTH_RATIO * (0.4 / distance)**3))
+        assert not any(approach_flags(SENSED_LEVEL * GROWTH_RATIO * (0.4 / distance)**3))
 
 
 @pytest.mark.parametrize('sizes', [
     2.0 * GROWTH_RATIO * SENSED_LEVEL * np.linspace(0.0, 1.0, 30)**2,
     np.concatenate([np.full(10, 0.5), np.linspace(0.5, 40.0, 30)])])
-def test_a_field_that_grows_differently_is_doubted_once(sizes):
-    """Of a target that starts beside a sensor; a linear growth, as of a current or temperature."""
-    assert sum(doubted_frames(sizes)) == 1
+def test_a_field_that_grows_differently_is_flagged_once(sizes):
+    """One field is of a target that starts next to a sensor. The other grows linearly, as with a
+    current or temperature."""
+    assert sum(approach_flags(sizes)) == 1
 
 
 def test_a_sudden_jump_and_an_intermediate_drop_are_accepted():
     jump = np.where(np.arange(30) < 12, 0.5, 30.0 * SENSED_LEVEL)
     rises = 2.0 * GROWTH_RATIO * SENSED_LEVEL * np.linspace(0.0, 1.0, 30)**2
     falls = np.where(np.arange(30) == 15, 0.5 * rises, rises)
-    assert not any(doubted_frames(jump)) and not any(doubted_frames(falls))
+    assert not any(approach_flags(jump)) and not any(approach_flags(falls))
 
 
 def test_a_field_that_starts_large_or_stays_small_is_accepted():
-    assert not any(doubted_frames(np.linspace(2.0 * SENSED_LEVEL, 30.0 * SENSED_LEVEL, 20)))
-    assert not any(doubted_frames(np.full(20, 2.0 * SENSED_LEVEL)))
+    assert not any(approach_flags(np.linspace(2.0 * SENSED_LEVEL, 30.0 * SENSED_LEVEL, 20)))
+    assert not any(approach_flags(np.full(20, 2.0 * SENSED_LEVEL)))
 
 
 @pytest.mark.parametrize('name, is_expected', [('there at the start, leaves', True),
                                                ('a car', False)])
-def test_a_car_that_leaves_its_place_is_doubted_and_a_passing_car_is_not(name, is_expected):
+def test_a_car_that_leaves_its_place_is_flagged_and_a_passing_car_is_not(name, is_expected):
     world = made(name, 'clouds', 0)
     pipeline = Pipeline(world.network, settings_for('vehicle'))
     poses = [r for r in pipeline.feed(world.readings) + pipeline.flush() if isinstance(r, Track)]

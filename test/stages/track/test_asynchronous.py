@@ -1,4 +1,4 @@
-"""Sensors that are read at different times: each measures the target at its own time."""
+"""Asynchronous sensors: each sensor measures the target at its own sampling time."""
 
 from dataclasses import replace
 
@@ -44,7 +44,8 @@ def test_derivatives_match_finite_differences_at_the_times_of_the_sensors(target
 
 
 def slow_passes(compensated):
-    """(mean NEES, RMS [m]) of fast passes by two sensors of 12.5 Hz, read 40 ms apart."""
+    """(mean NEES, RMS error [m]) of fast passes by two sensors that are sampled at 12.5 Hz, 40 ms
+    apart."""
     network = line_network(2)
     nees, squares = [], []
     for seed in range(6):
@@ -113,14 +114,16 @@ def errors_of(network, frames, truth):
 
 
 def test_poses_of_a_rotating_magnet_are_accurate_and_consistent():
-    """Six degrees per frame; a first-order rotation lengthened the moment in every frame."""
+    """The magnet rotates by six degrees per frame. A first-order rotation would increase the moment
+    in every frame."""
     error, nees = errors_of(*rotating_magnet(np.zeros(9)))
     assert error.max() < 0.5e-3
     assert nees.max() < 3.0
 
 
-def test_a_magnet_above_sensors_that_are_read_in_turn_is_tracked():
-    """One sensor every 30 ms; per round, the magnet moves by 6 mm and rotates by 6 degrees."""
+def test_a_magnet_above_sensors_that_are_read_sequentially_is_tracked():
+    """A sensor is read every 30 ms. In a frame of nine readings the magnet moves by 6 mm and
+    rotates by 6 degrees."""
     network, frames, truth = rotating_magnet(0.03 * (np.arange(9) - 4))
     error, nees = errors_of(network, frames, truth)
     without_offsets, _ = errors_of(
@@ -139,7 +142,7 @@ def test_a_magnet_above_sensors_that_are_read_in_turn_is_tracked():
 
 @pytest.mark.parametrize('gap_s', [2.0, 5.0, 15.0])
 def test_a_magnet_is_found_again_after_a_long_gap(gap_s):
-    """Wrong poses are ambiguous; after three frames the track is right again."""
+    """Wrong poses are ambiguous. After three frames the track is correct again."""
     network, frames, truth = rotating_magnet(np.zeros(9), n=40 + round(gap_s / 0.1), dt=0.1)
     keep = np.r_[0:20, -20:0]
     frames, truth = [frames[k] for k in keep], truth[keep]
@@ -155,8 +158,8 @@ def test_a_magnet_is_found_again_after_a_long_gap(gap_s):
     assert stage.counts['frames'] == 40
 
 
-def contradicted(manager, sizes):
-    """`Track`s of a steady field, then of random fields of these sizes [T]."""
+def tracks_with_contradiction(manager, sizes):
+    """`Track`s of a constant field, followed by random fields of these RMS values [T]."""
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
     rng = np.random.default_rng(1)
     records = []
@@ -170,7 +173,7 @@ def contradicted(manager, sizes):
 
 def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_restarted():
     stage = TrackManager(line_network(2), settings_for('vehicle').track)
-    tracks = contradicted(stage, [1e-4] * 10 + [1.9e-4] * 10)
+    tracks = tracks_with_contradiction(stage, [1e-4] * 10 + [1.9e-4] * 10)
     assert stage.counts['tracks ended: target lost'] == 1
     assert tracks[-1].ended and tracks[-2].ambiguous
     assert stage.counts['tracks'] == 1 and stage.bank is None
@@ -178,10 +181,10 @@ def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_restarted():
 
 @pytest.mark.parametrize('lookback_s', [1.0, 0.0])
 def test_twice_the_field_of_a_lost_vehicle_starts_an_ambiguous_track(lookback_s):
-    """In the tail of a pass the field only falls, so twice the field is another target."""
+    """In the tail of a pass the field only decreases, so twice the field is another target."""
     stage = TrackManager(line_network(2), settings_for(
         'vehicle', {'track.lookback_s': lookback_s}).track)
-    tracks = contradicted(stage, [1e-4] * 19 + [2.1e-4])
+    tracks = tracks_with_contradiction(stage, [1e-4] * 19 + [2.1e-4])
     assert stage.counts['tracks'] == 2
-    assert stage.counts['tracks started in a larger field than that of a lost track'] == 1
+    assert stage.counts['tracks started in the tail of a lost track, in a larger field'] == 1
     assert tracks[-1].id == 2 and tracks[-1].ambiguous

@@ -1,4 +1,4 @@
-"""Bank size: settings whose hypotheses would fill the memory are refused before a track starts."""
+"""Bank size: settings that exceed the memory limits are rejected before a track starts."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from support.networks import line_network
     ('vehicle', {'track.vehicle.arrival_names': [str(k) for k in range(3000)],
                  'track.vehicle.arrival_headings_deg': [0.1 * k for k in range(3000)]},
      'arrival_names (3000)')])
-def test_too_many_hypotheses_are_refused_with_their_number(target, changes, product):
+def test_too_many_hypotheses_are_rejected_with_their_number(target, changes, product):
     with pytest.raises(SettingsError) as error:
         Pipeline(line_network(2), settings_for(target, changes))
     assert str(error.value).startswith(f'track.{target}: ') and product in str(error.value)
@@ -35,7 +35,7 @@ def test_too_many_hypotheses_are_refused_with_their_number(target, changes, prod
      'the limit is 4.29 GB'),
     ({'starts': 1000},
      'track.magnet: 1000 starting hypotheses, starts (1000), with 822 states each for 90 sensors')])
-def test_too_many_hypotheses_of_a_magnet_are_refused(changes, message):
+def test_too_many_hypotheses_of_a_magnet_are_rejected(changes, message):
     changes = {f'track.magnet.{name}': value for name, value in changes.items()}
     settings = settings_for('magnet', {'track.mounting_std_deg': 5.0, 'track.max_sensors': 90,
                                        'track.model_error_time_s': 0.3, **changes})
@@ -46,7 +46,8 @@ def test_too_many_hypotheses_of_a_magnet_are_refused(changes, message):
 
 
 def bytes_at_start(n, settings):
-    """Size of the covariances of all hypotheses of a vehicle that starts with `n` sensors."""
+    """Memory [bytes] of the covariances of all hypotheses of a vehicle that starts with `n`
+    sensors."""
     network = line_network(n)
     target = target_of(settings, network)
     frame = FieldFrame(0, np.full((n, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], n, axis=0),
@@ -90,7 +91,7 @@ def test_a_magnet_starts_with_max_sensors():
 
 
 @pytest.mark.parametrize('n', [2, 16, 32, 90])
-def test_the_number_of_kept_hypotheses_is_limited_by_memory(n):
+def test_the_number_of_retained_hypotheses_is_limited_by_memory(n):
     settings, network = settings_for('vehicle').track, line_network(2)
     observation = BankFilter(network, target_of(settings, network).model, settings).observation
     kept, each = bank_size.max_hypotheses(observation, n), 8 * observation.n_states(n)**2
@@ -98,7 +99,7 @@ def test_the_number_of_kept_hypotheses_is_limited_by_memory(n):
             else kept * each <= bank_size.WIDER_BYTES < (kept + 1) * each)
 
 
-def test_more_sensors_than_fit_into_memory_are_refused():
+def test_more_sensors_than_fit_into_memory_are_rejected():
     changes = {'track.max_sensors': 1000}
     Pipeline(line_network(90), settings_for('vehicle', changes))
     with pytest.raises(SettingsError, match=r'track.max_sensors: 100 hypotheses with the '

@@ -1,4 +1,4 @@
-"""Clock comparison: offsets of clocks, estimated over several passes."""
+"""Clock comparison: clock offsets estimated from several passes."""
 
 import numpy as np
 import pytest
@@ -9,8 +9,8 @@ from mag_tracking.stages.track.rigid_pass import RigidPass
 FIRST_TWO = np.arange(2)
 
 
-def a_pass(offset, std=0.02, speed=15.0, misfit=1.0, reference=0, bent=100.0):
-    """Pass of one sensor more than `offset` has values."""
+def rigid_pass_of(offset, std=0.02, speed=15.0, misfit=1.0, reference=0, bent=100.0):
+    """`RigidPass` with these clock offsets relative to the sensor `reference`."""
     offsets = np.insert(np.atleast_1d(offset).astype(float), reference, 0.0)
     stds = np.where(np.arange(len(offsets)) == reference, 0.0, std)
     return RigidPass(0, 100.0, bent, 100.0 * misfit, 100, 1.0, reference, offsets, stds,
@@ -24,25 +24,26 @@ def comparison_of(passes, rows=FIRST_TWO, n_sensors=2):
     return clocks
 
 
-def test_passes_that_agree_name_the_clock_that_is_ahead():
-    clocks = comparison_of([a_pass(0.1)] * 4)
+def test_consistent_passes_identify_the_clock_that_is_ahead():
+    clocks = comparison_of([rigid_pass_of(0.1)] * 4)
     assert (clocks.apart.sensor, clocks.apart.against, clocks.apart.n_passes) == (1, 0, 4)
     assert clocks.apart.offset_s == pytest.approx(0.1, rel=1e-6)
     assert clocks.apart_s(FIRST_TWO) == pytest.approx(0.1, rel=1e-6)
     text = clocks.apart.text(('left', 'right'))
-    assert 'right is 100 ms ahead of that of left' in text and '4 passes' in text
+    assert 'right is 100 ms ahead of the clock of left' in text and '4 passes' in text
     assert 'increase clock_offset of right by 0.100 s' in text
     # With the other sensor as the reference.
-    assert comparison_of([a_pass(-0.1, reference=1)] * 4).apart.sensor == 1
+    assert comparison_of([rigid_pass_of(-0.1, reference=1)] * 4).apart.sensor == 1
 
 
-@pytest.mark.parametrize('offset, message', [(-0.2, 'behind those of the others'),
-                                             (0.2, 'ahead of those of the others')])
-def test_the_deviating_one_of_several_clocks_is_named(offset, message):
-    """With each of the sensors as the reference."""
+@pytest.mark.parametrize('offset, message', [(-0.2, 'behind the other clocks'),
+                                             (0.2, 'ahead of the other clocks')])
+def test_the_wrong_clock_of_several_is_identified(offset, message):
+    """Each sensor is the reference once."""
     for reference in range(4):
         true = np.array([0.0, 0.0, offset, 0.0])
-        rigid_pass = a_pass(np.delete(true - true[reference], reference), reference=reference)
+        rigid_pass = rigid_pass_of(np.delete(true - true[reference], reference),
+                                   reference=reference)
         clocks = comparison_of([rigid_pass] * 3, np.arange(4), 4)
         assert clocks.apart.sensor == 2 and clocks.apart.against is None
         assert clocks.apart.offset_s == pytest.approx(offset, abs=0.01)
@@ -50,61 +51,64 @@ def test_the_deviating_one_of_several_clocks_is_named(offset, message):
         assert clocks.apart_s(np.arange(4)) == pytest.approx(0.2, abs=0.01)
 
 
-def test_offsets_within_their_standard_deviations_name_no_clock():
-    """At 60 m/s each offset is harmful; four standard deviations are rare."""
+def test_offsets_within_their_standard_deviations_identify_no_clock():
+    """At 60 m/s every offset is harmful, but offsets of four standard deviations are rare."""
     rng = np.random.default_rng(1)
     std = float(np.hypot(0.05, 0.5 / 60.0))
-    named = sum(comparison_of([a_pass(std * rng.standard_normal(), std=0.05, speed=60.0)
+    named = sum(comparison_of([rigid_pass_of(std * rng.standard_normal(), std=0.05, speed=60.0)
                                for _ in range(4)]).apart is not None for _ in range(300))
     assert named <= 1
-    # Offsets of four times that size do name a clock.
-    assert sum(comparison_of([a_pass(4.0 * std * rng.standard_normal(), std=0.05, speed=60.0)
+    # Offsets four times as large do name a clock.
+    assert sum(comparison_of([rigid_pass_of(4.0 * std * rng.standard_normal(), std=0.05, speed=60.0)
                               for _ in range(4)]).apart is not None for _ in range(100)) > 10
 
 
-def test_a_single_pass_names_a_clock_but_does_not_doubt_later_tracks():
-    clocks = comparison_of([a_pass(0.3)])
+def test_a_single_pass_identifies_a_clock_but_does_not_flag_later_tracks():
+    clocks = comparison_of([rigid_pass_of(0.3)])
     assert clocks.apart is not None and clocks.apart_s(FIRST_TWO) == 0.0
     assert 'one pass' in clocks.apart.text(('left', 'right'))
 
 
 def test_passes_of_other_sensors_do_not_count_for_a_clock():
-    """Ten passes of the first two sensors, and one or two of the next two, whose clocks differ."""
-    clocks = comparison_of([a_pass(0.0)] * 10, FIRST_TWO, 4)
-    clocks.add(a_pass(0.3), np.array([2, 3]))
+    """There are ten passes of the first two sensors, and one or two passes of the next two, whose
+    clocks differ."""
+    clocks = comparison_of([rigid_pass_of(0.0)] * 10, FIRST_TWO, 4)
+    clocks.add(rigid_pass_of(0.3), np.array([2, 3]))
     assert clocks.apart_s(np.arange(4)) == 0.0
-    clocks.add(a_pass(0.3), np.array([2, 3]))
+    clocks.add(rigid_pass_of(0.3), np.array([2, 3]))
     assert clocks.apart_s(np.arange(4)) > 0.2
     assert clocks.apart_s(FIRST_TWO) == 0.0
 
 
 def test_an_offset_that_moves_a_target_by_less_than_a_metre_is_ignored():
-    assert comparison_of([a_pass(0.05)] * 100).apart is None
-    assert comparison_of([a_pass(0.05, speed=30.0)] * 100).apart is not None
-    # It does not hide a larger one of another sensor.
-    assert comparison_of([a_pass([0.05, 0.2])] * 100, np.arange(3), 3).apart.sensor == 2
+    assert comparison_of([rigid_pass_of(0.05)] * 100).apart is None
+    assert comparison_of([rigid_pass_of(0.05, speed=30.0)] * 100).apart is not None
+    # A small offset does not hide a larger offset of another sensor.
+    assert comparison_of([rigid_pass_of([0.05, 0.2])] * 100, np.arange(3), 3).apart.sensor == 2
 
 
 @pytest.mark.parametrize('changes', [{'misfit': 2.0}, {'bent': 10.0}, {'speed': 1.0},
                                      {'offset': 1.9}])
-def test_a_bent_slow_or_unexplained_pass_names_no_clock(changes):
-    assert comparison_of([a_pass(**{'offset': 0.45, 'std': 0.01, **changes})] * 5).apart is None
+def test_a_bent_slow_or_unexplained_pass_identifies_no_clock(changes):
+    assert comparison_of([rigid_pass_of(**{'offset': 0.45, 'std': 0.01, **changes})] * 5
+                         ).apart is None
 
 
 def test_corrected_clocks_are_accepted_after_some_passes():
-    clocks = comparison_of([a_pass(0.2)] * 50)
+    clocks = comparison_of([rigid_pass_of(0.2)] * 50)
     n = 0
     while clocks.apart is not None:
-        clocks.add(a_pass(0.0), FIRST_TWO)
+        clocks.add(rigid_pass_of(0.0), FIRST_TWO)
         n += 1
     print(f'{n} passes after the clocks were corrected')
     assert n < MEMORY_PASSES // 2
 
 
 def test_clocks_of_sensors_without_a_common_pass_are_compared():
-    """Passes of the first and second, and of the second and third sensor; the third is ahead."""
+    """Some passes compare the first and second sensor, others the second and third. The third clock
+    is ahead."""
     clocks = ClockComparison(3)
     for _ in range(5):
-        clocks.add(a_pass(0.0), np.array([0, 1]))
-        clocks.add(a_pass(0.2), np.array([1, 2]))
+        clocks.add(rigid_pass_of(0.0), np.array([0, 1]))
+        clocks.add(rigid_pass_of(0.2), np.array([1, 2]))
     assert clocks.apart.sensor == 2

@@ -1,4 +1,4 @@
-"""Compiled filters: comparison with NumPy step by step, and refused arguments."""
+"""Compiled filters: step-by-step comparison with NumPy, and rejected arguments."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ from support.plain_filter import PlainFilter
 
 SIGMA = 4e-9
 N_LARGE = 23
-"""With this number of sensors, updates of every case change only half of the covariance
+"""Number of sensors at which the updates of every case process only half of the covariance
 (`HALVED_FROM`)."""
 N_TARGETS = {'two rows that turn': 2, 'three points': 3}
 """{case: number of vehicles that share a state}."""
@@ -62,7 +62,7 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
                      (n_hyp, n_targets) if n_targets > 1 else n_hyp)
         if target == 'vehicle' else None)
     if settings.vehicle.turn_acceleration and target == 'vehicle':
-        # Half of the hypotheses go straight.
+        # Half of the hypotheses do not turn.
         for w in np.flatnonzero(np.isin(names, 'w')):
             bank.x[::2, w] = 0.0
             bank.P[::2, w] = bank.P[::2, :, w] = 0.0
@@ -81,7 +81,7 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
 
 
 def assert_same(a, b, tolerance=1e-9):
-    """Compare states and covariances of two banks, in standard deviations of the second one."""
+    """Compare states and covariances of two banks, in standard deviations of the second bank."""
     std = np.sqrt(np.einsum('pii->pi', b.P))
     std = np.where(std > 0.0, std, 1.0)
     assert np.abs((a.x - b.x) / std).max() <= tolerance
@@ -91,7 +91,7 @@ def assert_same(a, b, tolerance=1e-9):
 @pytest.mark.parametrize('n_sensors', [3, N_LARGE])
 @pytest.mark.parametrize('name', CASES)
 def test_a_bank_advanced_through_frames_matches_numpy(name, n_sensors):
-    """Some axes and a sensor are missing, and sensors are read at different times."""
+    """Some axes and one sensor are missing, and the sensors have different sampling times."""
     compiled, plain, bank, frames, intervals = case(name, n_sensors)
     other = bank.copy()
     for filter_, b in ((compiled, bank), (plain, other)):
@@ -151,7 +151,7 @@ def test_a_hypothesis_at_a_sensor_is_ruled_out_and_the_others_are_not():
     np.zeros((3, 3)), np.diag([-1.0, 1.0, 1.0]),
     [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
     [[1.0, 0.0, 2.0], [0.0, 1.0, 0.0], [2.0, 0.0, 1.0]]])
-def test_noise_that_is_not_positive_definite_is_refused(bad):
+def test_noise_that_is_not_positive_definite_is_rejected(bad):
     compiled, _, bank, frames, intervals = case('point')
     x, paths = bank.x.copy(), np.repeat(bank.x[:, None], 7, axis=1)
     frames[0].covariance[1] = SIGMA**2 * np.array(bad)
@@ -163,13 +163,13 @@ def test_noise_that_is_not_positive_definite_is_refused(bad):
     np.testing.assert_array_equal(bank.x, x)
 
 
-@pytest.mark.parametrize('spoil, error', [
+@pytest.mark.parametrize('corrupt, error', [
     (lambda b: setattr(b, 'x', b.x[:, :-1].copy()), 'x: shape does not match'),
     (lambda b: setattr(b, 'P', b.P[:, :-1].copy()), 'P: shape does not match'),
     (lambda b: setattr(b, 'P', b.P[:-1].copy()), 'P: shape does not match')])
-def test_arrays_of_wrong_sizes_are_refused(spoil, error):
+def test_arrays_of_wrong_shapes_are_rejected(corrupt, error):
     compiled, _, bank, frames, _ = case('point')
-    spoil(bank)
+    corrupt(bank)
     with pytest.raises(ValueError, match=error):
         compiled.advance(bank, frames[0], 0.0)
 
@@ -190,7 +190,7 @@ def test_a_bank_is_advanced_in_place_unless_its_prior_is_kept(name):
     np.testing.assert_array_equal(kept_P, before.P)
 
 
-def test_output_arrays_that_would_be_copied_are_refused():
+def test_output_arrays_that_would_be_copied_are_rejected():
     """The results would be written to the copy and lost."""
     compiled, _, bank, frames, intervals = case('point')
     paths = np.repeat(bank.x[:, None], 7, axis=1)
@@ -239,7 +239,7 @@ def test_the_number_of_vehicles_that_share_a_state_is_bounded():
 
 
 def test_two_vehicles_without_common_sensors_are_filtered_independently():
-    """Each passes its own sensors, far from those of the other."""
+    """Each vehicle passes its own sensors, far from the sensors of the other vehicle."""
     settings = settings_for('vehicle', {**POINT, 'track.background_std': 1e-8}).track
     near, rng = line_network(2), np.random.default_rng(1)
     far = dataclasses.replace(line_network(2), positions=near.positions + [5e4, 0.0, 0.0],
@@ -254,7 +254,7 @@ def test_two_vehicles_without_common_sensors_are_filtered_independently():
             network, model, settings).observation.own_covariance).alone(3)
         for network in (near, far)]
     filters = [BankFilter(network, model, settings) for network in (near, far)]
-    together = joined(*banks, len(model.state_names))
+    together = joint_bank(*banks, len(model.state_names))
     joint = BankFilter(both, model, settings, 2)
     for k in range(6):
         field = 3e-8 * rng.standard_normal((4, 3))
@@ -273,7 +273,7 @@ def test_two_vehicles_without_common_sensors_are_filtered_independently():
                           / np.outer(std, std)).max() <= 1e-9
 
 
-def joined(a, b, n_t):
+def joint_bank(a, b, n_t):
     """Bank of one hypothesis with the targets and sensors of two banks."""
     n_own = (a.x.shape[1] - n_t) // 2 - 3
     places = [(bank, np.arange(n_t), i * n_t + np.arange(n_t)) for i, bank in enumerate((a, b))]
@@ -300,7 +300,7 @@ ROW = (1, [1.0] * 3, [1.0] * 3, 0.1, 0.1, 0.0, 1.0, 1.0)
     (0, 0, 0, ROW, 'n_states'), (0, 0, 9, (0, *ROW[1:]), 'n_states'),
     (0, 0, 9, (50, *ROW[1:]), 'n_states'),
     (0, 0, 9 + 3 * 90 + 1, (90, *ROW[1:]), 'more states')])
-def test_a_filter_with_an_invalid_state_is_refused(n_angles, n_errors, n_states, row, error):
+def test_a_filter_with_an_invalid_state_is_rejected(n_angles, n_errors, n_states, row, error):
     with pytest.raises(ValueError, match=error):
         core.RowVehicleFilter(np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), n_angles, n_errors,
                               n_states, *row)

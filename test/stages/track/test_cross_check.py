@@ -1,4 +1,4 @@
-"""Cross-check of a track with a fit to the whole pass: when it runs, doubts and differences."""
+"""Cross-check of a track with fits to the whole pass: schedule, doubts and differences."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ from support.steady_frames import ROAD, STRAIGHT, state_at, steady_frames
 FAST = np.where(np.arange(10) == 3, 60.0, STRAIGHT)
 
 
-def checked(check, frames, path=STRAIGHT):
+def run_check(check, frames, path=STRAIGHT):
     """[(time [s], doubts, number of fits so far)] after each frame."""
     out, n, latest = [], 0, None
     for frame in frames:
@@ -34,7 +34,7 @@ def checked(check, frames, path=STRAIGHT):
 
 
 def test_fits_follow_the_cpa_at_increasing_intervals():
-    rows = checked(CrossCheck(ROAD), steady_frames(np.random.default_rng(1)))
+    rows = run_check(CrossCheck(ROAD), steady_frames(np.random.default_rng(1)))
     times = [t for (t, _, n), (_, _, before) in zip(rows[1:], rows[:-1], strict=True) if n > before]
     print(f'fits at {times} s')
     assert min(times) > 0.0 and 2 <= len(times) <= 6
@@ -46,15 +46,15 @@ def test_fits_follow_the_cpa_at_increasing_intervals():
     ({'clocks': (0.3,)}, STRAIGHT, doubts.CLOCKS_APART),
     ({'path': FAST}, FAST, doubts.FRAMES_TOO_LONG),
     ({'change': lambda B: np.clip(B, -3e-7, 3e-7)}, STRAIGHT, doubts.NO_STEADY_PATH)])
-def test_faults_found_in_the_whole_pass_doubt_the_track(of_frames, path, expected):
-    """The doubt begins when the vehicle has passed, and is permanent."""
+def test_faults_found_in_the_whole_pass_flag_the_track(of_frames, path, expected):
+    """The doubt begins after the vehicle has passed, and is permanent."""
     check = CrossCheck(ROAD)
-    rows = checked(check, steady_frames(np.random.default_rng(2), **of_frames), path)
+    rows = run_check(check, steady_frames(np.random.default_rng(2), **of_frames), path)
     assert not rows[15][1]
     assert all(expected in found for _, found, _ in rows[-8:]) and check.is_doubtful
 
 
-def test_clock_offsets_of_earlier_passes_doubt_a_track_from_its_first_frame():
+def test_clock_offsets_of_earlier_passes_flag_a_track_from_its_first_frame():
     check = CrossCheck(ROAD)
     frame = steady_frames(np.random.default_rng(3))[0]
     check.add(frame, state_at(frame.stamp_ns / 1e9))
@@ -65,14 +65,14 @@ def test_clock_offsets_of_earlier_passes_doubt_a_track_from_its_first_frame():
 
 def test_the_end_of_a_track_updates_the_clock_comparison():
     clocks, check = ClockComparison(2), CrossCheck(ROAD)
-    checked(check, steady_frames(np.random.default_rng(4), clocks=(0.3,)))
+    run_check(check, steady_frames(np.random.default_rng(4), clocks=(0.3,)))
     for _ in range(2):
         check.conclude(clocks, np.arange(2))
     assert clocks.apart.sensor == 1
     assert clocks.apart_s(np.arange(2)) == pytest.approx(0.3, abs=0.05)
 
 
-def test_no_frames_give_no_doubts():
+def test_a_check_without_frames_has_no_doubts():
     check = CrossCheck(ROAD)
     assert check.doubts(1.0) == set()
     clocks = ClockComparison(2)
@@ -93,7 +93,7 @@ def test_a_long_track_is_checked_at_its_cpa():
 
 
 def test_a_fit_stays_valid_if_later_frames_allow_none():
-    """One of two sensors falls silent."""
+    """One of two sensors stops measuring."""
     check = CrossCheck(ROAD)
     frames = steady_frames(np.random.default_rng(7), clocks=(0.3,), until_s=6.0)
     for frame in frames:
@@ -116,11 +116,11 @@ def test_the_cross_check_can_be_disabled():
         records, pipeline = tracks_of(world.readings, world.network,
                                       **{'track.cross_check': on})
         assert any(doubts.CLOCKS_APART in t.doubts for t in records if isinstance(t, Track)) is on
-        # Smoothed poses are doubted for the whole track.
+        # The smoothed poses of the whole track are ambiguous.
         assert all(t.ambiguous for t in records if isinstance(t, SmoothedPose)) is on
 
 
-def test_the_third_car_past_a_wrong_clock_is_doubted_from_its_first_pose():
+def test_the_third_car_past_a_wrong_clock_is_flagged_from_its_first_pose():
     rng = np.random.default_rng(5)
     world = ambient_world(rng, 'clouds', None, 75.0, cars=3)
     readings = spoiler.apply(world.readings, spoiler.delayed('mag_2', 0.25))
@@ -137,8 +137,8 @@ def test_the_third_car_past_a_wrong_clock_is_doubted_from_its_first_pose():
     assert pipeline.track.clocks_apart == ''
 
 
-def test_a_track_differs_by_its_distance_from_the_fitted_path():
-    """After the pass the difference stays that at its end."""
+def test_the_difference_of_a_track_is_its_distance_from_the_fitted_path():
+    """After the pass the difference stays constant."""
     check = CrossCheck(ROAD)
     slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
     away, states = [], []
@@ -147,12 +147,12 @@ def test_a_track_differs_by_its_distance_from_the_fitted_path():
         check.add(frame, state_at(t, slow if t > 0.0 else STRAIGHT))
         found = check.doubts(0.0)
         away.append(np.hypot(*check.difference[:2]))
-        # A difference larger than the length of a long vehicle is another place.
+        # A difference larger than the length of a long vehicle means another position.
         assert found == ({doubts.ANOTHER_PLACE} if away[-1] > 8.0 else set())
         if check.latest is None:
             assert away[-1] == 0.0
         elif t < 3.0:
-            # A long row explains the pass at another speed as well; the nearer path counts.
+            # A long row also explains the pass at another speed; the nearer path is used.
             assert 3.0 * t - 1.0 < away[-1] < 6.0 * t + 1.0
         states.append((frame.stamp_ns, state_at(t), np.eye(6)))
     assert away[-1] == away[-20] > 15.0 and check.is_doubtful
@@ -161,13 +161,13 @@ def test_a_track_differs_by_its_distance_from_the_fitted_path():
     assert all(np.hypot(*d[:2]) < 2.0 for d in check.differences(states))
     of_far = [np.hypot(*d[:2]) for d in check.differences(far)]
     assert len(of_far) == len(states) and of_far[0] > 5.0 and of_far[-1] == of_far[-20] > 15.0
-    # If the fit covers none of the states, they have the difference of the filter.
+    # If the fit covers none of the states, the difference of the filter is used.
     assert check.differences(far[-3:]) == [check.difference] * 3
 
 
-def test_smoothed_states_before_the_fitted_pass_differ_as_at_its_start():
+def test_smoothed_states_before_the_fitted_pass_have_the_difference_of_its_start():
     check = CrossCheck(ROAD)
-    checked(check, steady_frames(np.random.default_rng(9)))
+    run_check(check, steady_frames(np.random.default_rng(9)))
     slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
     states = [(round(t * 1e9), state_at(t, slow), np.eye(6)) for t in (-6.0, -4.5, -3.9, -3.0)]
     first, second, third, fourth = check.differences(states)
@@ -175,7 +175,7 @@ def test_smoothed_states_before_the_fitted_pass_differ_as_at_its_start():
 
 
 def test_a_fit_keeps_the_time_of_its_own_peak():
-    """Two further sensors sense the vehicle later and more strongly."""
+    """Two further sensors measure a stronger field later."""
     network = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0], [12.0, -3.5, 0.0], [12.0, 3.5, 0.0]])
     path = np.where(np.arange(10) == 3, 8.0, np.where(np.arange(10) == 4, 0.0, STRAIGHT))
     check, away, peaks = CrossCheck(network), [], set()
@@ -190,15 +190,15 @@ def test_a_fit_keeps_the_time_of_its_own_peak():
     assert len(peaks) > 1 and max(away) < 1.5
 
 
-def test_a_pass_that_begins_at_its_peak_gives_no_difference():
+def test_a_pass_that_begins_at_its_peak_has_no_difference():
     check = CrossCheck(ROAD)
     late = [f for f in steady_frames(np.random.default_rng(2), until_s=3.0) if f.stamp_ns > 3e8]
-    assert not any(found for _, found, _ in checked(check, late))
+    assert not any(found for _, found, _ in run_check(check, late))
     assert len(check.latest.straight_paths) and not check.difference.any()
 
 
 def test_the_difference_is_included_in_published_covariances(monkeypatch):
-    """Every path is patched to differ by five metres along x."""
+    """The difference of every path is patched to five metres along x."""
     away = np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     monkeypatch.setattr(RigidPass, 'difference', lambda *_: away)
     world = made('a car', 'clouds', 0)
@@ -207,7 +207,7 @@ def test_the_difference_is_included_in_published_covariances(monkeypatch):
         std = np.array([np.sqrt(r.covariance[0, 0]) for r in records if isinstance(r, kind)])
         print(f'{kind.__name__}: {std.round(1)} m')
         assert np.mean(std > 5.0 - 1e-6) >= share
-    # Poses before the pass do not include it.
+    # Poses before the pass do not include the difference.
     assert std.size and min(np.sqrt(r.covariance[0, 0]) for r in records
                             if isinstance(r, Track)) < 2.0
     without, _ = tracks_of(world.readings, world.network, **{'track.cross_check': False})

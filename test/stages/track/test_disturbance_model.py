@@ -1,4 +1,4 @@
-"""Disturbance model: evidence for fields of no target, uniform or at single sensors; handover."""
+"""Disturbance model: evidence for common fields and fields of single sensors, and handovers."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ NOISE = 4e-9
 
 
 def frames(network, fields, dt=0.08, seed=0):
-    """[`FieldFrame`] of fields (n, n_sensors, 3) [T] in the world."""
+    """[`FieldFrame`] of fields (n, n_sensors, 3) [T] in the world frame."""
     rng = np.random.default_rng(seed)
     seen = np.einsum('jik,nji->njk', network.R_ws, fields)
     seen = seen + NOISE * rng.standard_normal(seen.shape)
@@ -23,13 +23,13 @@ def frames(network, fields, dt=0.08, seed=0):
                        np.ones(n, dtype=int), np.zeros(n)) for k, y in enumerate(seen)]
 
 
-def density(model, some, dt=0.08):
-    none = np.zeros(len(some[0].field))
-    return sum(model.log_density(f, dt if k else 0.0, none) or 0.0 for k, f in enumerate(some))
+def total_log_density(model, sequence, dt=0.08):
+    none = np.zeros(len(sequence[0].field))
+    return sum(model.log_density(f, dt if k else 0.0, none) or 0.0 for k, f in enumerate(sequence))
 
 
 def slow_waves(t, network, own):
-    """Fields (n, n_sensors, 3) [T] of slow waves, of each sensor or common to all."""
+    """Fields (n, n_sensors, 3) [T] of slow waves, independent at each sensor or common to all."""
     rng = np.random.default_rng(3)
     size = 2e-7 * rng.standard_normal((len(network), 3))
     if not own:
@@ -44,9 +44,9 @@ def test_a_uniform_field_is_distinguished_from_fields_of_single_sensors(n_sensor
     network = line_network(n_sensors)
     model = DisturbanceModel(network, 2e-8)
     fields = slow_waves(np.arange(0.0, 8.0, 0.08), network, own)
-    # Backgrounds have errors of their stated standard deviation.
+    # The backgrounds have errors of the configured standard deviation.
     offsets = 2e-8 * np.random.default_rng(1).standard_normal((n_sensors, 3))
-    density(model, frames(network, fields - fields[0] + offsets))
+    total_log_density(model, frames(network, fields - fields[0] + offsets))
     assert model.uniform < 1e-3 if own else model.uniform > 0.999
 
 
@@ -57,7 +57,7 @@ def test_a_field_with_a_gradient_over_the_network_counts_as_uniform():
     wave = np.sin(np.arange(0.0, 8.0, 0.08))[:, None, None]
     shape = 2e-7 * np.array([1.0, -0.5, 0.7]) + 6e-9 * away @ G
     model = DisturbanceModel(network, 2e-8)
-    density(model, frames(network, wave * shape))
+    total_log_density(model, frames(network, wave * shape))
     assert model.uniform > 0.999
 
 
@@ -70,29 +70,32 @@ def test_the_evidence_falls_with_the_speed_of_a_passing_dipole():
         passing = dipole_field(network.positions - r[:, None], np.array([200.0, 100.0, -300.0]))
         # The field is zero at the beginning.
         passing -= passing[0]
-        explained.append(density(DisturbanceModel(network, 2e-8), frames(network, passing)[20:-20]))
+        explained.append(total_log_density(DisturbanceModel(network, 2e-8),
+                                           frames(network, passing)[20:-20]))
     assert -np.diff(explained).max() > np.log(20.0)
 
 
 def test_missing_axes_and_sensors_are_ignored():
     network = line_network(2)
-    some = frames(network, slow_waves(np.arange(0.0, 4.0, 0.08), network, True))
+    sequence = frames(network, slow_waves(np.arange(0.0, 4.0, 0.08), network, True))
     without = [dataclasses.replace(f, field=np.where(
-        [[False, False, True], [True, True, True]], np.nan, f.field)) for f in some]
-    of_two_axes = density(DisturbanceModel(network, 2e-8), without)
-    assert np.isfinite(of_two_axes) and of_two_axes < density(DisturbanceModel(network, 2e-8), some)
-    nothing = [dataclasses.replace(f, field=np.full((2, 3), np.nan)) for f in some]
-    assert density(DisturbanceModel(network, 2e-8), nothing) == 0.0
+        [[False, False, True], [True, True, True]], np.nan, f.field)) for f in sequence]
+    of_two_axes = total_log_density(DisturbanceModel(network, 2e-8), without)
+    assert np.isfinite(of_two_axes) and of_two_axes < total_log_density(
+        DisturbanceModel(network, 2e-8), sequence)
+    nothing = [dataclasses.replace(f, field=np.full((2, 3), np.nan)) for f in sequence]
+    assert total_log_density(DisturbanceModel(network, 2e-8), nothing) == 0.0
 
 
 def test_the_first_frame_after_a_handover_is_not_compared():
     network = line_network(2)
     field = 1e-6 + slow_waves(np.arange(0.0, 4.0, 0.08), network, True)
-    some = frames(network, field)
+    sequence = frames(network, field)
     model, none = DisturbanceModel(network, 2e-8, is_handover=True), np.zeros(2)
-    assert model.log_density(some[0], 0.0, none) is None
-    # Afterwards it is as without the jump, except for the cost of an unknown rate of change.
-    rest = sum(model.log_density(f, 0.08, none) for f in some[1:])
+    assert model.log_density(sequence[0], 0.0, none) is None
+    # Afterwards the evidence is as without the jump, except for the cost of an unknown rate of
+    # change.
+    rest = sum(model.log_density(f, 0.08, none) for f in sequence[1:])
     before = DisturbanceModel(network, 2e-8)
     smooth = frames(network, field - 1e-6)
     before.log_density(smooth[0], 0.0, none)
@@ -102,8 +105,10 @@ def test_the_first_frame_after_a_handover_is_not_compared():
 
 @pytest.mark.parametrize('gap_s', [2.0, 20.0, 60.0])
 def test_the_evidence_stays_finite_over_gaps_with_rotated_sensors(gap_s):
-    """Each update mixes all components. Unless one half of a covariance is mirrored, rounding
-    errors grow until it is indefinite."""
+    """Each update mixes all components.
+
+    Unless one half of a covariance is mirrored, rounding errors grow until it is indefinite.
+    """
     network, rng = line_network(4), np.random.default_rng(2)
     R = np.linalg.qr(rng.standard_normal((4, 3, 3)))[0]
     network = dataclasses.replace(

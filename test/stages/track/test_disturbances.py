@@ -1,4 +1,4 @@
-"""Disturbances: fields during tracks that no target explains."""
+"""Disturbances: fields that start a track but that no target explains."""
 
 import dataclasses
 import functools
@@ -17,7 +17,7 @@ from support.track_runs import magnet_frames
 
 
 def outputs(name, simulator='clouds', seed=0, parts=1):
-    """(`Pipeline`, its outputs) of a situation that is fed in `parts` batches."""
+    """(`Pipeline`, its outputs) for a situation whose readings are fed in `parts` batches."""
     world = made(name, simulator, seed)
     pipeline = Pipeline(world.network, settings_for('vehicle'))
     out = []
@@ -35,7 +35,7 @@ def outputs_of(name, simulator='clouds'):
 def test_a_disturbance_is_found_and_ends(name):
     pipeline, out = outputs_of(name, 'boxes')
     found = [r for r in out if isinstance(r, Disturbance)]
-    # Each is published when it is found and when it has ended, or only when it has ended.
+    # A disturbance is published when it is found and when it has ended, or only when it has ended.
     assert found and {d.id for d in found if d.ended} == {d.id for d in found}
     tracks = {r.id: r for r in out if isinstance(r, Track)}
     for d in found:

@@ -1,4 +1,4 @@
-"""Tracks are ambiguous if a background that they use is doubtful."""
+"""Doubtful backgrounds make the tracks that use them ambiguous."""
 
 import numpy as np
 import pytest
@@ -14,14 +14,14 @@ from support.dense_traffic import after_dense_traffic
 from support.networks import line_network
 from support.samples import one, simulate
 
-CLEAR_WITHOUT_DOUBT = ('junction_left_to_right', 'junction_left_turns_to_rear')
-DOUBTED = 'tracks with a doubtful background'
+UNAMBIGUOUS_WITHOUT_DOUBT = ('junction_left_to_right', 'junction_left_turns_to_rear')
+DOUBTFUL_TRACKS = 'tracks with a doubtful background'
 SETTINGS = settings_for('vehicle', QUICK)
-"""A fast tracker: the doubt does not depend on the model of the target."""
+"""Settings of a fast tracker: the doubt does not depend on the target model."""
 
 
 @pytest.fixture(scope='module')
-def passing():
+def pass_frames():
     """(network, frames after detection) of a pass at 10 m/s; the last sensor is 150 m away."""
     network = line_network(3, spacing=150.0, tilt=0.0)
     samples, *_ = simulate(network, random_vehicle(np.random.default_rng(1), length=4.0),
@@ -31,9 +31,9 @@ def passing():
     return network, [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, FieldFrame)]
 
 
-def tracked(passing, times, settings=None):
+def run_tracker(pass_frames, times, settings=None):
     """(TrackManager, poses) with doubtful intervals [s] of sensors."""
-    network, frames = passing
+    network, frames = pass_frames
     manager = TrackManager(network, settings_for('vehicle', {**QUICK, **(settings or {})}).track)
     start = frames[0].stamp_ns
     manager.doubt({name: tuple((start + round(b * 1e9), None if e is None else
@@ -43,37 +43,39 @@ def tracked(passing, times, settings=None):
                      if isinstance(r, Track) and not r.ended]
 
 
-def test_a_track_with_a_doubtful_background_is_ambiguous(passing):
-    """The whole track is, also if the doubt ended in the lookback before the detection."""
-    _, plain = tracked(passing, {})
-    first = (plain[0].stamp_ns - passing[1][0].stamp_ns) / 1e9
+def test_a_track_with_a_doubtful_background_is_ambiguous(pass_frames):
+    """The whole track is ambiguous, even if the doubt ended in the lookback before the
+    detection."""
+    _, plain = run_tracker(pass_frames, {})
+    first = (plain[0].stamp_ns - pass_frames[1][0].stamp_ns) / 1e9
     assert not all(t.ambiguous for t in plain)
     for begin, end in ((0.0, None), (first - 0.1, first), (0.0, first - 0.2)):
-        manager, poses = tracked(passing, {'mag_2': [(begin, end)]})
-        assert all(t.ambiguous for t in poses) and manager.counts[DOUBTED] == 1
+        manager, poses = run_tracker(pass_frames, {'mag_2': [(begin, end)]})
+        assert all(t.ambiguous for t in poses) and manager.counts[DOUBTFUL_TRACKS] == 1
         np.testing.assert_array_equal([t.position for t in poses], [t.position for t in plain])
-    manager, poses = tracked(passing, {'mag_2': [(0.0, 0.2)]})
+    manager, poses = run_tracker(pass_frames, {'mag_2': [(0.0, 0.2)]})
     assert [t.ambiguous for t in poses] == [t.ambiguous for t in plain]
-    assert manager.counts[DOUBTED] == 0
+    assert manager.counts[DOUBTFUL_TRACKS] == 0
 
 
-def test_poses_are_ambiguous_from_the_start_of_the_doubt(passing):
-    _, plain = tracked(passing, {})
+def test_poses_are_ambiguous_from_the_start_of_the_doubt(pass_frames):
+    _, plain = run_tracker(pass_frames, {})
     middle = plain[len(plain) // 2].stamp_ns
-    begin = (middle - passing[1][0].stamp_ns) / 1e9
-    manager, poses = tracked(passing, {'mag_1': [(begin, begin + 0.1)]})
-    assert all(t.ambiguous for t in poses if t.stamp_ns >= middle) and manager.counts[DOUBTED] == 1
+    begin = (middle - pass_frames[1][0].stamp_ns) / 1e9
+    manager, poses = run_tracker(pass_frames, {'mag_1': [(begin, begin + 0.1)]})
+    assert all(t.ambiguous for t in poses if t.stamp_ns >= middle) \
+        and manager.counts[DOUBTFUL_TRACKS] == 1
     assert [t.ambiguous for t in poses if t.stamp_ns < middle] \
         == [t.ambiguous for t in plain if t.stamp_ns < middle]
 
 
-def test_doubtful_backgrounds_of_unused_sensors_have_no_effect(passing):
+def test_doubtful_backgrounds_of_unused_sensors_have_no_effect(pass_frames):
     two = {'track.max_sensors': 2}
-    _, plain = tracked(passing, {}, two)
-    unused = {name for name in passing[0].names if tracked(
-        passing, {name: [(0.0, None)]}, two)[0].counts[DOUBTED] == 0}
+    _, plain = run_tracker(pass_frames, {}, two)
+    unused = {name for name in pass_frames[0].names if run_tracker(
+        pass_frames, {name: [(0.0, None)]}, two)[0].counts[DOUBTFUL_TRACKS] == 0}
     assert len(unused) == 1
-    _, poses = tracked(passing, {unused.pop(): [(0.0, None)]}, two)
+    _, poses = run_tracker(pass_frames, {unused.pop(): [(0.0, None)]}, two)
     assert [t.ambiguous for t in poses] == [t.ambiguous for t in plain]
 
 
@@ -99,9 +101,10 @@ def times_in_message(pipeline):
     return doubtful_times(type('State', (), {'sensors': sensors}))
 
 
-@pytest.mark.parametrize('name', CLEAR_WITHOUT_DOUBT)
+@pytest.mark.parametrize('name', UNAMBIGUOUS_WITHOUT_DOUBT)
 def test_a_vehicle_after_dense_traffic_is_tracked_and_ambiguous(name):
-    """There is no quiet interval in live data, so no pose is unambiguous, for any batches."""
+    """The data contain no quiet interval, so no pose is unambiguous. The batch size does not
+    matter."""
     network, readings = read_network(NETWORK_FILE), after_dense_traffic(name, 7.0)
     pipeline, other = (Pipeline(network, SETTINGS) for _ in range(2))
     tracks = poses_of(pipeline.feed(readings) + pipeline.flush())
@@ -116,9 +119,9 @@ def poses_of(records):
     return [r for r in records if isinstance(r, Track) and not r.ended]
 
 
-@pytest.mark.parametrize('name', CLEAR_WITHOUT_DOUBT)
+@pytest.mark.parametrize('name', UNAMBIGUOUS_WITHOUT_DOUBT)
 def test_poses_after_dense_traffic_are_unambiguous_without_the_doubt(name):
-    """Otherwise the test above would show nothing."""
+    """Therefore the ambiguity in the previous test is due to the doubt."""
     pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
     pipeline.track.doubt = lambda times: None
     tracks = poses_of(pipeline.feed(after_dense_traffic(name, 7.0)) + pipeline.flush())
@@ -128,14 +131,15 @@ def test_poses_after_dense_traffic_are_unambiguous_without_the_doubt(name):
 def test_fixed_lag_poses_after_dense_traffic_are_ambiguous():
     pipeline = Pipeline(read_network(NETWORK_FILE),
                         settings_for('vehicle', {**QUICK, 'track.smoothing_lag_s': 0.5}))
-    records = pipeline.feed(after_dense_traffic(CLEAR_WITHOUT_DOUBT[0], 7.0)) + pipeline.flush()
+    records = pipeline.feed(after_dense_traffic(UNAMBIGUOUS_WITHOUT_DOUBT[0], 7.0)) \
+        + pipeline.flush()
     smoothed = [r for r in records if isinstance(r, SmoothedPose)]
     assert len(smoothed) > 10 and all(s.ambiguous for s in smoothed)
 
 
 def test_the_doubt_persists_after_a_jump_back_in_time():
-    """Two copies in one batch: calibration has restarted before the first frames are tracked."""
-    readings = after_dense_traffic(CLEAR_WITHOUT_DOUBT[0], 7.0)
+    """Both copies are in one batch, so calibration restarts before the first frames are tracked."""
+    readings = after_dense_traffic(UNAMBIGUOUS_WITHOUT_DOUBT[0], 7.0)
     pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
     tracks = poses_of(pipeline.feed(Readings.joined([readings, readings])) + pipeline.flush())
     assert len(tracks) > 20 and all(t.ambiguous for t in tracks)

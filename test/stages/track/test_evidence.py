@@ -28,7 +28,7 @@ def pose(nis=6.0):
     return SimpleNamespace(nis=nis, degrees_of_freedom=6, stamp_ns=0)
 
 
-def test_noise_contradicts_a_track_with_the_stated_probability():
+def test_noise_contradicts_a_track_with_the_nominal_probability():
     rng = np.random.default_rng(0)
     nis = rng.chisquare(6, 3_000_000)
     doubted = 0
@@ -36,34 +36,34 @@ def test_noise_contradicts_a_track_with_the_stated_probability():
         evidence = TrackEvidence(2)
         evidence.contradicts(value * np.array([0.3, 0.7]), 6)
         doubted += evidence.doubted
-    # The number is Poisson distributed with mean 30.
+    # The number has a Poisson distribution with mean 30.
     assert 10 < doubted < 60 and len(nis) * CONTRADICTION == pytest.approx(30.0)
 
 
-def test_a_track_that_was_contradicted_once_stays_doubted():
+def test_a_track_that_was_contradicted_once_stays_doubtful():
     evidence = TrackEvidence(2)
     for nis in (6.0, 60.0, 6.0):
         assert evidence.contradicts(np.array([nis, 0.0]), 6) == (nis > 50.0)
     assert evidence.doubted
 
 
-def test_a_filter_that_overfits_is_doubted_for_the_length_of_the_window():
+def test_a_filter_that_overfits_is_flagged_for_the_duration_of_the_window():
     evidence = TrackEvidence(2)
     doubted = []
     for t, loss in ((0.0, -9.0), (1.0, 0.9), (1.1, 1.1), (3.0, 0.0), (3.2, -9.0)):
         doubted.append(evidence.doubts_filter(-loss * OVERFIT_NATS, round(t * NS), 2.0))
         evidence.note({doubts.OVERFIT} if doubted[-1] else {doubts.ANOTHER_PLACE}, round(t * NS))
     assert doubted == [False, False, True, True, False]
-    # The doubt concerns single poses, not the whole track.
+    # The doubt applies to single poses, not to the whole track.
     assert not evidence.doubted
-    # Smoothed poses of the same time are doubted as well.
+    # Smoothed poses at the same times are also doubtful.
     assert [evidence.was_filter_doubted(round(t * NS)) for t in (1.0, 1.1, 3.0, 3.2)] == [
         False, True, True, False]
 
 
 @pytest.mark.parametrize('nis, doubted', [
     ([60.0, 1.0], True), ([60.0, 2.0, 1.0], False), ([60.0, np.nan, 1.0], False)])
-def test_a_contradiction_doubts_a_track_of_two_sensors_but_not_of_three(nis, doubted):
+def test_a_contradiction_flags_a_track_of_two_sensors_but_not_of_three(nis, doubted):
     evidence = TrackEvidence(2)
     assert evidence.contradicts(np.array(nis), 3 * np.count_nonzero(~np.isnan(nis)))
     assert evidence.doubted == doubted
@@ -89,7 +89,7 @@ def bank_of(places, weights, std=0.5, lengths=3.0):
 
 
 def test_hypotheses_at_one_place_are_merged_in_the_covariance():
-    """Compared with samples of their mixture, about the published hypothesis."""
+    """The covariance about the published hypothesis matches samples of the mixture."""
     bank, model = bank_of([0.0, 1.0, -0.5], [0.5, 0.3, 0.2])
     rng = np.random.default_rng(1)
     which = rng.choice(3, 400_000, p=[0.5, 0.3, 0.2])
@@ -150,10 +150,10 @@ def test_a_track_that_no_target_ever_explained_ends():
 
     reason, after_s = end_of(lambda k: -1.0)
     assert reason == UNEXPLAINED
-    # It takes three frames to fall by log(20).
+    # The evidence takes three frames to fall by log(20).
     assert after_s == pytest.approx(UNEXPLAINED_S + 0.24, abs=0.17)
     assert end_of(lambda k: 1.0 if k < 5 else -1.0) is None
-    # A track that cannot be compared is doubted, but does not end.
+    # A track without a valid comparison is doubtful, but does not end.
     assert end_of(lambda k: np.nan) is None
 
 
@@ -181,7 +181,7 @@ def test_published_doubts_are_ordered_and_have_meanings():
 
 
 def test_a_transient_doubt_persists_for_a_tenth_of_a_second():
-    """Poses that are unambiguous for a single frame are wrong more often than others."""
+    """Poses that are unambiguous for only one frame are wrong more often than others."""
     evidence = TrackEvidence(2)
     assert evidence.note({doubts.HEIGHT, doubts.ANOTHER_PLACE}, NS) == \
         {doubts.HEIGHT, doubts.ANOTHER_PLACE}
@@ -190,20 +190,20 @@ def test_a_transient_doubt_persists_for_a_tenth_of_a_second():
     assert evidence.note({doubts.OVERFIT}, NS + round(0.16 * NS)) == {doubts.OVERFIT}
     assert evidence.note(set(), NS + round(0.24 * NS)) == {doubts.OVERFIT}
     assert evidence.note(set(), NS + round(0.32 * NS)) == set()
-    # Smoothed poses are doubted only at the time at which the doubt was found.
+    # Smoothed poses are doubtful only at the time at which the doubt was found.
     assert not evidence.was_filter_doubted(NS + round(0.32 * NS))
     assert evidence.was_filter_doubted(NS + round(0.16 * NS))
 
 
-def test_a_doubt_with_a_past_start_doubts_earlier_smoothed_poses():
-    """A long vehicle that is tracked as two is wrong before that is detected."""
+def test_a_doubt_with_a_past_start_flags_earlier_smoothed_poses():
+    """A long vehicle that is tracked as two has wrong poses before this is detected."""
     evidence = TrackEvidence(2)
     evidence.doubt_for(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0, since_ns=3 * NS)
     assert doubts.ANOTHER_VEHICLE in evidence.note(set(), 7 * NS)
     assert doubts.ANOTHER_VEHICLE not in evidence.note(set(), 9 * NS)
     assert [evidence.was_filter_doubted(t * NS) for t in (2, 3, 5, 7, 9)] == [
         False, True, True, True, False]
-    # Without a past start, no smoothed pose is doubted.
+    # Without a past start, no smoothed pose is doubtful.
     evidence = TrackEvidence(2)
     evidence.doubt_for(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0)
     assert not any(evidence.was_filter_doubted(t * NS) for t in range(10))

@@ -36,13 +36,14 @@ def test_the_hypothesis_on_the_side_that_fits_better_is_heavier():
     above = np.linalg.norm(bank.x[:, :3] - truth[0, :3], axis=1) < 0.005
     below = np.linalg.norm(bank.x[:, :3] - truth[0, :3] * [1, 1, -1], axis=1) < 0.005
     assert above.sum() == below.sum() == 1
-    # Below, z is off by four standard deviations: twice the field over half of it.
+    # Below the board, z is off by four standard deviations: twice the field divided by half the
+    # field.
     gap = float(bank.log_w[above][0] - bank.log_w[below][0])
     assert gap == pytest.approx(0.5 * 4.0**2, rel=0.1)
 
 
 def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
-    """The moment in the settings is that of hard and soft iron together."""
+    """The configured moment is the sum of hard and soft iron."""
     vehicle = settings_for('vehicle').track.vehicle
     frame = FieldFrame(0, np.full((2, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], 2, axis=0),
                        np.full(2, 8), np.zeros(2))
@@ -53,7 +54,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     np.testing.assert_allclose(np.linalg.norm(m, axis=1), np.take(vehicle.moments, bank.kind),
                                rtol=1e-9)
     np.testing.assert_array_equal(bank.x[:, length], np.take(vehicle.lengths, bank.kind))
-    # In 50 uT, the soft iron of each axis contributes its share of that moment.
+    # In 50 uT, the soft iron of each axis contributes the induced share of this moment.
     soft = [model.state_names.index(f'D{axis}') for axis in 'xyz']
     share = bank.x[:, soft] * 5e-5 / MU0 / np.take(vehicle.moments, bank.kind)[:, None]
     np.testing.assert_allclose(share, vehicle.induced_share, rtol=1e-12)
@@ -62,7 +63,8 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     np.testing.assert_allclose(share_covariance / vehicle.induced_share_std**2 - 1.0,
                                np.tile(np.eye(3), (len(bank), 1, 1)), atol=1e-9)
     assert len(bank) == 3 * 3 * 14 * 3 * 3 * 2
-    # Half of them turn, with an unknown sign and half the standard deviation of the settings.
+    # Half of the hypotheses turn, in an unknown direction, with half the configured standard
+    # deviation.
     turns = bank.P[:, turn, turn] > 0.0
     assert np.count_nonzero(turns) == len(bank) // 2 and not bank.x[:, turn].any()
     speed = np.hypot(*bank.x[:, 3:5].T)[turns]
@@ -77,11 +79,11 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     for label, heading in enumerate(np.deg2rad(vehicle.arrival_headings_deg)):
         rows = bank.label == label
         along = bank.x[rows, :2] @ [np.cos(heading), np.sin(heading)]
-        assert (along <= 0.0).all()  # all of them start before the sensors
+        assert (along <= 0.0).all()  # all hypotheses start before the sensors
         speed = np.hypot(*bank.x[rows, 3:5].T)
         np.testing.assert_allclose(bank.x[rows, 3], speed * np.cos(heading), atol=1e-9)
         assert set(np.round(speed, 6)) == set(vehicle.speeds)
-        # Standard deviations of the velocity are those of the settings, relative to the speed.
+        # The standard deviations of the velocity match the settings, relative to the speed.
         ahead = np.array([np.cos(heading), np.sin(heading)])
         across = np.array([-ahead[1], ahead[0]])
         for direction, share in ((ahead, vehicle.speed_std), (across, vehicle.cross_speed_std)):
@@ -91,7 +93,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
 
 @pytest.mark.parametrize('missing', [None, 0])
 def test_a_vehicle_starts_where_its_field_first_has_the_frame_energy(missing):
-    """At the previous place on its path it has less."""
+    """At the previous position on its path, the field has less energy."""
     network = line_network(6)
     vehicle = settings_for('vehicle', POINT).track.vehicle
     std = np.array([1e-8, 2e-8, 4e-8])
@@ -106,7 +108,8 @@ def test_a_vehicle_starts_where_its_field_first_has_the_frame_energy(missing):
     model = vehicle_model(vehicle, network)
 
     def energy(back):
-        """Energy of the fields of the hypotheses at the sensors, `back` [m] before their places."""
+        """Energy of the fields of the hypotheses at the sensors, `back` [m] before their
+        positions."""
         x = bank.x[:, :model_size].copy()
         x[:, :2] -= back * x[:, 3:5] / np.hypot(*x[:, 3:5].T)[:, None]
         m = model.dipoles(x).m.sum(axis=1)
@@ -144,7 +147,7 @@ def test_a_start_is_as_certain_as_the_model_is_accurate():
 
 
 def test_residuals_of_the_fit_widen_the_start():
-    """The errors are not stated, but the residuals show them."""
+    """The errors exceed the declared noise, but the residuals reveal them."""
     network, frames, truth = magnet_frames(1)
     rng = np.random.default_rng(3)
     nees = []
@@ -153,7 +156,7 @@ def test_residuals_of_the_fit_widen_the_start():
         bank = start(dataclasses.replace(frames[0], field=field), network)
         e = bank.x[bank.best(), :3] - truth[0, :3]
         nees.append(e @ np.linalg.solve(bank.P[bank.best(), :3, :3], e) / 3.0)
-    # The stated noise is a twentieth of the errors; without residuals the NEES would be 400.
+    # The declared noise is a twentieth of the errors. Without the residuals the NEES would be 400.
     assert 0.4 < np.mean(nees) < 2.0
 
 
@@ -168,7 +171,7 @@ def test_a_magnet_track_estimates_mounting_angles():
 
 
 def test_drifting_backgrounds_are_not_a_target(road_network):
-    """The frames are marked as containing a target, but only the backgrounds drift."""
+    """The frames are flagged as containing a target, but only the backgrounds drift."""
     drift = 3e-8
     settings = settings_for('vehicle', {'track.background_drift': drift}).track
     stage = TrackManager(road_network, settings)

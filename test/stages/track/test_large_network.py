@@ -1,4 +1,4 @@
-"""Hypotheses that `config/large_network.yaml` drops to bound the cost of a track."""
+"""Bound on the number of hypotheses in `config/large_network.yaml`: poses with and without it."""
 
 import numpy as np
 import pytest
@@ -14,13 +14,14 @@ from support.samples import one, simulate
 
 SETTINGS = read_parameter_file(ROOT / 'config' / 'large_network.yaml')
 LOST = [8, 13, 15, 18, 63, 118]
-"""Seeds of vehicles that are lost if the bound applies from the first frame on (the first four),
-or if it is 60."""
+"""Seeds of vehicles that are lost if the bound applies from the first frame (the first four), or if
+the bound is 60."""
 
 
 @pytest.fixture(scope='module')
 def drive():
-    """Function of a seed and changes: [Track] of a random vehicle past twenty sensors."""
+    """Function that returns, for a seed and changed settings, [Track] of a random vehicle that
+    passes twenty sensors."""
     network, recordings = line_network(20), {}
 
     def driven(seed, changes):
@@ -38,7 +39,7 @@ def drive():
 
 
 def distances(some, others):
-    """(n,) distances between the poses of two lists of tracks, in standard deviations."""
+    """Distances (n,) between the poses of two lists of tracks, in standard deviations."""
     at = {t.stamp_ns: t for t in others}
     pairs = [(t, at[t.stamp_ns]) for t in some if t.stamp_ns in at]
     assert len(pairs) == len(some) == len(others) > 0

@@ -47,7 +47,7 @@ def test_small_angles_are_a_rotation_to_first_order():
 
 
 def test_derivatives_by_state_and_angle_match_finite_differences():
-    """The field is a linear function of the state here, so that H is its derivative."""
+    """The field is a linear function of the state here, so H is its derivative."""
     h, H, angles = case()
 
     def field(v):
@@ -95,7 +95,7 @@ def test_mounting_angles_are_estimated_within_their_standard_deviations(rotated_
     last = rotated_pass[1][-1]
     z = (last.mounting - ANGLES) / last.mounting_std
     assert np.abs(z).max() < 3.0
-    # The angles of both sensors together are better known than before the pass.
+    # The angles of both sensors together are more accurate than before the pass.
     assert np.linalg.norm(last.mounting - ANGLES) < 0.5 * np.linalg.norm(ANGLES)
     assert (last.mounting_std < 0.8 * np.deg2rad(5.0)).all()
 
@@ -128,7 +128,8 @@ def test_a_tracker_without_mounting_angles_publishes_none():
 
 @cache
 def passes(n):
-    """{mounting_std_deg: (mean NEES, RMS error [m])} of `n` passes with tilts of 5 degrees."""
+    """{mounting_std_deg: (mean NEES, RMS error [m])} over `n` passes by sensors tilted by 5
+    degrees."""
     network = line_network(2, tilt=0.0)
     out = {}
     for mounting in (0.0, 5.0):
@@ -181,13 +182,13 @@ def test_orientation_covariances_are_rotated_into_sensor_frames():
     o = observation(rotated_network(upright, side, askew, side, std=(STD, STD, STD, None)))
     P = o.own_covariance
     np.testing.assert_allclose(P[0, :3, :3], np.diag(STD**2), atol=1e-18)
-    # Its y axis is the world's z axis, about which the heading rotates.
+    # The sensor's y axis is the world's z axis, about which the heading rotates.
     np.testing.assert_allclose(P[1, :3, :3], np.diag(STD[[0, 2, 1]]**2), atol=1e-18)
-    # In the sensor frame, the variance about the vertical is that of the heading.
+    # In the sensor frame, the variance about the vertical equals the variance of the heading.
     up = askew.inv().apply([0.0, 0.0, 1.0])
     assert up @ P[2, :3, :3] @ up == pytest.approx(STD[2]**2)
     assert np.trace(P[2, :3, :3]) == pytest.approx(STD @ STD)
-    # Without a stated uncertainty the setting applies.
+    # Without a declared uncertainty, the setting applies.
     np.testing.assert_allclose(P[3, :3, :3], np.deg2rad(5.0)**2 * np.eye(3), atol=1e-15)
     for block in P:
         np.testing.assert_array_equal(block[3:, 3:], np.eye(3))
@@ -205,7 +206,8 @@ def test_angle_covariances_are_those_of_each_sensor():
         np.testing.assert_array_equal(found[j], P[first:first + 3, first:first + 3])
     x = np.arange(float(n))
     np.testing.assert_array_equal(o.angles(x)[1], x[o.n_target + 6:o.n_target + 9])
-    # Without angles there are none; without lasting model errors there are no other own states.
+    # Without estimated angles, there are no covariances. Without a correlation time of the model
+    # error, the angles are the only states between targets and backgrounds.
     assert observation(line_network(3), 0.0).angle_covariances(P).shape == (0, 3, 3)
     bare = observation(line_network(3), error_time=0.0)
     rows = slice(o.n_target + 6, o.n_target + 9)
@@ -213,7 +215,8 @@ def test_angle_covariances_are_those_of_each_sensor():
 
 
 def test_a_narrow_mounting_prior_stays_narrow():
-    """The first sensor lies on its side, and is well known except for its heading."""
+    """The first sensor lies on its side. Its orientation is known accurately, except for the
+    heading."""
     side = Rotation.from_euler('x', 90.0, True)
     network = rotated_network(side, Rotation.identity(), std=(STD, None))
     tracks, *_ = drive(network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
@@ -221,7 +224,8 @@ def test_a_narrow_mounting_prior_stays_narrow():
     live = [t for t in tracks if not t.ended]
     first, last = live[0].mounting_std, live[-1].mounting_std
     assert (last[0] <= 1.02 * STD[[0, 2, 1]]).all()
-    # Its y axis is vertical, so the rotation about y starts with the uncertainty of the heading.
+    # The first sensor's y axis is vertical, so its rotation about y starts with the uncertainty of
+    # the heading.
     assert first[0, 1] == pytest.approx(STD[2], rel=0.2)
     np.testing.assert_allclose(first[0, [0, 2]], STD[0], rtol=0.2)
     assert last[1].max() > 2.0 * STD[0]

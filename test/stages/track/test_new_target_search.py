@@ -1,4 +1,4 @@
-"""Search for new targets in the frames of a track: triggers, doubts and joint tracks."""
+"""Search for new targets during a track: triggers, doubts and joint tracks."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -29,7 +29,7 @@ PERIOD = round(0.08 * NS)
 
 
 def searches(nis, n=20, rejected=False, is_long=False):
-    """[(frame, reason)] of searches in a track with innovations of this size."""
+    """[(frame, reason)] of searches in a track with normalised innovations squared of `nis`."""
     evidence, found = NewTargetEvidence(), []
     for k in range(n):
         evidence.add(nis, 6, k * PERIOD, rejected, is_long)
@@ -42,9 +42,9 @@ def test_consistent_innovations_trigger_no_search():
     assert searches(6.0) == []
 
 
-@pytest.mark.parametrize('given', [{'nis': 30.0}, {'nis': 1.0, 'rejected': True}])
-def test_improbable_innovations_and_rejected_sensors_trigger_a_search(given):
-    found = searches(**given)
+@pytest.mark.parametrize('innovations', [{'nis': 30.0}, {'nis': 1.0, 'rejected': True}])
+def test_improbable_innovations_and_rejected_sensors_trigger_a_search(innovations):
+    found = searches(**innovations)
     assert {reason for _, reason in found} == {IMPROBABLE}
     # A search takes longer than a frame, so it is not triggered in every frame.
     assert np.diff([k for k, _ in found]).min() * PERIOD >= MIN_INTERVAL_S * NS
@@ -75,18 +75,18 @@ def joint_of(velocities, odds, replaced=None, adds=True):
     return Joint(bank, None, None, odds, replaced, adds)
 
 
-@pytest.mark.parametrize('odds, replaced, doubted', [
+@pytest.mark.parametrize('odds, replaced, flagged', [
     (CONFIDENT_NATS - 1.0, None, (0, 1)), (CONFIDENT_NATS + 1.0, None, ()),
     (CONFIDENT_NATS + 1.0, 0, (0, 1))])
-def test_weak_explanations_and_replacements_of_a_vehicle_by_two_are_doubted(
-        odds, replaced, doubted):
+def test_weak_explanations_and_replacements_of_a_vehicle_by_two_are_flagged(
+        odds, replaced, flagged):
     """Both vehicles drive in the same direction."""
-    assert joint_of([[10.0, 0.0], [10.0, 0.0]], odds, replaced).doubtful(7) == doubted
+    assert joint_of([[10.0, 0.0], [10.0, 0.0]], odds, replaced).doubtful(7) == flagged
 
 
 @pytest.mark.parametrize('new', [[0.0, 10.0], [8.0, 8.0], [19.0, 0.0], [5.0, 0.0]])
 @pytest.mark.parametrize('n_before', [1, 2])
-def test_vehicles_that_cross_or_overtake_fast_are_doubted_up_to_sixty_nats(new, n_before):
+def test_vehicles_that_cross_or_overtake_fast_are_flagged_up_to_sixty_nats(new, n_before):
     """The number of earlier vehicles makes no difference."""
     velocities = [[10.0, 0.0], [-9.0, 1.0]][:n_before] + [new]
     all_members = tuple(range(n_before + 1))
@@ -96,14 +96,14 @@ def test_vehicles_that_cross_or_overtake_fast_are_doubted_up_to_sixty_nats(new, 
 
 @pytest.mark.parametrize('new', [
     [-10.0, 2.0], [14.0, -1.0], [6.0, 0.0], [17.0, 0.0], [9.5, 4.0], [-30.0, 0.0], [-2.0, 0.0]])
-def test_vehicles_that_meet_or_overtake_are_doubted_up_to_fifteen_nats_only(new):
+def test_vehicles_that_meet_or_overtake_are_flagged_up_to_fifteen_nats_only(new):
     """Vehicles that meet may have any speed."""
     assert joint_of([[10.0, 0.0], new], 14.0).doubtful(7) == (0, 1)
     assert joint_of([[10.0, 0.0], new], 16.0).doubtful(7) == ()
 
 
 @pytest.mark.parametrize('standing', [[0.0, 0.0], [0.3, 0.9], [0.9, 0.0]])
-def test_a_standing_vehicle_has_no_direction(standing):
+def test_a_stationary_vehicle_has_no_direction(standing):
     for velocities in ([standing, [10.0, 0.0]], [[10.0, 0.0], standing], [standing, standing]):
         assert joint_of(velocities, 16.0).doubtful(7) == ()
 
@@ -115,21 +115,21 @@ def test_directions_of_earlier_vehicles_are_not_compared():
     assert joint_of([new, *before], 16.0).doubtful(7) == (0, 1, 2)
 
 
-@pytest.mark.parametrize('first, second, doubted', [
+@pytest.mark.parametrize('first, second, flagged', [
     ([0.0, 10.0], [10.0, 0.0], (0, 1, 2)), ([10.0, 0.0], [0.0, 10.0], (0, 1, 2)),
     ([-10.0, 0.0], [10.0, 0.0], ()), ([-10.0, 0.0], [-11.0, 0.0], (1, 2))])
-def test_both_vehicles_that_replace_one_are_compared(first, second, doubted):
-    """There is a third vehicle; the two that replace another one are the last."""
-    assert joint_of([[12.0, 0.0], first, second], 16.0, 0).doubtful(7) == doubted
+def test_both_vehicles_that_replace_one_are_compared(first, second, flagged):
+    """The first vehicle is unrelated; the last two replace another vehicle."""
+    assert joint_of([[12.0, 0.0], first, second], 16.0, 0).doubtful(7) == flagged
 
 
-def test_a_vehicle_at_another_place_is_doubted_alone():
+def test_only_a_vehicle_at_another_position_is_flagged():
     for elsewhere in ([0.0, 10.0], [9.0, 0.0]):
         joint = joint_of([[10.0, 0.0], elsewhere], 16.0, 0, adds=False)
         assert joint.doubtful(7) == (1,)
 
 
-def test_the_best_hypothesis_decides_about_doubts():
+def test_the_best_hypothesis_determines_the_doubts():
     joint = joint_of([[10.0, 0.0], [0.0, 10.0]], 16.0)
     bank = joint.bank
     both = FilterBank(np.vstack([bank.x, joint_of([[10.0, 0.0], [11.0, 0.0]], 0.0).bank.x]),
@@ -144,7 +144,7 @@ def test_overlap_of_vehicles_is_measured_along_a_lane():
     path[:, 6], path[:, 13] = 3.0, 5.0
     for ahead, aside, depth in ((20.0, 0.0, 0.0), (3.0, 0.0, 2.0), (3.0, 3.5, 0.0)):
         path[:, 7], path[:, 8] = [20.0, ahead], aside
-        # Half the lengths of both rows add up to 4 m, and the bodies extend one metre further.
+        # Half the lengths of both rows add up to 4 m, and the bodies require one more metre.
         assert overlap_depth(path, 7, 2, 6) == pytest.approx(depth)
 
 
@@ -199,7 +199,7 @@ def test_two_vehicles_that_meet_keep_their_tracks(meeting):
 
 
 def test_two_vehicles_that_meet_are_smoothed_together(meeting):
-    """Each pose is smoothed once and in order, with a mean error of 0.6 m or less."""
+    """Each pose is smoothed once, in chronological order, with a mean error of at most 0.6 m."""
     scene, records, _ = meeting
     for id in (1, 2):
         poses = [r for r in records if isinstance(r, SmoothedPose) and r.id == id]
@@ -211,7 +211,8 @@ def test_two_vehicles_that_meet_are_smoothed_together(meeting):
 
 
 def test_slow_sensors_at_staggered_times_find_a_new_target():
-    """At 5 Hz and at its own times, each sensor is in less than half of the frames."""
+    """Each sensor is sampled at 5 Hz at its own times, so it contributes to less than half of the
+    frames."""
     rng, n_sensors = np.random.default_rng(3), 4
     scene = world(NETWORKS[n_sensors], [passing(rng, 'clouds', 14.0, 1, 9.0),
                                         passing(rng, 'clouds', 14.5, -1, 9.0)], 24.0, rng,
@@ -243,7 +244,7 @@ def test_joint_tracks_do_not_depend_on_batches(meeting):
 
 @pytest.fixture(scope='module')
 def following():
-    """(`World`, records) of two cars; the first one is out of reach before the second."""
+    """(`World`, records) of two cars; the first car is out of reach before the second."""
     rng = np.random.default_rng(5)
     scene = world(NETWORKS[4], [passing(rng, 'clouds', 12.0, 1, 6.0),
                                 passing(rng, 'clouds', 15.5, 1, 6.5)], 26.0, rng, rate=50.0)
@@ -252,7 +253,7 @@ def following():
 
 
 def test_smoothed_poses_are_complete_after_one_of_two_vehicles_leaves(following):
-    """Also the poses from before the two vehicles shared a state."""
+    """Poses from the time before the two vehicles shared a state are included."""
     scene, records = following
     tracks = [r for r in records if isinstance(r, Track)]
     ends = {t.id: t.stamp_ns for t in tracks if t.ended}
@@ -270,13 +271,14 @@ def test_the_replacement_at_the_earlier_place_keeps_the_track(is_first):
     places = np.array([[0.0, 0.0], [30.0, 0.0]])
 
     class Known:
-        """A member whose poses were at one of the places."""
+        """Member whose poses were at one of the positions."""
 
         def distance_from(self, stamps, path):
             return float(np.hypot(*(path - places[0 if is_first else 1]).T).mean())
 
     class Found:
-        """Two vehicles of two states that replace the second of two, at these places."""
+        """Joint explanation in which two vehicles replace the second vehicle, at these
+        positions."""
 
         replaced = 1
         bank = SimpleNamespace(best=lambda: 0)

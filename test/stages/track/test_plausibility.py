@@ -1,4 +1,4 @@
-"""Plausibility of vehicle states: height, mounting angles, speed and place on the road."""
+"""Plausibility of vehicle states: height, mounting angles, speed and position on the road."""
 
 from types import SimpleNamespace
 
@@ -42,13 +42,14 @@ def doubts_in_state(mounting=MOUNTING, dt=0.08, **of_state):
     ({'angles_deg': 6.0}, set()), ({'angles_deg': 8.0}, {doubts.SENSORS_ROTATED}),
     ({'angles_deg': -8.0}, {doubts.SENSORS_ROTATED}),
     ({'mounting': 0.0}, set()),
-    # At 4.5 m from both sensors, or above one of them.
+    # The vehicle is 4.5 m from both sensors, or above one of them.
     ({'speed': 40.0}, set()), ({'speed': 45.0}, {doubts.FRAMES_TOO_LONG}),
     ({'speed': 45.0, 'dt': 0.04}, set()), ({'speed': 40.0, 'at': (0.0, 4.4)}, set()),
-    # 1.645 standard deviations of 1.5 m beyond the outermost lane at 4 m, unless it stands.
+    # The limit is 1.645 standard deviations of 1.5 m beyond the outermost lane at 4 m, except for
+    # stationary vehicles.
     ({'at': (0.0, 6.4)}, set()), ({'at': (0.0, 6.5)}, {doubts.OFF_THE_ROAD}),
     ({'at': (30.0, -6.5)}, {doubts.OFF_THE_ROAD}), ({'at': (0.0, 6.5), 'speed': 0.9}, set())])
-def test_implausible_states_are_doubted(of_state, expected):
+def test_implausible_states_are_flagged(of_state, expected):
     assert doubts_in_state(**of_state) == expected
 
 
@@ -59,8 +60,9 @@ def observation_of(network=NETWORK):
 @pytest.mark.parametrize('y, after, expected', [
     (0.0, 8.0, set()), (8.0, 0.0, {doubts.OFF_THE_ROAD}), (0.0, 8.6, {doubts.OFF_THE_ROAD})])
 def test_a_path_is_evaluated_where_it_is_nearest_to_a_sensor(y, after, expected):
-    """A vehicle may turn off after the sensors, but not beyond the limit there. One that passed
-    beside the road stays doubted, also when it stops.
+    """A vehicle may turn off after the sensors, up to the second limit.
+
+    A vehicle that passed off the road stays doubtful, even after it has stopped.
     """
     plausibility, observation = Plausibility(), observation_of()
     for x, aside, speed in ((-20.0, 0.0, 10.0), (0.0, y, 10.0), (20.0, after, 10.0)):
@@ -71,8 +73,8 @@ def test_a_path_is_evaluated_where_it_is_nearest_to_a_sensor(y, after, expected)
         assert standing == (expected if y else set())
 
 
-def test_the_path_of_each_hypothesis_is_kept():
-    """It is kept while another hypothesis is published."""
+def test_the_path_of_each_hypothesis_is_stored():
+    """The path is retained while another hypothesis is published."""
     plausibility, observation = Plausibility(), observation_of()
     paths = {5: ((0.0, 7.0), (4.0, 0.0)), 2: ((0.0, 1.0), (4.0, 7.0))}
     for k in range(2):
@@ -86,8 +88,8 @@ def test_the_path_of_each_hypothesis_is_kept():
 @pytest.mark.parametrize('half_width, edge', [
     (1.0, 6.47), (4.5, 6.47), (5.0, 6.47), (6.0, 8.0), (8.0, 12.0), (9.0, 13.0)])
 def test_a_vehicle_may_pass_outside_a_wide_network(half_width, edge):
-    """The margin is the excess width of the network over the road, up to the distance of a lane
-    from the middle.
+    """The margin is the width by which the network exceeds the road, up to the distance of a lane
+    from the centre.
     """
     network = network_of([[0.0, -half_width, 0.0], [0.0, 0.0, 0.0], [0.0, half_width, 0.0]])
     observation = observation_of(network)

@@ -1,4 +1,4 @@
-"""Published records of a track are not modified later."""
+"""Published records of a track share no memory with the bank."""
 
 import dataclasses
 

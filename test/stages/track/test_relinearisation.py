@@ -1,4 +1,5 @@
-"""Relinearisation: a linear target, a batch fit as the reference, and the error over its bound."""
+"""Relinearisation: a linear target, comparison with batch fits, and errors relative to the
+bound."""
 
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
@@ -27,7 +28,7 @@ from support.samples import one, simulate
 
 N_T, PERIOD = 3, 0.08
 INTERVAL = 22.5 * PERIOD
-"""[s] With this interval it is done once in 24 frames, at the last of them."""
+"""[s] Interval with which 24 frames are relinearised once, at the last frame."""
 
 
 class LinearFilter(StepByStep):
@@ -67,8 +68,8 @@ class LinearFilter(StepByStep):
         return log_likelihood + bonus, gains
 
 
-def compared_with_plain(filter_, relinearisation, n=40, restarts_at=(), prune=True):
-    """(bank, bank of the filter alone, Counter) after `n` frames with a gap."""
+def compare_with_plain(filter_, relinearisation, n=40, restarts_at=(), prune=True):
+    """(bank, bank without relinearisation, Counter) after `n` frames with a gap."""
     rng, counts, stamp_ns = np.random.default_rng(0), Counter(), 0
     bank = FilterBank.from_targets(rng.standard_normal((12, N_T)), np.tile(np.eye(N_T), (12, 1, 1)),
                                  np.zeros(12, dtype=int), 1, 1.0)
@@ -108,10 +109,11 @@ def compared_with_plain(filter_, relinearisation, n=40, restarts_at=(), prune=Tr
 @pytest.mark.parametrize('passes', [relinearise.PASSES, 8])
 def test_relinearisation_does_not_change_a_linear_target(
         monkeypatch, window_s, interval_s, restarts_at, passes):
-    """For any interval and window, and while hypotheses are pruned. Few passes do not converge."""
+    """This holds for any interval and window, and while hypotheses are pruned. Few passes do not
+    converge."""
     monkeypatch.setattr(relinearise, 'PASSES', passes)
     filter_ = LinearFilter()
-    _, _, counts = compared_with_plain(
+    _, _, counts = compare_with_plain(
         filter_, Relinearisation(interval_s, window_s, 5), restarts_at=restarts_at)
     if window_s > 0.1 and passes == 8:
         assert counts[relinearise.ATTEMPTED] > counts[relinearise.FAILED] == 0
@@ -124,13 +126,13 @@ def test_the_path_of_a_long_vehicle_is_accepted_unless_it_fits_worse(
     monkeypatch.setattr(relinearise, 'PASSES', 8)
     filter_ = LinearFilter()
     filter_.long, filter_.bonus = long, bonus
-    _, _, counts = compared_with_plain(filter_, Relinearisation(0.0, 0.5, 5))
+    _, _, counts = compare_with_plain(filter_, Relinearisation(0.0, 0.5, 5))
     assert counts[relinearise.ATTEMPTED] > 50
     assert counts[relinearise.FAILED] == (0 if is_accepted else counts[relinearise.ATTEMPTED])
 
 
 class LessCertainFilter(LinearFilter):
-    """Along a path, its variance of the first state is larger, or smaller, than without."""
+    """Filter whose variance of the first state changes by `extra` along a path."""
 
     extra = 0.0
 
@@ -142,7 +144,7 @@ class LessCertainFilter(LinearFilter):
         return found
 
 
-def less_certain(extra, linear):
+def bank_after_one_frame(extra, linear):
     """(filter, bank, Relinearisation) after one frame."""
     filter_, rng = LessCertainFilter(), np.random.default_rng(0)
     filter_.extra, filter_.linear = extra, linear
@@ -159,8 +161,8 @@ def less_certain(extra, linear):
 
 
 @pytest.mark.parametrize('extra, is_wider', [(0.5, True), (-1e-3, False)])
-def test_a_converged_path_gives_the_state_and_the_wider_covariance(extra, is_wider):
-    filter_, bank, relinearisation = less_certain(extra, np.inf)
+def test_a_converged_path_determines_the_state_and_the_wider_covariance(extra, is_wider):
+    filter_, bank, relinearisation = bank_after_one_frame(extra, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
     assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 0
     np.testing.assert_allclose(bank.x[0], x[0] + 0.1 * np.eye(6)[1], atol=1e-9)
@@ -171,13 +173,13 @@ def test_a_converged_path_gives_the_state_and_the_wider_covariance(extra, is_wid
 @pytest.mark.parametrize('extra, linear, is_wider', [
     (0.5, np.inf, True), (0.5, 2.0, True), (0.5, 0.5, False), (-1e-3, np.inf, False)])
 def test_an_unconverged_path_only_widens_the_covariance(monkeypatch, extra, linear, is_wider):
-    """The limit of convergence is patched so that no path converges."""
+    """The convergence limit is patched so that no path converges."""
     monkeypatch.setattr(relinearise, 'CONVERGED', -1.0)
-    filter_, bank, relinearisation = less_certain(extra, linear)
+    filter_, bank, relinearisation = bank_after_one_frame(extra, linear)
     x, P = bank.x.copy(), bank.P.copy()
     assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 1
     np.testing.assert_array_equal(bank.x, x)
-    # It includes the difference of the two states.
+    # The covariance includes the difference between the two states.
     expected = P[0] + is_wider * (extra * np.eye(6)[0] * np.eye(6)[0][:, None]
                                   + 0.01 * np.eye(6)[1] * np.eye(6)[1][:, None])
     np.testing.assert_allclose(bank.P[0], expected, atol=1e-9)
@@ -185,7 +187,7 @@ def test_an_unconverged_path_only_widens_the_covariance(monkeypatch, extra, line
 
 @pytest.mark.parametrize('bonus', [-12.0, 3.0])
 def test_the_gain_is_the_log_likelihood_ratio_of_the_path(bonus):
-    filter_, bank, relinearisation = less_certain(0.0, np.inf)
+    filter_, bank, relinearisation = bank_after_one_frame(0.0, np.inf)
     filter_.bonus = bonus
     assert relinearisation.gain(0) == 0.0
     relinearisation.improve(filter_, bank)
@@ -198,8 +200,8 @@ def test_the_gain_is_the_log_likelihood_ratio_of_the_path(bonus):
 
 
 def test_a_path_with_an_invalid_covariance_is_rejected():
-    """For example due to rounding errors above a sensor; state and covariance do not change."""
-    filter_, bank, relinearisation = less_certain(-3.0, np.inf)
+    """Rounding errors above a sensor can cause this. State and covariance do not change."""
+    filter_, bank, relinearisation = bank_after_one_frame(-3.0, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
     assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 1
     np.testing.assert_array_equal(bank.x, x)
@@ -208,20 +210,21 @@ def test_a_path_with_an_invalid_covariance_is_rejected():
 
 @pytest.mark.parametrize('window_s, max_frames', [(0.5, 64), (60.0, 10)])
 def test_relinearisation_covers_twice_the_window_at_most(monkeypatch, window_s, max_frames):
-    """Frames are 0.05 s apart or more; besides the passes, the anchor moves over half of them."""
+    """Frames are at least 0.05 s apart. In addition to the passes, the anchor moves over half of
+    the frames."""
     monkeypatch.setattr(relinearise, 'MAX_FRAMES', max_frames)
     filter_ = LinearFilter()
-    compared_with_plain(filter_, Relinearisation(0.0, window_s, 5), n=90)
+    compare_with_plain(filter_, Relinearisation(0.0, window_s, 5), n=90)
     frames = min(2 * round(window_s / 0.05), max_frames) + 1
     assert relinearise.PASSES * 5 < max(filter_.lengths) <= (relinearise.PASSES + 1) * frames
 
 
 @pytest.mark.parametrize('n_max, max_elements', [(1, 10**9), (5, 6**2 * 40)])
 def test_only_the_heaviest_hypotheses_are_relinearised(monkeypatch, n_max, max_elements):
-    """Fewer of them if many states make it expensive: here one over forty frames."""
+    """Many states reduce their number: here to one hypothesis over forty frames."""
     monkeypatch.setattr(relinearise, 'MAX_ELEMENTS', max_elements)
     filter_ = LinearFilter()
-    bank, *_ = compared_with_plain(filter_, Relinearisation(60.0, 60.0, n_max), prune=False)
+    bank, *_ = compare_with_plain(filter_, Relinearisation(60.0, 60.0, n_max), prune=False)
     relinearisation = Relinearisation(0.0, 60.0, n_max)
     relinearisation.begin(bank.copy())
     assert not filter_.origins
@@ -232,15 +235,15 @@ def test_only_the_heaviest_hypotheses_are_relinearised(monkeypatch, n_max, max_e
     assert filter_.origins == {bank.origin[np.argmax(bank.log_w)]}
 
 
-STILL = {**matched.TARGETS['point'], 'track.vehicle.acceleration': 0.0,
-         'track.vehicle.climb_acceleration': 0.0, 'track.vehicle.moment_drift': 0.0,
-         'track.background_drift': 0.0, 'track.vehicle.speeds': [10.0]}
+DETERMINISTIC = {**matched.TARGETS['point'], 'track.vehicle.acceleration': 0.0,
+                 'track.vehicle.climb_acceleration': 0.0, 'track.vehicle.moment_drift': 0.0,
+                 'track.background_drift': 0.0, 'track.vehicle.speeds': [10.0]}
 
 
 def fields_along(model, network, x0, n):
     """Fields (n, n_sensors, 3) [T] of frames from a state `x0` (n_x,) and backgrounds."""
     n_t, out = len(model.state_names), []
-    filter_ = BankFilter(network, model, settings_for('vehicle', STILL).track)
+    filter_ = BankFilter(network, model, settings_for('vehicle', DETERMINISTIC).track)
     for k in range(n):
         x = model.propagate(x0[None, :n_t], k * PERIOD)[0]
         h, _, _ = filter_.observation.target_fields(x, np.zeros(len(network)), np.zeros((1, 1)))
@@ -256,7 +259,7 @@ def frames_of(y):
 
 
 def counts_after(filter_, bank, y, relinearisation):
-    """Feed measurements `y` (n, n_sensors, 3); (attempts, failures) with the last one."""
+    """Feed measurements `y` (n, n_sensors, 3); return (attempts, failures) at the last frame."""
     relinearisation.begin(bank.copy())
     for k, frame in enumerate(frames_of(y)):
         dt = PERIOD if k else 0.0
@@ -265,13 +268,14 @@ def counts_after(filter_, bank, y, relinearisation):
     return counts[relinearise.ATTEMPTED], counts[relinearise.FAILED]
 
 
-TURNS = {**STILL, 'track.vehicle.turn_acceleration': 1e-4, 'track.vehicle.turn_time': 1e3}
+TURNS = {**DETERMINISTIC, 'track.vehicle.turn_acceleration': 1e-4, 'track.vehicle.turn_time': 1e3}
 """Settings of a target with a constant turn rate."""
 
 
-def still_target(n, turns=False):
-    """(filter, function that makes a bank, measurements (n, 2, 3), last state fitted by scipy)."""
-    settings = settings_for('vehicle', TURNS if turns else STILL).track
+def deterministic_target(n, turns=False):
+    """(filter, function that creates a bank, measurements (n, 2, 3), last state fitted by
+    SciPy)."""
+    settings = settings_for('vehicle', TURNS if turns else DETERMINISTIC).track
     rng, model = np.random.default_rng(4), vehicle_model(settings.vehicle, matched.NETWORK)
     n_t = len(model.state_names)
     mean, P0 = matched.prior_of(settings, n_t - turns)
@@ -297,20 +301,21 @@ def still_target(n, turns=False):
 
 @pytest.mark.parametrize('turns', [False, True])
 def test_relinearisation_converges_to_a_batch_fit(turns):
-    """Without process noise the first state is the path, which scipy fits with the same prior."""
-    filter_, bank_of, y, expected = still_target(24, turns)
+    """Without process noise the first state determines the path. SciPy fits it with the same
+    prior."""
+    filter_, bank_of, y, expected = deterministic_target(24, turns)
     bank, plain = bank_of(1), bank_of(1)
     assert counts_after(filter_, bank, y, Relinearisation(0.0, 60.0, 1)) == (1, 0)
     std = np.sqrt(np.diagonal(bank.P[0]))
     assert np.abs((bank.x[0] - expected) / std).max() < 1e-2
-    # The filter alone differs from it, or this test would show nothing.
+    # The filter without relinearisation differs from the fit; otherwise the test would be void.
     counts_after(filter_, plain, y, Relinearisation(60.0, 60.0, 1))
     assert np.abs((plain.x[0] - expected) / std).max() > 0.2
 
 
 @pytest.mark.parametrize('turns', [False, True])
 def test_the_smoother_converges_to_a_batch_fit(turns):
-    filter_, bank_of, y, expected = still_target(24, turns)
+    filter_, bank_of, y, expected = deterministic_target(24, turns)
     states, left_out = smoothed_track(filter_, bank_of(1), frames_of(y),
                                       [0.0] + [PERIOD] * (len(y) - 1), relinearisations=9)
     x, P = states[-1]
@@ -319,8 +324,8 @@ def test_the_smoother_converges_to_a_batch_fit(turns):
 
 
 def test_a_path_that_has_not_converged_is_not_accepted(monkeypatch):
-    """One pass from the linearisation of the filter is not enough; eight passes are."""
-    filter_, bank_of, y, _ = still_target(24)
+    """One pass from the linearisation of the filter does not suffice; eight passes do."""
+    filter_, bank_of, y, _ = deterministic_target(24)
     expected, bank = bank_of(1), bank_of(1)
     counts_after(filter_, expected, y, Relinearisation(60.0, 60.0, 1))
     for passes, n_failed in ((1, 1), (8, 0)):
@@ -333,7 +338,7 @@ def test_a_path_that_has_not_converged_is_not_accepted(monkeypatch):
 def test_a_path_through_a_sensor_is_rejected(monkeypatch):
     """A dipole at a sensor has no valid field; the other hypotheses are not affected."""
     monkeypatch.setattr(relinearise, 'PASSES', 8)
-    filter_, bank_of, y, _ = still_target(12)
+    filter_, bank_of, y, _ = deterministic_target(12)
     alone, bank = bank_of(1), bank_of(2)
     bank.x[1, :6], bank.P[1, :6, :6] = 0.0, 0.0
     bank.x[1, 1] = -4.5
@@ -345,7 +350,8 @@ def test_a_path_through_a_sensor_is_rejected(monkeypatch):
 @pytest.mark.study
 @pytest.mark.parametrize('target', matched.TARGETS)
 def test_the_error_of_matched_targets_is_near_its_bound(target, n=60):
-    """RMS error over the path bound, without the worst 5 %; 1.4 and 1.8 if not relinearised."""
+    """Ratio of RMS error to path bound, without the worst 5 %. Without relinearisation it is 1.4
+    and 1.8."""
     with ProcessPoolExecutor(2) as pool:
         error, bound = (np.array(a)[:, matched.STEPS // 2:] for a in zip(
             *pool.map(partial(matched.one_run, target), range(n)), strict=True))
@@ -376,7 +382,7 @@ def test_new_settings_during_a_track_restart_relinearisation():
 
 
 def test_relinearisation_receives_the_intervals_between_frames(monkeypatch):
-    """Also if a frame is missing, and for frames before the detection."""
+    """The intervals are correct after a missing frame and before the detection."""
     received, add = [], Relinearisation.add
     monkeypatch.setattr(Relinearisation, 'add', lambda self, *a: (
         received.append((a[4].stamp_ns, a[5])), add(self, *a)))

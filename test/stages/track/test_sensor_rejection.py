@@ -1,4 +1,4 @@
-"""Rejection of sensors that contradict the others: what is rejected, its limits and its cost."""
+"""Rejection of sensors that contradict the others: rejected sensors, limits and cost."""
 
 import copy
 import dataclasses
@@ -26,12 +26,12 @@ SETTINGS = settings_for('vehicle', {**POINT, 'track.mounting_std_deg': 0.0,
 SIGMA = 1.2e-8 / 8**0.5
 TARGET = np.array([4.0, -1.0, 0.5])
 MOMENT = np.array([200.0, -150.0, 80.0])
-OFF = np.array([3e-5, -2e-5, 4e-5])
+FAULT = np.array([3e-5, -2e-5, 4e-5])
 DT = 0.08
 
 
 class CountingFilter(BankFilter):
-    """Counts its updates of whole banks."""
+    """Filter that counts its updates of whole banks."""
 
     n = 0
 
@@ -62,15 +62,15 @@ def situation(n=6, seed=0, spread=0.3, n_hyp=5):
     return bank_filter, bank, frame, network.names
 
 
-def faulty(frame, *rows, size=1.0):
+def with_fault(frame, *rows, size=1.0):
     field = frame.field.copy()
     for k, j in enumerate(rows):
-        field[j] += (1.0 + k) * size * OFF
+        field[j] += (1.0 + k) * size * FAULT
     return dataclasses.replace(frame, field=field)
 
 
-def without(frame, *rows):
-    """The frame as the alignment returns it if those sensors are missing."""
+def without_sensors(frame, *rows):
+    """The frame that alignment returns if these sensors are missing."""
     rows = list(rows)
     field, covariance = frame.field.copy(), frame.covariance.copy()
     n_samples, offset = frame.n_samples.copy(), frame.time_offset.copy()
@@ -89,7 +89,7 @@ def same_frame(a, b):
                else getattr(a, f.name) == getattr(b, f.name) for f in dataclasses.fields(a))
 
 
-def plain(bank_filter, bank, frame):
+def updated_without_rejection(bank_filter, bank, frame):
     """(log-likelihood, state) of the update without rejection."""
     bank = copy.deepcopy(bank)
     return bank_filter.advance(bank, frame, DT)[1], state(bank)
@@ -98,7 +98,7 @@ def plain(bank_filter, bank, frame):
 @pytest.mark.parametrize('n', [1, 2, 3, 6, 12])
 def test_a_frame_that_fits_is_not_changed_and_costs_one_update(n):
     bank_filter, bank, frame, names = situation(n)
-    expected, after = plain(bank_filter, bank, frame)
+    expected, after = updated_without_rejection(bank_filter, bank, frame)
     bank_filter.n = 0
     _, got, used, counts = SensorRejection(names).advance(bank_filter, bank, frame, DT)
     assert bank_filter.n == 1
@@ -112,21 +112,22 @@ def test_a_wrong_sensor_is_rejected_as_if_it_were_missing(n, seed):
     bank_filter, bank, frame, names = situation(n, seed)
     for j in range(n) if n > 2 else ():
         updated = copy.deepcopy(bank)
-        expected, after = plain(bank_filter, bank, without(frame, j))
+        expected, after = updated_without_rejection(bank_filter, bank, without_sensors(frame, j))
         _, got, used, counts = SensorRejection(names).advance(
-            bank_filter, updated, faulty(frame, j), DT)
+            bank_filter, updated, with_fault(frame, j), DT)
         assert counts == {f'frames in which {names[j]} was rejected': 1}
         assert got.tobytes() == expected.tobytes() and state(updated) == after
-        assert same_frame(used, without(frame, j))
+        assert same_frame(used, without_sensors(frame, j))
     if n == 2:
-        # With two sensors the wrong one is unknown, but one is rejected and the other is used.
-        *_, used, counts = SensorRejection(names).advance(bank_filter, bank, faulty(frame, 1), DT)
+        # With two sensors the faulty sensor is unknown, but one is rejected and the other is used.
+        *_, used, counts = SensorRejection(names).advance(
+            bank_filter, bank, with_fault(frame, 1), DT)
         assert sum(counts.values()) == 1 and np.count_nonzero(used.n_samples) == 1
 
 
 def test_the_frame_and_the_prior_are_not_modified():
     bank_filter, bank, frame, names = situation()
-    wrong = faulty(frame, 2)
+    wrong = with_fault(frame, 2)
     kept = copy.deepcopy(wrong)
     before, prior = (bank.x, bank.P), (bank.x.copy(), bank.P.copy())
     SensorRejection(names).advance(bank_filter, bank, wrong, DT)
@@ -139,14 +140,14 @@ def test_one_in_eight_sensors_and_at_least_one_may_be_rejected(n, max_rejected):
     assert max_rejected == max(1, n // SENSORS_PER_REJECTION)
     for wrong in (max_rejected, max_rejected + 1):
         bank_filter, bank, frame, names = situation(n, n_hyp=2)
-        # The sensors near the target, because those far away agree with everything.
+        # Sensors near the target are faulty, because distant sensors fit any hypothesis.
         near = np.argsort(np.linalg.norm(frame.field, axis=1))[-wrong:].tolist()
-        bad = faulty(frame, *near)
-        whole, after = plain(bank_filter, bank, bad)
+        bad = with_fault(frame, *near)
+        whole, after = updated_without_rejection(bank_filter, bank, bad)
         _, got, used, counts = SensorRejection(names).advance(bank_filter, bank, bad, DT)
         if wrong == max_rejected and n > 2:
             assert set(counts) == {f'frames in which {names[j]} was rejected' for j in near}
-            assert same_frame(used, without(frame, *near))
+            assert same_frame(used, without_sensors(frame, *near))
         elif wrong > max_rejected:
             # The whole frame is used, bit for bit: the track itself is lost.
             assert not counts and used is bad
@@ -156,7 +157,7 @@ def test_one_in_eight_sensors_and_at_least_one_may_be_rejected(n, max_rejected):
 def test_no_sensor_is_rejected_if_all_of_them_contradict_the_track():
     bank_filter, bank, frame, names = situation()
     lost = dataclasses.replace(frame, field=-3.0 * frame.field[::-1])
-    expected, after = plain(bank_filter, bank, lost)
+    expected, after = updated_without_rejection(bank_filter, bank, lost)
     _, got, used, counts = SensorRejection(names).advance(bank_filter, bank, lost, DT)
     assert used is lost and not counts
     assert got.tobytes() == expected.tobytes() and state(bank) == after
@@ -167,7 +168,7 @@ def test_no_sensor_is_rejected_if_all_of_them_contradict_the_track():
 def test_a_single_present_sensor_is_never_rejected():
     for n in (1, 6):
         bank_filter, bank, frame, names = situation(n)
-        alone = faulty(without(frame, *range(1, n)), 0)
+        alone = with_fault(without_sensors(frame, *range(1, n)), 0)
         bank_filter.n = 0
         *_, used, counts = SensorRejection(names).advance(bank_filter, bank, alone, DT)
         assert used is alone and not counts and bank_filter.n == 1
@@ -176,23 +177,23 @@ def test_a_single_present_sensor_is_never_rejected():
 def test_the_limit_on_rejected_sensors_counts_present_sensors_only():
     bank_filter, bank, frame, names = situation(16, n_hyp=2)
     near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()
-    bad = faulty(without(frame, near[0]), *near[-2:])
+    bad = with_fault(without_sensors(frame, near[0]), *near[-2:])
     *_, used, counts = SensorRejection(names).advance(bank_filter, bank, bad, DT)
     assert used is bad and not counts
 
 
-def test_a_sensor_with_a_missing_axis_is_rejected_as_well():
+def test_a_sensor_with_a_missing_axis_is_rejected():
     bank_filter, bank, frame, names = situation()
     field = frame.field.copy()
     field[:, 2] = np.nan
-    bad = faulty(dataclasses.replace(frame, field=field), 3)
+    bad = with_fault(dataclasses.replace(frame, field=field), 3)
     *_, used, counts = SensorRejection(names).advance(bank_filter, bank, bad, DT)
     assert counts == {f'frames in which {names[3]} was rejected': 1}
     assert np.isnan(used.field[3]).all() and not np.isnan(used.field[2, :2]).any()
 
 
 def cost(bank_filter, rejection, bank, frame):
-    """(number of updates, rows of unused sensors); the bank is not modified."""
+    """(number of updates, indices of unused sensors); the bank is not modified."""
     bank_filter.n = 0
     *_, used, _ = rejection.advance(bank_filter, copy.deepcopy(bank), frame, DT)
     return bank_filter.n, np.flatnonzero(used.n_samples == 0).tolist()
@@ -201,50 +202,51 @@ def cost(bank_filter, rejection, bank, frame):
 def test_the_sensor_rejected_in_the_previous_frame_is_tried_first():
     bank_filter, bank, frame, names = situation()
     rejection = SensorRejection(names)
-    assert cost(bank_filter, rejection, bank, faulty(frame, 2)) == (1 + 6 + 1, [2])
-    assert cost(bank_filter, rejection, bank, faulty(frame, 2)) == (2, [2])
-    # Now another sensor is wrong.
-    assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (1 + 1 + 6 + 1, [4])
-    # A frame that fits, or the end of a track, clears the suspicion.
+    assert cost(bank_filter, rejection, bank, with_fault(frame, 2)) == (1 + 6 + 1, [2])
+    assert cost(bank_filter, rejection, bank, with_fault(frame, 2)) == (2, [2])
+    # Now another sensor is faulty.
+    assert cost(bank_filter, rejection, bank, with_fault(frame, 4)) == (1 + 1 + 6 + 1, [4])
+    # A frame that fits, or the end of a track, clears the suspect.
     assert cost(bank_filter, rejection, bank, frame) == (1, [])
-    assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (8, [4])
+    assert cost(bank_filter, rejection, bank, with_fault(frame, 4)) == (8, [4])
     rejection.clear()
-    assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (8, [4])
-    # So does a frame in which no rejection helped.
-    assert cost(bank_filter, rejection, bank, faulty(frame, 2, 4)) == (9, [])
-    assert cost(bank_filter, rejection, bank, faulty(frame, 4)) == (8, [4])
-    # A missing sensor is not suspected, and costs no update.
-    assert cost(bank_filter, rejection, bank, faulty(without(frame, 4), 2)) == (1 + 5 + 1, [2, 4])
+    assert cost(bank_filter, rejection, bank, with_fault(frame, 4)) == (8, [4])
+    # A frame in which no rejection helps also clears the suspect.
+    assert cost(bank_filter, rejection, bank, with_fault(frame, 2, 4)) == (9, [])
+    assert cost(bank_filter, rejection, bank, with_fault(frame, 4)) == (8, [4])
+    # A missing sensor is not a suspect, and costs no update.
+    assert cost(bank_filter, rejection, bank, with_fault(without_sensors(frame, 4), 2)) == (
+        1 + 5 + 1, [2, 4])
 
 
 def test_previous_suspects_are_kept_if_too_few_sensors_are_present():
     bank_filter, bank, frame, names = situation(16, n_hyp=2)
     near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()
     rejection = SensorRejection(names)
-    assert cost(bank_filter, rejection, bank, faulty(frame, *near[-2:]))[1] == sorted(near[-2:])
-    fewer = faulty(without(frame, near[0]), *near[-2:])
+    assert cost(bank_filter, rejection, bank, with_fault(frame, *near[-2:]))[1] == sorted(near[-2:])
+    fewer = with_fault(without_sensors(frame, near[0]), *near[-2:])
     assert cost(bank_filter, rejection, bank, fewer)[1] == [near[0]]
 
 
 def test_the_second_of_two_wrong_sensors_is_sought_among_the_others():
     bank_filter, bank, frame, names = situation(16, n_hyp=2)
     near = np.argsort(np.linalg.norm(frame.field, axis=1)).tolist()[-2:]
-    assert cost(bank_filter, SensorRejection(names), bank, faulty(frame, *near)) == (
+    assert cost(bank_filter, SensorRejection(names), bank, with_fault(frame, *near)) == (
         1 + 16 + 1 + 15 + 1, sorted(near))
 
 
 def test_the_frame_has_to_fit_the_hypothesis_that_leads_by_weight():
     """Another hypothesis explains the frame, but its weight is negligible."""
     bank_filter, bank, frame, names = situation(n_hyp=2)
-    bank.x[1, bank_filter.observation.n_target + 3 * 2:][:3] = OFF
-    bad = faulty(frame, 2)
+    bank.x[1, bank_filter.observation.n_target + 3 * 2:][:3] = FAULT
+    bad = with_fault(frame, 2)
     assert cost(bank_filter, SensorRejection(names), bank, bad) == (1, [])
     bank.log_w = np.array([0.0, -1e9])
     assert cost(bank_filter, SensorRejection(names), bank, bad) == (8, [2])
 
 
 class RulingOutFilter(BankFilter):
-    """Rules out all hypotheses if a given sensor is present."""
+    """Filter that rules out all hypotheses if a given sensor is present."""
 
     def __init__(self, row, *args):
         super().__init__(*args)
@@ -260,7 +262,7 @@ def test_a_sensor_that_rules_out_every_hypothesis_is_rejected():
     plain_filter, bank, frame, names = situation()
     network = line_network(6, spacing=4.0, tilt=0.2)
     ruling_out = RulingOutFilter(3, network, vehicle_model(SETTINGS.vehicle, network), SETTINGS)
-    _, after = plain(plain_filter, bank, without(frame, 3))
+    _, after = updated_without_rejection(plain_filter, bank, without_sensors(frame, 3))
     _, got, _, counts = SensorRejection(names).advance(ruling_out, bank, frame, DT)
     assert counts == {f'frames in which {names[3]} was rejected': 1}
     assert np.isfinite(got).all() and state(bank) == after
@@ -269,9 +271,11 @@ def test_a_sensor_that_rules_out_every_hypothesis_is_rejected():
 # Rejection in the tracker.
 
 @functools.cache
-def passing(n_sensors, fault, seed=0, network_at=None, lasting_s=1.0):
-    """(pipeline, live tracks, (begin, end)) of a pass with a fault of mag_2; `network_at` [s] after
-    the begin of the fault, the network is replaced."""
+def tracked_pass(n_sensors, fault, seed=0, network_at=None, lasting_s=1.0):
+    """(pipeline, live tracks, (begin, end) of the fault) of a pass with a fault of mag_2.
+
+    The network is replaced `network_at` [s] after the fault begins.
+    """
     network, samples, _, times = stream(n_sensors, seed, fault, lasting_s)
     pipeline, tracks = Pipeline(network, settings_for('vehicle', POINT)), []
     for s in samples:
@@ -285,8 +289,8 @@ def passing(n_sensors, fault, seed=0, network_at=None, lasting_s=1.0):
 def test_a_fault_of_one_of_two_sensors_makes_the_track_ambiguous():
     flags = {}
     for fault in (None, 'swaps axes'):
-        # The fault is too short for a doubt about a single supporting sensor.
-        pipeline, tracks, (begin, _) = passing(
+        # The fault is too short for the doubt that only one sensor supports the track.
+        pipeline, tracks, (begin, _) = tracked_pass(
             2, fault, seed=1, lasting_s=MAX_SINGLE_SENSOR_S - 0.2)
         flags[fault] = [t.ambiguous for t in tracks if t.stamp_ns / NS > begin + 0.5]
         rejections = [what for what in pipeline.track.counts if 'was rejected' in what]
@@ -295,14 +299,14 @@ def test_a_fault_of_one_of_two_sensors_makes_the_track_ambiguous():
     assert not any(flags[None])
 
 
-WRONG_SENSOR = pytest.param(3, 0, marks=pytest.mark.xfail(strict=True, reason=(
-    'mag_3 is rejected in 7 of 16 frames: of three sensors, a track can fit any two; its poses are '
-    'ambiguous')))
+WRONG_REJECTION = pytest.param(3, 0, marks=pytest.mark.xfail(strict=True, reason=(
+    'mag_3 is rejected in 7 of 16 frames, because a track can fit any two of three sensors; '
+        'its poses are ambiguous')))
 
 
-@pytest.mark.parametrize('n_sensors, seed', [WRONG_SENSOR, (3, 1), (3, 2), (3, 3), (6, 0)])
+@pytest.mark.parametrize('n_sensors, seed', [WRONG_REJECTION, (3, 1), (3, 2), (3, 3), (6, 0)])
 def test_a_fault_of_one_of_several_sensors_leaves_the_track_unambiguous(n_sensors, seed):
-    pipeline, tracks, (begin, end) = passing(n_sensors, 'swaps axes', seed)
+    pipeline, tracks, (begin, end) = tracked_pass(n_sensors, 'swaps axes', seed)
     assert pipeline.track.counts['frames in which mag_2 was rejected'] > 3
     assert [what for what in pipeline.track.counts if 'was rejected' in what] == [
         'frames in which mag_2 was rejected']
@@ -316,21 +320,21 @@ def test_a_fault_of_one_of_several_sensors_leaves_the_track_unambiguous(n_sensor
 
 
 def test_a_track_that_is_fitted_to_the_wrong_two_sensors_is_ambiguous():
-    pipeline, tracks, (_, end) = passing(3, 'swaps axes', 0)
+    pipeline, tracks, (_, end) = tracked_pass(3, 'swaps axes', 0)
     assert [what for what in pipeline.track.counts if 'was rejected' in what]
     after = [t.ambiguous for t in tracks if t.stamp_ns / NS > end + 0.3]
     assert len(after) > 10 and all(after)
 
 
 def test_no_sensor_is_rejected_without_a_fault():
-    pipeline, tracks, _ = passing(3, None)
+    pipeline, tracks, _ = tracked_pass(3, None)
     assert len(tracks) > 20
     assert not [what for what in pipeline.track.counts if 'was rejected' in what]
 
 
 def test_a_new_network_during_a_rejection_waits_for_the_end_of_the_track():
-    pipeline, tracks, _ = passing(3, 'swaps axes', network_at=0.5)
-    _, expected, _ = passing(3, 'swaps axes')
+    pipeline, tracks, _ = tracked_pass(3, 'swaps axes', network_at=0.5)
+    _, expected, _ = tracked_pass(3, 'swaps axes')
     assert [(t.stamp_ns, t.position.tobytes(), t.ambiguous) for t in tracks] == [
         (t.stamp_ns, t.position.tobytes(), t.ambiguous) for t in expected]
 
@@ -380,6 +384,6 @@ def test_a_new_track_does_not_inherit_the_doubts_of_the_previous_one():
 
 @pytest.mark.parametrize('n_quiet', [0, 4])
 def test_a_target_that_was_not_seen_approaching_is_ambiguous(n_quiet):
-    """For example after a restart in the middle of a pass."""
+    """This happens after a restart in the middle of a pass."""
     _, tracks = first_tracks(n_quiet)
     assert tracks and all(t.ambiguous for t in tracks)

@@ -23,7 +23,7 @@ from support.samples import one, simulate
 
 
 def bank_of(rng, n_hyp, n_t, n_own, n_sensors):
-    """Hypotheses whose states are all correlated."""
+    """`FilterBank` of random hypotheses in which all states are correlated."""
     n_x = n_t + (n_own + 3) * n_sensors
     A = rng.standard_normal((n_hyp, n_x, n_x))
     bank = FilterBank.from_targets(np.zeros((n_hyp, n_t)), np.zeros((n_hyp, n_t, n_t)),
@@ -34,7 +34,7 @@ def bank_of(rng, n_hyp, n_t, n_own, n_sensors):
 
 
 @pytest.mark.parametrize('n_own', [0, 3, 6])
-def test_states_of_sensors_that_stay_are_kept(n_own):
+def test_states_of_common_sensors_are_retained(n_own):
     rng = np.random.default_rng(n_own)
     before, after = np.array([2, 5, 7]), np.array([5, 6, 7, 9])
     bank = bank_of(rng, 4, 8, n_own, 3)
@@ -78,7 +78,7 @@ def test_a_part_of_a_network_has_the_properties_of_its_sensors():
     assert part.earth_field is network.earth_field
 
 
-def driven(network, changes, speed=20.0, seed=1):
+def drive(network, changes, speed=20.0, seed=1):
     """(records, pipeline, true position at t) of a point target along the network."""
     farthest = float(network.positions[:, 0].max())
     path = Path(np.array([-60.0, -1.5]), 0.0, speed)
@@ -90,9 +90,9 @@ def driven(network, changes, speed=20.0, seed=1):
 
 
 def test_a_target_is_tracked_along_forty_sensors():
-    """180 m with six sensors at a time; the error stays within its covariance."""
+    """At any time six of the sensors over 180 m are used. The error stays within its covariance."""
     network = line_network(40, tilt=0.02)
-    records, pipeline, truth = driven(network, {'track.max_sensors': 6})
+    records, pipeline, truth = drive(network, {'track.max_sensors': 6})
     live = [r for r in records if isinstance(r, Track) and not r.ended]
     assert len({t.id for t in live}) == 1
     inside = [t for t in live if 0.0 < truth(t.stamp_ns / 1e9)[0] < 171.0]
@@ -108,7 +108,7 @@ def test_a_target_is_tracked_along_forty_sensors():
         assert t.predicted.shape == (40, 3) and t.mounting.shape == (40, 3)
         used = ~np.isnan(t.nis_by_sensor)
         assert used.sum() <= 6 and (~np.isnan(t.predicted[used])).all()
-        # One of the two nearest sensors with a learnt background is used.
+        # One of the two nearest sensors with an estimated background is used.
         present = np.flatnonzero(frames[t.stamp_ns].n_samples)
         nearest = present[np.argsort(np.abs(network.positions[present, 0] - t.position[0]))]
         assert used[nearest[:2]].any()
@@ -118,11 +118,11 @@ def test_a_target_is_tracked_along_forty_sensors():
 
 @pytest.mark.parametrize('limit', [8, 16])
 def test_further_sensors_join_after_the_frames_before_the_detection(monkeypatch, limit):
-    """A start with all of them would take seconds and gigabytes."""
+    """A start with all sensors would take seconds and gigabytes."""
     network, runs = line_network(12, tilt=0.02), []
     for n in (1000, 4):
         monkeypatch.setattr(manager, 'sensors_at_start', lambda *_, n=n: n)
-        records, pipeline, truth = driven(network, {'track.max_sensors': limit})
+        records, pipeline, truth = drive(network, {'track.max_sensors': limit})
         live = [r for r in records if isinstance(r, Track) and not r.ended]
         inside = [t for t in live if 0.0 < truth(t.stamp_ns / 1e9)[0] < 45.0]
         e = np.array([t.position[:2] - truth(t.stamp_ns / 1e9) for t in inside])
@@ -149,12 +149,12 @@ def test_further_sensors_join_after_the_frames_before_the_detection(monkeypatch,
 def frames():
     """(network, frames) of a point target along twelve sensors."""
     network = line_network(12, tilt=0.02)
-    found = [r for r in driven(network, {})[0] if isinstance(r, FieldFrame)]
+    found = [r for r in drive(network, {})[0] if isinstance(r, FieldFrame)]
     return network, found
 
 
-def managed(frames, changes, doubtful=None, start=slice(None)):
-    """(manager, live tracks) of frames that are fed to a `TrackManager`."""
+def track_frames(frames, changes, doubtful=None, start=slice(None)):
+    """(`TrackManager`, live tracks) after the frames have been fed."""
     network, every = frames
     tracker, tracks = manager.TrackManager(network, settings_for('vehicle', changes).track), []
     tracker.doubt(doubtful or {})
@@ -174,8 +174,8 @@ def test_sensors_that_join_without_measurements_change_nothing(monkeypatch, fram
         f, field=np.where(np.isin(np.arange(12), far)[:, None], np.nan, f.field),
         n_samples=np.where(np.isin(np.arange(12), far), 0, f.n_samples)) for f in every]
     monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
-    runs = [managed((network, silent), {**POINT, 'track.relinearise_window_s': 0.0,
-                                        'track.max_sensors': limit})[1] for limit in (4, 12)]
+    runs = [track_frames((network, silent), {**POINT, 'track.relinearise_window_s': 0.0,
+                                             'track.max_sensors': limit})[1] for limit in (4, 12)]
     for a, b in zip(*(tracks[:3] for tracks in runs), strict=True):
         np.testing.assert_allclose(b.position, a.position, atol=1e-6)
         np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-6, atol=1e-9)
@@ -183,14 +183,14 @@ def test_sensors_that_join_without_measurements_change_nothing(monkeypatch, fram
 
 def test_no_hypothesis_is_dropped_without_frames_before_the_detection(monkeypatch,
                                                                       frames):
-    """Their ranking is unknown until the other sensors join."""
+    """The ranking of the hypotheses is unknown until the other sensors join."""
     monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
     for name, value in (('WIDER_BYTES', 1), ('MIN_HYPOTHESES', 20)):
         monkeypatch.setattr(bank_size, name, value)
     first = next(k for k, f in enumerate(frames[1]) if f.target_present)
-    tracker, _ = managed(frames, {}, start=slice(first, first + 1))
+    tracker, _ = track_frames(frames, {}, start=slice(first, first + 1))
     assert len(tracker.bank) == settings_for('vehicle').track.max_initial_hypotheses
-    _, tracks = managed(frames, POINT, start=slice(first, None))
+    _, tracks = track_frames(frames, POINT, start=slice(first, None))
     used = [np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in tracks]
     assert used[0] <= 4 < max(used)
 
@@ -202,24 +202,24 @@ def test_the_approach_is_checked_with_the_same_sensors_in_all_frames(monkeypatch
         n_sensors.add(len(frame.field)), add(self, frame))[1])
     for limit, expected in ((16, {12}), (8, {8})):
         n_sensors.clear()
-        managed(frames, {**POINT, 'track.max_sensors': limit})
+        track_frames(frames, {**POINT, 'track.max_sensors': limit})
         assert n_sensors == expected
 
 
-def test_the_first_pose_is_doubted_for_a_sensor_that_joins_with_it(monkeypatch, frames):
+def test_the_first_pose_is_flagged_for_a_sensor_that_joins_with_it(monkeypatch, frames):
     network, every = frames
     first = next(f for f in every if f.target_present)
     far = network.names[int(np.nanargmin(np.linalg.norm(first.field, axis=1)))]
     for n in (1000, 4):
         monkeypatch.setattr(manager, 'sensors_at_start', lambda *_, n=n: n)
-        tracker, tracks = managed(frames, POINT, {far: ((0, 2**62),)})
+        tracker, tracks = track_frames(frames, POINT, {far: ((0, 2**62),)})
         assert DOUBTFUL_BACKGROUND in tracks[0].doubts
         assert tracker.counts['tracks with a doubtful background'] == 1
 
 
 def test_a_network_of_at_most_max_sensors_is_used_completely():
     network = line_network(6, tilt=0.02)
-    some, whole = ([r for r in driven(network, {'track.max_sensors': n})[0]
+    some, whole = ([r for r in drive(network, {'track.max_sensors': n})[0]
                     if isinstance(r, Track)] for n in (6, 1000))
     assert len(some) == len(whole) > 20
     for a, b in zip(some, whole, strict=True):
@@ -229,8 +229,8 @@ def test_a_network_of_at_most_max_sensors_is_used_completely():
 
 def test_a_part_of_a_frame_has_the_rows_of_its_sensors():
     network = line_network(4)
-    _, pipeline, _ = driven(network, {})
-    frame = next(r for r in driven(network, {})[0] if hasattr(r, 'n_samples'))
+    _, pipeline, _ = drive(network, {})
+    frame = next(r for r in drive(network, {})[0] if hasattr(r, 'n_samples'))
     part = part_of_frame(frame, np.array([0, 3]))
     np.testing.assert_array_equal(part.field, frame.field[[0, 3]])
     np.testing.assert_array_equal(part.covariance, frame.covariance[[0, 3]])

@@ -20,9 +20,11 @@ from support.plain_smoother import Step, smoothed_covariances, smoothed_states
 from support.samples import one, simulate
 
 
-def stacked(F, Q, H, R, y, x0, P0, missing):
-    """Means and covariances of all states given all measurements that are not `missing`, by one
-    least-squares solution."""
+def batch_solution(F, Q, H, R, y, x0, P0, missing):
+    """Means and covariances of all states from one least-squares solution.
+
+    Measurements marked in `missing` are excluded.
+    """
     n, n_x = len(y), len(x0)
     A, b = [np.linalg.inv(np.linalg.cholesky(P0)) @ np.eye(n_x, n * n_x)], []
     b.append(np.linalg.inv(np.linalg.cholesky(P0)) @ x0)
@@ -50,7 +52,8 @@ N_X = N_T + (N_OWN + 3) * N_SENSORS
 
 
 def whole_derivative(H):
-    """(3 n_sensors, n_x) derivative of all sensors; `plain_kalman.update` takes them one by one."""
+    """Derivative (3 n_sensors, n_x) of all sensors; `plain_kalman.update` processes one at a
+    time."""
     out = np.zeros((3 * N_SENSORS, N_X))
     for j in range(N_SENSORS):
         rows = slice(3 * j, 3 * j + 3)
@@ -61,7 +64,8 @@ def whole_derivative(H):
 
 
 def problem(seed):
-    """F, decay, Q (diagonal), C, H and measurements (n_steps, n_sensors, 3), some missing."""
+    """(F, decay, diagonal of Q, C, H, measurements (n_steps, n_sensors, 3), some of them
+    missing)."""
     rng = np.random.default_rng(seed)
     F = np.eye(N_T) + 0.2 * rng.standard_normal((N_T, N_T))
     decay, Q = rng.uniform(0.5, 1.0, N_X - N_T), rng.uniform(0.01, 0.1, N_X)
@@ -94,7 +98,8 @@ def steps_of(F, decay, Q, C, H, y, x, P, without=()):
 
 @pytest.mark.parametrize('unit', [1.0, 1e-8])
 def test_the_backward_pass_matches_least_squares_over_all_times(unit):
-    """Axes, sensors and a time are missing; the unit makes some states as small as fields in T."""
+    """Some axes, sensors and one time are missing. The unit makes some states as small as fields in
+    T."""
     F, decay, Q, C, H, y = problem(1)
     without = (3,)
     x0, P0 = np.random.default_rng(2).standard_normal((2, N_X)), np.diag(
@@ -104,9 +109,9 @@ def test_the_backward_pass_matches_least_squares_over_all_times(unit):
     whole = np.array([whole_derivative(h) for h in H])
     whole[missing] = 0.0
     R = block_diag(*C)
-    # Missing rows are removed from the noise as well.
-    expected = [stacked(block_diag(F, np.diag(decay)), np.diag(Q), whole, R,
-                        np.where(missing, 0.0, y.reshape(N_STEPS, -1)), x, P0, missing)
+    # Missing rows are also removed from the noise.
+    expected = [batch_solution(block_diag(F, np.diag(decay)), np.diag(Q), whole, R,
+                               np.where(missing, 0.0, y.reshape(N_STEPS, -1)), x, P0, missing)
                 for x in x0]
     # The states of the sensors are in another unit, like backgrounds and fields in tesla.
     T = np.append(np.ones(N_T), np.full(N_X - N_T, unit))
@@ -123,7 +128,7 @@ def test_the_backward_pass_matches_least_squares_over_all_times(unit):
 
 
 def test_exactly_known_states_do_not_change():
-    """One state has no variance and two are identical, so that the covariance is singular."""
+    """One state has no variance and two are identical, so the covariance is singular."""
     F, decay, Q, C, H, y = problem(4)
     F, Q, P0 = np.eye(N_T), 0.0 * Q, np.diag(np.r_[1.0, 1.0, 0.0, 2.0, np.ones(N_X - N_T)])
     P0[0, 1] = P0[1, 0] = 1.0
@@ -155,20 +160,24 @@ def run(body, changes, seed=0, speed=10.0):
 
 
 def errors_of(poses, truth):
-    """(errors (n,) [m], NEES (n,) per axis) in the plane."""
+    """(horizontal errors (n,) [m], NEES (n,) per axis)."""
     e = np.array([p.position[:2] for p in poses]) - truth([p.stamp_ns for p in poses])
     C = np.array([p.covariance[:2, :2] for p in poses])
     return np.hypot(*e.T), np.einsum('ni,ni->n', e, np.linalg.solve(C, e[:, :, None])[:, :, 0]) / 2
 
 
 def near(poses, truth):
-    """(n,) whether each pose is within five metres of the middle between the sensors."""
+    """Whether each pose (n,) is within five metres of the middle between the sensors."""
     return np.hypot(*truth([p.stamp_ns for p in poses]).T) < 5.0
 
 
 def smoothing_study(bodies, changes):
-    """Ratio of smoothed to filtered RMS error of the whole track and within 5 m of the middle, and
-    smoothed NEES per axis there, of each pass."""
+    """(error ratio of the whole track, error ratio within 5 m of the middle, NEES there) of each
+    pass.
+
+    The ratios divide the smoothed by the filtered RMS error. NEES is per axis, of the smoothed
+    poses.
+    """
     ratios, whole, nees = [], [], []
     for seed, body in enumerate(bodies):
         records, truth = run(body, changes, seed, np.random.default_rng(seed).uniform(8.0, 18.0))
@@ -185,7 +194,8 @@ def smoothing_study(bodies, changes):
 
 @pytest.mark.study
 def test_smoothing_reduces_the_error_of_a_matched_target_by_two_fifths():
-    """This is for the whole track; near the sensors, where the filter is accurate, it is less."""
+    """The reduction applies to the whole track. It is smaller near the sensors, where the filter is
+    accurate."""
     rng = np.random.default_rng(5)
     bodies = [point_body(rng.uniform(300.0, 500.0) * u / np.linalg.norm(u), 3.0, 0.5)
               for u in rng.standard_normal((40, 3))]
@@ -200,7 +210,7 @@ def test_smoothing_reduces_the_error_of_a_matched_target_by_two_fifths():
 
 
 @cache
-def clouds(n):
+def smoothing_study_of_cars(n):
     """`smoothing_study` of `n` cars of 4 m."""
     return smoothing_study(
         [random_vehicle(np.random.default_rng(100 + k), length=4.0) for k in range(n)], {})
@@ -210,12 +220,12 @@ def clouds(n):
 @pytest.mark.xfail(strict=True, reason='0.68: 0.59 of the error of a filter that does not '
                                        'relinearise, which is larger')
 def test_smoothing_reduces_the_error_of_a_car_by_two_fifths():
-    assert np.median(clouds(40)[0]) <= 0.6
+    assert np.median(smoothing_study_of_cars(40)[0]) <= 0.6
 
 
 @pytest.mark.parametrize('n', studied([10, 40]))
 def test_smoothed_poses_of_cars_are_more_accurate_and_consistent(n):
-    whole, ratios, nees = clouds(n)
+    whole, ratios, nees = smoothing_study_of_cars(n)
     print(f'clouds of 4 m: smoothed over filtered error {np.median(whole):.2f} (median), within '
           f'5 m {np.median(ratios):.2f}, ANEES {nees.mean():.2f}, median {np.median(nees):.2f}')
     assert np.median(ratios) <= 0.7
@@ -230,7 +240,8 @@ def test_smoothing_at_the_linearisation_of_the_filter_reproduces_its_pose(monkey
     live = [r for r in records if isinstance(r, Track) and not r.ended]
     smoothed = [r for r in records if isinstance(r, SmoothedPose)]
     np.testing.assert_allclose(smoothed[-1].position, live[-1].position, rtol=0, atol=1e-9)
-    # The covariance of the hypothesis alone; the published one includes others at this place.
+    # The smoothed covariance is of one hypothesis; the published one includes others at this
+    # position.
     own = next(h.covariance for h in live[-1].hypotheses
                if np.array_equal(h.position, live[-1].position))
     np.testing.assert_allclose(smoothed[-1].covariance, own, rtol=1e-7, atol=1e-12)
@@ -290,7 +301,7 @@ def test_smoothing_can_be_disabled_and_tracks_that_are_too_long_are_counted():
 
 
 def test_smoothing_bridges_missing_frames():
-    """Half a second in the middle of a pass has no measurements."""
+    """Measurements are missing for half a second in the middle of a pass."""
     network, samples, t, position = pass_of(point_body([250.0, -150.0, 80.0], 4.0, 0.5))
     pipeline = Pipeline(network, settings_for('vehicle', POINT))
     stage = TrackManager(network, settings_for('vehicle', POINT).track)
@@ -309,8 +320,9 @@ def test_smoothing_bridges_missing_frames():
         assert np.hypot(*(r.position[:2] - q)) < 0.3
 
 
-def spiked(stage, frames, at, size, n=1):
-    """Records of `stage` for `frames`, with `size` [T] on an axis of all sensors in `n` of them.
+def records_with_spike(stage, frames, at, size, n=1):
+    """Records of `stage` for `frames`, with `size` [T] added to an axis of all sensors in `n`
+    frames.
 
     A single sensor that contradicts the others would be rejected.
     """
@@ -334,7 +346,7 @@ def paths_without_and_with_a_spike(size):
                         for f in frames]))
     for spike in (0.0, size):
         stage = TrackManager(network, settings_for('vehicle').track)
-        out = spiked(stage, frames, at, spike)
+        out = records_with_spike(stage, frames, at, spike)
         poses = [r for r in out if isinstance(r, SmoothedPose) and r.id == 1]
         assert stage.counts['frames left out of smoothing'] == (1 if spike else 0)
         yield [p for p in poses if abs(np.interp(p.stamp_ns / 1e9, t, position[:, 0])) < 6.0]
@@ -342,7 +354,8 @@ def paths_without_and_with_a_spike(size):
 
 @pytest.mark.parametrize('size', studied([1e-6, 1e-5, 1e-3], [1e-5]))
 def test_a_frame_that_contradicts_the_track_does_not_distort_it(size):
-    """Another one of nearly equal hypotheses may survive: two standard deviations are allowed."""
+    """A different one of several nearly equal hypotheses may survive, so two standard deviations
+    are allowed."""
     plain, with_spike = paths_without_and_with_a_spike(size)
     assert len(plain) == len(with_spike) > 10
     for p, q in zip(plain, with_spike, strict=True):
@@ -352,9 +365,9 @@ def test_a_frame_that_contradicts_the_track_does_not_distort_it(size):
 
 @pytest.mark.study
 @pytest.mark.xfail(strict=True, reason=(
-    '0.50 m, 1.65 standard deviations: another one of nearly equal hypotheses survives'))
+    '0.50 m, 1.65 standard deviations: a different one of nearly equal hypotheses survives'))
 def test_a_frame_that_contradicts_the_track_does_not_distort_it_by_30_cm():
-    """The aim, which a row of three dipoles reached."""
+    """A row of three dipoles reached this aim."""
     plain, with_spike = paths_without_and_with_a_spike(1e-5)
     np.testing.assert_allclose([p.position for p in with_spike], [p.position for p in plain],
                                rtol=0, atol=0.3)
@@ -366,7 +379,7 @@ def test_smoothed_poses_of_a_lost_track_are_ambiguous():
     frames = [r for s in samples for r in pipeline.feed(one(s)) if isinstance(r, FieldFrame)]
     first = next(k for k, f in enumerate(frames) if f.target_present)
     stage = TrackManager(network, settings_for('vehicle').track)
-    out = spiked(stage, frames, first + 15, 1e-4, n=2)
+    out = records_with_spike(stage, frames, first + 15, 1e-4, n=2)
     assert stage.counts['tracks ended: target lost'] == 1
     smoothed = [r for r in out if isinstance(r, SmoothedPose)]
     assert smoothed and all(r.ambiguous for r in smoothed)

@@ -31,7 +31,7 @@ def field_of(path, network, t):
 
 
 def search_of(*paths, n_sensors=4, seed=0):
-    """`SteadySearch` in two seconds of frames with these vehicles, and its grid."""
+    """(`SteadySearch`, its grid) for two seconds of frames with these vehicles."""
     network, rng = NETWORKS[n_sensors], np.random.default_rng(seed)
     t = np.arange(-24, 1) * 0.08
     field = sum(field_of(path, network, t) for path in paths)
@@ -74,17 +74,17 @@ def test_another_vehicle_is_found_beside_a_known_one():
 
 
 def test_the_field_of_a_known_vehicle_is_not_another_vehicle():
-    """Only noise is left, and no path explains more than another."""
+    """Only noise remains, which no path explains better than another."""
     search, grid = search_of(FIRST)
     alone, beside = search.cost(grid), search.beside(FIRST).cost(grid)
     assert np.ptp(alone) > 1000.0
-    # The priors of paths and moments contribute some dozens.
+    # The priors of paths and moments contribute a few dozen.
     assert np.ptp(beside) < 100.0
 
 
 @pytest.mark.parametrize('truths', [[FIRST], [FIRST, SECOND]])
 def test_the_gradient_of_the_cost_is_exact(truths):
-    """Kaufman's Jacobian gives the exact gradient, also for two vehicles together."""
+    """Kaufman's Jacobian yields the exact gradient, also for two vehicles together."""
     search, _ = search_of(*truths)
     off = np.array([0.3, 0.2, 0.1, -0.5, 0.02, 0.01, 0.3])
     theta = np.concatenate([truth + off for truth in truths])[None]
@@ -99,7 +99,8 @@ def test_the_gradient_of_the_cost_is_exact(truths):
 
 
 def test_the_cost_of_the_grid_matches_the_full_covariance():
-    """Differences in the log-density of a point with a Gaussian moment, backgrounds and noise."""
+    """Cost differences match the log-density of a point with a Gaussian moment, backgrounds and
+    noise."""
     search, grid = search_of(FIRST)
     beside, rows = search.beside(SECOND), np.arange(0, len(grid.theta), 97)
     std = search.prior.moment_std[0] * np.sqrt(3.0)
@@ -116,7 +117,7 @@ def test_the_cost_of_the_grid_matches_the_full_covariance():
 
 @pytest.mark.parametrize('miss', [0.0, 1e-12, 1e-9, 1e-6])
 def test_a_path_through_a_sensor_raises_no_error(miss):
-    """A step of the search may lead there."""
+    """A step of the search may lead through a sensor."""
     search, grid = search_of(FIRST, SECOND)
     at = np.append(search.samples.positions[0] + [0.0, 0.0, miss], FIRST[3:])
     pair = np.append(at, SECOND)
@@ -161,19 +162,19 @@ def test_pairs_belong_to_different_minima():
     assert all((apart[i, k] > 0.3).any() for i in range(len(pairs)) for k in range(i))
 
 
-@pytest.mark.parametrize('standing', [0, 1])
-def test_a_pair_with_a_standing_vehicle_is_rejected(standing):
+@pytest.mark.parametrize('stationary', [0, 1])
+def test_a_pair_with_a_stationary_vehicle_is_rejected(stationary):
     search, _ = search_of(FIRST, SECOND)
     pair = np.array([FIRST, SECOND])
     assert np.isfinite(search.refined(pair.reshape(1, -1), 0)[1]).all()
-    pair[standing, 3] = 0.1
+    pair[stationary, 3] = 0.1
     assert np.isinf(search.refined(pair.reshape(1, -1), 0)[1]).all()
 
 
 @pytest.mark.parametrize('away, is_sensed', [
     (0.0, True), (15.0, True), (90.0, False), (300.0, False), (1e23, False), (-1e200, False)])
 def test_a_vehicle_that_no_sensor_senses_is_rejected(away, is_sensed):
-    """Another vehicle far away does not change how well the frames are explained."""
+    """A distant vehicle does not improve the fit of the frames."""
     search, _ = search_of(FIRST)
     other = np.append(away, SECOND[1:])
     for theta in (other, np.append(FIRST, other), np.append(other, FIRST)):
@@ -181,7 +182,7 @@ def test_a_vehicle_that_no_sensor_senses_is_rejected(away, is_sensed):
 
 
 def test_pairs_that_diverge_are_discarded(monkeypatch):
-    """The squares of their positions overflow."""
+    """The squares of the diverged positions overflow."""
     search, grid = search_of(FIRST, SECOND)
     refined = SteadySearch.refined
 
@@ -203,6 +204,6 @@ def test_a_search_without_a_valid_start_finds_nothing():
     assert search.best(grid, 3).shape == (0, 7) and search.pairs(grid, 3, 2) == []
 
 
-def test_standing_and_reversing_vehicles_are_not_found():
+def test_stationary_and_reversing_vehicles_are_not_found():
     search, grid = search_of(FIRST)
     assert (search.best(grid, 5)[:, 3] >= 0.2 * min(VEHICLE.speeds)).all()

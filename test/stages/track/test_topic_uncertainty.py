@@ -1,4 +1,4 @@
-"""Covariance of ambiguous tracks in messages without a flag: it includes all hypotheses."""
+"""Covariance of ambiguous tracks in messages without an ambiguity flag."""
 
 import dataclasses
 
@@ -26,7 +26,7 @@ VECTORS = st.tuples(UNIT, UNIT, UNIT).map(np.array)
 
 
 def track_of(weights, places, headings, policy=MIXTURE, std=0.5, **extra):
-    """`Track` of a bank of points along x that drive at 8 m/s; the first one is published."""
+    """`Track` of a bank of points along x that move at 8 m/s; the first hypothesis is published."""
     n, model = len(places), RowVehicle(np.zeros(3), np.ones(3), n_dipoles=1)
     x = np.zeros((n, 12))
     x[:, 0], x[:, 6] = places, 100.0
@@ -41,7 +41,7 @@ def track_of(weights, places, headings, policy=MIXTURE, std=0.5, **extra):
 
 
 def test_the_covariance_of_the_mixture_matches_samples():
-    """Position, heading and their correlation, about the published pose."""
+    """Position, heading and their correlation about the published pose are compared."""
     weights, places, headings = [0.6, 0.3, 0.1], [0.0, 20.0, -9.0], [0.0, np.pi - 0.2, 0.3]
     track = track_of(weights, places, headings)
     rng = np.random.default_rng(0)
@@ -54,12 +54,12 @@ def test_the_covariance_of_the_mixture_matches_samples():
     assert C[0, 5] == pytest.approx((x * yaw).mean(), rel=0.01)
     assert C[1, 1] == pytest.approx(0.25)
     assert np.linalg.eigvalsh(C).min() > 0.0
-    # Pose and covariance of the track are those of a single hypothesis.
+    # Pose and covariance of the track belong to a single hypothesis.
     assert track.position[0] == 0.0 and track.covariance[0, 0] == pytest.approx(0.25)
 
 
 def test_the_mixture_is_never_narrower_than_the_pose():
-    """Also if its covariance was widened by innovations or by another path."""
+    """This holds even if innovations or another path widen the covariance of the pose."""
     for extra in ({}, {'excess': 7.0}, {'difference': np.array([3.0, 1.0, 0.0, 0.5, 0.0, 0.0])}):
         track = track_of([0.7, 0.3], [0.0, 15.0], [0.0, 3.0], **extra)
         wider = track.topic_uncertainty.covariance - track.covariance
@@ -109,7 +109,7 @@ def test_the_rotation_between_two_headings_is_about_z():
 
 @pytest.mark.study
 def test_ambiguous_poses_on_the_topics_are_consistent():
-    """ANEES of 2 or less on the topics, over 102 random passes of two simulators."""
+    """The ANEES on the topics is at most 2, over 102 random passes of two simulators."""
     found = [one_random_pass(s, k, seed) for seed in range(17) for s in SIMULATORS for k in KINDS]
     ambiguous = np.concatenate([f.ambiguous for f in found])
     nees = np.concatenate([f.topic_nees for f in found])

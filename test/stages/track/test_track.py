@@ -19,7 +19,7 @@ from support.networks import line_network
 from support.samples import one, simulate
 from support.track_runs import drive, magnet_frames
 
-OVERFITS = 'poses doubted: the filter fits better than its path'
+OVERFITS = 'doubtful poses: the filter fits better than its path'
 
 
 def test_a_target_that_matches_the_model_is_tracked_within_its_covariance():
@@ -53,7 +53,7 @@ def test_the_evidence_identifies_the_kind_of_a_vehicle(kind, body):
     if kind == 'small':
         assert tracks[-1].length == tracks[-1].length_std == 0.0
     else:
-        # Most of the iron of the simulated vehicles spans seven tenths of their length.
+        # Most of the iron of the simulated vehicles extends over seven tenths of their length.
         assert 0.4 < tracks[-1].length / {'car': 4.3, 'truck': 11.0}[kind] < 1.0
         assert 0.0 < tracks[-1].length_std < 2.0
     assert sum(h.weight for h in tracks[-1].hypotheses if h.kind == kind) == pytest.approx(
@@ -62,7 +62,7 @@ def test_the_evidence_identifies_the_kind_of_a_vehicle(kind, body):
 
 @pytest.mark.study
 def test_most_trucks_are_identified_and_the_others_are_uncertain():
-    """35 of 40 trucks (seeds 0 to 39, other noise) were identified; the limit is binomial."""
+    """With other noise, 35 of 40 trucks (seeds 0 to 39) were identified. The limit is binomial."""
     n, ends = 16, []
     for seed in range(n):
         body = random_vehicle(np.random.default_rng(seed), **TRUCK)
@@ -123,7 +123,7 @@ def test_the_roll_of_a_dipole_is_flagged_as_unobservable():
     C = pose_covariance(track)
     np.testing.assert_allclose(C, C.T)
     assert np.linalg.eigvalsh(C).min() > -1e-12
-    # Rotations across the moment are well known.
+    # Rotations about axes across the moment are observable.
     across = np.linalg.svd(u[None])[2][1:]
     assert np.abs(across @ track.orientation_covariance @ across.T).max() < 1e-2
 
@@ -139,25 +139,25 @@ def test_a_vehicle_has_a_heading_and_unobservable_roll_and_pitch():
     np.testing.assert_allclose(R[:2, 0], v, atol=1e-9)
     C = middle.orientation_covariance
     assert C[0, 0] == C[1, 1] == pytest.approx(np.pi**2)
-    # The variance of the heading follows from that of the velocity across it.
+    # The variance of the heading follows from the variance of the velocity across the heading.
     u = np.array([-v[1], v[0]])
     expected = u @ middle.covariance[3:5, 3:5] @ u / (middle.velocity[:2] @ middle.velocity[:2])
     assert C[2, 2] == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize('gain, doubted', [(-20.0, True), (0.0, False)])
+@pytest.mark.parametrize('gain, is_flagged', [(-20.0, True), (0.0, False)])
 def test_poses_of_a_filter_that_fits_better_than_its_path_are_ambiguous(
-        monkeypatch, gain, doubted):
+        monkeypatch, gain, is_flagged):
     monkeypatch.setattr(Relinearisation, 'gain', lambda self, origin: gain)
     tracks, pipeline, truth = drive(line_network(2), point_body([200.0, -150.0, 80.0], 5.0, 0.5),
                                     Path(np.array([-70.0, -1.2]), 0.0, 10.0), POINT)
     live = [t for t in tracks if not t.ended]
     near = [t.ambiguous for t, place in zip(live, truth, strict=True) if np.hypot(*place) < 5.0]
-    assert len(near) > 8 and set(near) == {doubted}
-    assert bool(pipeline.track.counts[OVERFITS]) == doubted
+    assert len(near) > 8 and set(near) == {is_flagged}
+    assert bool(pipeline.track.counts[OVERFITS]) == is_flagged
 
 
-def test_a_magnet_is_not_doubted_for_overfitting(monkeypatch):
+def test_a_magnet_is_not_flagged_for_overfitting(monkeypatch):
     monkeypatch.setattr(Relinearisation, 'gain', lambda self, origin: -20.0)
     network, frames, _ = magnet_frames(20)
     stage = TrackManager(network, settings_for('magnet').track)
@@ -218,7 +218,7 @@ def test_a_hypothesis_at_a_sensor_is_dropped_and_the_others_continue():
     bank.origin = np.append(bank.origin, len(bank.origin))
     bank.x[-1, :3] = network.positions[0]
     bank.x[-1, 3:6] = 0.0
-    # The field is zero: a dropped hypothesis must not win because it predicts none.
+    # The field is zero. A dropped hypothesis must not lead because it predicts no field.
     track = stage.feed(dataclasses.replace(frames[1], field=0.0 * frames[1].field))[-1]
     assert np.isfinite(track.position).all() and not track.ended
     assert min(np.linalg.norm(h.position - network.positions[0]) for h in track.hypotheses) > 0.01
@@ -231,7 +231,8 @@ def test_soft_iron_has_no_effect_without_an_earth_field():
 
 
 def test_the_predicted_field_excludes_the_model_errors():
-    """With them any target would fit: a car that is tracked as a point has large residuals."""
+    """Any target would fit with the model errors. Without them, a car that is tracked as a point
+    has large residuals."""
     residual = {}
     for name, changes in (('point', {**POINT, 'track.vehicle.near_field_lengths': [2.0]}),
                           ('row', {})):

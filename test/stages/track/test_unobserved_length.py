@@ -1,4 +1,4 @@
-"""Middle of a long vehicle: its uncertainty before and after the whole vehicle has passed."""
+"""Uncertainty of the middle of a long vehicle, before and after the whole vehicle has passed."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ P = 0.04 * np.eye(19)
 SMALL, CAR, TRUCK = range(3)
 
 
-def of_vehicles():
+def length_of_vehicles():
     return UnobservedLength([0.0, 3.0, 9.0], [0.0, 1.0, 3.0])
 
 
@@ -22,8 +22,8 @@ def at(place, heading=0.0, speed=8.0):
     return x
 
 
-def off_middle(length, half_std, is_sensed, n=400_000):
-    """Samples of the offset from the middle of a row to that of its truck of 9 +- 3 m."""
+def middle_offsets(length, half_std, is_sensed, n=400_000):
+    """Samples of the offset from the middle of a row to the middle of its truck of 9 ± 3 m."""
     rng = np.random.default_rng(0)
     hidden = 0.5 * (9.0 - length) + half_std * rng.standard_normal(n)
     return hidden * (rng.uniform(-1.0, 1.0, n) if is_sensed else -1.0)
@@ -32,7 +32,8 @@ def off_middle(length, half_std, is_sensed, n=400_000):
 @pytest.mark.parametrize('complete', [True, False])
 @pytest.mark.parametrize('length', [5.0, -5.0])
 def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(complete, length):
-    """The variance along the heading grows by the excess length; a car keeps its covariance."""
+    """The variance along the heading grows by the excess length. The covariance of a car is
+    unchanged."""
     model, x, found = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi), {}
     x[18] = length
     for kind, usual, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
@@ -42,31 +43,32 @@ def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(comp
             complete=complete).covariance - P[:6, :6]
     assert not found['car'].any()
     along = found['truck'][1, 1]
-    assert along == pytest.approx(np.square(off_middle(5.0, 1.5, False)).mean(), rel=0.02)
+    assert along == pytest.approx(np.square(middle_offsets(5.0, 1.5, False)).mean(), rel=0.02)
     found['truck'][1, 1] = 0.0
     np.testing.assert_allclose(found['truck'], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize('length', [4.0, 8.9])
 def test_a_truck_that_has_been_sensed_may_have_its_iron_at_either_end(length):
-    unobserved_length = of_vehicles()
+    unobserved_length = length_of_vehicles()
     for beyond in (-9.0, 8.0):
         unobserved_length.update(at([beyond, 0.0]), P, np.zeros((1, 3)), True)
-        expected = np.square(off_middle(length, 1.5, beyond > 0.0)).mean()
+        expected = np.square(middle_offsets(length, 1.5, beyond > 0.0)).mean()
         found = unobserved_length.covariance(at([beyond, 0.0]), P, length, TRUCK)
         assert found[0, 0] == pytest.approx(expected, rel=0.02)
 
 
 def test_a_row_longer_than_its_kind_hides_only_the_spread_of_lengths():
-    unobserved_length = of_vehicles()
+    unobserved_length = length_of_vehicles()
     found = [unobserved_length.covariance(at([-9.0, 0.0]), P, length, TRUCK)[0, 0]
              for length in (9.0, 15.0)]
     np.testing.assert_allclose(found, 1.5**2)
 
 
 def test_an_approaching_car_may_be_the_front_of_a_truck():
-    """Variance of a mixture: one vehicle in three is a truck with its centre 3 m further back."""
-    added = of_vehicles().covariance(at([-20.0, 0.0]), P, 3.0, CAR)
+    """The variance is of a mixture in which one vehicle in three is a truck, with its middle 3 m
+    further back."""
+    added = length_of_vehicles().covariance(at([-20.0, 0.0]), P, 3.0, CAR)
     rng = np.random.default_rng(0)
     is_truck = rng.random(400_000) < 1.0 / 3.0
     behind = is_truck * 0.5 * (9.0 + 3.0 * rng.standard_normal(len(is_truck)) - 3.0)
@@ -76,7 +78,7 @@ def test_an_approaching_car_may_be_the_front_of_a_truck():
 
 @pytest.mark.parametrize('heading', [0.0, 2.0, np.pi])
 def test_a_car_is_certain_once_a_truck_would_have_been_sensed(heading):
-    unobserved_length, forward = of_vehicles(), np.array([np.cos(heading), np.sin(heading)])
+    unobserved_length, forward = length_of_vehicles(), np.array([np.cos(heading), np.sin(heading)])
     for beyond, is_open in ((-9.0, True), (2.9, True), (3.1, False), (8.0, False)):
         x = at(beyond * forward, heading)
         unobserved_length.update(x, P, np.zeros((1, 3)), True)
@@ -84,7 +86,7 @@ def test_a_car_is_certain_once_a_truck_would_have_been_sensed(heading):
 
 
 def test_the_distance_along_the_path_counts_around_a_corner():
-    unobserved_length = of_vehicles()
+    unobserved_length = length_of_vehicles()
     for place, heading, is_open in (([-4.0, 1.0], 0.0, True), ([1.0, 1.0], 0.0, True),
                                     ([2.0, 0.0], -1.5, True), ([2.0, -2.0], -1.5, False)):
         x = at(place, heading)
@@ -93,17 +95,17 @@ def test_the_distance_along_the_path_counts_around_a_corner():
 
 
 def test_only_a_sensor_near_the_path_confirms_the_length():
-    unobserved_length, far = of_vehicles(), np.array([[-100.0, 500.0, 0.0], [0.0, 3.0, 0.0]])
+    unobserved_length, far = length_of_vehicles(), np.array([[-100.0, 500.0, 0.0], [0.0, 3.0, 0.0]])
     unobserved_length.update(at([-20.0, 0.0]), P, far, True)
     assert unobserved_length.covariance(at([-20.0, 0.0]), P, 3.0, CAR).any()
     for places, is_certain in ((np.zeros((0, 3)), True), (far, False)):
-        # No sensor measured it, or its place is ambiguous.
+        # No sensor measured the vehicle, or its position is ambiguous.
         unobserved_length.update(at([20.0, 0.0]), P, places, is_certain)
         assert unobserved_length.covariance(at([20.0, 0.0]), P, 3.0, CAR).any()
 
 
 def test_a_vehicle_that_stops_keeps_its_heading():
-    unobserved_length = of_vehicles()
+    unobserved_length = length_of_vehicles()
     unobserved_length.update(at([-5.0, 0.0]), P, SENSORS, True)
     moving = unobserved_length.covariance(at([-4.0, 0.0]), P, 3.0, CAR)
     for heading in (0.0, 2.0, 4.0):
@@ -118,12 +120,13 @@ def test_no_vehicle_is_longer_than_the_longest_kind():
         assert not cars.covariance(coming, P, length, 0).any()
     longest = [UnobservedLength(lengths, [3.0] * len(lengths)).covariance(coming, P, 8.9, -1)
                for lengths in ([9.0], [0.0, 3.0, 9.0])]
-    # Shorter kinds do not change the result of the longest.
+    # Shorter kinds do not change the result for the longest kind.
     np.testing.assert_array_equal(*longest)
 
 
 def test_the_difference_to_another_path_widens_the_joint_covariance():
-    """Position, velocity and heading of a smoothed pose; the joint covariance stays valid."""
+    """It widens position, velocity and heading of a smoothed pose. The joint covariance stays
+    valid."""
     model, x = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi)
     found = {}
     for name, difference in (('here', np.zeros(6)), ('apart', np.array([6.0, 0, 0, 2.0, 0, 0]))):
