@@ -165,7 +165,7 @@ def test_a_rejected_joint_fit_has_a_reason():
     data, paths = world(rng, MEETING, 1)
     alone, two = [fit_pass(data, 1)], tracked(rng, paths)
     four = np.vstack([two, two + [0.0, 20.0, 0.0, 0.0, 0.0, 0.0]])
-    cases = [('4 were tracked, at most 3', data, four),
+    cases = [('4 targets were tracked, at most 3', data, four),
              ('too few measurements', replace(
                  data, t=data.t[::200], sensor=data.sensor[::200], field=data.field[::200],
                  covariance=data.covariance[::200]), two),
