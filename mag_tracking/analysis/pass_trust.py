@@ -17,9 +17,9 @@ from mag_tracking.arrays import FloatArray
 
 POINT_REACH = 2.1
 """[m] Reach of the iron of a car from a single dipole. At distance r, the model error relative to
-the field is the reach over r. Four real cars at 4.5 m had normalised costs of 10, 14, 17 and 51 (T10
-Table 6.1, TSP14 Table I). Their signal energy was 1200 times the noise energy at the CPA (T10 eq.
-(6.1)), or 87 times per value on average over the pass. Three cars left 10 to 18 % of the energy
+the field is the reach over r. Four real cars at 4.5 m had normalised costs of 10, 14, 17 and 51
+(T10 Table 6.1, TSP14 Table I). Their signal energy was 1200 times the noise energy at the CPA (T10
+eq. (6.1)), or 87 times per value on average over the pass. Three cars left 10 to 18 % of the energy
 unexplained; the fourth, with 57 %, cannot be modelled as a point."""
 
 ROW_REACH = 0.45

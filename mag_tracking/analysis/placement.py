@@ -1,7 +1,7 @@
 """Bounds and detection probabilities of a passing target for the planning of sensor positions.
 
-The target is a point that moves on a straight line at constant speed, with the states [r, v, m]. The
-direction of its moment is unknown in advance; all results are computed for each of `DIRECTIONS`.
+The target is a point that moves on a straight line at constant speed, with the states [r, v, m].
+The direction of its moment is unknown in advance; all results are computed for all `DIRECTIONS`.
 The bounds follow TSP14 section IV and MITRE12 section 4, with unknown backgrounds.
 """
 
@@ -39,8 +39,8 @@ class PlannedTarget:
     climb_std: float = np.inf
     """Prior standard deviation of the vertical speed [m/s]; inf = unknown."""
     moment_known: bool = True
-    """Whether the magnitude of the moment has a prior, with a relative standard deviation of one. The
-    direction is always unknown."""
+    """Whether the magnitude of the moment has a prior, with a relative standard deviation of one.
+    The direction is always unknown."""
 
     def prior(self) -> FloatArray:
         """Prior information matrix of [r, v, m].
@@ -67,7 +67,7 @@ class Sampling:
     period: float
     """Interval between frames [s]."""
     noise_std: FloatArray | float
-    """(n_sensors,) [T] noise standard deviation per axis and frame, or one value for all sensors."""
+    """(n_sensors,) [T] noise standard deviation per axis and frame; or one value for all."""
     field_error: float = 0.0
     """Error relative to the field due to clocks, mounting and model, treated as white noise. For an
     error that is constant over n frames, multiply by the square root of n."""

@@ -146,5 +146,5 @@ def test_invalid_arguments_raise_value_error():
     for mu_r in (0.99, math.nan, math.inf):
         with pytest.raises(ValueError, match=f'mu_r must be at least 1 and finite, got {mu_r}'):
             ellipsoid_moment((2.0, 1.0), mu_r, 0.0, B0)
-    with pytest.raises(ValueError, match=r'last axis of length 3, got \(2,\)'):
+    with pytest.raises(ValueError, match=r'last axis of length 3, got shape \(2,\)'):
         ellipsoid_moment((2.0, 1.0), 10.0, 0.0, B0[:2])

@@ -212,9 +212,9 @@ def test_shapes_broadcast_and_read_only_arrays_are_accepted():
 
 
 def test_invalid_arguments_raise_value_error():
-    with pytest.raises(ValueError, match='r needs a last axis of length 3'):
+    with pytest.raises(ValueError, match='r requires a last axis of length 3'):
         multipole_field(np.zeros((4, 2)), np.zeros(3))
-    with pytest.raises(ValueError, match='3, 8 or 15, got \\(5,\\)'):
+    with pytest.raises(ValueError, match=r'3, 8 or 15, got shape \(5,\)'):
         multipole_field(np.ones(3), np.zeros(5))
     with pytest.raises(ValueError, match='1, 2 or 3, got 4'):
         multipole_moments(np.zeros((1, 3)), np.zeros((1, 3)), 4)
