@@ -1,4 +1,4 @@
-"""Speed and direction from the delay between sensors: laws, and rejected data."""
+"""Speed and direction from the delay between sensors: accuracy, invariances, rejected data."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ HEIGHT = 0.5
 
 def along_x(speed, aside=2.0, seed=0, places=((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)), heading=0.0,
             noise=NOISE, n_dipoles=3):
-    """`PassData` of a row of dipoles that passes the sensors at some distance."""
+    """Simulate a pass of a row of dipoles at the distance `aside` [m] from the origin."""
     rng = np.random.default_rng(seed)
     u = np.array([np.cos(heading), np.sin(heading), 0.0])
     path = np.concatenate([[-aside * u[1], aside * u[0], HEIGHT], speed * u, [3.0]])
@@ -58,7 +58,7 @@ def test_small_orientation_and_gain_errors_have_little_effect():
 
 
 def test_three_sensors_off_a_line_observe_the_heading():
-    """Only pairs with similar fields count; here all do, because the target is far away."""
+    """The target is far away, so all pairs of sensors measure similar fields."""
     places = ((-2.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 0.6, 0.0))
     found = correlated_motion(along_x(6.0, aside=25.0, places=places, noise=1e-12))
     assert not found.reason and len(found.pairs) == 3 and 0.0 < found.heading_std < 0.5
@@ -78,7 +78,7 @@ def test_sensors_side_by_side_have_no_delay():
     assert 'at the same time' in found.reason
 
 
-def test_one_sensor_or_no_common_axis_yields_a_reason():
+def test_one_sensor_or_no_common_axis_results_in_a_reason():
     data = along_x(9.0)
     field = data.field.copy()
     field[data.sensor == 0] = np.nan
@@ -97,17 +97,17 @@ def test_one_common_axis_is_sufficient():
         9.0, rel=0.02)
 
 
-def test_contradictions_consider_speed_heading_and_their_stds():
+def test_contradictions_depend_on_speed_heading_and_their_stds():
     c = CorrelatedMotion('', 10.0, 0.2, 0.0, np.nan, 1.0)
     straight = 0.1, 0.02
     assert not contradicts_delays((10.4, 0.1), straight, c) \
         and contradicts_delays((14.0, 0.3), straight, c)
     assert contradicts_delays((10.0, 0.1), (np.pi, 0.1), c)
-    # Neither a difference with a large std nor a small difference is a contradiction.
+    # A difference is no contradiction if its std is large or if the difference is small.
     assert not contradicts_delays((14.0, 2.0), straight, c) \
         and not contradicts_delays((10.9, 0.01), straight, c)
     assert not contradicts_delays((10.0, 0.1), (np.radians(100.0), np.radians(40.0)), c)
-    # On a path oblique to the line of the sensors, the delay is shorter.
+    # The delay is shorter on a path oblique to the line of the sensors.
     assert not contradicts_delays((10.0 * np.cos(0.5), 0.1), (0.5, 0.02), c)
     assert contradicts_delays((10.0, 0.1), (0.5, 0.02), c)
     off_line = CorrelatedMotion('', 10.0, 0.2, 0.0, 0.1, 1.0)
@@ -129,7 +129,7 @@ def test_sensors_above_one_another_have_no_delay(places):
 @pytest.mark.parametrize('fault', ['first sensor constant', 'all zero', 'one infinite',
                                     'equal timestamps', 'few', 'no noise'])
 @pytest.mark.filterwarnings('error')
-def test_faulty_readings_yield_a_reason_or_an_estimate(fault):
+def test_faulty_readings_result_in_a_reason_or_an_estimate(fault):
     data = along_x(9.0)
     field, t = data.field.copy(), data.t.copy()
     if fault == 'first sensor constant':
@@ -140,28 +140,28 @@ def test_faulty_readings_yield_a_reason_or_an_estimate(fault):
         field[100, 0] = np.inf
     if fault == 'equal timestamps':
         for j in (0, 1):
-            mine = np.flatnonzero(data.sensor == j)
-            t[mine[100:900]] = t[mine[100]]
-    found = dataclasses.replace(data, field=field, t=t)
+            of_sensor = np.flatnonzero(data.sensor == j)
+            t[of_sensor[100:900]] = t[of_sensor[100]]
+    faulty = dataclasses.replace(data, field=field, t=t)
     if fault == 'few':
         rows = np.flatnonzero(data.t > 2.98)
-        found = dataclasses.replace(data, t=t[rows], sensor=data.sensor[rows], field=field[rows],
+        faulty = dataclasses.replace(data, t=t[rows], sensor=data.sensor[rows], field=field[rows],
                                     covariance=data.covariance[rows])
     if fault == 'no noise':
-        found = dataclasses.replace(data, covariance=0.0 * data.covariance)
-    c = correlated_motion(found)
-    assert c.reason if fault != 'one infinite' else abs(c.speed - 9.0) < 0.3
+        faulty = dataclasses.replace(data, covariance=0.0 * data.covariance)
+    motion = correlated_motion(faulty)
+    assert motion.reason if fault != 'one infinite' else abs(motion.speed - 9.0) < 0.3
 
 
-@pytest.mark.parametrize('share', [0.9, 0.5, 0.2])
-def test_simultaneous_opposite_vehicles_have_no_delay(share):
+@pytest.mark.parametrize('scale', [0.9, 0.5, 0.2])
+def test_simultaneous_opposite_vehicles_have_no_delay(scale):
     one, other = along_x(10.0, seed=1), along_x(14.0, seed=2, heading=np.pi)
-    both = dataclasses.replace(one, field=one.field + share * other.field)
+    both = dataclasses.replace(one, field=one.field + scale * other.field)
     assert 'different fields' in correlated_motion(both).reason
 
 
 def test_missing_readings_have_no_effect():
-    """In the log of a track, a missing reading and its covariance are NaN."""
+    """Missing readings and their covariances are NaN in the log of a track."""
     data = along_x(7.0)
     field, covariance = data.field.copy(), data.covariance.copy()
     field[[5, 1500]] = covariance[[5, 1500]] = np.nan
@@ -170,7 +170,7 @@ def test_missing_readings_have_no_effect():
 
 
 def test_a_scaled_or_rotated_field_is_different():
-    """If a vehicle turns away, its field at the second sensor is weaker and rotated."""
+    """A vehicle that turns away has a weaker and rotated field at the second sensor."""
     data = along_x(7.0)
     second = (data.sensor == 1)[:, None]
     far = rotation_from_quaternion(quaternion_from_rotation_vector(np.radians([0.0, 0.0, 15.0])))

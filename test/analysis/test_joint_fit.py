@@ -1,4 +1,4 @@
-"""Joint fit of several targets: estimates, consistent covariances, and rejected fits."""
+"""Joint fit of several targets: estimates, covariances, and rejected fits."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ FOUR = network_of([[-3.0, -4.5, 0.0], [-3.0, 4.5, 0.0], [3.0, -4.5, 0.0], [3.0, 
 
 
 def one_path(rng, at_s, direction, n_dipoles):
-    """(path, moments) of a vehicle that passes the origin at a time [s], in its lane."""
+    """Random (path, moments) of a vehicle in its lane, passing the origin at `at_s` [s]."""
     speed = direction * rng.uniform(8.0, 20.0)
     place = [-speed * at_s, -direction * rng.uniform(1.4, 2.2), rng.uniform(0.4, 1.0)]
     moments = random_moments(rng, n_dipoles)
@@ -36,7 +36,7 @@ def one_path(rng, at_s, direction, n_dipoles):
 
 
 def world(rng, plan, n_dipoles, network=ROAD):
-    """(`PassData`, [path]) of vehicles of a plan [(time [s], direction)]."""
+    """Simulate vehicles of a plan [(time [s], direction)]; return (`PassData`, [path])."""
     targets = [one_path(rng, *when, n_dipoles) for when in plan]
     fields = [measured(network, path, moments, rng, seconds=6.0, noise=1.2e-8 if k == 0 else 1e-15)
               for k, (path, moments) in enumerate(targets)]
@@ -47,11 +47,11 @@ def world(rng, plan, n_dipoles, network=ROAD):
 
 
 def tracked(rng, paths):
-    """Paths (K, 6) with the errors of a tracker: 0.5 m and 5 % of the speed."""
-    found = np.array([path[:6] for path in paths])
-    found[:, :2] += 0.5 * rng.standard_normal((len(paths), 2))
-    found[:, 3] *= 1.0 + 0.05 * rng.standard_normal(len(paths))
-    return found
+    """Add typical errors of a tracker to paths (K, 6): 0.5 m and 5 % of the speed."""
+    tracks = np.array([path[:6] for path in paths])
+    tracks[:, :2] += 0.5 * rng.standard_normal((len(paths), 2))
+    tracks[:, 3] *= 1.0 + 0.05 * rng.standard_normal(len(paths))
+    return tracks
 
 
 MEETING, FOLLOWING = ((-0.3, 1), (0.2, -1)), ((-0.8, 1), (0.8, 1))
@@ -89,7 +89,7 @@ def test_three_vehicles_are_fitted():
 
 
 def test_data_of_each_fit_exclude_the_fields_of_the_others():
-    """The field of one vehicle and the noise remain."""
+    """Only the field of one vehicle and the noise remain."""
     rng = np.random.default_rng(6)
     data, paths = world(rng, MEETING, 1)
     (first,), (second,) = fit_joint(data, tracked(rng, paths), GROUND, (1,))
@@ -110,7 +110,7 @@ def test_order_of_each_vehicle_is_chosen_separately():
     found = fit_joint(data, tracked(rng, (point, row)), GROUND, (1, 2, 3))
     orders = [choose_order(fits).n_dipoles for fits in found]
     assert orders[0] == 1 and orders[1] >= 2
-    # With any number of dipoles it is the same vehicle, with the same time zero.
+    # The fits of all orders describe the same vehicle and have the same time zero.
     for fits, path in zip(found, (point, row), strict=True):
         assert [fit.n_dipoles for fit in fits] == [1, 2, 3]
         assert len({(fit.data.stamp_ns, fit.data.t[0]) for fit in fits}) == 1
@@ -118,7 +118,7 @@ def test_order_of_each_vehicle_is_chosen_separately():
 
 
 def test_two_following_vehicles_are_not_fitted_as_one_long_row():
-    """Without tracks they are: a row of two dipoles, as long as the distance between them."""
+    """Without tracks, the vehicles are fitted as a row with the length of their distance."""
     rng = np.random.default_rng(3)
     one, moments = one_path(rng, -0.5, 1, 2)
     other = one.copy()
@@ -169,14 +169,14 @@ def test_a_rejected_joint_fit_has_a_reason():
              ('too few measurements', replace(
                  data, t=data.t[::200], sensor=data.sensor[::200], field=data.field[::200],
                  covariance=data.covariance[::200]), two),
-             # A third vehicle that was not tracked.
+             # A third, untracked vehicle.
              ('of the field unexplained', together(data, measured(
                  ROAD, *one_path(rng, 1.5, 1, 1), rng, seconds=6.0, noise=1e-15)), two)]
     for reason, of, tracks in cases:
         fits, = fit_targets(of, alone, tracks, GROUND, (1,))
         assert reason in fits[0].reason and fits[0].trusted == (), fits[0].reason
         assert choose_order(fits) is None
-    # With one sensor, the scale is not observable even for one vehicle.
+    # With one sensor, the scale is not observable, even for a single vehicle.
     one = measured(network_of([[0.0, -4.5, 0.0]]), paths[0], np.ones((1, 3)), rng)
     assert fit_targets(one, alone, two, GROUND, (1,)) == (tuple(alone),)
 
@@ -191,7 +191,7 @@ def test_vehicles_side_by_side_or_following_are_separate():
     assert are_separate(data, (one, moved(0.0, 3.5)))
     assert are_separate(data, (one, moved(-7.0)))
     assert not are_separate(data, (one, moved(-5.0)))
-    # One vehicle catches up within range of the sensors, another one stays far behind.
+    # The first vehicle catches up within range of the sensors, the second vehicle outside.
     assert not are_separate(data, (one, moved(-9.0, 0.0, 0.0, 6.0)))
     assert are_separate(data, (one, moved(-60.0, 0.0, 0.0, 2.0)))
     assert are_separate(data, (one,))
@@ -240,19 +240,19 @@ def test_fits_are_in_the_order_of_the_passes():
         assert found[0][0].data.stamp_ns < found[1][0].data.stamp_ns
 
 
-def test_a_fit_that_left_its_track_has_a_reason():
+def test_a_fit_that_differs_from_its_track_has_a_reason():
     rng = np.random.default_rng(14)
     data, paths = world(rng, MEETING, 1)
-    astray = tracked(rng, paths)
-    # No vehicle is this fast.
-    astray[1, 3] *= 3.0
-    found = fit_joint(data, astray, GROUND, (1,))
+    wrong_tracks = tracked(rng, paths)
+    # The track is three times as fast as the vehicle.
+    wrong_tracks[1, 3] *= 3.0
+    found = fit_joint(data, wrong_tracks, GROUND, (1,))
     assert sorted(fit.reason for fit, in found) == ['', 'the fit is not at the tracked position']
-    assert fit_joint(data, astray, GROUND, (1,), stopped=lambda: True) == ()
+    assert fit_joint(data, wrong_tracks, GROUND, (1,), stopped=lambda: True) == ()
 
 
 def two_minima(*others):
-    """Fits of two points whose search also ended at `others`, functions of theta (12,)."""
+    """Fit two points, with further minima `others` (functions of theta (12,))."""
     rng = np.random.default_rng(15)
     data, paths = world(rng, MEETING, 1)
     theta = np.concatenate(paths)
@@ -264,7 +264,7 @@ def two_minima(*others):
     return data, theta, fits_at_minimum(data, (1, 1), found, p, 1.0, SensorErrors()), (p, found)
 
 
-def test_exchanged_targets_are_no_rivals_of_each_other():
+def test_exchanged_targets_are_not_rivals():
     def exchanged(theta):
         return np.concatenate([theta[6:], theta[:6]])
 
@@ -275,7 +275,7 @@ def test_exchanged_targets_are_no_rivals_of_each_other():
     assert first.rivals == () and len(second.rivals) == 1
     np.testing.assert_allclose(second.rivals[0][1], theta[6:] + [0.0, 3.0, 0.0, 0.0, 0.0, 0.0])
     assert assignment([theta[:6], theta[6:]], [theta[6:], theta[:6]]) == (1, 0)
-    # A shift in time moves the rival along its own path.
+    # A shift of time zero also propagates the rival along its path.
     moved = second.shifted(2.0)
     np.testing.assert_allclose(moved.rivals[0][1][:3],
                                second.rivals[0][1][:3] + 2.0 * theta[9:12])
@@ -301,8 +301,8 @@ def test_residuals_near_any_target_are_not_elsewhere():
     rows = [FittedRow(1, path, (RowPass(data.t, data.positions, ROAD.R_sw[data.sensor], 1).basis(
         path[None])[0] @ [200.0, 100.0, -300.0]).reshape(-1, 3)) for path in paths]
     for row in rows:
-        left = np.einsum('nij,nj->ni', data.whitening, 0.2 * row.field)
-        assert residual_elsewhere(data, rows, left) < 1e-3
+        residual = np.einsum('nij,nj->ni', data.whitening, 0.2 * row.field)
+        assert residual_elsewhere(data, rows, residual) < 1e-3
 
 
 def test_targets_of_a_poor_joint_fit_are_ambiguous():

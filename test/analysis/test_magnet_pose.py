@@ -1,4 +1,4 @@
-"""Single poses of a magnet, and joint estimation of poses and network geometry."""
+"""Pose of a magnet from one reading, and joint estimation of poses and network geometry."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from support.magnet_boards import HIGH, LOW, MOMENT, SETTINGS, board, estimated,
 
 
 def test_single_poses_have_consistent_covariances():
-    """Random poses in the box, one reading per sensor; the field error is part of the noise."""
+    """Random poses in the box with one reading per sensor and a random field error."""
     network = board(4, 0.05)
     rng = np.random.default_rng(5)
     settings = PoseSettings()
@@ -77,7 +77,7 @@ def test_a_rejected_pose_has_a_reason():
                              'high': HIGH, 'settings': PoseSettings(), **change})
 
 
-# Without a tracker.
+# Calibration without a tracker.
 
 def test_unknown_poses_and_geometry_are_estimated_jointly():
     nees = []

@@ -1,4 +1,4 @@
-"""Classifier of signatures: accuracy, calibration, unknown signatures, rejected labels."""
+"""Classifier of signatures: accuracy, calibration, unknown signatures, and rejected labels."""
 
 from functools import cache
 
@@ -30,14 +30,14 @@ def trained(e):
 
 
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
-def test_accuracy_is_better_than_the_share_of_the_largest_class(simulator):
+def test_accuracy_exceeds_the_fraction_of_the_largest_class(simulator):
     e = examples(simulator)
     found = evaluate_splits(e.x, e.labels, e.groups, e.axes, e.unit, 5)
     assert found.majority == pytest.approx(100 / 140, abs=0.03)
     assert found.accuracy.mean() > found.majority + 0.05
-    # A constant answer has a balanced accuracy of a third.
+    # A constant prediction has a balanced accuracy of one third.
     assert found.balanced_accuracy.mean() > 0.65
-    # The aim is 0.05; three standard errors of 5 x 42 answers are added.
+    # The target is 0.05; the limit adds three standard errors of 5 x 42 predictions.
     assert found.reliability < 0.05 + 3.0 * np.sqrt(0.1 / 210)
     assert found.unknown.mean() < 0.1
 
@@ -76,7 +76,8 @@ def test_two_classes_have_probabilities():
 
 @pytest.mark.parametrize(('labels', 'message'), [
     (['car'] * 10, 'at least two classes, got car'), (['car'] * 9 + ['truck'], "got 1 of 'truck'"),
-    (['car'] * 5 + [''] * 5, 'labels are missing for 5'), (['car'] * 5 + ['unknown'] * 5, 'rename the class')])
+    (['car'] * 5 + [''] * 5, 'labels are missing for 5'),
+    (['car'] * 5 + ['unknown'] * 5, 'rename the class')])
 def test_labels_unsuitable_for_training_are_rejected(labels, message):
     x = np.random.default_rng(0).standard_normal((10, 4))
     with pytest.raises(LabelsError, match=message):
@@ -91,13 +92,13 @@ def test_reliability_error_follows_its_definition():
 
 
 def test_random_labels_are_not_learnt_from_sensors_of_one_pass():
-    """Four sensors measure nearly the same: one of them in the test set would leak the labels."""
+    """Four sensors measure almost equal readings, so a split of a pass would leak labels."""
     rng = np.random.default_rng(2)
     of_pass = rng.standard_normal((40, 20)).repeat(4, axis=0)
     x = of_pass + 0.01 * rng.standard_normal(of_pass.shape)
     labels = rng.choice(['a', 'b'], 40).repeat(4).tolist()
     groups = list(map(str, np.arange(40).repeat(4)))
     found = evaluate_splits(x, labels, groups, ('x',), 'T', 10)
-    # Chance level within three standard errors of ten splits of twelve passes, which overlap.
+    # Chance level within three standard errors of ten overlapping splits of twelve passes.
     assert abs(found.balanced_accuracy.mean() - 0.5) < 0.25
     assert found.accuracy.mean() < 0.8

@@ -172,7 +172,7 @@ def test_a_string_with_special_characters_is_read_back(tmp_path):
     ('x_azimuth_deg: 90', 'x_azimuth: 90', "site: unknown key 'x_azimuth'"),
     ('site:', 'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]\nsite:', 'both define the field'),
 ])
-def test_invalid_calibrations_are_refused(tmp_path, old, new, message):
+def test_invalid_calibrations_are_rejected(tmp_path, old, new, message):
     assert old in CALIBRATED
     with pytest.raises(NetworkError, match=message):
         read(tmp_path, CALIBRATED.replace(old, new))
@@ -203,13 +203,13 @@ def test_invalid_calibrations_are_refused(tmp_path, old, new, message):
     ('[2.0e-6, 1.55e-5, -4.9e-5]', '[2.0e-3, 0.0, 0.0]', 'exceeds a millitesla'),
     ('position: [0, -4.5, 0]', 'position: [0, 2.0e+8, 0]', 'too far from the origin'),
 ])
-def test_invalid_networks_are_refused(tmp_path, old, new, message):
+def test_invalid_networks_are_rejected(tmp_path, old, new, message):
     assert old in GOOD
     with pytest.raises(NetworkError, match=message.replace('[', r'\[')):
         read(tmp_path, GOOD.replace(old, new))
 
 
-def test_missing_and_empty_files_are_refused(tmp_path):
+def test_missing_and_empty_files_are_rejected(tmp_path):
     with pytest.raises(NetworkError, match='cannot read'):
         read_network(tmp_path / 'nowhere.yaml')
     for text in ('', 'sensors: {}', 'sensors: [a]'):
@@ -217,7 +217,7 @@ def test_missing_and_empty_files_are_refused(tmp_path):
             read(tmp_path, text)
 
 
-def test_an_unknown_sensor_is_refused(tmp_path):
+def test_an_unknown_sensor_is_rejected(tmp_path):
     with pytest.raises(NetworkError, match='unknown sensor c; the network has a, b'):
         read(tmp_path, GOOD).index('c')
 

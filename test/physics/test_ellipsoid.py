@@ -1,4 +1,4 @@
-"""Permeable ellipsoid: numerical integration, limits, and the corrected equations of MITRE12."""
+"""Permeable ellipsoid: comparison with integration, limit cases and corrected MITRE12 equations."""
 
 import math
 
@@ -23,7 +23,10 @@ induction = st.tuples(*3 * [st.floats(-60e-6, 60e-6)]).map(np.array)
 
 
 def integrated_factor(a, b, c):
-    """a b c/2 int_0^inf ds/((s + a^2) sqrt((s + a^2)(s + b^2)(s + c^2))), with s = exp(u)."""
+    """Demagnetisation factor along a, by numerical integration.
+
+    a b c/2 int_0^inf ds/((s + a^2) sqrt((s + a^2)(s + b^2)(s + c^2))), with s = exp(u).
+    """
     def integrand(u):
         s = math.exp(u)
         return s / ((s + a * a) * math.sqrt((s + a * a) * (s + b * b) * (s + c * c)))
