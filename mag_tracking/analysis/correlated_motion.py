@@ -225,8 +225,8 @@ class _SensorReadings:
 
 
 @dataclass(frozen=True)
-class _Pair:
-    """Two series, resampled to common times and smoothed, which does not change the delay."""
+class _SmoothedPair:
+    """Two smoothed series at common times. Smoothing does not change the delay."""
 
     t: FloatArray
     """(n,) [s]"""
@@ -247,7 +247,7 @@ class _Pair:
         return field, slope
 
 
-def _resampled_pair(data: PassData, i: int, j: int) -> _Pair | None:
+def _resampled_pair(data: PassData, i: int, j: int) -> _SmoothedPair | None:
     """Resample the readings of two sensors to common times; None if they are not comparable."""
     is_reported = [~np.isnan(data.field[data.sensor == k]).all(axis=0) for k in (i, j)]
     R = data.network.R_ws
@@ -270,8 +270,8 @@ def _resampled_pair(data: PassData, i: int, j: int) -> _Pair | None:
     energy /= energy.sum()
     width = max(step, SMOOTHING * float(np.sqrt(energy @ np.square(t - energy @ t))))
     smooth = first.smoothed(t, width)
-    return _Pair(t, smooth, np.gradient(smooth, t, axis=0), second.smoothed(t, width), width,
-                 float(np.hypot(first.noise, second.noise)))
+    return _SmoothedPair(t, smooth, np.gradient(smooth, t, axis=0), second.smoothed(t, width),
+                         width, float(np.hypot(first.noise, second.noise)))
 
 
 def _estimate_delay(data: PassData, i: int, j: int) -> PairDelay | None:
@@ -288,7 +288,7 @@ def _estimate_delay(data: PassData, i: int, j: int) -> PairDelay | None:
     return PairDelay(i, j, delay, std, similarity)
 
 
-def _correlation_maxima(pair: _Pair) -> list[float]:
+def _correlation_maxima(pair: _SmoothedPair) -> list[float]:
     """Delays [s] of the highest maxima of the cross-correlation, at most five."""
     every = max(1, len(pair.t) // N_COARSE)
     step = every * (pair.t[1] - pair.t[0])
@@ -299,7 +299,7 @@ def _correlation_maxima(pair: _Pair) -> list[float]:
     return [float((k - (len(a) - 1)) * step) for k in high] or [0.0]
 
 
-def _refine_delay(pair: _Pair, tau: float) -> tuple[float, float, float]:
+def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]:
     """Refine a delay [s]; return the delay, its standard deviation [s] and the similarity.
 
     The second field is modelled as the delayed first field with a small rotation, scale and gain
@@ -350,7 +350,7 @@ def _delay_std(t: FloatArray, J: FloatArray, residuals: FloatArray, prior: Float
     return float(np.sqrt(covariance[0, 0]))
 
 
-def _residuals(pair: _Pair, t: FloatArray, y: FloatArray,
+def _residuals(pair: _SmoothedPair, t: FloatArray, y: FloatArray,
                theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals (n k,) [T] and derivatives of the model (n k, n_theta) by `theta`."""
     k = y.shape[1]

@@ -1,8 +1,8 @@
 """Joint batch fit of several targets whose fields overlap.
 
-The targets are first modelled as points. Their starting positions are the tracked positions and,
-one target after another, the places of the strongest residual field. The number of dipoles of each
-target is then selected.
+The targets are first modelled as points. One search starts at the tracked positions. A second
+search adds the targets one by one where the residual field is strongest. The number of dipoles of
+each target is then selected.
 """
 
 from collections.abc import Callable, Sequence
@@ -150,13 +150,13 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
 def _initial_paths(rough: PassData, n_targets: int, ground: GroundPrior) -> FloatArray:
     """Best paths (n, 6 n_targets) of point targets, found by a coarse search in averaged data."""
     paths: FloatArray = np.zeros((1, 0))
-    rests = [rough]
+    residuals = [rough]
     for n in range(1, n_targets + 1):
         orders = n * (1,)
         model_of, prior = partial(SuperposedPasses.of, orders), ground.prior(orders)
         starts = []
-        for known, rest in zip(paths, rests, strict=True):
-            own = starting_paths(rest, 1)
+        for known, residual_data in zip(paths, residuals, strict=True):
+            own = starting_paths(residual_data, 1)
             starts.append(np.hstack([np.tile(known, (len(own), 1)), own]))
         coarse = separable_problem(rough, model_of, prior=prior)
         paths, _ = coarse_minima(separable_problem(rough, model_of, COARSE_ERROR, prior), coarse,
@@ -164,7 +164,7 @@ def _initial_paths(rough: PassData, n_targets: int, ground: GroundPrior) -> Floa
                                  N_STEPS, N_PLACEMENTS)
         if n < n_targets:
             model = model_of(rough.t, rough.positions, rough.network.R_sw[rough.sensor])
-            rests = [replace(rough, field=rough.field - (
+            residuals = [replace(rough, field=rough.field - (
                 model.basis(path[None])[0] @ coarse.linear(path)).reshape(-1, 3))
                 for path in paths]
     return paths

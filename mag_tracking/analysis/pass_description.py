@@ -62,7 +62,7 @@ def fits_at_minimum(data: PassData, orders: Sequence[int], found: Minimum, p: Fl
     """
     if len(data.sensors) == 1:
         return (_fit_of_one_sensor(data, orders[0], found, p, explained, cpa_range, errors),)
-    linear = _Linearised.about(data, orders, found.theta, p)
+    linear = _LinearisedFit.about(data, orders, found.theta, p)
     J = information(linear.whitened)
     if path_std is not None:
         of_paths = np.concatenate([own[:len(path)] for own, path in zip(
@@ -88,7 +88,7 @@ def _fit_of_one_sensor(data: PassData, n_dipoles: int, found: Minimum, p: FloatA
         return PassFit(n_dipoles, data, 'the path passes through the sensor (r0 parallel to v0): '
                        'the CPA range is zero and does not define a scale')
     theta, p = scaled
-    linear = _Linearised.about(data, (n_dipoles,), theta, p)
+    linear = _LinearisedFit.about(data, (n_dipoles,), theta, p)
     J = information(linear.whitened)
     J[:6, :6] += cpa_information(theta[:3] - position, theta[3:6],
                                  cpa_range[1] if cpa_range else CPA_UNIT_STD)[:6, :6]
@@ -102,7 +102,7 @@ def _fit_of_one_sensor(data: PassData, n_dipoles: int, found: Minimum, p: FloatA
 
 
 @dataclass(frozen=True)
-class _Linearised:
+class _LinearisedFit:
     """Linearisation of a fit at its minimum.
 
     The unknowns are the path and the moments of each target, followed by the backgrounds.
@@ -132,7 +132,7 @@ class _Linearised:
 
     @classmethod
     def about(cls, data: PassData, orders: Sequence[int], theta: FloatArray,
-              p: FloatArray) -> '_Linearised':
+              p: FloatArray) -> '_LinearisedFit':
         """Linearise a fit at the paths `theta` (n_theta,) and the linear parameters `p` (k,)."""
         model = SuperposedPasses.of(orders, data.t, data.positions,
                                     data.network.R_sw[data.sensor])
@@ -171,7 +171,7 @@ def _flatten(A: FloatArray) -> FloatArray:
     return A.reshape(-1, A.shape[-1])
 
 
-def _basic_fits(linear: _Linearised, found: Minimum, explained: float, errors: SensorErrors,
+def _basic_fits(linear: _LinearisedFit, found: Minimum, explained: float, errors: SensorErrors,
                 covariance: FloatArray) -> list[PassFit]:
     """Create the `PassFit` of each target, except rivals and reason.
 

@@ -281,7 +281,7 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
     Raises
     ------
     LabelsError
-        As `train`, or if no class has enough examples for a test part.
+        Under the conditions of `train`, or if no class has enough examples for a test part.
     MissingDependencyError
         If scikit-learn is not installed.
     """
@@ -289,7 +289,7 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
     y, g = np.array(labels), np.array(groups)
     parts = []
     for seed in progress(range(n_splits)):
-        inside, outside = _split(y, g, test_share, seed)
+        inside, outside = _random_split(y, g, test_share, seed)
         model = train(x[inside], y[inside].tolist(), g[inside].tolist(), axes, unit, seed)
         parts.append((model, x[outside], y[outside]))
     return _evaluate_parts(parts)
@@ -404,7 +404,7 @@ def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
     return folds.split(np.zeros(len(y)), y, np.array(groups))
 
 
-def _split(y: Any, groups: Any, test_share: float, seed: int) -> tuple[IntArray, IntArray]:
+def _random_split(y: Any, groups: Any, test_share: float, seed: int) -> tuple[IntArray, IntArray]:
     """Stratified random split of whole groups: indices of training and test examples."""
     rng, test_groups = np.random.default_rng(seed), set[str]()
     for name in np.unique(y):

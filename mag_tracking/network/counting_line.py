@@ -107,7 +107,7 @@ class Crossing(NamedTuple):
 
 
 class CrossingDetector:
-    """Detector of the crossing of a line by one track, from the successive poses of the track.
+    """Detector for the crossing of a line by one track.
 
     Parameters
     ----------

@@ -155,16 +155,16 @@ def _parse_calibration(label: str, value: Any) -> CalibrationRecord | None:
         if not isinstance(value.get(key), str) or not is_text(value[key]):
             raise NetworkError(f"{label}: {key} must be a string ('...'), "
                                f'got {shown(value.get(key))}')
-    std, stated = value.get('clock_offset_std'), value.get('stated')
+    std, orientation = value.get('clock_offset_std'), value.get('stated')
     std = float('nan') if std is None else float(_parse_vector(label, [std], (1,))[0])
     if std < 0.0:
         raise NetworkError(f'{label}: clock_offset_std: {std} s is negative')
-    if stated is not None:
-        stated = _parse_vector(f'{label}: stated', stated, (4,))
-        _parse_rotation(f'{label}: stated', stated)
-        stated = tuple(stated.tolist())
+    if orientation is not None:
+        orientation = _parse_vector(f'{label}: stated', orientation, (4,))
+        _parse_rotation(f'{label}: stated', orientation)
+        orientation = tuple(orientation.tolist())
     stated_std = _parse_orientation_std(label, value.get('stated_std_deg'))
-    return CalibrationRecord(value['date'], value['by'], std, stated,
+    return CalibrationRecord(value['date'], value['by'], std, orientation,
                              None if stated_std is None else tuple(stated_std.tolist()))
 
 

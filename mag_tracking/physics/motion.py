@@ -1,8 +1,8 @@
 """Motion models in exact discretisation: constant velocity and coordinated turn.
 
-The process noise is also exact, for continuous white noise of the highest derivative. In T10 eq.
-(4.2) and ICASSP11 eq. (2), in contrast, the noise is constant over a sample. PHD15 Paper A eq. (18)
-is misprinted.
+The process noise is the exact discretisation of continuous white noise in the highest derivative.
+T10 eq. (4.2) and ICASSP11 eq. (2) instead assume noise that is constant over a sample. PHD15 Paper
+A eq. (18) is misprinted.
 """
 
 import numpy as np
@@ -26,8 +26,8 @@ def integrator_noise(dt: float, density: ArrayLike) -> FloatArray:
     Returns
     -------
     (6, 6) array
-        density * [[dt^3/3, dt^2/2], [dt^2/2, dt]] for each axis. The first three rows belong to the
-        integrals, the last three rows to their rates.
+        For each axis, density * [[dt^3/3, dt^2/2], [dt^2/2, dt]]. The first three rows are for the
+        integrals, the last three rows for their rates.
 
     References
     ----------

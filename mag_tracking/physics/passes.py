@@ -158,12 +158,12 @@ class SuperposedPasses:
     @cached_property
     def paths(self) -> tuple[slice, ...]:
         """Slice of the path parameters of each row."""
-        return _consecutive([len(row.names) for row in self.rows])
+        return _consecutive_slices([len(row.names) for row in self.rows])
 
     @cached_property
     def moments(self) -> tuple[slice, ...]:
         """Slice of the linear parameters of each row."""
-        return _consecutive([3 * row.n_dipoles for row in self.rows])
+        return _consecutive_slices([3 * row.n_dipoles for row in self.rows])
 
     def split(self, theta: FloatArray) -> list[FloatArray]:
         """Split path parameters by row.
@@ -239,7 +239,7 @@ class SuperposedPasses:
             for row, own, linear in zip(self.rows, self.paths, self.moments, strict=True)], axis=2)
 
 
-def _consecutive(sizes: Sequence[int]) -> tuple[slice, ...]:
-    """Adjacent slices of the given sizes."""
-    ends = np.cumsum(sizes).tolist()
-    return tuple(slice(end - size, end) for end, size in zip(ends, sizes, strict=True))
+def _consecutive_slices(lengths: Sequence[int]) -> tuple[slice, ...]:
+    """Consecutive slices of the given lengths."""
+    ends = np.cumsum(lengths).tolist()
+    return tuple(slice(end - length, end) for end, length in zip(ends, lengths, strict=True))

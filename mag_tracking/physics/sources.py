@@ -147,10 +147,10 @@ class Magnet:
         """
         n, angle = len(x), dt * x[:, 9:12]
         R = rotation_from_quaternion(quaternion_from_rotation_vector(angle))
-        moved = x.copy()
-        moved[:, :3] += dt * x[:, 3:6]
-        moved[:, 6:9] = np.einsum('nij,nj->ni', R, x[:, 6:9])
-        C = -cross_matrix(moved[:, 6:9])
+        predicted = x.copy()
+        predicted[:, :3] += dt * x[:, 3:6]
+        predicted[:, 6:9] = np.einsum('nij,nj->ni', R, x[:, 6:9])
+        C = -cross_matrix(predicted[:, 6:9])
         F = np.tile(np.eye(12), (n, 1, 1))
         F[:, :6, :6] = constant_velocity(dt)
         F[:, 6:9, 6:9] = R
@@ -167,8 +167,8 @@ class Magnet:
             # uncertain rotation is added.
             before = R @ P[:, 6:9, 6:9] @ np.swapaxes(R, 1, 2)
             after = F[:, 6:9] @ P @ np.swapaxes(F[:, 6:9], 1, 2) + Q[:, 6:9, 6:9]
-            Q[:, 6:9, 6:9] += _second_order_noise(moved[:, 6:9], before, after)
-        return moved, F, Q
+            Q[:, 6:9, 6:9] += _second_order_noise(predicted[:, 6:9], before, after)
+        return predicted, F, Q
 
 
 def _second_order_noise(m: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:

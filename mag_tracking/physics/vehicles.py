@@ -151,10 +151,10 @@ class RowVehicle:
         # No decay in backward propagation, which has no process noise: the variance would shrink.
         fading = math.exp(-max(dt, 0.0) / self.turn_time)
         mean = (1.0 - fading) * self.turn_time / dt if dt > 0.0 else 1.0
-        moved, F_turn = fading_turn(x, dt, mean, fading)
+        predicted, F_turn = fading_turn(x, dt, mean, fading)
         turns = np.ones(len(x)) if P is None else P[:, -1, -1] > 0.0
         Q[:, -1, -1] = turns * (1.0 - fading**2) * self.turn_variance(np.hypot(x[:, 3], x[:, 4]))
-        return moved, F_turn, Q
+        return predicted, F_turn, Q
 
     def turn_variance(self, speed: FloatArray) -> FloatArray:
         """Variance of the turn rate at a given speed, at most `MAX_TURN_RATE` squared.

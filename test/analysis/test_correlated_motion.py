@@ -16,8 +16,8 @@ from support.passes import NOISE, measured, network_of
 HEIGHT = 0.5
 
 
-def along_x(speed, aside=2.0, seed=0, places=((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)), heading=0.0,
-            noise=NOISE, n_dipoles=3):
+def simulated_pass(speed, aside=2.0, seed=0, places=((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+                   heading=0.0, noise=NOISE, n_dipoles=3):
     """Simulate a pass of a row of dipoles at the distance `aside` [m] from the origin."""
     rng = np.random.default_rng(seed)
     u = np.array([np.cos(heading), np.sin(heading), 0.0])
@@ -29,7 +29,7 @@ def along_x(speed, aside=2.0, seed=0, places=((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 @pytest.mark.parametrize('speed', [2.0, 8.0, 25.0])
 @pytest.mark.parametrize('heading', [0.0, np.pi])
 def test_the_delay_is_distance_over_speed(speed, heading):
-    found = correlated_motion(along_x(speed, heading=heading))
+    found = correlated_motion(simulated_pass(speed, heading=heading))
     assert not found.reason and found.similarity > 0.99 and np.isnan(found.heading_std)
     assert abs(found.speed - speed) < max(3.0 * found.speed_std, 1e-3 * speed)
     assert found.speed_std < 0.05 * speed
@@ -39,7 +39,7 @@ def test_the_delay_is_distance_over_speed(speed, heading):
 
 
 def test_sensors_may_have_different_orientations():
-    data = along_x(7.0)
+    data = simulated_pass(7.0)
     rotations = rotation_from_quaternion(quaternion_from_rotation_vector(
         np.array([[0.3, 1.0, -0.5], [2.0, 0.1, 0.4]])))
     field = np.einsum('nji,nj->ni', rotations[data.sensor], data.field)
@@ -49,7 +49,7 @@ def test_sensors_may_have_different_orientations():
 
 
 def test_small_orientation_and_gain_errors_have_little_effect():
-    data = along_x(7.0)
+    data = simulated_pass(7.0)
     turn = rotation_from_quaternion(quaternion_from_rotation_vector(np.radians([1.5, -1.0, 2.0])))
     second = (data.sensor == 1)[:, None]
     field = np.where(second, 1.02 * data.field @ turn, data.field)
@@ -60,26 +60,26 @@ def test_small_orientation_and_gain_errors_have_little_effect():
 def test_three_sensors_off_a_line_observe_the_heading():
     """The target is far away, so all pairs of sensors measure similar fields."""
     places = ((-2.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 0.6, 0.0))
-    found = correlated_motion(along_x(6.0, aside=25.0, places=places, noise=1e-12))
+    found = correlated_motion(simulated_pass(6.0, aside=25.0, places=places, noise=1e-12))
     assert not found.reason and len(found.pairs) == 3 and 0.0 < found.heading_std < 0.5
     assert abs(np.angle(np.exp(1j * found.heading))) < max(3.0 * found.heading_std, 0.05)
 
 
 def test_sensors_on_opposite_sides_of_a_road_have_no_delay():
     places = ((0.0, -4.5, 0.0), (0.0, 4.5, 0.0))
-    found = correlated_motion(along_x(9.0, aside=1.5, places=places))
+    found = correlated_motion(simulated_pass(9.0, aside=1.5, places=places))
     assert 'different fields' in found.reason and np.isnan(found.speed)
 
 
 def test_sensors_side_by_side_have_no_delay():
     """A distant target passes both sensors at the same time."""
     places = ((0.0, -0.25, 0.0), (0.0, 0.25, 0.0))
-    found = correlated_motion(along_x(9.0, aside=20.0, places=places, noise=1e-11))
+    found = correlated_motion(simulated_pass(9.0, aside=20.0, places=places, noise=1e-11))
     assert 'at the same time' in found.reason
 
 
 def test_one_sensor_or_no_common_axis_results_in_a_reason():
-    data = along_x(9.0)
+    data = simulated_pass(9.0)
     field = data.field.copy()
     field[data.sensor == 0] = np.nan
     assert correlated_motion(dataclasses.replace(data, field=field)).reason.startswith('one sensor')
@@ -90,7 +90,7 @@ def test_one_sensor_or_no_common_axis_results_in_a_reason():
 
 
 def test_one_common_axis_is_sufficient():
-    data = along_x(9.0)
+    data = simulated_pass(9.0)
     field = data.field.copy()
     field[:, :2] = np.nan
     assert correlated_motion(dataclasses.replace(data, field=field)).speed == pytest.approx(
@@ -120,7 +120,7 @@ def test_contradictions_depend_on_speed_heading_and_their_stds():
 @pytest.mark.parametrize('places', [((0.0, 0.0, 0.0), (0.0, 0.0, 0.6)),
                                     ((0.0, 0.0, 0.0), (0.04, 0.0, 0.6))])
 def test_sensors_above_one_another_have_no_delay(places):
-    data = along_x(9.0, places=places)
+    data = simulated_pass(9.0, places=places)
     late = np.where(data.sensor == 1, 0.03, 0.0)
     found = correlated_motion(dataclasses.replace(data, t=data.t + late))
     assert 'no pair of separate sensors' in found.reason
@@ -130,7 +130,7 @@ def test_sensors_above_one_another_have_no_delay(places):
                                     'equal timestamps', 'few', 'no noise'])
 @pytest.mark.filterwarnings('error')
 def test_faulty_readings_result_in_a_reason_or_an_estimate(fault):
-    data = along_x(9.0)
+    data = simulated_pass(9.0)
     field, t = data.field.copy(), data.t.copy()
     if fault == 'first sensor constant':
         field[data.sensor == 0] = 1e-6
@@ -155,14 +155,14 @@ def test_faulty_readings_result_in_a_reason_or_an_estimate(fault):
 
 @pytest.mark.parametrize('scale', [0.9, 0.5, 0.2])
 def test_simultaneous_opposite_vehicles_have_no_delay(scale):
-    one, other = along_x(10.0, seed=1), along_x(14.0, seed=2, heading=np.pi)
+    one, other = simulated_pass(10.0, seed=1), simulated_pass(14.0, seed=2, heading=np.pi)
     both = dataclasses.replace(one, field=one.field + scale * other.field)
     assert 'different fields' in correlated_motion(both).reason
 
 
 def test_missing_readings_have_no_effect():
     """Missing readings and their covariances are NaN in the log of a track."""
-    data = along_x(7.0)
+    data = simulated_pass(7.0)
     field, covariance = data.field.copy(), data.covariance.copy()
     field[[5, 1500]] = covariance[[5, 1500]] = np.nan
     found = correlated_motion(dataclasses.replace(data, field=field, covariance=covariance))
@@ -171,7 +171,7 @@ def test_missing_readings_have_no_effect():
 
 def test_a_scaled_or_rotated_field_is_different():
     """A vehicle that turns away has a weaker and rotated field at the second sensor."""
-    data = along_x(7.0)
+    data = simulated_pass(7.0)
     second = (data.sensor == 1)[:, None]
     far = rotation_from_quaternion(quaternion_from_rotation_vector(np.radians([0.0, 0.0, 15.0])))
     for changed in (0.6 * data.field, data.field @ far):

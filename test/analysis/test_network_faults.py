@@ -90,13 +90,13 @@ def test_a_faulty_sensor_is_reported(boards, fault):
     """The estimates of the other sensors are almost as good as without the faulty sensor."""
     others, z2 = np.delete(np.arange(9), 2), {fault: [], 'dead': []}
     for (network, field, positions, axes, x), _ in boards[:8]:
-        for what, found in z2.items():
-            g = calibrate_geometry(network, apply_fault(field, what), positions, axes, MOMENT,
+        for case, values in z2.items():
+            g = calibrate_geometry(network, apply_fault(field, case), positions, axes, MOMENT,
                                    SETTINGS)
             z = (_corrections(g, network) - x[0][:, 3:]) / _corrections_std(g)
-            found.append(np.square(z[others]).mean())
+            values.append(np.square(z[others]).mean())
             assert g.converged and g.suspect_poses == ()
-            assert g.suspect_sensors == (() if what == 'dead' else ('mag_2',))
+            assert g.suspect_sensors == (() if case == 'dead' else ('mag_2',))
     print(f'mean squared z with a sensor {fault} {np.mean(z2[fault]):.2f}, '
           f'without it {np.mean(z2["dead"]):.2f}')
     assert np.mean(z2[fault]) < 1.25 * np.mean(z2['dead'])

@@ -118,11 +118,11 @@ def test_a_worse_fit_has_larger_stds():
     loud = board(noise=5e-7)
     network, field, positions, axes, x = simulated(
         4, network=loud, settings=replace(SETTINGS, field_error=0.05))
-    stated = board()
-    g = calibrate_geometry(stated, field, positions, axes, MOMENT, SETTINGS)
+    nominal = board()
+    g = calibrate_geometry(nominal, field, positions, axes, MOMENT, SETTINGS)
     assert g.converged and 15.0 < g.normalised_cost < 30.0
     e = estimated(g, network) - np.append(x[0].ravel(), x[1])
     assert np.mean(np.square(e / np.sqrt(np.diagonal(g.covariance)))) < 1.6
-    quiet = calibrate_geometry(stated, simulated(4)[1], positions, axes, MOMENT, SETTINGS)
+    quiet = calibrate_geometry(nominal, simulated(4)[1], positions, axes, MOMENT, SETTINGS)
     assert (g.bias_std > 3.0 * quiet.bias_std).all()
     assert (g.position_std <= (1.0 + 1e-9) * SETTINGS.position_std).all()

@@ -27,9 +27,9 @@ def test_derivatives_agree_with_differences():
             step = 1e-5
             f = []
             for sign in (1.0, -1.0):
-                moved = [v.copy() for v in x]
-                moved[which][..., c] += sign * step
-                f.append(predicted_readings(network, magnet, *moved)[0])
+                shifted = [v.copy() for v in x]
+                shifted[which][..., c] += sign * step
+                f.append(predicted_readings(network, magnet, *shifted)[0])
             numeric = (f[0] - f[1]) / (2.0 * step)
             scale = max(np.abs(J[..., c]).max(), 1e-6 * size)
             assert np.abs(numeric - J[..., c]).max() < 1e-5 * scale, (which, c)

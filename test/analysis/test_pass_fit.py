@@ -34,7 +34,7 @@ from support.passes import (
 ORDERS = (1, 2, 3)
 
 
-def rows(n_dipoles, n=6, seed=4):
+def random_row(n_dipoles, n=6, seed=4):
     """Random model with `n` samples, and random paths and linear parameters."""
     rng = np.random.default_rng(seed)
     M = rng.standard_normal((n, 3, 3))
@@ -46,7 +46,7 @@ def rows(n_dipoles, n=6, seed=4):
 
 @pytest.mark.parametrize('n_dipoles', [1, 2, 3, 4])
 def test_a_row_is_the_sum_of_its_dipoles(n_dipoles):
-    model, theta, p = rows(n_dipoles)
+    model, theta, p = random_row(n_dipoles)
     moments = (model.combinations @ p[0]).reshape(-1, 3)
     direction = theta[0, 3:6] / np.linalg.norm(theta[0, 3:6])
     expected = np.zeros((6, 3))
@@ -172,7 +172,7 @@ def test_robust_covariance_is_slightly_larger_than_the_nominal_covariance(n_dipo
 
 
 def test_hard_and_soft_iron_from_four_headings():
-    """Estimates of m0 and D are within three stds; passes of three dipoles, TSP14 section VI.E."""
+    """m0 and D from passes of three dipoles have errors below three stds; TSP14 section VI.E."""
     rng = np.random.default_rng(5)
     hard, soft = np.array([[60.0, 30.0, -40.0], [120.0, -10.0, -70.0], [20.0, 40.0, 30.0]]), 5.0
     moments, headings, covariances = [], [], []

@@ -110,8 +110,8 @@ def test_covariance_includes_the_errors_of_the_sensors(errors):
             field[of_sensor] = field[of_sensor] @ turn * (
                 1.0 + errors.gain_std * rng.standard_normal(3))
         fit = fit_pass(replace(data, field=field), 1, errors=errors)
-        alone = fit_pass(data, 1, errors=SensorErrors(0.0, 0.0))
-        assert fit.speed[1] > 1.2 * alone.speed[1]
+        without_errors = fit_pass(data, 1, errors=SensorErrors(0.0, 0.0))
+        assert fit.speed[1] > 1.2 * without_errors.speed[1]
         true = path[:6] + np.r_[fit.data.stamp_ns / 1e9 * path[3:6], np.zeros(3)]
         P = fit.robust_covariance[:6, :6]
         e = fit.x[:6] - true
@@ -134,7 +134,7 @@ def test_repeated_readings_of_a_coarse_sensor_are_counted_as_fractions():
     assert replace(data, covariance=slightly).n_independent == data.n_values
 
 
-def fitted(std_speed, std_heading, change=0.0):
+def point_fit(std_speed, std_heading, change=0.0):
     """Create the `PassFit` of a point with given stds of speed [m/s] and heading [rad]."""
     data, _ = field_and_data()
     x = np.concatenate([[0.0, -2.0, 0.5], [10.0, 0.0, 0.0], np.ones(9)])
@@ -145,16 +145,17 @@ def fitted(std_speed, std_heading, change=0.0):
 
 
 def test_each_quantity_is_trusted_according_to_its_own_std():
-    assert trusted(fitted(0.5, 0.1)) == ('speed', 'direction', 'time')
-    assert 'speed' not in trusted(fitted(2.6, 0.1))
+    assert trusted(point_fit(0.5, 0.1)) == ('speed', 'direction', 'time')
+    assert 'speed' not in trusted(point_fit(2.6, 0.1))
     # The direction is unknown if the speed does not differ significantly from zero.
-    assert 'direction' not in trusted(fitted(5.1, 0.1))
-    assert 'direction' not in trusted(fitted(0.5, 0.6)) and 'speed' in trusted(fitted(0.5, 0.6))
-    late = fitted(0.5, 0.1)
+    assert 'direction' not in trusted(point_fit(5.1, 0.1))
+    assert 'direction' not in trusted(point_fit(0.5, 0.6)) \
+        and 'speed' in trusted(point_fit(0.5, 0.6))
+    late = point_fit(0.5, 0.1)
     late.robust_covariance[0, 0] = 4.0
     assert trusted(late) == ('speed', 'direction')
-    assert trusted(fitted(0.5, 0.1, change=0.5)) == ()
-    assert trusted(replace(fitted(0.5, 0.1), residual_elsewhere=0.01)) == ()
+    assert trusted(point_fit(0.5, 0.1, change=0.5)) == ()
+    assert trusted(replace(point_fit(0.5, 0.1), residual_elsewhere=0.01)) == ()
 
 
 @pytest.mark.parametrize('name', [n for n in VEHICLES if 'turns' in n])

@@ -34,7 +34,7 @@ def poses_of(network):
 
 
 @pytest.mark.parametrize('error, background_std', [(0.0, np.inf), (0.04, 1e-8), (0.0, 1e-9)])
-def test_information_equals_that_of_all_measurements_stacked(error, background_std):
+def test_information_equals_the_stacked_measurements(error, background_std):
     """Oracle: stacked Jacobians with the backgrounds as states."""
     network = line_network(4)
     sampling = Sampling(0.1, 4e-9, error, background_std, 1.0)
@@ -93,8 +93,8 @@ def test_bounds_scale_with_the_network():
 
 
 def test_position_bound_of_one_sensor_is_very_large():
-    alone = network_of([[0.0, -4.5, 0.0]])
-    J = pass_information(*poses_of(alone), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
+    network = network_of([[0.0, -4.5, 0.0]])
+    J = pass_information(*poses_of(network), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
     assert (bounds_of(J, np.zeros((9, 9)))[..., 0] > 1e3).all()
 
 

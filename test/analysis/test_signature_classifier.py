@@ -25,7 +25,7 @@ def examples(simulator='boxes', seed=0):
     return examples_of(signatures(COUNTS, simulator, seed))
 
 
-def trained(e):
+def train_model(e):
     return train(e.x, e.labels, e.groups, e.axes, e.unit)
 
 
@@ -44,7 +44,7 @@ def test_accuracy_exceeds_the_fraction_of_the_largest_class(simulator):
 
 def test_a_signature_far_from_all_examples_is_unknown():
     e = examples()
-    model = trained(e)
+    model = train_model(e)
     assert np.mean(np.array(model.names(e.x)) == UNKNOWN) < 0.05
     far = e.x + 8.0 * model.scale * np.random.default_rng(0).choice([-1.0, 1.0], e.x.shape)
     assert set(model.names(far)) == {UNKNOWN}
@@ -53,9 +53,9 @@ def test_a_signature_far_from_all_examples_is_unknown():
 
 def test_training_is_reproducible_and_a_model_file_is_lossless(tmp_path):
     e, other = examples(), examples(seed=1)
-    model = trained(e)
+    model = train_model(e)
     write_model(tmp_path / 'classes.json', model)
-    again, stored = trained(e), read_model(tmp_path / 'classes.json')
+    again, stored = train_model(e), read_model(tmp_path / 'classes.json')
     for found in (again, stored):
         np.testing.assert_array_equal(found.posterior(other.x), model.posterior(other.x))
         assert found.names(other.x) == model.names(other.x)

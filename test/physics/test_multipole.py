@@ -38,7 +38,7 @@ def only(order, moments):
 
 
 def tensor(order, moments):
-    """Complete symmetric traceless tensor of one order of the moments."""
+    """Convert the moments of one order to the full symmetric traceless tensor."""
     T = np.zeros((3,) * order)
     for name, value in zip(COMPONENTS[order], moments[PARTS[order]], strict=True):
         for axes in set(permutations(['xyz'.index(c) for c in name])):
