@@ -102,7 +102,8 @@ def test_invalid_tables_are_refused(tmp_path, tables, capsys):
     by_row = str(tables / 'by_row.csv')
     (tmp_path / 'other.json').write_text('{"a": 1}')
     assert main(['classes', 'predict', by_row, '--model', str(tmp_path / 'other.json')]) == 1
-    assert 'is not a valid file of trained classes' in capsys.readouterr().err
+    assert "is not a valid file of trained classes: the entry 'mag_tracking.classes' is missing" \
+        in capsys.readouterr().err
     assert main(['classes', 'train', str(vehicle_path('straight_car_right')), '--out',
                  str(tmp_path / 'm.json')]) == 1
     assert 'needs a table of labelled intervals' in capsys.readouterr().err
@@ -151,11 +152,26 @@ def test_an_inconsistent_model_is_refused(tables, tmp_path, capsys):
     model = tmp_path / 'classes.json'
     assert main(['classes', 'train', str(tables / 'by_row.csv'), '--out', str(model)]) == 0
     good = json.loads(model.read_text())
-    for name, value in (('weights', [[1.0]]), ('temperature', 0), ('limit', None), ('scale', 0),
-                        ('classes', ['car']), ('classes', ['car', 'car']), ('mean', [1.0])):
-        model.write_text(json.dumps({**good, name: value}))
+    changes = [({name: value}, f'{name}: expected ') for name, value in (
+        ('weights', [[1.0]]), ('weights', [[1.0], [1.0, 2.0]]), ('temperature', 0),
+        ('limit', None), ('scale', 0), ('classes', ['car']), ('classes', ['car', 'car']),
+        ('classes', 'car'), ('offsets', [1.0]), ('mean', None), ('mean', []), ('unit', 7),
+        ('examples', 3))]
+    contents = [({**good, **change}, message) for change, message in changes]
+    contents += [({k: v for k, v in good.items() if k != name}, f'the entry {name!r} is missing')
+                 for name in good]
+    contents += [({**good, 'more': 1}, "unknown entry 'more'"), ([good], 'expected a mapping'),
+                 (good['mean'], 'expected a mapping')]
+    for content, message in contents:
+        model.write_text(json.dumps(content))
         assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
-        assert 'is not a valid file of trained classes' in capsys.readouterr().err
+        assert f'is not a valid file of trained classes: {message}' in capsys.readouterr().err
+    model.write_text('{')
+    assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
+    assert 'is not a valid file of trained classes: it is not valid JSON' in capsys.readouterr().err
+    model.write_text(json.dumps({**good, 'mag_tracking.classes': 99}))
+    assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
+    assert 'class version 99 is not supported' in capsys.readouterr().err
     model.write_text(json.dumps(good))
     table = tmp_path / 'table.csv'
     table.write_text((tables / 'by_row.csv').read_text())
