@@ -84,7 +84,7 @@ def test_labels_unsuitable_for_training_are_rejected(labels, message):
         train(x, labels, list(map(str, range(10))), ('x',), 'T')
 
 
-def test_reliability_error_follows_its_definition():
+def test_expected_calibration_error_follows_its_definition():
     assert reliability_error(np.array([0.9] * 10), np.array([True] * 9 + [False])) == \
         pytest.approx(0.0)
     assert reliability_error(np.array([0.95] * 10), np.array([True] * 5 + [False] * 5)) == \
