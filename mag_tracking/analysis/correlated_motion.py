@@ -71,13 +71,16 @@ _MAX_STEPS = 20
 
 @dataclass(frozen=True)
 class PairDelay:
-    """Delay between two sensors, given by their indices in the network."""
+    """Delay between two sensors."""
 
     first: int
+    """Index of the first sensor in the network."""
     second: int
+    """Index of the second sensor in the network."""
     delay: float
     """Delay of the second sensor after the first [s]."""
     delay_std: float
+    """[s]"""
     similarity: float
     """Fraction of the energy of the second field that is explained by the delayed first field."""
 
@@ -87,9 +90,11 @@ class CorrelatedMotion:
     """Velocity estimated from the delays between sensors, or a reason why there is no estimate."""
 
     reason: str = 'not evaluated'
+    """Empty if there is an estimate."""
     speed: float = np.nan
     """[m/s]"""
     speed_std: float = np.nan
+    """[m/s]"""
     heading: float = np.nan
     """[rad] Anticlockwise from x."""
     heading_std: float = np.nan
@@ -97,6 +102,7 @@ class CorrelatedMotion:
     similarity: float = np.nan
     """Largest `similarity` of the compared pairs."""
     pairs: tuple[PairDelay, ...] = ()
+    """Pairs of sensors that measure the same field."""
 
 
 def correlated_motion(data: PassData) -> CorrelatedMotion:
@@ -235,6 +241,7 @@ class _SmoothedPair:
     slope: FloatArray
     """(n, k) [T/s] Derivative of `first`."""
     second: FloatArray
+    """(n, k) [T]"""
     width: float
     """[s] Width of the smoothing kernel."""
     noise: float

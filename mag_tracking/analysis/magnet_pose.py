@@ -103,7 +103,8 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     if n_values <= N_UNKNOWNS:
         nothing = np.full(3, np.nan)
         return MagnetPose(nothing, nothing, np.full((6, 6), np.nan), nothing, np.nan, False,
-                          f'{n_values} axes measured, more than {N_UNKNOWNS} are required')
+                          f'number of measured axes is {n_values}, more than {N_UNKNOWNS} are '
+                          'required')
     size2 = np.nansum(np.square(field), axis=1)[:, None]
     std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * size2)
     problem = _problem(network, field, std, present, moment, settings.ambient_std)
@@ -165,7 +166,7 @@ def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converg
     T[:3, :3] = np.eye(3)
     T[3:, 3:6] = (np.eye(3) - np.outer(u, u)) / length
     if not (np.isfinite(cost) and converged):
-        reason = f'no minimum within {settings.iterations} steps'
+        reason = f'no minimum found (maximum number of steps: {settings.iterations})'
     elif not cost <= MAX_COST:
         reason = ('the readings do not fit one dipole of this moment: the normalised cost is '
                   f'{cost:.0f}')

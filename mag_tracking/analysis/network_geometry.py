@@ -79,13 +79,15 @@ class NetworkGeometry:
     rotation_std: FloatArray
     """(n, 3) [rad], about the axes of the sensor."""
     gain: FloatArray
-    """(n,)."""
+    """(n,); 1 = nominal."""
     gain_std: FloatArray
+    """(n,)."""
     bias: FloatArray
     """(n, 3) [T], sensor frame; NaN for an axis without readings."""
     bias_std: FloatArray
     """(n, 3) [T]; infinite for an axis without readings."""
     magnet: TrackedMagnet
+    """Tracked poses of the magnet, and its nominal moment."""
     rows: IntArray
     """(K,) indices of the used poses."""
     shared: FloatArray
@@ -352,11 +354,12 @@ def _failure_reason(problem: GeometryProblem, x: Unknowns, converged: bool, cost
     """Reason why the fit is not valid; empty if it is valid."""
     K, max_steps = len(problem.magnet.tool), problem.settings.iterations
     if K < MIN_POSES:
-        reason = f'{K} poses, at least {MIN_POSES} are required to separate biases from the magnet'
+        reason = (f'number of poses is {K}, at least {MIN_POSES} are required to separate the '
+                  'biases from the field of the magnet')
     elif _is_magnet_at_rest(problem, x):
         reason = 'all poses are at one place: the geometry is not observable; move the magnet'
     elif not converged:
-        reason = f'no minimum within {max_steps} steps'
+        reason = f'no minimum found (maximum number of steps: {max_steps})'
     elif np.isnan(cost):
         reason = 'fewer readings than unknowns'
     elif cost > MAX_COST:

@@ -28,6 +28,7 @@ Prediction: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, Fl
 """Predicted readings and their derivatives; see `predicted_readings`."""
 
 UP = np.array([0.0, 0.0, 1.0])
+"""Unit vector of the z axis."""
 
 
 def tool_rotations(axes: FloatArray) -> FloatArray:

@@ -110,6 +110,7 @@ class _LinearisedFit:
 
     data: PassData
     orders: tuple[int, ...]
+    """Number of dipoles of each target."""
     theta: tuple[FloatArray, ...]
     """Path (6 or 7,) of each target."""
     whitened: FloatArray
@@ -123,6 +124,7 @@ class _LinearisedFit:
     own: tuple[IntArray, ...]
     """Indices of the unknowns of each target, followed by those of the backgrounds."""
     names: tuple[str, ...]
+    """Names of the unknowns."""
     fields: FloatArray
     """(K, n, 3) [T] field of each target, sensor frame."""
     background: FloatArray

@@ -33,6 +33,7 @@ class MountingEvidence:
     covariances are consistent; NaN for fewer than two tracks. Values above one scale the
     covariance."""
     n_tracks: int
+    """Number of fused tracks."""
 
 
 def fuse_mounting(network: SensorNetwork, prior_std: Iterable[FloatArray],

@@ -47,9 +47,11 @@ class Bearing:
     cpa_time: float
     """[s] relative to time zero."""
     cpa_time_std: float
+    """[s]"""
     rate: float
     """[1/s] speed over CPA range."""
     rate_std: float
+    """[1/s]"""
 
 
 @dataclass(frozen=True)
@@ -61,9 +63,13 @@ class PassFit:
     """
 
     n_dipoles: int
+    """Number of dipoles of the row."""
     data: PassData
+    """Fitted readings, without the fields of other targets of a joint fit."""
     reason: str = ''
+    """Reason for a rejection of the fit as a whole; empty if the fit is accepted."""
     converged: bool = False
+    """Whether the search reached a minimum."""
     names: tuple[str, ...] = ()
     """Names of the unknowns: path, moments, backgrounds."""
     x: FloatArray = field(default_factory=lambda: np.zeros(0))

@@ -19,6 +19,7 @@ DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], *(
 """(7, 3) directions of the moment. Opposite directions provide the same information."""
 
 STATES = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz')
+"""Names of the states [r, v, m]."""
 
 MAX_FIELDS = 200_000
 """Maximum number of fields computed at once, to limit memory."""

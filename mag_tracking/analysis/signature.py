@@ -72,8 +72,8 @@ def features(signature: Signature) -> FloatArray:
     """
     t, field = np.asarray(signature.t, dtype=float), np.asarray(signature.field, dtype=float)
     if len(t) < MIN_SAMPLES:
-        raise ValueError(f'{len(t)} samples are too few for a signature; expected at least '
-                         f'{MIN_SAMPLES}')
+        raise ValueError(f'too few samples for a signature: {len(t)}, at least {MIN_SAMPLES} are '
+                         'required')
     if not (np.isfinite(t).all() and np.isfinite(field).all()):
         raise ValueError('a time or a field value is not finite')
     if not (np.diff(t) > 0.0).all():

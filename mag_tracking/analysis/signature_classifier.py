@@ -13,6 +13,7 @@ from mag_tracking.errors import LabelsError, MissingDependencyError
 from mag_tracking.inference.log_normal_classes import UNKNOWN
 
 VERSION = 1
+"""Version of the model files."""
 MIN_SAMPLES = 4
 """Minimum number of training examples of a class."""
 
@@ -34,10 +35,13 @@ class SignatureModel:
     """Linear classifier with a maximum distance to its classes."""
 
     classes: tuple[str, ...]
+    """Names of the classes."""
     axes: tuple[str, ...]
+    """Names of the axes of the signatures."""
     unit: str
     """Unit of the fields: T, or empty if unknown."""
     method: str
+    """Name of the selected training method."""
     mean: FloatArray
     """(n_features,) mean features of the training set."""
     scale: FloatArray
@@ -111,6 +115,7 @@ class Evaluation:
     """Accuracy of a classifier on one or several test sets."""
 
     classes: tuple[str, ...]
+    """Names of the classes."""
     n: int
     """Number of signatures in the first test set."""
     majority: float
@@ -120,7 +125,7 @@ class Evaluation:
     balanced_accuracy: FloatArray
     """(n_sets,) mean recall of the classes."""
     recall: FloatArray
-    """(n_sets, n_classes)"""
+    """(n_sets, n_classes) recall of each class; NaN for a class without test signatures."""
     unknown: FloatArray
     """(n_sets,) fraction of `unknown` predictions."""
     reliability: float

@@ -11,6 +11,7 @@ from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.units import NS
 
 Pose: TypeAlias = Track | SmoothedPose
+"""Filtered or smoothed pose of a track."""
 
 MIN_SPEED = 1.0
 """Minimum speed for extrapolation to a line [m/s]. Slower vehicles may stop before the line."""

@@ -101,7 +101,7 @@ def test_invalid_intervals_are_named(tmp_path, rows, error):
     ('label,signature,time_s,x\ncar,1,0,1\ncar,2,1,2\n', 'each signature has only one sample'),
     ('label,signature,time_s,x\ncar,1,0,1\ntruck,1,1,2\n',
      'signature 1 has several values of label: car, truck'),
-    ('label,x0,x1\ncar,1,2\n', 'row 2: 2 samples are too few'),
+    ('label,x0,x1\ncar,1,2\n', 'row 2: too few samples for a signature: 2'),
     ('label,x0,x1\ncar,1,two\n', "row 2: x1 is 'two', not a number"),
     ('label,x0\n', 'a.csv has no rows')])
 def test_an_invalid_table_is_rejected_with_its_error(tmp_path, capsys, text, message):
