@@ -141,8 +141,8 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
     """Whether a speed and a heading contradict the delays between the sensors.
 
     On a path oblique to the line of the sensors, the delay is shorter than on a path along the
-    line; the speeds are compared accordingly. Values that are unknown, or paths almost
-    perpendicular to the line, never contradict the delays.
+    line; the speeds are compared accordingly. An unknown value, or a path almost perpendicular
+    to the line, never contradicts the delays.
 
     Parameters
     ----------

@@ -171,7 +171,7 @@ def _initial_paths(rough: PassData, n_targets: int, ground: GroundPrior) -> Floa
 
 
 class _JointFits:
-    """Joint fits of several targets with any numbers of dipoles; repeated fits are cached.
+    """Cached joint fits of several targets, for any combination of their numbers of dipoles.
 
     Each fit starts at the point solutions `placed` (n, 6 K) and at an available fit with another
     number of dipoles.

@@ -13,8 +13,8 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
 
     The criterion adds a penalty of log(n) for each unknown to the cost, which is -2 times the
     log-likelihood up to a constant. If the normalised cost of the fit with the most dipoles exceeds
-    one, all costs are divided by it: a residual that no order explains is no evidence for a higher
-    order. TSP14 section V.C leaves the criterion open.
+    one, all costs are divided by this value: a residual that no order explains is no evidence for a
+    higher order. TSP14 section V.C leaves the criterion open.
 
     Parameters
     ----------

@@ -59,7 +59,8 @@ def multipole_field(r: ArrayLike, moments: ArrayLike) -> FloatArray:
     Raises
     ------
     ValueError
-        If the last axis of `r` does not have length 3, or of `moments` length 3, 8 or 15.
+        If the last axis of `r` does not have length 3, or the last axis of `moments` does not have
+        length 3, 8 or 15.
 
     Notes
     -----
@@ -93,7 +94,8 @@ def multipole_jacobians(r: ArrayLike, moments: ArrayLike) -> tuple[FloatArray, F
     Raises
     ------
     ValueError
-        If the last axis of `r` does not have length 3, or of `moments` length 3, 8 or 15.
+        If the last axis of `r` does not have length 3, or the last axis of `moments` does not have
+        length 3, 8 or 15.
 
     References
     ----------
