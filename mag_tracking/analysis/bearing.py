@@ -1,4 +1,4 @@
-"""Observable quantities of a pass measured by one sensor: everything but the scale."""
+"""Observable quantities of a pass at a single sensor: directions, CPA time and rate."""
 
 import numpy as np
 
@@ -6,20 +6,20 @@ from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.physics.anderson import closest_approach
 
-MIN_CPA_SHARE = 1e-3
-"""Minimum CPA range relative to the distance travelled. Below it, the path is treated as going
-through the sensor."""
+MIN_CPA_FRACTION = 1e-3
+"""Minimum CPA range relative to the distance travelled. At a smaller ratio, the path is treated as
+passing through the sensor."""
 
 MAX_DIRECTION_STD = 0.5
-"""[rad] Maximum standard deviation of a direction. A less certain direction is returned as NaN."""
+"""[rad] Maximum standard deviation of a direction. Less certain directions are set to NaN."""
 
 
 def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
                     distance: float) -> tuple[FloatArray, FloatArray] | None:
     """Scale a path and its moments to a given CPA range.
 
-    One sensor measures the same field for (r, v, m) and (u r, u v, u³ m), and for (r, v) and
-    (-r, -v). Of the latter two, the path that passes above the sensor is returned.
+    At a single sensor, (r, v, m) and (u r, u v, u³ m) have the same field. The paths (r, v) and
+    (-r, -v) also have the same field; the path above the sensor at the CPA is returned.
 
     Parameters
     ----------
@@ -35,30 +35,31 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
     Returns
     -------
     (array, array) or None
-        Path and moments; None if the path goes through the sensor.
+        Path and moments; None if the path passes through the sensor.
 
     References
     ----------
     [TSP14]_ eq. (34).
     """
     r, v = theta[:3] - place, theta[3:6]
-    time, at, _ = closest_approach(r, v)
-    if at <= MIN_CPA_SHARE * np.linalg.norm(r - time * v):
+    time, cpa_range, _ = closest_approach(r, v)
+    if cpa_range <= MIN_CPA_FRACTION * np.linalg.norm(r - time * v):
         return None
-    u = distance / at
-    # Target and motion may both be reversed. The solution that is not below the sensor is used.
-    side = 1.0 if (r + time * v)[2] >= 0.0 else -1.0
-    scaled = u * np.concatenate([side * r, side * v, theta[6:]])
+    u = distance / cpa_range
+    # The path reversed through the sensor has the same field; use the path above the sensor.
+    sign = 1.0 if (r + time * v)[2] >= 0.0 else -1.0
+    scaled = u * np.concatenate([sign * r, sign * v, theta[6:]])
     scaled[:3] += place
     return scaled, p * u**3
 
 
 def bearing_of(fit: PassFit, place: FloatArray) -> Bearing:
-    """Directions, time and rate of a fit with an assumed CPA range.
+    """Directions, CPA time and rate of a fit at one sensor, independent of the CPA range.
 
     Parameters
     ----------
     fit : PassFit
+        Fit with an assumed CPA range.
     place : (3,) array, m, world frame
         Position of the sensor.
 
@@ -74,13 +75,13 @@ def bearing_of(fit: PassFit, place: FloatArray) -> Bearing:
     dr_cpa = np.hstack([np.eye(3), time * np.eye(3)]) + np.outer(v, g_time)
     g_rate = np.concatenate([np.zeros(3), v / np.sqrt(v2)]) / distance
     m, P_m = fit.moment
-    up = 1.0 if r_cpa[2] >= 0.0 else -1.0
+    sign = 1.0 if r_cpa[2] >= 0.0 else -1.0
     stds = np.array([_direction_std(r_cpa, dr_cpa @ P[:6, :6] @ dr_cpa.T),
                      _direction_std(v, P[3:6, 3:6]), _direction_std(m, P_m)])
-    at, motion_direction, moment_direction = (
+    cpa_direction, motion_direction, moment_direction = (
         x / np.linalg.norm(x) if std < MAX_DIRECTION_STD else np.full(3, np.nan)
-        for x, std in zip((up * r_cpa, up * v, m), stds, strict=True))
-    return Bearing(at, motion_direction, moment_direction, stds, time,
+        for x, std in zip((sign * r_cpa, sign * v, m), stds, strict=True))
+    return Bearing(cpa_direction, motion_direction, moment_direction, stds, time,
                    float(np.sqrt(g_time @ P[:6, :6] @ g_time)), float(np.sqrt(v2) / distance),
                    float(np.sqrt(g_rate @ P[:6, :6] @ g_rate)))
 

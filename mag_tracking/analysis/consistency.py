@@ -11,7 +11,7 @@ from mag_tracking.report.metrics import interpolate_truth
 from mag_tracking.report.track_log import TrackLog
 
 MIN_MOTION = 1e-9
-"""[m/s] Minimum speed for the width of the velocity prior; slower targets are at rest."""
+"""[m/s] Minimum standard deviation of the velocity prior, for targets at rest."""
 
 
 def error_over_bound(network: SensorNetwork, log: TrackLog,
@@ -20,33 +20,34 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
                      rows: IntArray, axes: int) -> float | None:
     """Ratio of the RMS error of a track to the posterior Cramér-Rao bound along the true path.
 
-    The bound is that of a point target with the moment of the track, since the true moment is
-    unknown. It uses the motion model of the tracker, the sensor noise and the relative field error
-    that the tracker allows for. The backgrounds are states, and there is no information on the
-    first pose. Effects of the extent of a vehicle are not included.
+    The bound applies to a point target with the estimated moment of the track, because the true
+    moment is unknown. It assumes the tracker's motion model, sensor noise and relative field error.
+    The backgrounds are states, and the prior of the first pose is wide. The extent of the vehicle
+    is neglected.
 
     Parameters
     ----------
     network : SensorNetwork
     log : TrackLog
-    truth : (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)
-        (n,) ns, (n, 3) m, (n, 4).
+    truth : ((n,) int array, (n, 3) array, (n, 4) array)
+        Timestamps [ns], positions [m] and quaternions (xyzw) of the ground truth.
     acceleration : (3,) array, m²/s³
         Spectral density of the acceleration.
     moment_walk : float, 1/s^0.5
-        Random walk of the moment relative to its size.
+        Random walk of the moment relative to its magnitude.
     field_error : float
         Model error relative to the field.
     background_std : float, T
+        Prior standard deviation of the backgrounds.
     rows : (k,) int array
-        Poses whose errors are evaluated.
+        Indices of the evaluated poses in the log.
     axes : int
-        2 = horizontal errors, 3 = errors in space.
+        Number of axes: 2 = horizontal error, 3 = error in space.
 
     Returns
     -------
     float or None
-        None if fewer than two poses have a ground truth.
+        None if fewer than two poses have a ground truth, or no evaluated pose has one.
 
     References
     ----------
@@ -55,24 +56,25 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
     true = interpolate_truth(truth, log.stamp_ns)
     known = np.flatnonzero(np.isfinite(true).all(axis=1))
     if axes == 2:
-        # The true height is that of the road, not of the magnetic centre of the vehicle.
+        # The ground truth contains the height of the road, not of the magnetic centre.
         true[:, 2] = np.array(log.position)[:, 2]
     rows = np.intersect1d(rows, known)
     if len(known) < 2 or not len(rows):
         return None
     t = log.seconds()[known]
-    H, C = _linearised(network, log, true[known], t, known, field_error)
-    F, Q = _motion(t, acceleration, moment_walk, log, known, H.shape[-1])
-    P = path_bound(F, Q, H, C, _prior(network, true[known], t, log, known, background_std))
-    chosen = np.isin(known, rows)
-    variance = np.einsum('kii->ki', P[chosen])[:, :axes].sum(axis=1)
-    error = np.array(log.position)[known[chosen]] - true[known[chosen]]
+    H, C = _measurement_model(network, log, true[known], t, known, field_error)
+    F, Q = _motion_model(t, acceleration, moment_walk, log, known, H.shape[-1])
+    P = path_bound(F, Q, H, C,
+                   _prior_covariance(network, true[known], t, log, known, background_std))
+    is_evaluated = np.isin(known, rows)
+    variance = np.einsum('kii->ki', P[is_evaluated])[:, :axes].sum(axis=1)
+    error = np.array(log.position)[known[is_evaluated]] - true[known[is_evaluated]]
     return float(np.sqrt(np.mean(np.square(error[:, :axes]).sum(axis=1)) / np.mean(variance)))
 
 
-def _linearised(network: SensorNetwork, log: TrackLog, true: FloatArray, t: FloatArray,
-                known: IntArray, field_error: float) -> tuple[FloatArray, FloatArray]:
-    """Jacobians (k, n_sensors, 3, n_x) by [r, v, m, backgrounds] at the truth, and covariances."""
+def _measurement_model(network: SensorNetwork, log: TrackLog, true: FloatArray, t: FloatArray,
+                       known: IntArray, field_error: float) -> tuple[FloatArray, FloatArray]:
+    """Jacobians (k, n_sensors, 3, n_x) by [r, v, m, backgrounds] and noise covariances."""
     n, n_sensors = len(known), len(network)
     dr_dx, dm_dx = np.zeros((2, n, 1, 3, 9))
     dr_dx[:, 0, range(3), range(3)] = 1.0
@@ -89,9 +91,9 @@ def _linearised(network: SensorNetwork, log: TrackLog, true: FloatArray, t: Floa
     return H, C
 
 
-def _motion(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: TrackLog,
-            known: IntArray, n_x: int) -> tuple[FloatArray, FloatArray]:
-    """F and Q (k, n_x, n_x) between consecutive poses; identity and zero for the first pose."""
+def _motion_model(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: TrackLog,
+                  known: IntArray, n_x: int) -> tuple[FloatArray, FloatArray]:
+    """F and Q (k, n_x, n_x) from the previous pose; identity and zero for the first pose."""
     F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
     for k, dt in enumerate(np.diff(t), 1):
         F[k, :6, :6] = constant_velocity(dt)
@@ -101,12 +103,12 @@ def _motion(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: Tr
     return F, Q
 
 
-def _prior(network: SensorNetwork, true: FloatArray, t: FloatArray, log: TrackLog,
-           known: IntArray, background_std: float) -> FloatArray:
-    """Prior covariance (n_x, n_x) of the first pose, from the length and speed of the path."""
-    way = max(np.ptp(true, axis=0).max(), np.ptp(network.positions, axis=0).max())
+def _prior_covariance(network: SensorNetwork, true: FloatArray, t: FloatArray, log: TrackLog,
+                      known: IntArray, background_std: float) -> FloatArray:
+    """Prior covariance (n_x, n_x) of the first pose, from the extent and speed of the path."""
+    extent = max(np.ptp(true, axis=0).max(), np.ptp(network.positions, axis=0).max())
     speed = max(np.linalg.norm(np.diff(true, axis=0), axis=1).max()
                 / np.diff(t).min(), MIN_MOTION)
     std = np.full(9 + 3 * len(network), background_std)
-    std[:3], std[3:6], std[6:9] = way, speed, np.linalg.norm(log.moment[known[0]])
+    std[:3], std[3:6], std[6:9] = extent, speed, np.linalg.norm(log.moment[known[0]])
     return np.diag(std**2)

@@ -1,4 +1,4 @@
-"""Driving direction by the generalised likelihood ratio of a dipole in one of two lanes."""
+"""Driving direction from the generalised likelihood ratio of a dipole in one of two lanes."""
 
 from typing import NamedTuple
 
@@ -8,12 +8,11 @@ from scipy.optimize import fminbound
 from mag_tracking.arrays import FloatArray
 
 MAX_STEP = 0.05
-"""Maximum step of the search for the time of closest approach, in units of lateral distance over
-speed."""
+"""Maximum step of the search for the CPA time, in units of lateral distance over speed."""
 
 
 class LaneHypothesis(NamedTuple):
-    """A target that passes the sensor at a known speed and distance."""
+    """Hypothesis that a target passes in a lane, at a known speed and distance."""
 
     speed: float
     """Speed along x [m/s]; positive from left to right as seen from the sensor."""
@@ -26,57 +25,58 @@ class LaneHypothesis(NamedTuple):
 def direction_likelihood_ratio(t: FloatArray, field: FloatArray, noise_std: float,
                                left_to_right: LaneHypothesis,
                                right_to_left: LaneHypothesis) -> float:
-    """Generalised log-likelihood ratio of two lanes, maximised over moment and time of passing.
+    """Generalised log-likelihood ratio of two lanes, maximised over moment and CPA time.
 
     Parameters
     ----------
     t : (n,) array, s
     field : (n, 2) array, T
-        Horizontal field without the background, x along the road.
+        Horizontal field minus the background; x points along the road.
     noise_std : float, T
         Standard deviation of one sample, per axis.
     left_to_right, right_to_left : LaneHypothesis
+        Lanes of the two driving directions.
 
     Returns
     -------
     float
-        Positive for left to right.
+        Positive if left to right is more probable.
 
     References
     ----------
     [PHD15]_ Paper B eq. (24)-(35). Eq. (27) prints +||r||² where the dipole has -||r||².
     """
-    first, second = (_least_residual(t, field, h) for h in (left_to_right, right_to_left))
+    first, second = (_minimum_residual(t, field, h) for h in (left_to_right, right_to_left))
     return (second - first) / (2.0 * noise_std**2)
 
 
-def _least_residual(t: FloatArray, field: FloatArray, lane: LaneHypothesis) -> float:
-    """Minimum residual sum of squares [T²] of a dipole in the lane."""
+def _minimum_residual(t: FloatArray, field: FloatArray, lane: LaneHypothesis) -> float:
+    """Minimum residual sum of squares [T²] over the moments and CPA times of a dipole in a lane."""
     step = float(MAX_STEP * abs(lane.distance / lane.speed))
     grid = np.arange(t[0], t[-1] + step, step)
     at_grid = _residuals(t, field, lane, grid)
     k = int(np.argmin(at_grid))
 
-    def cost(at: float) -> float:
-        return float(_residuals(t, field, lane, np.array([at]))[0])
+    def cost(t_cpa: float) -> float:
+        return float(_residuals(t, field, lane, np.array([t_cpa]))[0])
 
-    found = float(fminbound(cost, float(grid[k] - step), float(grid[k] + step)))
-    return min(float(at_grid[k]), cost(found))
+    t_best = float(fminbound(cost, float(grid[k] - step), float(grid[k] + step)))
+    return min(float(at_grid[k]), cost(t_best))
 
 
 def _residuals(t: FloatArray, field: FloatArray, lane: LaneHypothesis,
-               at: FloatArray) -> FloatArray:
-    """Residual sums of squares (k,) [T²] of the best moments, for CPA times `at` (k,) [s]."""
-    along = lane.speed * (t - at[:, None])
+               t_cpa: FloatArray) -> FloatArray:
+    """Residual sums of squares (k,) [T²] of the best moment at each CPA time `t_cpa` (k,) [s]."""
+    along = lane.speed * (t - t_cpa[:, None])
     r = np.stack([along, np.full_like(along, lane.distance),
                   np.full_like(along, lane.height)], axis=-1)
-    size = np.linalg.norm(r, axis=-1)[..., None, None]
-    # The horizontal field of a vertical moment is zero at the height of the sensor.
+    distance = np.linalg.norm(r, axis=-1)[..., None, None]
+    # In the horizontal plane of the sensor, a vertical moment has no horizontal field.
     n = 3 if lane.height else 2
-    H = (3.0 * r[..., :2, None] * r[..., None, :n] / size**5 - np.eye(3)[:2, :n] / size**3)
-    H = H.reshape(len(at), -1, n)
+    H = (3.0 * r[..., :2, None] * r[..., None, :n] / distance**5 - np.eye(3)[:2, :n] / distance**3)
+    H = H.reshape(len(t_cpa), -1, n)
     y = field.ravel()
     b = y @ H
     moment = np.linalg.solve(np.swapaxes(H, 1, 2) @ H, b[..., None])[..., 0]
-    left: FloatArray = y @ y - np.sum(b * moment, axis=-1)
-    return left
+    residuals: FloatArray = y @ y - np.sum(b * moment, axis=-1)
+    return residuals

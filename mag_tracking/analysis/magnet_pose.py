@@ -17,19 +17,19 @@ N_UNKNOWNS = 5
 """Number of unknowns of a pose; the roll of a dipole is not observable."""
 
 EXACT_COST = 1e-9
-"""Sum of squares of exact readings; below it, convergence is assumed, since no step reduces it
-further."""
+"""Maximum sum of squared residuals of exact readings. Rounding prevents a further reduction, so the
+fit counts as converged."""
 
 MAX_COST = 100.0
-"""Maximum normalised cost; beyond it, the readings are not those of one dipole of this moment."""
+"""Maximum normalised cost; a larger cost means that the readings do not fit the dipole."""
 
 _Problem: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Maps points (n, 9) to residuals (n, n_y) and their Jacobians (n, n_y, 9)."""
+"""Function that maps states (n, 9) to residuals (n, n_y) and Jacobians (n, n_y, 9)."""
 
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """Settings of the search for a magnet and errors of its readings."""
+    """Settings of the search for a magnet, and error model of the readings."""
 
     field_error: float = param(
         0.01, 'Error of sensors and dipole model relative to the field.', '', (0.0, 1.0))
@@ -44,15 +44,15 @@ class PoseSettings:
 
 @dataclass(frozen=True)
 class MagnetPose:
-    """Position and direction of a magnet; not to be used if `reason` is not empty."""
+    """Position and direction of a magnet; valid only if `reason` is empty."""
 
     position: FloatArray
     """(3,) [m], world."""
     axis: FloatArray
     """(3,) unit vector, world: direction of the moment."""
     covariance: FloatArray
-    """(6, 6) of position and axis, singular along the axis; scaled up if the fit is worse than the
-    stated errors."""
+    """(6, 6) of position and axis, singular along the axis. Scaled by the normalised cost if that
+    exceeds one."""
     ambient: FloatArray
     """(3,) [T], world: change of the ambient field since the biases were estimated."""
     normalised_cost: float
@@ -60,30 +60,31 @@ class MagnetPose:
     converged: bool
     """Whether the pose is valid."""
     reason: str
-    """Why the pose is not valid; empty if it is."""
+    """Reason why the pose is not valid; empty if it is valid."""
 
 
 def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low: ArrayLike,
                   high: ArrayLike, settings: PoseSettings) -> MagnetPose:
-    """Pose of a dipole of known moment from one reading of all sensors.
+    """Estimate the pose of a dipole of known moment from one reading of all sensors.
 
-    Several starts on a grid are refined by the Levenberg-Marquardt method; the best is returned.
+    The best points of a grid are refined by the Levenberg-Marquardt method, and the solution with
+    the smallest cost is returned.
 
     Parameters
     ----------
     network : SensorNetwork
-        With `noise_std` of every sensor.
+        Every sensor requires a `noise_std`.
     field : (n, 3) array, T, sensor frame
         Readings corrected for bias and gain (`NetworkGeometry.signal`); NaN = not measured.
     moment : float, A m²
     low, high : (3,) array, m, world frame
-        Corners of the box in which the magnet is searched.
+        Opposite corners of the search box.
     settings : PoseSettings
 
     Returns
     -------
     MagnetPose
-        All NaN if too few axes were measured.
+        All values are NaN if too few axes were measured.
 
     Raises
     ------
@@ -96,26 +97,27 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     [PHD15]_ Paper A eq. (3).
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
-    _check(network, field, moment, low, high)
+    _check_input(network, field, moment, low, high)
     present = ~np.isnan(field)
     n_values = int(np.count_nonzero(present))
     if n_values <= N_UNKNOWNS:
         nothing = np.full(3, np.nan)
         return MagnetPose(nothing, nothing, np.full((6, 6), np.nan), nothing, np.nan, False,
-                          f'{n_values} axes measured, more than {N_UNKNOWNS} are required')
+                          f'number of measured axes is {n_values}, more than {N_UNKNOWNS} are '
+                          'required')
     size2 = np.nansum(np.square(field), axis=1)[:, None]
     std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * size2)
     problem = _problem(network, field, std, present, moment, settings.ambient_std)
-    starts = _starts(network, field, std, present, low, high, settings)
+    starts = _starting_states(network, field, std, present, low, high, settings)
     x, cost, covariance, converged = refine(problem, starts, settings.iterations, 1e-9)
     best = int(np.argmin(cost))
-    return _pose(x[best], covariance[best], cost[best] / (n_values - N_UNKNOWNS),
-                 converged[best] or cost[best] < EXACT_COST, low, high, settings)
+    return _pose_of_minimum(x[best], covariance[best], cost[best] / (n_values - N_UNKNOWNS),
+                            converged[best] or cost[best] < EXACT_COST, low, high, settings)
 
 
 def _problem(network: SensorNetwork, field: FloatArray, std: FloatArray, present: BoolArray,
              moment: float, ambient_std: float) -> _Problem:
-    """Residuals and Jacobians of x = [position, unnormalised axis, ambient field over its std]."""
+    """Create the residuals of x = [position, unnormalised axis, ambient field over its std]."""
     y = (field / std)[present]
     uniform = (network.R_sw * ambient_std / std[:, :, None])[present]
     prior = np.hstack([np.zeros((3, 6)), np.eye(3)])
@@ -138,13 +140,14 @@ def _problem(network: SensorNetwork, field: FloatArray, std: FloatArray, present
     return residual_and_jacobian
 
 
-def _starts(network: SensorNetwork, field: FloatArray, std: FloatArray, present: BoolArray,
-            low: FloatArray, high: FloatArray, settings: PoseSettings) -> FloatArray:
-    """Best points (k, 9) of a grid, each with the best-fitting direction of the moment."""
+def _starting_states(network: SensorNetwork, field: FloatArray, std: FloatArray,
+                     present: BoolArray, low: FloatArray, high: FloatArray,
+                     settings: PoseSettings) -> FloatArray:
+    """Best states (k, 9) on a grid of positions, each with its best-fitting moment direction."""
     per_axis = max(2, int(round(settings.grid_points ** (1.0 / 3.0))))
     axes = [np.linspace(a, b, per_axis + 2)[1:-1] for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
-    # Only the Jacobian by the moment is used; it does not depend on the moment.
+    # The Jacobian by the moment does not depend on the moment.
     dB_dm = dipole_jacobians(network.positions - grid[:, None], np.zeros(3))[1]
     A = (network.R_sw @ dB_dm / std[:, :, None])[:, present]
     usable = np.isfinite(A).all(axis=(1, 2))
@@ -154,16 +157,16 @@ def _starts(network: SensorNetwork, field: FloatArray, std: FloatArray, present:
     return np.hstack([grid[usable][best], m, np.zeros((len(m), 3))])
 
 
-def _pose(x: FloatArray, covariance: FloatArray, cost: float, converged: bool, low: FloatArray,
-          high: FloatArray, settings: PoseSettings) -> MagnetPose:
-    """`MagnetPose` of a minimum."""
+def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converged: bool,
+                     low: FloatArray, high: FloatArray, settings: PoseSettings) -> MagnetPose:
+    """Convert a minimum `x` (9,) to a `MagnetPose`."""
     length = np.linalg.norm(x[3:6])
     u = x[3:6] / length
     T = np.zeros((6, 9))
     T[:3, :3] = np.eye(3)
     T[3:, 3:6] = (np.eye(3) - np.outer(u, u)) / length
     if not (np.isfinite(cost) and converged):
-        reason = f'no minimum within {settings.iterations} steps'
+        reason = f'no minimum found (maximum number of steps: {settings.iterations})'
     elif not cost <= MAX_COST:
         reason = ('the readings do not fit one dipole of this moment: the normalised cost is '
                   f'{cost:.0f}')
@@ -175,8 +178,8 @@ def _pose(x: FloatArray, covariance: FloatArray, cost: float, converged: bool, l
                       settings.ambient_std * x[6:], float(cost), not reason, reason)
 
 
-def _check(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
-           high: FloatArray) -> None:
+def _check_input(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
+                 high: FloatArray) -> None:
     """Raise ValueError if an input is invalid."""
     if field.shape != (len(network), 3) or low.shape != (3,) or high.shape != (3,):
         raise ValueError(f'expected field ({len(network)}, 3) and corners (3,), got '

@@ -9,13 +9,12 @@ from mag_tracking.arrays import FloatArray
 
 
 def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
-    """Information criterion of each fit of one pass; the smallest is selected.
+    """Bayesian information criterion (BIC, Schwarz) of each fit of one pass.
 
-    The criterion is the Bayesian information criterion (BIC, Schwarz): each unknown is penalised
-    by log(n), so that orders that only fit noise are not selected. The noise is known, hence the
-    cost is -2 times the log-likelihood up to a constant. The cost is first divided by the
-    normalised cost of the fit with the most dipoles if that exceeds one, since a residual that no
-    order explains is no evidence for a higher order. TSP14 section V.C leaves the criterion open.
+    The criterion adds a penalty of log(n) for each unknown to the cost, which is -2 times the
+    log-likelihood up to a constant. If the normalised cost of the fit with the most dipoles exceeds
+    one, all costs are divided by this value: a residual that no order explains is no evidence for a
+    higher order. TSP14 section V.C leaves the criterion open.
 
     Parameters
     ----------
@@ -25,13 +24,14 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
     Returns
     -------
     (n,) array
-        Relative to the smallest; infinite for a fit that the measurements do not determine.
+        Difference from the smallest criterion, which is the best. Infinite for a fit that is not
+        determined by the measurements.
     """
     usable = [f for f in fits if f.determined]
     if not usable:
         return np.full(len(fits), np.inf)
-    richest = max(usable, key=lambda f: f.n_dipoles)
-    excess = max(1.0, richest.normalised_cost)
+    highest_order = max(usable, key=lambda f: f.n_dipoles)
+    excess = max(1.0, highest_order.normalised_cost)
     criteria: FloatArray = np.array([f.cost / excess + f.n_unknowns * np.log(f.data.n_values)
                          if f.determined else np.inf for f in fits])
     relative: FloatArray = criteria - criteria.min()
@@ -41,8 +41,8 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
 def choose_order(fits: Sequence[PassFit]) -> PassFit | None:
     """Return the fit with the smallest criterion, or None if that fit is rejected.
 
-    A point can fit a turn poorly without indicating it, so a rejection of the best fit holds for
-    all orders.
+    No other order is returned instead: a poor fit of fewer dipoles does not always show that the
+    target turned.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Geometry of a network from a magnet whose poses are unknown."""
+"""Calibration of the geometry of a network with a magnet at unknown poses."""
 
 from dataclasses import replace
 
@@ -17,19 +17,19 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 
 COARSE_ERROR = 0.1
-"""Assumed error relative to the field while the poses are close to their starts."""
+"""Assumed error relative to the field in the first stage, while the poses are inaccurate."""
 
-FIRST_POSE_SETTINGS = PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
-"""Settings of the search for the first poses, while the biases are hardly known."""
+INITIAL_POSE_SETTINGS = PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
+"""Settings of the search for the initial poses, with inaccurate biases."""
 
 
 def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: float,
                              low: ArrayLike, high: ArrayLike,
                              settings: GeometrySettings) -> NetworkGeometry:
-    """Estimate the geometry of a network from a magnet whose poses are unknown.
+    """Estimate the geometry of a network from readings of a magnet at unknown poses.
 
-    The first poses are found with the median of each sensor as its bias. Biases and poses are then
-    fitted with an assumed field error of 10 %, and finally all unknowns.
+    The initial poses are estimated with the median reading of each sensor as its bias. Biases and
+    poses are then fitted with an assumed field error of 10 %, and finally all unknowns.
 
     Parameters
     ----------
@@ -39,34 +39,34 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
         Readings including their constant background; NaN = not measured.
     moment : float, A m²
     low, high : (3,) array, m, world frame
-        Corners of the box that contains the magnet.
+        Opposite corners of the box that contains the magnet.
     settings : GeometrySettings
 
     Returns
     -------
     NetworkGeometry
-        The world frame is defined by the priors of the sensors only: register it before
-        comparing it with another. `rows` are the poses that were found in the box.
+        The world frame is defined only by the priors of the sensors and must be registered before
+        a comparison with another frame. `rows` are the indices of the poses inside the box.
 
     Raises
     ------
     ValueError
-        If an input is invalid (see `calibrate_geometry`), or fewer than `MIN_POSES` poses were
-        found in the box.
+        If an input is invalid (see `calibrate_geometry`), or fewer than `MIN_POSES` poses are
+        inside the box.
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
     s = settings
     shared_unit = np.append(np.zeros(SHARED - 1), s.moment_std)
     pose_unit = np.repeat([s.start_position_std, np.deg2rad(s.start_tilt_std_deg), s.ambient_std],
                           [3, 2, 3])
-    rows, r, u = _first_poses(network, field, moment, low, high)
+    rows, r, u = _initial_poses(network, field, moment, low, high)
     coarse = replace(s, gain_std=0.0, rotation_std_deg=0.0, position_std=0.0,
                      field_error=max(COARSE_ERROR, s.field_error))
-    for how in (coarse, s):
+    for stage in (coarse, s):
         if len(rows) < MIN_POSES:
-            raise ValueError(f'{len(rows)} of {len(field)} poses were found in the box, at least '
-                             f'{MIN_POSES} are required')
-        geometry = fitted_geometry(network, field[rows], r, u, moment, how, shared_unit,
+            raise ValueError(f'found {len(rows)} of {len(field)} poses in the box, at least '
+                             f'{MIN_POSES} are required; check the moment and the box')
+        geometry = fitted_geometry(network, field[rows], r, u, moment, stage, shared_unit,
                                    pose_unit)
         used, (r, u) = rows, geometry.poses
         inside = ((low <= r) & (r <= high)).all(axis=1)
@@ -75,17 +75,17 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
                    suspect_poses=tuple(int(used[k]) for k in geometry.suspect_poses))
 
 
-def _first_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
-                 high: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Rows (k,) of the poses that were found, their positions and axes (k, 3)."""
+def _initial_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
+                   high: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Locate the magnet in each reading; return indices (k,), positions and axes (k, 3)."""
     if field.ndim != 3 or field.shape[1:] != (len(network), 3):
         raise ValueError(f'expected field (K, {len(network)}, 3), got {field.shape}')
-    middle = np.zeros(field.shape[1:])
+    median = np.zeros(field.shape[1:])
     for j, a in zip(*np.nonzero((~np.isnan(field)).any(axis=0)), strict=True):
-        middle[j, a] = np.nanmedian(field[:, j, a])
-    found = [locate_magnet(network, B - middle, moment, low, high, FIRST_POSE_SETTINGS)
+        median[j, a] = np.nanmedian(field[:, j, a])
+    poses = [locate_magnet(network, B - median, moment, low, high, INITIAL_POSE_SETTINGS)
              for B in field]
-    rows = np.flatnonzero([pose.converged for pose in found])
-    positions, axes = (np.array([getattr(found[k], name) for k in rows]).reshape(-1, 3)
+    rows = np.flatnonzero([pose.converged for pose in poses])
+    positions, axes = (np.array([getattr(poses[k], name) for k in rows]).reshape(-1, 3)
                        for name in ('position', 'axis'))
     return rows, positions, axes

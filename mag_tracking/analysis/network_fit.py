@@ -1,6 +1,7 @@
-"""Gauss-Newton for the geometry of a network: weights, normal equations, steps.
+"""Least-squares fit of the geometry of a network: weights, normal equations and steps.
 
-Sensors and poses are coupled by their readings only, so the poses are eliminated block by block.
+Readings couple each pose to the sensors but not to other poses. The poses are therefore eliminated
+from the normal equations block by block.
 """
 
 from typing import Protocol, TypeAlias
@@ -21,36 +22,35 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 
 OUTLIER_PROBABILITY = 1e-3
-"""Probability under the noise below which a reading is down-weighted, the more the larger its
-residual."""
+"""Readings whose residuals are less probable than this under the noise are down-weighted."""
 
 STEP_TOLERANCE = 1e-3
-"""Squared length of a step, in posterior standard deviations, below which the fit has converged."""
+"""Maximum squared length of the last step, in posterior standard deviations."""
 
 MAX_DAMPING = 1e10
-"""Damping at which the search for a step is abandoned."""
+"""Damping beyond which the search for a step is abandoned."""
 
 Unknowns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-"""Unknowns of the sensors (n, 10), shared (12,) and of the poses (K, 8)."""
+"""Unknowns of the sensors (n, 10), shared unknowns (12,) and unknowns of the poses (K, 8)."""
 
 Weights: TypeAlias = tuple[FloatArray, Unknowns, float, FloatArray]
-"""As returned by `GeometryProblem.weights`."""
+"""Weights of readings and priors; see `GeometryProblem.weights`."""
 
 
 class Priors(Protocol):
-    """Prior standard deviations of the unknowns of a sensor, as in `GeometrySettings`."""
+    """Priors of a sensor and limits of the fit, as in `GeometrySettings`."""
 
     @property
     def gain_std(self) -> float:
-        """Standard deviation of a gain."""
+        """Standard deviation of the gain."""
 
     @property
     def rotation_std_deg(self) -> float:
-        """Standard deviation of an orientation, per axis [deg]."""
+        """Standard deviation of the orientation, per axis [deg]."""
 
     @property
     def position_std(self) -> float:
-        """Standard deviation of a position, per axis [m]."""
+        """Standard deviation of the position, per axis [m]."""
 
     @property
     def field_error(self) -> float:
@@ -62,17 +62,19 @@ class Priors(Protocol):
 
 
 class GeometryProblem:
-    """Readings, units and priors of the unknowns, and weighted predictions.
+    """Least-squares problem of a geometry calibration: readings, priors and predictions.
 
-    All x are `Unknowns` in units of their priors.
+    Each argument `x` contains `Unknowns` in units of their prior standard deviations.
 
     Parameters
     ----------
     network : SensorNetwork
     field : (K, n, 3) array, T, sensor frame
-        As for `calibrate_geometry`, checked.
+        Validated readings; see `calibrate_geometry`.
     positions, axes : (K, 3) array, m and unit vectors, tracker frame
+        Tracked poses.
     moment : float, A m²
+        Nominal moment of the magnet.
     settings : Priors
     shared_unit : (12,) array
         Prior standard deviations of the shared unknowns; zero = fixed.
@@ -112,7 +114,7 @@ class GeometryProblem:
                 [s.gain_std, np.deg2rad(s.rotation_std_deg), s.position_std], [1, 3, 3]), (n, 1))])
 
     def predicted(self, x: Unknowns) -> Prediction:
-        """Predicted readings and derivatives by x.
+        """Predicted readings and their derivatives by the unknowns.
 
         Parameters
         ----------
@@ -121,7 +123,7 @@ class GeometryProblem:
         Returns
         -------
         Prediction
-            As `predicted_readings`, with derivatives in units of the priors.
+            As for `predicted_readings`, with derivatives in units of the priors.
         """
         sensor, shared, pose = self.in_si(x)
         f, signal, by_sensor, by_shared, by_pose = predicted_readings(
@@ -130,7 +132,7 @@ class GeometryProblem:
                 by_shared * self.shared_unit, by_pose * self.pose_unit)
 
     def in_si(self, x: Unknowns) -> Unknowns:
-        """Convert x to SI units.
+        """Convert unknowns from units of their priors to SI units.
 
         Parameters
         ----------
@@ -144,7 +146,7 @@ class GeometryProblem:
         return sensor * self.sensor_unit, shared * self.shared_unit, pose * self.pose_unit
 
     def start(self) -> Unknowns:
-        """Starting point: no corrections, and biases from the median residuals.
+        """Initial unknowns: no corrections, and biases from the median residuals.
 
         Returns
         -------
@@ -152,14 +154,14 @@ class GeometryProblem:
         """
         n, K = len(self.network), len(self.magnet.tool)
         x = np.zeros((n, SENSOR)), np.zeros(SHARED), np.zeros((K, POSE))
-        left = self.field - self.predicted(x)[0]
+        residuals = self.field - self.predicted(x)[0]
         for j, a in zip(*np.nonzero(self.reported), strict=True):
-            x[0][j, a] = np.nanmedian(left[j, :, a]) / self.sensor_unit[j, a]
+            x[0][j, a] = np.nanmedian(residuals[j, :, a]) / self.sensor_unit[j, a]
         return x
 
     def misfit(self, f: FloatArray,
                signal: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Normalised squared residuals.
+        """Squared residuals normalised by their variance.
 
         Parameters
         ----------
@@ -171,18 +173,18 @@ class GeometryProblem:
         Returns
         -------
         e2 : (n, K, 3) array
-            Squared residuals over their variance; zero where nothing was measured.
+            Normalised squared residuals; zero where nothing was measured.
         count : (n, K) int array
             Number of measured axes.
         variance : (n, K, 3) array, T²
         """
-        size2 = np.einsum('nki,nki->nk', signal, signal)[:, :, None]
-        variance = self.variance + self.settings.field_error**2 * size2
+        signal2 = np.einsum('nki,nki->nk', signal, signal)[:, :, None]
+        variance = self.variance + self.settings.field_error**2 * signal2
         e2 = np.square(self.field - f) / variance
         return np.nan_to_num(e2), (~np.isnan(e2)).sum(axis=2), variance
 
     def weights(self, f: FloatArray, signal: FloatArray, x: Unknowns) -> Weights:
-        """Weights of readings and priors.
+        """Robust weights of readings and priors.
 
         Parameters
         ----------
@@ -197,9 +199,9 @@ class GeometryProblem:
         priors : Unknowns
             Weights of the priors.
         scale : float
-            Scale of the misfit, at least one.
+            Factor of the noise variances that fits the median residual, at least one.
         trust : (n, K) array
-            Robust weights, 0 to 1.
+            Robust weight of each sensor at each pose, 0 to 1.
         """
         e2, count, variance = self.misfit(f, signal)
         d2 = e2.sum(axis=2)
@@ -210,17 +212,17 @@ class GeometryProblem:
         return W, self._priors(x), scale, trust
 
     def _priors(self, x: Unknowns) -> Unknowns:
-        """Weights of the priors."""
-        # The square root limits the down-weighting: a large correction is a fault of the quantity
-        # that is estimated, not an outlier to be ignored.
+        """Robust weights of the priors."""
+        # The square root limits the down-weighting: a large correction is an error to be estimated,
+        # not an outlier to be ignored.
         sensor, pose = (np.sqrt(_robust_weights(np.square(v).sum(axis=1), v.shape[1]))[:, None]
                         for v in (x[0][:, 3:], x[2]))
-        # A bias has no prior. The prior of an axis without readings keeps the equations regular.
+        # A bias has no prior, except on an axis without readings, where it would be undetermined.
         return (np.hstack([1.0 * ~self.reported, np.tile(sensor, SENSOR - 3)]), np.ones(SHARED),
                 np.tile(pose, POSE))
 
     def cost(self, x: Unknowns, f: FloatArray, W: FloatArray, priors: Unknowns) -> float:
-        """Weighted sum of squares.
+        """Weighted sum of squared residuals and priors.
 
         Parameters
         ----------
@@ -228,6 +230,7 @@ class GeometryProblem:
         f : (n, K, 3) array, T
             Predicted readings.
         W : (n, K, 3) array
+            Weights of the readings.
         priors : Unknowns
             Weights of the priors.
 
@@ -242,7 +245,7 @@ class GeometryProblem:
 
 
 def median_ratio(d2: FloatArray, count: IntArray) -> FloatArray:
-    """Squared residuals over their median under the noise.
+    """Ratio of squared residuals to their median for pure noise.
 
     Parameters
     ----------
@@ -254,19 +257,19 @@ def median_ratio(d2: FloatArray, count: IntArray) -> FloatArray:
     Returns
     -------
     (...) array
-        One where nothing was measured.
+        One where no value was measured.
     """
     return np.where(count > 0, d2 / chi2.median(np.maximum(count, 1)), 1.0)
 
 
 def _robust_weights(d2: FloatArray, count: IntArray | int) -> FloatArray:
-    """Robust weights of residuals with `count` values: one, then falling with their square."""
+    """Robust weights (0 to 1) from squared residuals, each the sum of `count` values."""
     limit = chi2.isf(OUTLIER_PROBABILITY, np.maximum(count, 1))
     return limit / np.maximum(d2, limit)
 
 
 class NormalEquations:
-    """Normal equations with the poses eliminated block by block.
+    """Normal equations of a geometry calibration; the poses are eliminated block by block.
 
     Parameters
     ----------
@@ -289,7 +292,7 @@ class NormalEquations:
     g_pose : (K, 8) array
         Negative gradient of the poses.
     C : (K, N, 8) array
-        Information between [sensors, shared] and each pose.
+        Cross information between [sensors, shared] and each pose.
     """
 
     def __init__(self, problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
@@ -304,8 +307,8 @@ class NormalEquations:
         m = SENSOR * n
         A = np.zeros((m + SHARED, m + SHARED))
         for j, block in enumerate(Jst @ Js):
-            mine = slice(SENSOR * j, SENSOR * j + SENSOR)
-            A[mine, mine] = block + np.diag(priors[0][j])
+            block_slice = slice(SENSOR * j, SENSOR * j + SENSOR)
+            A[block_slice, block_slice] = block + np.diag(priors[0][j])
         A[:m, m:] = (Jst @ Jh).reshape(m, SHARED)
         A[m:, :m] = A[:m, m:].T
         Jh_all = Jh.reshape(-1, SHARED)
@@ -318,9 +321,9 @@ class NormalEquations:
         self.A_pose = np.swapaxes(by_k, 1, 2) @ by_k + priors[2][:, :, None] * np.eye(POSE)
         self.g_pose = np.einsum('kyi,ky->ki', by_k, np.swapaxes(
             e.reshape(n, K, 3), 0, 1).reshape(K, 3 * n)) - priors[2] * x[2]
-        across = np.einsum('nkai,nkap->knip', Js.reshape(n, K, 3, SENSOR), Jp)
-        shared = np.einsum('nkai,nkap->kip', Jh.reshape(n, K, 3, SHARED), Jp)
-        self.C = np.concatenate([across.reshape(K, m, POSE), shared], axis=1)
+        sensor_pose = np.einsum('nkai,nkap->knip', Js.reshape(n, K, 3, SENSOR), Jp)
+        shared_pose = np.einsum('nkai,nkap->kip', Jh.reshape(n, K, 3, SHARED), Jp)
+        self.C = np.concatenate([sensor_pose.reshape(K, m, POSE), shared_pose], axis=1)
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Solve the damped normal equations.
@@ -328,7 +331,7 @@ class NormalEquations:
         Parameters
         ----------
         damping : float
-            Share added to the diagonals.
+            Relative increase of the diagonals.
 
         Returns
         -------
@@ -339,10 +342,10 @@ class NormalEquations:
         """
         A, A_pose = self._damped(damping)
         CB = self.C @ np.linalg.inv(A_pose)
-        S = A - self._reduced(CB)
+        S = A - self._lost_information(CB)
         dx = np.linalg.solve(S, self.g - np.einsum('kip,kp->i', CB, self.g_pose))
-        rest = self.g_pose - np.einsum('kip,i->kp', self.C, dx)
-        return dx, np.linalg.solve(A_pose, rest[..., None])[..., 0]
+        residual = self.g_pose - np.einsum('kip,i->kp', self.C, dx)
+        return dx, np.linalg.solve(A_pose, residual[..., None])[..., 0]
 
     def covariance(self) -> tuple[FloatArray, FloatArray]:
         """Covariances of the solution.
@@ -356,19 +359,19 @@ class NormalEquations:
         """
         B = np.linalg.inv(self.A_pose)
         CB = self.C @ B
-        P = np.linalg.inv(self.A - self._reduced(CB))
+        P = np.linalg.inv(self.A - self._lost_information(CB))
         P = 0.5 * (P + P.T)
         return P, B + np.swapaxes(CB, 1, 2) @ (P @ CB)
 
-    def _reduced(self, CB: FloatArray) -> FloatArray:
-        """Information (N, N) that the elimination of the poses removes."""
+    def _lost_information(self, CB: FloatArray) -> FloatArray:
+        """Information (N, N) that is lost by the elimination of the poses."""
         N = len(self.g)
-        taken: FloatArray = (np.swapaxes(CB, 0, 1).reshape(N, -1)
+        lost: FloatArray = (np.swapaxes(CB, 0, 1).reshape(N, -1)
                              @ np.swapaxes(self.C, 0, 1).reshape(N, -1).T)
-        return taken
+        return lost
 
     def _damped(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Both information matrices with increased diagonals."""
+        """Information of [sensors, shared] and of the poses with increased diagonals."""
         return (self.A + damping * np.diag(np.diagonal(self.A)),
                 self.A_pose * (1.0 + damping * np.eye(POSE)))
 
@@ -399,14 +402,14 @@ def solve(problem: GeometryProblem,
         cost = problem.cost(x, predicted[0], W, priors)
         while damping < MAX_DAMPING:
             dx, dpose = normal.step(damping)
-            trial = _moved(x, dx, dpose)
-            there = problem.predicted(trial)
-            if problem.cost(trial, there[0], W, priors) <= cost:
+            candidate = _add_step(x, dx, dpose)
+            candidate_predicted = problem.predicted(candidate)
+            if problem.cost(candidate, candidate_predicted[0], W, priors) <= cost:
                 break
             damping *= 10.0
         else:
             break
-        x, predicted, damping = trial, there, 0.1 * damping
+        x, predicted, damping = candidate, candidate_predicted, 0.1 * damping
         if dx @ normal.g + (dpose * normal.g_pose).sum() < STEP_TOLERANCE:
             converged = True
             break
@@ -414,7 +417,7 @@ def solve(problem: GeometryProblem,
     return x, weights, predicted, converged
 
 
-def _moved(x: Unknowns, dx: FloatArray, dpose: FloatArray) -> Unknowns:
-    """x after a step."""
+def _add_step(x: Unknowns, dx: FloatArray, dpose: FloatArray) -> Unknowns:
+    """Add a step to the unknowns."""
     m = len(dx) - SHARED
     return x[0] + dx[:m].reshape(-1, SENSOR), x[1] + dx[m:], x[2] + dpose

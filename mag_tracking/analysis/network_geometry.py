@@ -1,8 +1,8 @@
-"""Calibration of a network's geometry from readings of a magnet at many poses.
+"""Calibration of the geometry of a network from readings of a magnet at many poses.
 
-Positions, orientations, gains and biases of fixed sensors are estimated by maximum a posteriori,
-jointly with the unknown alignment of a tracked tool and the board, or jointly with the poses
-themselves if the magnet is not tracked. PHD15 Paper A names this as future work.
+Positions, orientations, gains and biases of fixed sensors are estimated by maximum a posteriori.
+Further unknowns are the alignment between board, tracker and tool or, without a tracker, the poses
+of the magnet. PHD15 Paper A suggests such a calibration as future work.
 """
 
 from dataclasses import dataclass, replace
@@ -32,13 +32,13 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class GeometrySettings:
-    """Prior knowledge as standard deviations; zero means known exactly."""
+    """Prior standard deviations (zero: known exactly) and limits of the fit."""
 
     gain_std: float = param(0.03, 'Gain of a sensor.', '', (0.0, 1.0))
     rotation_std_deg: float = param(2.0, 'Orientation of a sensor, per axis.', 'deg',
                                     (0.0, 45.0))
     position_std: float = param(1e-3, 'Position of a sensor, per axis.', 'm', (0.0, 100.0))
-    moment_std: float = param(0.0, 'Moment of the magnet, relative to its size.', '',
+    moment_std: float = param(0.0, 'Moment of the magnet, relative to its magnitude.', '',
                               (0.0, 1.0))
     board_shift_std: float = param(
         0.01, 'Position of the network relative to the tracker, per axis.', 'm', (0.0, 100.0))
@@ -66,34 +66,36 @@ class GeometrySettings:
 
 @dataclass(frozen=True)
 class NetworkGeometry:
-    """A calibrated network; not to be used if `reason` is not empty.
+    """Result of a geometry calibration; valid only if `reason` is empty.
 
-    Standard deviations are posterior. If the readings fit worse than their stated noise, the noise
-    is scaled up accordingly.
+    Standard deviations are posterior. If the residuals exceed the configured noise, the noise is
+    scaled up accordingly.
     """
 
     network: SensorNetwork
-    """Corrected network: positions, orientations, and the biases as background."""
+    """Network with corrected positions and orientations, and with the biases as background."""
     position_std: FloatArray
     """(n, 3) [m]."""
     rotation_std: FloatArray
-    """(n, 3) [rad], about the sensor's own axes."""
+    """(n, 3) [rad], about the axes of the sensor."""
     gain: FloatArray
-    """(n,)."""
+    """(n,); 1 = nominal."""
     gain_std: FloatArray
+    """(n,)."""
     bias: FloatArray
-    """(n, 3) [T], sensor frame; NaN if an axis never reported."""
+    """(n, 3) [T], sensor frame; NaN for an axis without readings."""
     bias_std: FloatArray
-    """(n, 3) [T]; infinite if an axis never reported."""
+    """(n, 3) [T]; infinite for an axis without readings."""
     magnet: TrackedMagnet
+    """Tracked poses of the magnet, and its nominal moment."""
     rows: IntArray
-    """(K,) rows of the readings that were used."""
+    """(K,) indices of the used poses."""
     shared: FloatArray
-    """(12,), as in `TrackedMagnet.poses`."""
+    """(12,) shared unknowns; see `TrackedMagnet.poses`."""
     shared_std: FloatArray
     """(12,)."""
     pose: FloatArray
-    """(K, 8), as in `TrackedMagnet.poses`."""
+    """(K, 8) unknowns of each pose; see `TrackedMagnet.poses`."""
     pose_covariance: FloatArray
     """(K, 8, 8)."""
     covariance: FloatArray
@@ -104,16 +106,16 @@ class NetworkGeometry:
     sensor_residual: FloatArray
     """(n,) RMS of the normalised residuals; NaN without readings."""
     pose_residual: FloatArray
-    """(K,) median over the sensors of the residuals, relative to that of the noise."""
+    """(K,) median residual over the sensors, relative to the median for pure noise."""
     suspect_sensors: tuple[str, ...]
     """Names of the sensors with large residuals, or with corrections beyond `MAX_CORRECTION` prior
     standard deviations."""
     suspect_poses: tuple[int, ...]
-    """Rows of the poses with large residuals or corrections."""
+    """Indices of the poses with large residuals or corrections."""
     converged: bool
     """Whether the calibration is valid."""
     reason: str
-    """Why the calibration is not valid; empty if it is."""
+    """Reason why the calibration is not valid; empty if it is valid."""
 
     def signal(self, field: FloatArray) -> FloatArray:
         """Remove biases and gains from readings.
@@ -132,7 +134,7 @@ class NetworkGeometry:
 
     def magnet_poses(self, positions: FloatArray,
                      axes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Poses of the magnet in the world frame from tracked poses.
+        """Convert tracked poses to poses of the magnet in the world frame.
 
         Parameters
         ----------
@@ -157,43 +159,42 @@ class NetworkGeometry:
 
     @property
     def tool_offset(self) -> tuple[FloatArray, FloatArray]:
-        """Offset of the magnet's centre from the tracked point and its std, (3,) m, tool frame."""
+        """Offset of the magnet from the tracked point and its std, (3,) m each, tool frame."""
         return self.shared[6:9], self.shared_std[6:9]
 
     @property
     def tool_tilt(self) -> tuple[FloatArray, FloatArray]:
-        """Slopes of the moment (x and y over z) in the tool frame and their std, (2,)."""
+        """Slopes x/z and y/z of the moment and their standard deviations, (2,), tool frame."""
         return self.shared[9:11], self.shared_std[9:11]
 
     @property
     def poses(self) -> tuple[FloatArray, FloatArray]:
-        """Calibration poses of the magnet: positions (K, 3) m and axes (K, 3), world frame."""
+        """Estimated poses of the magnet: positions (K, 3) m and unit axes (K, 3), world frame."""
         return _positions_and_axes(self.magnet, self.shared, self.pose)
 
 
 def _positions_and_axes(magnet: TrackedMagnet, shared: FloatArray,
-            pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Positions and unit axes, each (K, 3)."""
+                        pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Positions and unit axes of the magnet, each (K, 3), world frame."""
     r, m, *_ = magnet.poses(shared, pose)
     return r, m / np.linalg.norm(m, axis=1)[:, None]
 
 
 MIN_POSES = 3
-"""Minimum number of poses; with fewer, the bias of a sensor is not separable from the magnet's
-field."""
+"""Minimum number of poses that separates the bias of a sensor from the field of the magnet."""
 
 MIN_CHANGE = 0.1
-"""Minimum range of the axis [rad], and of the position relative to the distance. Poses within it
-are at one place."""
+"""Minimum range of the axis [rad], and of the position relative to the distance. Poses within both
+ranges do not determine the geometry."""
 
 MAX_CORRECTION = 4.0
-"""Maximum correction in prior standard deviations; beyond it, a sensor or pose is suspect."""
+"""Maximum correction of a sensor or pose that is not suspect, in prior standard deviations."""
 
 MAX_RESIDUAL_RATIO = 3.0
-"""Maximum ratio of a residual to the median residual; beyond it, a sensor or pose is suspect."""
+"""Maximum residual of a sensor or pose that is not suspect, relative to the median residual."""
 
 MAX_COST = 100.0
-"""Maximum normalised cost; beyond it, the readings are not those of a dipole and this network."""
+"""Maximum normalised cost; a larger cost means that the readings do not fit the model."""
 
 
 def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: FloatArray,
@@ -201,22 +202,23 @@ def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: Flo
                        settings: GeometrySettings) -> NetworkGeometry:
     """Estimate the geometry of a network from readings of a tracked magnet.
 
-    Maximum a posteriori by the Levenberg-Marquardt method with redescending weights. A rotation of
-    the board is equivalent to one of all sensors; the priors resolve this gauge freedom. PHD15
-    Paper A section 8 proposes such a calibration.
+    Maximum a posteriori by the Levenberg-Marquardt method with robust weights. A rotation of the
+    board has the same effect as a rotation of all sensors; the priors resolve this gauge freedom.
+    PHD15 Paper A section 8 proposes such a calibration.
 
     Parameters
     ----------
     network : SensorNetwork
-        As stated, with `noise_std` of every sensor.
+        Nominal network. Every sensor requires a `noise_std`.
     field : (K, n, 3) array, T, sensor frame
         Readings including their constant background; NaN = not measured.
     positions : (K, 3) array, m, tracker frame
-        Positions of the tracked point. Tracker and world frames differ by the shift and rotation
-        of the settings only.
+        Positions of the tracked point. The tracker frame differs from the world frame only by a
+        shift and a rotation within the priors of the settings.
     axes : (K, 3) array, unit vectors, tracker frame
-        Directions of the moment except for the tilt.
+        Directions of the moment, apart from its tilt in the tool.
     moment : float, A m²
+        Nominal moment of the magnet.
     settings : GeometrySettings
 
     Returns
@@ -252,7 +254,7 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
     positions, axes : (K, 3) array, m and unit vectors, tracker frame
     moment : float, A m²
     settings : GeometrySettings
-        As for `calibrate_geometry`.
+        This and the arguments above are as for `calibrate_geometry`.
     shared_unit : (12,) array
         Prior standard deviations of the shared unknowns, in the units of `TrackedMagnet.poses`;
         zero = fixed.
@@ -266,30 +268,30 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
     Raises
     ------
     ValueError
-        As `calibrate_geometry`.
+        Under the conditions of `calibrate_geometry`.
     """
     field, positions, axes = (np.asarray(a, dtype=float) for a in (field, positions, axes))
-    _check(network, field, positions, axes, moment)
+    _check_input(network, field, positions, axes, moment)
     problem = GeometryProblem(network, field, positions, axes, moment, settings, shared_unit,
                               pose_unit)
     x, (W, priors, scale, trust), predicted, converged = solve(problem, settings.iterations)
     cost = _normalised_cost(problem, x, predicted, W, trust, priors)
-    # Only the noise of the readings is scaled up, not the priors.
-    worse = max(1.0, cost / scale)
-    P, P_pose = NormalEquations(problem, x, predicted, W / worse, priors).covariance()
+    # Scale up only the noise of the readings, not the priors.
+    noise_scale = max(1.0, cost / scale)
+    P, P_pose = NormalEquations(problem, x, predicted, W / noise_scale, priors).covariance()
     n = len(network)
     unit = np.append(problem.sensor_unit.ravel(), problem.shared_unit)
     covariance = P * unit[:, None] * unit
     std = np.sqrt(np.diagonal(covariance))
     sensor_std, shared_std = std[:-SHARED].reshape(n, SENSOR), std[-SHARED:]
     sensor, shared, pose = problem.in_si(x)
-    turn = rotation(sensor[:, 4:7])
-    by_sensor, by_pose = _residuals(problem, predicted)
+    corrections = rotation(sensor[:, 4:7])
+    by_sensor, by_pose = _sensor_and_pose_residuals(problem, predicted)
     outlier_sensors, outlier_poses = _suspects(problem, x, by_sensor, by_pose)
     reason = _failure_reason(problem, x, converged, cost)
     return NetworkGeometry(
         network=replace(network, positions=network.positions + sensor[:, 7:],
-                        R_ws=network.R_ws @ turn, background=tuple(
+                        R_ws=network.R_ws @ corrections, background=tuple(
                             b if h.all() else None
                             for b, h in zip(sensor[:, :3], problem.reported, strict=True))),
         position_std=sensor_std[:, 7:], rotation_std=sensor_std[:, 4:7],
@@ -306,7 +308,7 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
 
 def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
                      trust: FloatArray, priors: Unknowns) -> float:
-    """Weighted sum of squares per degree of freedom left by the priors; NaN without any."""
+    """Weighted sum of squared residuals per degree of freedom; NaN for less than one degree."""
     P, P_pose = NormalEquations(problem, x, predicted, W, priors).covariance()
     e2, count, _ = problem.misfit(predicted[0], predicted[1])
     known = np.append(priors[0].ravel(), priors[1]) @ np.diagonal(P)
@@ -316,8 +318,9 @@ def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Predictio
     return float((trust[:, :, None] * e2).sum() / freedom) if freedom >= 1.0 else np.nan
 
 
-def _residuals(problem: GeometryProblem, predicted: Prediction) -> tuple[FloatArray, FloatArray]:
-    """RMS residual of each sensor (n,); median residual over the sensors of each pose (K,)."""
+def _sensor_and_pose_residuals(problem: GeometryProblem,
+                               predicted: Prediction) -> tuple[FloatArray, FloatArray]:
+    """RMS residual of each sensor (n,), and median residual of each pose over its sensors (K,)."""
     e2, count, _ = problem.misfit(predicted[0], predicted[1])
     e2 = e2.sum(axis=2)
     by_pose = np.sqrt([np.median(median_ratio(d2, c)[c > 0])
@@ -330,7 +333,7 @@ def _residuals(problem: GeometryProblem, predicted: Prediction) -> tuple[FloatAr
 
 def _suspects(problem: GeometryProblem, x: Unknowns, by_sensor: FloatArray,
               by_pose: FloatArray) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Names of the suspect sensors and rows of the suspect poses."""
+    """Names of the suspect sensors and indices of the suspect poses."""
     sensors = by_sensor > MAX_RESIDUAL_RATIO * np.nanmedian(by_sensor)
     sensors |= (np.abs(x[0][:, 3:]) > MAX_CORRECTION).any(axis=1)
     poses = by_pose > MAX_RESIDUAL_RATIO * np.median(by_pose)
@@ -339,8 +342,8 @@ def _suspects(problem: GeometryProblem, x: Unknowns, by_sensor: FloatArray,
             tuple(int(k) for k in np.flatnonzero(poses)))
 
 
-def _at_one_place(problem: GeometryProblem, x: Unknowns) -> bool:
-    """Whether the magnet neither moved, relative to its distance, nor rotated."""
+def _is_magnet_at_rest(problem: GeometryProblem, x: Unknowns) -> bool:
+    """Whether the magnet hardly moved, relative to its distance, and hardly rotated."""
     r, u = _positions_and_axes(problem.magnet, *problem.in_si(x)[1:])
     nearest = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
     return bool((np.ptp(r, axis=0) < MIN_CHANGE * nearest).all()
@@ -348,14 +351,15 @@ def _at_one_place(problem: GeometryProblem, x: Unknowns) -> bool:
 
 
 def _failure_reason(problem: GeometryProblem, x: Unknowns, converged: bool, cost: float) -> str:
-    """Why the fit is not valid; empty if it is."""
-    K, most = len(problem.magnet.tool), problem.settings.iterations
+    """Reason why the fit is not valid; empty if it is valid."""
+    K, max_steps = len(problem.magnet.tool), problem.settings.iterations
     if K < MIN_POSES:
-        reason = f'{K} poses, at least {MIN_POSES} are required to separate biases from the magnet'
-    elif _at_one_place(problem, x):
+        reason = (f'number of poses is {K}, at least {MIN_POSES} are required to separate the '
+                  'biases from the field of the magnet')
+    elif _is_magnet_at_rest(problem, x):
         reason = 'all poses are at one place: the geometry is not observable; move the magnet'
     elif not converged:
-        reason = f'no minimum within {most} steps'
+        reason = f'no minimum found (maximum number of steps: {max_steps})'
     elif np.isnan(cost):
         reason = 'fewer readings than unknowns'
     elif cost > MAX_COST:
@@ -366,15 +370,15 @@ def _failure_reason(problem: GeometryProblem, x: Unknowns, converged: bool, cost
     return reason
 
 
-def _check(network: SensorNetwork, field: FloatArray, positions: FloatArray, axes: FloatArray,
-           moment: float) -> None:
+def _check_input(network: SensorNetwork, field: FloatArray, positions: FloatArray,
+                 axes: FloatArray, moment: float) -> None:
     """Raise ValueError if an input is invalid."""
     K, n = len(positions), len(network)
     if field.shape != (K, n, 3) or positions.shape != (K, 3) or axes.shape != (K, 3):
         raise ValueError(f'expected field (K, {n}, 3), positions and axes (K, 3), got '
                          f'{field.shape}, {positions.shape}, {axes.shape}')
     if K == 0:
-        raise ValueError('there are no poses, at least one is required')
+        raise ValueError('there are no poses; at least one pose is required')
     for name, std in zip(network.names, network.noise_std, strict=True):
         if std is None or not (np.asarray(std) > 0.0).all():
             raise ValueError(f'sensor {name}: noise_std is {std}, must be above 0 T')

@@ -1,6 +1,6 @@
 """Predicted readings of fixed sensors for a magnet on a tracked tool, and their derivatives.
 
-The unknowns and their order are described in `TrackedMagnet.poses` and `predicted_readings`.
+`TrackedMagnet.poses` and `predicted_readings` define the unknowns and their order.
 """
 
 from dataclasses import dataclass
@@ -20,21 +20,22 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_field, dipole_jacobians
 
 SENSOR, SHARED, POSE = 10, 12, 8
-"""Number of unknowns per sensor (bias, gain, rotation, position), shared (shift and rotation of the
-board, offset and tilt of the magnet in the tool, log of the moment), and per pose (position, tilt,
+"""Numbers of unknowns: per sensor (bias, gain, rotation, position); shared (shift and rotation of
+the board, offset and tilt of the magnet in the tool, log of the moment); per pose (position, tilt,
 ambient field)."""
 
 Prediction: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
-"""As returned by `predicted_readings`."""
+"""Predicted readings and their derivatives; see `predicted_readings`."""
 
 UP = np.array([0.0, 0.0, 1.0])
+"""Unit vector of the z axis."""
 
 
 def tool_rotations(axes: FloatArray) -> FloatArray:
     """Shortest rotations from the tool frame to the tracker frame.
 
-    A tracked axis has no roll. The shortest rotation is correct for a tool that an arm tilts
-    without twisting it; otherwise the components across the axis in the tool frame have no meaning.
+    The roll about a tracked axis is unknown. The shortest rotation is correct if the tool is tilted
+    without a twist; otherwise, the components across the axis in the tool frame are meaningless.
 
     Parameters
     ----------
@@ -64,16 +65,16 @@ def rotation(v: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class TrackedMagnet:
-    """A magnet on a tracked tool whose alignment with the tool and the board is uncertain."""
+    """A magnet on a tracked tool, with uncertain alignment to the tool and to the board."""
 
     tool: FloatArray
-    """(K, 3) [m], tracker frame: tracked points."""
+    """(K, 3) [m] tracked points, tracker frame."""
     R_tool: FloatArray
-    """(K, 3, 3), tool to tracker; the z axis is the tool's axis."""
+    """(K, 3, 3) rotations from the tool frame to the tracker frame; z is the axis of the tool."""
     pivot: FloatArray
-    """(3,) [m]: centre of the rotation of the board relative to the tracker."""
+    """(3,) [m] centre of the rotation between board and tracker, tracker frame."""
     moment: float
-    """[A m²], as stated."""
+    """[A m²] Nominal moment."""
 
     def poses(self, shared: FloatArray, pose: FloatArray) -> tuple[
             FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -82,13 +83,12 @@ class TrackedMagnet:
         Parameters
         ----------
         shared : (12,) array
-            Shift [m], rotation vector [rad], offset [m, tool frame], tilt [slope, tool frame], log
-            of the moment relative to the stated one. Shift and rotation are from the tracker frame
-            to the board (world) frame.
+            Shift [m] and rotation vector [rad] from the tracker frame to the board (world) frame;
+            offset [m, tool frame]; tilt [slope, tool frame]; log of the moment over its nominal
+            value.
         pose : (K, 8) array
             Corrections of the position [m, world frame] and of the tilt [slope, tool frame]; change
-            of the ambient field [T, world frame], which is the same at all sensors and not used
-            here.
+            of the ambient field [T, world frame], which does not affect the pose.
 
         Returns
         -------
@@ -122,16 +122,16 @@ class TrackedMagnet:
 
 def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: FloatArray,
                        shared: FloatArray, pose: FloatArray) -> Prediction:
-    """Readings of every sensor at every pose, and their derivatives.
+    """Predicted reading of each sensor at each pose, and its derivatives.
 
     Parameters
     ----------
     network : SensorNetwork
-        Positions and orientations as stated.
+        Nominal positions and orientations.
     magnet : TrackedMagnet
     sensor : (n, 10) array
-        Bias [T, sensor frame], gain minus one, rotation vector [rad, stated sensor frame],
-        position relative to the stated one [m, world frame].
+        Bias [T, sensor frame], gain minus one, rotation vector [rad, nominal sensor frame],
+        position minus the nominal position [m, world frame].
     shared : (12,) array
     pose : (K, 8) array
         As for `TrackedMagnet.poses`.
@@ -139,8 +139,9 @@ def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: Fl
     Returns
     -------
     f : (n, K, 3) array, T, sensor frame
+        Predicted readings.
     signal : (n, K, 3) array, T, sensor frame
-        Without the bias.
+        Predicted readings without the bias.
     by_sensor : (n, K, 3, 10) array
         NaN where the magnet is at the position of a sensor.
     by_shared : (n, K, 3, 12) array
@@ -148,25 +149,25 @@ def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: Fl
 
     References
     ----------
-    [TSP14]_ eq. (2), (30) for the dipole. The corrections are those of [T10]_ section 6.3, but
-    with finite rotations.
+    [TSP14]_ eq. (2), (30) for the dipole; [T10]_ section 6.3 for the corrections, here with finite
+    rotations.
     """
-    r, m, *by = magnet.poses(shared, pose)
+    r, m, *derivatives = magnet.poses(shared, pose)
     d = (network.positions + sensor[:, 7:])[:, None] - r
-    turn = np.swapaxes(rotation(sensor[:, 4:7]), 1, 2)
+    R_correction = np.swapaxes(rotation(sensor[:, 4:7]), 1, 2)
     gain = (1.0 + sensor[:, 3])[:, None, None]
-    M = gain * turn @ network.R_sw
-    stated = np.einsum('nij,nkj->nki', network.R_sw, dipole_field(d, m) + pose[:, 5:])
+    M = gain * R_correction @ network.R_sw
+    nominal = np.einsum('nij,nkj->nki', network.R_sw, dipole_field(d, m) + pose[:, 5:])
     dB_dr, dB_dm = dipole_jacobians(d, m)
     dB_dr, dB_dm = M[:, None] @ dB_dr, M[:, None] @ dB_dm
     by_sensor = np.zeros((*d.shape, SENSOR))
     by_sensor[..., :3] = np.eye(3)
-    field = np.einsum('nij,nkj->nki', turn, stated)
+    field = np.einsum('nij,nkj->nki', R_correction, nominal)
     by_sensor[..., 3] = field
-    by_sensor[..., 4:7] = ((gain * turn)[:, None] @ cross_matrix(stated)
+    by_sensor[..., 4:7] = ((gain * R_correction)[:, None] @ cross_matrix(nominal)
                            @ left_jacobian(sensor[:, 4:7])[:, None])
     by_sensor[..., 7:] = dB_dr
-    dr, dm, dr_pose, dm_pose = by
+    dr, dm, dr_pose, dm_pose = derivatives
     by_pose = dB_dm @ dm_pose - dB_dr @ dr_pose
     by_pose[..., 5:] = M[:, None]
     signal = gain * field

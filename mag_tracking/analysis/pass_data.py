@@ -13,13 +13,13 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.units import NS
 
 ModelOf: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], SeparableModel]
-"""Makes a model from times (n,) [s], positions (n, 3) [m] and matrices (n, 3, 3) that multiply the
-field."""
+"""Function that creates a model from times (n,) [s], positions (n, 3) [m] and matrices (n, 3, 3)
+that multiply the field."""
 
 
 @dataclass(frozen=True)
 class PassData:
-    """Samples of several sensors over one interval; the samples of one sensor are contiguous."""
+    """Samples of several sensors in one interval, sorted by sensor."""
 
     network: SensorNetwork
     stamp_ns: int
@@ -27,20 +27,20 @@ class PassData:
     t: FloatArray
     """(n,) [s], ascending for each sensor."""
     sensor: IntArray
-    """(n,) int, rows of the network, ascending."""
+    """(n,) index of the sensor of each sample, ascending."""
     field: FloatArray
     """(n, 3) [T], sensor frame; NaN = axis not measured."""
     covariance: FloatArray
-    """(n, 3, 3) [T²] of each sample, or of one of the samples that it is the mean of; ignored for
-    missing axes."""
+    """(n, 3, 3) [T²] covariance of each sample. If a sample is a mean, the covariance of a single
+    averaged sample. Ignored for missing axes."""
     count: IntArray | None = None
-    """(n,) number of samples that each one is the mean of; None = one."""
+    """(n,) number of averaged samples; None = 1."""
 
     @classmethod
     def of_frames(cls, network: SensorNetwork, stamps_ns: Sequence[int],
                   fields: Sequence[FloatArray], covariances: Sequence[FloatArray],
                   offsets: Sequence[FloatArray] | None = None) -> 'PassData':
-        """Create the data of a pass from frames.
+        """Create the data of a pass from frames of all sensors.
 
         Parameters
         ----------
@@ -49,7 +49,7 @@ class PassData:
         fields : sequence of n (n_sensors, 3) array, T
         covariances : sequence of n (n_sensors, 3, 3) array, T²
         offsets : sequence of n (n_sensors,) array, s, optional
-            Time of each sensor's sample relative to the timestamp of the frame.
+            Sampling time of each sensor relative to the timestamp of the frame.
 
         Returns
         -------
@@ -72,24 +72,24 @@ class PassData:
     def n_independent(self) -> float:
         """Number of independent values.
 
-        A coarse sensor at rest repeats its reading, and its variance is increased accordingly
-        (`calibration.resolution`). Each value counts by the smallest variance of its axis over its
-        own variance.
+        Repeated readings of a coarse sensor at rest are not independent and have an increased
+        variance (`calibration.resolution`). Such a value is counted as a fraction: the smallest
+        variance of its axis over its own variance.
         """
         total = 0.0
         for j in self.sensors:
-            mine = self.sensor == j
-            variance = np.where(np.isnan(self.field[mine]), np.nan,
-                                np.einsum('nii->ni', self.covariance[mine]))
+            of_sensor = self.sensor == j
+            variance = np.where(np.isnan(self.field[of_sensor]), np.nan,
+                                np.einsum('nii->ni', self.covariance[of_sensor]))
             variance = variance[:, ~np.isnan(variance).all(axis=0)]
-            share = np.nanmin(variance, axis=0) / variance
-            # The estimated noise varies slightly over time. At rest, dozens of readings repeat.
-            total += float(np.nansum(np.where(share > 0.5, 1.0, share)))
+            fraction = np.nanmin(variance, axis=0) / variance
+            # Small variations of the estimated noise do not indicate repeated readings.
+            total += float(np.nansum(np.where(fraction > 0.5, 1.0, fraction)))
         return total
 
     @property
     def sensors(self) -> IntArray:
-        """Rows of the network that have measurements, (k,)."""
+        """Indices of the sensors that have measurements, (k,)."""
         return np.unique(self.sensor[~np.isnan(self.field).all(axis=1)])
 
     @property
@@ -98,12 +98,12 @@ class PassData:
         return self.network.positions[self.sensor]
 
     def shifted(self, seconds: float) -> 'PassData':
-        """Return the same data with time zero moved.
+        """Return the data with time zero shifted.
 
         Parameters
         ----------
         seconds : float, s
-            Positive moves time zero later.
+            Shift of time zero; positive = later.
 
         Returns
         -------
@@ -114,7 +114,7 @@ class PassData:
 
     @cached_property
     def whitening(self) -> FloatArray:
-        """Matrices W, (n, 3, 3), with W C Wᵀ = I over the measured axes and zero rows elsewhere."""
+        """Matrices W, (n, 3, 3), with W C Wᵀ = I for the measured axes and zeros elsewhere."""
         W = np.zeros((len(self.t), 3, 3))
         present = ~np.isnan(self.field)
         for axes in np.unique(present, axis=0):
@@ -125,13 +125,13 @@ class PassData:
         return W if self.count is None else W * np.sqrt(self.count)[:, None, None]
 
     def averaged(self, max_samples: int) -> 'PassData':
-        """Reduce the data to means of adjacent samples.
+        """Average adjacent samples.
 
         Parameters
         ----------
         max_samples : int
-            Maximum number of means for each sensor. Each is over fewer samples where the field is
-            strong.
+            Maximum number of means per sensor. Means where the field is strong contain fewer
+            samples.
 
         Returns
         -------
@@ -140,41 +140,42 @@ class PassData:
         size = np.sqrt(np.linalg.norm(self.departure, axis=1))
         rows = []
         for j in np.unique(self.sensor):
-            mine = np.flatnonzero(self.sensor == j)
-            share = 1.0 / len(mine) + size[mine] / max(size[mine].sum(), 1e-300)
-            part = np.floor(np.cumsum(share) / share.sum() * max_samples * (1.0 - 1e-9)).astype(int)
-            first = np.flatnonzero(np.diff(part, prepend=-1))
-            n = np.diff(first, append=len(mine))
-            # If an axis is missing in some samples, its mean would belong to another time: NaN.
-            rows.append((np.add.reduceat(self.t[mine], first) / n, np.full(len(n), j),
-                         np.add.reduceat(self.field[mine], first) / n[:, None],
-                         np.add.reduceat(self.covariance[mine], first) / n[:, None, None], n))
+            own = np.flatnonzero(self.sensor == j)
+            weight = 1.0 / len(own) + size[own] / max(size[own].sum(), 1e-300)
+            group = np.floor(np.cumsum(weight) / weight.sum()
+                             * max_samples * (1.0 - 1e-9)).astype(int)
+            first = np.flatnonzero(np.diff(group, prepend=-1))
+            n = np.diff(first, append=len(own))
+            # A missing value makes the mean NaN: the mean of the remaining values has another time.
+            rows.append((np.add.reduceat(self.t[own], first) / n, np.full(len(n), j),
+                         np.add.reduceat(self.field[own], first) / n[:, None],
+                         np.add.reduceat(self.covariance[own], first) / n[:, None, None], n))
         t, sensor, field, covariance, n = (np.concatenate(c) for c in zip(*rows, strict=True))
         return replace(self, t=t, sensor=sensor, field=field, covariance=covariance, count=n)
 
     @cached_property
     def departure(self) -> FloatArray:
-        """Field minus the median of each sensor, (n, 3) T: approximately that of the target."""
+        """Field minus the median of each sensor, (n, 3) T: approximately the target's field."""
         out = np.zeros_like(self.field)
         for j in self.sensors:
-            mine = self.sensor == j
-            seen = ~np.isnan(self.field[mine]).all(axis=0)
-            level = np.zeros(3)
-            level[seen] = np.nanmedian(self.field[mine][:, seen], axis=0)
-            out[mine] = np.nan_to_num(self.field[mine] - level)
+            of_sensor = self.sensor == j
+            is_measured = ~np.isnan(self.field[of_sensor]).all(axis=0)
+            median = np.zeros(3)
+            median[is_measured] = np.nanmedian(self.field[of_sensor][:, is_measured], axis=0)
+            out[of_sensor] = np.nan_to_num(self.field[of_sensor] - median)
         return out
 
 
 def separable_problem(data: PassData, model_of: ModelOf, relative_error: float = 0.0,
                       prior: tuple[FloatArray, FloatArray] | None = None) -> SeparableProblem:
-    """Fit of a pass as a separable problem with unknown backgrounds.
+    """Create the separable least-squares problem of a pass, with unknown backgrounds.
 
     Parameters
     ----------
     data : PassData
     model_of : function
-        Takes t (n,), positions (n, 3) and M (n, 3, 3) (world to sensor, whitened) and returns a
-        `SeparableModel`.
+        Creates a `SeparableModel` from t (n,), positions (n, 3) and whitened world-to-sensor
+        rotations M (n, 3, 3).
     relative_error : float
         Model error relative to the field of each sample, added to the noise.
     prior : (mean, std), optional
@@ -195,7 +196,7 @@ def separable_problem(data: PassData, model_of: ModelOf, relative_error: float =
 
 
 def background_columns(data: PassData, W: FloatArray) -> FloatArray:
-    """Whitened columns of the constant fields of all measured axes.
+    """Columns of the design matrix for the background of each measured axis, whitened.
 
     Parameters
     ----------

@@ -1,5 +1,4 @@
-"""Unknowns, covariances, rivals and rejection reasons of each target at the minimum of a batch
-fit."""
+"""Estimates, covariances, rivals and rejection reasons of the targets of a batch fit."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -27,30 +26,30 @@ from mag_tracking.inference.separable_fit import Minimum
 from mag_tracking.physics.passes import SuperposedPasses
 
 PATH_TOLERANCE = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2, 0.3])
-"""[m], [m/s], [m] Paths that differ by less than this are the same."""
+"""[m], [m/s], [m] Maximum difference between two paths that count as equal."""
 
 CPA_UNIT_STD = 1e-4
-"""[m] Standard deviation of a CPA range that only serves as the unit of length."""
+"""[m] Standard deviation of an assumed CPA range, which only defines the unit of length."""
 
 
 def fits_at_minimum(data: PassData, orders: Sequence[int], found: Minimum, p: FloatArray,
                     explained: float, errors: SensorErrors,
                     cpa_range: tuple[float, float] | None = None,
                     path_std: FloatArray | None = None) -> tuple[PassFit, ...]:
-    """Describe the minimum of a joint fit by one `PassFit` for each target.
+    """Create the `PassFit` of each target from the minimum of a fit.
 
     Parameters
     ----------
     data : PassData
-        Of several sensors, or of one target.
+        Readings of several sensors, or of one sensor and one target.
     orders : sequence of K int
         Number of dipoles of each target.
     found : Minimum
-        Concatenated paths of the targets.
+        Minimum of the cost; its parameters are the concatenated paths of the targets.
     p : (k,) array
         Linear parameters of `SuperposedPasses`.
     explained : float
-        Share of the energy that all targets explain.
+        Fraction of the energy that is explained by all targets.
     errors : SensorErrors
     cpa_range : (float, float), m, optional
         Range at the CPA and its standard deviation; see `fit_pass`.
@@ -62,68 +61,70 @@ def fits_at_minimum(data: PassData, orders: Sequence[int], found: Minimum, p: Fl
     tuple of PassFit
     """
     if len(data.sensors) == 1:
-        return (_of_one_sensor(data, orders[0], found, p, explained, cpa_range, errors),)
-    about = _Linearised.about(data, orders, found.theta, p)
-    J = information(about.whitened)
+        return (_fit_of_one_sensor(data, orders[0], found, p, explained, cpa_range, errors),)
+    linear = _LinearisedFit.about(data, orders, found.theta, p)
+    J = information(linear.whitened)
     if path_std is not None:
         of_paths = np.concatenate([own[:len(path)] for own, path in zip(
-            about.own, about.theta, strict=True)])
+            linear.own, linear.theta, strict=True)])
         J[of_paths, of_paths] += 1.0 / np.square(path_std)
-    fits = _fits(about, found, explained, errors, bound(J))
-    ends = np.cumsum([len(path) for path in about.theta])[:-1]
-    rivals = [([paths[i] for i in assignment(about.theta, paths)], cost)
+    fits = _basic_fits(linear, found, explained, errors, bound(J))
+    ends = np.cumsum([len(path) for path in linear.theta])[:-1]
+    rivals = [([paths[i] for i in assignment(linear.theta, paths)], cost)
               for paths, cost in ((np.split(theta, ends), cost) for theta, cost in found.rivals)]
-    fits = [replace(fit, rivals=_rivals(fit, [(paths[k], cost) for paths, cost in rivals]))
+    fits = [replace(fit, rivals=_select_rivals(fit, [(paths[k], cost) for paths, cost in rivals]))
             for k, fit in enumerate(fits)]
     return tuple(replace(fit, reason=rejection_reason(fit), trusted=trusted(fit)) for fit in fits)
 
 
-def _of_one_sensor(data: PassData, n_dipoles: int, found: Minimum, p: FloatArray,
-                   explained: float, cpa_range: tuple[float, float] | None,
-                   errors: SensorErrors) -> PassFit:
-    """`PassFit` of one sensor, for which the scale is not observable."""
-    place = data.network.positions[data.sensors[0]]
-    # The CPA range is the given one, or the unit of length.
-    scaled = scaled_to_range(found.theta, p, place, cpa_range[0] if cpa_range else 1.0)
+def _fit_of_one_sensor(data: PassData, n_dipoles: int, found: Minimum, p: FloatArray,
+                       explained: float, cpa_range: tuple[float, float] | None,
+                       errors: SensorErrors) -> PassFit:
+    """Create the `PassFit` of a single sensor, for which the scale is not observable."""
+    position = data.network.positions[data.sensors[0]]
+    # Without a known CPA range, the range is the unit of length.
+    scaled = scaled_to_range(found.theta, p, position, cpa_range[0] if cpa_range else 1.0)
     if scaled is None:
-        return PassFit(n_dipoles, data, 'the path goes through the sensor (r0 parallel to v0): '
-                       'the CPA range is zero and gives no scale')
+        return PassFit(n_dipoles, data, 'the path passes through the sensor (r0 parallel to v0): '
+                       'the CPA range is zero and does not define a scale')
     theta, p = scaled
-    about = _Linearised.about(data, (n_dipoles,), theta, p)
-    J = information(about.whitened)
-    J[:6, :6] += cpa_information(theta[:3] - place, theta[3:6],
+    linear = _LinearisedFit.about(data, (n_dipoles,), theta, p)
+    J = information(linear.whitened)
+    J[:6, :6] += cpa_information(theta[:3] - position, theta[3:6],
                                  cpa_range[1] if cpa_range else CPA_UNIT_STD)[:6, :6]
-    fit, = _fits(about, found, explained, errors, bound(J))
-    # The path mirrored at the sensor gives the same field.
-    mirrored = np.concatenate([2.0 * place - theta[:3], -theta[3:6], theta[6:]])
+    fit, = _basic_fits(linear, found, explained, errors, bound(J))
+    # The path mirrored at the sensor has the same field.
+    mirrored = np.concatenate([2.0 * position - theta[:3], -theta[3:6], theta[6:]])
     fit = replace(fit, rivals=((0.0, mirrored),))
     if cpa_range is None:
-        fit = replace(fit, bearing=bearing_of(fit, place))
+        fit = replace(fit, bearing=bearing_of(fit, position))
     return replace(fit, reason=rejection_reason(fit), trusted=trusted(fit))
 
 
 @dataclass(frozen=True)
-class _Linearised:
-    """A fit linearised at its minimum.
+class _LinearisedFit:
+    """Linearisation of a fit at its minimum.
 
-    Unknowns: path and moments of each target, then the backgrounds.
+    The unknowns are the path and the moments of each target, followed by the backgrounds.
     """
 
     data: PassData
     orders: tuple[int, ...]
+    """Number of dipoles of each target."""
     theta: tuple[FloatArray, ...]
     """Path (6 or 7,) of each target."""
     whitened: FloatArray
     """(n, 3, n_x) whitened derivatives by paths, combinations of moments and backgrounds."""
     H: FloatArray
-    """(3 n, n_x) the same in [T], not whitened, in the sensors' frames."""
+    """(3 n, n_x) the same derivatives, not whitened, [T] per unit, sensor frame."""
     T: FloatArray
-    """(n_x, n_x) transforms these parameters into the unknowns."""
+    """(n_x, n_x) transformation of these parameters into the unknowns."""
     x: FloatArray
     """(n_x,) unknowns."""
     own: tuple[IntArray, ...]
     """Indices of the unknowns of each target, followed by those of the backgrounds."""
     names: tuple[str, ...]
+    """Names of the unknowns."""
     fields: FloatArray
     """(K, n, 3) [T] field of each target, sensor frame."""
     background: FloatArray
@@ -133,8 +134,8 @@ class _Linearised:
 
     @classmethod
     def about(cls, data: PassData, orders: Sequence[int], theta: FloatArray,
-              p: FloatArray) -> '_Linearised':
-        """Linearise at paths `theta` (n_theta,) and linear parameters `p` (k,)."""
+              p: FloatArray) -> '_LinearisedFit':
+        """Linearise a fit at the paths `theta` (n_theta,) and the linear parameters `p` (k,)."""
         model = SuperposedPasses.of(orders, data.t, data.positions,
                                     data.network.R_sw[data.sensor])
         measured = ~np.isnan(data.field)
@@ -143,13 +144,13 @@ class _Linearised:
             data.whitening
         fields = np.stack([(A[:, m] @ p[m]).reshape(-1, 3) for m in model.moments])
         y = np.nan_to_num(data.field) - fields.sum(axis=0)
-        level = np.asarray(np.linalg.lstsq(
-            _flat(W @ columns.reshape(*W.shape[:2], -1)), np.einsum('nij,nj->ni', W, y).ravel(),
+        backgrounds = np.asarray(np.linalg.lstsq(
+            _flatten(W @ columns.reshape(*W.shape[:2], -1)), np.einsum('nij,nj->ni', W, y).ravel(),
             rcond=None)[0], dtype=np.float64)
         H = np.hstack([*(part for path, m in zip(model.paths, model.moments, strict=True)
                          for part in (D[:, path], A[:, m])), columns])
         T, names, own, first = np.eye(H.shape[1]), [], [], 0
-        shared = np.arange(H.shape[1] - len(level), H.shape[1])
+        shared = np.arange(H.shape[1] - len(backgrounds), H.shape[1])
         for row in model.rows:
             end = first + len(row.names) + 3 * row.n_dipoles
             T[first + len(row.names):end, first + len(row.names):end] = row.combinations
@@ -158,52 +159,55 @@ class _Linearised:
             first = end
         names += [f'B {data.network.names[j]} {"xyz"[a]}' for j in data.sensors
                   for a in np.flatnonzero(measured[data.sensor == j].any(axis=0))]
-        background = (columns @ level).reshape(-1, 3)
+        background = (columns @ backgrounds).reshape(-1, 3)
         residuals = np.nan_to_num(data.field - fields.sum(axis=0) - background)
         x = np.concatenate([*(part for path, m in zip(model.paths, model.moments, strict=True)
-                              for part in (theta[path], p[m])), level])
+                              for part in (theta[path], p[m])), backgrounds])
         return cls(data, tuple(orders), tuple(model.split(theta)),
                    W @ H.reshape(len(W), 3, -1), H, T, T @ x, tuple(own), tuple(names), fields,
                    background, np.einsum('nij,nj->ni', W, residuals))
 
 
-def _flat(A: FloatArray) -> FloatArray:
-    """(n, 3, q) as (3 n, q)."""
+def _flatten(A: FloatArray) -> FloatArray:
+    """Reshape (n, 3, q) to (3 n, q)."""
     return A.reshape(-1, A.shape[-1])
 
 
-def _fits(about: _Linearised, found: Minimum, explained: float, errors: SensorErrors,
-          covariance: FloatArray) -> list[PassFit]:
-    """`PassFit` of each target, without rivals and reasons; `covariance` is due to noise."""
-    data, H, T = about.data, about.H, about.T
-    everything = about.fields.sum(axis=0)
-    # An unobservable state has an infinite variance; combinations of it are NaN.
+def _basic_fits(linear: _LinearisedFit, found: Minimum, explained: float, errors: SensorErrors,
+                covariance: FloatArray) -> list[PassFit]:
+    """Create the `PassFit` of each target, except rivals and reason.
+
+    `covariance` contains only the effect of the noise.
+    """
+    data, H, T = linear.data, linear.H, linear.T
+    total = linear.fields.sum(axis=0)
+    # The infinite variance of an unobservable state results in NaN.
     with np.errstate(invalid='ignore'):
-        robust = robust_covariance(data, about.whitened, about.residuals, everything, covariance,
+        robust = robust_covariance(data, linear.whitened, linear.residuals, total, covariance,
                                    errors)
-        spread = np.sqrt(np.einsum('yi,ij,yj->y', H, robust, H)).reshape(-1, 3)
+        predicted_std = np.sqrt(np.einsum('yi,ij,yj->y', H, robust, H)).reshape(-1, 3)
         covariance, robust = (T @ P @ T.T for P in (covariance, robust))
-    elsewhere = residual_elsewhere(data, [FittedRow(n, path, field) for n, path, field in zip(
-        about.orders, about.theta, about.fields, strict=True)], about.residuals)
+    unexplained = residual_elsewhere(data, [FittedRow(n, path, field) for n, path, field in zip(
+        linear.orders, linear.theta, linear.fields, strict=True)], linear.residuals)
     fits = []
-    for k, (n_dipoles, own) in enumerate(zip(about.orders, about.own, strict=True)):
-        alone = replace(data, field=data.field - (everything - about.fields[k]))
-        duration_s = _duration_s(alone)
-        change = velocity_change(data, about.whitened, about.residuals, int(own[0]),
-                                 about.theta[k][3:6], duration_s)
+    for k, (n_dipoles, own) in enumerate(zip(linear.orders, linear.own, strict=True)):
+        own_data = replace(data, field=data.field - (total - linear.fields[k]))
+        duration_s = _duration_s(own_data)
+        change = velocity_change(data, linear.whitened, linear.residuals, int(own[0]),
+                                 linear.theta[k][3:6], duration_s)
         block = np.ix_(own, own)
         fits.append(PassFit(
-            n_dipoles, alone, '', found.converged, tuple(about.names[i] for i in own),
-            about.x[own], covariance[block], robust[block], found.cost, explained, duration_s,
-            *change, elsewhere, predicted=about.fields[k] + about.background,
-            predicted_std=spread, n_other_unknowns=len(about.x) - len(own)))
+            n_dipoles, own_data, '', found.converged, tuple(linear.names[i] for i in own),
+            linear.x[own], covariance[block], robust[block], found.cost, explained, duration_s,
+            *change, unexplained, predicted=linear.fields[k] + linear.background,
+            predicted_std=predicted_std, n_other_unknowns=len(linear.x) - len(own)))
     return fits
 
 
 def assignment(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tuple[int, ...]:
-    """Match two sets of paths so that their total distance is minimal.
+    """Match two sets of paths by their minimum total distance.
 
-    The order of several targets in a solution is arbitrary.
+    The order of the targets in a solution of a joint fit is arbitrary.
 
     Parameters
     ----------
@@ -212,17 +216,17 @@ def assignment(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tup
     Returns
     -------
     tuple of int
-        Index into `others` for each of `paths`.
+        For each path, the index of the matching path in `others`.
     """
-    away = [[float(np.square((other[:6] - path[:6]) / PATH_TOLERANCE[:6]).sum())
+    distance = [[float(np.square((other[:6] - path[:6]) / PATH_TOLERANCE[:6]).sum())
              for other in others] for path in paths]
     return min(permutations(range(len(paths))),
-               key=lambda order: sum(away[k][i] for k, i in enumerate(order)))
+               key=lambda order: sum(distance[k][i] for k, i in enumerate(order)))
 
 
-def _rivals(fit: PassFit, minima: Iterable[tuple[FloatArray, float]]) -> tuple[
+def _select_rivals(fit: PassFit, minima: Iterable[tuple[FloatArray, float]]) -> tuple[
         tuple[float, FloatArray], ...]:
-    """`PassFit.rivals` from other minima (path, cost), except for the same row reversed."""
+    """Select `PassFit.rivals` among the other minima (path, cost), except the reversed row."""
     rivals, excess = [], max(1.0, fit.normalised_cost)
     for path, cost in minima:
         path = np.append(path[:6], np.abs(path[6:]))
@@ -233,9 +237,9 @@ def _rivals(fit: PassFit, minima: Iterable[tuple[FloatArray, float]]) -> tuple[
 
 
 def _duration_s(data: PassData) -> float:
-    """Duration [s] that contains nearly all of the target's energy."""
+    """Duration [s] that contains 96 % of the energy of the target."""
     energy = np.square(np.linalg.norm(data.departure, axis=1))
     order = np.argsort(data.t)
-    part = np.cumsum(energy[order]) / energy.sum()
-    first, last = data.t[order][np.searchsorted(part, (0.02, 0.98))]
+    fraction = np.cumsum(energy[order]) / energy.sum()
+    first, last = data.t[order][np.searchsorted(fraction, (0.02, 0.98))]
     return float(last - first)

@@ -16,14 +16,13 @@ from mag_tracking.inference.separable_fit import search
 from mag_tracking.physics.passes import RowPass
 
 N_COARSE = 24
-"""Number of samples per sensor for the evaluation of the starts."""
+"""Number of averaged samples per sensor in the coarse search."""
 
 COARSE_ERROR = 0.1
-"""Assumed error relative to the field for the evaluation of the starts; it smooths the cost
-function."""
+"""Assumed error relative to the field in the coarse search; it smooths the cost function."""
 
 FALSE_ALARM = 1e-6
-"""Probability that noise alone exceeds the energy threshold of a pass."""
+"""False alarm probability of the energy threshold of a pass."""
 
 DEFAULT_ERRORS = SensorErrors()
 """Errors of uncalibrated sensors that were mounted by hand."""
@@ -32,16 +31,16 @@ DEFAULT_ERRORS = SensorErrors()
 def fit_pass(data: PassData, n_dipoles: int = 3,
              cpa_range: tuple[float, float] | None = None,
              errors: SensorErrors = DEFAULT_ERRORS) -> PassFit:
-    """Fit a row of dipoles at constant velocity to the readings of a network.
+    """Fit the path and moments of a row of dipoles at constant velocity to a pass.
 
     Parameters
     ----------
     data : PassData
     n_dipoles : int
-        Model order; 1 = a point target, without a length.
+        Model order; 1 = point target without a length.
     cpa_range : (float, float), m, optional
-        Known range at the CPA and its standard deviation, for a single sensor, whose scale is not
-        observable (TSP14 section IV.B).
+        Known CPA range and its standard deviation. Only for a single sensor, for which the scale is
+        not observable (TSP14 section IV.B).
     errors : SensorErrors
         Sensor errors that the robust covariance includes.
 
@@ -81,9 +80,9 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
         return PassFit(n_dipoles, data, 'no valid start of the search')
     theta, p = found.theta, problem.linear(found.theta)
     theta, p = model_of(data.t, data.positions, data.whitening).forward(theta, p)
-    left = max(found.cost - n_free, 0.0) / (problem.energy - n_free)
-    fit, = fits_at_minimum(data, (n_dipoles,), replace(found, theta=theta), p, 1.0 - left, errors,
-                           cpa_range)
+    unexplained = max(found.cost - n_free, 0.0) / (problem.energy - n_free)
+    fit, = fits_at_minimum(data, (n_dipoles,), replace(found, theta=theta), p, 1.0 - unexplained,
+                           errors, cpa_range)
     return fit
 
 
@@ -97,9 +96,9 @@ def centred_on_peak(data: PassData) -> tuple[PassData, PassData]:
     Returns
     -------
     data : PassData
-        All samples.
+        All samples of the pass.
     rough : PassData
-        At most `N_COARSE` means per sensor.
+        Averaged samples, at most `N_COARSE` per sensor.
     """
     rough = data.averaged(N_COARSE)
     departure = rough.departure
@@ -119,7 +118,7 @@ def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
     Returns
     -------
     str
-        Reason why the fit is not possible; empty if it is.
+        Reason why a fit is not possible; empty if it is possible.
 
     Raises
     ------
@@ -139,9 +138,9 @@ def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
 
 
 def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
-    """Starting paths of the search: all headings past the sensor with the strongest field.
+    """Starting paths of the search: all headings, past the sensor with the strongest field.
 
-    The duration of the field at that sensor gives the ratio of speed to distance.
+    The duration of the field at that sensor determines the ratio of speed to distance.
 
     Parameters
     ----------
@@ -155,41 +154,43 @@ def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
     departure = data.departure
     energy = np.einsum('ni,ni->n', departure, departure)
     strongest = int(np.argmax(energy))
-    mine = data.sensor == data.sensor[strongest]
-    weight = energy[mine] / energy[mine].sum()
-    t_cpa = weight @ data.t[mine]
-    width = np.sqrt(weight @ np.square(data.t[mine] - t_cpa))
+    of_sensor = data.sensor == data.sensor[strongest]
+    weight = energy[of_sensor] / energy[of_sensor].sum()
+    t_cpa = weight @ data.t[of_sensor]
+    width = np.sqrt(weight @ np.square(data.t[of_sensor] - t_cpa))
     heading, offset, ratio = (a.ravel() for a in np.meshgrid(
         np.arange(12) * np.pi / 6.0, (-8.0, -4.5, -2.0, 2.0, 4.5, 8.0),
         (0.25, 0.35, 0.5, 0.7, 1.0, 1.4), indexing='ij'))
     length = 3.0 if n_dipoles > 1 else 0.0
     along = np.stack([np.cos(heading), np.sin(heading), 0.0 * heading], axis=1)
-    aside = np.stack([-np.sin(heading), np.cos(heading), 0.0 * heading], axis=1)
-    reach = np.hypot(np.hypot(offset, 0.5), 0.35 * length)
-    velocity = along * (ratio * reach / width)[:, None]
-    position = (data.positions[strongest] + offset[:, None] * aside - t_cpa * velocity
+    across = np.stack([-np.sin(heading), np.cos(heading), 0.0 * heading], axis=1)
+    distance = np.hypot(np.hypot(offset, 0.5), 0.35 * length)
+    velocity = along * (ratio * distance / width)[:, None]
+    position = (data.positions[strongest] + offset[:, None] * across - t_cpa * velocity
                 + [0.0, 0.0, 0.5])
     return np.hstack([position, velocity, np.full((len(heading), int(n_dipoles > 1)), length)])
 
 
 def shorter_rows(path: FloatArray) -> FloatArray:
-    """Paths of shorter rows that fit nearly as well.
+    """Alternative starting paths of a row, mostly with a shorter length.
 
-    A row whose end has no moment is similar to a shorter row with another centre.
+    If a dipole at the end of a row has no moment, a shorter row with another centre fits almost as
+    well.
 
     Parameters
     ----------
     path : (7,) array, m, m/s, m
+        Path of the row.
 
     Returns
     -------
     (n, 7) array, m, m/s, m
     """
     rows = []
-    for share, ahead in ((0.7, 0.15), (0.7, 0.0), (0.7, -0.15), (0.4, 0.25), (0.4, 0.0),
+    for ratio, offset in ((0.7, 0.15), (0.7, 0.0), (0.7, -0.15), (0.4, 0.25), (0.4, 0.0),
                          (0.4, -0.25), (0.1, 0.0), (1.5, 0.0)):
         row = path.copy()
-        row[:3] += ahead * path[6] * path[3:6] / np.linalg.norm(path[3:6])
-        row[6] *= share
+        row[:3] += offset * path[6] * path[3:6] / np.linalg.norm(path[3:6])
+        row[6] *= ratio
         rows.append(row)
     return np.array(rows)

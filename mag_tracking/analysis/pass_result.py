@@ -10,35 +10,34 @@ from mag_tracking.geometry import heading_of, propagated_path, speed_of
 from mag_tracking.physics.anderson import closest_approach
 
 RIVAL_CHI2 = 9.2
-"""Maximum chi-square distance of a rival from the best fit (probability 0.01)."""
+"""Maximum chi-square difference between a rival and the best fit (probability 0.01)."""
 
 DIFFERENT_PATH_CHI2 = 22.5
-"""Minimum squared normalised distance, in six parameters, of two different paths (probability
+"""Minimum squared normalised distance between two different paths, in six parameters (probability
 0.001)."""
 
 
 MAX_NORMALISED_COST = 2.0
-"""Maximum normalised cost; beyond it, model errors exceed the noise."""
+"""Maximum normalised cost of a joint fit that is not dominated by model errors."""
 
 MAX_COST_RATIO = 1.25
-"""Maximum ratio of the cost of a fit to the best cost at which it describes the pass equally
-well."""
+"""Maximum cost relative to the best cost; fits up to this ratio count as equally good."""
 
-MIN_LENGTH_SHARE = 1e-2
-"""Minimum length of a row relative to the distance travelled during the pass; a shorter row is a
-point. A row longer than the distance travelled is rejected."""
+MIN_LENGTH_FRACTION = 1e-2
+"""Minimum length of a row relative to the distance travelled during the pass. A shorter row is
+equivalent to a point. The maximum length is the distance travelled."""
 
 
 @dataclass(frozen=True)
 class Bearing:
-    """Observable quantities of a pass at one sensor: everything but the scale.
+    """Observable quantities of a pass at a single sensor, relative to the sensor.
 
-    Relative to the sensor. The same field results if target and motion are both reversed.
+    The distance is not observable. The path reversed through the sensor has the same field.
     """
 
     cpa_direction: FloatArray
-    """(3,) unit vector, world, to the target at the CPA; of the two solutions the one that is not
-    below."""
+    """(3,) unit vector, world, from the sensor to the target at the CPA. The solution above the
+    sensor is used."""
     motion_direction: FloatArray
     """(3,) unit vector, world."""
     moment_direction: FloatArray
@@ -48,70 +47,76 @@ class Bearing:
     cpa_time: float
     """[s] relative to time zero."""
     cpa_time_std: float
+    """[s]"""
     rate: float
     """[1/s] speed over CPA range."""
     rate_std: float
+    """[1/s]"""
 
 
 @dataclass(frozen=True)
 class PassFit:
     """Weighted least-squares fit of a pass at constant velocity.
 
-    If `reason` is not empty, the fit as a whole is rejected; the quantities in `trusted` are valid.
+    If `reason` is not empty, the fit as a whole is rejected; only the quantities in `trusted` are
+    valid.
     """
 
     n_dipoles: int
+    """Number of dipoles of the row."""
     data: PassData
+    """Fitted readings, without the fields of other targets of a joint fit."""
     reason: str = ''
+    """Reason for a rejection of the fit as a whole; empty if the fit is accepted."""
     converged: bool = False
+    """Whether the search reached a minimum."""
     names: tuple[str, ...] = ()
     """Names of the unknowns: path, moments, backgrounds."""
     x: FloatArray = field(default_factory=lambda: np.zeros(0))
     """(n_x,) values of the unknowns: [m], [m/s], [A m²], [T]."""
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    """(n_x, n_x) TSP14 eq. (47), for a correct model and noise; infinite variance = not
-    observable."""
+    """(n_x, n_x) covariance for a correct model and noise, TSP14 eq. (47). An infinite variance
+    means that the unknown is not observable."""
     robust_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    """(n_x, n_x) including model errors, whose residuals are correlated in time, and sensor errors.
-    All standard deviations are from this covariance."""
+    """(n_x, n_x) covariance including sensor errors and model errors with correlated residuals.
+    All standard deviations are derived from this covariance."""
     cost: float = np.nan
     """Sum of squared whitened residuals, TSP14 eq. (46b)."""
     explained: float = np.nan
-    """Share of the whitened energy, less backgrounds and noise, that the fit explains."""
+    """Fraction of the whitened energy, without backgrounds and noise, that the fit explains."""
     duration_s: float = np.nan
-    """[s] that contain nearly all of the target's energy."""
+    """[s] Duration that contains 96 % of the energy of the target."""
     velocity_change: float = np.nan
     """Apparent relative change of the velocity during the pass."""
     velocity_change_std: float = np.nan
-    """Due to noise and model errors."""
+    """Standard deviation due to noise and model errors."""
     residual_elsewhere: float = np.nan
-    """Share of the energy that is unexplained where a vehicle leaves no residual; see
-    `pass_trust`."""
+    """Unexplained fraction of the energy outside the reach of the vehicle; see `pass_trust`."""
     trusted: tuple[str, ...] = ()
-    """Those of speed, direction and time (of the CPA) that are determined, even if the fit as a
-    whole is rejected; see `pass_trust`."""
+    """Subset of speed, direction and time (of the CPA) that is valid even if the fit is rejected;
+    see `pass_trust`."""
     bearing: Bearing | None = None
-    """For one sensor."""
+    """Observable quantities of a fit of one sensor; None otherwise."""
     rivals: tuple[tuple[float, FloatArray], ...] = ()
-    """(d, path) of other minima with a likelihood ratio of exp(-d/2) to this one; the covariance
-    does not include them. A row whose end has no moment has a rival: a shorter row with another
-    centre."""
+    """(d, path) of other minima, with a likelihood ratio of exp(-d/2) to this fit. They are not
+    included in the covariance. For example, if a dipole at the end of a row has no moment, a
+    shorter row with another centre is a rival."""
     predicted: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(n, 3) [T], sensor frame, including the background."""
+    """(n, 3) [T] fitted field including the background, sensor frame."""
     predicted_std: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(n, 3) [T], from the robust covariance, without noise."""
+    """(n, 3) [T] standard deviation of `predicted` from the robust covariance, without noise."""
     n_other_unknowns: int = 0
     """Number of unknowns of other targets in the same joint fit; `data` does not contain their
     fields."""
 
     @property
     def n_unknowns(self) -> int:
-        """Number of unknowns that were fitted jointly."""
+        """Number of unknowns of the joint fit."""
         return len(self.x) + self.n_other_unknowns
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Number of independent measurements minus number of unknowns."""
+        """Number of independent measurements minus the number of unknowns."""
         return self.data.n_independent - self.n_unknowns
 
     @property
@@ -130,8 +135,9 @@ class PassFit:
         if self.n_dipoles == 1:
             return True
         length, length_std = self.length
-        way = np.linalg.norm(self.velocity) * self.duration_s
-        return bool(length_std <= max(length, 1.0) and MIN_LENGTH_SHARE * way <= length <= way)
+        travelled = np.linalg.norm(self.velocity) * self.duration_s
+        return bool(length_std <= max(length, 1.0)
+                    and MIN_LENGTH_FRACTION * travelled <= length <= travelled)
 
     @property
     def is_poor_mixture(self) -> bool:
@@ -142,7 +148,7 @@ class PassFit:
     def ambiguous(self) -> bool:
         """Whether a different path is possible at the 1 % level.
 
-        A poor joint fit is ambiguous as well, since the residual cannot be assigned to a target.
+        A poor joint fit is ambiguous because the residual cannot be assigned to a target.
         """
         if self.is_poor_mixture:
             return True
@@ -155,7 +161,7 @@ class PassFit:
 
     @property
     def position(self) -> FloatArray:
-        """Position of the centre at time zero, (3,) m, world frame."""
+        """Position of the centre of the target at time zero, (3,) m, world frame."""
         return self.x[:3]
 
     @property
@@ -164,12 +170,12 @@ class PassFit:
         return self.x[3:6]
 
     def shifted(self, seconds: float) -> 'PassFit':
-        """Return the same fit with time zero moved.
+        """Return the fit with time zero shifted.
 
         Parameters
         ----------
         seconds : float, s
-            Positive moves time zero later.
+            Shift of time zero; positive = later.
 
         Returns
         -------
@@ -211,7 +217,7 @@ class PassFit:
         return S @ self.x, S @ self.robust_covariance @ S.T
 
     def closest_approach(self, point: FloatArray) -> tuple[float, float, float, float]:
-        """CPA of the centre of the row to a point.
+        """Time and range of the CPA of the target's centre to a point.
 
         Parameters
         ----------

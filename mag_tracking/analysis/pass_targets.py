@@ -18,63 +18,65 @@ from mag_tracking.analysis.pass_trust import has_plausible_residual
 from mag_tracking.arrays import FloatArray
 
 MAX_TARGETS = 3
-"""Maximum number of targets in a joint fit; each has a dozen unknowns."""
+"""Maximum number of targets in a joint fit, each with about twelve unknowns."""
 
 MAX_LENGTH = 18.75
-"""[m] Maximum length of the iron of one vehicle: a road train (directive 96/53/EC)."""
+"""[m] Maximum length of the iron of one vehicle: a road train (Directive 96/53/EC)."""
 
 MAX_VELOCITY_SPREAD = 0.25
-"""Maximum relative difference of the velocities of parts of one vehicle."""
+"""Maximum difference between the velocity of a part of a vehicle and the mean, relative to it."""
 
 
 def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, ground: GroundPrior,
                 orders: Sequence[int], stopped: Callable[[], bool] | None = None
                 ) -> tuple[tuple[PassFit, ...], ...]:
-    """Fit a pass as one target or as the tracked targets, whichever explains the field.
+    """Select between a fit of a pass as one target and a joint fit of the tracked targets.
 
-    The number of targets is not observable from the fit alone: a long row of dipoles can explain
-    two vehicles in line, and two straight targets can explain one that turns.
+    A fit alone does not determine the number of targets: a long row of dipoles can explain two
+    vehicles in a line, and two targets on straight paths can explain a single target that turns.
 
     Parameters
     ----------
     data : PassData
     alone : sequence of PassFit
-        Fits as a single target, with several numbers of dipoles.
+        Fits as a single target, one for each number of dipoles.
     paths : (K, 6) array, m, m/s
-        Positions of the tracked targets when `data.t` is zero, and their velocities.
+        Positions of the tracked targets at time zero of `data`, and their velocities.
     ground : GroundPrior
     orders : sequence of int
-        Numbers of dipoles to try for several targets.
+        Candidate numbers of dipoles of each target in a joint fit.
     stopped : function, optional
-        Returns whether to abandon the fit. The result of an abandoned fit is not valid.
+        Called without arguments; returns whether to abandon the fit. The result of an abandoned fit
+        is not valid.
 
     Returns
     -------
     tuple of tuples of PassFit
-        For each target, one fit per number of dipoles. The fits as a single target if that
-        explains the field as well, or if the targets would be parts of it (long vehicles are
-        sometimes tracked as two). The fits have a reason if neither one target nor the tracked
-        targets explain the field.
+        For each target, one fit per number of dipoles. The fits as a single target are returned if
+        they explain the field equally well, or if the fitted targets are parts of one vehicle (long
+        vehicles are sometimes tracked as two). They are returned with a reason if neither one
+        target nor the tracked targets explain the field.
     """
     n_targets = len(paths)
     if n_targets < 2 or len(data.sensors) < 2:
         return (tuple(alone),)
     if n_targets > MAX_TARGETS:
-        return (_rejected(alone, n_targets, f'at most {MAX_TARGETS} can be fitted together'),)
-    found = fit_joint(data, paths, ground, orders, stopped=stopped)
-    if not found:
-        return (_rejected(alone, n_targets,
+        return (_reject(alone, n_targets, f'at most {MAX_TARGETS} can be fitted together'),)
+    joint_fits = fit_joint(data, paths, ground, orders, stopped=stopped)
+    if not joint_fits:
+        return (_reject(alone, n_targets,
                          'there are too few measurements to fit them together'),)
-    best, one = [_best(fits) for fits in found], _best(alone)
-    if not one.reason and one.length[0] <= MAX_LENGTH and all(fit.determined for fit in best) and (
-            _are_parts(data, best) or order_criteria([one, best[0]])[0] == 0.0):
+    best, single = [_best_fit(fits) for fits in joint_fits], _best_fit(alone)
+    if not single.reason and single.length[0] <= MAX_LENGTH and all(
+            fit.determined for fit in best) and (
+            _are_parts(data, best) or order_criteria([single, best[0]])[0] == 0.0):
         return (tuple(alone),)
-    why = _rejection_reason(data, best)
-    return (_rejected(alone, n_targets, why),) if why else found
+    reason = _rejection_reason(data, best)
+    return (_reject(alone, n_targets, reason),) if reason else joint_fits
 
 
-def _best(fits: Sequence[PassFit]) -> PassFit:
-    """The fit that `choose_order` considers; the first one if none is determined."""
+def _best_fit(fits: Sequence[PassFit]) -> PassFit:
+    """Fit with the smallest criterion; the first fit if none is determined."""
     return fits[int(np.argmin(order_criteria(fits)))]
 
 
@@ -88,7 +90,7 @@ def _are_parts(data: PassData, fits: Sequence[PassFit]) -> bool:
 
 
 def _rejection_reason(data: PassData, fits: Sequence[PassFit]) -> str:
-    """Why a joint fit is rejected; empty if it is not. An error in one target affects all."""
+    """Reason why a joint fit is rejected; empty if it is accepted."""
     if not all(fit.converged for fit in fits):
         return 'but the joint fit did not converge'
     if not all(has_plausible_residual(fit) for fit in fits):
@@ -101,11 +103,11 @@ def _rejection_reason(data: PassData, fits: Sequence[PassFit]) -> str:
         if fit.reason:
             return f'vehicle {k}: {fit.reason}'
         if fit.length[0] > MAX_LENGTH:
-            return f'vehicle {k}: a length of {fit.length[0]:.0f} m exceeds that of any vehicle'
+            return f'vehicle {k}: a length of {fit.length[0]:.0f} m is too long for a vehicle'
     return ''
 
 
-def _rejected(fits: Sequence[PassFit], n_targets: int, why: str) -> tuple[PassFit, ...]:
-    """The same fits with a reason and without trusted quantities."""
-    reason = f'not one target: {n_targets} were tracked, {why}'
+def _reject(fits: Sequence[PassFit], n_targets: int, details: str) -> tuple[PassFit, ...]:
+    """Reject fits: add a reason and remove the trusted quantities."""
+    reason = f'not one target: {n_targets} targets were tracked, {details}'
     return tuple(replace(fit, reason=reason, trusted=()) for fit in fits)

@@ -1,9 +1,9 @@
 """Plausibility of a fitted pass and of the quantities that it determines.
 
-A row of dipoles is an approximation of a vehicle: part of the near field remains unexplained. This
-residual is no reason to reject a fit as long as its location and size are those of real vehicles.
-Speed, direction and time of the CPA have their own standard deviations and are accepted
-individually. The fit as a whole is rejected only if a quantity is not determined.
+A row of dipoles approximates a vehicle, and part of the near field remains unexplained. This
+residual does not reject a fit if its location and magnitude are typical of real vehicles. Speed,
+direction and time of the CPA have their own standard deviations and are accepted individually. The
+fit as a whole is rejected if any quantity is not determined.
 """
 
 from collections.abc import Sequence
@@ -16,50 +16,50 @@ from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
 
 POINT_REACH = 2.1
-"""[m] Reach of the iron of a car from a single dipole: at distance r, the model error relative to
-the field is this over r. Four real cars at 4.5 m had normalised costs of 10, 14, 17 and 51 (T10
-Table 6.1, TSP14 Table I), at a signal energy of 1200 times that of the noise at the CPA (T10 eq.
-(6.1)), which is 87 times per value on average over the pass. Three of them left 10 to 18 % of the
-energy unexplained; the fourth, with 57 %, is not the pass of a point."""
+"""[m] Reach of the iron of a car from a single dipole. At distance r, the model error relative to
+the field is the reach over r. Four real cars at 4.5 m had normalised costs of 10, 14, 17 and 51
+(T10 Table 6.1, TSP14 Table I). Their signal energy was 1200 times the noise energy at the CPA (T10
+eq. (6.1)), or 87 times per value on average over the pass. Three cars left 10 to 18 % of the energy
+unexplained; the fourth, with 57 %, cannot be modelled as a point."""
 
 ROW_REACH = 0.45
-"""Reach of the iron from a row, relative to the spacing of its dipoles. With three dipoles, costs
-of 1.3 to 1.6 (cars) and 77 to 303 (trucks, of twenty times the energy) (T10 Table 6.5, TSP14 Table
-II) correspond to 0.15 to 0.45."""
+"""Reach of the iron from a row, relative to the spacing of its dipoles. With three dipoles, T10
+Table 6.5 and TSP14 Table II report costs of 1.3 to 1.6 for cars, and of 77 to 303 for trucks with
+twenty times the energy. These costs correspond to 0.15 to 0.45."""
 
 MIN_ROW_REACH = 0.4
-"""[m] Minimum reach of the iron from a row, for the cars of those tables."""
+"""[m] Minimum reach of the iron from a row, from the cars in T10 Table 6.5 and TSP14 Table II."""
 
 NOISE_ENERGY = 16.3
-"""Whitened energy of three axes that noise exceeds in one of a thousand samples."""
+"""Whitened energy of three axes that noise exceeds with a probability of 0.001."""
 
 MIN_ELSEWHERE, MAX_ELSEWHERE = 0.003, 0.1
-"""Maximum share of the field energy (gain errors, a swerve), and maximum share of the total
-residual, that a vehicle leaves unexplained outside its reach."""
+"""Unexplained energy outside the reach of a plausible vehicle: maximum fraction of the field energy
+(gain errors, a swerve), and maximum fraction of the total residual. The larger limit applies."""
 
 MIN_DISTANCE = 0.3
-"""Minimum distance travelled during the pass, relative to the distance of the nearest sensor."""
+"""Minimum distance travelled during a pass, relative to the distance of the nearest sensor."""
 
 MAX_CHANGE = 0.3
 """Maximum apparent relative change of the velocity during the pass, equivalent to a turn of 17
 degrees. The model errors of vehicles cause up to 0.2."""
 
 MIN_CHANGE_STDS = 2.5
-"""Minimum change of the velocity in standard deviations."""
+"""Minimum significant change of the velocity, in standard deviations."""
 
 MAX_SPEED_STD = 0.25
 """Maximum standard deviation of a trusted speed relative to the speed."""
 
 MAX_HEADING_STD = np.pi / 6.0
-"""[rad] Maximum standard deviation of a trusted direction; three of them are a right angle."""
+"""[rad] Maximum standard deviation of a trusted direction: a third of a right angle."""
 
 MAX_TIME_STD = 0.25
-"""Maximum standard deviation of a trusted CPA time, relative to the time in which the target
-travels the distance of the nearest sensor."""
+"""Maximum standard deviation of a trusted CPA time, relative to the distance of the nearest sensor
+over the speed."""
 
 
 def reach(n_dipoles: int, length: float) -> float:
-    """Reach of the iron beyond the dipoles of a row.
+    """Maximum distance of the iron of a vehicle from the dipoles of its row.
 
     Parameters
     ----------
@@ -76,33 +76,33 @@ def reach(n_dipoles: int, length: float) -> float:
 
 
 class FittedRow(NamedTuple):
-    """A row of dipoles of a fit."""
+    """A fitted row of dipoles."""
 
     n_dipoles: int
     theta: FloatArray
     """(6 or 7,) path: position at time zero, velocity, length."""
     field: FloatArray
-    """(n, 3) [T], sensor frame."""
+    """(n, 3) [T] field of the row, sensor frame."""
 
 
 def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: FloatArray) -> float:
-    """Share of the whitened energy of all targets that is unexplained where no vehicle leaves it.
+    """Unexplained fraction of the whitened energy of all targets, outside the reach of vehicles.
 
     The residual of a vehicle is proportional to its field and decreases with distance. An
-    additional vehicle leaves a residual at other times.
+    additional vehicle, in contrast, leaves a residual at other times.
 
     Parameters
     ----------
     data : PassData
     rows : sequence of FittedRow
-        The targets, each with n samples.
+        Fitted targets.
     residuals : (n, 3) array
         Whitened residuals.
 
     Returns
     -------
     float
-        Residual beyond ICASSP11 eq. (9), with `reach` in place of lambda, and beyond noise.
+        Residual in excess of the noise and of ICASSP11 eq. (9), with `reach` in place of lambda.
 
     References
     ----------
@@ -113,29 +113,29 @@ def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: Flo
         size2: FloatArray = np.einsum('ni,ni->n', whitened, whitened)
         return size2
 
-    known = sum((_residual_share(data, row) * energy(row.field) for row in rows),
+    plausible = sum((_plausible_residual_fraction(data, row) * energy(row.field) for row in rows),
                 np.zeros(len(residuals)))
-    beyond = np.square(residuals).sum(axis=1) - known - NOISE_ENERGY
-    everything = energy(np.sum([row.field for row in rows], axis=0))
-    return float(np.maximum(beyond, 0.0).sum() / everything.sum())
+    excess = np.square(residuals).sum(axis=1) - plausible - NOISE_ENERGY
+    total = energy(np.sum([row.field for row in rows], axis=0))
+    return float(np.maximum(excess, 0.0).sum() / total.sum())
 
 
-def _residual_share(data: PassData, row: FittedRow) -> FloatArray:
-    """Maximum unexplained share (n,) of a target's energy in each sample."""
+def _plausible_residual_fraction(data: PassData, row: FittedRow) -> FloatArray:
+    """Maximum plausible unexplained fraction (n,) of the energy of a target in each sample."""
     n_dipoles, theta, _ = row
     v = theta[3:6]
-    ahead = np.linspace(-0.5, 0.5, n_dipoles) * theta[6] if n_dipoles > 1 else np.zeros(1)
+    offsets = np.linspace(-0.5, 0.5, n_dipoles) * theta[6] if n_dipoles > 1 else np.zeros(1)
     forward = v / np.linalg.norm(v)
-    place = theta[:3] + data.t[:, None] * v - data.positions
-    distance = np.linalg.norm(place[:, None] + ahead[:, None] * forward, axis=2).min(axis=1)
+    positions = theta[:3] + data.t[:, None] * v - data.positions
+    distance = np.linalg.norm(positions[:, None] + offsets[:, None] * forward, axis=2).min(axis=1)
     length = float(theta[6]) if n_dipoles > 1 else 0.0
-    share: FloatArray = np.minimum(1.0, np.square(
+    fraction: FloatArray = np.minimum(1.0, np.square(
         reach(n_dipoles, length) / np.maximum(distance, 1e-9)))
-    return share
+    return fraction
 
 
 def rejection_reason(fit: PassFit) -> str:
-    """Why a fit as a whole is rejected.
+    """Reason why a fit as a whole is rejected.
 
     Parameters
     ----------
@@ -146,20 +146,20 @@ def rejection_reason(fit: PassFit) -> str:
     str
         Empty if the fit is accepted.
     """
-    if reason := _no_pass_reason(fit):
+    if reason := _invalid_pass_reason(fit):
         return reason
     if fit.bearing is not None:
         return ('one sensor: the scale is not observable, only directions and the time of the '
                 'closest approach are (TSP14 Proposition 1)')
-    lost = [name for name, variance in zip(fit.names, np.diagonal(fit.covariance), strict=True)
-            if not np.isfinite(variance)]
-    if lost:
-        return f'not observable: {", ".join(lost)}'
+    unobservable = [name for name, variance in zip(
+        fit.names, np.diagonal(fit.covariance), strict=True) if not np.isfinite(variance)]
+    if unobservable:
+        return f'not observable: {", ".join(unobservable)}'
     if not fit.determined:
         length, length_std = fit.length
         return (f'not determined: a length of {length:.1f} m with a standard deviation of '
                 f'{length_std:.1f} m; use fewer dipoles')
-    std, nearest = np.sqrt(np.trace(fit.robust_covariance[:3, :3])), _nearest(fit)
+    std, nearest = np.sqrt(np.trace(fit.robust_covariance[:3, :3])), _nearest_cpa_range(fit)
     if std > nearest:
         return (f'out of range: the position has a standard deviation of {std:.1f} m, and the '
                 f'nearest sensor is {nearest:.1f} m away')
@@ -167,7 +167,7 @@ def rejection_reason(fit: PassFit) -> str:
 
 
 def trusted(fit: PassFit) -> tuple[str, ...]:
-    """Those of speed, direction and time that a fit determines.
+    """Names of the quantities that a fit determines.
 
     Parameters
     ----------
@@ -176,25 +176,26 @@ def trusted(fit: PassFit) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        Subset of speed, direction, time. Empty if the model does not explain the target, or if
-        the target turned or did not pass.
+        Subset of speed, direction and time (of the CPA). Empty if the model does not explain the
+        field, or if the target turned or hardly moved.
     """
-    if _no_pass_reason(fit) or fit.bearing is not None:
+    if _invalid_pass_reason(fit) or fit.bearing is not None:
         return ()
     speed, speed_std = fit.speed
     _, heading_std = fit.heading
-    nearest = _nearest(fit)
+    nearest = _nearest_cpa_range(fit)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     _, time_std, _, _ = fit.closest_approach(centre)
     # A comparison with NaN (an unknown variance) is false.
-    known = {'speed': speed_std <= MAX_SPEED_STD * speed,
-             'direction': heading_std <= MAX_HEADING_STD and speed_std <= 0.5 * speed,
-             'time': time_std * speed <= MAX_TIME_STD * nearest}
-    return tuple(name for name, is_known in known.items() if is_known)
+    is_determined = {
+        'speed': speed_std <= MAX_SPEED_STD * speed,
+        'direction': heading_std <= MAX_HEADING_STD and speed_std <= 0.5 * speed,
+        'time': time_std * speed <= MAX_TIME_STD * nearest}
+    return tuple(name for name, is_valid in is_determined.items() if is_valid)
 
 
-def _no_pass_reason(fit: PassFit) -> str:
-    """Why a fit is not the pass of one target at constant velocity; empty if it is."""
+def _invalid_pass_reason(fit: PassFit) -> str:
+    """Reason why a fit is not a pass of one target at constant velocity; empty if it is."""
     if not fit.converged:
         return 'the fit did not converge'
     if not has_plausible_residual(fit):
@@ -202,15 +203,15 @@ def _no_pass_reason(fit: PassFit) -> str:
                 f'unexplained, {fit.residual_elsewhere:.1%} where a vehicle at that distance '
                 'leaves no residual (another vehicle, a turn, a wrong network file)')
     if has_velocity_change(fit):
-        return ('not at constant velocity: it changed by '
+        return ('not at constant velocity: the velocity changed by '
                 f'{fit.velocity_change:.0%} during the pass (a turn, braking)')
-    if np.linalg.norm(fit.velocity) * fit.duration_s < MIN_DISTANCE * _nearest(fit):
+    if np.linalg.norm(fit.velocity) * fit.duration_s < MIN_DISTANCE * _nearest_cpa_range(fit):
         return 'no pass: the target hardly moved'
     return ''
 
 
 def has_plausible_residual(fit: PassFit) -> bool:
-    """Whether the residual is plausible for a vehicle.
+    """Whether the location of the residual is plausible for a vehicle.
 
     Parameters
     ----------
@@ -225,7 +226,7 @@ def has_plausible_residual(fit: PassFit) -> bool:
 
 
 def has_velocity_change(fit: PassFit) -> bool:
-    """Whether the velocity changes by more than model errors can cause.
+    """Whether the change of the velocity is too large to be caused by model errors.
 
     Parameters
     ----------
@@ -239,7 +240,9 @@ def has_velocity_change(fit: PassFit) -> bool:
 
 
 def contradicts_straight_pass(fit: PassFit) -> bool:
-    """Whether a fit rules out a single target on a straight line, whatever its number of dipoles.
+    """Whether a fit rules out a pass of a single target on a straight line.
+
+    A fit of a single dipole rules out nothing, because the target may be extended.
 
     Parameters
     ----------
@@ -252,7 +255,7 @@ def contradicts_straight_pass(fit: PassFit) -> bool:
     return fit.n_dipoles > 1 and (has_velocity_change(fit) or not has_plausible_residual(fit))
 
 
-def _nearest(fit: PassFit) -> float:
-    """Distance [m] of the nearest sensor at its CPA."""
-    return min(fit.closest_approach(place)[2]
-               for place in fit.data.network.positions[fit.data.sensors])
+def _nearest_cpa_range(fit: PassFit) -> float:
+    """CPA range [m] of the nearest sensor."""
+    return min(fit.closest_approach(position)[2]
+               for position in fit.data.network.positions[fit.data.sensors])

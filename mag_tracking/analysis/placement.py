@@ -1,8 +1,8 @@
 """Bounds and detection probabilities of a passing target for the planning of sensor positions.
 
-A point target moves on a straight line at constant speed, with the states [r, v, m]. The direction
-of its moment is unknown in advance, so all results are computed for each of `DIRECTIONS`. The
-bounds are those of TSP14 section IV and MITRE12 section 4, with unknown backgrounds.
+The target is a point that moves on a straight line at constant speed, with the states [r, v, m].
+The direction of its moment is unknown in advance; all results are computed for all `DIRECTIONS`.
+The bounds follow TSP14 section IV and MITRE12 section 4, with unknown backgrounds.
 """
 
 from collections.abc import Iterator
@@ -16,9 +16,10 @@ from mag_tracking.physics.dipole import sensor_fields
 
 DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], *(
     np.array(d) / np.sqrt(3.0) for d in ((1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)))])
-"""(7, 3) directions of the moment; opposite directions give the same information."""
+"""(7, 3) directions of the moment. Opposite directions provide the same information."""
 
 STATES = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz')
+"""Names of the states [r, v, m]."""
 
 MAX_FIELDS = 200_000
 """Maximum number of fields computed at once, to limit memory."""
@@ -26,10 +27,10 @@ MAX_FIELDS = 200_000
 
 @dataclass(frozen=True)
 class PlannedTarget:
-    """Expected target."""
+    """Target for which a network is planned."""
 
     moment: float
-    """Size of the moment [A m²]."""
+    """Magnitude of the moment [A m²]."""
     height: float
     """Height of the magnetic centre [m]."""
     speed: float
@@ -39,11 +40,11 @@ class PlannedTarget:
     climb_std: float = np.inf
     """Prior standard deviation of the vertical speed [m/s]; inf = unknown."""
     moment_known: bool = True
-    """Whether the size of the moment is known in advance, with a standard deviation of that size.
-    Its direction is always unknown."""
+    """Whether the magnitude of the moment has a prior, with a relative standard deviation of one.
+    The direction is always unknown."""
 
     def prior(self) -> FloatArray:
-        """Prior information about [r, v, m].
+        """Prior information matrix of [r, v, m].
 
         Returns
         -------
@@ -62,22 +63,21 @@ class PlannedTarget:
 
 @dataclass(frozen=True)
 class Sampling:
-    """Sampling and errors of the sensors."""
+    """Sampling times and errors of the sensors."""
 
     period: float
     """Interval between frames [s]."""
     noise_std: FloatArray | float
-    """(n_sensors,) [T] standard deviation per axis and frame, or one value for all sensors."""
+    """(n_sensors,) [T] noise standard deviation per axis and frame; or one value for all."""
     field_error: float = 0.0
-    """Error relative to the field due to clocks, mounting and model, treated as noise that is
-    independent between frames. For an error that lasts n frames, multiply by the square root of
-    n."""
+    """Error relative to the field due to clocks, mounting and model, treated as white noise. For an
+    error that is constant over n frames, multiply by the square root of n."""
     background_std: float = np.inf
     """Prior standard deviation of the backgrounds [T]; inf = unknown."""
     half_window: float = 3.0
     """[s] Duration of the track before and after the evaluated point."""
     max_frames: int = 60
-    """Maximum number of frames that are computed."""
+    """Maximum number of computed frames."""
 
     def times(self) -> tuple[FloatArray, float]:
         """Times of the computed frames.
@@ -86,7 +86,7 @@ class Sampling:
         -------
         t : (k,) array, s
         weight : float
-            Number of real frames that each computed frame represents.
+            Number of real frames per computed frame.
         """
         n = 2 * int(self.half_window / self.period) + 1
         k = min(n, self.max_frames // 2 * 2 + 1)
@@ -97,7 +97,7 @@ class Sampling:
 def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                 sampling: Sampling, points: FloatArray,
                 heading: float) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
-    """Fields and Jacobians of passes through points, for every direction of the moment.
+    """Compute fields and Jacobians of passes through points, for each direction of the moment.
 
     Parameters
     ----------
@@ -112,9 +112,11 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
     Yields
     ------
     part : slice
-        Points of this part.
+        Slice of `points` with n_p points.
     h : (n_p, 7, k, n_sensors, 3) array, T
+        Fields at the k times of `sampling`.
     H : (n_p, 7, k, n_sensors, 3, 9) array
+        Derivatives of `h` by [r, v, m].
     """
     t, _ = sampling.times()
     v = target.speed * np.array([np.cos(heading), np.sin(heading), 0.0])
@@ -128,9 +130,9 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
     m = np.broadcast_to(target.moment * DIRECTIONS[:, None], (*shape, 3))
     step = max(1, MAX_FIELDS // (size * len(positions)))
     for first in range(0, len(points), step):
-        some = points[first:first + step]
-        n = len(some)
-        r0 = np.column_stack([some, np.full(n, target.height)])
+        part = points[first:first + step]
+        n = len(part)
+        r0 = np.column_stack([part, np.full(n, target.height)])
         r = np.broadcast_to(r0[:, None, None] + t[:, None] * v, (n, *shape, 3))
 
         def repeated(a: FloatArray, n: int = n) -> FloatArray:
@@ -139,7 +141,7 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
 
         h, H, _ = sensor_fields(positions, R_sw, r.reshape(n * size, 1, 3).copy(), repeated(m),
                                 repeated(dr_dx), repeated(dm_dx))
-        # At the position of a sensor the field is singular; the frame gives no information.
+        # At the position of a sensor, the field is singular. Such a frame is not used.
         on_it = ~(np.isfinite(h).all(axis=-1) & np.isfinite(H).all(axis=(-2, -1)))
         h[on_it], H[on_it] = 0.0, 0.0
         yield (slice(first, first + n), h.reshape(n, *shape, -1, 3),
@@ -148,9 +150,9 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
 
 def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                      sampling: Sampling, points: FloatArray, heading: float) -> FloatArray:
-    """Fisher information of each sensor about [r, v, m] when the target is at a point.
+    """Fisher information of each sensor about [r, v, m] with the target at a point.
 
-    The backgrounds are eliminated: a constant field adds no information beyond their prior.
+    The backgrounds are eliminated, with their prior.
 
     Parameters
     ----------
@@ -170,17 +172,17 @@ def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTar
     ----------
     [TSP14]_ eq. (28), (40); [MITRE12]_ eq. (17), (30).
     """
-    _, each = sampling.times()
-    out = np.empty((len(points), len(DIRECTIONS), len(positions), 9, 9))
+    _, frame_weight = sampling.times()
+    result = np.empty((len(points), len(DIRECTIONS), len(positions), 9, 9))
     for part, h, H in pass_fields(positions, R_sw, target, sampling, points, heading):
         variance = (np.square(sampling.noise_std) + sampling.field_error**2 * np.einsum(
-            'pdksa,pdksa->pdks', h, h)) / each
+            'pdksa,pdksa->pdks', h, h)) / frame_weight
         weighted = H / variance[..., None, None]
         J = np.einsum('pdksai,pdksaj->pdsij', weighted, H, optimize=True)
         mean = weighted.sum(axis=2)
         total = (1.0 / variance).sum(axis=2) + 1.0 / sampling.background_std**2
-        out[part] = J - np.einsum('pdsai,pdsaj->pdsij', mean, mean) / total[..., None, None]
-    return out
+        result[part] = J - np.einsum('pdsai,pdsaj->pdsij', mean, mean) / total[..., None, None]
+    return result
 
 
 def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
@@ -189,14 +191,15 @@ def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
     Parameters
     ----------
     information : (..., 9, 9) array
-        About [r, v, m].
+        Fisher information about [r, v, m].
     prior : (9, 9) array
+        Prior information.
 
     Returns
     -------
     (..., 3) array, m, m/s, A m²
         Square roots of the summed variances of horizontal position, horizontal velocity and
-        moment. Hardly observable quantities are large, at most 1e6 of their unit.
+        moment. The bounds of unobservable quantities are large, at most 1e6 of their unit per axis.
 
     References
     ----------
@@ -215,7 +218,7 @@ def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
 def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                             sampling: Sampling, points: FloatArray, false_alarm: float,
                             allowance: float = 0.0) -> FloatArray:
-    """Probability that one frame exceeds the detection threshold with the target at a point.
+    """Probability of detection in one frame with the target at a point.
 
     Parameters
     ----------
@@ -226,14 +229,14 @@ def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: Pla
     sampling : Sampling
     points : (n, 2) array, m, world frame
     false_alarm : float
-        Probability that noise alone exceeds the threshold in one frame.
+        False alarm probability of one frame.
     allowance : float, T
-        Allowed error of the backgrounds, added to the noise.
+        Standard deviation of the background errors, added to the noise.
 
     Returns
     -------
     (n, 7) array
-        For every direction of the moment.
+        Probability for each direction of the moment.
 
     References
     ----------

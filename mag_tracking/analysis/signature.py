@@ -1,4 +1,4 @@
-"""Signatures of passes at one sensor, and features of their shape."""
+"""Signatures of passes at one sensor, and their features for classification."""
 
 from dataclasses import dataclass
 
@@ -7,22 +7,22 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 
 N_SAMPLES = 64
-"""Number of samples of a resampled signature, which makes it independent of its duration."""
+"""Number of samples of a resampled signature."""
 
-BASELINE_SHARE = 0.1
-"""Share of a signature at each end that defines the baseline."""
+BASELINE_FRACTION = 0.1
+"""Fraction of a signature, at each end, to which the baseline is fitted."""
 
-ENERGY_TAIL = 0.005
-"""Share of the energy before the beginning, and after the end, of the evaluated part."""
+TAIL_FRACTION = 0.005
+"""Fraction of the energy that is cut off at each end of a signature."""
 
 MIN_PROMINENCE = 0.1
 """Minimum prominence of an extremum relative to the range of its axis."""
 
 LAGS = (2, 4, 8, 16)
-"""Lags of the autocorrelation of the field size, in samples."""
+"""Lags of the autocorrelation of the field magnitude, in samples."""
 
 N_COSINES = 8
-"""Number of coefficients of the discrete cosine transform of the field size."""
+"""Number of coefficients of the discrete cosine transform of the field magnitude."""
 
 MIN_SAMPLES = 8
 """Minimum number of samples of a signature."""
@@ -45,11 +45,11 @@ class Signature:
     unit: str
     """T, or empty if unknown."""
     group: str
-    """Name shared by the signatures of one target, which are kept together in training or test."""
+    """Name common to all signatures of one target; a group is either in training or in test."""
 
 
 def features(signature: Signature) -> FloatArray:
-    """Features of the shape and size of a signature.
+    """Features of the shape and magnitude of a signature.
 
     Parameters
     ----------
@@ -58,21 +58,22 @@ def features(signature: Signature) -> FloatArray:
     Returns
     -------
     (n_features,) array
-        For each axis: logarithm of the range, share of the energy, numbers of maxima and minima,
-        positions of the largest and the smallest value, share of the upper third of the spectrum.
-        For the size of the field: its logarithm, number of maxima, autocorrelation, cosine
-        transform. The duration is not a feature, since the speed is unknown.
+        For each axis: logarithm of the range, fraction of the energy, numbers of maxima and minima,
+        positions of the largest and the smallest value, fraction of the power in the upper third of
+        the spectrum. For the field magnitude: logarithm of its maximum, number of maxima,
+        autocorrelation, cosine transform. The duration is not a feature, because the speed is
+        unknown.
 
     Raises
     ------
     ValueError
-        If the signature has too few samples, is not finite, its times do not increase, or its
-        field is constant.
+        If there are too few samples, a value is not finite, the times do not increase, or the field
+        is constant.
     """
     t, field = np.asarray(signature.t, dtype=float), np.asarray(signature.field, dtype=float)
     if len(t) < MIN_SAMPLES:
-        raise ValueError(f'{len(t)} samples are too few for a signature; expected at least '
-                         f'{MIN_SAMPLES}')
+        raise ValueError(f'too few samples for a signature: {len(t)}, at least {MIN_SAMPLES} are '
+                         'required')
     if not (np.isfinite(t).all() and np.isfinite(field).all()):
         raise ValueError('a time or a field value is not finite')
     if not (np.diff(t) > 0.0).all():
@@ -80,18 +81,18 @@ def features(signature: Signature) -> FloatArray:
     largest = np.abs(field).max()
     if not largest > 0.0 or not np.ptp(field / largest, axis=0).max() > 1e-12:
         raise ValueError('the field is constant')
-    shape = _resampled(t, _without_baseline(t, field / largest))
-    size = np.linalg.norm(shape, axis=1)
+    shape = _resample(t, _subtract_baseline(t, field / largest))
+    magnitude = np.linalg.norm(shape, axis=1)
     energy = np.square(shape).sum(axis=0)
-    of_axes = [v for axis, share in zip(shape.T, energy / energy.sum(), strict=True)
-               for v in _axis_features(axis, float(share), float(size.max()))]
-    return np.array([np.log(size.max()) + np.log(largest), *of_axes,
-                     *_size_features(size / size.max())])
+    axis_features = [v for axis, fraction in zip(shape.T, energy / energy.sum(), strict=True)
+                     for v in _axis_features(axis, float(fraction), float(magnitude.max()))]
+    return np.array([np.log(magnitude.max()) + np.log(largest), *axis_features,
+                     *_magnitude_features(magnitude / magnitude.max())])
 
 
-def _without_baseline(t: FloatArray, field: FloatArray) -> FloatArray:
-    """Field minus the least-squares line through both ends of the signature."""
-    n = max(2, round(BASELINE_SHARE * len(t)))
+def _subtract_baseline(t: FloatArray, field: FloatArray) -> FloatArray:
+    """Subtract the least-squares line through both ends of a signature."""
+    n = max(2, round(BASELINE_FRACTION * len(t)))
     ends = np.r_[:n, len(t) - n:len(t)]
     A = np.stack([np.ones_like(t), (t - t[0]) / (t[-1] - t[0])], axis=1)
     line = np.linalg.lstsq(A[ends], field[ends], rcond=None)[0]
@@ -99,16 +100,16 @@ def _without_baseline(t: FloatArray, field: FloatArray) -> FloatArray:
     return departure
 
 
-def _resampled(t: FloatArray, field: FloatArray) -> FloatArray:
-    """Part (N_SAMPLES, n_axes) that contains nearly all of the energy."""
+def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
+    """Resample (N_SAMPLES, n_axes) the part of a signature that contains 99 % of the energy."""
     even = np.linspace(t[0], t[-1], max(4 * N_SAMPLES, len(t)))
     fine = np.stack([np.interp(even, t, axis) for axis in field.T], axis=1)
     energy = np.square(fine).sum(axis=1)
-    part = np.cumsum(energy) / energy.sum()
-    begin = int(np.searchsorted(part, ENERGY_TAIL))
-    end = int(np.searchsorted(part, 1.0 - ENERGY_TAIL)) + 1
+    fraction = np.cumsum(energy) / energy.sum()
+    begin = int(np.searchsorted(fraction, TAIL_FRACTION))
+    end = int(np.searchsorted(fraction, 1.0 - TAIL_FRACTION)) + 1
     at = np.linspace(begin, min(end, len(even) - 1), N_SAMPLES)
-    # Averaging over the new interval removes changes that the new samples cannot represent.
+    # Average over the new sampling interval to prevent aliasing.
     width = max(1, round((at[-1] - at[0]) / N_SAMPLES))
     smooth = np.stack([np.convolve(axis, np.ones(width) / width, 'same') for axis in fine.T],
                       axis=1)
@@ -117,32 +118,33 @@ def _resampled(t: FloatArray, field: FloatArray) -> FloatArray:
     return out
 
 
-def _axis_features(axis: FloatArray, share: float, size: float) -> list[float]:
-    """Features of one axis; `share` of the energy, `size` of the largest field."""
-    spread = float(np.ptp(axis))
+def _axis_features(axis: FloatArray, energy_fraction: float, max_magnitude: float) -> list[float]:
+    """Features of one axis, given its fraction of the energy and the maximum field magnitude."""
+    value_range = float(np.ptp(axis))
     spectrum = np.square(np.abs(np.fft.rfft(axis)))[1:]
-    high = spectrum[2 * len(spectrum) // 3:].sum() / spectrum.sum() if spread > 0.0 else 0.0
+    high_fraction = spectrum[2 * len(spectrum) // 3:].sum() / spectrum.sum() \
+        if value_range > 0.0 else 0.0
     n_high, n_low = (_n_maxima(v) for v in (axis, -axis))
-    return [float(np.log(max(spread / size, 1e-3))), share, n_high, n_low,
+    return [float(np.log(max(value_range / max_magnitude, 1e-3))), energy_fraction, n_high, n_low,
             int(np.argmax(axis)) / N_SAMPLES, int(np.argmin(axis)) / N_SAMPLES,
-            float(np.log10(high + 1e-8))]
+            float(np.log10(high_fraction + 1e-8))]
 
 
 def _n_maxima(values: FloatArray) -> int:
     """Number of prominent maxima."""
-    # The import takes 0.25 s.
+    # Deferred: the import takes 0.25 s.
     from scipy.signal import find_peaks
 
     return len(find_peaks(
         values, prominence=MIN_PROMINENCE * max(float(np.ptp(values)), 1e-300))[0])
 
 
-def _size_features(size: FloatArray) -> list[float]:
-    """Features of the field size, normalised to a maximum of one."""
+def _magnitude_features(magnitude: FloatArray) -> list[float]:
+    """Features of the field magnitude, which is normalised to a maximum of one."""
     from scipy.fft import dct
 
-    centred = size - size.mean()
+    centred = magnitude - magnitude.mean()
     variance = float(centred @ centred)
     correlations = [float(centred[:-lag] @ centred[lag:]) / max(variance, 1e-300) for lag in LAGS]
-    cosines = dct(size, norm='ortho')[:N_COSINES]
-    return [_n_maxima(size), *correlations, *(float(c) for c in cosines)]
+    cosines = dct(magnitude, norm='ortho')[:N_COSINES]
+    return [_n_maxima(magnitude), *correlations, *(float(c) for c in cosines)]

@@ -1,4 +1,4 @@
-"""Classifier of passes by their signature at one sensor: training, posteriors, evaluation."""
+"""Classifier of passes by their signatures at one sensor: training, posteriors, evaluation."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -13,52 +13,56 @@ from mag_tracking.errors import LabelsError, MissingDependencyError
 from mag_tracking.inference.log_normal_classes import UNKNOWN
 
 VERSION = 1
+"""Version of the model files."""
 MIN_SAMPLES = 4
-"""Minimum number of examples of a class; with fewer, there are none left for a test."""
+"""Minimum number of training examples of a class."""
 
 FOLDS = 5
 """Number of folds of the cross-validation."""
 PENALTIES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
-"""Candidate inverse penalties of the logistic regression."""
+"""Candidate values of C, the inverse regularisation strength of the logistic regression."""
 
 KNOWN_QUANTILE = 0.99
-"""A signature is of an unknown class if its distance to every class exceeds this quantile of the
-distances of left-out training examples to their own class."""
+"""Quantile of the distances of held-out training examples to their own class. A signature farther
+from all classes is of an unknown class."""
 
 TEMPERATURES = np.geomspace(0.3, 10.0, 40)
-"""Candidate temperatures."""
+"""Candidate temperatures of the logits."""
 
 
 @dataclass(frozen=True)
 class SignatureModel:
-    """Linear classifier with a limit on the distance to its classes."""
+    """Linear classifier with a maximum distance to its classes."""
 
     classes: tuple[str, ...]
+    """Names of the classes."""
     axes: tuple[str, ...]
+    """Names of the axes of the signatures."""
     unit: str
     """Unit of the fields: T, or empty if unknown."""
     method: str
+    """Name of the selected training method."""
     mean: FloatArray
-    """(n_features,) mean of the training set."""
+    """(n_features,) mean features of the training set."""
     scale: FloatArray
-    """(n_features,) standard deviations of the training set."""
+    """(n_features,) standard deviations of the features of the training set."""
     weights: FloatArray
-    """(n_classes, n_features) of the scaled features."""
+    """(n_classes, n_features) weights of the scaled features."""
     offsets: FloatArray
-    """(n_classes,)"""
+    """(n_classes,) offsets of the logits."""
     temperature: float
-    """Divisor of the logits, which corrects the overconfidence due to few examples."""
+    """Divisor of the logits. It corrects overconfidence due to a small training set."""
     centres: FloatArray
-    """(n_classes, n_features) of the scaled features."""
+    """(n_classes, n_features) mean scaled features of each class."""
     precision: FloatArray
-    """(n_features, n_features) inverse of the shrunk covariance within the classes."""
+    """(n_features, n_features) inverse of the shrinkage estimate of the within-class covariance."""
     limit: float
-    """Squared distance beyond which a signature is of an unknown class."""
+    """Maximum squared distance of a signature of a known class to the nearest class centre."""
     examples: dict[str, int]
-    """{class: number of examples}."""
+    """{class: number of training examples}."""
 
     def posterior(self, x: FloatArray) -> FloatArray:
-        """Class probabilities.
+        """Posterior probabilities of the classes.
 
         Parameters
         ----------
@@ -68,10 +72,10 @@ class SignatureModel:
         -------
         (n, n_classes) array
         """
-        return _softmax((self._scaled(x) @ self.weights.T + self.offsets) / self.temperature)
+        return _softmax((self._standardise(x) @ self.weights.T + self.offsets) / self.temperature)
 
     def is_known(self, x: FloatArray) -> FloatArray:
-        """Whether signatures are as close to a class as its own examples.
+        """Whether each signature is close to a class, compared with the training examples.
 
         Parameters
         ----------
@@ -81,7 +85,7 @@ class SignatureModel:
         -------
         (n,) bool array
         """
-        known: FloatArray = _distances(self._scaled(x), self.centres,
+        known: FloatArray = _squared_distances(self._standardise(x), self.centres,
                                        self.precision).min(axis=1) <= self.limit
         return known
 
@@ -100,36 +104,37 @@ class SignatureModel:
         return [self.classes[k] if known else UNKNOWN
                 for k, known in zip(best.tolist(), self.is_known(x).tolist(), strict=True)]
 
-    def _scaled(self, x: FloatArray) -> FloatArray:
-        """Features in units of the training set."""
+    def _standardise(self, x: FloatArray) -> FloatArray:
+        """Standardise features by the mean and scale of the training set."""
         scaled: FloatArray = (x - self.mean) / self.scale
         return scaled
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Accuracy on one or several test sets."""
+    """Accuracy of a classifier on one or several test sets."""
 
     classes: tuple[str, ...]
+    """Names of the classes."""
     n: int
-    """Number of signatures in a set."""
+    """Number of signatures in the first test set."""
     majority: float
-    """Share of the largest class: the accuracy of a constant prediction."""
+    """Fraction of the largest class, which is the accuracy of a constant prediction."""
     accuracy: FloatArray
-    """(n_sets,) share of correct predictions; `unknown` counts as incorrect."""
+    """(n_sets,) fraction of correct predictions; `unknown` counts as incorrect."""
     balanced_accuracy: FloatArray
-    """(n_sets,) mean of the recalls."""
+    """(n_sets,) mean recall of the classes."""
     recall: FloatArray
-    """(n_sets, n_classes)"""
+    """(n_sets, n_classes) recall of each class; NaN for a class without test signatures."""
     unknown: FloatArray
-    """(n_sets,) share of `unknown` predictions."""
+    """(n_sets,) fraction of `unknown` predictions."""
     reliability: float
-    """Expected calibration error: mean absolute difference between the stated probability and the
-    accuracy, over bins of the probability, weighted by their counts."""
+    """Expected calibration error: mean absolute difference between predicted probability and
+    accuracy over bins of the probability, weighted by the number of predictions."""
 
 
 def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray, list[str]]:
-    """Features of several signatures.
+    """Compute the features of several signatures.
 
     Parameters
     ----------
@@ -139,9 +144,9 @@ def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray
     -------
     x : (n, n_features) array
     rows : (n,) int array
-        Signatures that have features.
+        Indices of the signatures that have features.
     reasons : list of str
-        Why the others have none.
+        Reasons why the other signatures have no features.
 
     Raises
     ------
@@ -153,14 +158,14 @@ def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray
         raise LabelsError('the signatures have different axes or units: ' + ', '.join(
             f'{n} with {name or "none"} [{unit or "unit unknown"}]'
             for (name, unit), n in sorted(axes.items())))
-    rows, found, reasons = [], [], []
+    rows, table, reasons = [], [], []
     for i, signature in enumerate(signatures):
         try:
-            found.append(features(signature))
+            table.append(features(signature))
             rows.append(i)
         except ValueError as error:
             reasons.append(f'{signature.source}: {error}')
-    return np.array(found, ndmin=2), np.array(rows, dtype=np.int64), reasons
+    return np.array(table, ndmin=2), np.array(rows, dtype=np.int64), reasons
 
 
 def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tuple[str, ...],
@@ -172,11 +177,13 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
     x : (n, n_features) array
     labels : sequence of n str
     groups : sequence of n str
-        Signatures of one target have the same group and are left out together.
+        Signatures of one target have the same group, which is never split by a fold.
     axes : tuple of str
+        Names of the axes of the signatures.
     unit : str
+        Unit of the fields: T, or empty if unknown.
     seed : int
-        Seed of the folds.
+        Seed of the random folds.
 
     Returns
     -------
@@ -185,7 +192,7 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
     Raises
     ------
     LabelsError
-        If there are fewer than two classes, or too few examples of one.
+        If there are fewer than two classes, or too few examples of a class.
     MissingDependencyError
         If scikit-learn is not installed.
     """
@@ -196,21 +203,23 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
     scale = np.where(scale > 1e-9 * (1.0 + np.abs(mean)), scale, 1.0)
     z = (x - mean) / scale
     folds = list(_folds(y, groups, min(FOLDS, min(counts.values())), seed))
-    scored = []
-    for name, make in _candidates():
+    candidates = []
+    for name, create in _candidates():
         logits = np.zeros((len(y), len(classes)))
         for inside, outside in folds:
-            logits[outside] = _logits(make().fit(z[inside], y[inside]), z[outside])
+            logits[outside] = _logits(create().fit(z[inside], y[inside]), z[outside])
         losses = [_log_loss(logits / t, y) for t in TEMPERATURES]
         k = int(np.argmin(losses))
-        scored.append((losses[k], name, make, float(TEMPERATURES[k])))
-    _, name, make, temperature = min(scored, key=lambda s: s[0])
-    fitted = make().fit(z, y)
-    centres, precision = _spread(z, y)
-    left_out = np.concatenate([_own_distances(z, y, inside, outside) for inside, outside in folds])
-    return SignatureModel(classes, axes, unit, name, mean, scale, *_linear(fitted, len(classes)),
-                          temperature, centres, precision,
-                          float(np.quantile(left_out, KNOWN_QUANTILE)), dict(counts))
+        candidates.append((losses[k], name, create, float(TEMPERATURES[k])))
+    _, name, create, temperature = min(candidates, key=lambda s: s[0])
+    fitted = create().fit(z, y)
+    centres, precision = _class_statistics(z, y)
+    held_out = np.concatenate([_held_out_distances(z, y, inside, outside)
+                               for inside, outside in folds])
+    return SignatureModel(classes, axes, unit, name, mean, scale,
+                          *_weights_and_offsets(fitted, len(classes)), temperature,
+                          centres, precision,
+                          float(np.quantile(held_out, KNOWN_QUANTILE)), dict(counts))
 
 
 def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]':
@@ -219,7 +228,9 @@ def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]'
     Parameters
     ----------
     labels : sequence of n str
+        Class of each signature.
     groups : sequence of n str
+        Target of each signature.
 
     Returns
     -------
@@ -233,7 +244,8 @@ def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]'
     """
     counts = Counter(label for label, _ in set(zip(labels, groups, strict=True)))
     if '' in counts:
-        raise LabelsError(f'{counts[""]} signatures have no label')
+        raise LabelsError(f'labels are missing for {counts[""]} of the targets; label these '
+                          'signatures or remove them')
     if UNKNOWN in counts:
         raise LabelsError(f'the label {UNKNOWN!r} is reserved for signatures of no class; rename '
                           'the class')
@@ -251,7 +263,7 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
                     test_share: float = 0.3, progress: Any = iter) -> Evaluation:
     """Train and test on stratified random splits.
 
-    All choices are made within the training part of a split.
+    Method, penalty and temperature are selected within the training part of each split.
 
     Parameters
     ----------
@@ -261,8 +273,9 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
     unit : str
         As for `train`.
     n_splits : int
+        Number of random splits.
     test_share : float
-        Share of each class in the test part.
+        Fraction of each class in the test part.
     progress : function
         Wraps the iterator over the splits.
 
@@ -273,7 +286,7 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
     Raises
     ------
     LabelsError
-        As `train`, or if no class has enough examples for a test part.
+        Under the conditions of `train`, or if no class has enough examples for a test part.
     MissingDependencyError
         If scikit-learn is not installed.
     """
@@ -281,14 +294,14 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
     y, g = np.array(labels), np.array(groups)
     parts = []
     for seed in progress(range(n_splits)):
-        inside, outside = _split(y, g, test_share, seed)
+        inside, outside = _random_split(y, g, test_share, seed)
         model = train(x[inside], y[inside].tolist(), g[inside].tolist(), axes, unit, seed)
         parts.append((model, x[outside], y[outside]))
-    return _evaluation(parts)
+    return _evaluate_parts(parts)
 
 
 def evaluate(model: SignatureModel, x: FloatArray, labels: Sequence[str]) -> Evaluation:
-    """Evaluate a trained model on other signatures.
+    """Evaluate a trained model on labelled signatures.
 
     Parameters
     ----------
@@ -305,15 +318,16 @@ def evaluate(model: SignatureModel, x: FloatArray, labels: Sequence[str]) -> Eva
     LabelsError
         If a label is not a class of the model.
     """
-    others = sorted(set(labels) - set(model.classes))
-    if others:
-        raise LabelsError(f'the model does not have the classes {", ".join(map(repr, others))}; '
-                          f'it has {", ".join(model.classes)}')
-    return _evaluation([(model, x, np.array(labels))])
+    missing = sorted(set(labels) - set(model.classes))
+    if missing:
+        raise LabelsError('labels that are not classes of the model: '
+                          f'{", ".join(map(repr, missing))}; '
+                          f'its classes are {", ".join(model.classes)}')
+    return _evaluate_parts([(model, x, np.array(labels))])
 
 
-def _evaluation(parts: Sequence[tuple[SignatureModel, FloatArray, Any]]) -> Evaluation:
-    """`Evaluation` of models on their test sets."""
+def _evaluate_parts(parts: Sequence[tuple[SignatureModel, FloatArray, Any]]) -> Evaluation:
+    """Evaluate each model on its test set (features, labels)."""
     classes = parts[0][0].classes
     accuracy, recall, unknown, probability, correct = [], [], [], [], []
     for model, x, y in parts:
@@ -337,10 +351,11 @@ def reliability_error(probability: FloatArray, correct: FloatArray, n_bins: int 
     Parameters
     ----------
     probability : (n,) array
-        Probabilities of the predicted classes.
+        Probability of the predicted class.
     correct : (n,) bool array
-        Whether the predictions are correct.
+        Whether the prediction is correct.
     n_bins : int
+        Number of equal bins of the probability.
 
     Returns
     -------
@@ -352,7 +367,7 @@ def reliability_error(probability: FloatArray, correct: FloatArray, n_bins: int 
 
 
 def _candidates() -> list[tuple[str, Any]]:
-    """(name, function that creates an estimator) of each candidate."""
+    """Candidate classifiers: (name, function that creates an estimator)."""
     try:
         from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
         from sklearn.linear_model import LogisticRegression
@@ -367,8 +382,8 @@ def _candidates() -> list[tuple[str, Any]]:
     return out
 
 
-def _linear(fitted: Any, n_classes: int) -> tuple[FloatArray, FloatArray]:
-    """Weights (n_classes, n_features) and offsets (n_classes,) of an estimator."""
+def _weights_and_offsets(fitted: Any, n_classes: int) -> tuple[FloatArray, FloatArray]:
+    """Weights (n_classes, n_features) and offsets (n_classes,) of a fitted estimator."""
     weights, offsets = np.asarray(fitted.coef_), np.asarray(fitted.intercept_)
     if n_classes == 2:
         weights, offsets = np.vstack([-0.5 * weights, 0.5 * weights]), \
@@ -377,14 +392,14 @@ def _linear(fitted: Any, n_classes: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _logits(fitted: Any, z: FloatArray) -> FloatArray:
-    """(n, n_classes) logits of an estimator."""
-    weights, offsets = _linear(fitted, len(fitted.classes_))
+    """Logits (n, n_classes) of a fitted estimator."""
+    weights, offsets = _weights_and_offsets(fitted, len(fitted.classes_))
     logits: FloatArray = z @ weights.T + offsets
     return logits
 
 
 def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
-    """Stratified folds of whole groups: (training rows, test rows)."""
+    """Stratified folds of whole groups: indices of training and test examples."""
     try:
         from sklearn.model_selection import StratifiedGroupKFold
     except ImportError as error:
@@ -394,23 +409,24 @@ def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
     return folds.split(np.zeros(len(y)), y, np.array(groups))
 
 
-def _split(y: Any, groups: Any, test_share: float, seed: int) -> tuple[IntArray, IntArray]:
-    """Training and test rows, stratified by class, with whole groups."""
-    rng, tested = np.random.default_rng(seed), set[str]()
+def _random_split(y: Any, groups: Any, test_share: float, seed: int) -> tuple[IntArray, IntArray]:
+    """Stratified random split of whole groups: indices of training and test examples."""
+    rng, test_groups = np.random.default_rng(seed), set[str]()
     for name in np.unique(y):
-        mine = rng.permutation(np.unique(groups[y == name]))
-        # The training part keeps the minimum number of examples.
-        n = min(max(1, round(test_share * len(mine))), max(len(mine) - MIN_SAMPLES, 0))
-        tested |= set(mine[:n].tolist())
-    outside = np.isin(groups, list(tested))
+        class_groups = rng.permutation(np.unique(groups[y == name]))
+        # At least the minimum number of examples must remain in the training part.
+        n = min(max(1, round(test_share * len(class_groups))),
+                max(len(class_groups) - MIN_SAMPLES, 0))
+        test_groups |= set(class_groups[:n].tolist())
+    outside = np.isin(groups, list(test_groups))
     if not outside.any():
-        raise LabelsError('too few examples for a test set: expected more than '
-                          f'{MIN_SAMPLES} of a class')
+        raise LabelsError('too few examples for a test set: at least one class requires more than '
+                          f'{MIN_SAMPLES}')
     return np.flatnonzero(~outside), np.flatnonzero(outside)
 
 
-def _spread(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Class centres (n_classes, n_features) and the inverse covariance within the classes."""
+def _class_statistics(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Class centres (n_classes, n_features) and inverse within-class covariance."""
     from sklearn.covariance import ledoit_wolf
 
     centres = np.array([z[y == k].mean(axis=0) for k in range(int(y.max()) + 1)])
@@ -418,23 +434,24 @@ def _spread(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArray]:
     return centres, np.linalg.inv(covariance + 1e-6 * np.eye(z.shape[1]))
 
 
-def _own_distances(z: FloatArray, y: IntArray, inside: IntArray, outside: IntArray) -> FloatArray:
-    """Squared distances of left-out examples to their own class."""
-    centres, precision = _spread(z[inside], y[inside])
-    own: FloatArray = _distances(z[outside], centres, precision)[np.arange(len(outside)),
+def _held_out_distances(z: FloatArray, y: IntArray, inside: IntArray,
+                        outside: IntArray) -> FloatArray:
+    """Squared distances of held-out examples to their own class."""
+    centres, precision = _class_statistics(z[inside], y[inside])
+    own: FloatArray = _squared_distances(z[outside], centres, precision)[np.arange(len(outside)),
                                                                  y[outside]]
     return own
 
 
-def _distances(z: FloatArray, centres: FloatArray, precision: FloatArray) -> FloatArray:
-    """(n, n_classes) squared distances."""
+def _squared_distances(z: FloatArray, centres: FloatArray, precision: FloatArray) -> FloatArray:
+    """Squared Mahalanobis distances (n, n_classes) to the class centres."""
     e = z[:, None] - centres
     distances: FloatArray = np.einsum('nci,ij,ncj->nc', e, precision, e)
     return distances
 
 
 def _softmax(logits: FloatArray) -> FloatArray:
-    """(n, n_classes) probabilities."""
+    """Probabilities (n, n_classes) of logits."""
     p = np.exp(logits - logits.max(axis=1, keepdims=True))
     out: FloatArray = p / p.sum(axis=1, keepdims=True)
     return out

@@ -1,4 +1,4 @@
-"""The sensor network and its file."""
+"""The sensor network, its file, and the counting lines."""
 
 from mag_tracking.network.sensor_network import CalibrationRecord, SensorNetwork
 

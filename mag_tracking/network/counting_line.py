@@ -11,22 +11,23 @@ from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.units import NS
 
 Pose: TypeAlias = Track | SmoothedPose
+"""Filtered or smoothed pose of a track."""
 
 MIN_SPEED = 1.0
-"""Minimum speed for extrapolation to a line [m/s]. A slower vehicle may stop before the line."""
+"""Minimum speed for extrapolation to a line [m/s]. Slower vehicles may stop before the line."""
 
 MAX_EXTRAPOLATION_S = 1.0
-"""Maximum time of extrapolation from the beginning or end of a track to a line [s]."""
+"""Maximum extrapolation time from the beginning or end of a track to a line [s]."""
 
 
 @dataclass(frozen=True)
 class CountingLine:
-    """A counting line."""
+    """A line segment on the ground at which vehicles are counted."""
 
     name: str
     """Name of the line."""
     point: FloatArray
-    """Middle of the line, (2,) m, world frame."""
+    """Midpoint of the line, (2,) m, world frame."""
     along: FloatArray
     """Unit vector of the forward direction, perpendicular to the line, (2,), world frame."""
     half_width: float
@@ -47,7 +48,7 @@ class CountingLine:
         return float((position[:2] - self.point) @ self.along)
 
     def lateral(self, position: FloatArray) -> float:
-        """Lateral offset of a position from the middle of the line.
+        """Lateral offset of a position from the midpoint of the line.
 
         Parameters
         ----------
@@ -64,16 +65,18 @@ class CountingLine:
 
 def counting_lines(names: Sequence[str], headings_deg: Sequence[float], offsets: Sequence[float],
                    half_widths: Sequence[float], centre: FloatArray) -> list[CountingLine]:
-    """Create the counting lines of a network from lists of their parameters.
+    """Create counting lines from lists of their parameters.
 
     Parameters
     ----------
     names : sequence of str
+        Name of each line.
     headings_deg : sequence of float, deg
         Forward direction of each line, anticlockwise from x.
     offsets : sequence of float, m
         Distance of each line from the centre, in its forward direction.
     half_widths : sequence of float, m
+        Half of the length of each line.
     centre : (2,) or (3,) array, m, world frame
         Centre of the network.
 
@@ -105,7 +108,7 @@ class Crossing(NamedTuple):
 
 
 class CrossingDetector:
-    """Detects the crossing of a line by one track from its successive poses.
+    """Detector for the crossing of a line by one track.
 
     Parameters
     ----------
@@ -118,14 +121,14 @@ class CrossingDetector:
 
     def __init__(self, line: CountingLine) -> None:
         self.line = line
-        self._first: Pose | None = None
-        self._last: Pose | None = None
-        self._pair: tuple[Pose, Pose] | None = None
+        self._first_pose: Pose | None = None
+        self._last_pose: Pose | None = None
+        self._crossing_poses: tuple[Pose, Pose] | None = None
 
     @property
     def has_pose(self) -> bool:
         """Whether a pose has been added."""
-        return self._first is not None
+        return self._first_pose is not None
 
     def add(self, pose: Pose) -> None:
         """Add the next pose of the track.
@@ -134,44 +137,45 @@ class CrossingDetector:
         ----------
         pose : Track or SmoothedPose
         """
-        if self._first is None:
-            self._first = pose
-        if self._last is not None and self._is_beyond(self._last) != self._is_beyond(pose):
-            self._pair = self._last, pose
-        self._last = pose
+        if self._first_pose is None:
+            self._first_pose = pose
+        if self._last_pose is not None \
+                and self._is_beyond(self._last_pose) != self._is_beyond(pose):
+            self._crossing_poses = self._last_pose, pose
+        self._last_pose = pose
 
     def _is_beyond(self, pose: Pose) -> bool:
         """Whether a pose is beyond the line."""
         return self.line.forward(pose.position) >= 0.0
 
     def crossing(self) -> Crossing | None:
-        """Last crossing of the line.
+        """Return the last crossing of the line.
 
         Returns
         -------
         Crossing or None
             None if the track begins and ends on the same side, or misses the line.
         """
-        if self._first is None or self._last is None:
+        if self._first_pose is None or self._last_pose is None:
             return None
-        found = self._interpolated() if self._is_beyond(self._first) != self._is_beyond(
-            self._last) else self._extrapolated(self._first, self._last)
-        if found is None or abs(self.line.lateral(found.position)) > self.line.half_width:
+        crossing = self._interpolate() if self._is_beyond(self._first_pose) != self._is_beyond(
+            self._last_pose) else self._extrapolate(self._first_pose, self._last_pose)
+        if crossing is None or abs(self.line.lateral(crossing.position)) > self.line.half_width:
             return None
-        return found
+        return crossing
 
-    def _interpolated(self) -> Crossing:
-        """Interpolate the crossing between two poses."""
-        assert self._pair is not None
-        before, after = self._pair
-        s = [self.line.forward(p.position) for p in self._pair]
-        share = s[0] / (s[0] - s[1])
-        return Crossing(before.stamp_ns + round(share * (after.stamp_ns - before.stamp_ns)),
-                        (1.0 - share) * before.position + share * after.position, s[1] > s[0],
-                        before if share < 0.5 else after, False)
+    def _interpolate(self) -> Crossing:
+        """Interpolate the crossing between the poses before and after the line."""
+        assert self._crossing_poses is not None
+        before, after = self._crossing_poses
+        forward = [self.line.forward(p.position) for p in self._crossing_poses]
+        fraction = forward[0] / (forward[0] - forward[1])
+        return Crossing(before.stamp_ns + round(fraction * (after.stamp_ns - before.stamp_ns)),
+                        (1.0 - fraction) * before.position + fraction * after.position,
+                        forward[1] > forward[0], before if fraction < 0.5 else after, False)
 
-    def _extrapolated(self, first: Pose, last: Pose) -> Crossing | None:
-        """Extrapolate to a crossing shortly before the first or after the last pose."""
+    def _extrapolate(self, first: Pose, last: Pose) -> Crossing | None:
+        """Extrapolate to a crossing shortly before the first pose or after the last pose."""
         for pose, sign in ((first, -1.0), (last, 1.0)):
             speed = float(pose.velocity[:2] @ self.line.along)
             if abs(speed) < MIN_SPEED:

@@ -1,4 +1,4 @@
-"""`network.yaml`: the geometry and calibration of a sensor network."""
+"""Network file (`network.yaml`): geometry and calibration of a sensor network."""
 
 import datetime
 import json
@@ -27,94 +27,96 @@ _SENSOR_KEYS = {'position', 'orientation', 'orientation_std_deg', 'clock_offset'
                 'background', 'offset', 'correction', 'topic', 'imu_topic', 'calibrated'}
 
 _MAX_COORDINATE = 1e8
-"""Maximum distance of a position from the origin along an axis [m]: any frame of the Earth fits."""
+"""Maximum absolute coordinate of a position [m]; covers all frames on Earth."""
 
 _MIN_NOISE_STD = 1e-15
 """Minimum standard deviation of the noise [T]."""
 
 _MAX_CLOCK_OFFSET = 3600.0
-"""Maximum clock offset [s]. A clock with a larger error must be set instead of corrected."""
+"""Maximum clock offset that is corrected [s]. A clock with a larger offset must be set."""
 
 
-def _vector(label: str, value: object, lengths: tuple[int, ...]) -> FloatArray:
-    """Convert a list of finite numbers to an array; its length must be one of `lengths`."""
+def _parse_vector(label: str, value: object, lengths: tuple[int, ...]) -> FloatArray:
+    """Convert a list of finite numbers, whose length must be in `lengths`, to an array."""
     if not isinstance(value, list) or len(value) not in lengths:
         raise NetworkError(f'{label}: expected {" or ".join(map(str, lengths))} numbers, '
                            f'got {shown(value)}')
     for v in value:
-        # YAML 1.1 reads numbers without a point (1e-8) or without a sign (1.0e8) as text.
+        # YAML 1.1 parses exponents without a point (1e-8) or without a sign (1.0e8) as strings.
         if isinstance(v, str):
-            raise NetworkError(f'{label}: {shown(v)} is text; write numbers as 1.0e-8 or 1.0e+8')
+            raise NetworkError(f'{label}: {shown(v)} is a string; write numbers as 1.0e-8 or '
+                               '1.0e+8')
         if isinstance(v, bool) or not isinstance(v, (int, float)) or not abs(v) < 1e300:
             raise NetworkError(f'{label}: {shown(v)} is not a finite number')
     return np.array(value, dtype=float)
 
 
 def _check_keys(label: str, mapping: object, keys: Collection[str]) -> None:
-    """Raise NetworkError for a key that is not among `keys`."""
+    """Raise NetworkError if `mapping` is not a mapping or has a key that is not in `keys`."""
     if not isinstance(mapping, dict):
-        raise NetworkError(f'{label}: expected a mapping, got {shown(mapping)}')
+        raise NetworkError(f'{label}: expected a mapping (key: value), got {shown(mapping)}')
     for key in mapping:
         if key not in keys:
             raise NetworkError(f'{label}: unknown key {shown(key)}; expected one of '
                                f'{", ".join(sorted(keys))}')
 
 
-def _sensor(name: str, entry: Any) -> dict[str, Any]:
-    """Values of one entry by the field names of `SensorNetwork`."""
+def _parse_sensor(name: str, entry: Any) -> dict[str, Any]:
+    """Parse the entry of a sensor to values by the field names of `SensorNetwork`."""
     label = f'sensor {name}'
     _check_keys(label, entry, _SENSOR_KEYS)
     if 'position' not in entry:
         raise NetworkError(f'{label}: position is missing')
-    position = _vector(f'{label}: position', entry['position'], (3,))
+    position = _parse_vector(f'{label}: position', entry['position'], (3,))
     if np.abs(position).max() > _MAX_COORDINATE:
         raise NetworkError(f'{label}: position: {position.tolist()} m is too far from the '
-                           'origin for any place on Earth')
-    q = _vector(f'{label}: orientation', entry.get('orientation', [0, 0, 0, 1]), (4,))
-    R_ws = _rotation(f'{label}: orientation', q)
-    topic = _topic(label, 'topic', entry.get('topic', f'{name}/imu/mag'))
-    # REP-145: a driver publishes the accelerometer on data_raw beside the magnetometer on mag.
-    beside = topic.removesuffix('/mag') + '/data_raw' if topic.endswith('/mag') else None
-    imu_topic = entry.get('imu_topic', beside)
+                           'origin for any place on Earth; positions are in metres')
+    q = _parse_vector(f'{label}: orientation', entry.get('orientation', [0, 0, 0, 1]), (4,))
+    R_ws = _parse_rotation(f'{label}: orientation', q)
+    topic = _check_topic(label, 'topic', entry.get('topic', f'{name}/imu/mag'))
+    # REP-145: the accelerometer topic data_raw and the magnetometer topic mag have one namespace.
+    default_imu_topic = topic.removesuffix('/mag') + '/data_raw' if topic.endswith('/mag') else None
+    imu_topic = entry.get('imu_topic', default_imu_topic)
     return {'positions': position, 'R_ws': R_ws, 'topics': topic,
-            'imu_topics': None if imu_topic is None else _topic(label, 'imu_topic', imu_topic),
-            'noise_std': _noise(label, entry.get('noise_std')),
-            'background': _small_field(label, 'background', entry.get('background')),
-            'offset': _small_field(label, 'offset', entry.get('offset')),
-            'correction': _correction(label, entry.get('correction')),
-            'orientation_std': _orientation_std(label, entry.get('orientation_std_deg')),
-            'clock_offset': _clock_offset(label, entry.get('clock_offset', 0.0)),
-            'calibrated': _calibrated(label, entry.get('calibrated'))}
+            'imu_topics': None if imu_topic is None else _check_topic(label, 'imu_topic',
+                                                                      imu_topic),
+            'noise_std': _parse_noise(label, entry.get('noise_std')),
+            'background': _parse_small_field(label, 'background', entry.get('background')),
+            'offset': _parse_small_field(label, 'offset', entry.get('offset')),
+            'correction': _parse_correction(label, entry.get('correction')),
+            'orientation_std': _parse_orientation_std(label, entry.get('orientation_std_deg')),
+            'clock_offset': _parse_clock_offset(label, entry.get('clock_offset', 0.0)),
+            'calibrated': _parse_calibration(label, entry.get('calibrated'))}
 
 
-def _noise(label: str, noise: object) -> FloatArray | None:
-    """Noise standard deviation (3,) [T] from one or three numbers."""
+def _parse_noise(label: str, noise: object) -> FloatArray | None:
+    """Parse the noise standard deviation (3,) [T] from one or three numbers."""
     if noise is None:
         return None
     numbers = noise if isinstance(noise, list) else [noise]
-    std = _vector(f'{label}: noise_std', numbers, (1, 3)) * np.ones(3)
+    std = _parse_vector(f'{label}: noise_std', numbers, (1, 3)) * np.ones(3)
     if not ((std >= _MIN_NOISE_STD) & (std < 1e-3)).all():
         raise NetworkError(f'{label}: noise_std must be above a femtotesla and below a '
                            f'millitesla, got {std.tolist()} T')
     return std
 
 
-def _small_field(label: str, key: str, value: object) -> FloatArray | None:
-    """Field (3,) [T] from three numbers."""
+def _parse_small_field(label: str, key: str, value: object) -> FloatArray | None:
+    """Parse a field (3,) [T] of at most 0.1 T from three numbers."""
     if value is None:
         return None
-    B = _vector(f'{label}: {key}', value, (3,))
+    B = _parse_vector(f'{label}: {key}', value, (3,))
     if np.abs(B).max() > 0.1:
-        raise NetworkError(f'{label}: {key}: {B.tolist()} T is more than 0.1 T; is it in '
+        raise NetworkError(f'{label}: {key}: {B.tolist()} T exceeds 0.1 T; is the value in '
                            'microtesla or gauss?')
     return B
 
 
-def _correction(label: str, value: object) -> FloatArray | None:
-    """Correction matrix (3, 3) from nine numbers."""
+def _parse_correction(label: str, value: object) -> FloatArray | None:
+    """Parse the correction matrix (3, 3) from nine numbers."""
     if value is None:
         return None
-    matrix = _vector(f'{label}: correction', value, (9,)).reshape(3, 3)
+    matrix = _parse_vector(f'{label}: correction', value, (9,)).reshape(3, 3)
     singular = np.linalg.svd(matrix, compute_uv=False)
     if not singular[-1] > 0.02 * singular[0]:
         raise NetworkError(f'{label}: correction: {matrix.ravel().tolist()} is singular or almost '
@@ -122,60 +124,60 @@ def _correction(label: str, value: object) -> FloatArray | None:
     return matrix
 
 
-def _orientation_std(label: str, value: object) -> FloatArray | None:
-    """Orientation standard deviation (3,) [rad] from one or three numbers [deg]."""
+def _parse_orientation_std(label: str, value: object) -> FloatArray | None:
+    """Parse the orientation standard deviation (3,) [rad] from one or three numbers [deg]."""
     if value is None:
         return None
     numbers = value if isinstance(value, list) else [value]
-    std = _vector(f'{label}: orientation_std_deg', numbers, (1, 3)) * np.ones(3)
+    std = _parse_vector(f'{label}: orientation_std_deg', numbers, (1, 3)) * np.ones(3)
     if not ((std > 0.0) & (std <= 180.0)).all():
         raise NetworkError(f'{label}: orientation_std_deg must be above 0 and at most 180 degrees, '
                            f'got {std.tolist()}')
     return np.deg2rad(std)
 
 
-def _clock_offset(label: str, value: object) -> float:
-    """Clock offset [s]."""
-    offset = _vector(f'{label}: clock_offset', [value], (1,))[0]
+def _parse_clock_offset(label: str, value: object) -> float:
+    """Parse the clock offset [s]."""
+    offset = _parse_vector(f'{label}: clock_offset', [value], (1,))[0]
     if abs(offset) > _MAX_CLOCK_OFFSET:
         raise NetworkError(f'{label}: clock_offset: {offset} s exceeds {_MAX_CLOCK_OFFSET:g} s; '
                            "set the sensor's clock")
     return float(offset)
 
 
-def _calibrated(label: str, value: Any) -> CalibrationRecord | None:
-    """Calibration record from a mapping."""
+def _parse_calibration(label: str, value: Any) -> CalibrationRecord | None:
+    """Parse the calibration record."""
     if value is None:
         return None
     label = f'{label}: calibrated'
     _check_keys(label, value, {'date', 'by', 'clock_offset_std', 'stated', 'stated_std_deg'})
     for key in ('date', 'by'):
         if not isinstance(value.get(key), str) or not is_text(value[key]):
-            raise NetworkError(f"{label}: {key} must be text ('...'), "
+            raise NetworkError(f"{label}: {key} must be a string ('...'), "
                                f'got {shown(value.get(key))}')
-    std, stated = value.get('clock_offset_std'), value.get('stated')
-    std = float('nan') if std is None else float(_vector(label, [std], (1,))[0])
+    std, orientation = value.get('clock_offset_std'), value.get('stated')
+    std = float('nan') if std is None else float(_parse_vector(label, [std], (1,))[0])
     if std < 0.0:
         raise NetworkError(f'{label}: clock_offset_std: {std} s is negative')
-    if stated is not None:
-        stated = _vector(f'{label}: stated', stated, (4,))
-        _rotation(f'{label}: stated', stated)
-        stated = tuple(stated.tolist())
-    spread = _orientation_std(label, value.get('stated_std_deg'))
-    return CalibrationRecord(value['date'], value['by'], std, stated,
-                      None if spread is None else tuple(spread.tolist()))
+    if orientation is not None:
+        orientation = _parse_vector(f'{label}: stated', orientation, (4,))
+        _parse_rotation(f'{label}: stated', orientation)
+        orientation = tuple(orientation.tolist())
+    stated_std = _parse_orientation_std(label, value.get('stated_std_deg'))
+    return CalibrationRecord(value['date'], value['by'], std, orientation,
+                             None if stated_std is None else tuple(stated_std.tolist()))
 
 
-def _rotation(label: str, q: FloatArray) -> FloatArray:
-    """Rotation matrix (3, 3) from a quaternion."""
+def _parse_rotation(label: str, q: FloatArray) -> FloatArray:
+    """Convert a quaternion to a rotation matrix (3, 3)."""
     try:
         return rotation_from_quaternion(q)
     except ValueError as error:
         raise NetworkError(f'{label}: {error}') from error
 
 
-def _topic(label: str, key: str, topic: object) -> str:
-    """Validated topic name."""
+def _check_topic(label: str, key: str, topic: object) -> str:
+    """Return `topic` if it is a valid topic name; raise NetworkError otherwise."""
     if not isinstance(topic, str) or not NAME.fullmatch(topic):
         raise NetworkError(f'{label}: {key}: {shown(topic)} is not a valid ROS topic: use letters, '
                            'digits and _; no part may begin with a digit')
@@ -200,58 +202,61 @@ def read_network(path: str | PathLike[str]) -> SensorNetwork:
     """
     content = read_yaml(path, NetworkError)
     try:
-        return _network(content)
+        return _parse_network(content)
     except NetworkError as error:
         raise NetworkError(f'{path}: {error}') from error
 
 
-def _network(content: Any) -> SensorNetwork:
-    """Network of the parsed file."""
+def _parse_network(content: Any) -> SensorNetwork:
+    """Create the network from the parsed content of a file."""
     _check_keys('the file', content, _TOP_KEYS)
     sensors = content.get('sensors')
     if not isinstance(sensors, dict) or not sensors:
-        raise NetworkError('sensors: expected at least one sensor')
-    earth = _earth_field(content)
+        raise NetworkError('sensors: expected a mapping with at least one sensor')
+    earth = _parse_earth_field(content)
     frame = content.get('frame', 'map')
     if not isinstance(frame, str) or not _FRAME.fullmatch(frame):
-        raise NetworkError(f'frame: expected a name, got {shown(frame)}')
+        raise NetworkError('frame: expected a name of letters, digits, _ . / and -, got '
+                           f'{shown(frame)}')
     names = tuple(str(name) for name in sensors)
     for name in names:
         if not _NAME.fullmatch(name):
             raise NetworkError(f'{shown(name)} is not a valid sensor name: use letters, digits, '
                                '_ . and -')
-    entries = [_sensor(n, e) for n, e in zip(names, sensors.values(), strict=True)]
+    entries = [_parse_sensor(n, e) for n, e in zip(names, sensors.values(), strict=True)]
     columns: dict[str, Any] = {key: tuple(e[key] for e in entries) for key in entries[0]}
     for key in ('positions', 'R_ws', 'clock_offset'):
         columns[key] = np.array(columns[key])
     return SensorNetwork(names, frame=frame, earth_field=earth, **columns)
 
 
-def _earth_field(content: dict[str, Any]) -> FloatArray | None:
-    """Field of the Earth (3,) [T] as given, or by the World Magnetic Model at the site, else
-    None."""
+def _parse_earth_field(content: dict[str, Any]) -> FloatArray | None:
+    """Field of the Earth (3,) [T] from the file or from the World Magnetic Model at the site.
+
+    None if the file contains neither a field nor a site.
+    """
     earth, site = content.get('earth_field'), content.get('site')
     if earth is not None and site is not None:
         raise NetworkError('earth_field and site both define the field of the Earth: remove one '
                            'of them')
     if earth is not None:
-        earth = _vector('earth_field', earth, (3,))
+        earth = _parse_vector('earth_field', earth, (3,))
         if np.linalg.norm(earth) > 1e-3:
-            raise NetworkError(f'earth_field: {earth.tolist()} T is more than a millitesla; '
-                               'is it in microtesla or gauss?')
+            raise NetworkError(f'earth_field: {earth.tolist()} T exceeds a millitesla; is the '
+                               'value in microtesla or gauss?')
     if site is None:
         return earth
     _check_keys('site', site, _SITE_KEYS)
     missing = [key for key in _SITE_KEYS if key not in site]
     if missing:
         raise NetworkError(f'site: {missing[0]} is missing')
-    day = site['date']
-    if not isinstance(day, datetime.date) or isinstance(day, datetime.datetime):
-        raise NetworkError(f'site: date: expected a date such as 2026-05-01, got {shown(day)}')
-    latitude, longitude, height, azimuth = _vector('site', [
+    date = site['date']
+    if not isinstance(date, datetime.date) or isinstance(date, datetime.datetime):
+        raise NetworkError(f'site: date: expected a date such as 2026-05-01, got {shown(date)}')
+    latitude, longitude, height, azimuth = _parse_vector('site', [
         site[key] for key in ('latitude', 'longitude', 'height', 'x_azimuth_deg')], (4,))
     try:
-        return earth_field(Site(latitude, longitude, height, decimal_year(day), azimuth))
+        return earth_field(Site(latitude, longitude, height, decimal_year(date), azimuth))
     except ValueError as error:
         raise NetworkError(f'site: {error}') from error
     except ModuleNotFoundError as error:
@@ -259,47 +264,48 @@ def _earth_field(content: dict[str, Any]) -> FloatArray | None:
                            'pygeomag, or set earth_field instead') from error
 
 
-def _numbers(values: Iterable[float]) -> str:
-    """Flow list that YAML reads back as floats."""
-    return '[' + ', '.join(_number(v) for v in values) + ']'
+def _yaml_floats(values: Iterable[float]) -> str:
+    """Format floats as a YAML flow sequence."""
+    return '[' + ', '.join(_yaml_float(v) for v in values) + ']'
 
 
-def _number(value: float) -> str:
-    """Float with a decimal point, which YAML 1.1 requires before an exponent."""
+def _yaml_float(value: float) -> str:
+    """Format a float with a decimal point, which YAML 1.1 requires before an exponent."""
     text = repr(float(value))
     return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
 
 
 def _sensor_lines(network: SensorNetwork, i: int) -> list[str]:
-    """Entry of sensor `i` as lines of YAML."""
-    lines = [f'  {_text(network.names[i])}:', f'    position: {_numbers(network.positions[i])}',
-             f'    orientation: {_numbers(quaternion_from_rotation(network.R_ws[i]))}']
+    """Format the entry of sensor `i` as lines of YAML."""
+    lines = [f'  {_yaml_string(network.names[i])}:',
+             f'    position: {_yaml_floats(network.positions[i])}',
+             f'    orientation: {_yaml_floats(quaternion_from_rotation(network.R_ws[i]))}']
     std = network.orientation_std[i]
     if std is not None:
-        lines.append(f'    orientation_std_deg: {_numbers(np.rad2deg(std))}')
+        lines.append(f'    orientation_std_deg: {_yaml_floats(np.rad2deg(std))}')
     if network.clock_offset[i]:
-        lines.append(f'    clock_offset: {_number(network.clock_offset[i])}')
+        lines.append(f'    clock_offset: {_yaml_float(network.clock_offset[i])}')
     for key in ('noise_std', 'background', 'offset', 'correction'):
         value = getattr(network, key)[i]
         if value is not None:
-            lines.append(f'    {key}: {_numbers(np.ravel(value))}')
+            lines.append(f'    {key}: {_yaml_floats(np.ravel(value))}')
     lines.append(f'    topic: {network.topics[i]}')
     lines.append(f'    imu_topic: {network.imu_topics[i] or "null"}')
-    done = network.calibrated[i]
-    if done is not None:
-        lines += ['    calibrated:', f'      date: {json.dumps(done.date)}',
-                  f'      by: {json.dumps(done.by)}']
-        if not np.isnan(done.clock_offset_std):
-            lines.append(f'      clock_offset_std: {_number(done.clock_offset_std)}')
-        if done.stated is not None:
-            lines.append(f'      stated: {_numbers(done.stated)}')
-        if done.stated_std is not None:
-            lines.append(f'      stated_std_deg: {_numbers(np.rad2deg(done.stated_std))}')
+    record = network.calibrated[i]
+    if record is not None:
+        lines += ['    calibrated:', f'      date: {json.dumps(record.date)}',
+                  f'      by: {json.dumps(record.by)}']
+        if not np.isnan(record.clock_offset_std):
+            lines.append(f'      clock_offset_std: {_yaml_float(record.clock_offset_std)}')
+        if record.stated is not None:
+            lines.append(f'      stated: {_yaml_floats(record.stated)}')
+        if record.stated_std is not None:
+            lines.append(f'      stated_std_deg: {_yaml_floats(np.rad2deg(record.stated_std))}')
     return lines
 
 
-def _text(text: str) -> str:
-    """Text as YAML that reads back as the same text, unlike 'no' or '01' without quotes."""
+def _yaml_string(text: str) -> str:
+    """Format a string as YAML, with quotes if it could be parsed as another type (no, 01)."""
     return text if yaml.safe_load(text) == text else json.dumps(text)
 
 
@@ -311,16 +317,17 @@ def write_network(path: str | PathLike[str], network: SensorNetwork, comment: st
     path : path_like
     network : SensorNetwork
     comment : str, optional
-        Lines for the head of the file.
+        Comment at the beginning of the file; may contain several lines.
 
     Raises
     ------
     OutputError
         If the file cannot be written.
     """
-    lines = [f'# {line}' for line in comment.splitlines()] + [f'frame: {_text(network.frame)}']
+    lines = [f'# {line}' for line in comment.splitlines()] \
+        + [f'frame: {_yaml_string(network.frame)}']
     if network.earth_field is not None:
-        lines.append(f'earth_field: {_numbers(network.earth_field)}')
+        lines.append(f'earth_field: {_yaml_floats(network.earth_field)}')
     lines.append('sensors:')
     for i in range(len(network)):
         lines += _sensor_lines(network, i)

@@ -1,7 +1,7 @@
-"""The field of the Earth at a place and time, by the World Magnetic Model.
+"""Magnetic field of the Earth at a place and time, from the World Magnetic Model (WMM).
 
-The model is that of pygeomag, which includes the coefficients of NOAA and the British
-Geological Survey. T10 section 6.3.1 uses its declination.
+The model is evaluated by pygeomag, which contains the coefficients published by NOAA and the
+British Geological Survey. T10 section 6.3.1 uses the declination of the model.
 """
 
 import datetime
@@ -12,14 +12,14 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 
 COEFFICIENTS = 'wmm/WMM_2025.COF'
-"""Coefficient file of WMM2025 within pygeomag."""
+"""Coefficient file of WMM2025, relative to the pygeomag package."""
 FIRST_YEAR, LAST_YEAR = 2025.0, 2030.0
-"""First and last year of WMM2025."""
+"""Period of validity of WMM2025, decimal years."""
 
 
 @dataclass(frozen=True)
 class Site:
-    """Place and time of a network, and the orientation of its frame."""
+    """Place and date of a network, and orientation of its frame."""
 
     latitude: float
     """Geodetic latitude, deg, north positive."""
@@ -30,8 +30,8 @@ class Site:
     year: float
     """Decimal year."""
     x_azimuth: float
-    """Bearing of the frame's x axis, deg, clockwise from true north: 90 for east (ENU), or the
-    bearing of the road along which x points."""
+    """Bearing of the x axis of the frame, deg, clockwise from true north: 90 for ENU, or the
+    bearing of a road that is parallel to x."""
 
 
 def decimal_year(day: datetime.date) -> float:
@@ -50,7 +50,7 @@ def decimal_year(day: datetime.date) -> float:
 
 
 def earth_field(site: Site) -> FloatArray:
-    """Flux density of the Earth at a site.
+    """Magnetic flux density of the Earth at a site.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def earth_field(site: Site) -> FloatArray:
     ModuleNotFoundError
         If pygeomag is not installed.
     """
-    # Required only for networks that define a site instead of a field.
+    # Optional dependency, required only for networks that define a site instead of a field.
     from pygeomag import GeoMag
 
     for name, value, low, high, unit in (
@@ -78,9 +78,9 @@ def earth_field(site: Site) -> FloatArray:
             ('x_azimuth', site.x_azimuth, -360.0, 360.0, 'deg')):
         if not low <= value <= high:
             raise ValueError(f'{name}: {value:g} is outside {low:g} .. {high:g} {unit}')
-    found = GeoMag(coefficients_file=COEFFICIENTS).calculate(
+    field = GeoMag(coefficients_file=COEFFICIENTS).calculate(
         glat=site.latitude, glon=site.longitude, alt=site.height * 1e-3, time=site.year)
-    north, east, down = np.array([found.x, found.y, found.z]) * 1e-9
+    north, east, down = np.array([field.x, field.y, field.z]) * 1e-9
     azimuth = np.deg2rad(site.x_azimuth)
     return np.array([north * np.cos(azimuth) + east * np.sin(azimuth),
                      north * np.sin(azimuth) - east * np.cos(azimuth), -down])

@@ -1,4 +1,4 @@
-"""Topic names in a network file, a ROS graph or a recording."""
+"""Resolution and validation of topic names and namespaces."""
 
 import re
 from collections.abc import Collection, Iterable
@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable
 from mag_tracking.errors import NetworkError
 
 NAME = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
-"""Pattern of a relative or absolute name."""
+"""Pattern of a valid relative or absolute topic name."""
 _NAMESPACE = re.compile(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
@@ -28,23 +28,24 @@ def absolute(topic: str, namespace: str = '/') -> str:
 
 
 def namespaces_of(topics: Iterable[str], recorded: Collection[str]) -> list[str]:
-    """Find the namespaces in which at least one of the relative topics was recorded.
+    """Find the namespaces in which at least one relative topic was recorded.
 
     Parameters
     ----------
     topics : iterable of str
-        Absolute names are ignored.
+        Topic names; absolute names are ignored.
     recorded : collection of str
         Absolute names of the recorded topics.
 
     Returns
     -------
     list of str
-        Sorted. Only the root, '/', if it is one of them.
+        Namespaces in alphabetical order; only the root namespace '/' if it is among them.
     """
-    found = {name.removesuffix(f'/{topic}') or '/' for topic in topics if not topic.startswith('/')
-             for name in recorded if name.endswith(f'/{topic}')}
-    return ['/'] if '/' in found else sorted(found)
+    namespaces = {name.removesuffix(f'/{topic}') or '/'
+                  for topic in topics if not topic.startswith('/')
+                  for name in recorded if name.endswith(f'/{topic}')}
+    return ['/'] if '/' in namespaces else sorted(namespaces)
 
 
 def checked_namespace(namespace: str) -> str:
@@ -62,7 +63,7 @@ def checked_namespace(namespace: str) -> str:
     Raises
     ------
     NetworkError
-        If it is not a valid absolute namespace.
+        If `namespace` is not a valid absolute namespace.
     """
     if not _NAMESPACE.fullmatch(namespace):
         raise NetworkError(f'{namespace!r} is not a valid namespace: it must begin with / and '

@@ -11,8 +11,8 @@ namespace mag_tracking {
 
 constexpr int N_ANDERSON = 4;  // Three functions and a constant.
 
-// A constant and the three Anderson functions at `n` times t [s]: (4, n). `time` [s] is that of
-// the closest point of approach, `scale` [s] the range there over the speed.
+// A constant and the three Anderson functions at `n` times t [s]: (4, n). `time` [s] is the time of
+// the closest point of approach (CPA), `scale` [s] the CPA range over the speed.
 //
 // TSP14 eq. (23), with the exponent 5/2.
 inline std::vector<double> anderson_functions(const double* t, std::size_t n, double time,
@@ -30,9 +30,9 @@ inline std::vector<double> anderson_functions(const double* t, std::size_t n, do
     return f;
 }
 
-// Dot product of `n` elements; those of `b` are `stride` apart.
+// Dot product of `n` elements; `b` has a stride of `stride` elements.
 INLINE double dot(const double* a, const double* b, std::size_t n, std::size_t stride = 1) {
-    // Four independent sums, so that an addition does not wait for the previous one.
+    // Four independent sums, so that an addition does not wait for the previous addition.
     double sums[4] = {};
     std::size_t i = 0;
     for (; i + 4 <= n; i += 4)
@@ -42,7 +42,7 @@ INLINE double dot(const double* a, const double* b, std::size_t n, std::size_t s
 }
 
 // Residual sum of squares of y (n, k) after a fit of the functions to each column. The functions
-// are orthonormalised one after the other (Gram-Schmidt).
+// are orthonormalised by the Gram-Schmidt process.
 inline double anderson_residual(const double* t, const double* y, std::size_t n, std::size_t k,
                                 double time, double scale) {
     std::vector<double> f = anderson_functions(t, n, time, scale);

@@ -1,7 +1,6 @@
 """Field of a dipole on a straight pass, expanded in Anderson functions.
 
-Positions are target minus sensor, as in TSP14; the field of a dipole is an even function of
-position. Each function evaluates one pass.
+Positions are target minus sensor, as in TSP14. The sign does not affect the field of a dipole.
 """
 
 import numpy as np
@@ -24,8 +23,8 @@ def anderson_functions(tau: ArrayLike) -> FloatArray:
     Returns
     -------
     (..., 3) array
-        The function of n = 1 is odd and orthogonal to the other two. The other two are not
-        orthogonal to each other, contrary to TSP14.
+        The function of n = 1 is odd and orthogonal to the other two functions. Contrary to TSP14,
+        the functions of n = 0 and n = 2 are not orthogonal to each other.
 
     Notes
     -----
@@ -78,7 +77,7 @@ def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatA
     direction = v0 / speed
     path = -(r0 @ direction)
     r_cpa = r0 + path * direction
-    # Project twice: the difference still has a component along v0 from the rounding of r0.
+    # Project twice: rounding of r0 leaves a component along v0 in the first difference.
     r_cpa -= (r_cpa @ direction) * direction
     distance = float(np.linalg.norm(r_cpa))
     if distance <= 1e-15 * np.linalg.norm(r0):
@@ -94,7 +93,7 @@ def anderson_coefficients(r_cpa: ArrayLike, v0: ArrayLike, m: ArrayLike) -> Floa
     r_cpa : (3,) array, m
         Position of the target relative to the sensor at the closest point of approach.
     v0 : (3,) array, m/s
-        Velocity of the target; only its direction matters.
+        Velocity of the target. Only its direction has an effect.
     m : (3,) array, A m²
         Dipole moment.
 
@@ -152,8 +151,8 @@ def anderson_field(t: ArrayLike, r0: ArrayLike, v0: ArrayLike, m: ArrayLike) -> 
     Returns
     -------
     (..., 3) array, T
-        Equal to `dipole.dipole_field`. NaN at all times if the path goes through the sensor: the
-        expansion has no scale there.
+        Equal to `dipole.dipole_field`. NaN at all times if the path passes through the sensor,
+        because the expansion is then not defined.
 
     Raises
     ------
@@ -189,7 +188,7 @@ def anderson_residual(t: FloatArray, y: FloatArray, time: float, scale: float) -
     Returns
     -------
     float
-        Each column of `y` is fitted separately.
+        Sum over the columns of `y`, which are fitted separately.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""Compiled physics; the Python function of the same name documents each function.
+"""Compiled physics. Each function is documented by the Python function of the same name.
 
 Arrays must be C-contiguous. ValueError is raised if their shapes do not match.
 """

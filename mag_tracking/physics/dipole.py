@@ -1,4 +1,4 @@
-"""The magnetic dipole: flux density and derivatives."""
+"""Flux density of magnetic dipoles, and its derivatives."""
 
 import math
 
@@ -38,14 +38,15 @@ def sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: Flo
     Returns
     -------
     h : (n_hyp, n_sensors, 3) array, T, sensor frame
-        Field, summed over the dipoles.
+        Sum of the fields of the dipoles.
     H : (n_hyp, n_sensors, 3, n_t) array
         Derivative of `h` by the target state.
     gradient : (n_hyp, n_sensors) array, T/m
-        Sum of mu0/(4 pi) ‖m‖ / ‖d‖^4 over the dipoles, d the vector from dipole to sensor. It is
-        the magnitude of the first neglected multipole term per metre of body that a dipole
-        represents. Magnitudes are added, not squares, because the errors of adjacent dipoles of one
-        body are alike. All outputs are NaN or infinite if a dipole is at a sensor.
+        Sum of mu0/(4 pi) ‖m‖ / ‖d‖^4 over the dipoles, where d is the vector from dipole to sensor.
+        Each term is the magnitude of the first neglected multipole term, per metre of the body that
+        is represented by the dipole. Magnitudes are added instead of squares, because the errors of
+        adjacent dipoles of a body are correlated. All outputs are NaN or infinite if a dipole is at
+        the position of a sensor.
 
     References
     ----------
@@ -55,10 +56,10 @@ def sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: Flo
 
 
 def _broadcast_pair(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Broadcast `r` and `m` to one shape (..., 3), contiguous."""
+    """Broadcast `r` and `m` to contiguous arrays of a common shape (..., 3)."""
     r, m = np.broadcast_arrays(np.asarray(r, dtype=float), np.asarray(m, dtype=float))
     if r.shape[-1:] != (3,):
-        raise ValueError(f'r and m need a last axis of length 3, got {r.shape}')
+        raise ValueError(f'r and m require a last axis of length 3, got shape {r.shape}')
     return np.ascontiguousarray(r), np.ascontiguousarray(m)
 
 

@@ -1,4 +1,4 @@
-"""Induced moment of a vehicle, modelled as a permeable ellipsoid of revolution."""
+"""Induced moment of a vehicle that is modelled as a permeable ellipsoid of revolution."""
 
 import math
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
     L1 : (...) array
         Factor along the axis of revolution: sphere 1/3, needle 0, disk 1.
     L2 : (...) array
-        Factor across it, (1 - L1)/2: sphere 1/3, needle 1/2, disk 0.
+        Factor across the axis, (1 - L1)/2: sphere 1/3, needle 1/2, disk 0.
 
     Raises
     ------
@@ -34,11 +34,11 @@ def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
 
     Notes
     -----
-    The factors are evaluated as the integral from which the closed form is derived, a b c/2 times
-    the integral of ds/((s + a^2) sqrt(...)), which is Carlson's R_D. It holds for oblate ellipsoids
-    as well and loses no digits near the sphere, where the closed form is 0/0. The closed form
-    printed in the paper needs a correction: t2 = m - (t1 + 1)/m; the printed t2 = m - t1 - 1 gives
-    L1 + 2 L2 = 0.49 at m = 2.
+    The closed form is 0/0 for a sphere. Instead, the underlying integral, a b c/2 times the
+    integral of ds/((s + a^2) sqrt(...)), is evaluated as Carlson's R_D. The integral is also valid
+    for oblate ellipsoids and is accurate near the sphere. The closed form in MITRE12 contains an
+    error: t2 must be m - (t1 + 1)/m. With the printed t2 = m - t1 - 1, the sum L1 + 2 L2 is 0.49 at
+    m = 2 instead of 1.
 
     References
     ----------
@@ -81,10 +81,9 @@ def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, headi
 
     Notes
     -----
-    The factor printed as 2.5 B0/pi is B0/mu0, to which it is numerically equal for B0 in
-    microtesla. MITRE12 states the moment in the axes of the vehicle and measures its course
-    clockwise from north. MITRE12 eq. (A.6) counts the vertical field downwards although the third
-    axis points up.
+    The factor B0/mu0 is printed as 2.5 B0/pi in MITRE12, which is equal for B0 in microtesla. In
+    MITRE12, the moment is in the vehicle frame, and the course is clockwise from north. In MITRE12
+    eq. (A.6), the vertical field is positive downwards although the third axis points up.
 
     References
     ----------
@@ -97,7 +96,8 @@ def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, headi
         raise ValueError(f'mu_r must be at least 1 and finite, got {mu_r}')
     earth_field, heading = np.asarray(earth_field, dtype=float), np.asarray(heading, dtype=float)
     if earth_field.shape[-1:] != (3,):
-        raise ValueError(f'earth_field needs a last axis of length 3, got {earth_field.shape}')
+        raise ValueError('earth_field requires a last axis of length 3, got shape '
+                         f'{earth_field.shape}')
     volume = 4.0 / 3.0 * math.pi * a * b * b
     kappa = mu_r - 1.0
     p1, p2 = (volume * kappa / (1.0 + kappa * L) for L in demagnetisation_factors(a / b))

@@ -1,4 +1,4 @@
-// Motion models; motion.py has the references.
+// Motion models; motion.py cites the references.
 
 #pragma once
 
@@ -27,8 +27,7 @@ INLINE void integrator_noise(double* Q, int wide, int level, int rate, double de
 // section 11.7.
 INLINE void turn(const double* x, int w, double dt, double mean, double fading, Motion& out) {
     const double half = 0.5 * dt * mean * x[w];
-    // The chord of the arc deviates from the velocity by half the angle and is slightly shorter
-    // than the arc.
+    // The angle between chord and velocity is half the turn angle. The chord is shorter than the arc.
     const double c = std::cos(half), s = std::sin(half);
     double chord = 1.0 - half * half / 6.0, slope = -half / 3.0;
     if (std::abs(half) > SMALL_ANGLE) chord = s / half, slope = (c - chord) / half;

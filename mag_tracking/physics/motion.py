@@ -1,8 +1,8 @@
 """Motion models in exact discretisation: constant velocity and coordinated turn.
 
-Process noise is exact as well: continuous white noise drives the highest derivative. T10 eq. (4.2)
-and ICASSP11 eq. (2) hold the noise constant over a sample instead, and PHD15 Paper A eq. (18) is
-misprinted.
+The process noise is the exact discretisation of continuous white noise in the highest derivative.
+T10 eq. (4.2) and ICASSP11 eq. (2) instead assume noise that is constant over a sample. PHD15 Paper
+A eq. (18) is misprinted.
 """
 
 import numpy as np
@@ -26,8 +26,8 @@ def integrator_noise(dt: float, density: ArrayLike) -> FloatArray:
     Returns
     -------
     (6, 6) array
-        Per axis, density * [[dt^3/3, dt^2/2], [dt^2/2, dt]]. The first three rows belong to the
-        integral, the last three to its rate.
+        For each axis, density * [[dt^3/3, dt^2/2], [dt^2/2, dt]]. The first three rows are for the
+        integrals, the last three rows for their rates.
 
     References
     ----------
@@ -57,13 +57,13 @@ def constant_velocity(dt: float) -> FloatArray:
 
 
 def coordinated_turn(x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Propagate states along an arc: the horizontal velocity rotates at a constant rate.
+    """Propagate states along an arc with a constant turn rate.
 
     Parameters
     ----------
     x : (n, n_x) array
-        States. The first six are position [m] and velocity [m/s], the last is the turn rate
-        [rad/s], anticlockwise seen from above.
+        States: the first six are position [m] and velocity [m/s], the last is the turn rate
+        [rad/s], anticlockwise as seen from above.
     dt : float, s
 
     Returns

@@ -31,7 +31,7 @@ INLINE void rotated_field(const double* h, const double* H, const double* angles
         for (int k = 0; k < 3; ++k) out_H[i * n + n_t + k] = by_angles[i][k];
 }
 
-// The same for `n` sensors.
+// Rotates the fields and derivatives of `n` sensors, as `rotated_field`.
 FOR_PROCESSORS static void rotated_fields(const double* h, const double* H, const double* angles,
                                          std::size_t n, std::size_t n_t, double* out_h,
                                          double* out_H) {

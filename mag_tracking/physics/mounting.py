@@ -1,4 +1,4 @@
-"""Sensors with small mounting errors: orientations that differ from the network file."""
+"""Fields measured by sensors with small orientation errors."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from mag_tracking.physics import core
 
 def rotated_fields(h: FloatArray, H: FloatArray, angles: FloatArray
                   ) -> tuple[FloatArray, FloatArray]:
-    """Fields measured by sensors with small mounting errors, with derivatives.
+    """Fields measured by sensors with small mounting errors, and their derivatives.
 
     Parameters
     ----------
@@ -17,8 +17,8 @@ def rotated_fields(h: FloatArray, H: FloatArray, angles: FloatArray
     H : (n_hyp, n_sensors, 3, n_t) array
         Derivative of `h` by the target state.
     angles : (n_hyp, n_sensors, 3) array, rad, sensor frame
-        Vector a in B_actual = B_nominal + a x B_nominal. A sensor mounted with a rotation of +b
-        about one of its axes measures a field that is rotated by -b: a = -b.
+        Vector a in B_actual = B_nominal + a x B_nominal. If a sensor is rotated by +b about one of
+        its axes, the measured field is rotated by a = -b.
 
     Returns
     -------
@@ -29,11 +29,11 @@ def rotated_fields(h: FloatArray, H: FloatArray, angles: FloatArray
 
     Notes
     -----
-    First order in the angle: the field magnitude is too large by up to 1.5 % at 10 degrees and
+    First-order approximation: the field magnitude is too large by up to 1.5 % at 10 degrees and
     3.4 % at 15 degrees.
 
     References
     ----------
-    [T10]_ section 6.3, for the need of mounting errors.
+    [T10]_ section 6.3 describes the effect of mounting errors.
     """
     return core.rotated_fields(*(np.ascontiguousarray(a, dtype=float) for a in (h, H, angles)))

@@ -1,6 +1,6 @@
 // Magnetic multipoles of orders 1 to 3; multipole.py defines the moments.
 //
-// Every derivative follows from grad P and grad grad P of the polynomial P of one order. Both are
+// All derivatives follow from grad P and grad grad P of the polynomial P of one order. Both are
 // contractions of the moment tensor with d, and P = d.grad(P) / order.
 
 #pragma once
@@ -48,7 +48,7 @@ struct Multipole {
         }
     }
 
-    // As above, for grad P = `scale` H d.
+    // Adds one order with grad P = `scale` H d.
     INLINE void add_order(int order, double s, double scale, const double (&H)[6]) const {
         add_order(order, s, {scale * (H[0] * d[0] + H[1] * d[1] + H[2] * d[2]),
                              scale * (H[1] * d[0] + H[3] * d[1] + H[4] * d[2]),
@@ -99,7 +99,7 @@ INLINE void multipole(const double* d, const double* m, int k, double* B, double
     if (k > 8) at.add_octupole(m + 8, s * inv2 * inv2);
 }
 
-// The same for `n` sources.
+// Evaluates `n` sources, as `multipole`.
 FOR_PROCESSORS static void set_multipoles(const double* d, const double* m, std::size_t n, int k,
                                           double* B, double* dB_dd, double* dB_dm) {
     for (std::size_t i = 0; i < n; ++i)

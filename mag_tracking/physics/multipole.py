@@ -1,14 +1,14 @@
 """Magnetic multipoles of orders 1 to 3 about one point: dipole, quadrupole and octupole.
 
-The moment of order l is a symmetric traceless tensor with 2l + 1 independent components. They are
-stored as Cartesian components in alphabetical order, without the components that contain z more
-than once, which follow from the trace::
+The moment of order l is a symmetric traceless tensor with 2l + 1 independent components. The stored
+components are Cartesian, in alphabetical order. Components with more than one z follow from the
+trace and are not stored::
 
     0..2   x y z                             [A m^2]  dipole
     3..7   xx xy xz yy yz                    [A m^3]  zz = -xx - yy
     8..14  xxx xxy xxz xyy xyz yyy yyz       [A m^4]  izz = -ixx - iyy
 
-A vector of 3, 8 or 15 moments holds the orders up to 1, 2 or 3. The scale is that of T10 eq.
+A vector of 3, 8 or 15 moments contains the orders up to 1, 2 or 3, scaled as in T10 eq.
 (3.39)-(3.40). With d from the source to the sensor, the field of one order is::
 
     B = -mu0/(4 pi) grad(P / |d|^(2l+1)),  P = (1/l!) m_ij.. d_i d_j ..
@@ -25,13 +25,15 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.physics import core
 
 
-def _evaluate(r: ArrayLike, moments: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Field and both Jacobians, in the broadcast shape of the arguments."""
+def _field_and_jacobians(r: ArrayLike,
+                         moments: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Field and Jacobians by position and moments, after broadcasting of the arguments."""
     r, moments = np.asarray(r, dtype=float), np.asarray(moments, dtype=float)
     if r.shape[-1:] != (3,):
-        raise ValueError(f'r needs a last axis of length 3, got {r.shape}')
+        raise ValueError(f'r requires a last axis of length 3, got shape {r.shape}')
     if moments.shape[-1:] not in ((3,), (8,), (15,)):
-        raise ValueError(f'moments need a last axis of length 3, 8 or 15, got {moments.shape}')
+        raise ValueError('moments require a last axis of length 3, 8 or 15, '
+                         f'got shape {moments.shape}')
     k = moments.shape[-1]
     shape = np.broadcast_shapes(r.shape[:-1], moments.shape[:-1])
     return core.multipoles(np.ascontiguousarray(np.broadcast_to(r, shape + (3,))),
@@ -57,18 +59,19 @@ def multipole_field(r: ArrayLike, moments: ArrayLike) -> FloatArray:
     Raises
     ------
     ValueError
-        If the last axis of `r` is not of length 3 or that of `moments` is not of length 3, 8 or 15.
+        If the last axis of `r` does not have length 3, or the last axis of `moments` does not have
+        length 3, 8 or 15.
 
     Notes
     -----
-    T10 eq. (4.17) defines r from the sensor to the source; moments of even order have the opposite
-    sign there.
+    In T10 eq. (4.17), r points from the sensor to the source, so moments of even order have the
+    opposite sign.
 
     References
     ----------
     [T10]_ eq. (3.39)-(3.41).
     """
-    return _evaluate(r, moments)[0]
+    return _field_and_jacobians(r, moments)[0]
 
 
 def multipole_jacobians(r: ArrayLike, moments: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -91,13 +94,14 @@ def multipole_jacobians(r: ArrayLike, moments: ArrayLike) -> tuple[FloatArray, F
     Raises
     ------
     ValueError
-        If the last axis of `r` is not of length 3 or that of `moments` is not of length 3, 8 or 15.
+        If the last axis of `r` does not have length 3, or the last axis of `moments` does not have
+        length 3, 8 or 15.
 
     References
     ----------
     [T10]_ eq. (3.39)-(3.41), differentiated.
     """
-    return _evaluate(r, moments)[1:]
+    return _field_and_jacobians(r, moments)[1:]
 
 
 def multipole_moments(points: ArrayLike, dipoles: ArrayLike, order: int) -> FloatArray:
@@ -126,7 +130,7 @@ def multipole_moments(points: ArrayLike, dipoles: ArrayLike, order: int) -> Floa
 
     Notes
     -----
-    Taylor series of the potentials of the dipoles, in the scale of T10: the component of order l is
+    Taylor series of the potentials of the dipoles, scaled as in T10. The moment of order l is
     l (2l-1)!! times the symmetric traceless part of m x x .., with l - 1 factors x.
 
     References
@@ -143,16 +147,16 @@ def multipole_moments(points: ArrayLike, dipoles: ArrayLike, order: int) -> Floa
     moments = [m[..., i] for i in range(3)]
     if order > 1:
         moments += [3 * (m[..., i] * x[..., j] + x[..., i] * m[..., j]) - 2 * along * delta[i, j]
-                    for i, j in _independent(2)]
+                    for i, j in _stored_components(2)]
     if order > 2:
         u = 6 * along[..., None] * x + 3 * np.sum(x * x, axis=-1, keepdims=True) * m
         moments += [sum(15 * m[..., a] * x[..., b] * x[..., c] - delta[b, c] * u[..., a]
                         for a, b, c in ((i, j, k), (j, k, i), (k, i, j)))
-                    for i, j, k in _independent(3)]
+                    for i, j, k in _stored_components(3)]
     total: FloatArray = np.sum(np.stack(moments, axis=-1), axis=-2)
     return total
 
 
-def _independent(order: int) -> list[tuple[int, ...]]:
-    """Sorted indices of the stored components: those that contain z at most once."""
+def _stored_components(order: int) -> list[tuple[int, ...]]:
+    """Sorted axis indices of the stored components, which contain z at most once."""
     return [c for c in combinations_with_replacement(range(3), order) if c.count(2) < 2]

@@ -1,6 +1,6 @@
-"""Field of a straight pass as an expansion: multipoles about one point, or Anderson functions.
+"""Expansions of the field of a straight pass: multipoles about one point, or Anderson functions.
 
-The interface is that of `passes.RowPass`: linear in most of the parameters.
+The classes have the interface of `passes.RowPass` and are linear in most of their parameters.
 """
 
 from dataclasses import dataclass
@@ -12,17 +12,16 @@ from mag_tracking.physics.anderson import anderson_functions
 from mag_tracking.physics.multipole import multipole_jacobians
 
 _N_MOMENTS = {1: 3, 2: 8, 3: 15}
-"""Number of moments up to each order."""
+"""{highest order: number of moments}"""
 
 
 @dataclass(frozen=True)
 class MultipolePass:
-    """Multipoles up to an order about one point, on a straight path at constant velocity.
+    """Multipole expansion about a point that moves on a straight path at constant velocity.
 
     Path parameters (6): position r0 at time zero [m], velocity v0 [m/s]. Linear parameters (3, 8 or
-    15): the moments of `multipole.multipole_field`, world frame. Where a row has a length, this
-    model has more moments. It describes a body of any shape, but is valid only outside the sphere
-    that encloses the body.
+    15): the moments of `multipole.multipole_field`, world frame. The model describes bodies of any
+    shape, but is valid only outside the sphere that encloses the body.
 
     References
     ----------
@@ -86,12 +85,12 @@ class MultipolePass:
 
 @dataclass(frozen=True)
 class AndersonPass:
-    """A dipole that passes one sensor on a straight path, in Anderson functions.
+    """Field of a dipole that passes one sensor on a straight path, in Anderson functions.
 
     Path parameters (2): time of the closest point of approach (CPA) [s], speed over range at the
     CPA [1/s]. Linear parameters (9): coefficients of the three functions on each axis of the sensor
-    [T], axis by axis. A dipole has only six independent coefficients; fitting all nine freely makes
-    the search easier.
+    [T], axis by axis. A dipole has only six independent coefficients, but a search with nine free
+    coefficients is easier.
 
     References
     ----------
@@ -106,8 +105,8 @@ class AndersonPass:
     names = ('t_cpa', 'rate')
     """Names of the path parameters."""
 
-    def _spread(self, f: FloatArray) -> FloatArray:
-        """Design matrix (n_paths, 3 n, 9) of functions of time (n_paths, n, 3)."""
+    def _design_matrix(self, f: FloatArray) -> FloatArray:
+        """Whitened design matrix (n_paths, 3 n, 9) from functions of time (n_paths, n, 3)."""
         columns: FloatArray = np.einsum('nab,pnf->pnabf', self.W, f)
         return columns.reshape(len(f), 3 * len(self.t), 9)
 
@@ -123,7 +122,7 @@ class AndersonPass:
         -------
         (n_paths, 3 n, 9) array
         """
-        return self._spread(anderson_functions(theta[:, 1:] * (self.t - theta[:, :1])))
+        return self._design_matrix(anderson_functions(theta[:, 1:] * (self.t - theta[:, :1])))
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """Derivative of the whitened field by the path parameters.
@@ -145,6 +144,6 @@ class AndersonPass:
         # f_n = tau^n (tau^2 + 1)^(-5/2), so f_n' = n f_{n-1} - 5 tau/(tau^2 + 1) f_n.
         decay = 5.0 * tau / (tau * tau + 1.0)
         slope = np.stack([-decay * f0, f0 - decay * f1, 2.0 * f1 - decay * f2], axis=-1)
-        by_tau = np.einsum('pyk,pk->py', self._spread(slope), p)
+        by_tau = np.einsum('pyk,pk->py', self._design_matrix(slope), p)
         by_time = np.repeat(self.t - theta[:, :1], 3, axis=1)
         return np.stack([-theta[:, 1:] * by_tau, by_time * by_tau], axis=-1)

@@ -1,7 +1,7 @@
-"""Field of a whole pass at constant velocity, for rows of dipoles on straight paths.
+"""Field of rows of dipoles on straight passes at constant velocity.
 
-The moments enter linearly, the path does not: a model returns the design matrix of the moments and
-the derivatives by the path. `inference.least_squares` fits such models.
+The field is linear in the moments, but not in the path. A model returns the design matrix of the
+moments and the derivatives by the path. `inference.least_squares` fits such models.
 """
 
 from collections.abc import Sequence
@@ -23,8 +23,8 @@ class RowPass:
     (3 n_dipoles): coefficients of orthogonal combinations of the moments [A m², world frame]. The
     dipoles are ordered from tail to head.
 
-    The row is parallel to v0, as in TSP14; that of `vehicles.RowVehicle` stays horizontal. If v0 is
-    zero, a row of two or more dipoles has no direction and the field is NaN.
+    The row is parallel to v0, as in TSP14, whereas the row of `vehicles.RowVehicle` is horizontal.
+    If v0 is zero, a row of two or more dipoles has no direction, and the field is NaN.
 
     References
     ----------
@@ -52,7 +52,7 @@ class RowPass:
 
     @cached_property
     def combinations(self) -> FloatArray:
-        """Orthogonal matrix, (3 d, 3 d): moments of the row = combinations @ linear parameters."""
+        """Orthogonal matrix, (3 d, 3 d), that converts linear parameters to moments of the row."""
         powers = np.vander(self._places, increasing=True)
         return np.kron(np.linalg.qr(powers)[0], np.eye(3))
 
@@ -63,9 +63,9 @@ class RowPass:
         return np.linspace(-0.5, 0.5, d, dtype=np.float64) if d > 1 else np.zeros(1)
 
     def forward(self, theta: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same row with a positive length.
+        """Convert to the equivalent parameters with a positive length.
 
-        A row of negative length is the same row listed from its other end.
+        A row of negative length equals a row of positive length with the opposite order of dipoles.
 
         Parameters
         ----------
@@ -77,9 +77,9 @@ class RowPass:
         Returns
         -------
         theta : (6 or 7,) array
-            Path parameters; the length is not negative.
+            Path parameters with a non-negative length.
         p : (3 n_dipoles,) array
-            Linear parameters with the dipoles in reversed order if the length was negative.
+            Linear parameters; the dipoles are in reversed order if the length was negative.
         """
         if self.n_dipoles == 1 or theta[6] >= 0.0:
             return theta, p
@@ -125,9 +125,9 @@ class RowPass:
 
 @dataclass(frozen=True)
 class SuperposedPasses:
-    """Several rows at the same time; their fields add up.
+    """Simultaneous passes of several rows, whose fields are added.
 
-    Path and linear parameters are those of the rows, concatenated.
+    The path and linear parameters of the rows are concatenated.
     """
 
     rows: tuple[RowPass, ...]
@@ -158,12 +158,12 @@ class SuperposedPasses:
     @cached_property
     def paths(self) -> tuple[slice, ...]:
         """Slice of the path parameters of each row."""
-        return _consecutive([len(row.names) for row in self.rows])
+        return _consecutive_slices([len(row.names) for row in self.rows])
 
     @cached_property
     def moments(self) -> tuple[slice, ...]:
         """Slice of the linear parameters of each row."""
-        return _consecutive([3 * row.n_dipoles for row in self.rows])
+        return _consecutive_slices([3 * row.n_dipoles for row in self.rows])
 
     def split(self, theta: FloatArray) -> list[FloatArray]:
         """Split path parameters by row.
@@ -181,7 +181,7 @@ class SuperposedPasses:
         return [theta[own] for own in self.paths]
 
     def forward(self, theta: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same rows with positive lengths.
+        """Convert to the equivalent parameters with positive lengths.
 
         Parameters
         ----------
@@ -193,15 +193,15 @@ class SuperposedPasses:
         Returns
         -------
         theta : (n_theta,) array
-            Path parameters; no length is negative.
+            Path parameters without negative lengths.
         p : (k,) array
             Linear parameters.
         """
-        turned = [row.forward(path, p[linear])
+        converted = [row.forward(path, p[linear])
                   for row, path, linear in zip(self.rows, self.split(theta), self.moments,
                                                strict=True)]
-        return (np.concatenate([path for path, _ in turned]),
-                np.concatenate([moments for _, moments in turned]))
+        return (np.concatenate([path for path, _ in converted]),
+                np.concatenate([moments for _, moments in converted]))
 
     def basis(self, theta: FloatArray) -> FloatArray:
         """Whitened fields of unit linear parameters.
@@ -239,7 +239,7 @@ class SuperposedPasses:
             for row, own, linear in zip(self.rows, self.paths, self.moments, strict=True)], axis=2)
 
 
-def _consecutive(sizes: Sequence[int]) -> tuple[slice, ...]:
-    """Adjacent slices of the given sizes."""
-    ends = np.cumsum(sizes).tolist()
-    return tuple(slice(end - size, end) for end, size in zip(ends, sizes, strict=True))
+def _consecutive_slices(lengths: Sequence[int]) -> tuple[slice, ...]:
+    """Consecutive slices of the given lengths."""
+    ends = np.cumsum(lengths).tolist()
+    return tuple(slice(end - length, end) for end, length in zip(ends, lengths, strict=True))

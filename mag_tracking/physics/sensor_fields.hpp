@@ -45,8 +45,8 @@ INLINE double sensor_field(const Cloud& cloud, const double* position, const dou
     return gradient;
 }
 
-// The same for `n` hypotheses, stored consecutively from `cloud` on, and `n_sensors` sensors:
-// h (n, n_sensors, 3), H (n, n_sensors, 3, n_t), gradient (n, n_sensors).
+// Evaluates `n` hypotheses at `n_sensors` sensors: h (n, n_sensors, 3), H (n, n_sensors, 3, n_t),
+// gradient (n, n_sensors). The hypotheses are stored consecutively, beginning with `cloud`.
 FOR_PROCESSORS static void set_sensor_fields(Cloud cloud, std::size_t n, const double* positions,
                                              const double* R_sw, std::size_t n_sensors, double* h,
                                              double* H, double* gradient) {

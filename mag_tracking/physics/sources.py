@@ -1,8 +1,8 @@
-"""Source models: meaning of a target state, its motion and its dipoles.
+"""Source models of targets: states, motion and dipoles.
 
-A source model maps a batch of target states to dipoles with derivatives; `dipole.sensor_fields`
-computes the field at the sensors from the dipoles alone. A new target therefore needs one new
-class, here or (for vehicles) in `vehicles.py`.
+A source model maps a batch of target states to dipoles and their derivatives.
+`dipole.sensor_fields` computes the field at the sensors from the dipoles alone. A new type of
+target therefore requires only one new class, here or (for vehicles) in `vehicles.py`.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from mag_tracking.physics.motion import constant_velocity, integrator_noise
 
 
 class Dipoles(NamedTuple):
-    """Dipoles of every hypothesis, with derivatives by the target state."""
+    """Dipoles of each hypothesis, and their derivatives by the target state."""
 
     r: FloatArray
     """Positions, (n_hyp, n_dipoles, 3) m, world frame."""
@@ -34,14 +34,14 @@ class Dipoles(NamedTuple):
 
 
 class SourceModel(Protocol):
-    """Interface of a target model. Every state begins with position and velocity."""
+    """Interface of a source model. The first six states are position and velocity."""
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Names of the states, in order."""
+        """Names of the states in their order."""
 
     def dipoles(self, x: FloatArray) -> Dipoles:
-        """Dipoles of target states.
+        """Compute the dipoles of target states.
 
         Parameters
         ----------
@@ -65,7 +65,7 @@ class SourceModel(Protocol):
             Prediction interval; negative to propagate backwards.
         P : (n_hyp, n_t, n_t) array, optional
             Covariances of `x`. If given, `Q` includes the second-order terms that the Jacobian
-            omits, and a state of zero variance may be treated as constant.
+            neglects, and a state of zero variance may be treated as constant.
 
         Returns
         -------
@@ -80,10 +80,10 @@ class SourceModel(Protocol):
 
 @dataclass(frozen=True)
 class Magnet:
-    """A small magnet: one dipole that moves and rotates, with five degrees of freedom.
+    """Source model of a small magnet: one dipole that moves and rotates.
 
     State (12): position r [m], velocity v [m/s], moment m [A m²], angular velocity w [rad/s], all
-    in the world frame. The moment rotates with w; the roll about m is not observable.
+    in the world frame. The moment rotates with w. The roll about m is not observable.
 
     References
     ----------
@@ -96,10 +96,10 @@ class Magnet:
     """Power spectral density of the angular acceleration, rad²/s³."""
 
     state_names = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz', 'wx', 'wy', 'wz')
-    """Names of the states, in order."""
+    """Names of the states in their order."""
 
     def dipoles(self, x: FloatArray) -> Dipoles:
-        """Dipoles of target states: one dipole per hypothesis.
+        """Compute the dipole of each target state.
 
         Parameters
         ----------
@@ -136,21 +136,21 @@ class Magnet:
         F : (n_hyp, 12, 12) array
             Jacobian of the prediction.
         Q : (n_hyp, 12, 12) array
-            Noise of the double integrator, mapped to the moment by w -> w x m. With `P`, plus the
-            second-order noise of the rotation.
+            Process noise of a double integrator, whose rotational part is mapped to the moment by
+            w -> w x m. With `P`, the second-order noise of the rotation is added.
 
         Notes
         -----
-        The moment is rotated by the full angle w dt. PHD15 Paper A eq. (24) uses the first order, m
-        + dt (w x m), which lengthens the moment by half the squared angle in every step. A filter
-        with a known moment magnitude would compensate by moving the magnet away.
+        The moment is rotated by the full angle w dt. The first-order rotation m + dt (w x m) of
+        PHD15 Paper A eq. (24) lengthens the moment by half the squared angle in each step. In a
+        filter with a known moment magnitude, this leads to an overestimated distance.
         """
         n, angle = len(x), dt * x[:, 9:12]
         R = rotation_from_quaternion(quaternion_from_rotation_vector(angle))
-        moved = x.copy()
-        moved[:, :3] += dt * x[:, 3:6]
-        moved[:, 6:9] = np.einsum('nij,nj->ni', R, x[:, 6:9])
-        C = -cross_matrix(moved[:, 6:9])
+        predicted = x.copy()
+        predicted[:, :3] += dt * x[:, 3:6]
+        predicted[:, 6:9] = np.einsum('nij,nj->ni', R, x[:, 6:9])
+        C = -cross_matrix(predicted[:, 6:9])
         F = np.tile(np.eye(12), (n, 1, 1))
         F[:, :6, :6] = constant_velocity(dt)
         F[:, 6:9, 6:9] = R
@@ -163,36 +163,36 @@ class Magnet:
         Q[:, 6:, 6:] = (G @ integrator_noise(dt, np.full(3, self.angular_density))
                         @ np.swapaxes(G, 1, 2))
         if P is not None:
-            # The uncertainty of the moment itself is rotated exactly; only the increase by the
-            # uncertain rotation counts.
+            # The uncertainty of the moment is rotated exactly. Only the increase due to the
+            # uncertain rotation is added.
             before = R @ P[:, 6:9, 6:9] @ np.swapaxes(R, 1, 2)
             after = F[:, 6:9] @ P @ np.swapaxes(F[:, 6:9], 1, 2) + Q[:, 6:9, 6:9]
-            Q[:, 6:9, 6:9] += _second_order_noise(moved[:, 6:9], before, after)
-        return moved, F, Q
+            Q[:, 6:9, 6:9] += _second_order_noise(predicted[:, 6:9], before, after)
+        return predicted, F, Q
 
 
 def _second_order_noise(m: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Second moment (n, 3, 3), along m, of the shortening of m by a rotation of uncertain angle.
+    """Second moment (n, 3, 3) of the shortening of m along m by a rotation of uncertain angle.
 
-    A moment `m` (n, 3) rotated by small angles (a, b) about axes perpendicular to it ends (a^2 +
-    b^2)/2 |m| short of the plane in which the Jacobian moves it. With the variances p, q of a, b,
-    the second moment of that is (3 p^2 + 3 q^2 + 2 p q)/4 |m|^2. Only the increase from the
-    covariance `before` (n, 3, 3) to the covariance `after` (n, 3, 3) of the rotated moment is
-    counted, limited to |m|^2.
+    A rotation by small angles (a, b) about axes perpendicular to `m` (n, 3) shortens the component
+    along m by (a^2 + b^2)/2 |m|, which the Jacobian neglects. With the variances p, q of a, b, the
+    second moment of the shortening is (3 p^2 + 3 q^2 + 2 p q)/4 |m|^2. The result is its increase
+    from the covariance `before` (n, 3, 3) to the covariance `after` (n, 3, 3) of the rotated
+    moment, at most |m|^2.
     """
     size2 = np.einsum('ni,ni->n', m, m)
     along = np.einsum('ni,nj->nij', m, m)
-    # A zero moment cannot be rotated: `along` is zero, and so is the result.
+    # The result for a zero moment is zero because `along` is zero.
     size2 = np.where(size2 > 0.0, size2, 1.0)
     across = np.eye(3) - along / size2[:, None, None]
 
     def second_moment(P: FloatArray) -> FloatArray:
         S = across @ P @ across / size2[:, None, None]
-        # Only the sum of the two variances and the sum of their squares are needed.
+        # The sum of the two variances and the sum of their squares are sufficient.
         moment: FloatArray = 0.25 * (2.0 * np.einsum('nij,nji->n', S, S)
                                      + np.trace(S, axis1=1, axis2=2) ** 2)
         return moment
 
-    more = np.clip(second_moment(after) - second_moment(before), 0.0, 1.0)
-    taken: FloatArray = more[:, None, None] * along
-    return taken
+    increase = np.clip(second_moment(after) - second_moment(before), 0.0, 1.0)
+    noise: FloatArray = increase[:, None, None] * along
+    return noise

@@ -29,7 +29,7 @@ constexpr double WEIGHTS[N_NODES] = {
 // Centre of the row at one time.
 struct Middle {
     double position[3], heading;  // [m], [rad]
-    double time;                  // [s] of the reference clock; stamps of a clock ahead are late.
+    double time;                  // [s], reference clock. A clock that is ahead stamps too late.
 
     // `clock` is the clock of the sample; -1: reference clock.
     INLINE Middle(const double* theta, double t, long clock) {

@@ -1,8 +1,8 @@
-"""Field of a pass with constant acceleration and a changing turn rate, with sensor clock offsets.
+"""Field of a pass with constant acceleration and turn acceleration, and with clock offsets.
 
-Unlike in `passes.RowPass` the vehicle may accelerate and turn, and the row of dipoles rotates with
-it. The moments enter linearly; the path and the clock offsets do not. `inference.least_squares`
-fits such models.
+Unlike in `passes.RowPass`, the vehicle may accelerate and turn. The row of dipoles rotates with the
+vehicle. The field is linear in the moments, but not in the path and the clock offsets.
+`inference.least_squares` fits such models.
 """
 
 from dataclasses import dataclass, field
@@ -26,13 +26,14 @@ N_STRAIGHT = PATH.index('acceleration')
 
 @dataclass(frozen=True)
 class SteadyPass:
-    """A row of `n_dipoles` dipoles along a path with constant acceleration and turn acceleration.
+    """A row of `n_dipoles` dipoles on a path with constant acceleration and turn acceleration.
 
-    Non-linear parameters theta: those of `PATH` and of the clock offsets that are listed in `free`,
-    in that order; the others stay as in `fixed`. Linear parameters (3 n_dipoles): coefficients of
-    orthogonal combinations of the moments. The tracker fits this model in compiled code
-    (`stages/track/steady_fit.hpp`); `basis` and `derivative` serve searches with a prior, and
-    simulations.
+    The path parameters `PATH` and the clock offsets are concatenated. The entries in `free` form
+    the non-linear parameters theta; all other entries are constants from `fixed`. Linear parameters
+    (3 n_dipoles): coefficients of orthogonal combinations of the moments.
+
+    The tracker fits this model in compiled code (`stages/track/steady_fit.hpp`). `basis` and
+    `derivative` are for searches with a prior and for simulations.
     """
 
     t: FloatArray
@@ -42,18 +43,17 @@ class SteadyPass:
     M: FloatArray
     """Whitening matrix times world-to-sensor rotation of each sample, (n, 3, 3)."""
     clock: IntArray
-    """Index of the clock of each sample, (n,); -1 is the reference clock."""
+    """Index of the clock of each sample, (n,); -1 = reference clock."""
     free: IntArray
-    """Indices into the concatenation of path and clock offsets that theta holds, ascending."""
+    """Indices of the entries of theta in the concatenated path and clock offsets, ascending."""
     fixed: FloatArray
-    """Path and clock offsets [s], (N_PATH + n_clocks,); entries that are free are not used."""
+    """Path and clock offsets [s], (N_PATH + n_clocks,). Entries in `free` are not used."""
     n_dipoles: int
     """Number of dipoles of the row."""
     places: FloatArray = field(init=False)
     """Positions of the dipoles along the row, (d,), in row lengths from the centre."""
     combinations: FloatArray = field(init=False)
-    """Map from the linear parameters to the moments, per component, (d, d); its columns are
-    orthogonal along the row."""
+    """Orthogonal matrix, (d, d), that converts linear parameters to moments, per component."""
 
     def __post_init__(self) -> None:
         """Compute the positions of the dipoles and the combinations of their moments."""
@@ -65,11 +65,11 @@ class SteadyPass:
 
     @cached_property
     def _moment_transform(self) -> FloatArray:
-        """Matrix (3 d, 3 d): moments of the row = matrix @ linear parameters."""
+        """Matrix, (3 d, 3 d), that converts linear parameters to moments of the row."""
         return np.kron(self.combinations, np.eye(3)).astype(np.float64)
 
     def whole(self, theta: FloatArray) -> FloatArray:
-        """Complete free parameters by the fixed ones.
+        """Combine free and fixed parameters.
 
         Parameters
         ----------

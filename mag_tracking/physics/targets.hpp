@@ -1,6 +1,6 @@
 // Target models of vehicles.py and sources.py, for one state at a time.
 //
-// The Python classes RowVehicle and Magnet define the states and have the references; the tests
+// The Python classes RowVehicle and Magnet define the states and cite the references; the tests
 // compare both implementations. A model predicts a state (`move`) and computes the process noise of
 // the prediction (`noise`) and the field at one sensor with its derivative (`field`).
 

@@ -71,7 +71,7 @@ struct RowVehicle {
             return;
         }
         const int w = n_states - 1;
-        // No decay backwards: without process noise it would reduce the variance.
+        // No decay in backward propagation, which has no process noise: the variance would shrink.
         const double fading = std::exp(-std::max(dt, 0.0) / turn_time);
         const double mean = dt > 0.0 ? (1.0 - fading) * turn_time / dt : 1.0;
         turn(x, w, dt, mean, fading, out);
@@ -95,7 +95,7 @@ struct RowVehicle {
                     Q[(6 + 3 * i + a) * wide + 6 + 3 * k + a] =
                         between + (i == k ? difference : 0.0);
         if (turn_acceleration == 0.0) return;
-        // A turn rate of zero variance gets no noise: the vehicle drives straight on.
+        // A turn rate of zero variance has no noise: the path remains straight.
         const int w = n - 1;
         const double fading = std::exp(-dt / turn_time);
         const double speed = std::max(std::sqrt(x[3] * x[3] + x[4] * x[4]),

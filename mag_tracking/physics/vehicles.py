@@ -1,4 +1,4 @@
-"""Vehicle models: a point target, or a row of dipoles along the heading."""
+"""Source model of vehicles: a point target, or a row of dipoles along the heading."""
 
 import math
 from dataclasses import dataclass
@@ -13,34 +13,35 @@ from mag_tracking.physics.motion import constant_velocity, fading_turn, integrat
 from mag_tracking.physics.sources import Dipoles
 
 MAX_TURN_RATE = 1.0
-"""Standard deviation of the turn rate of a slow vehicle [rad/s]; no car turns much faster."""
+"""Maximum standard deviation of the turn rate [rad/s], which limits the rate of slow vehicles."""
 
 
 @dataclass(frozen=True)
 class RowVehicle:
-    """A point target, or a row of equidistant dipoles along the heading, of unknown length.
+    """A point target, or a row of equidistant dipoles along the heading with an unknown length.
 
     State: position r of the centre of the row [m], velocity v [m/s], hard iron moment m0 of each
-    dipole [A m²] in the vehicle frame (x forward, z up; from tail to head), diagonal of the soft
-    iron tensor D of the whole vehicle [m³] in that frame, length L [m], turn rate w [rad/s]. It has
-    10 + 3 d components for d dipoles; 12 for one dipole, which has no length; one more with a turn
-    rate. Moment and position of dipole i = 1 .. d are::
+    dipole [A m²] from tail to head in the vehicle frame (x forward, z up), diagonal of the soft
+    iron tensor D of the whole vehicle [m³] in the vehicle frame, length L [m], turn rate w [rad/s].
+    The length is omitted for a single dipole, and the turn rate is optional. Without a turn rate,
+    the state has 10 + 3 d components for d > 1 dipoles, and 12 for a single dipole. Moment and
+    position of dipole i = 1 .. d are::
 
         m_i = R (m0_i + D R^T B0/(d mu0)) with R = Rz(heading),
         r_i = r + (i - (d+1)/2) L/(d-1) heading
 
-    Sheets and axles are magnetised along themselves, so that a body is easier to magnetise along
-    some of its axes. If all three components of D are equal, D is the scalar of TSP14.
+    D depends on the axis because sheets and axles are easier to magnetise along their length than
+    across. If all components of D are equal, D is the scalar of TSP14.
 
-    The heading is the direction of the horizontal velocity; there is no roll, pitch or slip. At
-    zero speed the heading is atan2(0, 0) = 0 and its derivative is set to zero. With one dipole, or
-    L = 0, the model is the point target of ICASSP11 eq. (4)-(8). A negative length is the same row
-    from its other end.
+    The heading is the direction of the horizontal velocity; roll, pitch and slip are zero. At zero
+    speed, the heading is atan2(0, 0) = 0, and its derivative is set to zero. With one dipole, or
+    with L = 0, the model is the point target of ICASSP11 eq. (4)-(8). A row of negative length
+    equals a row of positive length with the opposite order of dipoles.
 
     Notes
     -----
-    The induced moment is (D/mu0) B0 as in ICASSP11 eq. (8), not (3D/mu0) B0 as in T10. A D that
-    depends on the axis follows MITRE12 eq. (A.5).
+    The induced moment is (D/mu0) B0 as in ICASSP11 eq. (8), not (3D/mu0) B0 as in T10. The
+    dependence of D on the axis follows MITRE12 eq. (A.5).
 
     References
     ----------
@@ -48,20 +49,20 @@ class RowVehicle:
     """
 
     earth_field: FloatArray
-    """Flux density B0 of the earth's field, (3,) T, world frame. Zeros: no soft iron can be
-    modelled."""
+    """Flux density B0 of the earth's field, (3,) T, world frame. Zeros disable soft iron."""
     acceleration_density: FloatArray
     """Power spectral density of the acceleration, per axis, (3,) m²/s³."""
     moment_drift: float = 0.0
     """Random walk of the total hard iron moment per axis, relative to the magnitude of the iron,
     1/s^0.5."""
     difference_drift: float = 0.0
-    """Random walk of the difference of each dipole from the mean of the row, likewise, 1/s^0.5."""
+    """Random walk of the difference of each dipole from the mean of the row, with the same
+    normalisation, 1/s^0.5."""
     n_dipoles: int = 3
     """Number of dipoles of the row."""
     turn_acceleration: float = 0.0
-    """Standard deviation of the lateral acceleration of turning vehicles, m/s². 0: no vehicle
-    turns, and the state has no turn rate."""
+    """Standard deviation of the lateral acceleration of turning vehicles, m/s². Zero removes the
+    turn rate from the state."""
     turn_time: float = 1.5
     """Correlation time of the turn rate (first-order Gauss-Markov), s."""
 
@@ -80,9 +81,9 @@ class RowVehicle:
         return np.asarray(self.earth_field, dtype=float) / MU0
 
     @cached_property
-    def _walk(self) -> FloatArray:
-        """Random walk of the hard iron moments relative to the squared iron magnitude, (3 d, 3 d)
-        1/s.
+    def _moment_walk(self) -> FloatArray:
+        """Random walk covariance of the hard iron moments over the squared magnitude of the iron,
+        (3 d, 3 d) 1/s.
         """
         d = self.n_dipoles
         mean = np.full((d, d), 1.0 / d)
@@ -90,7 +91,7 @@ class RowVehicle:
                        + self.difference_drift**2 * (np.eye(d) - mean), np.eye(3))
 
     def dipoles(self, x: FloatArray) -> Dipoles:
-        """Dipoles of target states: `n_dipoles` per hypothesis.
+        """Compute the `n_dipoles` dipoles of each target state.
 
         Parameters
         ----------
@@ -104,7 +105,7 @@ class RowVehicle:
         Raises
         ------
         ValueError
-            If the number of states differs from that of `state_names`.
+            If the number of states differs from the length of `state_names`.
         """
         if x.shape[1:] != (len(self.state_names),):
             raise ValueError(f'{self.n_dipoles} dipoles need {len(self.state_names)} states, '
@@ -124,39 +125,39 @@ class RowVehicle:
             Prediction interval; negative to propagate backwards, without process noise of the turn
             rate.
         P : (n_hyp, n_t, n_t) array, optional
-            Covariances of `x`. A turn rate of zero variance gets no process noise: the vehicle
-            drives straight on.
+            Covariances of `x`. A turn rate of zero variance has no process noise: the path remains
+            straight.
 
         Returns
         -------
         x : (n_hyp, n_t) array
             States after `dt`.
         F : (n_t, n_t) or (n_hyp, n_t, n_t) array
-            Jacobian of the prediction; common to all hypotheses without a turn rate.
+            Jacobian of the prediction. Without a turn rate, it is common to all hypotheses.
         Q : (n_hyp, n_t, n_t) array
             Covariance of the process noise. The drift of the moments is proportional to the
-            magnitude of the iron. The effect of the turn rate noise on position and velocity within
+            magnitude of the iron. The effect of the turn rate noise on position and velocity during
             `dt` is neglected.
         """
         n = x.shape[1]
         Q = np.zeros((len(x), n, n))
         Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
-        core.set_moment_noise(np.ascontiguousarray(x, dtype=float), abs(dt) * self._walk,
+        core.set_moment_noise(np.ascontiguousarray(x, dtype=float), abs(dt) * self._moment_walk,
                               float(self.induction @ self.induction), Q)
         if not self.turn_acceleration:
             F = np.eye(n)
             F[:6, :6] = constant_velocity(dt)
             return x @ F.T, F, Q
-        # No decay backwards: without process noise it would reduce the variance.
+        # No decay in backward propagation, which has no process noise: the variance would shrink.
         fading = math.exp(-max(dt, 0.0) / self.turn_time)
         mean = (1.0 - fading) * self.turn_time / dt if dt > 0.0 else 1.0
-        moved, turned = fading_turn(x, dt, mean, fading)
+        predicted, F_turn = fading_turn(x, dt, mean, fading)
         turns = np.ones(len(x)) if P is None else P[:, -1, -1] > 0.0
         Q[:, -1, -1] = turns * (1.0 - fading**2) * self.turn_variance(np.hypot(x[:, 3], x[:, 4]))
-        return moved, turned, Q
+        return predicted, F_turn, Q
 
     def turn_variance(self, speed: FloatArray) -> FloatArray:
-        """Variance of the turn rate, limited at low speed by `MAX_TURN_RATE`.
+        """Variance of the turn rate at a given speed, at most `MAX_TURN_RATE` squared.
 
         Parameters
         ----------

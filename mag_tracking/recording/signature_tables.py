@@ -7,8 +7,9 @@ per signature (`label`, and its samples in order). A table of intervals has `lab
 
 import json
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from os import PathLike
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +31,7 @@ MAX_TIME_S = 1e11
 UNITS = {'t': 1.0, 'ut': 1e-6, 'nt': 1e-9}
 """Tesla per unit, by suffix of the column."""
 
+_VERSION_ENTRY = 'mag_tracking.classes'
 _AXIS = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?')
 _SAMPLE = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?_?(?P<number>\d+)')
 
@@ -258,7 +260,7 @@ def write_model(path: str | PathLike[str], model: SignatureModel) -> None:
     """
     content = {name: value.tolist() if isinstance(value, np.ndarray) else value
                for name, value in asdict(model).items()}
-    replace_text(path, json.dumps({'mag_tracking.classes': VERSION, **content}, indent=1) + '\n')
+    replace_text(path, json.dumps({_VERSION_ENTRY: VERSION, **content}, indent=1) + '\n')
 
 
 def read_model(path: str | PathLike[str]) -> SignatureModel:
@@ -281,34 +283,73 @@ def read_model(path: str | PathLike[str]) -> SignatureModel:
     try:
         with open(path, encoding='utf-8') as stream:
             content = json.load(stream)
-        version = content.pop('mag_tracking.classes')
-        if version != VERSION:
-            raise RecordingError(f'{path}: class version {version} is not supported; '
-                                 f'expected {VERSION}')
-        names = ('mean', 'scale', 'weights', 'offsets', 'centres', 'precision')
-        content.update({name: np.array(content[name], dtype=float) for name in names})
-        content.update({name: float(content[name]) for name in ('temperature', 'limit')})
-        content.update({name: tuple(map(str, content[name])) for name in ('classes', 'axes')})
-        model = SignatureModel(**content)
-        _check_model(model)
-        return model
     except OSError as error:
         raise RecordingError(f'cannot read {path}: {error.strerror}') from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise RecordingError(f'{path} is not a valid file of trained classes ({error})') from error
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f'{path} is not a valid file of trained classes: '
+                             'it is not valid JSON') from error
+    if isinstance(content, dict) and content.get(_VERSION_ENTRY, VERSION) != VERSION:
+        raise RecordingError(f'{path}: class version {content[_VERSION_ENTRY]} is not supported; '
+                             f'expected {VERSION}')
+    try:
+        return _parse_model(content)
+    except ValueError as error:
+        raise RecordingError(f'{path} is not a valid file of trained classes: {error}') from error
+
+
+def _parse_model(content: Any) -> SignatureModel:
+    """Create a model from the content of its file; a ValueError names the invalid entry."""
+    if not isinstance(content, dict):
+        raise ValueError('expected a mapping of entries')
+    names = [field.name for field in fields(SignatureModel)]
+    for name in (_VERSION_ENTRY, *names):
+        if name not in content:
+            raise ValueError(f'the entry {name!r} is missing')
+    for name in content:
+        if name not in (_VERSION_ENTRY, *names):
+            raise ValueError(f'unknown entry {name!r}')
+    model = SignatureModel(**{name: _parse_entry(name, content[name]) for name in names})
+    _check_model(model)
+    return model
+
+
+def _parse_entry(name: str, value: Any) -> Any:
+    """Convert an entry of a model file to the type of its field; raise ValueError if invalid."""
+    if name in ('temperature', 'limit'):
+        expected, is_valid = 'a number', isinstance(value, (int, float))
+    elif name in ('method', 'unit'):
+        expected, is_valid = 'a string', isinstance(value, str)
+    elif name == 'examples':
+        expected, is_valid = 'a mapping from classes to numbers', isinstance(value, dict)
+    elif name in ('classes', 'axes'):
+        expected = 'a list of names'
+        is_valid = isinstance(value, list) and all(isinstance(v, str) for v in value)
+        value = tuple(value) if is_valid else value
+    else:
+        expected, is_valid = 'a list of numbers', isinstance(value, list)
+        try:
+            value = np.array(value, dtype=float)
+        except (ValueError, TypeError):
+            is_valid = False
+    if not is_valid:
+        raise ValueError(f'{name}: expected {expected}')
+    return value
 
 
 def _check_model(model: SignatureModel) -> None:
     """Raise ValueError if the arrays of a model are inconsistent or not finite."""
     n, k = len(model.mean), len(set(model.classes))
+    if k < 2 or k < len(model.classes):
+        raise ValueError('classes: expected at least two different names')
+    if not n:
+        raise ValueError('mean: expected at least one number')
     shapes = {'mean': (n,), 'scale': (n,), 'weights': (k, n), 'offsets': (k,), 'centres': (k, n),
               'precision': (n, n)}
     for name, shape in shapes.items():
         values = getattr(model, name)
         if values.shape != shape or not np.isfinite(values).all():
-            raise ValueError(f'{name}: expected finite numbers of shape {shape}')
-    if k < 2 or k < len(model.classes) or not n:
-        raise ValueError('classes: expected at least two different names')
+            raise ValueError(f'{name}: expected finite numbers of shape {shape}, since there are '
+                             f'{k} classes, and mean has length {n}')
     for name in ('temperature', 'limit'):
         if not 0.0 < getattr(model, name) < np.inf:
             raise ValueError(f'{name}: expected a positive number')

@@ -1,4 +1,4 @@
-"""Ratio of the error of a track to the path bound, as reported by replays with truth."""
+"""Ratio of the error of a track to the path bound, as reported by replays with ground truth."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ N = 30
 
 
 def log_with_errors(errors, noise=NOISE, missing=False):
-    """Log of a straight pass with given position errors (n, 3), and its truth."""
+    """Track log of a straight pass with given position errors (n, 3), and its ground truth."""
     t = 0.08 * np.arange(N)
     true = np.column_stack([10.0 * t - 12.0, np.full(N, 1.0), np.full(N, 0.5)])
     log = TrackLog(1)
@@ -44,7 +44,7 @@ def test_poorer_sensors_have_a_larger_bound():
     assert ratio(*log_with_errors(e), field_error=0.1) < once
 
 
-def test_only_poses_with_truth_count():
+def test_poses_without_ground_truth_are_ignored():
     log, (stamps, true, q) = log_with_errors(np.full((N, 3), 0.1))
     assert ratio(log, (stamps[:1], true[:1], q[:1])) is None
     assert ratio(log, (stamps[:20], true[:20], q[:20]), range(25, N)) is None
@@ -53,8 +53,8 @@ def test_only_poses_with_truth_count():
 
 
 def test_ratio_of_magnet_tracks_is_within_its_limits(magnet_replays):
-    """The aim is 1; the limit of 3 is the present result with a margin."""
+    """The target is 1; the limit of 3 is the present result with a margin."""
     for run, _ in magnet_replays.values():
-        found = run.summary['tracks'][0]['truth']['error_over_bound']
-        print(f'magnet: error over path bound {found:.2f}')
-        assert 0.1 < found < 3.0
+        ratio_to_bound = run.summary['tracks'][0]['truth']['error_over_bound']
+        print(f'magnet: error over path bound {ratio_to_bound:.2f}')
+        assert 0.1 < ratio_to_bound < 3.0

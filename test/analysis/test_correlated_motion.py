@@ -1,4 +1,4 @@
-"""Speed and direction from the delay between sensors: laws, and rejected data."""
+"""Speed and direction from the delay between sensors: accuracy, invariances, rejected data."""
 
 import dataclasses
 
@@ -16,9 +16,9 @@ from support.passes import NOISE, measured, network_of
 HEIGHT = 0.5
 
 
-def along_x(speed, aside=2.0, seed=0, places=((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)), heading=0.0,
-            noise=NOISE, n_dipoles=3):
-    """`PassData` of a row of dipoles that passes the sensors at some distance."""
+def simulated_pass(speed, aside=2.0, seed=0, places=((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+                   heading=0.0, noise=NOISE, n_dipoles=3):
+    """Simulate a pass of a row of dipoles at the distance `aside` [m] from the origin."""
     rng = np.random.default_rng(seed)
     u = np.array([np.cos(heading), np.sin(heading), 0.0])
     path = np.concatenate([[-aside * u[1], aside * u[0], HEIGHT], speed * u, [3.0]])
@@ -29,7 +29,7 @@ def along_x(speed, aside=2.0, seed=0, places=((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 @pytest.mark.parametrize('speed', [2.0, 8.0, 25.0])
 @pytest.mark.parametrize('heading', [0.0, np.pi])
 def test_the_delay_is_distance_over_speed(speed, heading):
-    found = correlated_motion(along_x(speed, heading=heading))
+    found = correlated_motion(simulated_pass(speed, heading=heading))
     assert not found.reason and found.similarity > 0.99 and np.isnan(found.heading_std)
     assert abs(found.speed - speed) < max(3.0 * found.speed_std, 1e-3 * speed)
     assert found.speed_std < 0.05 * speed
@@ -39,7 +39,7 @@ def test_the_delay_is_distance_over_speed(speed, heading):
 
 
 def test_sensors_may_have_different_orientations():
-    data = along_x(7.0)
+    data = simulated_pass(7.0)
     rotations = rotation_from_quaternion(quaternion_from_rotation_vector(
         np.array([[0.3, 1.0, -0.5], [2.0, 0.1, 0.4]])))
     field = np.einsum('nji,nj->ni', rotations[data.sensor], data.field)
@@ -49,7 +49,7 @@ def test_sensors_may_have_different_orientations():
 
 
 def test_small_orientation_and_gain_errors_have_little_effect():
-    data = along_x(7.0)
+    data = simulated_pass(7.0)
     turn = rotation_from_quaternion(quaternion_from_rotation_vector(np.radians([1.5, -1.0, 2.0])))
     second = (data.sensor == 1)[:, None]
     field = np.where(second, 1.02 * data.field @ turn, data.field)
@@ -58,28 +58,28 @@ def test_small_orientation_and_gain_errors_have_little_effect():
 
 
 def test_three_sensors_off_a_line_observe_the_heading():
-    """Only pairs with similar fields count; here all do, because the target is far away."""
+    """The target is far away, so all pairs of sensors measure similar fields."""
     places = ((-2.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 0.6, 0.0))
-    found = correlated_motion(along_x(6.0, aside=25.0, places=places, noise=1e-12))
+    found = correlated_motion(simulated_pass(6.0, aside=25.0, places=places, noise=1e-12))
     assert not found.reason and len(found.pairs) == 3 and 0.0 < found.heading_std < 0.5
     assert abs(np.angle(np.exp(1j * found.heading))) < max(3.0 * found.heading_std, 0.05)
 
 
 def test_sensors_on_opposite_sides_of_a_road_have_no_delay():
     places = ((0.0, -4.5, 0.0), (0.0, 4.5, 0.0))
-    found = correlated_motion(along_x(9.0, aside=1.5, places=places))
+    found = correlated_motion(simulated_pass(9.0, aside=1.5, places=places))
     assert 'different fields' in found.reason and np.isnan(found.speed)
 
 
 def test_sensors_side_by_side_have_no_delay():
     """A distant target passes both sensors at the same time."""
     places = ((0.0, -0.25, 0.0), (0.0, 0.25, 0.0))
-    found = correlated_motion(along_x(9.0, aside=20.0, places=places, noise=1e-11))
+    found = correlated_motion(simulated_pass(9.0, aside=20.0, places=places, noise=1e-11))
     assert 'at the same time' in found.reason
 
 
-def test_one_sensor_or_no_common_axis_yields_a_reason():
-    data = along_x(9.0)
+def test_one_sensor_or_no_common_axis_results_in_a_reason():
+    data = simulated_pass(9.0)
     field = data.field.copy()
     field[data.sensor == 0] = np.nan
     assert correlated_motion(dataclasses.replace(data, field=field)).reason.startswith('one sensor')
@@ -90,24 +90,24 @@ def test_one_sensor_or_no_common_axis_yields_a_reason():
 
 
 def test_one_common_axis_is_sufficient():
-    data = along_x(9.0)
+    data = simulated_pass(9.0)
     field = data.field.copy()
     field[:, :2] = np.nan
     assert correlated_motion(dataclasses.replace(data, field=field)).speed == pytest.approx(
         9.0, rel=0.02)
 
 
-def test_contradictions_consider_speed_heading_and_their_stds():
+def test_contradictions_depend_on_speed_heading_and_their_stds():
     c = CorrelatedMotion('', 10.0, 0.2, 0.0, np.nan, 1.0)
     straight = 0.1, 0.02
     assert not contradicts_delays((10.4, 0.1), straight, c) \
         and contradicts_delays((14.0, 0.3), straight, c)
     assert contradicts_delays((10.0, 0.1), (np.pi, 0.1), c)
-    # Neither a difference with a large std nor a small difference is a contradiction.
+    # A difference is no contradiction if its std is large or if the difference is small.
     assert not contradicts_delays((14.0, 2.0), straight, c) \
         and not contradicts_delays((10.9, 0.01), straight, c)
     assert not contradicts_delays((10.0, 0.1), (np.radians(100.0), np.radians(40.0)), c)
-    # On a path oblique to the line of the sensors, the delay is shorter.
+    # The delay is shorter on a path oblique to the line of the sensors.
     assert not contradicts_delays((10.0 * np.cos(0.5), 0.1), (0.5, 0.02), c)
     assert contradicts_delays((10.0, 0.1), (0.5, 0.02), c)
     off_line = CorrelatedMotion('', 10.0, 0.2, 0.0, 0.1, 1.0)
@@ -120,7 +120,7 @@ def test_contradictions_consider_speed_heading_and_their_stds():
 @pytest.mark.parametrize('places', [((0.0, 0.0, 0.0), (0.0, 0.0, 0.6)),
                                     ((0.0, 0.0, 0.0), (0.04, 0.0, 0.6))])
 def test_sensors_above_one_another_have_no_delay(places):
-    data = along_x(9.0, places=places)
+    data = simulated_pass(9.0, places=places)
     late = np.where(data.sensor == 1, 0.03, 0.0)
     found = correlated_motion(dataclasses.replace(data, t=data.t + late))
     assert 'no pair of separate sensors' in found.reason
@@ -129,8 +129,8 @@ def test_sensors_above_one_another_have_no_delay(places):
 @pytest.mark.parametrize('fault', ['first sensor constant', 'all zero', 'one infinite',
                                     'equal timestamps', 'few', 'no noise'])
 @pytest.mark.filterwarnings('error')
-def test_faulty_readings_yield_a_reason_or_an_estimate(fault):
-    data = along_x(9.0)
+def test_faulty_readings_result_in_a_reason_or_an_estimate(fault):
+    data = simulated_pass(9.0)
     field, t = data.field.copy(), data.t.copy()
     if fault == 'first sensor constant':
         field[data.sensor == 0] = 1e-6
@@ -140,29 +140,29 @@ def test_faulty_readings_yield_a_reason_or_an_estimate(fault):
         field[100, 0] = np.inf
     if fault == 'equal timestamps':
         for j in (0, 1):
-            mine = np.flatnonzero(data.sensor == j)
-            t[mine[100:900]] = t[mine[100]]
-    found = dataclasses.replace(data, field=field, t=t)
+            of_sensor = np.flatnonzero(data.sensor == j)
+            t[of_sensor[100:900]] = t[of_sensor[100]]
+    faulty = dataclasses.replace(data, field=field, t=t)
     if fault == 'few':
         rows = np.flatnonzero(data.t > 2.98)
-        found = dataclasses.replace(data, t=t[rows], sensor=data.sensor[rows], field=field[rows],
+        faulty = dataclasses.replace(data, t=t[rows], sensor=data.sensor[rows], field=field[rows],
                                     covariance=data.covariance[rows])
     if fault == 'no noise':
-        found = dataclasses.replace(data, covariance=0.0 * data.covariance)
-    c = correlated_motion(found)
-    assert c.reason if fault != 'one infinite' else abs(c.speed - 9.0) < 0.3
+        faulty = dataclasses.replace(data, covariance=0.0 * data.covariance)
+    motion = correlated_motion(faulty)
+    assert motion.reason if fault != 'one infinite' else abs(motion.speed - 9.0) < 0.3
 
 
-@pytest.mark.parametrize('share', [0.9, 0.5, 0.2])
-def test_simultaneous_opposite_vehicles_have_no_delay(share):
-    one, other = along_x(10.0, seed=1), along_x(14.0, seed=2, heading=np.pi)
-    both = dataclasses.replace(one, field=one.field + share * other.field)
+@pytest.mark.parametrize('scale', [0.9, 0.5, 0.2])
+def test_simultaneous_opposite_vehicles_have_no_delay(scale):
+    one, other = simulated_pass(10.0, seed=1), simulated_pass(14.0, seed=2, heading=np.pi)
+    both = dataclasses.replace(one, field=one.field + scale * other.field)
     assert 'different fields' in correlated_motion(both).reason
 
 
 def test_missing_readings_have_no_effect():
-    """In the log of a track, a missing reading and its covariance are NaN."""
-    data = along_x(7.0)
+    """Missing readings and their covariances are NaN in the log of a track."""
+    data = simulated_pass(7.0)
     field, covariance = data.field.copy(), data.covariance.copy()
     field[[5, 1500]] = covariance[[5, 1500]] = np.nan
     found = correlated_motion(dataclasses.replace(data, field=field, covariance=covariance))
@@ -170,8 +170,8 @@ def test_missing_readings_have_no_effect():
 
 
 def test_a_scaled_or_rotated_field_is_different():
-    """If a vehicle turns away, its field at the second sensor is weaker and rotated."""
-    data = along_x(7.0)
+    """A vehicle that turns away has a weaker and rotated field at the second sensor."""
+    data = simulated_pass(7.0)
     second = (data.sensor == 1)[:, None]
     far = rotation_from_quaternion(quaternion_from_rotation_vector(np.radians([0.0, 0.0, 15.0])))
     for changed in (0.6 * data.field, data.field @ far):

@@ -1,4 +1,4 @@
-"""Likelihood ratio of two lanes: sign, scale, and directions in the published traffic."""
+"""Likelihood ratio of two lanes: sign, scale, and directions in simulated traffic of PHD15."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ T = np.arange(-0.75, 0.75, 0.01)
 
 
 def passing(rng, lane):
-    """(n, 2) [T] horizontal field of a random dipole in a lane, at the sensor."""
+    """Horizontal field (n, 2) [T] of a random dipole in a lane, at the sensor."""
     r = np.stack([lane.speed * (T - rng.uniform(-0.1, 0.1)), np.full(len(T), lane.distance),
                   np.full(len(T), lane.height)], axis=1)
     return dipole_field(-r, 400.0 * rng.standard_normal(3))[:, :2]
@@ -24,16 +24,16 @@ def passing(rng, lane):
 @pytest.mark.parametrize('height', [0.0, 0.6])
 def test_sign_of_the_ratio_identifies_the_lane_of_a_dipole(height):
     rng = np.random.default_rng(0)
-    right, left = RIGHT._replace(height=height), LEFT._replace(height=height)
+    right_lane, left_lane = RIGHT._replace(height=height), LEFT._replace(height=height)
     for _ in range(30):
-        for lane, sign in ((right, 1.0), (left, -1.0)):
+        for lane, sign in ((right_lane, 1.0), (left_lane, -1.0)):
             h = passing(rng, lane)
             noisy = h + 1e-8 * rng.standard_normal(h.shape)
-            assert sign * direction_likelihood_ratio(T, noisy, 1e-8, right, left) > 0.0
+            assert sign * direction_likelihood_ratio(T, noisy, 1e-8, right_lane, left_lane) > 0.0
 
 
 def test_ratio_is_proportional_to_the_signal_to_noise_power_ratio():
-    """The lane that matches leaves no residual."""
+    """The correct lane has no residual."""
     rng = np.random.default_rng(1)
     h = passing(rng, RIGHT)
     ratios = [direction_likelihood_ratio(T, h, std, RIGHT, LEFT) for std in (2e-8, 1e-8)]
@@ -43,13 +43,13 @@ def test_ratio_is_proportional_to_the_signal_to_noise_power_ratio():
 @pytest.mark.study
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
 def test_directions_in_the_published_traffic(simulator):
-    """PHD15 Paper B, Table 1: 510 of 511 near, 494 of 511 fused."""
+    """PHD15 Paper B, Table 1: 510 of 511 correct at the near sensor, 494 of 511 after fusion."""
     vehicles = passings(simulator, 1)
-    share = shares(vehicles, [v.log_odds_of_north() for v in vehicles])
-    # Three standard deviations of 511 vehicles below the aims of 99.8 % and 97 %. Boxes reach
-    # 99.5 % (`bench.directions`): in six of seven errors another vehicle is in the other lane
-    # within 0.62 s, in four of them a truck.
-    assert share.near > 0.998 - 3.0 * np.sqrt(0.998 * 0.002 / 511)
-    assert share.fused > 0.97 - 3.0 * np.sqrt(0.97 * 0.03 / 511)
-    stated, measured = calibration(vehicles)
-    assert abs(stated - measured) < 0.05
+    fractions = shares(vehicles, [v.log_odds_of_north() for v in vehicles])
+    # The limits are three standard deviations (511 vehicles) below the targets, 99.8 % and 97 %.
+    # With boxes, the result is 99.5 % (`bench.directions`). In six of seven errors, another vehicle
+    # is in the other lane within 0.62 s; in four of these errors, it is a truck.
+    assert fractions.near > 0.998 - 3.0 * np.sqrt(0.998 * 0.002 / 511)
+    assert fractions.fused > 0.97 - 3.0 * np.sqrt(0.97 * 0.03 / 511)
+    predicted, measured = calibration(vehicles)
+    assert abs(predicted - measured) < 0.05

@@ -1,4 +1,4 @@
-"""Joint fit of several targets: estimates, consistent covariances, and rejected fits."""
+"""Joint fit of several targets: estimates, covariances, and rejected fits."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ FOUR = network_of([[-3.0, -4.5, 0.0], [-3.0, 4.5, 0.0], [3.0, -4.5, 0.0], [3.0, 
 
 
 def one_path(rng, at_s, direction, n_dipoles):
-    """(path, moments) of a vehicle that passes the origin at a time [s], in its lane."""
+    """Random (path, moments) of a vehicle in its lane, passing the origin at `at_s` [s]."""
     speed = direction * rng.uniform(8.0, 20.0)
     place = [-speed * at_s, -direction * rng.uniform(1.4, 2.2), rng.uniform(0.4, 1.0)]
     moments = random_moments(rng, n_dipoles)
@@ -35,8 +35,8 @@ def one_path(rng, at_s, direction, n_dipoles):
     return np.concatenate([place, [speed, 0.1 * rng.standard_normal(), 0.0], length]), moments
 
 
-def world(rng, plan, n_dipoles, network=ROAD):
-    """(`PassData`, [path]) of vehicles of a plan [(time [s], direction)]."""
+def simulated_pass(rng, plan, n_dipoles, network=ROAD):
+    """Simulate vehicles of a plan [(time [s], direction)]; return (`PassData`, [path])."""
     targets = [one_path(rng, *when, n_dipoles) for when in plan]
     fields = [measured(network, path, moments, rng, seconds=6.0, noise=1.2e-8 if k == 0 else 1e-15)
               for k, (path, moments) in enumerate(targets)]
@@ -46,12 +46,12 @@ def world(rng, plan, n_dipoles, network=ROAD):
     return data, [path for path, _ in targets]
 
 
-def tracked(rng, paths):
-    """Paths (K, 6) with the errors of a tracker: 0.5 m and 5 % of the speed."""
-    found = np.array([path[:6] for path in paths])
-    found[:, :2] += 0.5 * rng.standard_normal((len(paths), 2))
-    found[:, 3] *= 1.0 + 0.05 * rng.standard_normal(len(paths))
-    return found
+def tracked_paths(rng, paths):
+    """Add typical errors of a tracker to paths (K, 6): 0.5 m and 5 % of the speed."""
+    tracks = np.array([path[:6] for path in paths])
+    tracks[:, :2] += 0.5 * rng.standard_normal((len(paths), 2))
+    tracks[:, 3] *= 1.0 + 0.05 * rng.standard_normal(len(paths))
+    return tracks
 
 
 MEETING, FOLLOWING = ((-0.3, 1), (0.2, -1)), ((-0.8, 1), (0.8, 1))
@@ -62,8 +62,8 @@ def test_two_vehicles_are_fitted_with_consistent_covariances(plan, n_dipoles):
     z = []
     for seed in range(6):
         rng = np.random.default_rng([seed, n_dipoles])
-        data, paths = world(rng, plan, n_dipoles)
-        found = fit_joint(data, tracked(rng, paths), GROUND, (n_dipoles,))
+        data, paths = simulated_pass(rng, plan, n_dipoles)
+        found = fit_joint(data, tracked_paths(rng, paths), GROUND, (n_dipoles,))
         assert len(found) == 2
         for (fit,), path in zip(found, paths, strict=True):
             assert fit.converged and fit.n_other_unknowns == 6 + (n_dipoles > 1) + 3 * n_dipoles
@@ -79,8 +79,8 @@ def test_two_vehicles_are_fitted_with_consistent_covariances(plan, n_dipoles):
 
 def test_three_vehicles_are_fitted():
     rng = np.random.default_rng(5)
-    data, paths = world(rng, ((-1.2, 1), (0.1, -1), (1.1, 1)), 1, FOUR)
-    found = fit_joint(data, tracked(rng, paths), GROUND, (1, 2))
+    data, paths = simulated_pass(rng, ((-1.2, 1), (0.1, -1), (1.1, 1)), 1, FOUR)
+    found = fit_joint(data, tracked_paths(rng, paths), GROUND, (1, 2))
     assert [choose_order(fits).n_dipoles for fits in found] == [1, 1, 1]
     for fits, path in zip(found, paths, strict=True):
         fit = choose_order(fits)
@@ -89,10 +89,10 @@ def test_three_vehicles_are_fitted():
 
 
 def test_data_of_each_fit_exclude_the_fields_of_the_others():
-    """The field of one vehicle and the noise remain."""
+    """Only the field of one vehicle and the noise remain."""
     rng = np.random.default_rng(6)
-    data, paths = world(rng, MEETING, 1)
-    (first,), (second,) = fit_joint(data, tracked(rng, paths), GROUND, (1,))
+    data, paths = simulated_pass(rng, MEETING, 1)
+    (first,), (second,) = fit_joint(data, tracked_paths(rng, paths), GROUND, (1,))
     assert first.cost == second.cost and first.n_unknowns == second.n_unknowns
     np.testing.assert_allclose(first.data.field - first.predicted,
                                second.data.field - second.predicted, atol=1e-15)
@@ -107,10 +107,10 @@ def test_order_of_each_vehicle_is_chosen_separately():
     row, moments = one_path(rng, 0.3, -1, 3)
     data = together(measured(ROAD, point, m, rng, seconds=6.0),
                     measured(ROAD, row, moments, rng, seconds=6.0, noise=1e-15))
-    found = fit_joint(data, tracked(rng, (point, row)), GROUND, (1, 2, 3))
+    found = fit_joint(data, tracked_paths(rng, (point, row)), GROUND, (1, 2, 3))
     orders = [choose_order(fits).n_dipoles for fits in found]
     assert orders[0] == 1 and orders[1] >= 2
-    # With any number of dipoles it is the same vehicle, with the same time zero.
+    # The fits of all orders describe the same vehicle and have the same time zero.
     for fits, path in zip(found, (point, row), strict=True):
         assert [fit.n_dipoles for fit in fits] == [1, 2, 3]
         assert len({(fit.data.stamp_ns, fit.data.t[0]) for fit in fits}) == 1
@@ -118,7 +118,7 @@ def test_order_of_each_vehicle_is_chosen_separately():
 
 
 def test_two_following_vehicles_are_not_fitted_as_one_long_row():
-    """Without tracks they are: a row of two dipoles, as long as the distance between them."""
+    """Without tracks, the vehicles are fitted as a row with the length of their distance."""
     rng = np.random.default_rng(3)
     one, moments = one_path(rng, -0.5, 1, 2)
     other = one.copy()
@@ -128,7 +128,7 @@ def test_two_following_vehicles_are_not_fitted_as_one_long_row():
     alone = [fit_pass(data, n) for n in (1, 2)]
     wrong = choose_order(alone)
     assert wrong is not None and wrong.length[0] > 12.0
-    paths = tracked(rng, (one, other))
+    paths = tracked_paths(rng, (one, other))
     assert fit_targets(data, alone, paths[:1], GROUND, ORDERS) == (tuple(alone),)
     found = [choose_order(fits) for fits in fit_targets(data, alone, paths, GROUND, ORDERS)]
     assert len(found) == 2
@@ -150,11 +150,11 @@ def test_two_tracks_of_one_vehicle_are_fitted_as_one():
 
 def test_fits_of_overlapping_vehicles_are_rejected():
     rng = np.random.default_rng(1)
-    slow, m = one_path(rng, 0.0, 1, 1)
-    fast, more = one_path(rng, 0.3, 1, 1)
+    slow, slow_moments = one_path(rng, 0.0, 1, 1)
+    fast, fast_moments = one_path(rng, 0.3, 1, 1)
     fast[1], fast[3] = slow[1], 2.0 * slow[3]
-    data = together(measured(ROAD, slow, m, rng, seconds=6.0),
-                    measured(ROAD, fast, more, rng, seconds=6.0, noise=1e-15))
+    data = together(measured(ROAD, slow, slow_moments, rng, seconds=6.0),
+                    measured(ROAD, fast, fast_moments, rng, seconds=6.0, noise=1e-15))
     alone = [fit_pass(data, n) for n in (1, 2)]
     fits, = fit_targets(data, alone, np.array([slow, fast]), GROUND, ORDERS)
     assert all('overlap' in fit.reason for fit in fits) and choose_order(alone) is not None
@@ -162,27 +162,27 @@ def test_fits_of_overlapping_vehicles_are_rejected():
 
 def test_a_rejected_joint_fit_has_a_reason():
     rng = np.random.default_rng(7)
-    data, paths = world(rng, MEETING, 1)
-    alone, two = [fit_pass(data, 1)], tracked(rng, paths)
+    data, paths = simulated_pass(rng, MEETING, 1)
+    alone, two = [fit_pass(data, 1)], tracked_paths(rng, paths)
     four = np.vstack([two, two + [0.0, 20.0, 0.0, 0.0, 0.0, 0.0]])
-    cases = [('4 were tracked, at most 3', data, four),
+    cases = [('4 targets were tracked, at most 3', data, four),
              ('too few measurements', replace(
                  data, t=data.t[::200], sensor=data.sensor[::200], field=data.field[::200],
                  covariance=data.covariance[::200]), two),
-             # A third vehicle that was not tracked.
+             # A third, untracked vehicle.
              ('of the field unexplained', together(data, measured(
                  ROAD, *one_path(rng, 1.5, 1, 1), rng, seconds=6.0, noise=1e-15)), two)]
     for reason, of, tracks in cases:
         fits, = fit_targets(of, alone, tracks, GROUND, (1,))
         assert reason in fits[0].reason and fits[0].trusted == (), fits[0].reason
         assert choose_order(fits) is None
-    # With one sensor, the scale is not observable even for one vehicle.
+    # With one sensor, the scale is not observable, even for a single vehicle.
     one = measured(network_of([[0.0, -4.5, 0.0]]), paths[0], np.ones((1, 3)), rng)
     assert fit_targets(one, alone, two, GROUND, (1,)) == (tuple(alone),)
 
 
 def test_vehicles_side_by_side_or_following_are_separate():
-    data, _ = world(np.random.default_rng(8), MEETING, 1)
+    data, _ = simulated_pass(np.random.default_rng(8), MEETING, 1)
     one = np.array([0.0, -1.75, 0.5, 10.0, 0.0, 0.0, 3.0])
 
     def moved(*by):
@@ -191,7 +191,7 @@ def test_vehicles_side_by_side_or_following_are_separate():
     assert are_separate(data, (one, moved(0.0, 3.5)))
     assert are_separate(data, (one, moved(-7.0)))
     assert not are_separate(data, (one, moved(-5.0)))
-    # One vehicle catches up within range of the sensors, another one stays far behind.
+    # The first vehicle catches up within range of the sensors, the second vehicle outside.
     assert not are_separate(data, (one, moved(-9.0, 0.0, 0.0, 6.0)))
     assert are_separate(data, (one, moved(-60.0, 0.0, 0.0, 2.0)))
     assert are_separate(data, (one,))
@@ -199,9 +199,9 @@ def test_vehicles_side_by_side_or_following_are_separate():
 
 def test_path_from_refers_to_the_time_zero_of_the_data():
     rng = np.random.default_rng(2)
-    data, paths = world(rng, MEETING, 2)
+    data, paths = simulated_pass(rng, MEETING, 2)
     data = replace(data, stamp_ns=1_700_000_000_000_000_000)
-    found = fit_joint(data, tracked(rng, paths), GROUND, (2,))
+    found = fit_joint(data, tracked_paths(rng, paths), GROUND, (2,))
     for (fit,), path in zip(found, paths, strict=True):
         np.testing.assert_allclose(path_from(data, fit)[:2], path[:2], atol=1.0)
     assert np.isfinite(order_criteria([fits[0] for fits in found])).all()
@@ -219,11 +219,12 @@ def test_a_false_track_is_not_fitted_as_a_vehicle():
 def test_a_velocity_change_of_one_target_rejects_all_fits():
     """The second vehicle drives at half its speed, then at twice its speed."""
     rng = np.random.default_rng(11)
-    (first, m), (second, more) = one_path(rng, -0.3, 1, 1), one_path(rng, 0.2, -1, 1)
-    data = measured(ROAD, first, m, rng, seconds=6.0)
+    (first, first_moments), (second, second_moments) = (
+        one_path(rng, -0.3, 1, 1), one_path(rng, 0.2, -1, 1))
+    data = measured(ROAD, first, first_moments, rng, seconds=6.0)
     warped = np.where(data.t < 0.2, 0.1 + 0.5 * data.t, 2.0 * data.t - 0.2)
     model = RowPass(warped, data.positions, ROAD.R_sw[data.sensor], 1)
-    field = (model.basis(second[None])[0] @ more[0]).reshape(-1, 3)
+    field = (model.basis(second[None])[0] @ second_moments[0]).reshape(-1, 3)
     data = replace(data, field=data.field + field)
     paths = np.array([first, second])
     changes = [fits[0].velocity_change for fits in fit_joint(data, paths, GROUND, (1,))]
@@ -234,27 +235,27 @@ def test_a_velocity_change_of_one_target_rejects_all_fits():
 
 def test_fits_are_in_the_order_of_the_passes():
     rng = np.random.default_rng(13)
-    data, paths = world(rng, FOLLOWING, 1)
+    data, paths = simulated_pass(rng, FOLLOWING, 1)
     for order in ([0, 1], [1, 0]):
-        found = fit_joint(data, tracked(rng, paths)[order], GROUND, (1,))
+        found = fit_joint(data, tracked_paths(rng, paths)[order], GROUND, (1,))
         assert found[0][0].data.stamp_ns < found[1][0].data.stamp_ns
 
 
-def test_a_fit_that_left_its_track_has_a_reason():
+def test_a_fit_that_differs_from_its_track_has_a_reason():
     rng = np.random.default_rng(14)
-    data, paths = world(rng, MEETING, 1)
-    astray = tracked(rng, paths)
-    # No vehicle is this fast.
-    astray[1, 3] *= 3.0
-    found = fit_joint(data, astray, GROUND, (1,))
+    data, paths = simulated_pass(rng, MEETING, 1)
+    wrong_tracks = tracked_paths(rng, paths)
+    # The track is three times as fast as the vehicle.
+    wrong_tracks[1, 3] *= 3.0
+    found = fit_joint(data, wrong_tracks, GROUND, (1,))
     assert sorted(fit.reason for fit, in found) == ['', 'the fit is not at the tracked position']
-    assert fit_joint(data, astray, GROUND, (1,), stopped=lambda: True) == ()
+    assert fit_joint(data, wrong_tracks, GROUND, (1,), stopped=lambda: True) == ()
 
 
-def two_minima(*others):
-    """Fits of two points whose search also ended at `others`, functions of theta (12,)."""
+def fits_with_minima(*others):
+    """Fit two points, with further minima `others` (functions of theta (12,))."""
     rng = np.random.default_rng(15)
-    data, paths = world(rng, MEETING, 1)
+    data, paths = simulated_pass(rng, MEETING, 1)
     theta = np.concatenate(paths)
     model = SuperposedPasses.of((1, 1), data.t, data.positions, ROAD.R_sw[data.sensor])
     A = model.basis(theta[None])[0]
@@ -264,27 +265,27 @@ def two_minima(*others):
     return data, theta, fits_at_minimum(data, (1, 1), found, p, 1.0, SensorErrors()), (p, found)
 
 
-def test_exchanged_targets_are_no_rivals_of_each_other():
+def test_exchanged_targets_are_not_rivals():
     def exchanged(theta):
         return np.concatenate([theta[6:], theta[:6]])
 
     def second_elsewhere(theta):
         return exchanged(theta + np.eye(12)[7] * 3.0)
 
-    _, theta, (first, second), _ = two_minima(exchanged, second_elsewhere)
+    _, theta, (first, second), _ = fits_with_minima(exchanged, second_elsewhere)
     assert first.rivals == () and len(second.rivals) == 1
     np.testing.assert_allclose(second.rivals[0][1], theta[6:] + [0.0, 3.0, 0.0, 0.0, 0.0, 0.0])
     assert assignment([theta[:6], theta[6:]], [theta[6:], theta[:6]]) == (1, 0)
-    # A shift in time moves the rival along its own path.
-    moved = second.shifted(2.0)
-    np.testing.assert_allclose(moved.rivals[0][1][:3],
+    # A shift of time zero also propagates the rival along its path.
+    shifted = second.shifted(2.0)
+    np.testing.assert_allclose(shifted.rivals[0][1][:3],
                                second.rivals[0][1][:3] + 2.0 * theta[9:12])
-    np.testing.assert_allclose(moved.position, second.position + 2.0 * second.velocity)
-    assert moved.data.stamp_ns == second.data.stamp_ns + 2_000_000_000
+    np.testing.assert_allclose(shifted.position, second.position + 2.0 * second.velocity)
+    assert shifted.data.stamp_ns == second.data.stamp_ns + 2_000_000_000
 
 
 def test_a_prior_adds_information():
-    data, _, (_, second), (p, found) = two_minima()
+    data, _, (_, second), (p, found) = fits_with_minima()
     std = np.full(12, np.inf)
     std[8] = 0.05
     _, known = fits_at_minimum(data, (1, 1), found, p, 1.0, SensorErrors(), path_std=std)
@@ -297,16 +298,16 @@ def test_a_prior_adds_information():
 
 def test_residuals_near_any_target_are_not_elsewhere():
     rng = np.random.default_rng(16)
-    data, paths = world(rng, FOLLOWING, 1)
+    data, paths = simulated_pass(rng, FOLLOWING, 1)
     rows = [FittedRow(1, path, (RowPass(data.t, data.positions, ROAD.R_sw[data.sensor], 1).basis(
         path[None])[0] @ [200.0, 100.0, -300.0]).reshape(-1, 3)) for path in paths]
     for row in rows:
-        left = np.einsum('nij,nj->ni', data.whitening, 0.2 * row.field)
-        assert residual_elsewhere(data, rows, left) < 1e-3
+        residual = np.einsum('nij,nj->ni', data.whitening, 0.2 * row.field)
+        assert residual_elsewhere(data, rows, residual) < 1e-3
 
 
 def test_targets_of_a_poor_joint_fit_are_ambiguous():
-    *_, (first, _), _ = two_minima()
+    *_, (first, _), _ = fits_with_minima()
     assert not first.ambiguous and first.n_other_unknowns == 9
     poor = replace(first, cost=2.1 * first.degrees_of_freedom)
     assert poor.ambiguous and not replace(poor, n_other_unknowns=0).ambiguous

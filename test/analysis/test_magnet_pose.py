@@ -1,4 +1,4 @@
-"""Single poses of a magnet, and joint estimation of poses and network geometry."""
+"""Pose of a magnet from one reading, and joint estimation of poses and network geometry."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from support.magnet_boards import HIGH, LOW, MOMENT, SETTINGS, board, estimated,
 
 
 def test_single_poses_have_consistent_covariances():
-    """Random poses in the box, one reading per sensor; the field error is part of the noise."""
+    """Random poses in the box with one reading per sensor and a random field error."""
     network = board(4, 0.05)
     rng = np.random.default_rng(5)
     settings = PoseSettings()
@@ -58,7 +58,7 @@ def test_a_rejected_pose_has_a_reason():
     few = np.full((9, 3), np.nan)
     few[:2, :2] = 1e-6
     pose = locate_magnet(network, few, MOMENT, LOW, HIGH, PoseSettings())
-    assert not pose.converged and '4 axes measured' in pose.reason
+    assert not pose.converged and 'number of measured axes is 4' in pose.reason
     assert np.isnan(pose.position).all()
     pose = locate_magnet(network, reading([0.06, 0.05, 0.3], MOMENT), MOMENT, LOW, HIGH,
                          PoseSettings())
@@ -77,7 +77,7 @@ def test_a_rejected_pose_has_a_reason():
                              'high': HIGH, 'settings': PoseSettings(), **change})
 
 
-# Without a tracker.
+# Calibration without a tracker.
 
 def test_unknown_poses_and_geometry_are_estimated_jointly():
     nees = []
@@ -104,7 +104,7 @@ def test_unknown_poses_and_geometry_are_estimated_jointly():
 def test_readings_without_a_magnet_are_rejected():
     network = board()
     field = 3e-5 + 1e-7 * np.random.default_rng(0).standard_normal((10, 9, 3))
-    with pytest.raises(ValueError, match='of 10 poses were found in the box'):
+    with pytest.raises(ValueError, match='found 0 of 10 poses in the box'):
         calibrate_geometry_blind(network, field, MOMENT, LOW, HIGH, SETTINGS)
     with pytest.raises(ValueError, match=r'expected field \(K, 9, 3\)'):
         calibrate_geometry_blind(network, field[0], MOMENT, LOW, HIGH, SETTINGS)

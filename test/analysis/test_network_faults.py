@@ -1,4 +1,4 @@
-"""Geometry calibration with faulty sensors, poses or input."""
+"""Geometry calibration with faulty sensors, faulty poses or invalid arguments."""
 
 from dataclasses import replace
 
@@ -13,12 +13,12 @@ from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, es
 
 @pytest.fixture(scope='module')
 def boards():
-    """[(simulated, geometry)] of several boards."""
+    """Simulate and calibrate several boards: [(simulated, geometry)]."""
     return calibrated_boards()
 
 
-def within(g, h, network, max_stds):
-    """Whether two estimates agree within `max_stds` stds of the first; NaN never agrees."""
+def agrees_within(g, h, network, max_stds):
+    """Whether two estimates agree within `max_stds` stds of the first estimate."""
     return bool((np.abs(estimated(g, network) - estimated(h, network))
                  < max_stds * np.sqrt(np.diagonal(g.covariance))).all())
 
@@ -55,22 +55,22 @@ def test_an_outlying_pose_is_reported_and_has_little_effect(boards, shift):
     wrong[7, 0] += shift
     h = calibrate_geometry(network, field, wrong, axes, MOMENT, SETTINGS)
     assert h.converged and h.suspect_poses == (7,) and h.suspect_sensors == ()
-    assert within(g, h, network, 1.0)
-    # One pose does not raise the residuals of the sensors.
+    assert agrees_within(g, h, network, 1.0)
+    # The faulty pose does not increase the residuals of the sensors.
     np.testing.assert_allclose(h.sensor_residual, g.sensor_residual, rtol=0.1)
 
 
-def test_a_pose_with_the_readings_of_another_is_reported(boards):
+def test_a_pose_with_the_readings_of_another_pose_is_reported(boards):
     (network, field, positions, axes, _), g = boards[6]
     wrong = field.copy()
     wrong[7] = field[8]
     h = calibrate_geometry(network, wrong, positions, axes, MOMENT, SETTINGS)
     assert h.converged and h.suspect_poses == (7,) and h.suspect_sensors == ()
-    assert within(g, h, network, 1.0)
+    assert agrees_within(g, h, network, 1.0)
 
 
-def faulty(field, fault):
-    """A copy in which sensor 2 is at fault."""
+def apply_fault(field, fault):
+    """Copy readings and apply a fault to sensor 2."""
     wrong = field.copy()
     if fault == 'flipped':
         wrong[:, 2, 1] *= -1.0
@@ -87,27 +87,28 @@ def faulty(field, fault):
 
 @pytest.mark.parametrize('fault', ['flipped', 'swapped', 'rotated', 'gain'])
 def test_a_faulty_sensor_is_reported(boards, fault):
-    """The estimates of the other sensors are hardly worse than without it."""
+    """The estimates of the other sensors are almost as good as without the faulty sensor."""
     others, z2 = np.delete(np.arange(9), 2), {fault: [], 'dead': []}
     for (network, field, positions, axes, x), _ in boards[:8]:
-        for what, found in z2.items():
-            g = calibrate_geometry(network, faulty(field, what), positions, axes, MOMENT, SETTINGS)
+        for case, values in z2.items():
+            g = calibrate_geometry(network, apply_fault(field, case), positions, axes, MOMENT,
+                                   SETTINGS)
             z = (_corrections(g, network) - x[0][:, 3:]) / _corrections_std(g)
-            found.append(np.square(z[others]).mean())
+            values.append(np.square(z[others]).mean())
             assert g.converged and g.suspect_poses == ()
-            assert g.suspect_sensors == (() if what == 'dead' else ('mag_2',))
+            assert g.suspect_sensors == (() if case == 'dead' else ('mag_2',))
     print(f'mean squared z with a sensor {fault} {np.mean(z2[fault]):.2f}, '
           f'without it {np.mean(z2["dead"]):.2f}')
     assert np.mean(z2[fault]) < 1.25 * np.mean(z2['dead'])
 
 
 def _corrections(geometry, network):
-    """(n, 7) of all but the biases."""
+    """Estimated corrections of the sensors (n, 7) without the biases."""
     return estimated(geometry, network)[:-12].reshape(-1, 10)[:, 3:]
 
 
 def _corrections_std(geometry):
-    """(n, 7)."""
+    """Standard deviations of `_corrections`, (n, 7)."""
     return np.sqrt(np.diagonal(geometry.covariance))[:-12].reshape(-1, 10)[:, 3:]
 
 
@@ -115,9 +116,9 @@ def test_too_few_poses_do_not_converge():
     network, field, positions, axes, _ = simulated(9)
     for K in (1, 2):
         g = calibrate_geometry(network, field[:K], positions[:K], axes[:K], MOMENT, SETTINGS)
-        assert not g.converged and f'{K} poses' in g.reason
+        assert not g.converged and f'number of poses is {K}' in g.reason
     g = calibrate_geometry(network, field, positions, axes, MOMENT, replace(SETTINGS, iterations=1))
-    assert not g.converged and 'no minimum within 1 steps' in g.reason
+    assert not g.converged and 'no minimum found (maximum number of steps: 1)' in g.reason
 
 
 def test_one_sensor_adds_almost_no_information():
@@ -127,7 +128,7 @@ def test_one_sensor_adds_almost_no_information():
     g = calibrate_geometry(network, scarce, positions[:3], axes[:3], MOMENT, SETTINGS)
     assert (g.position_std > 0.95 * SETTINGS.position_std).all()
     assert (g.gain_std > 0.95 * SETTINGS.gain_std).all()
-    # Even a poor fit does not inflate the std beyond the prior.
+    # The std never exceeds the prior, even for a poor fit.
     assert (g.position_std <= (1.0 + 1e-9) * SETTINGS.position_std).all()
     free = np.repeat([0.1, 0.5, 0.0], [3, 2, 3])
     g = fitted_geometry(network, scarce, positions[:3], axes[:3], MOMENT, SETTINGS,

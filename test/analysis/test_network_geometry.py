@@ -13,7 +13,7 @@ from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, es
 
 @pytest.fixture(scope='module')
 def boards():
-    """[(simulated, geometry)] of several boards."""
+    """Simulate and calibrate several boards: [(simulated, geometry)]."""
     return calibrated_boards()
 
 
@@ -32,28 +32,29 @@ def test_covariance_agrees_with_the_errors(boards):
     print(f'NEES {np.mean(nees):.1f} in {low:.1f} .. {high:.1f}, cost {np.mean(costs):.3f}, '
           f'outside 2 std {np.mean(outside):.3f}')
     assert low <= np.mean(nees) <= high
-    # The gauge is common to all sensors, so the spread exceeds that of a binomial distribution.
+    # The errors are correlated by the gauge, so the tolerance exceeds a binomial distribution.
     assert np.mean(outside) == pytest.approx(0.0455, abs=0.02)
     assert np.mean(costs) == pytest.approx(1.0, abs=0.03)
 
 
 def test_calibration_reduces_the_prior_errors(boards):
-    """Errors relative to the mean of all sensors; a common error belongs to the gauge."""
-    for part, share in ((slice(3, 4), 0.35), (slice(4, 7), 0.35), (slice(7, 10), 0.6)):
+    """Errors are relative to the mean of all sensors, because a common error is a gauge freedom."""
+    for part, max_ratio in ((slice(3, 4), 0.35), (slice(4, 7), 0.35), (slice(7, 10), 0.6)):
         error, before, std = [], [], []
         for (network, *_, x), g in boards:
             e = (estimated(g, network)[:90] - x[0].ravel()).reshape(9, 10)[:, part]
             if part.start == 4:
-                e, was = (np.einsum('nij,nj->ni', network.R_ws, v) for v in (e, x[0][:, part]))
+                e, prior_error = (np.einsum('nij,nj->ni', network.R_ws, v)
+                                  for v in (e, x[0][:, part]))
             else:
-                was = x[0][:, part]
+                prior_error = x[0][:, part]
             error.append(e - e.mean(axis=0))
-            before.append(was - was.mean(axis=0))
+            before.append(prior_error - prior_error.mean(axis=0))
             std.append(np.sqrt(np.diagonal(g.covariance)[:90]).reshape(9, 10)[:, part])
         error, before = (np.sqrt(np.mean(np.square(v))) for v in (error, before))
         print(f'remaining error of {part}: {error / before:.2f}')
-        assert error < share * before
-        # The errors do not exceed the stated stds.
+        assert error < max_ratio * before
+        # The errors are consistent with the estimated stds.
         assert error < 1.1 * np.sqrt(np.mean(np.square(std)))
 
 
@@ -66,7 +67,7 @@ def test_estimated_poses_are_closer_to_the_truth_than_tracked_ones(boards):
         assert np.linalg.norm(r - as_tracked, axis=1).max() < 2.5e-3
         assert (np.einsum('ki,ki->k', u, m) / np.linalg.norm(m, axis=1)).min() > np.cos(0.025)
         true_r, *_ = magnet.poses(x[1], x[2])
-        # An error common to all poses belongs to the gauge; the rest is the error of the tracker.
+        # An error common to all poses is a gauge freedom; only the tracker error is compared.
         for found, out in ((g.poses[0], remaining), (r, without)):
             e = found - true_r
             out.append(np.square(e - e.mean(axis=0)).mean())
@@ -113,15 +114,15 @@ def test_parameters_known_exactly_do_not_change():
 
 
 def test_a_worse_fit_has_larger_stds():
-    """The noise is five times the stated one."""
+    """The simulated noise is five times the configured noise."""
     loud = board(noise=5e-7)
     network, field, positions, axes, x = simulated(
         4, network=loud, settings=replace(SETTINGS, field_error=0.05))
-    stated = board()
-    g = calibrate_geometry(stated, field, positions, axes, MOMENT, SETTINGS)
+    nominal = board()
+    g = calibrate_geometry(nominal, field, positions, axes, MOMENT, SETTINGS)
     assert g.converged and 15.0 < g.normalised_cost < 30.0
     e = estimated(g, network) - np.append(x[0].ravel(), x[1])
     assert np.mean(np.square(e / np.sqrt(np.diagonal(g.covariance)))) < 1.6
-    quiet = calibrate_geometry(stated, simulated(4)[1], positions, axes, MOMENT, SETTINGS)
+    quiet = calibrate_geometry(nominal, simulated(4)[1], positions, axes, MOMENT, SETTINGS)
     assert (g.bias_std > 3.0 * quiet.bias_std).all()
     assert (g.position_std <= (1.0 + 1e-9) * SETTINGS.position_std).all()

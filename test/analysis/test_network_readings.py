@@ -1,4 +1,4 @@
-"""Predicted readings of a magnet by a board, and their derivatives by all unknowns."""
+"""Predicted readings of a board near a magnet, and their derivatives by all unknowns."""
 
 import numpy as np
 
@@ -27,15 +27,15 @@ def test_derivatives_agree_with_differences():
             step = 1e-5
             f = []
             for sign in (1.0, -1.0):
-                moved = [v.copy() for v in x]
-                moved[which][..., c] += sign * step
-                f.append(predicted_readings(network, magnet, *moved)[0])
+                shifted = [v.copy() for v in x]
+                shifted[which][..., c] += sign * step
+                f.append(predicted_readings(network, magnet, *shifted)[0])
             numeric = (f[0] - f[1]) / (2.0 * step)
             scale = max(np.abs(J[..., c]).max(), 1e-6 * size)
             assert np.abs(numeric - J[..., c]).max() < 1e-5 * scale, (which, c)
 
 
-def test_an_exact_network_reads_the_dipole_field():
+def test_a_network_without_errors_measures_the_dipole_field():
     network = board()
     positions, axes = tracked(4, np.random.default_rng(2))
     magnet = TrackedMagnet(positions, tool_rotations(axes), np.zeros(3), MOMENT)
@@ -74,7 +74,7 @@ def test_each_unknown_has_its_documented_effect():
     np.testing.assert_allclose(f, sensor[0, :3] + 1.1 * B @ R_ws, rtol=1e-9)
 
 
-def test_tool_rotations_are_the_shortest_ones_from_z():
+def test_tool_rotations_are_the_shortest_rotations_from_z():
     axes = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
     R = tool_rotations(axes)
     np.testing.assert_allclose(R[:, :, 2], axes, atol=1e-12)

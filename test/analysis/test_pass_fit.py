@@ -34,8 +34,8 @@ from support.passes import (
 ORDERS = (1, 2, 3)
 
 
-def rows(n_dipoles, n=6, seed=4):
-    """A model of `n` random samples, and paths and linear parameters."""
+def random_row(n_dipoles, n=6, seed=4):
+    """Random model with `n` samples, and random paths and linear parameters."""
     rng = np.random.default_rng(seed)
     M = rng.standard_normal((n, 3, 3))
     model = RowPass(rng.uniform(-1.0, 1.0, n), rng.uniform(-5.0, 5.0, (n, 3)), M, n_dipoles)
@@ -46,7 +46,7 @@ def rows(n_dipoles, n=6, seed=4):
 
 @pytest.mark.parametrize('n_dipoles', [1, 2, 3, 4])
 def test_a_row_is_the_sum_of_its_dipoles(n_dipoles):
-    model, theta, p = rows(n_dipoles)
+    model, theta, p = random_row(n_dipoles)
     moments = (model.combinations @ p[0]).reshape(-1, 3)
     direction = theta[0, 3:6] / np.linalg.norm(theta[0, 3:6])
     expected = np.zeros((6, 3))
@@ -61,8 +61,8 @@ def test_a_row_is_the_sum_of_its_dipoles(n_dipoles):
 @pytest.mark.parametrize('road', [True, False], ids=['road', 'any heading'])
 @pytest.mark.parametrize('n_dipoles', ORDERS)
 def test_the_search_finds_the_global_optimum(n_dipoles, road):
-    """The cost is not above the minimum at the truth; `bench.pass_search` runs 200 passes."""
-    missed = []
+    """The cost does not exceed the minimum near the truth. `bench.pass_search` has 200 passes."""
+    failures = []
     for seed in range(10):
         rng = np.random.default_rng([seed, n_dipoles, road])
         path, moments = random_path(rng, n_dipoles, road)
@@ -71,13 +71,13 @@ def test_the_search_finds_the_global_optimum(n_dipoles, road):
         problem = separable_problem(data, lambda *a: RowPass(*a, n_dipoles=n_dipoles))
         _, cost, _, _ = refine(problem.residual_and_jacobian, path[None], 100, 1e-8)
         if not fit.cost <= cost[0] * (1.0 + 1e-6):
-            missed.append((seed, fit.cost, cost[0], fit.reason))
-    assert not missed
+            failures.append((seed, fit.cost, cost[0], fit.reason))
+    assert not failures
 
 
 @pytest.mark.parametrize('n_dipoles', ORDERS)
 def test_errors_agree_with_the_covariance(n_dipoles):
-    """NEES of 25 passes is inside its band, TSP14 eq. (47); the cost is chi-square."""
+    """NEES (TSP14 eq. (47)) and cost of 25 passes are within their chi-square bands."""
     nees, costs, n = [], [], 25
     for seed in range(n):
         rng = np.random.default_rng([seed, n_dipoles, 7])
@@ -86,7 +86,7 @@ def test_errors_agree_with_the_covariance(n_dipoles):
         true = unknowns_at(path, moments, (fit.data.stamp_ns) / 1e9)
         k = len(true)
         error = fit.x[:k] - true
-        # A row of three may be ambiguous, or so short that its model is not linear.
+        # Skip ambiguous rows, and rows that are too short for a linear model.
         if not fit.ambiguous and fit.length[1] < 0.3:
             nees.append(error @ np.linalg.solve(fit.covariance[:k, :k], error))
         costs.append(fit.cost)
@@ -98,12 +98,12 @@ def test_errors_agree_with_the_covariance(n_dipoles):
 
 
 def test_stds_of_derived_quantities_agree_with_the_errors():
-    """Heading, speed, time and range of the CPA: squared errors over variances."""
+    """Squared errors over variances of heading, speed, CPA time and CPA range."""
     squares, n = [], 30
     for seed in range(n):
         rng = np.random.default_rng([seed, 21])
         path, moments = random_path(rng, 1, False)
-        # A CPA far from time zero makes the derivatives matter.
+        # With a CPA far from time zero, errors of the derivatives are significant.
         place = np.array([12.0, -9.0, 0.0])
         fit = fit_pass(measured(ROAD, path, moments, rng), 1)
         fit = replace(fit, robust_covariance=fit.covariance)
@@ -121,8 +121,8 @@ def test_stds_of_derived_quantities_agree_with_the_errors():
     assert ((low < total) & (total < high)).all(), total
 
 
-def test_a_misfit_of_all_orders_does_not_favour_a_higher_one():
-    """The cost is normalised by that of the highest order."""
+def test_a_misfit_of_all_orders_does_not_favour_a_higher_order():
+    """The costs are normalised by the cost of the highest order."""
     data = measured(ROAD, *random_path(np.random.default_rng(1), 1, True),
                     np.random.default_rng(1))
     n = data.n_values
@@ -133,9 +133,9 @@ def test_a_misfit_of_all_orders_does_not_favour_a_higher_one():
         return PassFit(n_dipoles, data, '', True, tuple('u' * k), x, np.eye(k) * 1e-4,
                        np.eye(k) * 1e-4, float(cost), 1.0, 2.0)
 
-    # The cost decreases by 35. This justifies four more unknowns if the rest is noise ...
+    # A cost reduction of 35 justifies four more unknowns if the remaining residual is noise ...
     assert choose_order([fit(1, n + 40.0), fit(2, n + 5.0)]).n_dipoles == 2
-    # ... but not if the rest is ten times the noise.
+    # ... but not if the residual is ten times the noise.
     assert choose_order([fit(1, 10.0 * n + 40.0), fit(2, 10.0 * n + 5.0)]).n_dipoles == 1
 
 
@@ -151,14 +151,14 @@ def test_correlated_residuals_increase_the_covariance():
         errors.append(x)
         found += P @ score_sum_covariance(H * (e - H @ x)[:, None], 60) @ P / 300.0
     true = np.cov(np.transpose(errors))
-    # For white noise, the stated variance would be a twentieth of the true one.
+    # The covariance for white noise is too small by a factor of about twenty.
     assert (np.diagonal(P) < 0.1 * np.diagonal(true)).all()
     assert (np.diagonal(found) > 0.7 * np.diagonal(true)).all()
     assert (np.diagonal(found) < 1.2 * np.diagonal(true)).all()
 
 
 @pytest.mark.parametrize('n_dipoles', ORDERS)
-def test_robust_covariance_is_never_below_and_close_to_the_nominal_one(n_dipoles):
+def test_robust_covariance_is_slightly_larger_than_the_nominal_covariance(n_dipoles):
     ratios = []
     for seed in range(6):
         rng = np.random.default_rng([seed, n_dipoles, 9])
@@ -172,7 +172,7 @@ def test_robust_covariance_is_never_below_and_close_to_the_nominal_one(n_dipoles
 
 
 def test_hard_and_soft_iron_from_four_headings():
-    """m0 and D within three stds, from passes of a row of three; TSP14 section VI.E."""
+    """m0 and D from passes of three dipoles have errors below three stds; TSP14 section VI.E."""
     rng = np.random.default_rng(5)
     hard, soft = np.array([[60.0, 30.0, -40.0], [120.0, -10.0, -70.0], [20.0, 40.0, 30.0]]), 5.0
     moments, headings, covariances = [], [], []
@@ -193,8 +193,8 @@ def test_hard_and_soft_iron_from_four_headings():
     assert std[3] < 0.5 and (std[:3] < 20.0).all()
 
 
-def test_chosen_order_is_that_of_the_simulated_target():
-    """A point is not fitted as a row, nor a row of three as a point."""
+def test_selected_order_equals_the_order_of_the_simulated_target():
+    """Points are not fitted as rows, and rows of three dipoles are not fitted as points."""
     chosen = {1: [], 3: []}
     for n_dipoles, orders in chosen.items():
         for seed in range(8):
@@ -220,7 +220,7 @@ def single_sensor_pass(moments, seed=1, path=(0.5, 0.0, 0.6, 9.0, 0.3, 0.0)):
     return measured(ONE_SENSOR, path, moments, np.random.default_rng(seed)), path, moments
 
 
-def test_one_sensor_yields_directions_and_a_time_but_no_scale():
+def test_one_sensor_determines_directions_and_time_but_not_the_scale():
     data, path, moments = single_sensor_pass([100.0, 250.0, -200.0])
     fit = fit_pass(data, 1)
     assert fit.reason.startswith('one sensor: the scale is not observable')
@@ -237,7 +237,7 @@ def test_one_sensor_yields_directions_and_a_time_but_no_scale():
 
 
 def test_a_fit_of_one_sensor_is_ambiguous_in_the_sign_of_the_path():
-    """(r, v) and (-r, -v) give the same field; the fit is the one above the sensor."""
+    """The paths (r, v) and (-r, -v) have the same field; the fit is above the sensor."""
     for seed in range(12):
         rng = np.random.default_rng([seed, 5])
         path, moments = random_path(rng, 1, False)
@@ -256,7 +256,7 @@ def test_a_fit_of_one_sensor_is_ambiguous_in_the_sign_of_the_path():
         assert (fit.position + t * fit.velocity)[2] >= ONE_SENSOR.positions[0, 2]
 
 
-def test_one_sensor_with_a_known_range_yields_all_parameters():
+def test_one_sensor_with_a_known_range_determines_all_parameters():
     data, path, moments = single_sensor_pass([100.0, 250.0, -200.0])
     r, v = path[:3] - ONE_SENSOR.positions[0], path[3:6]
     distance = np.linalg.norm(np.cross(r, v)) / np.linalg.norm(v)
@@ -264,14 +264,14 @@ def test_one_sensor_with_a_known_range_yields_all_parameters():
     assert not fit.reason and fit.bearing is None and fit.ambiguous
     error = fit.x[:9] - unknowns_at(path, moments, fit.data.stamp_ns / 1e9)
     assert (np.abs(error) < 3.0 * np.sqrt(np.diagonal(fit.covariance)[:9])).all()
-    # The range is known to 4 %, hence also the speed.
+    # The relative std of the speed equals the relative std of the range.
     assert fit.speed[1] / fit.speed[0] == pytest.approx(0.2 / distance, rel=0.2)
     with pytest.raises(ValueError, match='requires data of a single sensor'):
         fit_pass(measured(ROAD, path, moments, np.random.default_rng(1)), 1, (4.0, 0.1))
 
 
 def test_a_moment_perpendicular_to_the_plane_leaves_directions_unknown():
-    """The kernel has two dimensions (TSP14 section IV.A); affected quantities are NaN."""
+    """The kernel has two dimensions (TSP14 section IV.A). Unobservable directions are NaN."""
     data, _, _ = single_sensor_pass([0.0, 0.0, 300.0], path=(0.5, 0.0, 0.0, 9.0, 0.0, 0.0))
     b = fit_pass(data, 1).bearing
     assert np.isnan(b.cpa_direction).all() and np.isnan(b.motion_direction).all()
@@ -283,7 +283,7 @@ def test_a_path_through_the_sensor_is_rejected():
     assert 'r0 parallel to v0' in fit_pass(data, 1).reason
 
 
-def test_data_that_cannot_be_fitted_yield_a_reason():
+def test_data_that_cannot_be_fitted_result_in_a_reason():
     rng = np.random.default_rng(2)
     path, moments = random_path(rng, 3, True)
     data = measured(ROAD, path, moments, rng)
@@ -334,7 +334,7 @@ def test_missing_axes_and_sensors_only_reduce_the_accuracy():
 
 @pytest.fixture(scope='session')
 def recorded_passes(road_network):
-    """{name: FittedPass} of the bundled vehicle recordings."""
+    """Fit the bundled vehicle recordings: {name: FittedPass}."""
     out = {}
     for name in VEHICLES:
         job = RecordingFit(Recording(vehicle_path(name)), road_network, settings_for('vehicle'),
@@ -351,16 +351,16 @@ STRAIGHT = {'straight_car_right': 8.3, 'straight_small_left': 11.1, 'straight_ca
 
 @pytest.mark.parametrize('name', STRAIGHT)
 def test_order_three_describes_vehicles(recorded_passes, name):
-    """Normalised cost and speed; the limits are the aims of the project."""
+    """Normalised cost and speed are within the targets of the project."""
     fit = next(f for f in recorded_passes[name].fits if f.n_dipoles == 3)
     assert not fit.reason
     assert fit.normalised_cost < (8.0 if 'truck' in name else 2.0)
     assert fit.speed[0] == pytest.approx(STRAIGHT[name], rel=0.08)
-    # A row of three is a poor model of a truck: the robust stds are several times the nominal
-    # ones.
+    # A row of three dipoles is a poor model of a truck, so the robust stds are several times the
+    # nominal stds.
     std_ratio = np.sqrt(np.diagonal(fit.robust_covariance) / np.diagonal(fit.covariance))[:6]
     assert np.median(std_ratio) > (5.0 if 'truck' in name else 1.0)
-    # The chosen order may be another one.
+    # The selected order may differ.
     assert recorded_passes[name].chosen.speed[0] == pytest.approx(STRAIGHT[name], rel=0.1)
 
 

@@ -24,7 +24,7 @@ PRIOR = np.deg2rad([[0.3, 0.3, 2.0], [1.0, 2.0, 3.0], [5.0, 5.0, 5.0]])
 
 @dataclass
 class SimulatedTracks:
-    """Tracks that measure the rotation of every sensor linearly, and their joint estimate."""
+    """Tracks with linear measurements of the rotation of each sensor, and their joint estimate."""
 
     tracks: list
     truth: np.ndarray
@@ -34,10 +34,10 @@ class SimulatedTracks:
 
 def simulated_tracks(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=NETWORK,
                      prior=PRIOR):
-    """Simulate tracks that each measure `axes` directions with noise of std `noise` [rad].
+    """Simulate tracks that measure `axes` directions with noise of std `noise` [rad].
 
-    The std stated by a track is `claimed` times that. The joint estimate, the oracle, is one
-    least-squares solution of all rows.
+    The tracks assume `claimed` times this standard deviation. The oracle is the joint least-squares
+    solution of all measurements.
     """
     rng = np.random.default_rng(seed)
     n = len(network)
@@ -52,7 +52,7 @@ def simulated_tracks(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=
             A, y = A / claimed, y / claimed
             rows[j].append((A, y))
             P = np.linalg.inv(np.diag(prior[j]**-2.0) + A.T @ A)
-            # Filter angles rotate the field in the sensor frame: inverse rotation of the sensor.
+            # The angles rotate the field in the sensor frame; the sensor has the inverse rotation.
             R_sw = network.R_sw[j]
             mounting[j], covariance[j] = -R_sw @ (P @ A.T @ y), R_sw @ P @ R_sw.T
         tracks.append(SimpleNamespace(id=k + 1, mounting=mounting, mounting_covariance=covariance))
@@ -67,7 +67,7 @@ def simulated_tracks(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=
 @pytest.mark.parametrize('axes', [1, 2, 3])
 @pytest.mark.parametrize('n_tracks', [1, 2, 7])
 def test_fused_tracks_equal_one_joint_estimate(n_tracks, axes):
-    # The stated noise is too large, so the covariance is not inflated.
+    # The assumed noise is too large, so the covariance is not inflated.
     t = simulated_tracks(n_tracks, noise=0.01, claimed=3.0, axes=axes)
     e = fuse_mounting(NETWORK, PRIOR, t.tracks)
     assert e.n_tracks == n_tracks
@@ -90,7 +90,7 @@ def test_without_tracks_the_prior_remains():
 
 
 def test_a_track_without_information_has_no_effect():
-    """Its covariance is that of the prior or, by linearisation at the mean, slightly larger."""
+    """Due to linearisation, the covariance of such a track may slightly exceed the prior."""
     prior = np.einsum('jik,jk,jlk->jil', NETWORK.R_sw, PRIOR**2, NETWORK.R_sw)
     uninformative = SimpleNamespace(id=9, mounting=np.zeros((3, 3)),
                            mounting_covariance=1.02 * prior)
@@ -101,19 +101,19 @@ def test_a_track_without_information_has_no_effect():
 
 
 def scatters(n_runs, n_tracks, **kwargs):
-    """Scatter, and NEES of the rotation, of each run and sensor, (n_runs * n_sensors,) each."""
+    """Scatter and NEES of the rotation of each run and sensor, each (n_runs * n_sensors,)."""
     out, nees = [], []
     for seed in range(n_runs):
         t = simulated_tracks(n_tracks, seed, **kwargs)
         e = fuse_mounting(NETWORK, PRIOR, t.tracks)
         out += e.scatter.tolist()
-        off = e.rotation - t.truth
-        nees += [d @ np.linalg.solve(C, d) for d, C in zip(off, e.covariance, strict=True)]
+        errors = e.rotation - t.truth
+        nees += [d @ np.linalg.solve(C, d) for d, C in zip(errors, e.covariance, strict=True)]
     return np.array(out), np.array(nees)
 
 
 def test_scatter_of_consistent_tracks_is_about_one():
-    # The tracks are far more accurate than the prior, so they are only compared with each other.
+    # The tracks are far more accurate than the prior, which therefore has no effect.
     scatter, nees = scatters(60, 5, noise=1e-4)
     freedom = 3 * (5 - 1)
     low, high = chi2.ppf([0.001, 0.999], freedom * len(scatter)) / (freedom * len(scatter))
@@ -125,7 +125,7 @@ def test_scatter_of_consistent_tracks_is_about_one():
 
 @pytest.mark.parametrize('n_tracks', [2, 5])
 def test_scatter_of_consistent_weak_tracks_is_not_above_one(n_tracks):
-    """Tracks with a tenth of the information of the prior: its pull is not counted as scatter."""
+    """The prior dominates tracks with a tenth of its information, but adds no scatter."""
     scatter, _ = scatters(80, n_tracks, noise=0.15)
     freedom = 3 * (n_tracks - 1)
     high = chi2.ppf(0.999, freedom * len(scatter)) / (freedom * len(scatter))
@@ -136,7 +136,7 @@ def test_scatter_of_consistent_weak_tracks_is_not_above_one(n_tracks):
 def test_covariance_of_overconfident_tracks_is_inflated():
     scatter, nees = scatters(60, 5, noise=1e-3, claimed=0.2)
     assert scatter.mean() == pytest.approx(25.0, rel=0.1)
-    # Without inflation 25; with it as for Student's t distribution with 12 degrees of freedom.
+    # Student's t distribution with 12 degrees of freedom; without inflation, the value is 25.
     assert 0.6 < nees.mean() / 3 < 1.5
     t = simulated_tracks(5, 3, noise=1e-3, claimed=0.2)
     e = fuse_mounting(NETWORK, PRIOR, t.tracks)
@@ -168,36 +168,36 @@ CHANGES = {**POINT, 'track.field_error': 0.0, 'track.vehicle.near_field_lengths'
 
 @pytest.fixture(scope='module')
 def rotated_sensor_passes():
-    """(stated network, true R_ws, evidence) of passes with one sensor rotated by 6 degrees."""
-    stated = line_network(4, tilt=0.5)
-    R_ws = stated.R_ws.copy()
+    """Simulate passes with one sensor rotated by 6 degrees: (network, true R_ws, evidence)."""
+    nominal = line_network(4, tilt=0.5)
+    R_ws = nominal.R_ws.copy()
     R_ws[1] = rotation_about_z(np.deg2rad(6.0)) @ R_ws[1]
     tracks = []
     for k, (start, heading, hard) in enumerate((
             ([-60.0, -1.2], 0.0, [600.0, -300.0, 160.0]),
             ([70.0, 1.2], np.pi, [-300.0, 500.0, -250.0]))):
         samples, *_ = simulate(
-            replace(stated, R_ws=R_ws),
+            replace(nominal, R_ws=R_ws),
             point_body(hard, 5.0, 0.5), Path(np.array(start), heading, 10.0), 50.0, 12.0,
             np.random.default_rng(k))
-        pipeline = Pipeline(stated, settings_for('vehicle', CHANGES))
+        pipeline = Pipeline(nominal, settings_for('vehicle', CHANGES))
         records = [r for s in samples for r in pipeline.feed(one(s))]
         tracks.append([r for r in records if isinstance(r, Track) and not r.ended][-1])
     prior = np.full((4, 3), np.deg2rad(5.0))
-    return stated, R_ws, fuse_mounting(stated, prior, tracks)
+    return nominal, R_ws, fuse_mounting(nominal, prior, tracks)
 
 
 def test_passes_correct_the_orientation_of_a_rotated_sensor(rotated_sensor_passes):
-    stated, truth, evidence = rotated_sensor_passes
-    found = with_evidence(stated, evidence)
+    nominal, truth, evidence = rotated_sensor_passes
+    found = with_evidence(nominal, evidence)
     before, after = (Rotation.from_matrix(truth @ np.swapaxes(R, 1, 2)).as_rotvec()
-                     for R in (stated.R_ws, found.R_ws))
+                     for R in (nominal.R_ws, found.R_ws))
     print(np.degrees(evidence.rotation).round(2), np.degrees(after).round(2),
           np.degrees(found.orientation_std).round(2))
     # The correction about the vertical is towards the truth.
     assert evidence.rotation[1, 2] > np.deg2rad(3.0)
     assert abs(after[1, 2]) < 0.5 * abs(before[1, 2])
-    # The other sensors hardly rotate, and all errors agree with the stated stds.
+    # The corrections of the other sensors are small, and all errors agree with their stds.
     assert np.abs(evidence.rotation[[0, 2, 3]]).max() < 3.0 * np.deg2rad(5.0) / 3.0
     assert np.abs(after / np.array(found.orientation_std)).max() < 4.0
     assert np.array(found.orientation_std)[:, 2].max() < np.deg2rad(5.0)

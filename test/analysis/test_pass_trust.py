@@ -21,7 +21,7 @@ PATH = np.array([0.0, -2.0, 0.5, 10.0, 0.0, 0.0, 3.0])
 
 
 def test_reach_covers_the_residuals_of_published_vehicles():
-    """TSP14 Tables I and II as shares of the energy: (cost - 1) / 87, at 4.5 m."""
+    """Unexplained energy from costs of TSP14 Tables I and II: (cost - 1) / 87, at 4.5 m."""
     cars, trucks = (10, 14, 17), ((302.6, 9.09), (76.7, 11.25))
     for cost in cars:
         assert 1.0 < 4.5 * np.sqrt((cost - 1.0) / 87.0) <= reach(1, 0.0)
@@ -42,18 +42,18 @@ def field_and_data(seed=3):
 def test_residuals_near_the_vehicle_are_not_elsewhere():
     data, field = field_and_data()
     W = data.whitening
-    place = PATH[:3] + data.t[:, None] * PATH[3:6] - data.positions
-    near = np.minimum(1.0, 0.3 / np.linalg.norm(place, axis=1))[:, None]
-    for residual, low, high in ((0.0 * field, 0.0, 0.0), (near * field, 0.0, 1e-6),
+    position = PATH[:3] + data.t[:, None] * PATH[3:6] - data.positions
+    scale = np.minimum(1.0, 0.3 / np.linalg.norm(position, axis=1))[:, None]
+    for residual, low, high in ((0.0 * field, 0.0, 0.0), (scale * field, 0.0, 1e-6),
                             (0.3 * field, 0.001, 0.2)):
-        share = residual_elsewhere(data, [FittedRow(3, PATH, field)],
+        fraction = residual_elsewhere(data, [FittedRow(3, PATH, field)],
                                   np.einsum('nij,nj->ni', W, residual))
-        assert low <= share <= high
-    # The same energy at another time, as of a second vehicle.
+        assert low <= fraction <= high
+    # The same residual at another time, as caused by a second vehicle.
     late = np.roll(field, 150, axis=0)
-    share = residual_elsewhere(data, [FittedRow(3, PATH, field)],
+    fraction = residual_elsewhere(data, [FittedRow(3, PATH, field)],
                            np.einsum('nij,nj->ni', W, 0.2 * late))
-    assert share > 0.02
+    assert fraction > 0.02
 
 
 def test_noise_is_not_counted_as_residual_elsewhere():
@@ -88,7 +88,7 @@ def test_a_single_fit_of_two_vehicles_is_not_trusted():
 
 
 def test_a_near_vehicle_is_not_rejected_for_its_residuals():
-    """Formerly, 15 of 16 correct fits at 0.8 m were rejected for residuals of 2.4 to 11.9 %."""
+    """Correct fits at 0.8 m have residuals of 2.4 to 11.9 %."""
     for seed in (2, 9, 20):
         velocity, std = answers(seed).fit
         assert abs(velocity / answers(seed).truth - 1.0) < 0.1 and std < 0.25 * abs(velocity)
@@ -96,7 +96,7 @@ def test_a_near_vehicle_is_not_rejected_for_its_residuals():
 
 @pytest.mark.parametrize('errors', [SensorErrors(), SensorErrors(np.deg2rad(4.0), 0.03)])
 def test_covariance_includes_the_errors_of_the_sensors(errors):
-    """With rotations and gains as assumed, the normalised errors are about one."""
+    """The mean normalised squared error is about one for the assumed rotations and gains."""
     z = []
     for seed in range(12):
         rng = np.random.default_rng([seed, 40])
@@ -106,11 +106,12 @@ def test_covariance_includes_the_errors_of_the_sensors(errors):
         for j in range(2):
             a, b, c = errors.rotation_std * rng.standard_normal(3)
             turn = np.array([[1.0, -c, b], [c, 1.0, -a], [-b, a, 1.0]])
-            mine = data.sensor == j
-            field[mine] = field[mine] @ turn * (1.0 + errors.gain_std * rng.standard_normal(3))
+            of_sensor = data.sensor == j
+            field[of_sensor] = field[of_sensor] @ turn * (
+                1.0 + errors.gain_std * rng.standard_normal(3))
         fit = fit_pass(replace(data, field=field), 1, errors=errors)
-        alone = fit_pass(data, 1, errors=SensorErrors(0.0, 0.0))
-        assert fit.speed[1] > 1.2 * alone.speed[1]
+        without_errors = fit_pass(data, 1, errors=SensorErrors(0.0, 0.0))
+        assert fit.speed[1] > 1.2 * without_errors.speed[1]
         true = path[:6] + np.r_[fit.data.stamp_ns / 1e9 * path[3:6], np.zeros(3)]
         P = fit.robust_covariance[:6, :6]
         e = fit.x[:6] - true
@@ -119,22 +120,22 @@ def test_covariance_includes_the_errors_of_the_sensors(errors):
     assert 0.4 < np.mean(z) < 1.7, np.round(z, 2)
 
 
-def test_resting_readings_of_a_coarse_sensor_count_once():
+def test_repeated_readings_of_a_coarse_sensor_are_counted_as_fractions():
     data, _ = field_and_data()
     coarse = data.covariance.copy()
     coarse[::2] *= 60.0
     assert data.n_independent == data.n_values
-    found = replace(data, covariance=coarse)
-    assert found.n_independent == pytest.approx(data.n_values / 2.0 * (1.0 + 1.0 / 60.0))
-    np.testing.assert_allclose(found.whitening[0], data.whitening[0] / np.sqrt(60.0))
-    np.testing.assert_allclose(found.whitening[1], np.eye(3) / NOISE)
-    # While the noise is being learnt it varies by some percent; each reading counts.
+    mixed = replace(data, covariance=coarse)
+    assert mixed.n_independent == pytest.approx(data.n_values / 2.0 * (1.0 + 1.0 / 60.0))
+    np.testing.assert_allclose(mixed.whitening[0], data.whitening[0] / np.sqrt(60.0))
+    np.testing.assert_allclose(mixed.whitening[1], np.eye(3) / NOISE)
+    # Small variations of the noise estimate do not reduce the number of independent values.
     slightly = data.covariance * np.linspace(1.0, 1.3, len(data.t))[:, None, None]
     assert replace(data, covariance=slightly).n_independent == data.n_values
 
 
-def fitted(std_speed, std_heading, change=0.0):
-    """A `PassFit` of a point with given stds of speed [m/s] and heading [rad]."""
+def point_fit(std_speed, std_heading, change=0.0):
+    """Create the `PassFit` of a point with given stds of speed [m/s] and heading [rad]."""
     data, _ = field_and_data()
     x = np.concatenate([[0.0, -2.0, 0.5], [10.0, 0.0, 0.0], np.ones(9)])
     P = 1e-4 * np.eye(len(x))
@@ -143,17 +144,18 @@ def fitted(std_speed, std_heading, change=0.0):
                    velocity_change=change, velocity_change_std=0.05, residual_elsewhere=0.0)
 
 
-def test_each_quantity_is_trusted_by_its_own_std():
-    assert trusted(fitted(0.5, 0.1)) == ('speed', 'direction', 'time')
-    assert 'speed' not in trusted(fitted(2.6, 0.1))
-    # If the speed does not differ from zero, the direction is unknown.
-    assert 'direction' not in trusted(fitted(5.1, 0.1))
-    assert 'direction' not in trusted(fitted(0.5, 0.6)) and 'speed' in trusted(fitted(0.5, 0.6))
-    late = fitted(0.5, 0.1)
+def test_each_quantity_is_trusted_according_to_its_own_std():
+    assert trusted(point_fit(0.5, 0.1)) == ('speed', 'direction', 'time')
+    assert 'speed' not in trusted(point_fit(2.6, 0.1))
+    # The direction is unknown if the speed does not differ significantly from zero.
+    assert 'direction' not in trusted(point_fit(5.1, 0.1))
+    assert 'direction' not in trusted(point_fit(0.5, 0.6)) \
+        and 'speed' in trusted(point_fit(0.5, 0.6))
+    late = point_fit(0.5, 0.1)
     late.robust_covariance[0, 0] = 4.0
     assert trusted(late) == ('speed', 'direction')
-    assert trusted(fitted(0.5, 0.1, change=0.5)) == ()
-    assert trusted(replace(fitted(0.5, 0.1), residual_elsewhere=0.01)) == ()
+    assert trusted(point_fit(0.5, 0.1, change=0.5)) == ()
+    assert trusted(replace(point_fit(0.5, 0.1), residual_elsewhere=0.01)) == ()
 
 
 @pytest.mark.parametrize('name', [n for n in VEHICLES if 'turns' in n])

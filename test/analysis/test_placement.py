@@ -1,4 +1,4 @@
-"""Sensor placement: bounds against oracles and fits, detection, and the command `plan`."""
+"""Sensor placement: bounds compared with oracles and fits, detection, and the command `plan`."""
 
 import json
 
@@ -34,8 +34,8 @@ def poses_of(network):
 
 
 @pytest.mark.parametrize('error, background_std', [(0.0, np.inf), (0.04, 1e-8), (0.0, 1e-9)])
-def test_information_equals_that_of_all_measurements_stacked(error, background_std):
-    """Oracle: a stack of Jacobians with the backgrounds as states."""
+def test_information_equals_the_stacked_measurements(error, background_std):
+    """Oracle: stacked Jacobians with the backgrounds as states."""
     network = line_network(4)
     sampling = Sampling(0.1, 4e-9, error, background_std, 1.0)
     found = pass_information(*poses_of(network), CAR, sampling, POINTS, 0.7)
@@ -60,7 +60,7 @@ def test_information_equals_that_of_all_measurements_stacked(error, background_s
                                        expected / np.outer(scale, scale), rtol=0, atol=1e-9)
 
 
-def test_bounds_are_those_of_the_blocks_of_the_covariance():
+def test_bounds_equal_the_blocks_of_the_covariance():
     J = pass_information(*poses_of(ROAD), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
     for prior in (np.zeros((9, 9)), PlannedTarget(400.0, 0.5, 10.0, 0.2, 0.1).prior()):
         found = bounds_of(J, prior)
@@ -70,7 +70,7 @@ def test_bounds_are_those_of_the_blocks_of_the_covariance():
             np.testing.assert_allclose(found[at], expected, rtol=1e-5)
 
 
-def test_neither_another_sensor_nor_a_prior_increases_the_bounds():
+def test_neither_an_additional_sensor_nor_a_prior_increases_the_bounds():
     place = np.vstack([ROAD.positions, [[6.0, 1.0, 0.0]]]), np.tile(np.eye(3), (3, 1, 1))
     J = pass_information(*place, CAR, Sampling(0.1, 4e-9), POINTS, 0.0)
     two, three = bounds_of(J[:, :, :2].sum(axis=2), np.zeros((9, 9))), bounds_of(
@@ -81,25 +81,25 @@ def test_neither_another_sensor_nor_a_prior_increases_the_bounds():
 
 
 def test_bounds_scale_with_the_network():
-    """A network scaled by u with moments scaled by u^3 has position bounds scaled by u."""
+    """If the network is scaled by u and the moments by u^3, the position bounds scale with u."""
     u = 0.02
     small = PlannedTarget(400.0 * u**3, 0.5 * u, 10.0 * u)
     J = pass_information(*poses_of(ROAD), CAR, Sampling(0.1, 4e-9), POINTS, 0.3).sum(axis=2)
     K = pass_information(u * ROAD.positions, ROAD.R_sw, small, Sampling(0.1, 4e-9), u * POINTS,
                          0.3).sum(axis=2)
     none = np.zeros((9, 9))
-    # `bounds_of` has a lower limit of 1e-12 in the information per unit, which is not scaled.
+    # The constant information of 1e-12 in `bounds_of` is not scaled.
     np.testing.assert_allclose(bounds_of(K, none) / [u, u, u**3], bounds_of(J, none), rtol=1e-4)
 
 
 def test_position_bound_of_one_sensor_is_very_large():
-    alone = network_of([[0.0, -4.5, 0.0]])
-    J = pass_information(*poses_of(alone), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
+    network = network_of([[0.0, -4.5, 0.0]])
+    J = pass_information(*poses_of(network), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
     assert (bounds_of(J, np.zeros((9, 9)))[..., 0] > 1e3).all()
 
 
 def test_fits_reach_the_bound():
-    """Errors of 40 batch fits of a point: their mean square over the bound is chi-square / n."""
+    """The normalised squared errors of 40 fits of a point are chi-square distributed."""
     rng, path = np.random.default_rng(3), np.array([0.0, 1.0, 0.5, 10.0, 0.0, 0.0])
     sampling = Sampling(0.01, NOISE, half_window=2.0, max_frames=500)
     J = pass_information(*poses_of(ROAD), CAR, sampling, path[None, :2], 0.0)[0, 4].sum(axis=0)
@@ -114,7 +114,7 @@ def test_fits_reach_the_bound():
     assert low < nees < high
 
 
-def test_detection_probability_is_that_of_the_energy_test():
+def test_detection_probability_agrees_with_the_energy_detector():
     points = np.array([[12.0, 0.0], [0.0, 30.0], [14.0, 3.0]])
     noise = np.array([4e-9, 6e-9])
     found = detection_probabilities(*poses_of(ROAD), CAR, Sampling(0.08, noise), points, 1e-3)
@@ -139,7 +139,7 @@ def road_plan():
 def test_a_plan_is_consistent(road_plan):
     p = road_plan
     lane, = p.lanes
-    # A whole pass has more information than its part up to a frame.
+    # A complete pass contains more information than its part before a frame.
     assert (lane.pass_std[:, 0] <= 1.05 * lane.filter_std).all()
     assert lane.detection[np.argmin(np.abs(lane.along))] > 0.999
     # The road and the two sensors are symmetric.
@@ -169,7 +169,7 @@ def test_plan_writes_all_its_files(tmp_path, capsys):
     assert 'additional sensor: best at' in text and 'observable, condition number' in text
 
 
-@pytest.mark.parametrize('options, text', [
+@pytest.mark.parametrize('options, message', [
     (['--target', 'tank'], '--target: expected one of small, car, truck, magnet'),
     (['--target', 'car', '--moment', '3'], '--target: give either target or moment'),
     (['--moment', '3'], '--height: required together with moment'),
@@ -188,15 +188,15 @@ def test_plan_writes_all_its_files(tmp_path, capsys):
     (['--heading', '0', '0'], 'two lanes are equal'),
     (['--target', 'magnet'], '--moment: required for a magnet, together with height'),
 ])
-def test_plan_rejects_invalid_options(tmp_path, capsys, options, text):
+def test_plan_rejects_invalid_options(tmp_path, capsys, options, message):
     assert main(['plan', '--network', str(NETWORK_FILE), *options,
                  '--out', str(tmp_path / 'out')]) == 1
-    assert text in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
 
 
 @pytest.mark.parametrize('options', [
-    # Points of the map and of a lane at a sensor; no free place; two lanes with one heading.
+    # Points of the map and of a lane at a sensor; no free position; two lanes with one heading.
     ['--height', '0', '--heading', '0', '--offset', '4.5', '--area', '-10', '-10', '10', '10'],
     ['--height', '0', '--heading', '90', '--area', '-9', '-9', '9', '9', '--clearance', '1e6'],
     ['--heading', '0', '0', '--offset', '2', '-2', '--rate', '1'],
@@ -212,7 +212,7 @@ def test_plan_accepts_unusual_options(tmp_path, capsys, options):
         assert 'the area has no place clear of the lanes' in capsys.readouterr().out
 
 
-def test_another_sensor_keeps_clear_of_every_lane():
+def test_the_additional_sensor_has_the_clearance_from_each_lane():
     p = compute_plan(ROAD, CAR, Sampling(0.08, 4e-9, 0.04, 1e-8),
                      [('a', 0.0, 2.0), ('b', 0.0, -3.0)], (-12.0, -12.0, 12.0, 12.0),
                      settings_for('vehicle'), clearance=1.5, n_grid=13)
@@ -232,8 +232,8 @@ def test_missed_detection_probability_agrees_with_simulation():
     np.testing.assert_allclose(missed_detection_probability(p, 1), np.prod(1.0 - p, axis=0))
 
 
-def test_a_lane_counts_every_frame_once():
-    """A third of the frames with a third of the variance gives the same std at every step."""
+def test_the_std_of_a_lane_does_not_depend_on_the_frame_rate():
+    """A third of the frames with a third of the variance results in the same std."""
     slow = PlannedTarget(400.0, 0.5, 0.8, 0.2, 0.1)
     lanes = [compute_plan(
         ROAD, slow, Sampling(0.08 * k, 4e-9 / np.sqrt(k), 0.04 / np.sqrt(k), 1e-8, 20.0),

@@ -1,4 +1,4 @@
-"""Calibration of a board of 41 sensors from recorded readings, tested on other readings."""
+"""Calibration of a board of 41 sensors with recorded readings, and test with other readings."""
 
 import numpy as np
 import pytest
@@ -13,12 +13,12 @@ from support.real_board import BOX, MOMENT, board_of_41, errors, said, within_li
 
 @pytest.fixture(scope='module')
 def recorded():
-    """(network, field, positions, axes)."""
+    """Recorded readings of the board: (network, field, positions, axes)."""
     return board_of_41()
 
 
 @pytest.mark.parametrize('first', studied([0, 1], [0]))
-def test_calibration_on_every_other_row_is_accurate_on_the_rest(recorded, first):
+def test_calibration_with_half_of_the_readings_is_accurate_for_the_other_half(recorded, first):
     network, field, positions, axes = recorded
     g = calibrate_geometry(network, field[first::2], positions[first::2], axes[first::2], MOMENT,
                            GeometrySettings())
@@ -27,25 +27,28 @@ def test_calibration_on_every_other_row_is_accurate_on_the_rest(recorded, first)
     # The magnet is about 8 mm below the tracked point.
     assert g.tool_offset[0][2] == pytest.approx(-8e-3, abs=1e-3)
     assert g.tool_offset[1][2] < 3e-4 and (g.tool_tilt[1] < 2e-3).all()
-    rest = slice(1 - first, None, 2)
-    place, turn = errors(g, field[rest], positions[rest], axes[rest], g.magnet_poses)
-    low = positions[rest, 2] < 0.1
-    said(f'known poses, rows {first}::2', place, turn, low)
-    within_limits(place, turn, low)
+    test_rows = slice(1 - first, None, 2)
+    position_error, axis_error = errors(g, field[test_rows], positions[test_rows],
+                                        axes[test_rows], g.magnet_poses)
+    low = positions[test_rows, 2] < 0.1
+    said(f'known poses, rows {first}::2', position_error, axis_error, low)
+    within_limits(position_error, axis_error, low)
     if first == 0:
-        # The stated geometry with calibrated biases only is at least three times worse.
-        stated = GeometrySettings(
+        # With calibrated biases only, the errors are at least three times as large.
+        bias_only = GeometrySettings(
             gain_std=0.0, rotation_std_deg=0.0, position_std=0.0, board_shift_std=0.0,
             board_rotation_std_deg=0.0, tool_offset_std=0.0, tool_tilt_std_deg=0.0)
-        plain = calibrate_geometry(network, field[::2], positions[::2], axes[::2], MOMENT, stated)
+        nominal = calibrate_geometry(network, field[::2], positions[::2], axes[::2], MOMENT,
+                                     bias_only)
         few = slice(1, None, 6)
-        worse, turn = errors(plain, field[few], positions[few], axes[few], plain.magnet_poses)
-        said('as stated', worse, turn, positions[few, 2] < 0.1)
-        assert np.median(worse) > 3.0 * np.median(place)
+        nominal_error, axis_error = errors(nominal, field[few], positions[few], axes[few],
+                                           nominal.magnet_poses)
+        said('as stated', nominal_error, axis_error, positions[few, 2] < 0.1)
+        assert np.median(nominal_error) > 3.0 * np.median(position_error)
 
 
-def registered(r, u, positions, axes):
-    """Map from tracked poses to the world: best rigid motion, tool offset and tool tilt."""
+def fit_registration(r, u, positions, axes):
+    """Fit the map from tracked poses to world poses: rigid motion, tool offset and tool tilt."""
     centre = positions.mean(axis=0)
 
     def poses(x, positions, axes):
@@ -63,12 +66,12 @@ def registered(r, u, positions, axes):
 
 
 @pytest.mark.study
-def test_blind_calibration_is_accurate_on_the_other_rows(recorded):
-    """Calibrated without the tracker, registered by the training rows, tested on the others."""
+def test_blind_calibration_is_accurate_for_the_other_readings(recorded):
+    """Calibrate without the tracker, register with the same readings, test with other readings."""
     network, field, positions, axes = recorded
     g = calibrate_geometry_blind(network, field[::2], MOMENT, *BOX, GeometrySettings())
     assert g.converged and g.suspect_sensors == () and len(g.rows) >= 155
-    poses = registered(*g.poses, positions[::2][g.rows], axes[::2][g.rows])
+    poses = fit_registration(*g.poses, positions[::2][g.rows], axes[::2][g.rows])
     place, turn = errors(g, field[1::2], positions[1::2], axes[1::2], poses)
     low = positions[1::2, 2] < 0.1
     said('unknown poses, rows 0::2', place, turn, low)

@@ -17,12 +17,12 @@ def changed(s, t=None, field=None):
     return replace(s, t=s.t if t is None else t, field=s.field if field is None else field)
 
 
-def test_duration_has_no_effect():
+def test_duration_does_not_affect_the_features():
     s = example_signature()
     np.testing.assert_allclose(features(changed(s, t=3.7 * s.t + 100.0)), features(s), atol=1e-9)
 
 
-def test_the_unit_changes_only_the_size():
+def test_the_unit_affects_only_the_magnitude_feature():
     s = example_signature()
     first, other = features(s), features(changed(s, field=1e9 * s.field))
     assert other[0] - first[0] == pytest.approx(np.log(1e9))
@@ -50,8 +50,8 @@ def test_quiet_ends_have_little_effect():
     inside = (t >= 2.0) & (t <= s.t[-1] + 2.0)
     field[inside] += np.stack([np.interp(t[inside] - 2.0, s.t, axis - axis[0])
                                for axis in s.field.T], axis=1)
-    apart = np.abs(features(changed(s, t=t, field=field)) - features(s))
-    assert np.median(apart) < 0.1
+    difference = np.abs(features(changed(s, t=t, field=field)) - features(s))
+    assert np.median(difference) < 0.1
 
 
 @pytest.mark.parametrize(('t', 'field', 'message'), [
@@ -59,6 +59,6 @@ def test_quiet_ends_have_little_effect():
     (np.arange(20.0), np.ones((20, 3)), 'is constant'),
     (np.arange(20.0), np.full((20, 3), np.nan), 'not finite'),
     (np.zeros(20), np.random.default_rng(0).standard_normal((20, 3)), 'do not increase')])
-def test_signatures_without_shape_are_rejected(t, field, message):
+def test_invalid_signatures_are_rejected(t, field, message):
     with pytest.raises(ValueError, match=message):
         features(changed(example_signature(), t, field))

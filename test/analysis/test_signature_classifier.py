@@ -1,4 +1,4 @@
-"""Classifier of signatures: accuracy, calibration, unknown signatures, rejected labels."""
+"""Classifier of signatures: accuracy, calibration, unknown signatures, and rejected labels."""
 
 from functools import cache
 
@@ -25,26 +25,26 @@ def examples(simulator='boxes', seed=0):
     return examples_of(signatures(COUNTS, simulator, seed))
 
 
-def trained(e):
+def train_model(e):
     return train(e.x, e.labels, e.groups, e.axes, e.unit)
 
 
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
-def test_accuracy_is_better_than_the_share_of_the_largest_class(simulator):
+def test_accuracy_exceeds_the_fraction_of_the_largest_class(simulator):
     e = examples(simulator)
     found = evaluate_splits(e.x, e.labels, e.groups, e.axes, e.unit, 5)
     assert found.majority == pytest.approx(100 / 140, abs=0.03)
     assert found.accuracy.mean() > found.majority + 0.05
-    # A constant answer has a balanced accuracy of a third.
+    # A constant prediction has a balanced accuracy of one third.
     assert found.balanced_accuracy.mean() > 0.65
-    # The aim is 0.05; three standard errors of 5 x 42 answers are added.
+    # The target is 0.05; the limit adds three standard errors of 5 x 42 predictions.
     assert found.reliability < 0.05 + 3.0 * np.sqrt(0.1 / 210)
     assert found.unknown.mean() < 0.1
 
 
 def test_a_signature_far_from_all_examples_is_unknown():
     e = examples()
-    model = trained(e)
+    model = train_model(e)
     assert np.mean(np.array(model.names(e.x)) == UNKNOWN) < 0.05
     far = e.x + 8.0 * model.scale * np.random.default_rng(0).choice([-1.0, 1.0], e.x.shape)
     assert set(model.names(far)) == {UNKNOWN}
@@ -53,14 +53,14 @@ def test_a_signature_far_from_all_examples_is_unknown():
 
 def test_training_is_reproducible_and_a_model_file_is_lossless(tmp_path):
     e, other = examples(), examples(seed=1)
-    model = trained(e)
+    model = train_model(e)
     write_model(tmp_path / 'classes.json', model)
-    again, stored = trained(e), read_model(tmp_path / 'classes.json')
+    again, stored = train_model(e), read_model(tmp_path / 'classes.json')
     for found in (again, stored):
         np.testing.assert_array_equal(found.posterior(other.x), model.posterior(other.x))
         assert found.names(other.x) == model.names(other.x)
     assert evaluate(stored, other.x, other.labels).accuracy[0] > 0.8
-    with pytest.raises(LabelsError, match="does not have the classes 'tank'"):
+    with pytest.raises(LabelsError, match="not classes of the model: 'tank'"):
         evaluate(stored, other.x, ['tank'] * len(other.labels))
 
 
@@ -76,14 +76,15 @@ def test_two_classes_have_probabilities():
 
 @pytest.mark.parametrize(('labels', 'message'), [
     (['car'] * 10, 'at least two classes, got car'), (['car'] * 9 + ['truck'], "got 1 of 'truck'"),
-    (['car'] * 5 + [''] * 5, 'no label'), (['car'] * 5 + ['unknown'] * 5, 'rename the class')])
+    (['car'] * 5 + [''] * 5, 'labels are missing for 5'),
+    (['car'] * 5 + ['unknown'] * 5, 'rename the class')])
 def test_labels_unsuitable_for_training_are_rejected(labels, message):
     x = np.random.default_rng(0).standard_normal((10, 4))
     with pytest.raises(LabelsError, match=message):
         train(x, labels, list(map(str, range(10))), ('x',), 'T')
 
 
-def test_reliability_error_follows_its_definition():
+def test_expected_calibration_error_follows_its_definition():
     assert reliability_error(np.array([0.9] * 10), np.array([True] * 9 + [False])) == \
         pytest.approx(0.0)
     assert reliability_error(np.array([0.95] * 10), np.array([True] * 5 + [False] * 5)) == \
@@ -91,13 +92,13 @@ def test_reliability_error_follows_its_definition():
 
 
 def test_random_labels_are_not_learnt_from_sensors_of_one_pass():
-    """Four sensors measure nearly the same: one of them in the test set would leak the labels."""
+    """Four sensors measure almost equal readings, so a split of a pass would leak labels."""
     rng = np.random.default_rng(2)
     of_pass = rng.standard_normal((40, 20)).repeat(4, axis=0)
     x = of_pass + 0.01 * rng.standard_normal(of_pass.shape)
     labels = rng.choice(['a', 'b'], 40).repeat(4).tolist()
     groups = list(map(str, np.arange(40).repeat(4)))
     found = evaluate_splits(x, labels, groups, ('x',), 'T', 10)
-    # Chance level within three standard errors of ten splits of twelve passes, which overlap.
+    # Chance level within three standard errors of ten overlapping splits of twelve passes.
     assert abs(found.balanced_accuracy.mean() - 0.5) < 0.25
     assert found.accuracy.mean() < 0.8

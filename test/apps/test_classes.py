@@ -87,26 +87,42 @@ def test_invalid_intervals_are_named(tmp_path, rows, error):
                             read_network(NETWORK_FILE))
 
 
-def test_invalid_tables_are_refused(tmp_path, tables, capsys):
-    invalid = {'no label': 'a,x0,x1\n1,2,3\n', 'numbered': 'label,x,y\ncar,1,2\n',
-               'two x': 'label,x0,x1,bx0,bx1\ncar,1,2,3,4\n', 'a gap': 'label,x0,x2\ncar,1,2\n',
-               'half a unit': 'label,x_nt_0,y_0\ncar,1,2\n', 'semicolons': 'label;x0\ncar;1\n',
-               'several labels': 'label,signature,time_s,x\ncar,1,0,1\ntruck,1,1,2\n',
-               'one sample': 'label,time_s,x\ncar,0,1\n', 'too few': 'label,x0,x1\ncar,1,2\n',
-               'no number': 'label,x0,x1\ncar,1,two\n', 'has no rows': 'label,x0\n'}
-    for k, text in enumerate(invalid.values()):
-        path = tmp_path / f'{k}.csv'
-        path.write_text(text)
-        assert main(['classes', 'train', str(path), '--out', str(tmp_path / 'm.json')]) == 1
-        assert 'mag-tracking: ' in capsys.readouterr().err and not (tmp_path / 'm.json').exists()
+@pytest.mark.parametrize(('text', 'message'), [
+    ('a,x0,x1\n1,2,3\n', "column 'label' is missing; the columns are a, x0, x1\n"),
+    ('label;x0\ncar;1\n', "the delimiter is ';', expected a comma"),
+    ('label,x,y\ncar,1,2\n', 'expected numbered columns of samples'),
+    ('label,x0,x1,y0\ncar,1,2,3\n', 'the same number for each axis'),
+    ('label,x0,x1,bx0,bx1\ncar,1,2,3,4\n', 'the columns x0, ... are not numbered consecutively'),
+    ('label,x0,x2\ncar,1,2\n', 'the columns x0, ... are not numbered consecutively'),
+    ('label,x_nt_0,y_0\ncar,1,2\n', 'only some fields have a unit'),
+    ('label,signature,time_s,x,bx\ncar,1,0,1,2\n', 'several columns hold the axis x'),
+    ('label,signature,time_s\ncar,1,0\n', 'no column holds a field'),
+    ('label,time_s,x\ncar,0,1\n', 'no column identifies the signatures'),
+    ('label,signature,time_s,x\ncar,1,0,1\ncar,2,1,2\n', 'each signature has only one sample'),
+    ('label,signature,time_s,x\ncar,1,0,1\ntruck,1,1,2\n',
+     'signature 1 has several values of label: car, truck'),
+    ('label,x0,x1\ncar,1,2\n', 'row 2: too few samples for a signature: 2'),
+    ('label,x0,x1\ncar,1,two\n', "row 2: x1 is 'two', not a number"),
+    ('label,x0\n', 'a.csv has no rows')])
+def test_an_invalid_table_is_rejected_with_its_error(tmp_path, capsys, text, message):
+    """The message is compared because such a table could not be trained even without the check."""
+    path = tmp_path / 'a.csv'
+    path.write_text(text)
+    assert main(['classes', 'train', str(path), '--out', str(tmp_path / 'm.json')]) == 1
+    assert message in capsys.readouterr().err and not (tmp_path / 'm.json').exists()
+
+
+def test_invalid_arguments_are_refused(tmp_path, tables, capsys):
     by_row = str(tables / 'by_row.csv')
     (tmp_path / 'other.json').write_text('{"a": 1}')
     assert main(['classes', 'predict', by_row, '--model', str(tmp_path / 'other.json')]) == 1
-    assert 'is not a valid file of trained classes' in capsys.readouterr().err
+    assert "is not a valid file of trained classes: the entry 'mag_tracking.classes' is missing" \
+        in capsys.readouterr().err
     assert main(['classes', 'train', str(vehicle_path('straight_car_right')), '--out',
                  str(tmp_path / 'm.json')]) == 1
     assert 'needs a table of labelled intervals' in capsys.readouterr().err
     assert main(['classes', 'evaluate', by_row, '--splits', '0']) == 1
+    assert '--splits' in capsys.readouterr().err
 
 
 def test_a_model_of_other_axes_is_refused(tables, tmp_path, capsys):
@@ -151,11 +167,26 @@ def test_an_inconsistent_model_is_refused(tables, tmp_path, capsys):
     model = tmp_path / 'classes.json'
     assert main(['classes', 'train', str(tables / 'by_row.csv'), '--out', str(model)]) == 0
     good = json.loads(model.read_text())
-    for name, value in (('weights', [[1.0]]), ('temperature', 0), ('limit', None), ('scale', 0),
-                        ('classes', ['car']), ('classes', ['car', 'car']), ('mean', [1.0])):
-        model.write_text(json.dumps({**good, name: value}))
+    changes = [({name: value}, f'{name}: expected ') for name, value in (
+        ('weights', [[1.0]]), ('weights', [[1.0], [1.0, 2.0]]), ('temperature', 0),
+        ('limit', None), ('scale', 0), ('classes', ['car']), ('classes', ['car', 'car']),
+        ('classes', 'car'), ('offsets', [1.0]), ('mean', None), ('mean', []), ('unit', 7),
+        ('examples', 3))]
+    contents = [({**good, **change}, message) for change, message in changes]
+    contents += [({k: v for k, v in good.items() if k != name}, f'the entry {name!r} is missing')
+                 for name in good]
+    contents += [({**good, 'more': 1}, "unknown entry 'more'"), ([good], 'expected a mapping'),
+                 (good['mean'], 'expected a mapping')]
+    for content, message in contents:
+        model.write_text(json.dumps(content))
         assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
-        assert 'is not a valid file of trained classes' in capsys.readouterr().err
+        assert f'is not a valid file of trained classes: {message}' in capsys.readouterr().err
+    model.write_text('{')
+    assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
+    assert 'is not a valid file of trained classes: it is not valid JSON' in capsys.readouterr().err
+    model.write_text(json.dumps({**good, 'mag_tracking.classes': 99}))
+    assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
+    assert 'class version 99 is not supported' in capsys.readouterr().err
     model.write_text(json.dumps(good))
     table = tmp_path / 'table.csv'
     table.write_text((tables / 'by_row.csv').read_text())

@@ -2,9 +2,10 @@
 
 Random passes of motorcycles, cars and trucks of two simulators are tracked with two sensors. The
 figures are the share of counted vehicles, the share of correct classes, the recall of each class
-and the reliability error of the class probabilities. In addition, a classifier is trained and
-tested on splits of simulated signatures of one sensor. The aims are 95 % correct classes and a
-reliability error of at most 0.05.
+and the expected calibration error of the class probabilities ("reliability error" in the names of
+the figures). In addition, a classifier is trained and
+tested on splits of simulated signatures of one sensor. The aims are 95 % correct classes and an
+expected calibration error of at most 0.05.
 """
 
 import sys

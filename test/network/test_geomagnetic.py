@@ -1,4 +1,4 @@
-"""World Magnetic Model: official test values, local frame and range of validity."""
+"""World Magnetic Model: official test values, rotation to the local frame, range of validity."""
 
 import datetime
 from dataclasses import replace
@@ -14,7 +14,7 @@ LINKOPING = Site(58.4, 15.6, 60.0, 2026.33, 90.0)
 
 
 def test_every_official_test_value_is_reproduced():
-    """The tolerances are two decimals of the declination, and 2 nT."""
+    """Tolerances: 0.0051 degrees of declination, since two decimals are published, and 2 nT."""
     assert len(ROWS) == 100
     worst = np.zeros(4)
     for year, km, latitude, longitude, declination, _, _, x, y, z in ROWS[:, :10]:
@@ -30,7 +30,7 @@ def test_every_official_test_value_is_reproduced():
 
 def test_the_field_is_rotated_by_the_azimuth_of_the_x_axis():
     north, west, up = earth_field(replace(LINKOPING, x_azimuth=0.0))
-    # The axis x points east, south and south-west.
+    # The x axis points east, then south, then south-west.
     np.testing.assert_allclose(earth_field(LINKOPING), [-west, north, up], rtol=1e-9)
     np.testing.assert_allclose(earth_field(replace(LINKOPING, x_azimuth=180.0)),
                                [-north, -west, up], rtol=1e-9)
@@ -57,7 +57,7 @@ def test_longitudes_are_periodic():
     ({'year': 2024.9}, 'year: 2024.9 is outside 2025 .. 2030'), ({'year': 2030.5}, 'year'),
     ({'x_azimuth': 400.0}, 'x_azimuth'), ({'latitude': float('nan')}, 'latitude'),
     ({'year': float('nan')}, 'year'), ({'longitude': float('inf')}, 'longitude')])
-def test_sites_outside_the_model_are_refused(change, message):
+def test_sites_outside_the_range_of_the_model_are_rejected(change, message):
     with pytest.raises(ValueError, match=message):
         earth_field(replace(LINKOPING, **change))
 
@@ -71,5 +71,5 @@ def test_sites_at_the_limits_of_the_model_are_accepted(change):
 @pytest.mark.parametrize('day, year', [
     ((2026, 1, 1), 2026.0), ((2026, 7, 2), 2026.0 + 182 / 365), ((2028, 7, 1), 2028 + 182 / 366),
     ((2027, 12, 31), 2027 + 364 / 365)])
-def test_the_decimal_year_includes_the_fraction(day, year):
+def test_the_decimal_year_includes_the_fraction_of_the_year(day, year):
     assert decimal_year(datetime.date(*day)) == pytest.approx(year, abs=1e-12)

@@ -1,4 +1,4 @@
-"""network.yaml: values, round trips and errors."""
+"""Network files: values, round trips, and rejected files."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def read(tmp_path, text):
 def test_a_network_file_is_read(tmp_path):
     n = read(tmp_path, GOOD)
     assert n.names == ('a', 'b') and n.topics == ('a/imu/mag', '/other/mag')
-    # A quarter turn about z rotates the sensor's x axis to the world's y axis.
+    # A rotation by 90 degrees about z maps the x axis of the sensor to the y axis of the world.
     np.testing.assert_allclose(n.R_ws[0] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
     np.testing.assert_array_equal(n.R_ws[1], np.eye(3))
     np.testing.assert_allclose(n.R_sw[0], n.R_ws[0].T)
@@ -77,13 +77,13 @@ def test_the_calibration_of_a_sensor_is_read(tmp_path):
     assert n.orientation_std[2] is None
     np.testing.assert_array_equal(n.clock_offset, [-0.0223, 0.0, 0.0])
     np.testing.assert_array_equal(n.offset[0], [1e-6, -2e-6, 3e-6])
-    # The nine numbers are the rows of the matrix.
+    # The matrix is in row-major order.
     np.testing.assert_array_equal(n.correction[0],
                                   [[1.01, 0.02, 0.0], [0.02, 0.98, 0.0], [0.0, -0.01, 1.0]])
     assert n.offset[1] is n.correction[1] is n.calibrated[1] is None
     assert n.calibrated[0] == CalibrationRecord('2026-05-01', 'accelerometer and compass', 2e-5)
     assert n.calibrated[2].by == 'as stated' and np.isnan(n.calibrated[2].clock_offset_std)
-    # The IMU topic follows from a topic that ends as in REP-145; otherwise it is unknown.
+    # The IMU topic is derived from a topic that follows REP-145, and is otherwise unknown.
     assert n.imu_topics == ('a/imu/data_raw', None, '/imu_of_c')
 
 
@@ -94,7 +94,7 @@ def test_the_site_determines_the_earth_field(tmp_path):
 
 
 def assert_equal_networks(a, b):
-    """Check that two networks are equal."""
+    """Assert that two networks are equal."""
     assert (a.names, a.topics, a.frame, a.imu_topics) == (b.names, b.topics, b.frame, b.imu_topics)
     for name in ('positions', 'earth_field', 'clock_offset'):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
@@ -124,7 +124,7 @@ def test_a_written_network_is_read_back(tmp_path, text):
 
 @pytest.mark.parametrize('deg', [1e-5, 0.06, 30.0, 45.0, 180.0])
 def test_any_orientation_std_of_a_survey_is_read_back(tmp_path, deg):
-    """An unknown heading has 180 degrees, the maximum of survey.stated_std_deg."""
+    """The value of 180 degrees is for an unknown heading; see survey.stated_std_deg."""
     n = read(tmp_path, GOOD)
     n = replace(n, orientation_std=(np.deg2rad([0.3, 0.3, deg]), None))
     write_network(tmp_path / 'copy.yaml', n)
@@ -138,7 +138,7 @@ def test_a_sensor_without_an_accelerometer_is_read_back(tmp_path):
     assert_equal_networks(read_network(tmp_path / 'copy.yaml'), n)
 
 
-def test_text_with_special_characters_is_read_back(tmp_path):
+def test_a_string_with_special_characters_is_read_back(tmp_path):
     n = read(tmp_path, GOOD)
     n = replace(n, calibrated=(
         CalibrationRecord('2026-05-01', "the installer's eye: # 1", np.nan), None))
@@ -151,7 +151,7 @@ def test_text_with_special_characters_is_read_back(tmp_path):
     ('orientation_std_deg: 5', 'orientation_std_deg: -2.0', 'must be above 0'),
     ('orientation_std_deg: 5', 'orientation_std_deg: [1, 2]', 'expected 1 or 3 numbers'),
     ('clock_offset: -0.0223', 'clock_offset: 4000', 'clock_offset: 4000.0 s exceeds 3600'),
-    ('clock_offset: -0.0223', 'clock_offset: soon', "'soon' is text"),
+    ('clock_offset: -0.0223', 'clock_offset: soon', "'soon' is a string"),
     ('clock_offset: -0.0223', 'clock_offset: .nan', 'not a finite number'),
     ('offset: [1.0e-6', 'offset: [1.0', 'offset: .* microtesla or gauss'),
     ('[1.01, 0.02, 0.0,', '[1.01, 0.02,', 'correction: expected 9 numbers'),
@@ -159,20 +159,20 @@ def test_text_with_special_characters_is_read_back(tmp_path):
     ('imu_topic: /imu_of_c', 'imu_topic: imu/', "imu_topic: 'imu/' is not a valid ROS topic"),
     ('imu_topic: /imu_of_c', 'imu_topic: /imu of c', 'is not a valid ROS topic'),
     ('topic: /b/field', 'topic: null', 'topic: None is not a valid ROS topic'),
-    ("date: '2026-05-02'", 'date: 2026-05-02', 'date must be text'),
-    (', by: as stated', '', 'by must be text'),
-    ('by: as stated', 'by: "\\udc80"', r"calibrated: by must be text .* got '\\udc80'"),
+    ("date: '2026-05-02'", 'date: 2026-05-02', 'date must be a string'),
+    (', by: as stated', '', 'by must be a string'),
+    ('by: as stated', 'by: "\\udc80"', r"calibrated: by must be a string .* got '\\udc80'"),
     ('by: as stated', 'by: as stated, who: me', "unknown key 'who'"),
     ("calibrated: {date: '2026-05-02', by: as stated}", 'calibrated: yes', 'expected a mapping'),
     ('site: {latitude: 58.4, ', 'site: {', 'site: latitude is missing'),
     ('latitude: 58.4', 'latitude: 98.4', 'site: latitude: 98.4 is outside'),
-    ('latitude: 58.4', 'latitude: north', "'north' is text"),
+    ('latitude: 58.4', 'latitude: north', "'north' is a string"),
     ('date: 2026-05-01,', 'date: 2024-05-01,', 'site: year: 2024.33 is outside'),
     ('date: 2026-05-01,', "date: '2026-05-01',", 'site: date: expected a date'),
     ('x_azimuth_deg: 90', 'x_azimuth: 90', "site: unknown key 'x_azimuth'"),
     ('site:', 'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]\nsite:', 'both define the field'),
 ])
-def test_invalid_calibrations_are_refused(tmp_path, old, new, message):
+def test_invalid_calibrations_are_rejected(tmp_path, old, new, message):
     assert old in CALIBRATED
     with pytest.raises(NetworkError, match=message):
         read(tmp_path, CALIBRATED.replace(old, new))
@@ -180,7 +180,7 @@ def test_invalid_calibrations_are_refused(tmp_path, old, new, message):
 
 @pytest.mark.parametrize('old, new, message', [
     ('  b:', '  a:', 'duplicate key a'),
-    ('/other/mag', '/a/imu/mag', 'topic /a/imu/mag is assigned to two sensors'),
+    ('/other/mag', '/a/imu/mag', 'topic /a/imu/mag is assigned to more than one sensor'),
     ('/other/mag', '~/other', 'is not a valid ROS topic'),
     ('position: [0, -4.5, 0]', 'position: [0, -4.5]', 'sensor a: position: expected 3'),
     ('position: [0, -4.5, 0]', 'positon: [0, -4.5, 0]', "unknown key 'positon'"),
@@ -190,7 +190,7 @@ def test_invalid_calibrations_are_refused(tmp_path, old, new, message):
     ('1.2e-8', '1e-8', 'write numbers as 1.0e-8'),
     ('1.2e-8', '1.0e-100', 'above a femtotesla'),
     ('position: [0, -4.5, 0]', 'position: [0, 1.0e+200, 0]', 'too far from the origin'),
-    ('position: [0, -4.5, 0]', 'position: [0, 1.0e9, 0]', "'1.0e9' is text"),
+    ('position: [0, -4.5, 0]', 'position: [0, 1.0e9, 0]', "'1.0e9' is a string"),
     ('position: [0, -4.5, 0]', 'position: [0, 4.5, 0]', 'sensors a and b are both at'),
     ('0.7071067811865476, 0.7', '0.1, 0.7', 'must have norm 1'),
     ('[2.0e-6, 1.55e-5, -4.9e-5]', '[0.02, 0.155, -0.49]', 'microtesla or gauss'),
@@ -199,17 +199,17 @@ def test_invalid_calibrations_are_refused(tmp_path, old, new, message):
     ('frame: map', 'frame: "a b"', 'frame: expected a name'),
     ('  b:', '  b/c:', "'b/c' is not a valid sensor name"),
     ('  b:', '  "\\ud800":', r"'\\ud800' is not a valid sensor name"),
-    ('background: [1.0e-6', 'background: [0.2', 'background: .* is it in microtesla'),
-    ('[2.0e-6, 1.55e-5, -4.9e-5]', '[2.0e-3, 0.0, 0.0]', 'more than a millitesla'),
+    ('background: [1.0e-6', 'background: [0.2', 'background: .* is the value in microtesla'),
+    ('[2.0e-6, 1.55e-5, -4.9e-5]', '[2.0e-3, 0.0, 0.0]', 'exceeds a millitesla'),
     ('position: [0, -4.5, 0]', 'position: [0, 2.0e+8, 0]', 'too far from the origin'),
 ])
-def test_invalid_networks_are_refused(tmp_path, old, new, message):
+def test_invalid_networks_are_rejected(tmp_path, old, new, message):
     assert old in GOOD
     with pytest.raises(NetworkError, match=message.replace('[', r'\[')):
         read(tmp_path, GOOD.replace(old, new))
 
 
-def test_missing_and_empty_files_are_refused(tmp_path):
+def test_missing_and_empty_files_are_rejected(tmp_path):
     with pytest.raises(NetworkError, match='cannot read'):
         read_network(tmp_path / 'nowhere.yaml')
     for text in ('', 'sensors: {}', 'sensors: [a]'):
@@ -217,7 +217,7 @@ def test_missing_and_empty_files_are_refused(tmp_path):
             read(tmp_path, text)
 
 
-def test_an_unknown_sensor_is_refused(tmp_path):
+def test_an_unknown_sensor_is_rejected(tmp_path):
     with pytest.raises(NetworkError, match='unknown sensor c; the network has a, b'):
         read(tmp_path, GOOD).index('c')
 

@@ -1,4 +1,4 @@
-"""Topic names in namespaces, and recordings made in a namespace."""
+"""Resolution of topic names in namespaces, and recordings with namespaces."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ RELATIVE = ('mag_1/imu/mag', 'mag_2/imu/mag')
 
 
 def recording_of(path, *namespaces):
-    """Recording with one reading of mag_1 in each namespace, of 1, 2, ... T."""
+    """Create a recording with one reading of mag_1 per namespace: 1 T, 2 T, ..."""
     path.parent.mkdir(exist_ok=True)
     with RecordingWriter(path) as writer:
         for k, namespace in enumerate(namespaces):
@@ -28,7 +28,7 @@ def recording_of(path, *namespaces):
 
 
 def read_fields(recording, namespace=None):
-    """(x components, missing topics) that a reader finds with relative topics."""
+    """Read a recording with relative topics; return (x components, missing topics)."""
     network = dataclasses.replace(line_network(2), topics=RELATIVE, namespace=namespace)
     reader = SampleReader(recording, network)
     return [s.field[0] for s in recorded(reader)], reader.missing_topics()
@@ -51,10 +51,10 @@ def test_several_namespaces_require_a_choice(tmp_path):
         read_fields(recording, '/west')
 
 
-def test_names_are_resolved_and_namespaces_are_checked():
+def test_names_are_resolved_and_namespaces_are_validated():
     assert absolute('a/b') == '/a/b' and absolute('a', '/n/m') == '/n/m/a'
     assert absolute('/a', '/n') == '/a'
-    # The end of a longer name does not match.
+    # A topic does not match the end of a longer name.
     assert namespaces_of(['mag'], ['/imag', '/x/mag']) == ['/x']
     assert namespaces_of(['/mag'], ['/x/mag']) == []
     assert checked_namespace('/') == '/' and checked_namespace('/a/b_1') == '/a/b_1'

@@ -1,4 +1,4 @@
-"""The Anderson expansion equals the dipole field of a straight pass."""
+"""Anderson expansion: comparison with the dipole field of a straight pass, and CPA."""
 
 import math
 
@@ -87,7 +87,7 @@ def test_no_point_of_the_pass_is_closer_than_the_cpa(one_pass, dt):
 
 
 def test_cpa_of_a_grazing_pass_is_perpendicular_to_the_velocity():
-    # The rounding error of r0 along v0 is not small compared with the range here.
+    # The rounding error of r0 along v0 is not small relative to the CPA range.
     rng = np.random.default_rng(0)
     for v0, sideways in rng.standard_normal((50, 2, 3)):
         r0 = 1000.0 * v0 + 1e-10 * sideways
@@ -113,10 +113,10 @@ def test_a_pass_through_the_sensor_has_range_zero_and_no_expansion(v0, factor, s
 
 
 def test_coefficients_of_a_known_pass():
-    # Path along x at y = 2, moment along z: only the third row is non-zero.
+    # Path along x at y = 2, moment along z: only the third row is not zero.
     C = anderson_coefficients([0.0, 2.0, 0.0], [3.0, 0.0, 0.0], [0.0, 0.0, 8.0])
     np.testing.assert_allclose(C, [[0, 0, 0], [0, 0, 0], [-1e-7, 0, -1e-7]], rtol=0, atol=1e-22)
-    # Moment along the path: the lateral component is the middle function.
+    # Moment along the path: the lateral component contains only the function of n = 1.
     C = anderson_coefficients([0.0, 2.0, 0.0], [3.0, 0.0, 0.0], [8.0, 0.0, 0.0])
     np.testing.assert_allclose(C, [[-1e-7, 0, 2e-7], [0, 3e-7, 0], [0, 0, 0]], rtol=0, atol=1e-22)
 

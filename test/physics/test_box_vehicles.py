@@ -1,4 +1,4 @@
-"""The second vehicle simulator: fields of box vehicles, and speed and heading of a drive."""
+"""Box vehicle simulator: fields of box vehicles, and speed and heading of a drive."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Dipole field and Jacobians: laws of magnetostatics, and comparison with magpylib."""
+"""Dipole field and Jacobians: magnetostatics, invariances, and comparison with magpylib."""
 
 import magpylib
 import numpy as np

@@ -1,4 +1,4 @@
-"""Permeable ellipsoid: numerical integration, limits, and the corrected equations of MITRE12."""
+"""Permeable ellipsoid: comparison with integration, limit cases and corrected MITRE12 equations."""
 
 import math
 
@@ -23,7 +23,10 @@ induction = st.tuples(*3 * [st.floats(-60e-6, 60e-6)]).map(np.array)
 
 
 def integrated_factor(a, b, c):
-    """a b c/2 int_0^inf ds/((s + a^2) sqrt((s + a^2)(s + b^2)(s + c^2))), with s = exp(u)."""
+    """Demagnetisation factor along a, by numerical integration.
+
+    a b c/2 int_0^inf ds/((s + a^2) sqrt((s + a^2)(s + b^2)(s + c^2))), with s = exp(u).
+    """
     def integrand(u):
         s = math.exp(u)
         return s / ((s + a * a) * math.sqrt((s + a * a) * (s + b * b) * (s + c * c)))
@@ -146,5 +149,5 @@ def test_invalid_arguments_raise_value_error():
     for mu_r in (0.99, math.nan, math.inf):
         with pytest.raises(ValueError, match=f'mu_r must be at least 1 and finite, got {mu_r}'):
             ellipsoid_moment((2.0, 1.0), mu_r, 0.0, B0)
-    with pytest.raises(ValueError, match=r'last axis of length 3, got \(2,\)'):
+    with pytest.raises(ValueError, match=r'last axis of length 3, got shape \(2,\)'):
         ellipsoid_moment((2.0, 1.0), 10.0, 0.0, B0[:2])

@@ -1,4 +1,4 @@
-"""Multipole fields: laws of magnetostatics, clouds of dipoles, and a magnet of magpylib."""
+"""Multipole fields: magnetostatics, expansions of dipole clouds, and comparison with magpylib."""
 
 import math
 from itertools import permutations, product
@@ -31,14 +31,14 @@ COMPONENTS = {1: ('x', 'y', 'z'), 2: ('xx', 'xy', 'xz', 'yy', 'yz'),
 
 
 def only(order, moments):
-    """The moments with those of the other orders set to zero."""
+    """Set the moments of all other orders to zero."""
     out = np.zeros_like(moments)
     out[..., PARTS[order]] = moments[..., PARTS[order]]
     return out
 
 
 def tensor(order, moments):
-    """The full symmetric traceless tensor, from the names of its components."""
+    """Convert the moments of one order to the full symmetric traceless tensor."""
     T = np.zeros((3,) * order)
     for name, value in zip(COMPONENTS[order], moments[PARTS[order]], strict=True):
         for axes in set(permutations(['xyz'.index(c) for c in name])):
@@ -51,7 +51,7 @@ def tensor(order, moments):
 
 
 def published_field(r, order, moments):
-    """T10 eq. (3.39) and (3.40) as published."""
+    """Field of one order as published: T10 eq. (3.39) and (3.40)."""
     distance = np.linalg.norm(r)
     M = tensor(order, moments)
     for _ in range(order - 1):
@@ -61,7 +61,7 @@ def published_field(r, order, moments):
 
 
 def cloud(n, size):
-    """`n` points in a cube of edge length `size`, and their dipole moments."""
+    """Random positions of `n` dipoles in a cube of edge length `size`, and their moments."""
     rng = np.random.default_rng(n)
     return rng.uniform(-0.5 * size, 0.5 * size, (n, 3)), rng.standard_normal((n, 3))
 
@@ -166,13 +166,13 @@ def test_expansion_of_a_cloud_converges_with_the_first_neglected_order(order):
         exact = dipole_field(r[:, None] - points, dipoles).sum(axis=1)
         return np.sqrt(np.mean((multipole_field(r, moments) - exact)**2))
 
-    # The error decays with power 4, 5 or 6 of the distance for expansions up to order 1, 2 or 3.
+    # Up to order 1, 2 or 3, the error decreases with power 4, 5 or 6 of the distance.
     measured = np.log2(error(20.0) / error(40.0))
     assert abs(measured - (order + 3)) < 0.05
 
 
 def test_expansion_of_a_cuboid_magnet_equals_magpylib():
-    # Two Gauss points per axis integrate every moment up to order 3 (and 4) exactly.
+    # Two Gauss points per axis are exact for all moments up to order 4.
     sides, polarization = np.array([0.03, 0.02, 0.05]), np.array([0.3, -0.5, 1.1])
     magnet = magpylib.magnet.Cuboid(dimension=sides, polarization=polarization)
     corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
@@ -183,7 +183,7 @@ def test_expansion_of_a_cuboid_magnet_equals_magpylib():
     r = r[np.linalg.norm(r, axis=1) > 0.3]
     expected = magnet.getB(r)
     assert relative_error(multipole_field(r, moments[:3]), expected).max() > 1e-3
-    # Order 5 is the first one missing: (size/distance)^4.
+    # Order 5 is the first neglected order: (size/distance)^4.
     assert relative_error(multipole_field(r, moments), expected).max() < 1e-4
 
 
@@ -212,9 +212,9 @@ def test_shapes_broadcast_and_read_only_arrays_are_accepted():
 
 
 def test_invalid_arguments_raise_value_error():
-    with pytest.raises(ValueError, match='r needs a last axis of length 3'):
+    with pytest.raises(ValueError, match='r requires a last axis of length 3'):
         multipole_field(np.zeros((4, 2)), np.zeros(3))
-    with pytest.raises(ValueError, match='3, 8 or 15, got \\(5,\\)'):
+    with pytest.raises(ValueError, match=r'3, 8 or 15, got shape \(5,\)'):
         multipole_field(np.ones(3), np.zeros(5))
     with pytest.raises(ValueError, match='1, 2 or 3, got 4'):
         multipole_moments(np.zeros((1, 3)), np.zeros((1, 3)), 4)

@@ -1,4 +1,4 @@
-"""Every pass model: derivatives against finite differences, and models against each other."""
+"""All pass models: derivatives compared with finite differences, and models with each other."""
 
 import inspect
 
@@ -32,10 +32,10 @@ N_PARAMETERS = {
 
 
 def test_every_model_has_an_example():
-    found = {name for module in (passes, pass_expansions)
+    names = {name for module in (passes, pass_expansions)
              for name, c in inspect.getmembers(module, inspect.isclass)
              if hasattr(c, 'basis') and hasattr(c, 'derivative')}
-    assert found == {name.split()[0] for name in EXAMPLES}
+    assert names == {name.split()[0] for name in EXAMPLES}
 
 
 @pytest.mark.parametrize('name', EXAMPLES)
@@ -93,7 +93,7 @@ def test_a_row_far_away_has_the_field_of_its_multipoles():
 
 
 def test_multipoles_describe_a_vehicle_better_with_every_order():
-    """A cloud of sixty dipoles at a distance of four metres."""
+    """The vehicle is a cloud of sixty dipoles at a distance of 4 m."""
     network = network_of([[0.0, -4.0, 0.0], [0.0, 4.0, 0.0]])
     rng = np.random.default_rng(3)
     path = np.array([0.0, 0.0, 0.5, 9.0, 0.0, 0.0])
@@ -124,7 +124,7 @@ def test_anderson_functions_and_the_dipole_agree_on_one_sensor():
     b = fit_pass(data, 1)
     zero = b.data.stamp_ns / 1e9
     assert converged[0] and abs(cost[0] / data.n_values - 1.0) < 0.1
-    # The dipole has fewer unknowns for the same measurements, so its std is not larger.
+    # The dipole model has fewer unknowns, so its std is not larger.
     std = np.sqrt(np.diagonal(P[0]))
     assert abs(theta[0, 0] - b.bearing.cpa_time - zero) < 3.0 * std[0] < 0.05
     assert abs(theta[0, 1] - b.bearing.rate) < 3.0 * std[1] < 0.2

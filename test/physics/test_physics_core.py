@@ -1,4 +1,4 @@
-"""Compiled functions reject arrays of mismatched shape or type and do not modify arguments."""
+"""Compiled functions: rejected shapes and types of arrays, and unmodified arguments."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Every source model: Jacobians against differences, process noise against exact integrals."""
+"""All source models: Jacobians compared with differences, process noise with exact integrals."""
 
 import inspect
 
@@ -99,12 +99,12 @@ def test_a_coordinated_turn_is_a_circular_arc(rate):
     A = np.zeros((6, 6))
     A[:3, 3:] = np.eye(3)
     A[3, 4], A[4, 3] = -rate, rate
-    moved, _ = coordinated_turn(x, dt)
-    np.testing.assert_allclose(moved[0, :6], expm(A * dt) @ x[0, :6], rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(coordinated_turn(moved, -dt)[0], x, atol=1e-12)
+    predicted, _ = coordinated_turn(x, dt)
+    np.testing.assert_allclose(predicted[0, :6], expm(A * dt) @ x[0, :6], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(coordinated_turn(predicted, -dt)[0], x, atol=1e-12)
     if rate:
         centre = x[0, :2] + np.array([3.0, 6.0]) / rate
-        np.testing.assert_allclose(np.hypot(*(moved[0, :2] - centre)), np.hypot(6.0, 3.0)
+        np.testing.assert_allclose(np.hypot(*(predicted[0, :2] - centre)), np.hypot(6.0, 3.0)
                                    / abs(rate), rtol=1e-6)
 
 
@@ -132,16 +132,16 @@ def test_a_turn_does_not_depend_on_the_step_size():
     at_once = model.propagate(x, 2.0)[0]
     # Integral of a turn rate that decays with a time constant of 1.5 s.
     expected = 1.5 * -np.expm1(-2.0 / 1.5)
-    for moved in (steps, at_once):
-        assert np.arctan2(moved[0, 4], moved[0, 3]) == pytest.approx(expected, rel=1e-9)
-        assert moved[0, -1] == pytest.approx(np.exp(-2.0 / 1.5), rel=1e-9)
+    for predicted in (steps, at_once):
+        assert np.arctan2(predicted[0, 4], predicted[0, 3]) == pytest.approx(expected, rel=1e-9)
+        assert predicted[0, -1] == pytest.approx(np.exp(-2.0 / 1.5), rel=1e-9)
 
 
 def test_turn_rate_does_not_decay_in_backward_propagation():
-    """Backward propagation omits the process noise, so the turn rate must not decay."""
+    """Backward propagation has no process noise, so the turn rate must not decay."""
     model = EXAMPLES['RowVehicle with turn rate']
-    moved, F, _ = model.propagate(states(model), -3.0)
-    assert np.array_equal(moved[:, -1], states(model)[:, -1]) and (F[:, -1, -1] == 1.0).all()
+    predicted, F, _ = model.propagate(states(model), -3.0)
+    assert np.array_equal(predicted[:, -1], states(model)[:, -1]) and (F[:, -1, -1] == 1.0).all()
 
 
 def test_a_turn_rate_known_to_be_zero_keeps_the_path_straight():
@@ -150,14 +150,14 @@ def test_a_turn_rate_known_to_be_zero_keeps_the_path_straight():
     x[:, -1] = 0.0
     P = np.tile(np.eye(x.shape[1]), (len(x), 1, 1))
     P[:, -1], P[:, :, -1] = 0.0, 0.0
-    moved, F, Q = turning.propagate(x, 0.3, P)
+    predicted, F, Q = turning.propagate(x, 0.3, P)
     expected, F_straight, Q_straight = straight.propagate(x[:, :-1], 0.3)
-    np.testing.assert_allclose(moved[:, :-1], expected, atol=1e-12)
+    np.testing.assert_allclose(predicted[:, :-1], expected, atol=1e-12)
     np.testing.assert_allclose(F[0, :-1, :-1], F_straight, atol=1e-12)
     np.testing.assert_allclose(Q[:, :-1, :-1], Q_straight, atol=1e-15)
-    # The turn rate stays exactly zero, which identifies hypotheses that do not turn.
+    # Exactly zero: this is the criterion for hypotheses that do not turn.
     after = F @ P @ np.swapaxes(F, 1, 2) + Q
-    assert not moved[:, -1].any() and not after[:, -1].any() and not after[:, :, -1].any()
+    assert not predicted[:, -1].any() and not after[:, -1].any() and not after[:, :, -1].any()
 
 
 def test_vehicle_moment_is_rotated_hard_iron_plus_soft_iron():
@@ -170,7 +170,7 @@ def test_vehicle_moment_is_rotated_hard_iron_plus_soft_iron():
 
 @pytest.mark.parametrize('heading', [0.0, 0.7, 2.0, -2.9])
 def test_soft_iron_is_induced_along_the_axes_of_the_vehicle(heading):
-    """Equals R D R' B0/mu0, and `ellipsoid_moment`, MITRE12 eq. (A.5)."""
+    """Comparison with R D R' B0/mu0 and with `ellipsoid_moment`, MITRE12 eq. (A.5)."""
     model, axes = EXAMPLES['RowVehicle'], (2.1, 0.9)
     along = np.array([1.0, 0.0, 0.0])
     p1, p2 = (ellipsoid_moment(axes, 11.0, 0.0, b)[k] * MU0 for k, b in (
@@ -200,7 +200,7 @@ def test_states_of_another_model_are_rejected():
 
 
 def row_state(d, length, heading=0.6):
-    """State of a row of `d` dipoles whose total moment does not depend on `d`."""
+    """State of a row of `d` dipoles with the same total moment for any `d`."""
     x = np.zeros((1, 6 + 3 * d + (4 if d > 1 else 3)))
     x[0, :6] = [3.0, -1.0, 0.5, 8.0 * np.cos(heading), 8.0 * np.sin(heading), 0.2]
     x[0, 6:6 + 3 * d] = np.tile(np.array([250.0, -90.0, 60.0]) / d, d)
@@ -210,7 +210,7 @@ def row_state(d, length, heading=0.6):
 
 
 def field_of(model, x, places):
-    """(n, 3) [T] at `places` (n, 3)."""
+    """Field (n, 3) [T] of a state at `places` (n, 3) [m]."""
     return sensor_fields(places, np.tile(np.eye(3), (len(places), 1, 1)), *model.dipoles(x))[0][0]
 
 
@@ -244,7 +244,7 @@ def test_a_row_reversed_end_to_end_has_the_same_field():
 
 
 def test_a_uniform_row_approaches_a_dipole_with_the_squared_distance():
-    """Without a quadrupole, the first error term is smaller by two powers of the distance."""
+    """The row has no quadrupole, so the first error term is the octupole."""
     direction = np.array([[0.3, 0.9, 0.1]])
     errors = []
     for distance in (40.0, 80.0, 160.0):
@@ -257,7 +257,7 @@ def test_a_uniform_row_approaches_a_dipole_with_the_squared_distance():
     np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 4.0, rtol=0.02)
 
 
-def test_total_moment_and_differences_drift_separately_as_stated():
+def test_total_moment_and_differences_have_their_own_drift():
     model = EXAMPLES['RowVehicle']
     x = row_state(3, 3.0)
     Q = model.propagate(x, 0.5)[2][0, 6:15, 6:15].reshape(3, 3, 3, 3)
@@ -284,23 +284,23 @@ def magnet_state(m, w):
 def test_a_magnet_rotates_by_the_full_angle_and_keeps_its_moment():
     model = EXAMPLES['Magnet']
     # A rotation about x by 90 degrees maps z to -y.
-    moved, _, _ = model.propagate(magnet_state([0.0, 0.0, 2.0], [0.5 * np.pi, 0.0, 0.0]), 1.0)
-    np.testing.assert_allclose(moved[0, 6:9], [0.0, -2.0, 0.0], atol=1e-12)
+    predicted, _, _ = model.propagate(magnet_state([0.0, 0.0, 2.0], [0.5 * np.pi, 0.0, 0.0]), 1.0)
+    np.testing.assert_allclose(predicted[0, 6:9], [0.0, -2.0, 0.0], atol=1e-12)
     x = states(model)
     for dt in (0.01, 0.3, 5.0, -2.0):
-        there, _, _ = model.propagate(x, dt)
-        np.testing.assert_allclose(np.linalg.norm(there[:, 6:9], axis=1),
+        forward, _, _ = model.propagate(x, dt)
+        np.testing.assert_allclose(np.linalg.norm(forward[:, 6:9], axis=1),
                                    np.linalg.norm(x[:, 6:9], axis=1), rtol=1e-12)
-        back, _, _ = model.propagate(there, -dt)
+        back, _, _ = model.propagate(forward, -dt)
         np.testing.assert_allclose(back, x, atol=1e-9)
 
 
 def test_a_small_rotation_of_a_magnet_follows_the_published_model():
-    """PHD15 Paper A eq. (24) is its first order."""
+    """PHD15 Paper A eq. (24) is a first-order approximation of the rotation."""
     dt, x = 1e-4, states(EXAMPLES['Magnet'])
-    moved, F, Q = EXAMPLES['Magnet'].propagate(x, dt)
+    predicted, F, Q = EXAMPLES['Magnet'].propagate(x, dt)
     m, w = x[:, 6:9], x[:, 9:12]
-    np.testing.assert_allclose(moved[:, 6:9], m + dt * np.cross(w, m), atol=1e-7)
+    np.testing.assert_allclose(predicted[:, 6:9], m + dt * np.cross(w, m), atol=1e-7)
     for p in range(len(x)):
         C = np.array([np.cross(e, m[p]) for e in np.eye(3)]).T  # w x m = C w
         np.testing.assert_allclose(F[p, 6:9, 9:12], dt * C, atol=1e-7)
@@ -308,39 +308,39 @@ def test_a_small_rotation_of_a_magnet_follows_the_published_model():
 
 
 def rotation_noise(std_w, std_m, dt, density=0.0):
-    """Variance along the rotated moment: by sampling, and of the model's additional noise."""
+    """Variance along the rotated moment: (sampled variance, additional noise of the model)."""
     model = Magnet(np.zeros(3), density)
     rng = np.random.default_rng(8)
     x = magnet_state(np.array([0.3, -0.4, 1.2]), np.array([0.2, 0.1, 0.0]))
     P = np.zeros((1, 12, 12))
     P[0, 6:9, 6:9], P[0, 9:, 9:] = np.diag(std_m**2), np.diag(std_w**2)
-    moved, F, without = model.propagate(x, dt)
+    predicted, F, without = model.propagate(x, dt)
     extra = (model.propagate(x, dt, P)[2] - without)[0, 6:9, 6:9]
     samples = np.repeat(x, 400_000, axis=0)
     samples[:, 6:9] += std_m * rng.standard_normal((len(samples), 3))
     samples[:, 9:] += std_w * rng.standard_normal((len(samples), 3))
-    left = model.propagate(samples, dt)[0][:, 6:9] - moved[0, 6:9] - np.einsum(
+    neglected = model.propagate(samples, dt)[0][:, 6:9] - predicted[0, 6:9] - np.einsum(
         'ij,nj->ni', F[0, 6:9], samples - x)
-    u = moved[0, 6:9] / np.linalg.norm(moved[0, 6:9])
+    u = predicted[0, 6:9] / np.linalg.norm(predicted[0, 6:9])
     np.testing.assert_allclose(extra, (u @ extra @ u) * np.outer(u, u), atol=1e-12)
-    return np.mean((left @ u) ** 2), u @ extra @ u
+    return np.mean((neglected @ u) ** 2), u @ extra @ u
 
 
 @pytest.mark.study
 def test_noise_covers_the_second_order_of_an_uncertain_rotation():
-    """Oracle: deviation of sampled, rotated moments from the linearised rotation."""
+    """Oracle: difference between exact and linearised rotation of sampled moments."""
     std_w = np.array([0.10, 0.25, 0.15])
     expected, extra = rotation_noise(std_w, np.zeros(3), 0.5)
     assert extra == pytest.approx(expected, rel=0.05)
-    # The deviation is limited to the length of the moment.
+    # The noise is limited to the squared magnitude of the moment.
     assert rotation_noise(1e3 * std_w, np.zeros(3), 0.5)[1] == pytest.approx(1.69)
 
 
 def test_a_known_rotation_adds_no_noise_to_an_uncertain_moment():
-    """Otherwise each of many short steps would add the same uncertainty again."""
+    """Noise for a known rotation would be added repeatedly in many short steps."""
     expected, extra = rotation_noise(np.zeros(3), np.full(3, 0.2), 0.5)
     assert expected < 1e-20 and extra < 1e-20
-    # The noise density of the angular velocity adds an angle variance of the third power of time.
+    # The noise of the angular velocity adds an angle variance proportional to dt^3.
     assert rotation_noise(np.zeros(3), np.zeros(3), 1.0, 0.04)[1] == pytest.approx(
         2.0 * (0.04 / 3.0) ** 2 * 1.69)
 

@@ -1,4 +1,4 @@
-"""Row of dipoles on a path with acceleration and turn rate, with sensor clock offsets."""
+"""Row of dipoles on a path with acceleration and turn rate, measured with clock offsets."""
 
 import numpy as np
 import pytest
@@ -32,22 +32,23 @@ def test_a_straight_path_equals_a_row_at_constant_velocity(n_dipoles):
 def test_clock_offsets_shift_the_sample_times():
     offsets = np.array([0.12, -0.05])
     late = T - np.append(offsets, 0.0)[CLOCK]
-    apart = model(N_PATH + 2).basis(np.append(CURVED, offsets)[None])
-    np.testing.assert_allclose(apart, model(N_PATH, t=late).basis(CURVED[None]), rtol=1e-12)
+    with_offsets = model(N_PATH + 2).basis(np.append(CURVED, offsets)[None])
+    np.testing.assert_allclose(with_offsets, model(N_PATH, t=late).basis(CURVED[None]), rtol=1e-12)
 
 
 def test_a_curved_path_equals_its_numerical_integration():
-    """One dipole: its field equals that of a dipole at the integrated position."""
-    _, _, _, v, heading, climb, _, gain, rate, more = CURVED
+    """The field of a single dipole equals the field of a dipole at the integrated position."""
+    _, _, _, v, heading, climb, _, gain, rate, turn_acceleration = CURVED
     for time in (-1.0, 0.7, 1.5):
         steps = (np.arange(200_000) + 0.5) * time / 200_000
-        angle = heading + (rate + 0.5 * more * steps) * steps
+        angle = heading + (rate + 0.5 * turn_acceleration * steps) * steps
         speed = v + gain * steps
-        way = np.array([np.mean(speed * np.cos(angle)), np.mean(speed * np.sin(angle)), climb])
-        there = np.zeros(N_PATH + 2)
-        there[:3] = CURVED[:3] + time * way
+        mean_velocity = np.array([np.mean(speed * np.cos(angle)), np.mean(speed * np.sin(angle)),
+                                  climb])
+        end = np.zeros(N_PATH + 2)
+        end[:3] = CURVED[:3] + time * mean_velocity
         curved = model(N_PATH, 1, np.full(6, time)).basis(CURVED[None])
-        still = model(N_PATH, 1, np.zeros(6)).basis(there[None, :N_PATH])
+        still = model(N_PATH, 1, np.zeros(6)).basis(end[None, :N_PATH])
         np.testing.assert_allclose(curved, still, rtol=1e-6, atol=1e-20)
 
 
