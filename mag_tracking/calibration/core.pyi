@@ -1,6 +1,7 @@
 """Calibration of readings one by one, compiled; the rules are in `readings.hpp`.
 
-`sensors` is an array of `SENSOR`. Functions without a row take an array of a single element.
+`sensors` is an array of `SENSOR`. Functions without an argument
+`row` or `rows` require an array of a single element.
 """
 
 from typing import Any
@@ -62,12 +63,12 @@ def calibrate_readings(
         Updated.
     limits : (1,) LIMITS array
     rows : (n,) int array
-        Sensors of the readings; negative = unknown.
+        Index of the sensor of each reading; negative = unknown.
     stamps : (n,) int array, ns
     fields : (n, 3) array, T
         Raw fields.
     own : (n,) int array
-        NONE, VALID or INVALID.
+        Covariance in the message: NONE, VALID or INVALID.
     covariances : (n, 3, 3) array, T²
         Ignored where `own` is NONE.
     batches : (1,) BATCH array
@@ -81,12 +82,12 @@ def calibrate_readings(
     Returns
     -------
     int
-        DONE, or the reason that `row` and `stamp_ns` refer to.
+        DONE, or the reason for stopping; `row` and `stamp_ns` of the batch identify the reading.
 
     Raises
     ------
     IndexError
-        If an output array is full, or a row is out of range.
+        If an output array is full, or the index of a sensor is out of range.
     """
 
 def use_reading(
@@ -103,11 +104,11 @@ def use_reading(
     batches : (1,) BATCH array
         Updated.
     row : int
-        Sensor of the reading.
+        Index of the sensor.
     stamp : int, ns
     field : (3,) array, T
     own : int
-        NONE, VALID or INVALID.
+        Covariance in the message: NONE, VALID or INVALID.
     covariance : (3, 3) array, T²
     out_rows : (m,) int array
     out_stamps : (m,) int array, ns
@@ -140,7 +141,7 @@ def steps_of(sensors: StructArray, are_corrected: bool) -> FloatArray:
     ----------
     sensors : (1,) SENSOR array
     are_corrected : bool
-        Whether the steps are those after the soft-iron correction.
+        Whether to apply the soft-iron correction to the steps.
 
     Returns
     -------
@@ -168,9 +169,9 @@ def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> 
     sensors : (1,) SENSOR array
         Updated.
     freeze_std : float
-        Number of standard deviations of the limits.
+        Limits in standard deviations.
     limits : (3,) array, T
-        Overwritten: maximum deviation of the mean of a block.
+        Overwritten: maximum difference between the mean of a block and the background.
     """
 
 def block_moments(sensors: StructArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
@@ -219,7 +220,7 @@ def pooled_covariance(scatter: FloatArray, n: FloatArray) -> FloatArray | None:
     """
 
 def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
-    """Update the steps of a sensor and the time since which each axis is constant.
+    """Update the steps of a sensor and the time of the latest change of each axis.
 
     Parameters
     ----------
@@ -230,7 +231,7 @@ def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
     """
 
 def is_stuck(sensors: StructArray, field: FloatArray) -> bool:
-    """Whether a reading repeats the previous one for longer than chance can explain.
+    """Record a reading, and return whether it has been repeated for too long to be chance.
 
     Parameters
     ----------
@@ -251,7 +252,7 @@ def screen_spike(sensors: StructArray, threshold: float, stamp: int, field: Floa
     sensors : (1,) SENSOR array
         Updated.
     threshold : float
-        Minimum size of a spike in standard deviations of the noise.
+        Minimum magnitude of a spike in standard deviations of the noise.
     stamp : int, ns
     field : (3,) array, T
 
@@ -262,7 +263,7 @@ def screen_spike(sensors: StructArray, threshold: float, stamp: int, field: Floa
     """
 
 def collect(sensors: StructArray, time: float, field: FloatArray) -> None:
-    """Add a reading to the current block, after starting a new one if it is due.
+    """Add a reading to the current block, after starting a new block if one is due.
 
     Parameters
     ----------

@@ -9,8 +9,8 @@ from mag_tracking.calibration.blocks import Blocks, line_through, pooled_covaria
 from mag_tracking.calibration.resolution import TOGGLE
 
 MAX_CALM_RATIO = 3.0
-"""Maximum standard deviation of a calm block relative to that of the quietest fifth of the blocks;
-while a target moves by, the field changes within a block."""
+"""Maximum standard deviation of a calm block relative to that of the quietest fifth of the blocks.
+A passing target changes the field within a block."""
 
 LEVEL_WIDTH = 4.0
 """Maximum difference of the means of blocks of one level, in standard deviations of a mean, per
@@ -19,19 +19,19 @@ axis."""
 MIN_WIDTH = 5e-9
 """[T] Minimum tolerance of a level, which allows for drift."""
 
-MIN_REPORTED_SHARE = 0.5
-"""Minimum share of the blocks in which a used axis is reported."""
+MIN_REPORTED_FRACTION = 0.5
+"""Minimum fraction of the blocks in which a used axis is reported."""
 
 MIN_BLOCKS = 4
 """Minimum number of blocks of a level."""
 
 MIN_LEVEL_DISTANCE = 3.0
-"""Minimum distance of another level, in widths. A smaller difference is the same level with a
-target far away."""
+"""Minimum distance of another level, in widths. A smaller difference may be due to a
+distant target at the same level."""
 
 MIN_DURATION_RATIO = 4.0
-"""Minimum ratio of the duration of a level to that of the initial level for replacing it: a target
-that was present at the start has left."""
+"""Minimum ratio of the duration of a level to the duration of the initial level for replacing the
+initial level: a target that was present at the start has left."""
 
 BATCH_SIZE = 64
 """Number of blocks that are compared with all others at once, to limit memory."""
@@ -44,22 +44,22 @@ class QuietLevel:
     n_blocks: int
     """Number of blocks of the level."""
     n_rival: int
-    """Number of blocks of the most frequent level among the others."""
+    """Number of blocks of the second most frequent level."""
     begin: float
-    """[s] Time of the first of the blocks."""
+    """[s] Time of the first block of the level."""
     end: float
-    """[s] Time of the last of the blocks."""
+    """[s] Time of the last block of the level."""
     level: FloatArray
     """(3,) [T] Level of the earliest blocks; NaN = axis not reported."""
     covariance: FloatArray
-    """(3, 3) [T²] Scatter of its readings; NaN = axis not reported."""
+    """(3, 3) [T²] Scatter of the readings of the level; NaN = axis not reported."""
     block_s: float
     """[s] Typical length of a block."""
     width: FloatArray
     """(3,) [T] Maximum difference of the means of blocks of one level."""
 
     def is_at(self, level: FloatArray) -> bool:
-        """Whether another level is the same.
+        """Whether another level is the same within the tolerance.
 
         Parameters
         ----------
@@ -73,21 +73,21 @@ class QuietLevel:
 
 
 def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLevel | None:
-    """Find the level of the largest number of blocks of a sensor.
+    """Find the most frequent level of the blocks of a sensor.
 
     Parameters
     ----------
     blocks : Blocks
-        In order of time.
+        Chronological.
     steps : (3,) array, T
         Smallest change of each axis; 0 = unknown.
     most : int
-        Maximum number of blocks, the earliest ones, that determine the level.
+        Maximum number of blocks that determine the level; the earliest blocks are used.
 
     Returns
     -------
     QuietLevel or None
-        None if fewer than `MIN_BLOCKS` have one level.
+        None if no level has at least `MIN_BLOCKS` blocks.
     """
     n = np.maximum(blocks.n, 1.0)
     variance = np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1.0, 1.0)
@@ -95,7 +95,7 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLe
     if np.isnan(variance).all():
         return None
     # An axis that is rarely reported would exclude the blocks without it.
-    known = (~np.isnan(variance)).mean(axis=0) > MIN_REPORTED_SHARE
+    known = (~np.isnan(variance)).mean(axis=0) > MIN_REPORTED_FRACTION
     if not known.any():
         return None
     quietest = np.nanquantile(variance[:, known], 0.2, axis=0)
@@ -126,7 +126,7 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLe
 
 
 def _densest(means: FloatArray, width: FloatArray) -> IntArray:
-    """Rows of `means` (n, k) within `width` (k,) of the mean that has the most such rows."""
+    """Indices of the `means` (n, k) in the densest box of half-width `width` (k,)."""
     best: BoolArray = np.zeros(len(means), dtype=bool)
     for first in range(0, len(means), BATCH_SIZE):
         near: BoolArray = np.ones((len(means[first:first + BATCH_SIZE]), len(means)), dtype=bool)

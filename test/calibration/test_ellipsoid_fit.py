@@ -222,7 +222,7 @@ def test_outliers_are_bounded_and_counted(factor):
     y[::25] = OFFSET + factor * (y[::25] - OFFSET)
     fit = fit_ellipsoid(y)
     assert fit.converged and fit.n_outliers == 80 and fit.n_readings == 2000
-    assert fit.warnings[-1] == 'a share of 0.04 of the readings are outliers'
+    assert fit.warnings[-1] == 'the fraction of outliers is 0.04'
     assert (np.abs(fit.offset - OFFSET) < 4.0 * fit.offset_std).all()
     assert (fit.offset_std < 1.5 * clean.offset_std).all()
     assert fit.residual == pytest.approx(spread(fit.correct(y)), rel=1e-12)
@@ -244,7 +244,7 @@ def test_missing_readings_are_excluded_and_counted():
     gaps = np.insert(y, range(0, 1000, 10), [np.nan, 1.0, 1.0], axis=0)
     fit, whole = fit_ellipsoid(gaps), fit_ellipsoid(y)
     assert fit.n_missing == 100 and fit.n_readings == 1000 and fit.converged
-    assert fit.warnings == ('100 readings with a missing axis are excluded',)
+    assert fit.warnings == ('readings excluded because of a missing axis: 100',)
     np.testing.assert_array_equal(fit.offset, whole.offset)
     assert fit.residual == whole.residual and fit.residual_before == whole.residual_before
 
@@ -257,7 +257,7 @@ def test_saturated_readings_are_excluded_and_reported():
     fit = fit_ellipsoid(y)
     assert fit.n_readings + fit.n_missing + fit.n_saturated == 20000 and fit.n_missing == 400
     assert fit.converged and fit.n_saturated > (y[:, 1] == top).sum() > 1000
-    assert fit.warnings[1] == f'{fit.n_saturated} readings with saturation of y are excluded'
+    assert fit.warnings[1] == f'readings excluded because of saturation of y: {fit.n_saturated}'
     assert (np.abs(fit.offset - OFFSET) < 4.0 * fit.offset_std).all()
     assert fit.residual == pytest.approx(spread(fit.correct(y[~np.isnan(y[:, 0])])), rel=1e-12)
 
