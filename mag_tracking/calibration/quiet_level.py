@@ -29,8 +29,7 @@ MAX_BLOCKS = 4000
 
 
 class BlockRecorder(RunningBackground):
-    """Collects the blocks of a sensor in the first pass over a recording; the background is never
-    ready."""
+    """Collects the blocks of a sensor in the first pass over a recording; is never ready."""
 
     def evaluate_block(self) -> None:
         """Store the current block if it is complete."""

@@ -34,7 +34,8 @@ struct Sensor {
     double repeats, changes;
     // Resolution: the latest value of each raw axis, the time of its latest change and
     // the number of readings since then, the numbers of repetitions and changes, the smallest
-    // change, and the variance due to the steps; the number of readings of a decimated one.
+    // change, and the variance due to the steps; the number of raw readings in a decimated
+    // reading.
     double raw[3];
     int64_t rest_since_ns[3], n_rest[3], n_same[3], n_changed[3];
     double step[3], step_variance[3], n_averaged;

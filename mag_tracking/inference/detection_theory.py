@@ -44,7 +44,7 @@ def false_alarm_probability(threshold: float | FloatArray,
     Returns
     -------
     float or (...) array
-        The inverse of `energy_threshold`.
+        Inverse of `energy_threshold`.
     """
     return cast(FloatArray, chdtrc(degrees_of_freedom, threshold))
 

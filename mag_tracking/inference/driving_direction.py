@@ -26,7 +26,7 @@ MAX_CONFIDENCE = 0.98
 target at the height of the sensor. For a target above the sensor by half its lateral distance, 0.6
 % of random moments rotate the other way; by the whole distance, 2.2 %."""
 
-MAX_VERTICAL_SHARE = 0.2
+MAX_VERTICAL_COSINE = 0.2
 """Maximum direction cosine between a missing axis and a horizontal axis at which the missing axis
 is treated as vertical."""
 
@@ -35,13 +35,14 @@ class FieldRotation(NamedTuple):
     """Statistic of the sense of rotation, treated as normally distributed."""
 
     correlation: float
-    """T²; negative for a target that moves from left to right."""
+    """Correlation of the horizontal axes, T²; negative for a target that moves from left to
+    right."""
     variance: float
     """Variance of the correlation, T⁴."""
 
     @property
     def error_probability(self) -> float:
-        """Probability that the sign is wrong; PHD15 Paper B eq. (17), (18)."""
+        """Probability that the sign of the correlation is wrong; PHD15 Paper B eq. (17), (18)."""
         return float(ndtr(-abs(self.correlation) / np.sqrt(self.variance)))
 
     @property
@@ -72,7 +73,7 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
     Returns
     -------
     FieldRotation
-        The variance is not below that of noise alone.
+        Its variance is at least the variance of noise alone.
 
     Raises
     ------
@@ -137,7 +138,7 @@ def lag_of(field: FloatArray, noise_std: float, most: int) -> int:
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     most : int
-        Maximum lag: number of samples at each end that are free of the target.
+        Maximum lag, the number of samples at each end that are free of the target.
 
     Returns
     -------
@@ -146,7 +147,8 @@ def lag_of(field: FloatArray, noise_std: float, most: int) -> int:
     """
     around = 1 + len(field) // 20
     energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(around), 'same')
-    # The samples are counted because another target may be at an end of the window.
+    # Another target at an end of the window extends the span of strong samples, but hardly the
+    # count.
     width = np.count_nonzero(energy > 0.5 * energy.max())
     if not width:
         return 0
@@ -185,14 +187,14 @@ def fused_log_odds(log_odds: Iterable[float], same_side: Iterable[bool]) -> floa
     Parameters
     ----------
     log_odds : iterable of float
-        Log-odds of left to right, as seen by each sensor.
+        Log-odds of left to right, as viewed from each sensor.
     same_side : iterable of bool
         False for a sensor on the opposite side of the road, where left and right are exchanged.
 
     Returns
     -------
     float
-        Log-odds of left to right, as seen from the side for which `same_side` is true. The errors
+        Log-odds of left to right, as viewed from the side for which `same_side` is true. The errors
         of the sensors are treated as independent.
 
     References
@@ -224,14 +226,14 @@ def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
         for b in range(2):
             part = R_ws[b, a] * field[:, a]
             out[:, b] += np.where(
-                missing, 0.0 if abs(R_ws[b, a]) < MAX_VERTICAL_SHARE else np.nan, part)
+                missing, 0.0 if abs(R_ws[b, a]) < MAX_VERTICAL_COSINE else np.nan, part)
     return out
 
 
 def rotation_of_pass(field: FloatArray, noise_std: float, n_quiet: int) -> FieldRotation | None:
     """`field_rotation` at the lag matched to the width of a pass.
 
-    The prior of the correlation is uniform, so that the probability of the direction is
+    The prior of the correlation is uniform. The probability of the direction is therefore
     overconfident for a target below the noise.
 
     Parameters

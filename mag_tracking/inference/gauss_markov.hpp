@@ -14,8 +14,8 @@
 namespace mag_tracking {
 
 // n vectors of m components, the first n_moving of which change. Each vector has a bank of
-// strengths: states (n, n_strengths, n_x), which are the levels and then the rates of the changing
-// components, n_x = m + n_moving; covariances (n, n_strengths, n_x, n_x); log-weights
+// strengths: states (n, n_strengths, n_x), n_x = m + n_moving (all levels, then the rates of the
+// changing components); covariances (n, n_strengths, n_x, n_x); log-weights
 // (n, n_strengths). `densities` (n_strengths, m) are spectral densities.
 struct VectorBank {
     int n, n_strengths, m, n_moving;
@@ -25,7 +25,7 @@ struct VectorBank {
     INLINE int n_x() const { return m + n_moving; }
 };
 
-// Scalar measurements: number of the `vector` of each, ascending; rows `H` (n_y, m), values and
+// Scalar measurements: index of the `vector` of each, ascending; rows `H` (n_y, m), values and
 // variances.
 struct ScalarMeasurements {
     int n;

@@ -3,7 +3,7 @@
 Each component is an integrated random walk: its rate of change is a Wiener process. The strength of
 the process is unknown and may change: a bank of strengths is weighted by the data, and each
 strength switches to another one at a constant rate. The states of different strengths are not
-mixed, because all of them follow the same data.
+mixed, because all states follow the same data.
 """
 
 import numpy as np
@@ -44,7 +44,7 @@ class GaussMarkovVectors:
     def __init__(self, n: int, scale: FloatArray, std: float) -> None:
         m, n_moving, n_strengths = len(scale), np.count_nonzero(scale), len(STRENGTHS)
         if not scale[:n_moving].all():
-            raise ValueError('scale: constant components, which have zero, must come last')
+            raise ValueError('scale: the zeros of constant components must come last')
         # [k, i]: strength k, component i.
         self._densities = np.square(STRENGTHS[:, None] * scale)
         # Constant components have no rate state: it would be exactly zero.

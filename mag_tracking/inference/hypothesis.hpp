@@ -216,7 +216,7 @@ INLINE void before_update(double* __restrict after, const Sizes& n, const Gains&
     }
 }
 
-// The same over a prediction.
+// Propagates the adjoint state `after` backwards over a prediction, in place.
 INLINE void before_move(double* after, const Sizes& n, const Motion& motion, const double* decay) {
     double moved[MAX_ROWS];
     for (int r = 0; r < motion.n; ++r) {
@@ -279,7 +279,8 @@ INLINE void information_before_update(double* __restrict after, const Sizes& n,
     }
 }
 
-// The same over a prediction: F' after F. `T` (motion.n, wide) is overwritten.
+// Propagates the adjoint information `after` backwards over a prediction, in place: F' after F.
+// `T` (motion.n, wide) is overwritten.
 INLINE void information_before_move(double* __restrict after, const Sizes& n,
                                     const Motion& motion, const double* decay,
                                     double* __restrict T) {

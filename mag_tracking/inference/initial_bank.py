@@ -20,7 +20,7 @@ class InitialBank:
     """
 
     x: FloatArray
-    """States, (n_hyp, n_x): of the target, then of the sensors."""
+    """States of the target, then of the sensors, (n_hyp, n_x)."""
     P: FloatArray
     """Covariances of the target states, (n_hyp, n_t, n_t)."""
     P_sensors: FloatArray
@@ -36,7 +36,7 @@ class InitialBank:
 
     @classmethod
     def of(cls, bank: FilterBank, n_target: int) -> 'InitialBank':
-        """Copy the start of a bank.
+        """Copy a bank at its start.
 
         Parameters
         ----------
@@ -58,12 +58,12 @@ class InitialBank:
         return len(self.x)
 
     def rows(self, rows: IntArray) -> FilterBank:
-        """Restore some hypotheses with equal weights.
+        """Restore selected hypotheses with equal weights.
 
         Parameters
         ----------
         rows : (n,) int array
-            Rows to restore.
+            Indices of the hypotheses to restore.
 
         Returns
         -------
@@ -77,7 +77,7 @@ class InitialBank:
                           self.kind[rows], self.origin[rows], np.full((n, self.n_sensors), np.nan))
 
     def keep(self, mask: BoolArray) -> None:
-        """Keep some hypotheses.
+        """Remove all hypotheses except the selected ones.
 
         Parameters
         ----------

@@ -120,7 +120,7 @@ class Eigen {
 class PseudoInverter {
   public:
     // Matrices that `Inverter` inverts with `least` have full rank. For the others, directions with
-    // an eigenvalue below the fraction `rank` of the largest are left out.
+    // an eigenvalue below the fraction `rank` of the largest are excluded.
     PseudoInverter(std::size_t n, double least, double rank)
         : n_(n), least_(least), rank_(rank), inverter_(n), eigen_(n), unit_(n * n), scale_(n) {}
 

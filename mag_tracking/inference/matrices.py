@@ -35,7 +35,7 @@ def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
     if H.ndim < 2:
         raise ValueError(f'H must have shape (..., n_y, n_x), got {H.shape}')
     missing = np.isnan(H).all(axis=-1)
-    raise_for_invalid('row of H ', 'finite or wholly NaN', H,
+    raise_for_invalid('row of H ', 'finite or all NaN', H,
                       ~np.isfinite(H).all(axis=-1) & ~missing)
     H = np.where(missing[..., None], 0.0, H)
     if C is None:
@@ -142,7 +142,7 @@ def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, Flo
 
 
 def triangular_factor(A: FloatArray) -> FloatArray:
-    """R of the QR decomposition A = Q R.
+    """Triangular factor R of the QR decomposition A = Q R.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def triangular_factor(A: FloatArray) -> FloatArray:
 
 
 def ignoring_overflow() -> AbstractContextManager[None]:
-    """Context in which overflow is not reported: a diverging search has infinite cost.
+    """Context that suppresses overflow warnings, because a diverging search has infinite cost.
 
     Returns
     -------
@@ -181,7 +181,7 @@ def pseudo_inverse(A: FloatArray, rank: float = PSEUDO_INVERSE_TOLERANCE) -> Flo
     A : (n, k, k) array
         Symmetric positive semidefinite matrices.
     rank : float
-        Directions with an eigenvalue below this fraction of the largest are left out.
+        Directions with an eigenvalue below this fraction of the largest are excluded.
 
     Returns
     -------

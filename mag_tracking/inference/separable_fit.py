@@ -1,6 +1,6 @@
 """Fits of models that are linear in most of their parameters, from many starting points.
 
-The model is passed as an object.
+A model is an object with the methods of `SeparableModel`.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ class SeparableModel(Protocol):
         """
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of basis(theta) p by theta.
+        """Derivative of basis(theta) p with respect to theta.
 
         Parameters
         ----------
@@ -57,7 +57,7 @@ class SeparableProblem:
     nuisance : (n_y, q) array, optional
         Whitened linear terms that do not depend on theta, such as backgrounds.
     prior : (mean, std) of (n_theta,) arrays, optional
-        Gaussian prior of theta; an infinite standard deviation is no prior.
+        Gaussian prior of theta; an infinite standard deviation means no prior.
 
     Attributes
     ----------
@@ -102,7 +102,8 @@ class SeparableProblem:
         with ignoring_overflow():
             A = self._without_nuisance(self._model.basis(theta))
             p, _, _ = project_out_linear(A, self._y)
-            # Cheaper than from the residuals, and accurate enough for a grid of starting points.
+            # Cheaper than the sum of the squared residuals, and accurate enough for a grid of
+            # starting points.
             cost = self.energy - np.einsum('ni,ni->n', p, self._y @ A)
             if self._prior is not None:
                 cost = cost + np.square(self._prior.residual(theta)).sum(axis=1)
@@ -119,9 +120,9 @@ class SeparableProblem:
         Returns
         -------
         residual : (n, n_y) array
-            Whitened; with a prior, its residuals are appended.
+            Whitened; the residuals of the prior, if any, are appended.
         jacobian : (n, n_y, n_theta) array
-            Derivative of the prediction by theta.
+            Derivative of the prediction with respect to theta.
         """
         A = self._without_nuisance(self._model.basis(theta))
         p, residual, inverse = project_out_linear(A, self._y)
@@ -129,13 +130,13 @@ class SeparableProblem:
         J = D - A @ (inverse @ (np.swapaxes(A, 1, 2) @ D))
         if self._prior is None:
             return residual, J
-        known = self._prior.residual(theta)
-        return (np.hstack([residual, known]), np.concatenate(
+        prior_residual = self._prior.residual(theta)
+        return (np.hstack([residual, prior_residual]), np.concatenate(
             [J, np.broadcast_to(self._prior.jacobian, (len(J), *self._prior.jacobian.shape))],
             axis=1))
 
     def linear(self, theta: FloatArray) -> FloatArray:
-        """Best linear parameters.
+        """Linear parameters that minimise the cost.
 
         Parameters
         ----------
@@ -162,13 +163,13 @@ class _Prior:
 
     def residual(self, theta: FloatArray) -> FloatArray:
         """Whitened residuals (n, n_known) for theta (n, n_theta)."""
-        left: FloatArray = (self._mean - theta[:, self._known]) / self._std
-        return left
+        residual_of_prior: FloatArray = (self._mean - theta[:, self._known]) / self._std
+        return residual_of_prior
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """Lowest minimum found by a search."""
+    """Result of a search for the lowest minimum."""
 
     theta: FloatArray
     """Non-linear parameters, (n_theta,)."""
@@ -177,13 +178,13 @@ class Minimum:
     converged: bool
     """Whether the final search converged."""
     rivals: tuple[tuple[FloatArray, float], ...] = ()
-    """(theta, cost) of other minima found, best first."""
+    """Other minima as (theta, cost), best first."""
 
 
 def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparableProblem,
            starts: FloatArray, apart: FloatArray,
            companions: Callable[[FloatArray], FloatArray] | None = None) -> Minimum:
-    """Search the lowest minimum of a separable problem from many starting points.
+    """Search for the lowest minimum of a separable problem from many starting points.
 
     Parameters
     ----------
@@ -198,8 +199,8 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
     apart : (n_theta,) array
         Points are distinct if they differ by more than this in any parameter.
     companions : callable, (n_theta,) array -> (n, n_theta) array, optional
-        Takes the best point of the coarse problem and returns points whose minima are often
-        mistaken for it. The search continues from them as well.
+        Function of the best point of the coarse problem that returns points near minima that are
+        often confused with the best minimum. The search also starts from these points.
 
     Returns
     -------
@@ -207,16 +208,16 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
     """
     theta, cost = coarse_minima(smooth, coarse, starts, apart)
     if companions is not None:
-        more, more_cost, _, _ = refine(coarse.residual_and_jacobian,
+        added, added_cost, _, _ = refine(coarse.residual_and_jacobian,
                                        companions(theta[np.argmin(cost)]), 40, 1e-6)
-        theta, cost = np.vstack([theta, more]), np.append(cost, more_cost)
+        theta, cost = np.vstack([theta, added]), np.append(cost, added_cost)
     return fine_minimum(fine, theta, cost, apart)
 
 
 def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: FloatArray,
                   apart: FloatArray, n_refined: int = 60, n_steps: int = 4,
                   n_distinct: int = 8) -> tuple[FloatArray, FloatArray]:
-    """Minima of a reduced separable problem.
+    """Find the minima of a reduced separable problem.
 
     All starting points are evaluated with the smooth problem, and the best `n_refined` are refined
     by `n_steps` Levenberg-Marquardt steps. The best `n_distinct` distinct points are then refined
@@ -256,7 +257,7 @@ def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: Fl
 
 def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray, apart: FloatArray,
                  n_best: int = 4) -> Minimum:
-    """Lowest minimum of a separable problem, from points near its minima.
+    """Find the lowest minimum of a separable problem from points near its minima.
 
     Parameters
     ----------
@@ -304,12 +305,12 @@ def distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) 
     Returns
     -------
     (k,) int array
-        Rows of the selected points, best first.
+        Indices of the selected points, best first.
     """
-    kept: list[int] = []
-    for row in np.argsort(cost, kind='stable').tolist():
-        if all((np.abs(theta[row] - theta[other]) > apart).any() for other in kept):
-            kept.append(row)
-            if len(kept) == most:
+    selected: list[int] = []
+    for i in np.argsort(cost, kind='stable').tolist():
+        if all((np.abs(theta[i] - theta[other]) > apart).any() for other in selected):
+            selected.append(i)
+            if len(selected) == most:
                 break
-    return np.array(kept, dtype=np.int64)
+    return np.array(selected, dtype=np.int64)
