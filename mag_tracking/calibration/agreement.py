@@ -132,8 +132,8 @@ def _cache_key(a: FloatArray) -> tuple[float, ...]:
 
 @functools.lru_cache(maxsize=4096)
 def _fits_cached(field: tuple[float, ...], orientation: tuple[float, ...],
-                  orientation_std: tuple[float, ...], B0: tuple[float, ...],
-                  bias_std: float) -> bool:
+                 orientation_std: tuple[float, ...], B0: tuple[float, ...],
+                 bias_std: float) -> bool:
     """Cached `_fits` of tuples; a monitored network is checked every second."""
     y, R_ws, std = (np.array(field), np.array(orientation).reshape(3, 3),
                     np.array(orientation_std))

@@ -226,7 +226,7 @@ def _refined_lag(a: _Series, b: _Series, lag: float) -> tuple[float, float]:
 
 
 def _fitted_lag(a: _Series, b: _Series, lag: float,
-            curve: PchipInterpolator | CubicSpline) -> tuple[float, float]:
+                curve: PchipInterpolator | CubicSpline) -> tuple[float, float]:
     """Offset and standard deviation [s] with `curve` as the interpolated series."""
     t, s = b
     step = max(_sampling_interval(*a), _sampling_interval(*b))
@@ -241,8 +241,8 @@ def _fitted_lag(a: _Series, b: _Series, lag: float,
         return s - (u @ s) / (u @ u) * u
 
     optimum = minimize_scalar(lambda d: np.sum(residual(d)**2), method='bounded', args=(),
-                            bounds=(lag - 2.0 * step, lag + 2.0 * step),
-                            options={'xatol': 1e-6})
+                              bounds=(lag - 2.0 * step, lag + 2.0 * step),
+                              options={'xatol': 1e-6})
     u, slope = curve(t - optimum.x), curve.derivative()(t - optimum.x)
     gain, square = (u @ s) / (u @ u), slope @ slope
     # The residuals are heteroscedastic: multiplicative noise and interpolation errors are largest

@@ -75,10 +75,10 @@ def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTi
     """
     out = dict(earlier)
     for name, times in latest.items():
-        earlier_segments = [(begin, end) for begin, end in earlier.get(name, ())
-                if not any(b <= begin and (e is None or begin < e or b == begin) for b, e in times)]
+        retained = [(begin, end) for begin, end in earlier.get(name, ()) if not any(
+            b <= begin and (e is None or begin < e or b == begin) for b, e in times)]
         segments: list[tuple[int, int | None]] = []
-        for begin, end in sorted([*earlier_segments, *times], key=lambda segment: segment[0]):
+        for begin, end in sorted([*retained, *times], key=lambda segment: segment[0]):
             if segments and segments[-1][1] is None:
                 segments[-1] = (segments[-1][0], begin)
             segments.append((begin, end))

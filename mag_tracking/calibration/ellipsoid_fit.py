@@ -204,8 +204,8 @@ def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> Elli
     axes = np.linalg.eigvalsh(C)
     if not axes[0] * MAX_AXIS_RATIO >= axes[2]:
         return _rejected_fit(f'the axes of the ellipsoid have a ratio of {axes[0]:.2g} to '
-                         f'{axes[2]:.2g}, maximum 1 to {MAX_AXIS_RATIO:g}; {POSSIBLE_CAUSES}',
-                         counts, notes)
+                             f'{axes[2]:.2g}, maximum 1 to {MAX_AXIS_RATIO:g}; {POSSIBLE_CAUSES}',
+                             counts, notes)
     counts['n_outliers'] += quality['n_outliers']
     out = _in_units(o, C, P, centre, scale, field_size)
     residual = _relative_spread(np.linalg.norm(

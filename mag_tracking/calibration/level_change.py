@@ -165,6 +165,6 @@ class SharedChanges:
         if change.size >= CLEAR_SIZE and change.has_departed is not None:
             return change.has_departed
         candidates = [other for other in self._latest_changes.values()
-                   if other.has_departed is not None
-                   and abs(other.since - change.since) < MAX_TIME_DIFFERENCE_S]
+                      if other.has_departed is not None
+                      and abs(other.since - change.since) < MAX_TIME_DIFFERENCE_S]
         return max(candidates, key=lambda other: other.size).has_departed if candidates else None

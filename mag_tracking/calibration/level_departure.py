@@ -93,7 +93,7 @@ class LevelDeparture:
 
         Parameters
         ----------
-        share : float
+        ratio : float
             Required duration relative to the usual duration.
 
         Returns

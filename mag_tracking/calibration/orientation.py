@@ -94,7 +94,7 @@ def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
                          + (' (is its unit g?)' if 0.8 < size < 1.2 else ''))
     scatter = float(at_rest.std(axis=0).max()) / np.sqrt(len(at_rest))
     return UpDirection(mean / size, size, float(np.hypot(scatter, bias)) / GRAVITY, len(at_rest),
-              len(a) - len(at_rest))
+                       len(a) - len(at_rest))
 
 
 @dataclass(frozen=True)

@@ -190,7 +190,7 @@ def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
         selected = np.arange(len(J))[np.asarray(keep)]
     except IndexError as error:
         raise ValueError(f'keep is not valid for {len(J)} states: {error}') from error
-    if len(set(selected.tolist())) != selected.cpa_range:
+    if len(set(selected.tolist())) != selected.size:
         raise ValueError(f'keep contains a state twice: {selected.tolist()}')
     scale, root, kernel = _inverse_root(J)
     # The complement is not computed by subtraction: eliminated states that are barely observable

@@ -235,7 +235,7 @@ class FilterBank:
         ----------
         n : int
             Number of hypotheses.
-        share : float
+        fraction : float
             Required fraction of the total weight.
 
         Returns

@@ -209,7 +209,7 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
     theta, cost = coarse_minima(smooth, coarse, starts, apart)
     if companions is not None:
         added, added_cost, _, _ = refine(coarse.residual_and_jacobian,
-                                       companions(theta[np.argmin(cost)]), 40, 1e-6)
+                                         companions(theta[np.argmin(cost)]), 40, 1e-6)
         theta, cost = np.vstack([theta, added]), np.append(cost, added_cost)
     return fine_minimum(fine, theta, cost, apart)
 

@@ -62,7 +62,7 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
     ready = background.ready and calibrate.last_stamp_ns(name) is not None
     C = background.covariance if ready else None
     q, std = quaternion_from_rotation(network.R_ws[j]), network.orientation_std[j]
-    done = network.calibrated[j]
+    record = network.calibrated[j]
     since, until = background.doubtful_times[-1] if background.doubtful_times else (None, None)
     return {'sensor': name, 'ready': ready, 'frozen': background.frozen,
             'doubtful': background.doubtful,
@@ -74,9 +74,9 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
             'orientation': {**xyz(q), 'w': float(q[3])},
             'orientation_std': (np.full(3, np.nan) if std is None else std).tolist(),
             'clock_offset': float(network.clock_offset[j]),
-            'clock_offset_std': float('nan') if done is None else done.clock_offset_std,
-            'calibrated_at': '' if done is None else done.date,
-            'calibrated_by': '' if done is None else done.by}
+            'clock_offset_std': float('nan') if record is None else record.clock_offset_std,
+            'calibrated_at': '' if record is None else record.date,
+            'calibrated_by': '' if record is None else record.by}
 
 
 def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
@@ -99,7 +99,7 @@ def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
 
 
 def with_orientations(network: SensorNetwork, message: CalibrationState) -> SensorNetwork:
-    """Copy of a network with the sensor orientations of a CalibrationState.
+    """Copy a network with the sensor orientations of a CalibrationState.
 
     Parameters
     ----------

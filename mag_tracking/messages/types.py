@@ -1,6 +1,6 @@
-"""Message definitions as text, and encoding and decoding of CDR bytes, without ROS.
+"""Message schemas, and encoding and decoding of CDR bytes, without ROS.
 
-Recordings carry the texts of `definitions` as their schemas.
+The schemas are built from the message definitions of `definitions`.
 """
 
 import functools
@@ -49,13 +49,13 @@ _FIELD = re.compile(r'\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?P<array>(?:<=)
 
 
 def _full_name(kind: str, package: str) -> str:
-    """Full name of a type that a definition of `package` refers to."""
+    """Full name of a type that is referenced by a definition of `package`."""
     owner, _, leaf = kind.rpartition('/')
     return f'{(owner or package).partition("/")[0]}/msg/{leaf}'
 
 
 def referenced_types(text: str, package: str) -> list[str]:
-    """Message types that a definition refers to.
+    """Message types that are referenced by a definition.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def _dependencies(type_name: str) -> list[str]:
 
 
 def definition(type_name: str) -> str:
-    """Definition of a type with those of all contained types, in the format of a `ros2msg` schema.
+    """Definition of a type and of all contained types, in the format of a `ros2msg` schema.
 
     Parameters
     ----------

@@ -177,7 +177,7 @@ def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float =
     fraction = rng.dirichlet(np.full(n_parts, 1.5))
     common = rng.standard_normal(3)
     permanent = (fraction[:, None] * (common / np.linalg.norm(common)
-                                   + 0.7 * rng.standard_normal((n_parts, 3)))
+                                      + 0.7 * rng.standard_normal((n_parts, 3)))
                  * moment / 1.4)
     # Sheet metal is easier to magnetise along the vehicle than across it.
     easy = np.array([1.3, 1.0, 0.7]) * rng.uniform(0.8, 1.2, (n_parts, 3))

@@ -157,7 +157,7 @@ def test_separated_weight_counts_distant_hypotheses_only():
 
 
 def initial_bank(network, earth, offset_std=0.5):
-    """Bank of 126 hypotheses with a tight prior, all of one arrival along x."""
+    """Bank of 126 hypotheses with a tight prior, all with an arrival along x."""
     x, P = [], []
     for m in 300.0 * moment_directions():
         for lateral in (-1.0, 0.0, 1.0):
@@ -200,7 +200,7 @@ def matched_run(rng, network, model, sigma):
 
 
 def test_anees_of_matched_runs_is_near_one():
-    """Position and velocity; 200 runs, two sensors, 12.5 Hz, tight prior, 126 hypotheses."""
+    """The states are position and velocity; 200 runs with two sensors at 12.5 Hz."""
     earth = np.array([2e-6, 1.55e-5, -4.9e-5])
     network = line_network(2, tilt=0.0)
     model = RowVehicle(earth, np.array([0.1, 0.1, 1e-4]), 0.003, n_dipoles=1)
@@ -234,7 +234,7 @@ def test_keep_leaves_the_remaining_hypotheses_unchanged(removed):
 
 
 def test_an_initial_bank_returns_the_rows_of_its_source_bank():
-    """Later changes of that bank and of a copy with the same arrays have no effect."""
+    """Later changes of the source bank and of a copy with the same arrays have no effect."""
     from_targets = random_bank(5, 4)
     own = np.array([np.diag([1.0, 2.0]), np.diag([3.0, 4.0])])
     bank = FilterBank.from_targets(from_targets.x, from_targets.P, from_targets.label, 2, 1e-8, own,

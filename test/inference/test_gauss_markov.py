@@ -1,4 +1,4 @@
-"""Bank of integrated random walks: against plain Kalman filters, and on data of its own model."""
+"""Bank of integrated random walks: comparison with plain Kalman filters, and data of its model."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def plain_filter(density, std):
 
 
 def by_plain_filters(series, variance, dt, scale, std):
-    """Log-densities of the vectors `series` (n, m), by plain filters of each component."""
+    """Log-densities of the vectors `series` (n, m) from one plain filter for each component."""
     banks = [[plain_filter((s * scale)**2, std) for _ in series[0]] for s in STRENGTHS]
     log_w = np.full(len(STRENGTHS), -np.log(len(STRENGTHS)))
     out = []

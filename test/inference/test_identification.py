@@ -1,4 +1,4 @@
-"""Identification of enrolled vehicles: published passes of one, and two cars of equal size."""
+"""Identification of enrolled vehicles: published passes of a vehicle, and two similar cars."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ HARD, SOFT = SCALE * np.array([-0.47, 0.29, -0.56]), 1.22
 
 
 def distances(between_std, monkeypatch):
-    """Squared distance of each published pass from the prediction of the twelve others."""
+    """Squared distance of each published pass from the prediction by the twelve other passes."""
     monkeypatch.setattr('mag_tracking.inference.identification.PASS_TO_PASS_STD', between_std)
     out = []
     for k in range(len(TABLE)):
@@ -31,7 +31,7 @@ def distances(between_std, monkeypatch):
 
 
 def test_published_passes_are_consistent_with_the_spread_between_passes(monkeypatch):
-    """T10 Table 6.9, leaving one pass out; the stated standard deviations alone are too small."""
+    """T10 Table 6.9, leaving one pass out; the published standard deviations are too small."""
     low, high = chi2.ppf([0.005, 0.995], 3 * len(TABLE)) / len(TABLE)
     assert low < distances(PASS_TO_PASS_STD, monkeypatch).mean() < high
     assert distances(1e-6, monkeypatch).mean() > high
@@ -53,7 +53,7 @@ def moment_at(hard, heading):
 
 
 def rotated_hard_iron(degrees):
-    """Hard iron of a car of equal size."""
+    """Hard iron of a car of equal moment: HARD, rotated about the vertical."""
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ HARD
 
@@ -80,7 +80,7 @@ def test_two_cars_of_equal_size_are_distinguished(degrees):
     right = [identify(fleet, m, C, heading, 0.02, INDUCTION).name == name
              for name, hard in cars.items() for heading in np.deg2rad([90.0, 270.0, 20.0, 200.0])
              for m in passes(hard, [heading] * 10)]
-    # One in a hundred exceeds the threshold of `unknown`.
+    # One pass in a hundred exceeds the threshold of `unknown`.
     assert np.mean(right) > 0.99 - 3.0 * np.sqrt(0.01 * 0.99 / len(right))
 
 

@@ -7,7 +7,7 @@ from mag_tracking.inference.matrices import pseudo_inverse
 
 
 def information(k, rank, rng, n=5):
-    """Symmetric matrices (n, k, k) of a rank, whose units differ by decades."""
+    """Symmetric matrices (n, k, k) of a given rank, with units that differ by decades."""
     A = rng.standard_normal((n, k, rank)) * 10.0**rng.uniform(-6.0, 6.0, (k, 1))
     return A @ np.swapaxes(A, 1, 2)
 

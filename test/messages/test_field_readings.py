@@ -1,4 +1,4 @@
-"""Readings of several sensors in one message: conversion both ways, and recordings."""
+"""Readings of several sensors in one message: conversion in both directions, and recordings."""
 
 from array import array
 from collections import Counter
@@ -64,7 +64,7 @@ def test_a_round_trip_keeps_samples_and_their_order(n, known, seed):
 
 
 def test_arrays_follow_the_message_definition():
-    """Row by row; integers and single-precision numbers are accepted."""
+    """Arrays are in row-major order; integers and single-precision numbers are accepted."""
     samples = [MagSample(7, 'b', np.array([1, 2, 3]), np.diag([1, 2, 3])),
                MagSample(5, 'a', np.array([0.5, 1.5, 2.5], dtype=np.float32),
                          np.arange(9, dtype=np.float32).reshape(3, 3)),
@@ -113,7 +113,7 @@ def test_an_empty_message_has_no_readings():
 
 
 def recording(path, messages):
-    """Recording of [(topic, type, content)] at intervals of one second."""
+    """Write a recording of [(topic, type, content)] at intervals of one second."""
     path.parent.mkdir(exist_ok=True)
     with RecordingWriter(path) as writer:
         for k, (topic, kind, content) in enumerate(messages):

@@ -1,4 +1,4 @@
-"""Curves and regions on the pages against independently computed values."""
+"""Curves and regions on the pages, compared with independently computed values."""
 
 import numpy as np
 import pytest
