@@ -134,7 +134,7 @@ def _cache_key(a: FloatArray) -> tuple[float, ...]:
 def _fits_cached(field: tuple[float, ...], orientation: tuple[float, ...],
                  orientation_std: tuple[float, ...], B0: tuple[float, ...],
                  bias_std: float) -> bool:
-    """Cached `_fits` of tuples; a monitored network is checked every second."""
+    """Cached version of `_fits`, with tuples as arguments."""
     y, R_ws, std = (np.array(field), np.array(orientation).reshape(3, 3),
                     np.array(orientation_std))
     reported = ~np.isnan(y)

@@ -1,7 +1,7 @@
 """Running estimate of the background and noise of one sensor from intervals without a target.
 
 The background is a line in time (level and drift) through the means of short quiet blocks; the
-noise is the scatter within the blocks, pooled. A block that departs from the line freezes the
+noise is pooled from the scatter within the blocks. A block that departs from the line freezes the
 estimate and discards the blocks shortly before it, because a target approaches gradually. Without a
 quiet interval, the most frequent level is a provisional background. TSP14 section VI and T10
 section 6.3 use the mean and covariance of a target-free interval; the line and the freezing are
@@ -173,7 +173,7 @@ class RunningBackground:
     def covariance(self) -> FloatArray | None:
         """Noise covariance of one sample, (3, 3) T², or None; NaN = axis not reported.
 
-        It includes the variance due to the sensor's steps.
+        The variance due to the sensor's steps is included.
         """
         return self._level.covariance
 
@@ -202,7 +202,7 @@ class RunningBackground:
 
     @property
     def scatter_std(self) -> FloatArray:
-        """Scatter of the quiet readings including their steps, (3,) T; NaN = unknown."""
+        """Standard deviation of the quiet readings including steps, (3,) T; NaN = unknown."""
         variance = self._quiet.scatter() + self._state['step_variance']
         return np.where(variance > 0.0, np.sqrt(variance), np.nan)
 
@@ -232,14 +232,14 @@ class RunningBackground:
         self.doubtful_times = updated(self.doubtful_times, last_ns, self.doubtful)
 
     def _collect_until_quiet(self, block: Block) -> None:
-        """Collect blocks until a quiet interval is long enough; the background is not ready yet."""
+        """Add a block, and adopt a quiet interval as the background once it is long enough."""
         self._start = block.time if np.isnan(self._start) else self._start
         segments = self._learning_window.segments(block, self.stuck)
         if not any(self._adopt_if_steady(s) for s in segments) and not self.stuck:
             self._start_provisionally(block)
 
     def _start_provisionally(self, block: Block) -> None:
-        """Start with the most frequent level, because there is no quiet interval."""
+        """Add a block, and start with the most frequent level if it is known."""
         self._provisional.collect(block)
         frequent = self._provisional.frequent_level(corrected_steps(self._sensors))
         if frequent is not None and self._known_background is not None:
@@ -264,7 +264,7 @@ class RunningBackground:
     def _update(self, block: Block) -> None:
         """Extend the quiet interval by a block, or freeze the background."""
         difference = np.abs(self._level.departure(block.time, block.mean))
-        # A comparison with NaN is false: an axis that is not reported does not freeze.
+        # A comparison with NaN is false: an axis that is not reported freezes nothing.
         self.frozen = bool((difference > self._level.limits).any())
         self._provisional.collect(block)
         if self.frozen:
@@ -283,7 +283,7 @@ class RunningBackground:
             self._fit(blocks)
 
     def _change_if_steady(self, block: Block) -> None:
-        """Adopt another level that lasts or was the background before; the background is frozen."""
+        """While frozen, adopt another level that lasts or that was the background before."""
         self._seen_until = np.nan
         departure = self._departure
         since = block.time - departure.blocks[0].time
@@ -297,8 +297,8 @@ class RunningBackground:
         latest = departure.steady_end(SHORTENED_FRACTION)
         if latest is not None and self._relearn and self._adopt_if_background(latest):
             return
-        # Two levels of equal duration may both be the background, unless a vehicle was observed
-        # to arrive at one of them.
+        # Either of two levels of equal duration may be the background, unless a vehicle was
+        # observed to arrive at one of the levels.
         self._is_contested = not departure.has_arrived and (
             self._is_contested
             or since >= min(self._seen_s, self._relearn) and departure.steady_end() is not None

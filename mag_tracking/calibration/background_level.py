@@ -125,7 +125,7 @@ class BackgroundLevel:
     def covariance(self) -> FloatArray | None:
         """Noise covariance of one sample, (3, 3) T², or None; NaN = axis not reported.
 
-        It includes the variance due to the sensor's steps.
+        The variance due to the sensor's steps is included.
         """
         if self.noise is None:
             return None

@@ -11,7 +11,7 @@ from mag_tracking.calibration import core
 from mag_tracking.records import plain
 
 MAX_VARIANCE_RATIO = 100.0
-"""Maximum ratio of the variance of a block to that of the quietest block. A target that
+"""Maximum ratio of the variance of a block to the variance of the quietest block. A target that
 passes within a block, as in the long blocks of a slow sensor, causes a higher ratio. Noise and
 coarse steps cause much lower ratios."""
 
@@ -23,7 +23,7 @@ class Block:
     time: float
     """[s] Mean time of the readings."""
     mean: FloatArray
-    """(3,) [T]; NaN = axis not reported."""
+    """(3,) [T] Mean field; NaN = axis not reported."""
     scatter: FloatArray
     """(3, 3) [T²] Sum of squared deviations from the mean."""
     n: FloatArray

@@ -35,11 +35,11 @@ class Lag:
     """Clock offset of one sensor relative to another."""
 
     offset: float
-    """[s] NaN if the offset is unknown."""
+    """[s] Clock offset; NaN if it is unknown."""
     std: float
     """[s] Standard deviation of the offset."""
     correlation: float
-    """Correlation at that lag, 0 to 1; NaN if a sensor measured no knock."""
+    """Correlation at this offset, 0 to 1; NaN if a sensor measured no knock."""
     reason: str
     """Why the offset is unknown; empty if it is known."""
 
@@ -71,7 +71,7 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
     """Clock offset of a sensor relative to a reference, from knocks measured by both.
 
     The lag with the largest correlation is refined below the sampling interval by least squares,
-    which also gives the standard deviation.
+    which also yields the standard deviation.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ def _fitted_lag(a: _Series, b: _Series, lag: float,
     t, s = b
     step = max(_sampling_interval(*a), _sampling_interval(*b))
     first, last = _knock_times(*a)
-    # A fixed set of readings, since a set that depends on the lag would make the sum discontinuous.
+    # The set of readings is fixed: if it depended on the lag, the sum would be discontinuous.
     near = (t >= first + lag - MARGIN_S) & (t <= last + lag + MARGIN_S)
     near &= (t >= a[0][0] + lag + 2.0 * step) & (t <= a[0][-1] + lag - 2.0 * step)
     t, s = t[near], s[near]

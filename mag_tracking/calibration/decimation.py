@@ -75,7 +75,7 @@ class Decimator:
         self._until_next = 0
 
     def feed(self, stamp_ns: int, field: FloatArray) -> list[tuple[int, FloatArray]]:
-        """Add a sample and return the outputs that it completes, usually none.
+        """Add a sample, and return the outputs that are now complete, usually none.
 
         Parameters
         ----------

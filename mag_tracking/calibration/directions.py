@@ -79,8 +79,8 @@ def even_weights(q: FloatArray) -> FloatArray:
 def coverage(u: FloatArray, w: FloatArray) -> float:
     """Coverage of the sphere by directions.
 
-    It is the smallest eigenvalue of the weighted mean of f fᵀ, with the spherical harmonics f to
-    degree two.
+    The coverage is the smallest eigenvalue of the weighted mean of f fᵀ, with the spherical
+    harmonics f to degree two.
 
     Parameters
     ----------

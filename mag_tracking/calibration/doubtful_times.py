@@ -7,7 +7,7 @@ DoubtfulTimes: TypeAlias = tuple[tuple[int, int | None], ...]
 """((begin, end) [ns], ...), oldest first, ends excluded; an end of None is not known yet."""
 
 MAX_INTERVALS = 16
-"""Maximum number of intervals; the latest intervals are kept."""
+"""Maximum number of intervals; the oldest intervals are removed."""
 
 
 def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
@@ -21,7 +21,7 @@ def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
         Start of the state.
     is_doubtful : bool
     max_intervals : int
-        Maximum number of intervals; the latest intervals are kept.
+        Maximum number of intervals; the oldest intervals are removed.
 
     Returns
     -------
@@ -58,8 +58,8 @@ def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTi
            ) -> dict[str, DoubtfulTimes]:
     """Merge two records of the same sensors.
 
-    An interval in `latest` replaces an earlier one that begins at the same time or during it. If
-    the end of an earlier interval is missing, the interval ends where the next one begins. If
+    An interval in `latest` replaces an earlier interval that begins at the same time or within it.
+    If the end of an earlier interval is missing, the interval ends where the next one begins. If
     `latest` has no interval of a sensor, the background was replaced, and an open interval is
     removed.
 

@@ -11,8 +11,8 @@ TYPICAL_DRIFT = 3e-9
 """[T/s] Typical drift of a background."""
 
 STEEP_DRIFT = 1e-8
-"""[T/s] Maximum drift of a background, as of a sensor that is warming up. A faster change may be
-due to an approaching target."""
+"""[T/s] Maximum drift of a background, reached by a sensor that is warming up. A faster change may
+be due to an approaching target."""
 
 MAX_AGE_S = 600.0
 """[s] Maximum age of a former level."""

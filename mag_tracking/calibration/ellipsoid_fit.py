@@ -104,8 +104,8 @@ class EllipsoidFit:
     n_saturated: int
     """Number of readings excluded because of saturation."""
     n_outliers: int
-    """Number of glitches, which are excluded, and of readings further than OUTLIER robust standard
-    deviations from the ellipsoid, whose influence the loss limits."""
+    """Number of excluded glitches, plus the number of readings further than OUTLIER robust standard
+    deviations from the ellipsoid. The loss limits the influence of the latter."""
     converged: bool
     """Whether the calibration is valid."""
     reason: str

@@ -14,8 +14,8 @@ LOSS_SCALE = 2.0
 Gaussian noise is small."""
 
 N_BLOCKS = 40
-"""Number of intervals of the block jackknife for the covariance. Each must be long compared with
-the correlation time of the residuals."""
+"""Number of intervals of the block jackknife for the covariance. Each interval must be long
+compared with the correlation time of the residuals."""
 
 _UPPER = np.triu_indices(3)
 _ROWS, _COLUMNS = _UPPER

@@ -9,7 +9,7 @@ from mag_tracking.calibration.blocks import Blocks, line_through, pooled_covaria
 from mag_tracking.calibration.resolution import TOGGLE
 
 MAX_CALM_RATIO = 3.0
-"""Maximum standard deviation of a calm block relative to that of the quietest fifth of the blocks.
+"""Maximum standard deviation of a calm block relative to the quietest fifth of the blocks.
 A passing target changes the field within a block."""
 
 LEVEL_WIDTH = 4.0

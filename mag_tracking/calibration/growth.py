@@ -1,9 +1,9 @@
 """Growth rate of a field change, which distinguishes approaching from starting targets.
 
 The field of a vehicle that approaches at constant speed grows with the inverse cube of its
-distance: faster and faster. The change due to a vehicle that starts or stops grows with the
-distance travelled, the square of time: more and more slowly. The test is an addition of this
-package.
+distance; its relative growth accelerates. The change due to a vehicle that starts or stops grows
+with the distance travelled, the square of time; its relative growth decelerates. The test is an
+addition of this package.
 """
 
 from dataclasses import dataclass

@@ -28,7 +28,7 @@ MIN_ASYMMETRY = 0.8
 """Minimum asymmetry of a change (a binary logarithm) for a decision; 0 = equal ends."""
 
 MIN_GROWTH = 3.5
-"""Minimum ratio of the small part of a change to the detection limit."""
+"""Minimum ratio of the largest evaluated magnitude to the detection limit."""
 
 MAX_QUARTER_FRACTION = 0.5
 """Maximum duration of a quarter, less one block, as a fraction of the total growth time; a longer
@@ -146,7 +146,7 @@ class SharedChanges:
         self._latest_changes: dict[int, LevelChange] = {}
 
     def evaluate_change(self, sensor: int, change: LevelChange) -> bool | None:
-        """Evaluate a change of a sensor together with those of the other sensors.
+        """Evaluate a change of a sensor together with the changes of the other sensors.
 
         A change that is not clear is classified by the largest simultaneous change.
 

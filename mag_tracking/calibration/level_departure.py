@@ -1,4 +1,4 @@
-"""Interval in which a sensor departs from its background, and the level at its end."""
+"""Interval in which a sensor departs from its background, and the level at the end."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -13,8 +13,8 @@ from mag_tracking.calibration.level_change import NO_CHANGE, ChangeEvaluator, le
 from mag_tracking.units import NS
 
 MIN_RELEARN_S = 10.0
-"""[s] Minimum time on another steady level that replaces a background that was resumed or observed
-only briefly."""
+"""[s] Minimum duration of another steady level that replaces a resumed or briefly observed
+background."""
 
 SHORTENED_FRACTION = 2.0 / 3.0
 """Required duration of a level after a departure, and of a former level, relative to the usual
@@ -26,7 +26,7 @@ evaluated, since each evaluation uses all blocks."""
 
 
 class LevelDeparture:
-    """Blocks that depart from the background since it was frozen.
+    """Blocks that depart from a frozen background.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from mag_tracking.geometry import (
 )
 
 GRAVITY = 9.81
-"""[m/s²], to 1 % anywhere on Earth."""
+"""[m/s²] Gravity, accurate to 1 % anywhere on Earth."""
 
 MAX_GRAVITY_DIFFERENCE = 1.0
 """[m/s²] Maximum difference between the magnitude of the acceleration at rest and gravity."""
@@ -40,7 +40,7 @@ _Fit: TypeAlias = Callable[[float], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True)
 class UpDirection:
-    """Direction of up for a sensor at rest."""
+    """Up direction of a sensor at rest."""
 
     direction: FloatArray
     """(3,) unit vector, sensor frame."""
@@ -55,7 +55,7 @@ class UpDirection:
 
 
 def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
-    """Direction of up from the accelerometer of a sensor at rest.
+    """Up direction from the accelerometer of a sensor at rest.
 
     At rest, an accelerometer measures the reaction to gravity.
 
@@ -217,7 +217,7 @@ def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
     """Standard deviation of the biases of a network's sensors.
 
     The bias is observable along the heading and the vertical, but not across the heading. Each
-    sensor therefore counts with one axis less.
+    sensor therefore contributes one axis less.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ MIN_BLOCKS = 12
 """Minimum number of blocks, independent of the rate of the sensor."""
 
 MAX_BLOCKS = 240
-"""Maximum number of blocks, the latest ones: a minute of the usual length."""
+"""Maximum number of stored blocks: a minute of blocks of the usual length."""
 
 SEARCH_GROWTH = 1.1
 """Growth of the number of blocks after which the level is determined again."""
@@ -84,7 +84,7 @@ class ProvisionalLevel:
         self._n_new += 1
 
     def frequent_level(self, steps: FloatArray) -> FrequentLevel | None:
-        """Determine the most frequent level, if enough blocks have been added since the last time.
+        """Determine the most frequent level if enough blocks have been added.
 
         Parameters
         ----------

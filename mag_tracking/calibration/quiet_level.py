@@ -16,8 +16,8 @@ from mag_tracking.calibration.frequent_level import (
 from mag_tracking.calibration.resolution import corrected_steps, raw_steps
 
 NEAR_STDS = 8.0
-"""Maximum difference between the initial and the most frequent level, in standard deviations of a
-reading, that an approaching target may cause."""
+"""Maximum difference between the initial and the most frequent level that an approaching target may
+cause, in standard deviations of a reading."""
 NEAR_DURATION_RATIO = 1.5
 """Value that replaces `MIN_DURATION_RATIO` for levels that differ by at most `NEAR_STDS`."""
 
@@ -29,7 +29,7 @@ MAX_BLOCKS = 4000
 
 
 class BlockRecorder(RunningBackground):
-    """Collects the blocks of a sensor in the first pass over a recording; is never ready."""
+    """Background that only collects the blocks of a sensor, in a first pass over a recording."""
 
     def evaluate_block(self) -> None:
         """Store the current block if it is complete."""
@@ -90,7 +90,7 @@ class BlockRecorder(RunningBackground):
             if found.begin <= block.time <= found.end \
                     and not (np.abs(level - found.level) > found.width).any():
                 return True
-        # An approaching target changes the level slightly; a stationary one changes it by more.
+        # An approaching target changes the level slightly; a stationary target changes it more.
         noise = np.sqrt(found.covariance.diagonal() + (found.width / LEVEL_WIDTH)**2)
         is_near = not (np.abs(initial - found.level) > NEAR_STDS * noise).any()
         return (NEAR_DURATION_RATIO if is_near else MIN_DURATION_RATIO) * n > found.n_blocks

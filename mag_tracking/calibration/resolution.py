@@ -55,7 +55,7 @@ def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
     """Steps of all axes; unknown steps are copied from other axes at rest.
 
     An axis that has never changed is dead if another axis of the same sensor changes with every
-    reading. If no axis has changed, it may be at rest.
+    reading. If no axis has changed, all axes may be at rest.
 
     Parameters
     ----------

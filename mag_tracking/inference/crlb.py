@@ -199,7 +199,7 @@ def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
     U, kernel_components, _ = np.linalg.svd(kernel[selected])
     U = U[:, np.count_nonzero(kernel_components > _KERNEL_TOLERANCE):]
     U = np.where(np.linalg.norm(U, axis=1, keepdims=True) > _KERNEL_TOLERANCE, U, 0.0)
-    # ... then invert the bound in them, U (U'PU)^-1 U'.
+    # ... then invert the bound in these directions, U (U'PU)^-1 U'.
     R = triangular_factor((U.T @ root[selected]).T)
     W = scale[selected, None] * np.linalg.solve(R.T, U.T).T
     return W @ W.T
@@ -301,7 +301,7 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
     for k in range(n_steps):
         P = F[k] @ P @ F[k].T + Q[k]
         _, w, V = unit_diagonal(f'covariance of step {k}', P)
-        # The scale of `unit_diagonal` is 1 at zero variance; an exactly known state must stay so.
+        # The scale of `unit_diagonal` is 1 at zero variance; an exactly known state must remain so.
         L = np.sqrt(np.diagonal(P))[:, None] * V * np.sqrt(np.maximum(w, 0.0))
         # P = L L' becomes L (I + L'A'A L)^-1 L'; QR avoids squares and subtractions.
         R = triangular_factor(np.vstack([A[k].reshape(-1, n_x) @ L, np.eye(n_x)]))
@@ -370,7 +370,7 @@ def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
               ratio: float | FloatArray) -> FloatArray:
     """Distance at which `snr_at_distance` reaches a given ratio.
 
-    Along the axis of the dipole the distance is larger by 2^(1/3).
+    Along the axis of the dipole the distance is larger by a factor of 2^(1/3).
 
     Parameters
     ----------

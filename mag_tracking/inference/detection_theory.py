@@ -92,7 +92,7 @@ def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray
     waiting[0] = 1.0
     for detected in p:
         # The count of consecutive detections grows by one or restarts at zero. The probability
-        # that leaves the last entry is that of an onset.
+        # that leaves the last entry is the probability of an onset.
         waiting = np.concatenate([((1.0 - detected) * waiting.sum(axis=0))[None],
                                   detected * waiting[:-1]])
     missed: FloatArray = waiting.sum(axis=0)

@@ -1,7 +1,7 @@
 """Driving direction from the sense of rotation of a target's horizontal field.
 
-Seen from the sensor towards the target, a target that moves from left to right rotates the field
-clockwise and a target that moves from right to left rotates it anticlockwise, whatever its moment.
+Viewed from the sensor, a target that moves from left to right rotates the field clockwise, and a
+target that moves from right to left rotates it anticlockwise, whatever the moment of the target.
 This is exact for a target at the height of the sensor. A sensor in the lane does not observe the
 direction.
 """
@@ -23,8 +23,9 @@ MIN_SAMPLES = 8
 
 MAX_CONFIDENCE = 0.98
 """Upper limit of the probability of a direction. The sign of the correlation is exact only for a
-target at the height of the sensor. For a target above the sensor by half its lateral distance, 0.6
-% of random moments rotate the other way; by the whole distance, 2.2 %."""
+target at the height of the sensor. The field of 0.6 % of
+random moments rotates in the opposite direction if the target is above the sensor by half its
+lateral distance, and of 2.2 % if it is above by the whole distance."""
 
 MAX_VERTICAL_COSINE = 0.2
 """Maximum direction cosine between a missing axis and a horizontal axis at which the missing axis
@@ -118,7 +119,7 @@ def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRo
 
 
 def _correlation(field: FloatArray, lag: int) -> float:
-    """PHD15 Paper B eq. (5a) over all but the first and last `lag` samples."""
+    """Correlation of PHD15 Paper B eq. (5a), without the first and last `lag` samples."""
     now, later = field[lag:-lag], field[2 * lag:]
     return float(np.sum(now[:, 0] * later[:, 1] - now[:, 1] * later[:, 0])) / lag
 

@@ -1,6 +1,6 @@
 """Bank of filters: hypotheses as arrays, with logarithmic weights.
 
-The bank follows T10 section 2.6 and Alg. 3. Weights are kept as logarithms because two hypotheses
+The bank follows T10 section 2.6 and Alg. 3. Weights are stored as logarithms because two hypotheses
 may differ by thousands of nats.
 """
 
@@ -152,7 +152,7 @@ class FilterBank:
                           self.label[:, i].copy(), self.kind[:, i].copy(), self.origin, self.nis)
 
     def without_target(self, i: int, n_one: int) -> 'FilterBank':
-        """Marginal bank of all other targets of a joint bank.
+        """Marginal bank of a joint bank without one target.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Filters of vectors that change smoothly, without a model of their cause.
+"""Filters for vectors that change smoothly, without a model of the cause.
 
 Each component is an integrated random walk: its rate of change is a Wiener process. The strength of
 the process is unknown and may change: a bank of strengths is weighted by the data, and each
@@ -20,7 +20,7 @@ SWITCH_S = 0.75
 
 
 class GaussMarkovVectors:
-    """Filters of vectors that change independently of each other and start at zero.
+    """Filters for vectors that change independently of each other and start at zero.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class GaussMarkovVectors:
 
     def log_density(self, vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray,
                     dt: float) -> float:
-        """Update with scalar measurements and return their log-density given the previous ones.
+        """Update with scalar measurements, and return their log-density given earlier measurements.
 
         Parameters
         ----------

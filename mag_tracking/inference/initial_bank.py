@@ -1,7 +1,7 @@
 """Compact copy of a filter bank at its start, before target and sensor states are correlated.
 
 Smoothing and relinearisation restart at the beginning of a track. Storing the full covariances of
-all hypotheses would need as much memory as the bank.
+all hypotheses would require as much memory as the bank.
 """
 
 from dataclasses import dataclass

@@ -21,7 +21,9 @@ CORRELATION_TIME_S = 0.2
 
 def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iterations: int = 40,
            tolerance: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Minimise by Levenberg-Marquardt from many starting points, each with its own damping.
+    """Minimise sums of squares by Levenberg-Marquardt from many starting points at once.
+
+    Each starting point has its own damping.
 
     Parameters
     ----------
@@ -164,8 +166,8 @@ def model_error_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatA
     """Additional covariance of an estimate due to errors of the model.
 
     Residuals caused by model errors are correlated over `CORRELATION_TIME_S`, so they contain less
-    information than their number suggests. The result is never negative, even if the residuals are
-    smaller than the noise by chance.
+    information than their number suggests. The result is positive semidefinite, even if the
+    residuals are smaller than the noise by chance.
 
     Parameters
     ----------

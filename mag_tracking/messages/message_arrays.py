@@ -1,7 +1,7 @@
 """Decoding of many messages of one type at once, from their CDR bytes.
 
 A message that consists of a header and numbers has a fixed size, except for the frame name. Many
-messages can therefore be decoded as arrays, twenty times faster than one by one.
+messages can therefore be decoded as arrays, twenty times faster than individually.
 """
 
 from typing import NamedTuple
@@ -30,9 +30,9 @@ class FieldArrays(NamedTuple):
     stamp_ns: IntArray
     """(n,) Timestamps."""
     field: FloatArray
-    """(n, 3) [T], sensor frame."""
+    """(n, 3) [T] Field, sensor frame."""
     covariance: FloatArray | None
-    """(n, 3, 3) [T^2], as in `Readings`."""
+    """(n, 3, 3) [T^2] Covariance, as in `Readings`."""
 
 
 class PoseArrays(NamedTuple):

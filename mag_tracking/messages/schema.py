@@ -114,7 +114,7 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
     Returns
     -------
     AccelerationSample
-        NaN if the message carries no acceleration (its covariance begins with -1).
+        NaN if the message contains no acceleration (its covariance begins with -1).
     """
     a = message.linear_acceleration
     is_present = message.linear_acceleration_covariance[0] != -1.0
@@ -125,7 +125,7 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
 def float64_array(values: ArrayLike) -> 'array[float]':
     """Convert numbers to the array type that a float64[] field accepts without conversion.
 
-    In a list, the message would check each number.
+    The elements of a list would be checked one by one.
 
     Parameters
     ----------
@@ -313,7 +313,7 @@ def _pose(position: FloatArray, quaternion: FloatArray) -> MessageDict:
 
 
 def pose_covariance(uncertainty: Track | SmoothedPose | PoseUncertainty) -> FloatArray:
-    """Covariance of position and small rotations about the fixed axes, in the order of ROS.
+    """Covariance of position and small rotations about the fixed axes, in the element order of ROS.
 
     Parameters
     ----------

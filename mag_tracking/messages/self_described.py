@@ -130,7 +130,7 @@ def _field(message: Any) -> MessageDict:
 
 
 def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
-    """First field of a time that exists among `names`; ValueError unless it is in [0, limit)."""
+    """Value of the first field of `names` that a time has; ValueError unless in [0, limit)."""
     for name in names:
         value = getattr(stamp, name, None)
         if isinstance(value, int) and not isinstance(value, bool):

@@ -34,7 +34,7 @@ TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 
 RAW_READINGS = 'field_readings'
 """Topic of raw readings of many sensors. Like the topics below, it is relative to the namespace of
-the nodes and independent of their names."""
+the nodes and independent of the node names."""
 CALIBRATED_READINGS = 'field_readings_calibrated'
 """Topic of calibrated readings of many sensors."""
 CALIBRATION_STATE = 'calibration_state'

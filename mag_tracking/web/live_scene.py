@@ -18,7 +18,7 @@ from mag_tracking.units import NS
 from mag_tracking.web.live_track import LiveTrack
 
 HISTORY_S = 600.0
-"""[s] Time after its end at which a track is removed."""
+"""[s] Time from the end of a track to its removal."""
 MAX_POSES = 30_000
 """Maximum number of poses over all tracks; the oldest tracks are removed first."""
 MAX_FRAMES = 64
@@ -190,7 +190,7 @@ class LiveScene:
             return out
 
     def _scene_messages(self, tracks: list[dict[str, Any]]) -> list[str]:
-        """Message that replaces the scene, in a list; empty while the sensors are unknown."""
+        """List of the message that replaces the scene; empty while the sensors are unknown."""
         if not len(self._network):
             return []
         begin_ns = self._begin_ns or 0

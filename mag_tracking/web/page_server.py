@@ -162,7 +162,7 @@ class PageServer:
             return [json_text({'type': 'fault', 'text': text})]
 
     def _send_updates(self) -> None:
-        """Send new messages to all viewers, and the complete scene to those that have caught up."""
+        """Send new messages to all viewers, and the complete scene to viewers after a lag."""
         if not self._viewers and not self._lagging:
             return
         now = self._loop.time()
@@ -214,7 +214,7 @@ class PageServer:
             self._lagging.pop(viewer, None)
 
     def _process_request(self, _: ServerConnection, request: Request) -> Response | None:
-        """Answer an HTTP request; None accepts a WebSocket connection."""
+        """Return the response to an HTTP request, or None to accept a WebSocket connection."""
         address = urlsplit(request.path)
         refusal = self._refusal(request, parse_qs(address.query).get('token', [''])[0])
         if refusal:
