@@ -111,8 +111,7 @@ class LiveTrack:
         return self._entry(begin_ns, range(self._sent)) if self._sent else None
 
     def _entry(self, begin_ns: int, rows: range) -> dict[str, Any]:
-        """JSON object of selected poses, with the fields of the sensors that were strongest
-        lately."""
+        """JSON object of selected poses, with the fields of the recently strongest sensors."""
         recent = range(max(0, rows.stop - max(N_RECENT, len(rows))), rows.stop)
         entry = track_entry(self.log, begin_ns, strongest_sensors(self.log, recent), rows)
         entry['key'], entry['smoothed'] = self.key, self.smoothed

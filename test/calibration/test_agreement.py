@@ -65,7 +65,7 @@ def test_a_swapped_pair_is_identified(pair, seed):
 
 @pytest.mark.parametrize('order, text', [([2, 0, 1], 'z, x, y'), ([1, 2, 0], 'y, z, x')])
 def test_axes_in_another_order_are_identified(order, text):
-    """In the first case, the sensor sends its z as x, its x as y and its y as z."""
+    """In the first case, the sensor reports its z as x, its x as y and its y as z."""
     fields = correct_fields()
     fields[0] = fields[0][order]
     assert explanations_of(fields) == {'a': (f'its axes are in the order {text}',)}
@@ -93,7 +93,7 @@ def test_exchanged_sensors_are_identified(i, j):
 
 
 def test_a_match_in_one_direction_is_not_an_exchange():
-    """The other sensor is also faulty, but does not fit at the place of the first sensor."""
+    """The other sensor is also faulty, but an exchange does not explain its readings."""
     fields = correct_fields()
     fields[0], fields[1] = fields[1], fields[1] + [9e-6, -7e-6, 8e-6]
     assert explanations_of(fields) == {'a': (), 'b': ()}
@@ -101,7 +101,7 @@ def test_a_match_in_one_direction_is_not_an_exchange():
 
 @pytest.mark.parametrize('turn', [90.0, 180.0])
 def test_exchanged_sensors_at_right_angles_are_identified(turn):
-    """Most sensors are installed at right angles; two sensors with two flipped axes are rarer."""
+    """Most sensors are installed at right angles; two sensors with two flipped axes are rare."""
     R_ws = np.array([np.eye(3), rotation_about_z(np.deg2rad(turn)), *R_WS[2:]])
     fields = correct_fields(None, R_ws)
     fields[[0, 1]] = fields[[1, 0]]
@@ -127,7 +127,7 @@ def test_message_contains_the_explanation():
 
 
 def test_faults_that_are_not_observable_are_not_reported():
-    """Upright sensors with x to the east: 2 uT on x is within the heading error and the bias."""
+    """On an upright sensor with x to the east, 2 uT on x is within heading error and bias."""
     R_ws = np.tile(np.eye(3), (3, 1, 1))
     fields = correct_fields(None, R_ws)
     fields[0, 0] *= -1.0
@@ -165,7 +165,7 @@ def test_false_alarm_rate_does_not_exceed_the_nominal_rate(std, missing, n=300):
 
 
 def test_the_statistic_is_chi_square(monkeypatch, n=200):
-    """With a false-alarm probability of 0.1, the rate of alarms agrees with it."""
+    """With a false-alarm probability of 0.1, the rate of alarms agrees with the probability."""
     monkeypatch.setattr('mag_tracking.calibration.agreement.FALSE_ALARM_PROBABILITY', 0.1)
     std, rng = np.deg2rad([0.3, 0.5, 2.0]), np.random.default_rng(12)
     for missing in ([], [2]):
@@ -218,7 +218,7 @@ def test_two_faults_are_identified_separately():
 @pytest.mark.parametrize('sensor, axis', [
     (j, a) for j, a in np.argwhere(np.abs(correct_fields()) > 2e-5)])
 def test_a_flipped_axis_is_identified_with_iron_nearby(sensor, axis):
-    """Only axes with a large part of the field: flipping another axis explains little."""
+    """Axes with a small part of the field are not tested: flipping these explains little."""
     first_explanations = []
     for seed in range(20):
         rng = np.random.default_rng(seed)

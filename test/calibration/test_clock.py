@@ -57,7 +57,7 @@ def pair(offset, seed=0, rates=(100.0, 100.0), noise=NOISE, is_rotated=True, **k
 def test_offset_is_positive_if_the_clock_is_ahead(offset):
     lag = knock_lag(*pair(offset, rates=(400.0, 400.0)), 0.5)
     assert lag.reason == '' and lag.correlation > 0.99
-    # A tenth of a sample.
+    # The error is at most a tenth of a sample.
     assert abs(lag.offset - offset) < 0.25e-3
 
 
@@ -95,7 +95,7 @@ def test_shock_does_not_depend_on_the_orientation():
     for seed in range(5):
         R = Rotation.random(random_state=seed)
         np.testing.assert_allclose(shock(R.apply(a)), shock(a), atol=1e-12)
-    # The shock at rest is zero, and missing values stay missing.
+    # The shock at rest is zero, and missing values remain missing.
     a[7] = np.nan
     s = shock(a)
     assert np.isnan(s[7]) and np.nanmedian(s) == 0.0

@@ -152,7 +152,7 @@ def test_rotated_and_shifted_readings_rotate_and_shift_the_fit():
 
 
 def test_optimum_is_that_of_a_general_solver():
-    """Soft L1 loss of magnitudes, numerical Jacobian; evenly spread readings have unit weights."""
+    """The oracle minimises the soft L1 loss with a numerical Jacobian and unit weights."""
     y = readings(scattered(2000), 0.03)
     y[::30] = OFFSET + 1.3 * (y[::30] - OFFSET)
     rows, columns = np.triu_indices(3)

@@ -77,7 +77,7 @@ def _direction(rng):
 
 
 def blocks_of(signal, seconds, seed=0):
-    """`Blocks` of a signal, each with the noise of the mean of 25 readings."""
+    """`Blocks` of a signal; each block mean has the noise of 25 averaged readings."""
     time = np.arange(0.5 * BLOCK_S, seconds, BLOCK_S)
     noise = np.random.default_rng(seed).standard_normal((len(time), 3)) * SIGMA / 5.0
     mean = np.array([signal(t) for t in time]) + noise
@@ -95,7 +95,7 @@ def time_reversed(blocks):
 
 @pytest.mark.parametrize('stops', [True, False])
 def test_a_stopping_vehicle_has_arrived_and_a_starting_one_has_departed(stops):
-    """Eighty vehicles each; the time-reversed change gives the opposite result."""
+    """Eighty vehicles of each kind are simulated; the reversed change has the opposite result."""
     verdicts = []
     for seed in range(80):
         begin, end = (0.0, 16.0) if stops else (8.0, 30.0)

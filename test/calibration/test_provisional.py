@@ -90,8 +90,8 @@ def test_a_background_with_a_vehicle_before_dense_traffic_is_doubtful_and_replac
     def signal(t):
         return standing_vehicle(stood_s)(t) + vehicles(t)
 
-    doubted = run_on(signal, stood_s + 55.0)
-    assert doubted.doubtful or (np.abs(doubted.level(60.0) - EARTH) < 2.0 * SIGMA).all()
+    b_early = run_on(signal, stood_s + 55.0)
+    assert b_early.doubtful or (np.abs(b_early.level(60.0) - EARTH) < 2.0 * SIGMA).all()
     b = run_on(signal, 140.0)
     assert b.certain and (np.abs(b.level(140.0) - EARTH) < 2.0 * SIGMA).all()
 
@@ -213,16 +213,16 @@ def test_doubtful_intervals_are_recorded_and_merged():
         times = updated(times, 10 + k, k % 2 == 1)
     assert len(times) == 16 and times[-1] == (109, None)
     assert shifted(times, 5)[-1] == (114, None)
-    # An interval that began earlier replaces the open one.
+    # An interval that began earlier replaces the open interval.
     assert merged({'a': ((1, 2), (4, None))}, {'a': ((3, 6),)}) == {'a': ((1, 2), (3, 6))}
     assert doubtful_since(((1, 2), (4, 5), (6, None)), 3) == ((1, 2), (3, None))
     assert doubtful_since(((1, 4),), 3) == ((1, None),)
     assert merged({'a': ((1, 2), (4, None))}, {'a': ((4, 6),), 'b': ((3, None),)}) \
         == {'a': ((1, 2), (4, 6)), 'b': ((3, None),)}
-    # An interval without an end is closed at the start of the next one.
+    # An interval without an end is closed at the start of the next interval.
     assert merged({'a': ((1, None),)}, {'a': ((4, 6),)}) == {'a': ((1, 4), (4, 6))}
     # An interval that begins and ends with the same reading, and the next interval.
     assert merged({'a': ((4, None),)}, {'a': ((4, 4),)}) == {'a': ((4, 4),)}
     assert merged({'a': ((4, 4),)}, {'a': ((4, None),)}) == {'a': ((4, None),)}
-    # The doubtful background was replaced by one that was never doubtful.
+    # The doubtful background was replaced by a background that was never doubtful.
     assert merged({'a': ((1, 2), (4, None))}, {'a': ()}) == {'a': ((1, 2),)}

@@ -18,7 +18,7 @@ NETWORK, SETTINGS = line_network(1), CalibrateSettings()
 
 
 def readings(signal, seconds=60.0, rate=50.0, seed=0, step=0.0):
-    """Readings of one sensor: noise, the Earth field, and `signal(t)`, (3,) or a number [T]."""
+    """Readings of one sensor: noise, the Earth's field, and `signal(t)` [T], (3,) or a scalar."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 1.0 / rate)
     fields = [EARTH + signal(s) + SIGMA * rng.standard_normal(3) for s in t]
     if step:
@@ -57,7 +57,7 @@ def test_the_most_frequent_level_is_that_between_the_targets(signal, step):
 
 
 def test_a_target_present_at_the_start_is_not_the_background():
-    """The background is the level after its departure."""
+    """The background is the level after the departure of the target."""
     signal = readings(departing(10.0))
     stage = Calibrate(NETWORK, SETTINGS)
     prescan([signal], NETWORK, SETTINGS).apply(stage)
@@ -73,13 +73,13 @@ def test_a_target_that_arrives_later_and_stays_is_not_the_background(arrives, un
     def signal(t):
         return 2e-6 - departing(arrives)(t)
     assert prescan_of(signal, seconds=until).levels == {}
-    # Without relearning, a level stays the background even if another one lasts longer.
+    # Without relearning, a level stays the background even if another level lasts longer.
     never = replace(SETTINGS, {'relearn_s': 0.0})
     assert prescan_of(signal, never, seconds=10.0 * until).levels == {}
 
 
 def test_a_level_that_lasts_most_of_the_recording_is_not_the_background():
-    """The vehicle departs, so the short level after it is the background."""
+    """The vehicle departs, so the short level after the departure is the background."""
     def shutdown(t):
         way = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
         return 4e-6 / (1.0 + (way / 5.0)**2)**1.5
@@ -88,7 +88,7 @@ def test_a_level_that_lasts_most_of_the_recording_is_not_the_background():
 
 
 def test_a_first_level_that_returns_is_the_background():
-    """Two vehicles arrive; after one has departed, half of their field remains until 60 s."""
+    """Two vehicles arrive; one vehicle departs, and half of the field remains until 60 s."""
     def queue(t):
         way = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
         return (2e-6 + 2e-6 / (1.0 + (way / 5.0)**2)**1.5) * (20.0 < t < 60.0)

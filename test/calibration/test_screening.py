@@ -109,7 +109,7 @@ def passes(rate, speed, n=4):
 @pytest.mark.parametrize('step', [0.0, 1.0, 3.0, 10.0])
 @pytest.mark.parametrize('rate', [10.0, 50.0, 100.0])
 def test_vehicles_at_a_metre_are_no_spikes(rate, step):
-    """At 10 Hz, a whole pass could be mistaken for a spike.
+    """At 10 Hz, a whole pass must not be rejected as a spike.
 
     After the pass, a sensor with coarse steps at rest must not be classified as stuck.
     """
@@ -171,7 +171,7 @@ def test_a_spike_is_steeper_than_preceding_changes(before, found):
 @pytest.mark.parametrize('rate, size, found', [
     (50.0, 25.0, False), (50.0, 35.0, True), (10.0, 3300.0, False), (10.0, 3700.0, True)])
 def test_a_lower_rate_requires_a_larger_spike(rate, size, found):
-    """Limit for 30 m/s at 1 m: 130 (30 / rate)^3 noise stds, but at least 30."""
+    """The limit for 30 m/s at 1 m is 130 (30 / rate)^3 noise stds, but at least 30."""
     y = np.tile(EARTH, (40, 1))
     y[30, 1] += size * SIGMA
     assert screened(y, rate)[0] == ([30] if found else [])
@@ -253,7 +253,7 @@ def test_recent_differences_replace_an_unknown_noise():
     y[300:2900:100] += 5e-6
     rows, max_held, _ = screened(y, std=None, step=1e-11)
     assert rows == list(range(300, 2900, 100)) and max_held == 1
-    # Without a known step, a change may be the first one of a sensor at rest.
+    # Without a known step, a change may be the first change of a sensor at rest.
     assert screened(y, std=None) == ([], 0, [])
     coarse = 2e-7 * np.round(y / 2e-7)
     assert screened(coarse, std=None, step=2e-7)[0] == rows
@@ -338,7 +338,7 @@ def test_old_repetitions_are_forgotten():
 
 
 def test_coarse_steps_are_not_classified_as_stuck():
-    """At rest, a sensor with coarse steps may repeat a reading forever, after any history."""
+    """At rest, a sensor with coarse steps may repeat a reading forever after many changes."""
     rng = np.random.default_rng(0)
     changes = np.eye(3)[rng.integers(0, 3, 4000)] * rng.choice([-1.0, 0.0, 1.0], (4000, 1))
     moving = np.cumsum(changes, axis=0) * 1e-7

@@ -121,7 +121,7 @@ def test_best_is_of_the_heaviest_kind_of_the_heaviest_arrival():
 
 
 def test_best_is_at_the_maximum_of_the_mixture_density():
-    """The more certain one of two distant hypotheses of equal weight is the best one.
+    """The best of two distant hypotheses of equal weight is the more certain hypothesis.
 
     If a covariance is invalid, the heaviest hypothesis is the best one.
     """

@@ -129,7 +129,7 @@ def test_estimate_of_a_linear_model_reaches_the_bound():
     low, high = chi2.ppf([0.005, 0.995], 15 * n) / (15 * n)
     print(f'NEES per state {nees / (15 * n):.4f}, limits {low:.4f} .. {high:.4f}')
     assert low <= nees / (15 * n) <= high
-    # Each variance separately, at a significance of 1 % over all fifteen.
+    # Each variance is tested separately; the total significance is 1 % for all fifteen.
     low, high = chi2.ppf([0.005 / 15, 1.0 - 0.005 / 15], n) / n
     ratio = (e**2).mean(axis=0) / np.diag(P)
     assert np.all((low <= ratio) & (ratio <= high)), ratio
@@ -159,7 +159,7 @@ def test_a_state_with_a_small_part_in_the_kernel_is_unobservable():
     assert np.array_equal(np.isinf(np.diag(bound(J))), unobservable)
     for i in range(6):
         assert np.isinf(bound(marginal(J, [i]))[0, 0]) == unobservable[i]
-    # A state without any information, next to units that differ by many decades.
+    # One state has no information, and the units differ by many decades.
     np.testing.assert_allclose(bound(np.diag([4.0, 0.0, 1e16])), [
         [0.25, np.nan, 0.0], [np.nan, np.inf, np.nan], [0.0, np.nan, 1e-16]], rtol=1e-12)
 
@@ -204,7 +204,7 @@ def test_marginal_information_is_the_schur_complement():
 @pytest.mark.parametrize('keep', [[0], [2], [2, 0], [0, 1, 2], [3, 4, 5], [6, 7, 8], range(9)])
 @pytest.mark.parametrize('m', [ONES, UP])
 def test_unobservable_states_stay_unobservable_in_marginal_information(m, keep):
-    """Rounding errors must not turn an infinite bound into a large finite one."""
+    """Rounding errors must not turn an infinite bound into a large finite bound."""
     J, keep = unitless(m, ONE), np.array(keep)
     whole, part = bound(J)[np.ix_(keep, keep)], bound(marginal(J, keep))
     assert np.array_equal(np.isinf(np.diag(part)), np.isinf(np.diag(whole)))
@@ -250,7 +250,7 @@ def test_path_bound_is_the_covariance_of_the_kalman_filter():
     print('path bound against the filter:', relative(P, expected))
     assert relative(P, expected) < 1e-7
     assert P[-1][0, 0] < 0.02 * P0[0, 0]
-    # Whitened Jacobians, and one F and Q for all steps.
+    # The same with whitened Jacobians, and with one F and Q for all steps.
     white = np.linalg.solve(np.linalg.cholesky(CORRELATED), H[:7])
     assert relative(path_bound(F[0], Q[0], white, None, P0), expected[:7]) < 1e-7
 
@@ -311,7 +311,7 @@ def test_snr_is_the_energy_of_the_field_and_minimal_abeam():
 
 
 def test_range_of_a_magnetometer_is_about_ten_metres():
-    """T10 eq. (5.22)-(5.24), (6.1), and the same equations at the correct scale of TSP14."""
+    """T10 eq. (5.22)-(5.24) and (6.1) as published, and with the correct scale of TSP14."""
     t10 = snr_range(1.0, np.sqrt(1e-21), 9.2)
     cars = snr_range(np.array([300.0, 600.0, 1800.0]), np.sqrt(NOISE), 9.2)
     print(f'range: {t10:.2f} m; cars and truck {cars}')

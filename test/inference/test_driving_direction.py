@@ -34,7 +34,7 @@ def test_expected_rotation_equals_the_published_simulation():
     assert np.mean(np.sum(h**2, axis=1)) == pytest.approx(0.583103, abs=1e-6)
     assert expected_rotation(h, 1.0, 1).correlation == pytest.approx(-8.73775, abs=1e-5)
     assert expected_rotation(h, 1.0, 15).correlation == pytest.approx(-1.12269, abs=1e-5)
-    # Agrees with 20 000 Monte Carlo runs.
+    # These values agree with 20 000 Monte Carlo runs.
     assert expected_rotation(h, noise_for(h, -10.0), 15).variance == pytest.approx(33.42, abs=5e-3)
     for snr_db, error in ((-20, 0.4919), (-15, 0.4747), (-10, 0.4230), (-5, 0.2881), (0, 0.0773),
                           (5, 0.00098)):
@@ -118,5 +118,5 @@ def test_sensors_on_both_sides_are_fused():
     p, q = near.left_to_right, 1.0 - far.left_to_right
     fused = fused_log_odds([near.log_odds, far.log_odds], [True, False])
     assert fused == pytest.approx(np.log(p * q / ((1.0 - p) * (1.0 - q))))
-    # A log-odds whose probability rounds to one.
+    # The probability of this log-odds rounds to one.
     assert FieldRotation(-40.0, 1.0).log_odds > 800.0

@@ -14,7 +14,7 @@ AXES = np.array([3, 3])
 
 
 def run(nis):
-    """`InnovationConsistency` after frames (n, n_sensors)."""
+    """`InnovationConsistency` after adding the NIS of frames (n, n_sensors)."""
     consistency = InnovationConsistency(nis.shape[1])
     for k, row in enumerate(nis):
         consistency.add(row, AXES[:nis.shape[1]], round(k * DT * NS))

@@ -147,7 +147,7 @@ def test_update_linearised_away_from_the_mean():
 
 
 def test_nees_of_a_linear_gaussian_case_is_chi_square():
-    """Linear model, true prior and noise: the mean NEES lies in its 95 % band."""
+    """With a linear model, true prior and true noise, the mean NEES lies in its 95 % band."""
     rng = np.random.default_rng(11)
     runs, steps, n_t, n_sensors, dt = 400, 12, 6, 2, 0.1
     n_x = n_t + 3 * n_sensors

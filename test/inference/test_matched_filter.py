@@ -23,7 +23,7 @@ def mitre(f):
 
 
 def white(density):
-    """A flat spectrum."""
+    """Flat spectrum of a given density."""
     return lambda f: np.full(f.shape, density)
 
 
@@ -42,7 +42,7 @@ def pulse(n, rate, rng=None):
 
 
 def test_noise_spectrum_equals_the_published_one():
-    """MITRE12 eq. (B.8) at 4 Hz in a town; eq. (B.9): step density integrates to step^2/12."""
+    """MITRE12 eq. (B.8) at 4 Hz in a town; the density of eq. (B.9) integrates to step^2/12."""
     # Not pytest.approx: its absolute tolerance of 1e-12 exceeds these values.
     np.testing.assert_allclose(noise_spectrum(4.0, 1e-10, 0.0, 11.0), 2.5e-21, rtol=1e-12)
     steps = noise_spectrum(np.array([0.0, 5.0]), 0.0, 9e-10, 11.0)

@@ -31,7 +31,7 @@ class Viewer:
 
 
 def follow(scene, records):
-    """A viewer that receives frequent updates from the start."""
+    """Create a viewer that receives frequent updates from the start."""
     viewer = Viewer().receive(scene.news())
     for k in range(0, len(records), 7):
         feed(scene, records[k:k + 7])

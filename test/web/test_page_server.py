@@ -207,7 +207,7 @@ def status_of(url, **headers):
 
 
 def test_without_a_token_only_local_requests_are_served(server):
-    """A foreign page may point its host name here, or open the socket from a script."""
+    """A foreign page may resolve its host name to this server, or open the socket in a script."""
     assert 'token' not in server.url
     assert status_of(server.url) == 200
     assert status_of(server.url + 'etc/passwd') == 404
