@@ -59,7 +59,7 @@ class RunningBackground:
     sensors : (1,) SENSOR array
         State of the sensor: the current block, and the line and noise for compiled code.
     evaluate_change : ChangeEvaluator, optional
-        Evaluates level changes of the sensor together with those of other sensors.
+        Classifies level changes of the sensor together with the changes at other sensors.
 
     Attributes
     ----------

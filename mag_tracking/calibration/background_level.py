@@ -1,4 +1,4 @@
-"""Background line and noise of one sensor, stored where compiled code reads them."""
+"""Background line and noise of one sensor, in arrays that compiled code can read."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class BackgroundLevel:
     line : (float, (3,), (3,), float) or None
         Centre [s], mean [T], slope [T/s] and horizon [s].
     noise : (3, 3) array or None, T²
-        Noise of one reading, without its steps.
+        Noise covariance of one reading, without the variance due to steps.
     limits : (3,) array, T
         Maximum difference between the mean of a block and the background.
     is_provisional : bool
@@ -59,7 +59,7 @@ class BackgroundLevel:
         line : (float, (3,), (3,), float) or None
             Centre [s], mean [T], slope [T/s] and horizon [s].
         noise : (3, 3) array or None, T²
-            Noise of one reading, without its steps.
+            Noise covariance of one reading, without the variance due to steps.
         """
         s = self._state
         self.line, self.noise = line, noise

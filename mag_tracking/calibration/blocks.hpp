@@ -24,7 +24,7 @@ inline void subtract_background(const Sensor& s, double time, const double* fiel
 // Integer part of a / b for `a` >= 0 and `b` > 0, correct even if the quotient is rounded up.
 inline double whole_times(double a, double b) { return std::round((a - std::fmod(a, b)) / b); }
 
-// Begin the next block if a reading at `time` [s] is the first after the current one. An earlier
+// Begin the next block if a reading at `time` [s] is the first after the current block. An earlier
 // complete block (`is_full`) must have been evaluated before.
 inline void begin_block_if_due(Sensor& s, double time) {
     if (std::isnan(s.end)) {

@@ -74,10 +74,13 @@ def calibrate_readings(
     batches : (1,) BATCH array
         Updated.
     out_rows : (m,) int array
+        Output: index of the sensor of each calibrated reading.
     out_stamps : (m,) int array, ns
+        Output: timestamps.
     out_fields : (m, 3) array, T
+        Output: fields minus the background.
     out_covariances : (m, 3, 3) array, T²
-        The calibrated readings are appended from `n_out` on.
+        Output: noise covariances. All outputs are appended from `n_out` on.
 
     Returns
     -------
@@ -107,12 +110,17 @@ def use_reading(
         Index of the sensor.
     stamp : int, ns
     field : (3,) array, T
+        Field after the iron correction.
     own : int
         Covariance in the message: NONE, VALID or INVALID.
     covariance : (3, 3) array, T²
+        Covariance in the message; ignored if `own` is NONE.
     out_rows : (m,) int array
+        As for `calibrate_readings`.
     out_stamps : (m,) int array, ns
+        As for `calibrate_readings`.
     out_fields : (m, 3) array, T
+        As for `calibrate_readings`.
     out_covariances : (m, 3, 3) array, T²
         As for `calibrate_readings`.
 
@@ -155,6 +163,7 @@ def complete_steps(variance: FloatArray, steps: FloatArray) -> None:
     Parameters
     ----------
     variance : (3,) array, T²
+        Noise variance of each axis; NaN = missing axis.
     steps : (3,) array, T
         Updated.
     """
@@ -196,9 +205,13 @@ def line_through(time: FloatArray, n: FloatArray, y: FloatArray, centre: float
     Parameters
     ----------
     time : (k,) array, s
+        Mean time of each block.
     n : (k, 3) array
+        Number of readings of each block, per axis.
     y : (k, 3) array, T
+        Mean of each block.
     centre : float, s
+        Time at which the mean is evaluated.
 
     Returns
     -------
@@ -207,12 +220,14 @@ def line_through(time: FloatArray, n: FloatArray, y: FloatArray, centre: float
     """
 
 def pooled_covariance(scatter: FloatArray, n: FloatArray) -> FloatArray | None:
-    """Pooled scatter within blocks; see `blocks.pooled_covariance`.
+    """Noise covariance from the scatter within blocks; see `blocks.pooled_covariance`.
 
     Parameters
     ----------
     scatter : (k, 3, 3) array, T²
+        Sum of squared deviations of each block.
     n : (k, 3) array
+        Number of readings of each block, per axis.
 
     Returns
     -------
@@ -228,6 +243,7 @@ def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
         Updated.
     stamp : int, ns
     raw : (3,) array, T
+        Raw reading; NaN = missing axis.
     """
 
 def is_stuck(sensors: StructArray, field: FloatArray) -> bool:
@@ -238,6 +254,7 @@ def is_stuck(sensors: StructArray, field: FloatArray) -> bool:
     sensors : (1,) SENSOR array
         Updated.
     field : (3,) array, T
+        Reading; NaN = missing axis.
 
     Returns
     -------
@@ -255,6 +272,7 @@ def screen_spike(sensors: StructArray, threshold: float, stamp: int, field: Floa
         Minimum magnitude of a spike in standard deviations of the noise.
     stamp : int, ns
     field : (3,) array, T
+        Reading; NaN = missing axis.
 
     Returns
     -------
@@ -271,4 +289,5 @@ def collect(sensors: StructArray, time: float, field: FloatArray) -> None:
         Updated.
     time : float, s
     field : (3,) array, T
+        Reading; NaN = missing axis.
     """

@@ -95,6 +95,7 @@ def shifted(times: DoubtfulTimes, ns: int) -> DoubtfulTimes:
     ----------
     times : DoubtfulTimes
     ns : int, ns
+        Offset that is added to all times.
 
     Returns
     -------

@@ -34,7 +34,7 @@ MIN_DURATION_RATIO = 4.0
 initial level: a target that was present at the start has left."""
 
 BATCH_SIZE = 64
-"""Number of blocks that are compared with all others at once, to limit memory."""
+"""Number of blocks that are compared with all other blocks at once, to limit memory."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,7 @@ class QuietLevel:
         Parameters
         ----------
         level : (3,) array, T
+            Level to compare; NaN = axis not reported.
 
         Returns
         -------

@@ -136,7 +136,7 @@ def _asymmetry(time: FloatArray, off_before: FloatArray, off_after: FloatArray, 
 
 
 NO_CHANGE = LevelChange(np.nan, 0.0, None)
-"""Value that replaces an earlier change of a sensor when that change has ended."""
+"""Value that replaces an earlier change of a sensor after the end of that change."""
 
 
 class SharedChanges:

@@ -33,8 +33,11 @@ class LevelDeparture:
     learn, relearn : float, s
         As for `RunningBackground`.
     state : SENSOR record
+        State of the sensor.
     level : BackgroundLevel
+        Background of the sensor.
     evaluate_change : ChangeEvaluator
+        Classifies a level change of the sensor.
 
     Attributes
     ----------

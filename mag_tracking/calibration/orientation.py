@@ -73,7 +73,7 @@ def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
     Raises
     ------
     ValueError
-        If fewer than 8 readings are at rest, or the magnitude of their mean is not gravity.
+        If fewer than 8 readings are at rest, or the magnitude of the mean differs from gravity.
     """
     a = np.asarray(acceleration, dtype=float).reshape(-1, 3)
     finite = a[np.isfinite(a).all(axis=1)]

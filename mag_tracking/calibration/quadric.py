@@ -9,7 +9,7 @@ OUTLIER = 4.0
 """[std] Distance from the ellipsoid beyond which a reading is an outlier."""
 
 MIN_SCALE = 1e-9
-"""Standard deviation of residuals, relative to the radius, below which they are due to rounding."""
+"""Standard deviation of residuals, relative to the radius, below which the cause is rounding."""
 
 POSSIBLE_CAUSES = ('possible causes are too few directions, a sensor at rest, or a field that is '
                    'not uniform')
@@ -22,6 +22,7 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
     Parameters
     ----------
     z : (n, 3) array
+        Normalised readings.
 
     Returns
     -------
@@ -73,6 +74,7 @@ def robust_std(d: FloatArray, w: FloatArray) -> float:
     Parameters
     ----------
     d : (n,) array
+        Residuals.
     w : (n,) array
         Weights.
 

@@ -65,7 +65,7 @@ class QuietInterval:
         Yields
         ------
         Blocks
-            All blocks of the interval, after each one that has been delayed long enough.
+            All blocks of the interval, after the addition of each sufficiently delayed block.
         """
         self.pending.append(block)
         while self.pending and self.pending[0].time <= block.time - self._guard:

@@ -155,7 +155,7 @@ inline bool is_credible(const Sensor& s, const double* C) {
         if (stated > MAX_VARIANCE_RATIO * known || known > MAX_VARIANCE_RATIO * stated)
             return false;
         for (int b = 0; b < a; ++b) {
-            // The correlation in the message must be close to the measured one.
+            // The correlation in the message must be close to the measured correlation.
             const double both = std::sqrt(stated * C[4 * b]);
             const double measured = s.noise[a][b]
                                     / std::sqrt(known * (s.noise[b][b] + s.step_variance[b]));

@@ -33,7 +33,7 @@ constexpr double MAX_RATE = 30.0;
 // deviations.
 constexpr double MAX_OF_RECENT = 2.4;
 // If a dipole moves by the fraction s > 0.4 of its distance between two readings, the ratio of
-// their difference to the previous ones is less than this times s^3 in 99.9 % of the cases
+// their difference to the previous differences is less than this times s^3 in 99.9 % of the cases
 // (simulated).
 constexpr double RATIO_PER_CUBE = 130.0;
 // [T] Typical maximum step of magnetometers. With the default threshold, steps of up to 1.3e-5 T
@@ -43,7 +43,7 @@ constexpr double MAX_STEP = 1.5e-6;
 constexpr double MAX_RETURN = 0.3;
 
 // The reading passes; it is held; the held readings are a spike (call again for the reading
-// itself); the held readings and this one pass, in order.
+// itself); the held readings and the current reading pass, in order.
 enum Verdict { PASSES, HELD, SPIKE, RELEASED };
 
 // Whether the current run of equal readings is too long to be due to chance.
@@ -96,8 +96,8 @@ inline double usual_noise(const Sensor& s, int a) {
     return std::max(largest_recent(s, a) / MAX_OF_RECENT, step / std::sqrt(12.0));
 }
 
-// Whether the differences `steps` (3) [T] from the previous reading are larger than those of a
-// target.
+// Whether the differences `steps` (3) [T] from the previous reading are larger than a target can
+// cause.
 inline bool is_off(const Sensor& s, double threshold, int64_t stamp, const double* steps) {
     // A comparison with NaN is false: a missing axis is no spike.
     bool is_high = false;
@@ -142,7 +142,7 @@ inline void hold(Sensor& s, const Reading& reading, const double* steps) {
     ++s.n_held;
 }
 
-// Record a reading that passes; the next one is compared with it. `steps` may be nullptr.
+// Record a reading that passes, for comparison with the next reading. `steps` may be nullptr.
 inline void pass(Sensor& s, const Reading& reading, const double* steps) {
     double* place = s.steps[s.n_steps % RECENT];
     for (int a = 0; a < 3; ++a) {

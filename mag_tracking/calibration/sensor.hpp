@@ -28,7 +28,7 @@ struct Sensor {
     // a stored background may be restored at the next reading.
     int64_t first_ns, last_ns, unconfirmed_ns, is_restorable, accepted;
     // Repetition: the latest reading, the length of the current run of equal readings, and the
-    // numbers of readings that were equal to the previous one, or differed.
+    // numbers of readings that were equal to the previous reading, or differed.
     double last[3];
     int64_t run;
     double repeats, changes;
@@ -53,8 +53,8 @@ struct Sensor {
     double held_field[MAX_HELD + 1][3], held_steps[MAX_HELD + 1][3];
     int64_t held_own[MAX_HELD + 1];
     double held_covariance[MAX_HELD + 1][3][3];
-    // Blocks: length of a block, relative extra length of the first one (NaN: blocks are not
-    // staggered, and each is evaluated at once), end of the current one, index of the current
+    // Blocks: length of a block, relative extra length of the first block (NaN: blocks are
+    // not staggered, and each is evaluated at once), end of the current block, index of the current
     // block, and whether the other block is complete.
     double length, phase, end;
     int64_t now, is_full;

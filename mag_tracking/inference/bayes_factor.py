@@ -34,7 +34,7 @@ class TargetBayesFactor:
         Parameters
         ----------
         log_ratio : float, nats
-            Log-density of the frame with a target, minus that with the alternative.
+            Log-density of the frame with a target, minus the log-density with the alternative.
         stamp_ns : int, ns
             Timestamp of the frame.
         ratio : float
@@ -69,7 +69,7 @@ class TargetBayesFactor:
         Returns
         -------
         bool
-            False if the Bayes factor is at or below `MIN_LOG_RATIO`, or not known.
+            False if the Bayes factor is unknown, or at or below `MIN_LOG_RATIO`.
         """
         return self._is_known and self.log_ratio > MIN_LOG_RATIO \
             and self.log_ratio + log_ratio >= float(np.log(ratio))

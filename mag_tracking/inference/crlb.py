@@ -221,7 +221,7 @@ def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
     Returns
     -------
     (9, 9) array
-        For the states [r0, v0, m]; of rank one.
+        Information about the states [r0, v0, m]; rank one.
 
     Raises
     ------
@@ -290,7 +290,7 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
     """
     A = whitened(H, C)
     if A.ndim < 3:
-        raise ValueError(f'H needs a leading axis of steps, got {np.shape(H)}')
+        raise ValueError(f'H requires a leading axis of steps, got {np.shape(H)}')
     n_steps, n_x = len(A), A.shape[-1]
     F = leading_broadcast('F', F, (n_steps, n_x, n_x))
     Q = leading_broadcast('Q', Q, (n_steps, n_x, n_x))

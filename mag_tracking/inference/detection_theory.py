@@ -85,7 +85,7 @@ def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray
     Returns
     -------
     (...) array
-        Exact: propagates the distribution of the current number of consecutive detections.
+        Computed exactly from the distribution of the current number of consecutive detections.
     """
     p = np.asarray(probability, dtype=float)
     waiting = np.zeros((run, *p.shape[1:]))

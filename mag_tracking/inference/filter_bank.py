@@ -120,9 +120,10 @@ class FilterBank:
         Returns
         -------
         int
-            Among the hypotheses of the heaviest label, and of the heaviest kind within it, the one
-            at whose position their mixture is densest, near the mode of the posterior. The heaviest
-            hypothesis would be a random choice if many neighbours share the weight.
+            The candidates are the hypotheses of the heaviest label and, within that label, of the
+            heaviest kind. The best candidate is at the maximum density of their mixture, near the
+            mode of the posterior. If many neighbours share the weight, the heaviest hypothesis
+            would be a random choice.
         """
         return core.best(self.x, self.P, self.log_w, _classes(self.label), _classes(self.kind),
                          _NEGLIGIBLE_LOG_RATIO)
@@ -301,7 +302,7 @@ class FilterBank:
         Parameters
         ----------
         mask : (n_hyp,) bool array
-            Hypotheses to keep.
+            True for the selected hypotheses.
 
         Returns
         -------
@@ -327,7 +328,7 @@ class FilterBank:
         Parameters
         ----------
         log_ratio : float, nats
-            Maximum difference of the log-weight from that of the heaviest hypothesis.
+            Maximum difference from the log-weight of the heaviest hypothesis.
         most : int
             Maximum number of hypotheses; the lightest are removed.
 

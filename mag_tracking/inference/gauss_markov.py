@@ -2,7 +2,7 @@
 
 Each component is an integrated random walk: its rate of change is a Wiener process. The strength of
 the process is unknown and may change: a bank of strengths is weighted by the data, and each
-strength switches to another one at a constant rate. The states of different strengths are not
+strength switches to another strength at a constant rate. The states of different strengths are not
 mixed, because all states follow the same data.
 """
 
@@ -34,7 +34,7 @@ class GaussMarkovVectors:
     Raises
     ------
     ValueError
-        If a constant component precedes one that changes.
+        If a constant component precedes a changing component.
 
     References
     ----------

@@ -2,8 +2,8 @@
 //
 // The state consists of the target state (n_t), which affects all sensors, n_own states of each
 // sensor, which affect only that sensor, and three backgrounds of each sensor. The update processes
-// the sensors one after the other, linearised at one common point. The result is that of the
-// stacked update, at a fraction of its cost.
+// the sensors one after the other, linearised at one common point. The result equals the stacked
+// update, at a fraction of the cost.
 
 #pragma once
 

@@ -82,7 +82,7 @@ class InitialBank:
         Parameters
         ----------
         mask : (n_hyp,) bool array
-            Hypotheses to keep.
+            True for the selected hypotheses.
         """
         for name in ('x', 'P', 'label', 'kind', 'origin'):
             setattr(self, name, getattr(self, name)[mask])

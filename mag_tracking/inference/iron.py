@@ -34,9 +34,9 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
     moments : (n, 3) array, A m², world frame
         Fitted moments of the passes.
     headings : (n,) array, rad, world frame
-        From x, anticlockwise seen from above.
+        Angle from x, anticlockwise when viewed from above.
     induction : (3,) array, A/m, world frame
-        B0/mu0. With 3 B0/mu0 the resulting D is that of T10.
+        B0/mu0. With 3 B0/mu0, the result is D as defined in T10.
     covariances : (n, 3, 3) array, A² m⁴, optional
         Covariances of the moments. Default: all moments have equal weight, and the covariance of
         the result is estimated from the residuals.

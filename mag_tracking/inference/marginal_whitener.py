@@ -34,6 +34,7 @@ class MarginalWhitener:
         Parameters
         ----------
         A : (n_y, k) array
+            Matrix A of the product; the same function is applied to B.
 
         Returns
         -------

@@ -1,7 +1,7 @@
 """Matched filter: detection of a known signal in coloured noise, by one or several sensors.
 
 It bounds the detectability of a pass with a known signature; the energy test (`detection_theory`)
-requires no signature and detects less. The equations are those of MITRE12 section 3 and appendix B.
+requires no signature and detects less. The equations are from MITRE12 section 3 and appendix B.
 Spectral densities are two-sided: the noise power is their integral over negative and positive
 frequencies. NaN marks an axis that was not measured, or a detector without axes. Invalid values
 raise ValueError.

@@ -49,6 +49,7 @@ def cdr_of(schema: Schema, data: bytes) -> bytes:
     ----------
     schema : Schema
     data : bytes
+        Message in the encoding of the schema.
 
     Returns
     -------
@@ -130,7 +131,7 @@ def _field(message: Any) -> MessageDict:
 
 
 def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
-    """Value of the first field of `names` that a time has; ValueError unless in [0, limit)."""
+    """Return the first existing field of `names`; raise ValueError unless in [0, limit)."""
     for name in names:
         value = getattr(stamp, name, None)
         if isinstance(value, int) and not isinstance(value, bool):
@@ -141,7 +142,7 @@ def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
 
 
 def _axis_value(field: Any, axis: str) -> float:
-    """Field of one axis [T]; NaN if the value is null (not measured). ValueError if missing."""
+    """Return the field of one axis [T], NaN for null; raise ValueError if it is missing."""
     if not hasattr(field, axis):
         raise ValueError(f'magnetic_field.{axis} is missing')
     value = getattr(field, axis)

@@ -59,7 +59,8 @@ def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[Messag
 def detections_3d_dict(track: Track, frame: str) -> MessageDict:
     """Convert a `Track` to vision_msgs/Detection3DArray.
 
-    The results are the kinds of target with their probabilities; each has the pose of the track.
+    The results are the kinds of target with their probabilities; each result has the pose of the
+    track.
     The box has the length of the line of dipoles; its width and height are not observable and set
     to 0.
 

@@ -125,6 +125,7 @@ class LiveScene:
         ----------
         track_id : int
         points : (n, 3) array, m
+            Smoothed positions.
         """
         with self._lock:
             live = self._latest.get(track_id)

@@ -298,7 +298,7 @@ LONG = np.diag([1.0, 1.0, 8.0])
     (readings(ball(3000)), 'scatter about the ellipsoid is 0.* of the radius, maximum 0.1'),
     (readings(POSES, 1e-4), '^15 different directions, minimum 18'),
     (readings(EVEN) * np.where(np.arange(1500) % 25 == 0, 100.0, 1.0)[:, None],
-     'share of 0.96 of the readings are outliers, maximum 0.2')])
+     'fraction of outliers is 0.96, maximum 0.2')])
 def test_readings_that_cannot_be_fitted_are_rejected(y, reason):
     fit = fit_ellipsoid(y)
     print(fit.reason)

@@ -267,7 +267,7 @@ def test_headings_are_weighted_by_their_variances(compass, stated, expected, std
                                np.deg2rad(stated))
     assert np.degrees(yaw_between(R, both.R_ws)) == pytest.approx(expected, rel=1e-3)
     np.testing.assert_allclose(np.degrees(both.std), [0.3, 0.4, std], rtol=1e-3)
-    # The tilt is that of the accelerometer.
+    # The tilt is measured by the accelerometer.
     np.testing.assert_allclose(both.R_ws.T @ UP, R.T @ UP, atol=1e-12)
     assert both.bias[0] == 1e-7
 

@@ -79,7 +79,7 @@ def stuck(fields):
 @pytest.mark.parametrize('slope', [0.0, 2e-11])
 @pytest.mark.parametrize('rate', [10.0, 100.0])
 def test_noise_and_coarse_steps_at_rest_pass_at_once(step, slope, rate):
-    """10 000 readings; the background may drift from one step of the sensor to the next.
+    """Ten thousand readings pass; the background may drift from one step of the sensor to the next.
 
     During such a drift, a sensor with coarse steps must not be classified as stuck.
     """

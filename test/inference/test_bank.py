@@ -123,7 +123,7 @@ def test_best_is_of_the_heaviest_kind_of_the_heaviest_arrival():
 def test_best_is_at_the_maximum_of_the_mixture_density():
     """The best of two distant hypotheses of equal weight is the more certain hypothesis.
 
-    If a covariance is invalid, the heaviest hypothesis is the best one.
+    If a covariance is invalid, the heaviest hypothesis is the best.
     """
     b = bank(3, spread=100.0, label=[0, 0, 0])
     b.P[1, :3, :3] *= 0.5

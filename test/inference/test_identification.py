@@ -60,8 +60,7 @@ def rotated_hard_iron(degrees):
 
 @pytest.mark.parametrize('degrees', [60, 90, 120, 180])
 def test_two_cars_of_equal_size_are_distinguished(degrees):
-    """As in T10 Fig. 7.1, cars enrolled at headings north and south are identified at any
-    heading."""
+    """As in T10 Fig. 7.1, cars enrolled at two headings are identified at any heading."""
     rng, C = np.random.default_rng(degrees), np.diag([8.0, 8.0, 15.0])**2
     spread = np.linalg.cholesky(C + PASS_TO_PASS_STD**2 * np.eye(3))
     cars = {'vehicle 5': HARD, 'other': rotated_hard_iron(degrees)}

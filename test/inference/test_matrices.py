@@ -1,4 +1,4 @@
-"""Pseudo-inverses compared with those of NumPy."""
+"""Pseudo-inverses compared with NumPy."""
 
 import numpy as np
 import pytest
