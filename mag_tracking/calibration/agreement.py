@@ -199,8 +199,8 @@ def _remaining_difference(y: FloatArray, R_ws: FloatArray, std: FloatArray,
 
 def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Possible heading errors (n,) [rad] of a sensor, and the Earth's field (n, 3) for each."""
-    most = min(np.pi, MAX_HEADING_STDS * std[2])
-    yaw = np.linspace(-most, most, 1 + 2 * max(1, round(most / YAW_STEP)))
+    max_error = min(np.pi, MAX_HEADING_STDS * std[2])
+    yaw = np.linspace(-max_error, max_error, 1 + 2 * max(1, round(max_error / YAW_STEP)))
     return yaw, np.stack([B0[0] * np.cos(yaw) + B0[1] * np.sin(yaw),
                           B0[1] * np.cos(yaw) - B0[0] * np.sin(yaw), np.full(len(yaw), B0[2])],
                          axis=1)
@@ -212,8 +212,8 @@ def _axis_changes() -> list[list[_AxisChange]]:
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             n_moved = sum(k != i for i, k in enumerate(order))
-            flipped = [_AXES[i] for i, s in enumerate(signs) if s < 0.0]
-            if not n_moved and not flipped:
+            flipped_axes = [_AXES[i] for i, s in enumerate(signs) if s < 0.0]
+            if not n_moved and not flipped_axes:
                 continue
             parts = []
             if n_moved == 2:
@@ -222,9 +222,9 @@ def _axis_changes() -> list[list[_AxisChange]]:
             elif n_moved:
                 parts.append('its axes are in the order '
                              + ', '.join(_AXES[order.index(i)] for i in range(3)))
-            if flipped:
-                parts.append(f'{" and ".join(flipped)} {"is" if len(flipped) == 1 else "are"} '
-                             'flipped')
-            groups.setdefault((n_moved + len(flipped) + (n_moved > 0), n_moved), []).append(
+            if flipped_axes:
+                parts.append(f'{" and ".join(flipped_axes)} '
+                             f'{"is" if len(flipped_axes) == 1 else "are"} flipped')
+            groups.setdefault((n_moved + len(flipped_axes) + (n_moved > 0), n_moved), []).append(
                 (', '.join(parts), order, np.array(signs)))
     return [groups[key] for key in sorted(groups)]

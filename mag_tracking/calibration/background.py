@@ -107,7 +107,7 @@ class RunningBackground:
         self.doubtful_times = updated(self.doubtful_times, int(self._state['last_ns']), False)
         # Duration for which the level was observed, its end, and the start of the background.
         self._seen_s = 0.0 if self._known_background is None else inf
-        self._seen_until = self._start = np.nan
+        self._seen_until = self._start_time = np.nan
         self._level.set_uncertainty()
         self._level.set(None if self._known_background is None
                         else (0.0, self._known_background, np.zeros(3), 0.0), self._known_noise)
@@ -233,7 +233,7 @@ class RunningBackground:
 
     def _collect_until_quiet(self, block: Block) -> None:
         """Add a block, and adopt a quiet interval as the background once it is long enough."""
-        self._start = block.time if np.isnan(self._start) else self._start
+        self._start_time = block.time if np.isnan(self._start_time) else self._start_time
         segments = self._learning_window.segments(block, self.stuck)
         if not any(self._adopt_if_steady(s) for s in segments) and not self.stuck:
             self._start_provisionally(block)
@@ -286,63 +286,63 @@ class RunningBackground:
         """While frozen, adopt another level that lasts or that was the background before."""
         self._seen_until = np.nan
         departure = self._departure
-        since = block.time - departure.blocks[0].time
+        duration = block.time - departure.blocks[0].time
         relearn_time = departure.relearn_time(
             self._seen_s, self._is_resumed and self._relearns_soon)
         if not relearn_time:
             return departure.end()
-        other = self._provisional.frequent_level(corrected_steps(self._sensors))
-        if other is not None and other.level.is_at(self._level.at(block.time)):
-            other = None
-        latest = departure.steady_end(SHORTENED_FRACTION)
-        if latest is not None and self._relearn and self._adopt_if_background(latest):
+        other_level = self._provisional.frequent_level(corrected_steps(self._sensors))
+        if other_level is not None and other_level.level.is_at(self._level.at(block.time)):
+            other_level = None
+        new_blocks = departure.steady_end(SHORTENED_FRACTION)
+        if new_blocks is not None and self._relearn and self._adopt_if_background(new_blocks):
             return
         # Either of two levels of equal duration may be the background, unless a vehicle was
         # observed to arrive at one of the levels.
         self._is_contested = not departure.has_arrived and (
             self._is_contested
-            or since >= min(self._seen_s, self._relearn) and departure.steady_end() is not None
-            or other is not None and other.seen_s >= min(self._seen_s, MIN_SEEN_S))
-        if since < relearn_time:
+            or duration >= min(self._seen_s, self._relearn) and departure.steady_end() is not None
+            or other_level is not None and other_level.seen_s >= min(self._seen_s, MIN_SEEN_S))
+        if duration < relearn_time:
             return
         if self._adopt_if_steady(departure.blocks):
             self.n_relearnt += 1
             self.frozen = self._is_contested = False
-        elif other is not None and other.is_certain:
+        elif other_level is not None and other_level.is_certain:
             self.n_relearnt += 1
-            self._start_with_frequent(other)
+            self._start_with_frequent(other_level)
         else:
             departure.shorten()
 
-    def _adopt_if_background(self, latest: deque[Block]) -> bool:
-        """Adopt the level of the `latest` blocks if it is the background; return whether it is."""
+    def _adopt_if_background(self, new_blocks: deque[Block]) -> bool:
+        """Adopt the level of the `new_blocks` if it is the background; return whether it is."""
         former_seen_s = self._departure.former_seen_s()
         if former_seen_s:
-            self._change_to(latest, former_seen_s)
+            self._change_to(new_blocks, former_seen_s)
             return True
         is_known = self._known_background is not None and self._departure.former is None
-        if not self._departure.has_departed(latest) or is_known:
+        if not self._departure.has_departed(new_blocks) or is_known:
             return False
-        since_ns = int(self._state['first_ns']) + round(np.nan_to_num(self._start) * NS)
-        self._change_to(latest, self._learn)
+        since_ns = int(self._state['first_ns']) + round(np.nan_to_num(self._start_time) * NS)
+        self._change_to(new_blocks, self._learn)
         # The earlier background contained the field of the vehicle.
         self.doubtful_times = doubtful_since(self.doubtful_times, since_ns)
         return True
 
-    def _change_to(self, latest: deque[Block], seen_s: float) -> None:
-        """Change the background to the level of the `latest` blocks, observed for `seen_s` [s]."""
+    def _change_to(self, new_blocks: deque[Block], seen_s: float) -> None:
+        """Change the background to the level of `new_blocks`, observed for `seen_s` [s]."""
         # The first half may contain the tail of the departing vehicle's field.
-        half = list(latest)[len(latest) // 2:]
-        self._store_former_level(half[0].time)
-        self._level.set_constant(stacked(half))
+        second_half = list(new_blocks)[len(new_blocks) // 2:]
+        self._store_former_level(second_half[0].time)
+        self._level.set_constant(stacked(second_half))
         self._is_resumed, self._relearns_soon, self._seen_s = True, False, seen_s
-        self._quiet.begin(half)
+        self._quiet.begin(second_half)
         self.n_relearnt += 1
         self.frozen = self._is_contested = self._is_steep = False
 
     def _store_former_level(self, begin: float) -> None:
         """Store the present level as the former level, which ended at `begin` [s]."""
-        self._start = begin
+        self._start_time = begin
         self._departure.former = FormerLevel(begin, self._level.at(begin), self._seen_s)
         self._departure.end()
 

@@ -224,13 +224,13 @@ class BackgroundLevel:
             None if the blocks are not steady or too few.
         """
         since = blocks[-1].time - length
-        latest: deque[Block] = deque()
+        latest_blocks: deque[Block] = deque()
         for block in reversed(blocks):
-            if block.time <= since and len(latest) >= 3:
+            if block.time <= since and len(latest_blocks) >= 3:
                 break
-            latest.appendleft(block)
+            latest_blocks.appendleft(block)
         is_long = len(blocks) >= 3 and blocks[0].time <= since
-        return latest if is_long and self.are_steady(stacked(latest)) else None
+        return latest_blocks if is_long and self.are_steady(stacked(latest_blocks)) else None
 
     def are_steady(self, blocks: Blocks) -> bool:
         """Whether blocks are at one steady level, given the present noise.

@@ -128,8 +128,8 @@ def _series(t: FloatArray, s: FloatArray, name: str) -> _Series:
     t, s = np.asarray(t, dtype=float), np.asarray(s, dtype=float)
     if t.shape != s.shape or t.ndim != 1:
         raise ValueError(f'the {name} has times of shape {t.shape} for values of shape {s.shape}')
-    good = ~np.isnan(s)
-    t, s = t[good], s[good]
+    is_valid = ~np.isnan(s)
+    t, s = t[is_valid], s[is_valid]
     if (np.diff(t) <= 0.0).any():
         raise ValueError(f'the times of the {name} do not increase')
     return t, s
@@ -139,14 +139,14 @@ def _without_cut_knocks(t: FloatArray, s: FloatArray) -> _Series:
     """Remove knocks that are cut off at the beginning or end of a series."""
     if len(s) < 8:
         return t, s
-    loud = _is_knock(s)
+    is_loud = _is_knock(s)
     for _ in range(2):
-        if loud[t <= t[0] + MARGIN_S].any():
+        if is_loud[t <= t[0] + MARGIN_S].any():
             # The knock ends where the signal has been quiet for MARGIN_S.
-            ends = np.flatnonzero(np.diff(np.append(t[loud], np.inf)) > MARGIN_S)
-            keep = t > t[loud][ends[0]]
-            t, s, loud = t[keep], s[keep], loud[keep]
-        t, s, loud = -t[::-1], s[::-1], loud[::-1]
+            ends = np.flatnonzero(np.diff(np.append(t[is_loud], np.inf)) > MARGIN_S)
+            keep = t > t[is_loud][ends[0]]
+            t, s, is_loud = t[keep], s[keep], is_loud[keep]
+        t, s, is_loud = -t[::-1], s[::-1], is_loud[::-1]
         if not len(t):
             break
     return t, s
@@ -157,8 +157,9 @@ def _separation(a: _Series, b: _Series, max_lag: float) -> float | None:
     if not (len(a[1]) > 7 and len(b[1]) > 7 and _is_knock(a[1]).any() and _is_knock(b[1]).any()):
         return None
     s, t = a[0][_is_knock(a[1])], b[0][_is_knock(b[1])]
-    after = np.clip(np.searchsorted(t, s), 0, len(t) - 1)
-    distance = np.minimum(np.abs(t[after] - s), np.abs(t[np.maximum(after - 1, 0)] - s)).min()
+    next_index = np.clip(np.searchsorted(t, s), 0, len(t) - 1)
+    distance = np.minimum(np.abs(t[next_index] - s),
+                          np.abs(t[np.maximum(next_index - 1, 0)] - s)).min()
     return float(distance) if distance > max_lag + MARGIN_S else None
 
 
@@ -167,28 +168,28 @@ def _around_knocks(a: _Series, b: _Series, max_lag: float) -> _Series:
     if len(b[1]) < 8 or not _is_knock(b[1]).any():
         return a
     first, last = _knock_times(*b)
-    near = (a[0] >= first - max_lag - CONTEXT_S) & (a[0] <= last + max_lag + CONTEXT_S)
-    return a[0][near], a[1][near]
+    is_near = (a[0] >= first - max_lag - CONTEXT_S) & (a[0] <= last + max_lag + CONTEXT_S)
+    return a[0][is_near], a[1][is_near]
 
 
 def _is_knock(s: FloatArray) -> BoolArray:
     """Whether each value of a signal belongs to a knock, (n,)."""
-    rest = 1.4826 * np.median(np.abs(s - np.median(s)))
-    loud: BoolArray = s > KNOCK_THRESHOLD * max(rest, 1e-3)
-    return loud
+    rest_level = 1.4826 * np.median(np.abs(s - np.median(s)))
+    is_loud: BoolArray = s > KNOCK_THRESHOLD * max(rest_level, 1e-3)
+    return is_loud
 
 
 def _knock_times(t: FloatArray, s: FloatArray) -> tuple[float, float]:
     """Times [s] of the first and the last value that belong to knocks."""
-    loud = t[_is_knock(s)]
-    return loud[0], loud[-1]
+    knocks = t[_is_knock(s)]
+    return knocks[0], knocks[-1]
 
 
 def _sampling_interval(t: FloatArray, s: FloatArray) -> float:
     """Sampling interval [s] around the knocks."""
     first, last = _knock_times(t, s)
-    near = (t >= first - MARGIN_S) & (t <= last + MARGIN_S)
-    return float(np.median(np.diff(t[near]))) if np.count_nonzero(near) > 2 else float('inf')
+    is_near = (t >= first - MARGIN_S) & (t <= last + MARGIN_S)
+    return float(np.median(np.diff(t[is_near]))) if np.count_nonzero(is_near) > 2 else float('inf')
 
 
 def _coarse_lag(a: _Series, b: _Series, max_lag: float) -> tuple[float, float, str]:
@@ -209,10 +210,10 @@ def _coarse_lag(a: _Series, b: _Series, max_lag: float) -> tuple[float, float, s
         return lags[best], float(c[best]), (
             f'the two sensors did not measure the same knocks within {max_lag:g} s '
             f'(correlation {c[best]:.2f})')
-    others = [k for k in find_peaks(c)[0] if abs(k - best) > 2 and c[k] > MIN_RIVAL_RATIO * c[best]]
-    if others:
+    rivals = [k for k in find_peaks(c)[0] if abs(k - best) > 2 and c[k] > MIN_RIVAL_RATIO * c[best]]
+    if rivals:
         return lags[best], float(c[best]), (
-            f'lags of {lags[best]:.3f} and {lags[others[0]]:.3f} s fit equally well: knock again '
+            f'lags of {lags[best]:.3f} and {lags[rivals[0]]:.3f} s fit equally well: knock again '
             'at unevenly spaced times')
     return float(lags[best]), float(c[best]), ''
 
@@ -221,8 +222,8 @@ def _refined_lag(a: _Series, b: _Series, lag: float) -> tuple[float, float]:
     """Offset and standard deviation [s] of the best fit of `a`, interpolated and scaled, to `b`."""
     offset, std = _fitted_lag(a, b, lag, PchipInterpolator(*a, extrapolate=False))
     # The signal between two readings is unknown; a second interpolation estimates its effect.
-    other, _ = _fitted_lag(a, b, lag, CubicSpline(*a, extrapolate=False))
-    return offset, float(np.hypot(std, other - offset))
+    other_offset, _ = _fitted_lag(a, b, lag, CubicSpline(*a, extrapolate=False))
+    return offset, float(np.hypot(std, other_offset - offset))
 
 
 def _fitted_lag(a: _Series, b: _Series, lag: float,
@@ -232,9 +233,9 @@ def _fitted_lag(a: _Series, b: _Series, lag: float,
     step = max(_sampling_interval(*a), _sampling_interval(*b))
     first, last = _knock_times(*a)
     # The set of readings is fixed: if it depended on the lag, the sum would be discontinuous.
-    near = (t >= first + lag - MARGIN_S) & (t <= last + lag + MARGIN_S)
-    near &= (t >= a[0][0] + lag + 2.0 * step) & (t <= a[0][-1] + lag - 2.0 * step)
-    t, s = t[near], s[near]
+    is_near = (t >= first + lag - MARGIN_S) & (t <= last + lag + MARGIN_S)
+    is_near &= (t >= a[0][0] + lag + 2.0 * step) & (t <= a[0][-1] + lag - 2.0 * step)
+    t, s = t[is_near], s[is_near]
 
     def residual(offset: float) -> FloatArray:
         u = curve(t - offset)

@@ -73,7 +73,7 @@ class QuietLevel:
         return not bool((np.abs(self.level - level) > MIN_LEVEL_DISTANCE * self.width).any())
 
 
-def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLevel | None:
+def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int) -> QuietLevel | None:
     """Find the most frequent level of the blocks of a sensor.
 
     Parameters
@@ -82,7 +82,7 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLe
         Chronological.
     steps : (3,) array, T
         Smallest change of each axis; 0 = unknown.
-    most : int
+    max_blocks : int
         Maximum number of blocks that determine the level; the earliest blocks are used.
 
     Returns
@@ -96,32 +96,32 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLe
     if np.isnan(variance).all():
         return None
     # An axis that is rarely reported would exclude the blocks without it.
-    known = (~np.isnan(variance)).mean(axis=0) > MIN_REPORTED_FRACTION
-    if not known.any():
+    is_used = (~np.isnan(variance)).mean(axis=0) > MIN_REPORTED_FRACTION
+    if not is_used.any():
         return None
-    quietest = np.nanquantile(variance[:, known], 0.2, axis=0)
-    calm = (variance[:, known] <= MAX_CALM_RATIO**2 * quietest).all(axis=1)
+    quietest = np.nanquantile(variance[:, is_used], 0.2, axis=0)
+    calm = (variance[:, is_used] <= MAX_CALM_RATIO**2 * quietest).all(axis=1)
     width = np.full(3, np.nan)
-    width[known] = np.maximum(LEVEL_WIDTH * np.sqrt(quietest / np.median(n[:, known], axis=0)),
-                              np.maximum(TOGGLE * steps[known], MIN_WIDTH))
+    width[is_used] = np.maximum(LEVEL_WIDTH * np.sqrt(quietest / np.median(n[:, is_used], axis=0)),
+                                np.maximum(TOGGLE * steps[is_used], MIN_WIDTH))
     rows = np.flatnonzero(calm)
     if len(rows) < MIN_BLOCKS:
         return None
-    means = blocks.mean[rows][:, known]
-    densest = _densest(means, width[known])
+    means = blocks.mean[rows][:, is_used]
+    densest = _densest(means, width[is_used])
     chosen = rows[densest]
     if len(chosen) < MIN_BLOCKS:
         return None
     centre = np.median(means[densest], axis=0)
-    others = means[(np.abs(means - centre) > MIN_LEVEL_DISTANCE * width[known]).any(axis=1)]
+    other_means = means[(np.abs(means - centre) > MIN_LEVEL_DISTANCE * width[is_used]).any(axis=1)]
     time = blocks.time[chosen]
-    first = chosen[time <= time[0] + (time[-1] - time[0]) * most / len(chosen)][:most]
+    first = chosen[time <= time[0] + (time[-1] - time[0]) * max_blocks / len(chosen)][:max_blocks]
     early = Blocks(*(values[first] for values in blocks))
     covariance = pooled_covariance(Blocks(*(values[chosen] for values in blocks)))
     if covariance is None:
         return None
     _, mean, _ = line_through(early)
-    n_rival = len(_densest(others, width[known])) if len(others) else 0
+    n_rival = len(_densest(other_means, width[is_used])) if len(other_means) else 0
     return QuietLevel(len(chosen), n_rival, float(time[0]), float(time[-1]), mean, covariance,
                       float(np.median(np.diff(blocks.time))), width)
 
@@ -130,10 +130,10 @@ def _densest(means: FloatArray, width: FloatArray) -> IntArray:
     """Indices of the `means` (n, k) in the densest box of half-width `width` (k,)."""
     best: BoolArray = np.zeros(len(means), dtype=bool)
     for first in range(0, len(means), BATCH_SIZE):
-        near: BoolArray = np.ones((len(means[first:first + BATCH_SIZE]), len(means)), dtype=bool)
+        is_near: BoolArray = np.ones((len(means[first:first + BATCH_SIZE]), len(means)), dtype=bool)
         for axis, widest in zip(means.T, width, strict=True):
-            near &= np.abs(axis[first:first + BATCH_SIZE, None] - axis) <= widest
-        most = near[np.argmax(np.count_nonzero(near, axis=1))]
-        best = most if np.count_nonzero(most) > np.count_nonzero(best) else best
+            is_near &= np.abs(axis[first:first + BATCH_SIZE, None] - axis) <= widest
+        densest = is_near[np.argmax(np.count_nonzero(is_near, axis=1))]
+        best = densest if np.count_nonzero(densest) > np.count_nonzero(best) else best
     centre = np.median(means[best], axis=0)
     return np.flatnonzero((np.abs(means - centre) <= width).all(axis=1))

@@ -104,9 +104,9 @@ class LevelDeparture:
         deque of Block or None
             None if they are not steady.
         """
-        latest = self._level.steady_end(self.blocks, ratio * self._learn)
-        self.was_steady |= latest is not None
-        return latest
+        new_blocks = self._level.steady_end(self.blocks, ratio * self._learn)
+        self.was_steady |= new_blocks is not None
+        return new_blocks
 
     def relearn_time(self, seen_s: float, relearns_soon: bool) -> float:
         """Time on another steady level after which that level becomes the background.
@@ -143,12 +143,12 @@ class LevelDeparture:
         is_at_it = former is not None and former.is_at(self.blocks[-1], self._level.limits)
         return former.seen_s if former is not None and is_at_it else 0.0
 
-    def has_departed(self, latest: deque[Block]) -> bool | None:
+    def has_departed(self, new_blocks: deque[Block]) -> bool | None:
         """Determine and store whether a vehicle that was part of the background has departed.
 
         Parameters
         ----------
-        latest : deque of Block
+        new_blocks : deque of Block
             Blocks of the new level.
 
         Returns
@@ -160,9 +160,9 @@ class LevelDeparture:
             return False if self.has_arrived else None
         blocks = stacked([*self._blocks_before, *self.blocks])
         has_departed = self._evaluate_change(level_change(
-            blocks, len(latest), self._level.at_all(blocks.time), self._state['noise_std'],
+            blocks, len(new_blocks), self._level.at_all(blocks.time), self._state['noise_std'],
             int(self._state['first_ns']) / NS))
         self.has_arrived = has_departed is False
         if has_departed and self.former is None and self.departed_at is None:
-            self.departed_at = latest[0].time
+            self.departed_at = new_blocks[0].time
         return has_departed

@@ -165,8 +165,8 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
                          f'of {level:.2g} T is too small for a bias of {bias_std:.2g} T')
     # A tilt error projects part of the vertical field onto the horizontal plane.
     heading_std = np.sqrt(1.0 / information + (up.std * upright / level)**2)
-    others = [np.angle(np.exp(1j * (other - yaw))) for other in yaws]
-    rivals = [d for d, c in zip(others, costs, strict=True)
+    differences = [np.angle(np.exp(1j * (other - yaw))) for other in yaws]
+    rivals = [d for d, c in zip(differences, costs, strict=True)
               if abs(d) > 0.1 and c < costs.min() + MAX_RIVAL_COST]
     R_ws = rotation_about_z(yaw) @ R_level
     return Orientation(R_ws, np.array([up.std, up.std, heading_std]), y - R_ws.T @ B0,

@@ -105,8 +105,9 @@ class ProvisionalLevel:
         level = most_frequent_level(stored, np.where(np.isfinite(steps), steps, 0.0), MAX_BLOCKS)
         if level is None:
             return None
-        distance, known = np.full(3, np.nan), ~np.isnan(level.level)
-        distance[known] = np.nanmedian(np.abs(stored.mean[:, known] - level.level[known]), axis=0)
+        distance, is_known = np.full(3, np.nan), ~np.isnan(level.level)
+        distance[is_known] = np.nanmedian(
+            np.abs(stored.mean[:, is_known] - level.level[is_known]), axis=0)
         is_certain = level.n_blocks * level.block_s >= MIN_SEEN_S \
             and level.n_blocks >= MIN_DURATION_RATIO * level.n_rival
         return FrequentLevel(level, MAD_TO_STD * distance, is_certain)

@@ -38,13 +38,13 @@ def isolated_readings(values: FloatArray) -> IntArray:
     if len(values) < 5:
         return np.zeros(0, dtype=np.int64)
     change = np.diff(values)
-    before, after = change[1:-2], change[2:-1]
+    change_before, change_after = change[1:-2], change[2:-1]
     around = np.maximum(np.abs(change[:-3]), np.abs(change[3:]))
-    around = np.maximum(around, np.abs(before + after))
-    height = np.minimum(np.abs(before), np.abs(after))
-    least = np.min(np.abs(change[change != 0.0]), initial=np.inf)
-    indices: IntArray = 2 + np.flatnonzero((before * after < 0.0) & (
-        height > MIN_ISOLATION * np.maximum(around, least)))
+    around = np.maximum(around, np.abs(change_before + change_after))
+    height = np.minimum(np.abs(change_before), np.abs(change_after))
+    smallest_change = np.min(np.abs(change[change != 0.0]), initial=np.inf)
+    indices: IntArray = 2 + np.flatnonzero((change_before * change_after < 0.0) & (
+        height > MIN_ISOLATION * np.maximum(around, smallest_change)))
     return indices
 
 

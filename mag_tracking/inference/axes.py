@@ -97,9 +97,9 @@ def are_valid_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
     is_measured = ~np.isnan(y)
     finite = np.isfinite(C)
     is_used = is_measured[:, :, None] & is_measured[:, None, :]
-    known = np.where(is_used & finite, C, 0.0)
-    largest = np.abs(known).max(axis=(1, 2), initial=0.0)
-    asymmetry = np.abs(known - np.swapaxes(known, 1, 2)).max(axis=(1, 2), initial=0.0)
+    used_C = np.where(is_used & finite, C, 0.0)
+    largest = np.abs(used_C).max(axis=(1, 2), initial=0.0)
+    asymmetry = np.abs(used_C - np.swapaxes(used_C, 1, 2)).max(axis=(1, 2), initial=0.0)
     valid: BoolArray = (finite | ~is_used).all(axis=(1, 2)) & (asymmetry <= 1e-6 * largest) \
         & (smallest_pivots(y, C) > MIN_PIVOT)
     return valid

@@ -88,12 +88,12 @@ def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray
         Computed exactly from the distribution of the current number of consecutive detections.
     """
     p = np.asarray(probability, dtype=float)
-    waiting = np.zeros((run, *p.shape[1:]))
-    waiting[0] = 1.0
+    run_probability = np.zeros((run, *p.shape[1:]))
+    run_probability[0] = 1.0
     for detected in p:
         # The count of consecutive detections grows by one or restarts at zero. The probability
         # that leaves the last entry is the probability of an onset.
-        waiting = np.concatenate([((1.0 - detected) * waiting.sum(axis=0))[None],
-                                  detected * waiting[:-1]])
-    missed: FloatArray = waiting.sum(axis=0)
+        run_probability = np.concatenate([((1.0 - detected) * run_probability.sum(axis=0))[None],
+                                          detected * run_probability[:-1]])
+    missed: FloatArray = run_probability.sum(axis=0)
     return missed

@@ -120,8 +120,8 @@ def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRo
 
 def _correlation(field: FloatArray, lag: int) -> float:
     """Correlation of PHD15 Paper B eq. (5a), without the first and last `lag` samples."""
-    now, later = field[lag:-lag], field[2 * lag:]
-    return float(np.sum(now[:, 0] * later[:, 1] - now[:, 1] * later[:, 0])) / lag
+    current, delayed = field[lag:-lag], field[2 * lag:]
+    return float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
 
 
 def _spread(field: FloatArray, lag: int) -> float:
@@ -129,7 +129,7 @@ def _spread(field: FloatArray, lag: int) -> float:
     return float(np.sum(np.square(field[2 * lag:] - field[:-2 * lag])))
 
 
-def lag_of(field: FloatArray, noise_std: float, most: int) -> int:
+def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     """Lag matched to the width of a pass.
 
     Parameters
@@ -138,7 +138,7 @@ def lag_of(field: FloatArray, noise_std: float, most: int) -> int:
         As for `field_rotation`.
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
-    most : int
+    max_lag : int
         Maximum lag, the number of samples at each end that are free of the target.
 
     Returns
@@ -146,14 +146,14 @@ def lag_of(field: FloatArray, noise_std: float, most: int) -> int:
     int
         From 1 to a quarter of the window; 0 if the field does not exceed the noise.
     """
-    around = 1 + len(field) // 20
-    energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(around), 'same')
+    window = 1 + len(field) // 20
+    energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(window), 'same')
     # Another target at an end of the window extends the span of strong samples, but hardly the
     # count.
     width = np.count_nonzero(energy > 0.5 * energy.max())
     if not width:
         return 0
-    return int(np.clip(round(LAG * width), 1, max(1, min(most, len(field) // 4))))
+    return int(np.clip(round(LAG * width), 1, max(1, min(max_lag, len(field) // 4))))
 
 
 def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int]) -> int:
@@ -202,8 +202,8 @@ def fused_log_odds(log_odds: Iterable[float], same_side: Iterable[bool]) -> floa
     ----------
     [PHD15]_ Paper B eq. (20)-(23).
     """
-    return float(sum(value if same else -value
-                     for value, same in zip(log_odds, same_side, strict=True)))
+    return float(sum(value if is_same_side else -value
+                     for value, is_same_side in zip(log_odds, same_side, strict=True)))
 
 
 def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:

@@ -146,9 +146,9 @@ class FilterBank:
         """
         if self.label.ndim == 1:
             return self
-        others = n_one * self.label.shape[1]
+        n_target_states = n_one * self.label.shape[1]
         columns = np.append(np.arange(i * n_one, (i + 1) * n_one),
-                            np.arange(others, self.x.shape[1]))
+                            np.arange(n_target_states, self.x.shape[1]))
         return FilterBank(*_of_columns(self.x, self.P, columns), self.log_w,
                           self.label[:, i].copy(), self.kind[:, i].copy(), self.origin, self.nis)
 
@@ -290,10 +290,10 @@ class FilterBank:
             do not change.
         """
         log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, -np.inf)
-        joint = self.log_w + log_likelihood
-        evidence = float(log_sum_exp(joint))
+        joint_log_w = self.log_w + log_likelihood
+        evidence = float(log_sum_exp(joint_log_w))
         if np.isfinite(evidence):
-            self.log_w = joint - evidence
+            self.log_w = joint_log_w - evidence
         return evidence
 
     def keep(self, mask: BoolArray) -> int:
@@ -368,7 +368,7 @@ def _compacted(a: FloatArray, rows: IntArray) -> FloatArray:
     buffer = a if a.base is None else a.base
     if len(rows) * a[:1].nbytes < buffer.nbytes // 2:
         return a[rows]
-    for new, old in enumerate(rows.tolist()):
-        if new != old:
-            a[new] = a[old]
+    for target, source in enumerate(rows.tolist()):
+        if target != source:
+            a[target] = a[source]
     return a[:len(rows)]

@@ -59,10 +59,10 @@ class InnovationConsistency:
     def excess(self) -> float:
         """Factor by which the latest innovation variances exceed their covariance; 1 = consistent.
         """
-        latest = self._recent_sum.total
-        fails = self._fails(latest)
+        recent = self._recent_sum.total
+        fails = self._fails(recent)
         with np.errstate(invalid='ignore', divide='ignore'):
-            ratio = np.where(fails, latest[0] / latest[1], 1.0)
+            ratio = np.where(fails, recent[0] / recent[1], 1.0)
         return float(ratio.max())
 
     @property

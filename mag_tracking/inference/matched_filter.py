@@ -203,10 +203,10 @@ def any_detection_probability(probability: ArrayLike,
 
 
 def _raise_for_invalid(name: str, requirement: str, value: ArrayLike,
-                       bad: bool | BoolArray) -> None:
-    """Raise ValueError for the first entry of `value` that is flagged in `bad`, if any."""
-    if np.any(bad):
-        index = np.argwhere(bad)[0].tolist() if np.ndim(bad) else []
+                       is_invalid: bool | BoolArray) -> None:
+    """Raise ValueError for the first entry of `value` that is flagged in `is_invalid`, if any."""
+    if np.any(is_invalid):
+        index = np.argwhere(is_invalid)[0].tolist() if np.ndim(is_invalid) else []
         where = index if index else ''
         actual = np.asarray(value)[tuple(index)].tolist()
         raise ValueError(f'{name}{where} must be {requirement}, got {actual}')

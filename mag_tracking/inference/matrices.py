@@ -80,7 +80,8 @@ def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatA
     raise ValueError(f'{name} has shape {A.shape}, expected {shape}')
 
 
-def raise_for_invalid(name: str, fault: str, A: FloatArray, bad: BoolArray | np.bool_) -> None:
+def raise_for_invalid(name: str, fault: str, A: FloatArray,
+                      is_invalid: BoolArray | np.bool_) -> None:
     """Raise ValueError for the first invalid matrix.
 
     Parameters
@@ -91,7 +92,7 @@ def raise_for_invalid(name: str, fault: str, A: FloatArray, bad: BoolArray | np.
         Property that is violated, such as 'symmetric'.
     A : (..., n, n) array
         Matrices.
-    bad : (...) bool array
+    is_invalid : (...) bool array
         Flags of the invalid matrices.
 
     Raises
@@ -99,8 +100,8 @@ def raise_for_invalid(name: str, fault: str, A: FloatArray, bad: BoolArray | np.
     ValueError
         If any flag is set.
     """
-    for at in np.argwhere(bad).tolist():
-        raise ValueError(f'{name}{at or ""} is not {fault}: {A[tuple(at)].tolist()}')
+    for index in np.argwhere(is_invalid).tolist():
+        raise ValueError(f'{name}{index or ""} is not {fault}: {A[tuple(index)].tolist()}')
 
 
 def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -133,8 +134,8 @@ def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, Flo
     diagonal = np.einsum('...ii->...i', A)
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     unit = A / (scale[..., :, None] * scale[..., None, :])
-    skew = np.abs(unit - np.swapaxes(unit, -1, -2))
-    raise_for_invalid(name, 'symmetric', A, (skew > 1e-9).any(axis=(-2, -1)))
+    asymmetry = np.abs(unit - np.swapaxes(unit, -1, -2))
+    raise_for_invalid(name, 'symmetric', A, (asymmetry > 1e-9).any(axis=(-2, -1)))
     w, V = np.linalg.eigh(unit)
     raise_for_invalid(name, 'positive semidefinite', A,
                       (w < -1e-9).any(-1) | (diagonal < 0.0).any(-1))

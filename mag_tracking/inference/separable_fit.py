@@ -156,14 +156,14 @@ class _Prior:
     """Gaussian prior as whitened measurements of theta."""
 
     def __init__(self, mean: FloatArray, std: FloatArray) -> None:
-        self._known = np.flatnonzero(np.isfinite(std))
-        self._mean, self._std = mean[self._known], std[self._known]
-        self.jacobian = (np.eye(len(mean)) / std)[self._known]
+        self._prior_indices = np.flatnonzero(np.isfinite(std))
+        self._mean, self._std = mean[self._prior_indices], std[self._prior_indices]
+        self.jacobian = (np.eye(len(mean)) / std)[self._prior_indices]
         """Derivative of the whitened measurements, (n_known, n_theta)."""
 
     def residual(self, theta: FloatArray) -> FloatArray:
         """Whitened residuals (n, n_known) for theta (n, n_theta)."""
-        residual_of_prior: FloatArray = (self._mean - theta[:, self._known]) / self._std
+        residual_of_prior: FloatArray = (self._mean - theta[:, self._prior_indices]) / self._std
         return residual_of_prior
 
 
@@ -182,7 +182,7 @@ class Minimum:
 
 
 def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparableProblem,
-           starts: FloatArray, apart: FloatArray,
+           starts: FloatArray, min_difference: FloatArray,
            companions: Callable[[FloatArray], FloatArray] | None = None) -> Minimum:
     """Search for the lowest minimum of a separable problem from many starting points.
 
@@ -196,8 +196,8 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
         Problem to be solved; see `fine_minimum`.
     starts : (n, n_theta) array
         Starting points.
-    apart : (n_theta,) array
-        Points are distinct if they differ by more than this in any parameter.
+    min_difference : (n_theta,) array
+        Difference in any parameter beyond which points are distinct.
     companions : callable, (n_theta,) array -> (n, n_theta) array, optional
         Function of the best point of the coarse problem that returns points near minima that are
         often confused with the best minimum. The search also starts from these points.
@@ -206,16 +206,16 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
     -------
     Minimum
     """
-    theta, cost = coarse_minima(smooth, coarse, starts, apart)
+    theta, cost = coarse_minima(smooth, coarse, starts, min_difference)
     if companions is not None:
         added, added_cost, _, _ = refine(coarse.residual_and_jacobian,
                                          companions(theta[np.argmin(cost)]), 40, 1e-6)
         theta, cost = np.vstack([theta, added]), np.append(cost, added_cost)
-    return fine_minimum(fine, theta, cost, apart)
+    return fine_minimum(fine, theta, cost, min_difference)
 
 
 def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: FloatArray,
-                  apart: FloatArray, n_refined: int = 60, n_steps: int = 4,
+                  min_difference: FloatArray, n_refined: int = 60, n_steps: int = 4,
                   n_distinct: int = 8) -> tuple[FloatArray, FloatArray]:
     """Find the minima of a reduced separable problem.
 
@@ -231,8 +231,8 @@ def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: Fl
         Problem whose minima are returned.
     starts : (n, n_theta) array
         Starting points.
-    apart : (n_theta,) array
-        Points are distinct if they differ by more than this in any parameter.
+    min_difference : (n_theta,) array
+        Difference in any parameter beyond which points are distinct.
     n_refined : int
         Number of starting points to refine.
     n_steps : int
@@ -250,13 +250,13 @@ def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: Fl
     theta, cost = starts, smooth.cost(starts)
     theta = theta[np.argsort(cost, kind='stable')[:n_refined]]
     theta, cost, _, _ = refine(smooth.residual_and_jacobian, theta, n_steps)
-    theta = theta[distinct(theta, cost, apart, n_distinct)]
+    theta = theta[distinct(theta, cost, min_difference, n_distinct)]
     theta, cost, _, _ = refine(coarse.residual_and_jacobian, theta, 40, 1e-6)
     return theta, cost
 
 
-def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray, apart: FloatArray,
-                 n_best: int = 4) -> Minimum:
+def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray,
+                 min_difference: FloatArray, n_best: int = 4) -> Minimum:
     """Find the lowest minimum of a separable problem from points near its minima.
 
     Parameters
@@ -267,8 +267,8 @@ def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray, ap
         Starting points.
     cost : (n,) array
         Costs by which the starting points are ranked.
-    apart : (n_theta,) array
-        Points are distinct if they differ by more than this in any parameter.
+    min_difference : (n_theta,) array
+        Difference in any parameter beyond which points are distinct.
     n_best : int
         Maximum number of distinct starting points.
 
@@ -276,19 +276,20 @@ def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray, ap
     -------
     Minimum
     """
-    theta = theta[distinct(theta, cost, apart, n_best)]
+    theta = theta[distinct(theta, cost, min_difference, n_best)]
     theta, cost, _, converged = refine(fine.residual_and_jacobian, theta, 100, 1e-8)
     order = np.argsort(cost, kind='stable')
     best = order[0]
     rivals: list[tuple[FloatArray, float]] = []
     for k in order[1:]:
-        if all((np.abs(theta[k] - x) > apart).any()
+        if all((np.abs(theta[k] - x) > min_difference).any()
                for x in (theta[best], *(x for x, _ in rivals))):
             rivals.append((theta[k], float(cost[k])))
     return Minimum(theta[best], float(cost[best]), bool(converged[best]), tuple(rivals))
 
 
-def distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> IntArray:
+def distinct(theta: FloatArray, cost: FloatArray, min_difference: FloatArray,
+             max_points: int) -> IntArray:
     """Select the best distinct points.
 
     Parameters
@@ -297,9 +298,9 @@ def distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) 
         Points.
     cost : (n,) array
         Costs by which the points are ranked.
-    apart : (n_theta,) array
-        Points are distinct if they differ by more than this in any parameter.
-    most : int
+    min_difference : (n_theta,) array
+        Difference in any parameter beyond which points are distinct.
+    max_points : int
         Maximum number of points.
 
     Returns
@@ -309,8 +310,8 @@ def distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) 
     """
     selected: list[int] = []
     for i in np.argsort(cost, kind='stable').tolist():
-        if all((np.abs(theta[i] - theta[other]) > apart).any() for other in selected):
+        if all((np.abs(theta[i] - theta[other]) > min_difference).any() for other in selected):
             selected.append(i)
-            if len(selected) == most:
+            if len(selected) == max_points:
                 break
     return np.array(selected, dtype=np.int64)

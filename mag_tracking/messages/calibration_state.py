@@ -63,10 +63,10 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
     C = background.covariance if ready else None
     q, std = quaternion_from_rotation(network.R_ws[j]), network.orientation_std[j]
     record = network.calibrated[j]
-    since, until = background.doubtful_times[-1] if background.doubtful_times else (None, None)
+    begin, end = background.doubtful_times[-1] if background.doubtful_times else (None, None)
     return {'sensor': name, 'ready': ready, 'frozen': background.frozen,
             'doubtful': background.doubtful,
-            'doubtful_since': stamp_dict(since or 0), 'doubtful_until': stamp_dict(until or 0),
+            'doubtful_since': stamp_dict(begin or 0), 'doubtful_until': stamp_dict(end or 0),
             'background': xyz(calibrate.background(name) if ready else np.full(3, np.nan)),
             'covariance': (np.full((3, 3), np.nan) if C is None else C).ravel().tolist(),
             'n_samples': counts['accepted'], 'n_rejected': counts['rejected'],
@@ -93,8 +93,8 @@ def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
     """
     times: dict[str, DoubtfulTimes] = {}
     for s in message.sensors:
-        since, until = stamp_ns(s.doubtful_since), stamp_ns(s.doubtful_until)
-        times[s.sensor] = ((since, until or None),) if since else ()
+        begin, end = stamp_ns(s.doubtful_since), stamp_ns(s.doubtful_until)
+        times[s.sensor] = ((begin, end or None),) if begin else ()
     return times
 
 

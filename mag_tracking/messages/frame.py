@@ -70,9 +70,9 @@ def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
                              f'has {", ".join(network.names)}')
     lengths = {name: len(getattr(message, name)) for name in (
         'field', 'covariance', 'n_samples', 'time_offset')}
-    expected = dict(zip(lengths, (3 * n, 9 * n, n, n), strict=True))
-    if lengths != expected:
-        raise RecordingError(f'NetworkFrame of {n} sensors: expected array lengths {expected}; '
+    required = dict(zip(lengths, (3 * n, 9 * n, n, n), strict=True))
+    if lengths != required:
+        raise RecordingError(f'NetworkFrame of {n} sensors: expected array lengths {required}; '
                              f'got {lengths}')
     frame = FieldFrame(
         stamp_ns(message.header.stamp), np.array(message.field).reshape(n, 3),

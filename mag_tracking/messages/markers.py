@@ -103,10 +103,11 @@ def _smallest_distance(positions: FloatArray) -> float:
     return float(distances.min())
 
 
-def _marker(track: Track, frame: str, kind: str, shape: int, **content: Any) -> dict[str, Any]:
+def _marker(track: Track, frame: str, kind: str, shape: int,
+            **message_fields: Any) -> dict[str, Any]:
     """Build a visualization_msgs/Marker as a dict."""
     return {'header': header_dict(track.stamp_ns, frame), 'ns': kind, 'id': track.id,
-            'type': shape, **content}
+            'type': shape, **message_fields}
 
 
 def _quaternion(R: FloatArray) -> dict[str, float]:

@@ -125,9 +125,9 @@ class _StampedMessages:
         """Whether the frame names of `rows` are zero-terminated ASCII: (k,) array."""
         out = np.zeros(len(rows), dtype=bool)
         for length in np.unique(self._length[rows]):
-            same = np.flatnonzero(self._length[rows] == length)
-            names = self._frames(rows[same], length)
-            out[same] = (names[:, -1] == 0) & (names < 128).all(axis=1)
+            same_length = np.flatnonzero(self._length[rows] == length)
+            names = self._frames(rows[same_length], length)
+            out[same_length] = (names[:, -1] == 0) & (names < 128).all(axis=1)
         return out
 
     def have_frame(self, rows: IntArray, frame: str) -> BoolArray:

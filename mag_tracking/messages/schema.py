@@ -94,11 +94,11 @@ def known_covariances(C: FloatArray) -> FloatArray | None:
     (n, 3, 3) array or None, T²
         NaN where unknown; None if all are unknown.
     """
-    known = (C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))
-    if not known.any():
+    is_known = (C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))
+    if not is_known.any():
         return None
     C = np.where(np.isnan(C).all(axis=(1, 2), keepdims=True), 0.0, C)
-    return np.where(known[:, None, None], C, np.nan)
+    return np.where(is_known[:, None, None], C, np.nan)
 
 
 def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:

@@ -54,12 +54,12 @@ def _full_name(kind: str, package: str) -> str:
     return f'{(owner or package).partition("/")[0]}/msg/{leaf}'
 
 
-def referenced_types(text: str, package: str) -> list[str]:
+def referenced_types(message_definition: str, package: str) -> list[str]:
     """Message types that are referenced by a definition.
 
     Parameters
     ----------
-    text : str
+    message_definition : str
         Definition of a message type.
     package : str
         Package of that type.
@@ -70,7 +70,7 @@ def referenced_types(text: str, package: str) -> list[str]:
         Full names without duplicates, in order of appearance.
     """
     out: list[str] = []
-    for line in text.splitlines():
+    for line in message_definition.splitlines():
         field = _FIELD.match(line.partition('#')[0])
         if field and not field['is_constant'] and field['type'] not in _BUILT_IN:
             name = _full_name(field['type'], package)
@@ -81,14 +81,14 @@ def referenced_types(text: str, package: str) -> list[str]:
 
 def _dependencies(type_name: str) -> list[str]:
     """Types that `type_name` contains, without duplicates, breadth first."""
-    seen: list[str] = []
+    visited: list[str] = []
     queue = [type_name]
     while queue:
         name = queue.pop(0)
-        if name not in seen:
-            seen.append(name)
+        if name not in visited:
+            visited.append(name)
             queue += referenced_types(DEFINITIONS[name], name.partition('/')[0])
-    return seen[1:]
+    return visited[1:]
 
 
 def definition(type_name: str) -> str:
@@ -110,11 +110,11 @@ def definition(type_name: str) -> str:
     """
     if type_name not in DEFINITIONS:
         raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
-    text = DEFINITIONS[type_name]
+    message_definition = DEFINITIONS[type_name]
     for name in _dependencies(type_name):
         package, _, leaf = name.split('/')
-        text += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name]}'
-    return text
+        message_definition += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name]}'
+    return message_definition
 
 
 @functools.cache
@@ -130,9 +130,9 @@ def schema_of(type_name: str) -> Schema:
     Schema
         Empty if `definitions` does not contain the type.
     """
-    known = type_name in DEFINITIONS
-    return Schema(1, definition(type_name).encode() if known else b'',
-                  'ros2msg' if known else '', type_name)
+    is_defined = type_name in DEFINITIONS
+    return Schema(1, definition(type_name).encode() if is_defined else b'',
+                  'ros2msg' if is_defined else '', type_name)
 
 
 @functools.cache

@@ -227,9 +227,10 @@ class Path:
         # In the frame of the start pose: x forward, y left.
         side = np.sign(self.turn)
         forward = lead + self.radius * np.sin(np.abs(angle)) + tail * np.cos(angle)
-        left = side * self.radius * (1.0 - np.cos(angle)) + tail * np.sin(angle)
+        sideways = side * self.radius * (1.0 - np.cos(angle)) + tail * np.sin(angle)
         c, w = np.cos(self.heading), np.sin(self.heading)
-        position = self.start + np.stack([c * forward - w * left, w * forward + c * left], axis=1)
+        position = self.start + np.stack([c * forward - w * sideways,
+                                          w * forward + c * sideways], axis=1)
         return position, self.heading + angle
 
 

@@ -72,7 +72,7 @@ class LiveScene:
         self._is_frame_new = False
         self._tracks: dict[int, LiveTrack] = {}
         # {track id: latest track with this id}
-        self._latest: dict[int, LiveTrack] = {}
+        self._latest_by_id: dict[int, LiveTrack] = {}
         self._is_new = True
 
     def add_frame(self, frame: FieldFrame) -> None:
@@ -101,13 +101,13 @@ class LiveScene:
         track : Track
         """
         with self._lock:
-            live = self._latest.get(track.id)
+            live = self._latest_by_id.get(track.id)
             if live is None or not live.continues(track):
                 if track.ended:
                     return
                 self._n_tracks += 1
                 live = LiveTrack(self._n_tracks, track.id)
-                self._tracks[live.key] = self._latest[track.id] = live
+                self._tracks[live.key] = self._latest_by_id[track.id] = live
             self._extend_time(track.stamp_ns)
             live.add(track, self._frames.get(track.stamp_ns) or self._empty_frame(track))
             self._remove_old_tracks()
@@ -128,7 +128,7 @@ class LiveScene:
             Smoothed positions.
         """
         with self._lock:
-            live = self._latest.get(track_id)
+            live = self._latest_by_id.get(track_id)
             if live is not None:
                 live.smoothed = {**path_entry(track_id, points), 'key': live.key}
                 live.is_smoothed_new = True
@@ -220,5 +220,5 @@ class LiveScene:
             if is_old or n > MAX_POSES:
                 n -= len(live.log.stamp_ns)
                 del self._tracks[key]
-                if self._latest.get(live.log.id) is live:
-                    del self._latest[live.log.id]
+                if self._latest_by_id.get(live.log.id) is live:
+                    del self._latest_by_id[live.log.id]

@@ -155,11 +155,11 @@ class PageServer:
             return get_messages()
         except Exception as error:
             # The page is optional: its errors must stop neither the server nor the nodes.
-            text = f'{type(error).__name__}: {error}'
-            if text not in self._logged_errors:
-                self._logged_errors.add(text)
+            description = f'{type(error).__name__}: {error}'
+            if description not in self._logged_errors:
+                self._logged_errors.add(description)
                 LOG.exception('error in the live page')
-            return [json_text({'type': 'fault', 'text': text})]
+            return [json_text({'type': 'fault', 'text': description})]
 
     def _send_updates(self) -> None:
         """Send new messages to all viewers, and the complete scene to viewers after a lag."""
@@ -167,24 +167,24 @@ class PageServer:
             return
         now = self._loop.time()
         for viewer, allowed in list(self._viewers.items()):
-            waiting = _buffered_bytes(viewer)
-            if waiting > allowed:
+            n_buffered = _buffered_bytes(viewer)
+            if n_buffered > allowed:
                 del self._viewers[viewer]
-                self._lagging[viewer] = now, waiting
+                self._lagging[viewer] = now, n_buffered
                 self.n_lagged += 1
             else:
                 # A complete scene may exceed MAX_BUFFERED; the excess is allowed until it is sent.
-                self._viewers[viewer] = max(MAX_BUFFERED, min(allowed, waiting + MAX_BUFFERED))
+                self._viewers[viewer] = max(MAX_BUFFERED, min(allowed, n_buffered + MAX_BUFFERED))
         for message in self._messages(self._source.news):
             broadcast(self._viewers, message)
-        for viewer, (since, buffered_before) in list(self._lagging.items()):
-            waiting = _buffered_bytes(viewer)
-            if not waiting:
+        for viewer, (progress_time, buffered_before) in list(self._lagging.items()):
+            n_buffered = _buffered_bytes(viewer)
+            if not n_buffered:
                 del self._lagging[viewer]
                 self._send_snapshot(viewer)
-            elif waiting < buffered_before:
-                self._lagging[viewer] = now, waiting
-            elif now - since > LAG_TIMEOUT_S:
+            elif n_buffered < buffered_before:
+                self._lagging[viewer] = now, n_buffered
+            elif now - progress_time > LAG_TIMEOUT_S:
                 del self._lagging[viewer]
                 viewer.transport.abort()
 

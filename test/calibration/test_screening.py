@@ -55,12 +55,12 @@ def screened(fields, rate=100.0, std=SIGMA, threshold=30.0, step=np.inf):
     """Indices of spikes, maximum number of held readings, and indices of late releases."""
     spikes, max_held, late, out, f = [], 0, [], 0, SpikeScreen(threshold, std, step)
     for k, field in enumerate(fields):
-        got = f.feed(k, round(k * NS / rate), field)
-        assert [row for row, _ in got] == list(range(out, out + len(got)))
-        out += len(got)
+        decided = f.feed(k, round(k * NS / rate), field)
+        assert [row for row, _ in decided] == list(range(out, out + len(decided)))
+        out += len(decided)
         max_held = max(max_held, k + 1 - out)
-        spikes += [row for row, is_spike in got if is_spike]
-        late += [row for row, _ in got if row < k]
+        spikes += [row for row, is_spike in decided if is_spike]
+        late += [row for row, _ in decided if row < k]
     rest = f.flush()
     assert [row for row, _ in rest] == list(range(out, len(fields)))
     assert not any(is_spike for _, is_spike in rest)

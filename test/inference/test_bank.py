@@ -129,8 +129,8 @@ def test_best_is_at_the_maximum_of_the_mixture_density():
     b.P[1, :3, :3] *= 0.5
     assert b.best() == 1
     b.log_w = np.log([0.2, 0.3, 0.5])
-    for wrong in (np.nan, np.inf, -1.0):
-        b.P[0, 0, 0] = wrong
+    for invalid in (np.nan, np.inf, -1.0):
+        b.P[0, 0, 0] = invalid
         assert b.best() == 2
 
 
@@ -243,8 +243,9 @@ def test_an_initial_bank_returns_the_rows_of_its_source_bank():
     other = copy(start)
     bank.x[:], bank.P[:] = np.nan, np.nan
     other.keep(np.array([False, False, True, False, True]))
-    for made, rows in ((start.rows(np.array([4, 1])), [4, 1]), (other.rows(np.arange(2)), [2, 4])):
+    for copy_of_rows, rows in ((start.rows(np.array([4, 1])), [4, 1]),
+                               (other.rows(np.arange(2)), [2, 4])):
         for name in ('x', 'P', 'label', 'kind', 'origin', 'nis'):
-            np.testing.assert_array_equal(getattr(made, name), getattr(before, name)[rows])
-        np.testing.assert_allclose(np.exp(made.log_w), 0.5)
+            np.testing.assert_array_equal(getattr(copy_of_rows, name), getattr(before, name)[rows])
+        np.testing.assert_allclose(np.exp(copy_of_rows.log_w), 0.5)
     assert len(start) == 5 and len(other) == 2

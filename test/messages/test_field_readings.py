@@ -129,23 +129,23 @@ def test_a_recording_returns_the_same_samples(tmp_path, known):
         (BATCH_TOPIC, FIELD_READINGS, readings_dict(batch(g))) for g in groups]),
                           line_network(2))
     assert reader.missing_topics() == []
-    got = list(reader.readings_as_received())
-    assert identical(samples_of(*(r for r, _ in got)), [s for g in groups for s in g])
-    assert [t for _, t in got] == [START + k * 10**9 for k, g in enumerate(groups)]
+    batches = list(reader.readings_as_received())
+    assert identical(samples_of(*(r for r, _ in batches)), [s for g in groups for s in g])
+    assert [t for _, t in batches] == [START + k * 10**9 for k, g in enumerate(groups)]
     assert identical(samples_of(*reader.readings_and_accelerations()), recorded(reader))
     assert reader.rejected == Counter()
 
 
 def test_unknown_sensors_and_undecodable_messages_are_counted(tmp_path):
     rng = np.random.default_rng(2)
-    mine = random_samples(3, False, rng, ('mag_1',))
+    known_samples = random_samples(3, False, rng, ('mag_1',))
     other = random_samples(4, False, rng, ('elsewhere',))
-    broken = readings_dict(batch(mine))
+    broken = readings_dict(batch(known_samples))
     broken['stamp'] = broken['stamp'][:2]
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
-        (BATCH_TOPIC, FIELD_READINGS, readings_dict(batch(other + mine))),
+        (BATCH_TOPIC, FIELD_READINGS, readings_dict(batch(other + known_samples))),
         (BATCH_TOPIC, FIELD_READINGS, broken)]), line_network(2))
-    assert identical(recorded(reader), mine)
+    assert identical(recorded(reader), known_samples)
     assert reader.rejected == {'reading of elsewhere, which is not in the network': 4,
                                f'undecodable message on {BATCH_TOPIC}': 1}
 
