@@ -94,7 +94,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     ----------
     names : sequence of n str
     fields : (n, 3) array, T, sensor frames
-        Without a target; NaN = not reported.
+        Measured without a target; NaN = axis not reported.
     R_ws : (n, 3, 3) array
         Sensor to world.
     orientation_std : (n, 3) array, rad

@@ -154,7 +154,7 @@ class LevelDeparture:
         Returns
         -------
         bool or None
-            False: a vehicle has arrived. None: unknown.
+            True: a vehicle has departed. False: a vehicle has arrived. None: unknown.
         """
         if self.has_arrived or not self._has_first_block or len(self.blocks) > MAX_EVALUATED_BLOCKS:
             return False if self.has_arrived else None

@@ -120,7 +120,7 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
     ----------
     up : UpDirection
     field : (3,) array, T, sensor frame
-        Without a target; NaN = axis not reported.
+        Measured without a target; NaN = axis not reported.
     earth_field : (3,) array, T, world frame
     bias_std : float, T
         Standard deviation of the bias of the sensor, including nearby iron, per axis. A bias is

@@ -77,9 +77,9 @@ def test_knocks_and_readings_that_are_not_finite_are_excluded():
 
 
 @pytest.mark.parametrize('a, message', [
-    (np.zeros((0, 3)), '0 accelerations are too few'),
-    (at_rest(np.eye(3), 7), '7 accelerations are too few'),
-    (np.full((50, 3), np.nan), '0 accelerations are too few'),
+    (np.zeros((0, 3)), '8 valid accelerations, got 0'),
+    (at_rest(np.eye(3), 7), '8 valid accelerations, got 7'),
+    (np.full((50, 3), np.nan), '8 valid accelerations, got 0'),
     (at_rest(np.eye(3)) / GRAVITY, r'is its unit g\?'),
     (np.zeros((50, 3)), 'at rest is 0, not 9.81'),
     (1.2 * at_rest(np.eye(3)), 'at rest is 11.8, not 9.81')])
