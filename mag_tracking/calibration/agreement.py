@@ -1,4 +1,4 @@
-"""Comparison of all sensors of a network with the Earth's field, and explanations of differences.
+"""Comparison of the sensors of a network with the Earth's field, and explanation of differences.
 
 Without a target, all sensors measure the same field in different frames. Flipped axes, swapped
 axes, a wrong unit or two exchanged sensors are therefore detected and named.
@@ -19,18 +19,18 @@ FALSE_ALARM_PROBABILITY = 1e-5
 """Probability that a correct sensor is reported."""
 
 MAX_HEADING_STDS = 5.0
-"""Maximum heading error that is tried, in standard deviations."""
+"""Maximum tested heading error, in standard deviations."""
 
 YAW_STEP = np.deg2rad(0.25)
-"""[rad] Step of the headings that are tried; with 20 uT across the vertical it changes the field by
-0.1 uT."""
+"""[rad] Step of the tested headings; a step changes a horizontal field of 20 uT by 0.1 uT."""
 
-MAX_REMAINING_SHARE = 0.3
-"""A change of axes is a partial explanation if the remaining difference is below this share of the
-original one ..."""
+MAX_REMAINING_FRACTION = 0.3
+"""Maximum difference that remains after a partial explanation, as a fraction of the original
+difference."""
 
 MAX_RATIO_TO_NEXT = 0.5
-"""... and below this share of the remainder of the next change of the same complexity."""
+"""Maximum difference that remains after a partial explanation, relative to the next best change of
+axes of the same complexity."""
 
 UNITS = (('gauss', 1e4), ('millitesla', 1e3), ('microtesla', 1e6), ('nanotesla', 1e9))
 _AXES = 'xyz'
@@ -45,20 +45,20 @@ class Disagreement:
 
     sensor: str
     size: float
-    """[T] Size of the difference between measured and expected field."""
+    """[T] Magnitude of the difference between the measured and the expected field."""
     explanations: tuple[str, ...]
     """The simplest possible explanations; empty if no known fault explains the difference."""
 
     def __str__(self) -> str:
-        because = ' or '.join(self.explanations) or (
-            'no axis, unit or exchange of sensors explains it; check for iron or a magnet nearby '
-            'and the stated orientation')
+        cause = ' or '.join(self.explanations) or (
+            'no change of axes, other unit or exchange of sensors explains it; check for iron or '
+            'magnets nearby, and check the configured orientation')
         return (f'{self.sensor} differs from the Earth\'s field by {self.size * 1e6:.3g} uT: '
-                f'{because}')
+                f'{cause}')
 
 
 def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
-    """Field that most sensors of a network agree on.
+    """Median field of the sensors of a network.
 
     Parameters
     ----------
@@ -74,13 +74,14 @@ def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
     Raises
     ------
     ValueError
-        If fewer than three sensors report all axes; two sensors do not show which one is correct.
+        If fewer than three sensors report all axes: two sensors do not reveal the faulty sensor.
     """
-    whole = ~np.isnan(fields).any(axis=1)
-    if np.count_nonzero(whole) < 3:
-        raise ValueError('without earth_field, three sensors with three axes are required for a '
-                         f'comparison, there are {np.count_nonzero(whole)}')
-    field: FloatArray = np.median(np.einsum('jik,jk->ji', R_ws[whole], fields[whole]), axis=0)
+    is_complete = ~np.isnan(fields).any(axis=1)
+    if np.count_nonzero(is_complete) < 3:
+        raise ValueError('a comparison without earth_field requires three sensors that report '
+                         f'all axes, but there are {np.count_nonzero(is_complete)}')
+    field: FloatArray = np.median(
+        np.einsum('jik,jk->ji', R_ws[is_complete], fields[is_complete]), axis=0)
     return field
 
 
@@ -93,7 +94,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     ----------
     names : sequence of n str
     fields : (n, 3) array, T, sensor frames
-        Without a target; NaN = not reported.
+        Measured without a target; NaN = axis not reported.
     R_ws : (n, 3, 3) array
         Sensor to world.
     orientation_std : (n, 3) array, rad
@@ -121,28 +122,28 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
 def _fits(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray,
           bias_std: float) -> bool:
     """Whether a field is consistent with the Earth's field at the best heading."""
-    return _fits_numbers(_numbers(y), _numbers(R_ws), _numbers(std), _numbers(B0), bias_std)
+    return _fits_cached(_cache_key(y), _cache_key(R_ws), _cache_key(std), _cache_key(B0), bias_std)
 
 
-def _numbers(a: FloatArray) -> tuple[float, ...]:
-    """Elements as a hashable cache key."""
+def _cache_key(a: FloatArray) -> tuple[float, ...]:
+    """Elements of an array as a hashable cache key."""
     return tuple(np.ravel(a).tolist())
 
 
 @functools.lru_cache(maxsize=4096)
-def _fits_numbers(field: tuple[float, ...], orientation: tuple[float, ...],
-                  orientation_std: tuple[float, ...], B0: tuple[float, ...],
-                  bias_std: float) -> bool:
-    """`_fits` of tuples, cached, since a monitored network is checked every second."""
+def _fits_cached(field: tuple[float, ...], orientation: tuple[float, ...],
+                 orientation_std: tuple[float, ...], B0: tuple[float, ...],
+                 bias_std: float) -> bool:
+    """Cached version of `_fits`, with tuples as arguments."""
     y, R_ws, std = (np.array(field), np.array(orientation).reshape(3, 3),
                     np.array(orientation_std))
     reported = ~np.isnan(y)
     if not reported.any():
         return True
-    # Heading errors may be large and are tried; tilts are small and are linearised.
+    # Heading errors may be large, so a grid is tested; tilts are small and are linearised.
     yaw, B = _headings(std, np.array(B0))
-    turn = (R_ws.T @ np.cross(np.eye(3), np.array(B0)).T * std)[:, :2]
-    S = (bias_std**2 * np.eye(3) + turn @ turn.T)[np.ix_(reported, reported)]
+    tilt_effect = (R_ws.T @ np.cross(np.eye(3), np.array(B0)).T * std)[:, :2]
+    S = (bias_std**2 * np.eye(3) + tilt_effect @ tilt_effect.T)[np.ix_(reported, reported)]
     r = (y - B @ R_ws)[:, reported]
     energy = np.einsum('ni,ij,nj->n', r, np.linalg.inv(S), r) + (yaw / std[2])**2
     return bool(energy.min() <= chi2.isf(FALSE_ALARM_PROBABILITY, np.count_nonzero(reported)))
@@ -164,29 +165,32 @@ def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields:
     found += [f'its unit is {unit}' for unit, scale in UNITS if fits(y / scale)]
     if found:
         return tuple(found)
-    for others in _changes():
-        found = [text for text, order, signs in others if fits(signs * y[list(order)])]
+    for changes in _axis_changes():
+        found = [description for description, order, signs in changes
+                 if fits(signs * y[list(order)])]
         if found:
             return tuple(found)
     return _partial_explanation(y, R_ws[j], orientation_std[j], B0)
 
 
 def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
-                 B0: FloatArray) -> tuple[str, ...]:
+                         B0: FloatArray) -> tuple[str, ...]:
     """Simplest change of axes that explains most of the difference, if any."""
-    before = _remaining(y, R_ws, std, B0)
-    for others in _changes():
-        left = sorted((_remaining(signs * y[list(order)], R_ws, std, B0), text)
-                      for text, order, signs in others)
-        # If two changes explain it equally well, neither is reported.
-        if left[0][0] < MAX_REMAINING_SHARE * before and not (
-                len(left) > 1 and left[1][0] < left[0][0] / MAX_RATIO_TO_NEXT):
-            return (f'{left[0][1]}, and {left[0][0] * 1e6:.2g} uT remain (iron nearby, or the bias '
-                    'of the sensor)',)
+    original = _remaining_difference(y, R_ws, std, B0)
+    for changes in _axis_changes():
+        remainders = sorted(
+            (_remaining_difference(signs * y[list(order)], R_ws, std, B0), description)
+            for description, order, signs in changes)
+        # If two changes explain the difference equally well, neither is reported.
+        if remainders[0][0] < MAX_REMAINING_FRACTION * original and not (
+                len(remainders) > 1 and remainders[1][0] < remainders[0][0] / MAX_RATIO_TO_NEXT):
+            return (f'{remainders[0][1]}, and {remainders[0][0] * 1e6:.2g} uT remain (iron nearby, '
+                    'or the bias of the sensor)',)
     return ()
 
 
-def _remaining(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray) -> float:
+def _remaining_difference(y: FloatArray, R_ws: FloatArray, std: FloatArray,
+                          B0: FloatArray) -> float:
     """Difference [T] from the Earth's field at the best heading."""
     reported = ~np.isnan(y)
     _, B = _headings(std, B0)
@@ -195,32 +199,32 @@ def _remaining(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray)
 
 def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Possible heading errors (n,) [rad] of a sensor, and the Earth's field (n, 3) for each."""
-    most = min(np.pi, MAX_HEADING_STDS * std[2])
-    yaw = np.linspace(-most, most, 1 + 2 * max(1, round(most / YAW_STEP)))
+    max_error = min(np.pi, MAX_HEADING_STDS * std[2])
+    yaw = np.linspace(-max_error, max_error, 1 + 2 * max(1, round(max_error / YAW_STEP)))
     return yaw, np.stack([B0[0] * np.cos(yaw) + B0[1] * np.sin(yaw),
                           B0[1] * np.cos(yaw) - B0[0] * np.sin(yaw), np.full(len(yaw), B0[2])],
                          axis=1)
 
 
-def _changes() -> list[list[_AxisChange]]:
-    """Groups of equally complex signed permutations, simplest first: (text, order, signs)."""
+def _axis_changes() -> list[list[_AxisChange]]:
+    """Groups of equally complex signed permutations, simplest first."""
     groups: dict[tuple[int, int], list[_AxisChange]] = {}
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
-            moved = sum(k != i for i, k in enumerate(order))
-            flipped = [_AXES[i] for i, s in enumerate(signs) if s < 0.0]
-            if not moved and not flipped:
+            n_moved = sum(k != i for i, k in enumerate(order))
+            flipped_axes = [_AXES[i] for i, s in enumerate(signs) if s < 0.0]
+            if not n_moved and not flipped_axes:
                 continue
             parts = []
-            if moved == 2:
+            if n_moved == 2:
                 parts.append(' and '.join(_AXES[i] for i in range(3) if order[i] != i)
                              + ' are swapped')
-            elif moved:
+            elif n_moved:
                 parts.append('its axes are in the order '
                              + ', '.join(_AXES[order.index(i)] for i in range(3)))
-            if flipped:
-                parts.append(f'{" and ".join(flipped)} {"is" if len(flipped) == 1 else "are"} '
-                             'flipped')
-            groups.setdefault((moved + len(flipped) + (moved > 0), moved), []).append(
+            if flipped_axes:
+                parts.append(f'{" and ".join(flipped_axes)} '
+                             f'{"is" if len(flipped_axes) == 1 else "are"} flipped')
+            groups.setdefault((n_moved + len(flipped_axes) + (n_moved > 0), n_moved), []).append(
                 (', '.join(parts), order, np.array(signs)))
     return [groups[key] for key in sorted(groups)]

@@ -1,10 +1,11 @@
 """Running estimate of the background and noise of one sensor from intervals without a target.
 
 The background is a line in time (level and drift) through the means of short quiet blocks; the
-noise is their pooled scatter. A block that departs from the line freezes the estimate and discards
-the blocks shortly before, because a target approaches gradually. Without a quiet interval, the most
-frequent level is a provisional background. TSP14 section VI and T10 section 6.3 use the mean and
-covariance of a target-free interval; the line and the freezing are additions of this package.
+noise is pooled from the scatter within the blocks. A block that departs from the line freezes the
+estimate and discards the blocks shortly before it, because a target approaches gradually. Without a
+quiet interval, the most frequent level is a provisional background. TSP14 section VI and T10
+section 6.3 use the mean and covariance of a target-free interval; the line and the freezing are
+additions of this package.
 """
 
 from collections import deque
@@ -21,7 +22,7 @@ from mag_tracking.calibration.drift import FormerLevel, is_steep
 from mag_tracking.calibration.frequent_level import MIN_DURATION_RATIO
 from mag_tracking.calibration.learning_window import LearningWindow
 from mag_tracking.calibration.level_change import ChangeEvaluator, SharedChanges
-from mag_tracking.calibration.level_departure import SHORTENED_SHARE, LevelDeparture
+from mag_tracking.calibration.level_departure import SHORTENED_FRACTION, LevelDeparture
 from mag_tracking.calibration.provisional import MIN_SEEN_S, FrequentLevel, ProvisionalLevel
 from mag_tracking.calibration.quiet_interval import QuietInterval, line_of
 from mag_tracking.calibration.resolution import MIN_STD, corrected_steps
@@ -45,20 +46,20 @@ class RunningBackground:
         A block departs from the background if its mean differs by this number of standard
         deviations of the noise.
     relearn : float, s
-        Time on another steady level after which that level becomes the background. Shorter if the
-        background was observed only briefly, or contains a target that has left. 0 = never.
+        Time on another steady level after which that level becomes the background. It is shorter if
+        the background was observed only briefly, or contains a target that has left. 0 = never.
     background : (3,) array, T, optional
         Known background.
     noise_std : (3,) array, T, optional
         Known noise. If both are known, the background is ready at once.
     phase : float, optional
-        Staggers the blocks of sensors that started together: the first block is longer by this
-        share, the others follow at even times. A complete block is evaluated by `evaluate_block`,
-        or before the next reading. Without a phase it is evaluated at once.
+        Extra length of the first block, as a fraction of `block`, which staggers the blocks of
+        sensors that started together. A complete block is then evaluated by `evaluate_block`, or
+        before the next reading. Default: blocks are evaluated at once.
     sensors : (1,) SENSOR array
-        State of the sensor: contains the current block, and line and noise for compiled code.
+        State of the sensor: the current block, and the line and noise for compiled code.
     evaluate_change : ChangeEvaluator, optional
-        Evaluates level changes of the sensor together with those of other sensors.
+        Classifies level changes of the sensor together with the changes at other sensors.
 
     Attributes
     ----------
@@ -82,8 +83,8 @@ class RunningBackground:
         self._max_blocks = max(3, int(round(memory / block)))
         self._quiet = QuietInterval(guard, self._max_blocks)
         self._learning_window = LearningWindow(learn, block, self._max_blocks)
-        self._given = None if background is None else np.asarray(background, dtype=float)
-        self._given_noise: FloatArray | None = \
+        self._known_background = None if background is None else np.asarray(background, dtype=float)
+        self._known_noise: FloatArray | None = \
             None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
         self._level = BackgroundLevel(sensors, freeze_std)
         self.n_relearnt = 0
@@ -94,27 +95,27 @@ class RunningBackground:
         self.forget()
 
     def forget(self) -> None:
-        """Discard everything learnt; the known background and noise remain."""
+        """Discard the learnt background and noise; known values are retained."""
         self._state['n'], self._state['end'], self._state['is_full'] = 0, np.nan, False
         self._quiet.clear()
         self._learning_window.clear()
         self._departure.forget()
         self.frozen = self.stuck = False
-        self._resumed = self._relearns_soon = self._contested = self._steep = False
+        self._is_resumed = self._relearns_soon = self._is_contested = self._is_steep = False
         self._provisional.clear()
         # Frames still in the pipeline remain doubtful.
         self.doubtful_times = updated(self.doubtful_times, int(self._state['last_ns']), False)
         # Duration for which the level was observed, its end, and the start of the background.
-        self._seen_s = 0.0 if self._given is None else inf
-        self._seen_until = self._since = np.nan
+        self._seen_s = 0.0 if self._known_background is None else inf
+        self._seen_until = self._start_time = np.nan
         self._level.set_uncertainty()
-        self._level.set(None if self._given is None else (0.0, self._given, np.zeros(3), 0.0),
-                        self._given_noise)
+        self._level.set(None if self._known_background is None
+                        else (0.0, self._known_background, np.zeros(3), 0.0), self._known_noise)
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
-        """Continue from a background that was recently known.
+        """Resume with a background that was known recently.
 
-        The level is constant until the quiet interval is as long as for a new background.
+        The level is constant until the quiet interval is as long as a new background requires.
 
         Parameters
         ----------
@@ -125,16 +126,16 @@ class RunningBackground:
         """
         noise = np.asarray(covariance, dtype=float)
         self._level.set((0.0, np.asarray(background, dtype=float), np.zeros(3), 0.0),
-                        noise if self._given_noise is None else self._given_noise)
-        self._resumed = self._relearns_soon = True
-        self._seen_s, self._steep = inf, False
+                        noise if self._known_noise is None else self._known_noise)
+        self._is_resumed = self._relearns_soon = True
+        self._seen_s, self._is_steep = inf, False
         self._level.set_uncertainty()
 
     def start_from(self, level: FloatArray, covariance: FloatArray) -> None:
-        """Start with a level that is taken from other readings.
+        """Start with a level that was determined from other readings.
 
-        As `resume`, but another level has to last for the full time to replace it. No effect if no
-        axis changes.
+        Unlike after `resume`, another level must last for the full time to replace this level. No
+        effect if all axes are constant.
 
         Parameters
         ----------
@@ -156,11 +157,11 @@ class RunningBackground:
     @property
     def doubtful(self) -> bool:
         """Whether the background is provisional or may contain the field of a target."""
-        return self._level.is_provisional or self._contested or self._steep
+        return self._level.is_provisional or self._is_contested or self._is_steep
 
     @property
     def departed_at(self) -> float | None:
-        """Time [s] at which a vehicle present from the start had left; None if there was none."""
+        """Time [s] by which a vehicle present at the start had left; None = no such vehicle."""
         return self._departure.departed_at
 
     @property
@@ -170,7 +171,10 @@ class RunningBackground:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Noise of one sample including steps, (3, 3) T², or None; NaN = axis not reported."""
+        """Noise covariance of one sample, (3, 3) T², or None; NaN = axis not reported.
+
+        The variance due to the sensor's steps is included.
+        """
         return self._level.covariance
 
     @property
@@ -198,13 +202,13 @@ class RunningBackground:
 
     @property
     def scatter_std(self) -> FloatArray:
-        """Scatter of the quiet readings including their steps, (3,) T; NaN = unknown."""
+        """Standard deviation of the quiet readings including steps, (3,) T; NaN = unknown."""
         variance = self._quiet.scatter() + self._state['step_variance']
         return np.where(variance > 0.0, np.sqrt(variance), np.nan)
 
     @property
     def measured(self) -> bool:
-        """Whether the background is from readings, not the known one."""
+        """Whether the background was measured rather than given."""
         return bool(self._quiet) and self.ready
 
     def evaluate_block(self) -> None:
@@ -213,64 +217,64 @@ class RunningBackground:
             return
         block = block_of(self._sensors)
         self._state['is_full'] = False
-        still = (block.n > 1) & (block.scatter.diagonal() < MIN_STD**2 * (block.n - 1))
+        is_constant = (block.n > 1) & (block.scatter.diagonal() < MIN_STD**2 * (block.n - 1))
         if self.ready and not self._level.is_provisional:
             self._level.apply_steps()
             # A constant axis is at rest if its steps are coarse, and stuck if they are fine.
-            self.stuck = bool((still & (self._state['step_variance'] == 0.0)
+            self.stuck = bool((is_constant & (self._state['step_variance'] == 0.0)
                                & ~np.isnan(self._state['noise_std'])).any())
             if not self.stuck:
-                self._follow(block)
+                self._update(block)
         else:
-            self.stuck = bool(still[block.n > 1].all())
-            self._begin(block)
+            self.stuck = bool(is_constant[block.n > 1].all())
+            self._collect_until_quiet(block)
         last_ns = int(self._state['last_ns'])
         self.doubtful_times = updated(self.doubtful_times, last_ns, self.doubtful)
 
-    def _begin(self, block: Block) -> None:
-        """Before the background is ready: collect blocks until a quiet interval is long enough."""
-        self._since = block.time if np.isnan(self._since) else self._since
+    def _collect_until_quiet(self, block: Block) -> None:
+        """Add a block, and adopt a quiet interval as the background once it is long enough."""
+        self._start_time = block.time if np.isnan(self._start_time) else self._start_time
         segments = self._learning_window.segments(block, self.stuck)
         if not any(self._adopt_if_steady(s) for s in segments) and not self.stuck:
-            self._provide(block)
+            self._start_provisionally(block)
 
-    def _provide(self, block: Block) -> None:
-        """Without a quiet interval: start with the most frequent level."""
+    def _start_provisionally(self, block: Block) -> None:
+        """Add a block, and start with the most frequent level if it is known."""
         self._provisional.collect(block)
-        found = self._provisional.found(corrected_steps(self._sensors))
-        if found is not None and self._given is not None:
-            self.start_from(self._given, found.level.covariance)
+        frequent = self._provisional.frequent_level(corrected_steps(self._sensors))
+        if frequent is not None and self._known_background is not None:
+            self.start_from(self._known_background, frequent.level.covariance)
             self._learning_window.clear()
-        elif found is not None and found.is_certain:
-            self._begin_with_frequent(found)
-        elif found is not None:
-            level, noise = found.level, self._level.without_dead_axes(found.level.covariance)
+        elif frequent is not None and frequent.is_certain:
+            self._start_with_frequent(frequent)
+        elif frequent is not None:
+            level, noise = frequent.level, self._level.without_dead_axes(frequent.level.covariance)
             if not np.isnan(noise).all():
                 self._level.set((0.0, level.level, np.zeros(3), 0.0),
-                                noise if self._given_noise is None else self._given_noise)
-                self._level.set_uncertainty(found.std, is_provisional=True)
+                                noise if self._known_noise is None else self._known_noise)
+                self._level.set_uncertainty(frequent.std, is_provisional=True)
 
-    def _begin_with_frequent(self, found: FrequentLevel) -> None:
+    def _start_with_frequent(self, frequent: FrequentLevel) -> None:
         """Start with a frequent level; other levels may still replace it."""
-        self.start_from(found.level.level, found.level.covariance)
-        self._seen_s, self.frozen, self._contested = found.seen_s, False, False
+        self.start_from(frequent.level.level, frequent.level.covariance)
+        self._seen_s, self.frozen, self._is_contested = frequent.seen_s, False, False
         self._learning_window.clear()
         self._departure.end()
 
-    def _follow(self, block: Block) -> None:
-        """Once the background is ready: extend the quiet interval, or freeze."""
-        off = np.abs(self._level.departure(block.time, block.mean))
-        # A comparison with NaN is false: an axis that is not reported does not freeze.
-        self.frozen = bool((off > self._level.limits).any())
+    def _update(self, block: Block) -> None:
+        """Extend the quiet interval by a block, or freeze the background."""
+        difference = np.abs(self._level.departure(block.time, block.mean))
+        # A comparison with NaN is false: an axis that is not reported freezes nothing.
+        self.frozen = bool((difference > self._level.limits).any())
         self._provisional.collect(block)
         if self.frozen:
             self._departure.add(block, self._quiet.pending)
             self._quiet.pending.clear()
             self._change_if_steady(block)
             return
-        self._contested = False
+        self._is_contested = False
         if self._departure.was_steady:
-            self._provisional.clear()  # The vehicle has left; its level is obsolete.
+            self._provisional.clear()  # The level of the vehicle, which has left, is obsolete.
         if not np.isnan(self._seen_until):
             self._seen_s += block.time - self._seen_until
         self._seen_until = block.time
@@ -279,89 +283,90 @@ class RunningBackground:
             self._fit(blocks)
 
     def _change_if_steady(self, block: Block) -> None:
-        """While frozen: adopt another level that lasts, or that was the background before."""
+        """While frozen, adopt another level that lasts or that was the background before."""
         self._seen_until = np.nan
         departure = self._departure
-        since = block.time - departure.blocks[0].time
-        relearn_time = departure.relearn_time(self._seen_s, self._resumed and self._relearns_soon)
+        duration = block.time - departure.blocks[0].time
+        relearn_time = departure.relearn_time(
+            self._seen_s, self._is_resumed and self._relearns_soon)
         if not relearn_time:
             return departure.end()
-        other = self._provisional.found(corrected_steps(self._sensors))
-        if other is not None and other.level.is_at(self._level.at(block.time)):
-            other = None
-        latest = departure.steady_end(SHORTENED_SHARE)
-        if latest is not None and self._relearn and self._adopt_if_background(latest):
+        other_level = self._provisional.frequent_level(corrected_steps(self._sensors))
+        if other_level is not None and other_level.level.is_at(self._level.at(block.time)):
+            other_level = None
+        new_blocks = departure.steady_end(SHORTENED_FRACTION)
+        if new_blocks is not None and self._relearn and self._adopt_if_background(new_blocks):
             return
-        # Two levels of equal duration may both be the background, unless a vehicle was observed
-        # to arrive at one of them.
-        self._contested = not departure.has_arrived and (
-            self._contested
-            or since >= min(self._seen_s, self._relearn) and departure.steady_end() is not None
-            or other is not None and other.seen_s >= min(self._seen_s, MIN_SEEN_S))
-        if since < relearn_time:
+        # Either of two levels of equal duration may be the background, unless a vehicle was
+        # observed to arrive at one of the levels.
+        self._is_contested = not departure.has_arrived and (
+            self._is_contested
+            or duration >= min(self._seen_s, self._relearn) and departure.steady_end() is not None
+            or other_level is not None and other_level.seen_s >= min(self._seen_s, MIN_SEEN_S))
+        if duration < relearn_time:
             return
         if self._adopt_if_steady(departure.blocks):
             self.n_relearnt += 1
-            self.frozen = self._contested = False
-        elif other is not None and other.is_certain:
+            self.frozen = self._is_contested = False
+        elif other_level is not None and other_level.is_certain:
             self.n_relearnt += 1
-            self._begin_with_frequent(other)
+            self._start_with_frequent(other_level)
         else:
             departure.shorten()
 
-    def _adopt_if_background(self, latest: deque[Block]) -> bool:
-        """Adopt the level of the `latest` blocks if it is the background; return whether it is."""
+    def _adopt_if_background(self, new_blocks: deque[Block]) -> bool:
+        """Adopt the level of the `new_blocks` if it is the background; return whether it is."""
         former_seen_s = self._departure.former_seen_s()
         if former_seen_s:
-            self._change_to(latest, former_seen_s)
+            self._change_to(new_blocks, former_seen_s)
             return True
-        is_given = self._given is not None and self._departure.former is None
-        if not self._departure.has_departed(latest) or is_given:
+        is_known = self._known_background is not None and self._departure.former is None
+        if not self._departure.has_departed(new_blocks) or is_known:
             return False
-        since_ns = int(self._state['first_ns']) + round(np.nan_to_num(self._since) * NS)
-        self._change_to(latest, self._learn)
+        since_ns = int(self._state['first_ns']) + round(np.nan_to_num(self._start_time) * NS)
+        self._change_to(new_blocks, self._learn)
         # The earlier background contained the field of the vehicle.
         self.doubtful_times = doubtful_since(self.doubtful_times, since_ns)
         return True
 
-    def _change_to(self, latest: deque[Block], seen_s: float) -> None:
-        """Continue with the level of the `latest` blocks, observed for `seen_s` [s] in total."""
+    def _change_to(self, new_blocks: deque[Block], seen_s: float) -> None:
+        """Change the background to the level of `new_blocks`, observed for `seen_s` [s]."""
         # The first half may contain the tail of the departing vehicle's field.
-        half = list(latest)[len(latest) // 2:]
-        self._depart_from(half[0].time)
-        self._level.set_constant(stacked(half))
-        self._resumed, self._relearns_soon, self._seen_s = True, False, seen_s
-        self._quiet.begin(half)
+        second_half = list(new_blocks)[len(new_blocks) // 2:]
+        self._store_former_level(second_half[0].time)
+        self._level.set_constant(stacked(second_half))
+        self._is_resumed, self._relearns_soon, self._seen_s = True, False, seen_s
+        self._quiet.begin(second_half)
         self.n_relearnt += 1
-        self.frozen = self._contested = self._steep = False
+        self.frozen = self._is_contested = self._is_steep = False
 
-    def _depart_from(self, begin: float) -> None:
-        """Keep the present level as the former one; another is the background since `begin` [s]."""
-        self._since = begin
+    def _store_former_level(self, begin: float) -> None:
+        """Store the present level as the former level, which ended at `begin` [s]."""
+        self._start_time = begin
         self._departure.former = FormerLevel(begin, self._level.at(begin), self._seen_s)
         self._departure.end()
 
     def _adopt_if_steady(self, collected: deque[Block]) -> bool:
         """Adopt the collected blocks as the background if they lie on one line."""
         blocks = stacked(collected)
-        noise = pooled_covariance(blocks) if self._given_noise is None else self._given_noise
+        noise = pooled_covariance(blocks) if self._known_noise is None else self._known_noise
         noise = None if noise is None else self._level.without_dead_axes(noise)
         if noise is None or np.isnan(noise).all():
             return False
-        before = self._level.noise
+        previous_noise = self._level.noise
         self._level.set(self._level.line, noise)
         if not self._level.are_steady(blocks):
-            self._level.set(self._level.line, before)
+            self._level.set(self._level.line, previous_noise)
             return False
-        if self._given is not None and self._level.line is not None and not self.n_relearnt \
-                and not self.frozen:
+        if self._known_background is not None and self._level.line is not None \
+                and not self.n_relearnt and not self.frozen:
             # The background was given and only the noise had to be learnt.
             self._learning_window.clear()
             return True
         if self.frozen and self._level.line is not None:
-            self._depart_from(float(blocks.time[0]))
+            self._store_former_level(float(blocks.time[0]))
         # The required length was checked by the caller; the initial length does not apply.
-        self._resumed = False
+        self._is_resumed = False
         self._seen_s = float(blocks.time[-1] - blocks.time[0]) + self._length
         self._seen_until = float(blocks.time[-1])
         self._level.set_uncertainty()
@@ -372,15 +377,16 @@ class RunningBackground:
 
     def _fit(self, blocks: Blocks) -> None:
         """Fit line and noise to the quiet `blocks`."""
-        if (self._given is not None or self._resumed) and np.ptp(blocks.time) < self._learn:
+        if (self._known_background is not None or self._is_resumed) \
+                and np.ptp(blocks.time) < self._learn:
             return
-        self._resumed = False
+        self._is_resumed = False
         line = line_of(blocks)
         assert self._level.noise is not None
         is_young = MIN_DURATION_RATIO * self._seen_s < self._relearn
-        self._steep = is_young and is_steep(
+        self._is_steep = is_young and is_steep(
             blocks, line[2], self._level.noise.diagonal() + self._state['step_variance'])
-        self._level.set_uncertainty(np.abs(line[2]) * self._learn if self._steep else 0.0)
-        noise = pooled_covariance(blocks) if self._given_noise is None else None
+        self._level.set_uncertainty(np.abs(line[2]) * self._learn if self._is_steep else 0.0)
+        noise = pooled_covariance(blocks) if self._known_noise is None else None
         self._level.set(line, self._level.noise if noise is None
                         else self._level.without_dead_axes(noise))

@@ -1,4 +1,4 @@
-"""Background line and noise of one sensor, stored where compiled code reads them."""
+"""Background line and noise of one sensor, in arrays that compiled code can read."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -25,18 +25,18 @@ class BackgroundLevel:
     sensors : (1,) SENSOR array
         State of the sensor.
     freeze_std : float
-        Number of standard deviations by which the mean of a block departs from the background.
+        Number of standard deviations beyond which the mean of a block departs from the background.
 
     Attributes
     ----------
     line : (float, (3,), (3,), float) or None
         Centre [s], mean [T], slope [T/s] and horizon [s].
     noise : (3, 3) array or None, T²
-        Noise of one reading, without its steps.
+        Noise covariance of one reading, without the variance due to steps.
     limits : (3,) array, T
-        Maximum deviation of the mean of a block from the background.
+        Maximum difference between the mean of a block and the background.
     is_provisional : bool
-        Whether the line may be that of something else.
+        Whether the line may not be the background.
     """
 
     def __init__(self, sensors: StructArray, freeze_std: float) -> None:
@@ -59,7 +59,7 @@ class BackgroundLevel:
         line : (float, (3,), (3,), float) or None
             Centre [s], mean [T], slope [T/s] and horizon [s].
         noise : (3, 3) array or None, T²
-            Noise of one reading, without its steps.
+            Noise covariance of one reading, without the variance due to steps.
         """
         s = self._state
         self.line, self.noise = line, noise
@@ -70,7 +70,7 @@ class BackgroundLevel:
         self.apply_steps()
 
     def apply_steps(self) -> None:
-        """Update the noise for the sensor's steps, which may have been found since `set`."""
+        """Add the variance due to the sensor's steps, which may have changed since `set`."""
         core.apply_steps(self._sensors, self._freeze_std, self.limits)
 
     def without_dead_axes(self, noise: FloatArray) -> FloatArray:
@@ -83,7 +83,7 @@ class BackgroundLevel:
         Returns
         -------
         (3, 3) array, T²
-            NaN for an axis that is constant and does not rest.
+            NaN for a dead axis, which is constant although its steps are not coarse.
         """
         steps, variance = corrected_steps(self._sensors), noise.diagonal()
         if np.isfinite(steps).all() and (variance > MIN_STD**2).all():
@@ -116,13 +116,17 @@ class BackgroundLevel:
         std : (3,) array or float, T
             Standard deviation; NaN = axis not reported.
         is_provisional : bool
+            Whether the line may not be the background.
         """
         self.is_provisional = is_provisional
         self._state['level_variance'] = np.where(np.isnan(std), 0.0, np.square(std))
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Noise of one sample including steps, (3, 3) T², or None; NaN = axis not reported."""
+        """Noise covariance of one sample, (3, 3) T², or None; NaN = axis not reported.
+
+        The variance due to the sensor's steps is included.
+        """
         if self.noise is None:
             return None
         covariance: FloatArray = self.noise + np.diag(self._state['step_variance'])
@@ -152,7 +156,7 @@ class BackgroundLevel:
         return -self.departure(time, np.zeros(3))
 
     def set_constant(self, blocks: Blocks) -> None:
-        """Set a constant level, the mean of some blocks.
+        """Set a constant level, the mean of the given blocks.
 
         Parameters
         ----------
@@ -206,7 +210,7 @@ class BackgroundLevel:
         return out
 
     def steady_end(self, blocks: Sequence[Block], length: float) -> deque[Block] | None:
-        """Latest blocks if they are of a steady level.
+        """Latest blocks, if they are at a steady level.
 
         Parameters
         ----------
@@ -220,16 +224,16 @@ class BackgroundLevel:
             None if the blocks are not steady or too few.
         """
         since = blocks[-1].time - length
-        latest: deque[Block] = deque()
+        latest_blocks: deque[Block] = deque()
         for block in reversed(blocks):
-            if block.time <= since and len(latest) >= 3:
+            if block.time <= since and len(latest_blocks) >= 3:
                 break
-            latest.appendleft(block)
+            latest_blocks.appendleft(block)
         is_long = len(blocks) >= 3 and blocks[0].time <= since
-        return latest if is_long and self.are_steady(stacked(latest)) else None
+        return latest_blocks if is_long and self.are_steady(stacked(latest_blocks)) else None
 
     def are_steady(self, blocks: Blocks) -> bool:
-        """Whether blocks are of one steady level, given the present noise.
+        """Whether blocks are at one steady level, given the present noise.
 
         Parameters
         ----------
@@ -240,6 +244,6 @@ class BackgroundLevel:
         bool
         """
         centre, mean, slope = line_through(blocks)
-        off = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
+        residual = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
         return not has_noisy_block(blocks, self._state['step_variance']) \
-            and bool(np.nanmax(off / self.limits) <= 1.0)
+            and bool(np.nanmax(residual / self.limits) <= 1.0)

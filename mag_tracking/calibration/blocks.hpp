@@ -24,7 +24,7 @@ inline void subtract_background(const Sensor& s, double time, const double* fiel
 // Integer part of a / b for `a` >= 0 and `b` > 0, correct even if the quotient is rounded up.
 inline double whole_times(double a, double b) { return std::round((a - std::fmod(a, b)) / b); }
 
-// Begin the next block if a reading at `time` [s] is the first after the current one. An earlier
+// Begin the next block if a reading at `time` [s] is the first after the current block. An earlier
 // complete block (`is_full`) must have been evaluated before.
 inline void begin_block_if_due(Sensor& s, double time) {
     if (std::isnan(s.end)) {
@@ -71,8 +71,8 @@ inline void collect(Sensor& s, double time, const double* field) {
     }
 }
 
-// Mean (3) [T] and sum of squared deviations (3, 3) [T^2] of block `k`; a missing axis affects its
-// own elements only.
+// Mean (3) [T] and sum of squared deviations (3, 3) [T^2] of block `k`; a missing axis affects only
+// its own elements.
 inline void moments(const Sensor& s, int64_t k, double* mean, double* scatter) {
     const auto &count = s.count[k], &sum = s.sum[k];
     for (int a = 0; a < 3; ++a) mean[a] = count[a][a] > 0.0 ? sum[a][a] / count[a][a] : NAN;
@@ -86,8 +86,8 @@ inline void moments(const Sensor& s, int64_t k, double* mean, double* scatter) {
 }
 
 // Pooled covariance within k blocks, from their sums of squared deviations `scatter` (k, 3, 3) and
-// numbers of samples `n` (k, 3), into `out` (3, 3); NaN if an axis is not reported. Returns false
-// if there are too few samples.
+// numbers of samples `n` (k, 3), into `out` (3, 3); NaN = axis not reported. Returns false if there
+// are too few samples.
 inline bool pool(int64_t k, const double* scatter, const double* n, double* out) {
     double freedom[3] = {0.0, 0.0, 0.0}, sum[9] = {};
     for (int64_t i = 0; i < k; ++i) {
@@ -104,7 +104,7 @@ inline bool pool(int64_t k, const double* scatter, const double* n, double* out)
 }
 
 // Weighted least-squares line of one axis through the means `y` [T] of k blocks of `n` readings at
-// `time` [s]; its value and slope at `centre`. `y` and `n` have a stride of three. NaN if no block
+// `time` [s]: its value and slope at `centre`. `y` and `n` have a stride of three. NaN if no block
 // has the axis.
 inline void line(int64_t k, const double* time, const double* n, const double* y, double centre,
                  double& mean, double& slope) {

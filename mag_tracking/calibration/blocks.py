@@ -11,9 +11,9 @@ from mag_tracking.calibration import core
 from mag_tracking.records import plain
 
 MAX_VARIANCE_RATIO = 100.0
-"""Maximum ratio of the variance of a block to that of the quietest block. A higher ratio is not
-noise: a target passed within the block, which is possible in the long blocks of a slow sensor.
-Noise and coarse steps remain well below."""
+"""Maximum ratio of the variance of a block to the variance of the quietest block. A target that
+passes within a block, as in the long blocks of a slow sensor, causes a higher ratio. Noise and
+coarse steps cause much lower ratios."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class Block:
     time: float
     """[s] Mean time of the readings."""
     mean: FloatArray
-    """(3,) [T]; NaN = axis not reported."""
+    """(3,) [T] Mean field; NaN = axis not reported."""
     scatter: FloatArray
     """(3, 3) [T²] Sum of squared deviations from the mean."""
     n: FloatArray
-    """(3,) number of samples per axis."""
+    """(3,) Number of samples per axis."""
 
 
 def block_of(sensors: StructArray) -> Block:
@@ -45,7 +45,7 @@ def block_of(sensors: StructArray) -> Block:
 
 
 class Blocks(NamedTuple):
-    """Several `Block` as arrays: time (k,), mean (k, 3), scatter (k, 3, 3), n (k, 3)."""
+    """Several blocks as arrays: time (k,), mean (k, 3), scatter (k, 3, 3), n (k, 3)."""
 
     time: FloatArray
     mean: FloatArray
@@ -75,7 +75,7 @@ class BlockWindow:
         self._count = 0
 
     def append(self, block: Block) -> None:
-        """Append a block; if the window is full, it replaces the oldest one.
+        """Append a block; if the window is full, the oldest block is replaced.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ def stacked(blocks: Iterable[Block]) -> Blocks:
 
 
 def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
-    """Whether a block scatters far more than the others, on any axis.
+    """Whether one block has a far larger scatter than the quietest block, on any axis.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
 
 
 def pooled_covariance(blocks: Blocks) -> FloatArray | None:
-    """Pooled scatter within blocks.
+    """Noise covariance from the scatter within blocks, pooled over all blocks.
 
     Parameters
     ----------

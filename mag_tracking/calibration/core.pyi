@@ -1,6 +1,7 @@
 """Calibration of readings one by one, compiled; the rules are in `readings.hpp`.
 
-`sensors` is an array of `SENSOR`. Functions without a row take an array of a single element.
+`sensors` is an array of `SENSOR`. Functions without an argument
+`row` or `rows` require an array of a single element.
 """
 
 from typing import Any
@@ -62,31 +63,34 @@ def calibrate_readings(
         Updated.
     limits : (1,) LIMITS array
     rows : (n,) int array
-        Sensors of the readings; negative = unknown.
+        Index of the sensor of each reading; negative = unknown.
     stamps : (n,) int array, ns
     fields : (n, 3) array, T
         Raw fields.
     own : (n,) int array
-        NONE, VALID or INVALID.
+        Covariance in the message: NONE, VALID or INVALID.
     covariances : (n, 3, 3) array, T²
         Ignored where `own` is NONE.
     batches : (1,) BATCH array
         Updated.
     out_rows : (m,) int array
+        Output: index of the sensor of each calibrated reading.
     out_stamps : (m,) int array, ns
+        Output: timestamps.
     out_fields : (m, 3) array, T
+        Output: fields minus the background.
     out_covariances : (m, 3, 3) array, T²
-        The calibrated readings are appended from `n_out` on.
+        Output: noise covariances. All outputs are appended from `n_out` on.
 
     Returns
     -------
     int
-        DONE, or the reason that `row` and `stamp_ns` refer to.
+        DONE, or the reason for stopping; `row` and `stamp_ns` of the batch identify the reading.
 
     Raises
     ------
     IndexError
-        If an output array is full, or a row is out of range.
+        If an output array is full, or the index of a sensor is out of range.
     """
 
 def use_reading(
@@ -103,15 +107,20 @@ def use_reading(
     batches : (1,) BATCH array
         Updated.
     row : int
-        Sensor of the reading.
+        Index of the sensor.
     stamp : int, ns
     field : (3,) array, T
+        Field after the iron correction.
     own : int
-        NONE, VALID or INVALID.
+        Covariance in the message: NONE, VALID or INVALID.
     covariance : (3, 3) array, T²
+        Covariance in the message; ignored if `own` is NONE.
     out_rows : (m,) int array
+        As for `calibrate_readings`.
     out_stamps : (m,) int array, ns
+        As for `calibrate_readings`.
     out_fields : (m, 3) array, T
+        As for `calibrate_readings`.
     out_covariances : (m, 3, 3) array, T²
         As for `calibrate_readings`.
 
@@ -140,7 +149,7 @@ def steps_of(sensors: StructArray, are_corrected: bool) -> FloatArray:
     ----------
     sensors : (1,) SENSOR array
     are_corrected : bool
-        Whether the steps are those after the soft-iron correction.
+        Whether to apply the soft-iron correction to the steps.
 
     Returns
     -------
@@ -154,6 +163,7 @@ def complete_steps(variance: FloatArray, steps: FloatArray) -> None:
     Parameters
     ----------
     variance : (3,) array, T²
+        Noise variance of each axis; NaN = missing axis.
     steps : (3,) array, T
         Updated.
     """
@@ -168,9 +178,9 @@ def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> 
     sensors : (1,) SENSOR array
         Updated.
     freeze_std : float
-        Number of standard deviations of the limits.
+        Limits in standard deviations.
     limits : (3,) array, T
-        Overwritten: maximum deviation of the mean of a block.
+        Overwritten: maximum difference between the mean of a block and the background.
     """
 
 def block_moments(sensors: StructArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
@@ -195,9 +205,13 @@ def line_through(time: FloatArray, n: FloatArray, y: FloatArray, centre: float
     Parameters
     ----------
     time : (k,) array, s
+        Mean time of each block.
     n : (k, 3) array
+        Number of readings of each block, per axis.
     y : (k, 3) array, T
+        Mean of each block.
     centre : float, s
+        Time at which the mean is evaluated.
 
     Returns
     -------
@@ -206,12 +220,14 @@ def line_through(time: FloatArray, n: FloatArray, y: FloatArray, centre: float
     """
 
 def pooled_covariance(scatter: FloatArray, n: FloatArray) -> FloatArray | None:
-    """Pooled scatter within blocks; see `blocks.pooled_covariance`.
+    """Noise covariance from the scatter within blocks; see `blocks.pooled_covariance`.
 
     Parameters
     ----------
     scatter : (k, 3, 3) array, T²
+        Sum of squared deviations of each block.
     n : (k, 3) array
+        Number of readings of each block, per axis.
 
     Returns
     -------
@@ -219,7 +235,7 @@ def pooled_covariance(scatter: FloatArray, n: FloatArray) -> FloatArray | None:
     """
 
 def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
-    """Update the steps of a sensor and the time since which each axis is constant.
+    """Update the steps of a sensor and the time of the latest change of each axis.
 
     Parameters
     ----------
@@ -227,16 +243,18 @@ def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
         Updated.
     stamp : int, ns
     raw : (3,) array, T
+        Raw reading; NaN = missing axis.
     """
 
 def is_stuck(sensors: StructArray, field: FloatArray) -> bool:
-    """Whether a reading repeats the previous one for longer than chance can explain.
+    """Record a reading, and return whether it has been repeated for too long to be chance.
 
     Parameters
     ----------
     sensors : (1,) SENSOR array
         Updated.
     field : (3,) array, T
+        Reading; NaN = missing axis.
 
     Returns
     -------
@@ -251,9 +269,10 @@ def screen_spike(sensors: StructArray, threshold: float, stamp: int, field: Floa
     sensors : (1,) SENSOR array
         Updated.
     threshold : float
-        Minimum size of a spike in standard deviations of the noise.
+        Minimum magnitude of a spike in standard deviations of the noise.
     stamp : int, ns
     field : (3,) array, T
+        Reading; NaN = missing axis.
 
     Returns
     -------
@@ -262,7 +281,7 @@ def screen_spike(sensors: StructArray, threshold: float, stamp: int, field: Floa
     """
 
 def collect(sensors: StructArray, time: float, field: FloatArray) -> None:
-    """Add a reading to the current block, after starting a new one if it is due.
+    """Add a reading to the current block, after starting a new block if one is due.
 
     Parameters
     ----------
@@ -270,4 +289,5 @@ def collect(sensors: StructArray, time: float, field: FloatArray) -> None:
         Updated.
     time : float, s
     field : (3,) array, T
+        Reading; NaN = missing axis.
     """

@@ -8,14 +8,14 @@ from mag_tracking.arrays import FloatArray
 
 ATTENUATION_DB = 60.0
 """Attenuation of the frequencies that alias into the pass band."""
-PASS_SHARE = 0.5
-"""Pass band relative to half the output rate. The filter falls from there to the mirrored
-frequency, so that only frequencies above the pass band alias. A wider pass band would increase the
-delay, which is about four output intervals."""
+PASS_FRACTION = 0.5
+"""Pass band as a fraction of half the output rate. The transition band ends at the mirrored
+frequency: only frequencies above the pass band alias. A wider pass band would increase the delay,
+which is about four output intervals."""
 GAP_TOLERANCE = 0.5
-"""Relative deviation of an interval from the median interval beyond which there is a gap."""
+"""Difference from the median interval, relative to it, beyond which an interval is a gap."""
 RATE_SAMPLES = 32
-"""Number of samples for the measurement of the rate; they are not lost."""
+"""Number of samples from which the rate is measured; they are decimated afterwards."""
 
 
 def lowpass(factor: int) -> FloatArray:
@@ -34,18 +34,18 @@ def lowpass(factor: int) -> FloatArray:
     # The import takes 0.3 s, and most sensors need no filter.
     from scipy.signal import firwin, kaiserord
 
-    width = 2.0 * (1.0 - PASS_SHARE) / factor
+    width = 2.0 * (1.0 - PASS_FRACTION) / factor
     n, beta = kaiserord(ATTENUATION_DB, width)
     taps: FloatArray = firwin(n | 1, 1.0 / factor, window=('kaiser', beta))
     return taps
 
 
 class Decimator:
-    """Decimates the samples of one sensor; stores one filter length.
+    """Decimator of the samples of one sensor.
 
-    The filter is that of `scipy.signal.firwin`, of linear phase; its delay is subtracted from the
+    The filter has linear phase (`scipy.signal.firwin`), and its delay is subtracted from the
     timestamps. The rate is measured from the first samples. After a gap or a step of the clock the
-    filter restarts, because filtering across it would produce an invalid field.
+    filter restarts, because filtering across the gap would produce an invalid field.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class Decimator:
         self._until_next = 0
 
     def feed(self, stamp_ns: int, field: FloatArray) -> list[tuple[int, FloatArray]]:
-        """Add a sample and return the outputs that it completes, usually none.
+        """Add a sample, and return the outputs that are now complete, usually none.
 
         Parameters
         ----------
@@ -92,15 +92,15 @@ class Decimator:
             self.reset()
         self._window.append((stamp_ns, field))
         if self.factor is None:
-            return self._measure()
+            return self._measure_rate()
         if self._taps is None:
             self._window = deque(list(self._window)[-2:])
             return [(stamp_ns, field)]
-        return self._step(self.factor, self._taps)
+        return self._filter(self.factor, self._taps)
 
     @property
     def n_waiting(self) -> int:
-        """Number of samples that wait for the rate and may be output at once."""
+        """Number of samples stored until the rate is known, when they are output together."""
         return len(self._window) if self.factor is None else 0
 
     def noise_gain(self) -> float:
@@ -120,25 +120,25 @@ class Decimator:
         return 1.0 if self._taps is None else float(self._taps @ self._taps)
 
     def _is_gap(self, stamp_ns: int) -> bool:
-        """Whether the interval to a sample is not the regular one."""
+        """Whether the interval between the previous sample and this sample is a gap."""
         interval = stamp_ns - self._window[-1][0]
         return interval <= 0 or (self.factor is not None and abs(
             interval - self._interval) > GAP_TOLERANCE * self._interval)
 
-    def _measure(self) -> list[tuple[int, FloatArray]]:
-        """Determine the factor once there are enough samples, which are then output."""
+    def _measure_rate(self) -> list[tuple[int, FloatArray]]:
+        """Determine the factor once enough samples are stored, and return their outputs."""
         if len(self._window) < RATE_SAMPLES:
             return []
         stamps = np.array([s for s, _ in self._window], dtype=np.int64)
         self._interval = float(np.median(np.diff(stamps)))
         self.factor = max(1, round(1e9 / self._interval / self._rate))
         self._taps = lowpass(self.factor) if self.factor > 1 else None
-        waiting = list(self._window)
+        stored = list(self._window)
         self.reset()
-        return [out for stamp, field in waiting for out in self.feed(stamp, field)]
+        return [out for stamp, field in stored for out in self.feed(stamp, field)]
 
-    def _step(self, factor: int, taps: FloatArray) -> list[tuple[int, FloatArray]]:
-        """Output of the filter if one is due."""
+    def _filter(self, factor: int, taps: FloatArray) -> list[tuple[int, FloatArray]]:
+        """Return the output of the filter if one is due."""
         if len(self._window) < len(taps):
             return []
         if self._until_next:

@@ -11,7 +11,7 @@ EMPTY_OCTANT = 0.125
 """Maximum weight of an empty octant relative to the mean weight."""
 
 N_CELLS = 500
-"""Number of equal cells of the directions, about 10 degrees wide."""
+"""Number of equal cells on the sphere of directions, about 10 degrees wide."""
 
 MAX_CELL_WEIGHT = 3.0
 """Maximum weight of the readings of a cell, in multiples of the median number per cell."""
@@ -42,12 +42,14 @@ def binned(q: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
     Parameters
     ----------
     q : (n, 3) array
+        Vectors of any length.
 
     Returns
     -------
     u : (n, 3) array
         Unit vectors.
     cell : (n,) int array
+        Index of the cell of each direction.
     count : (N_CELLS,) int array
         Number of directions in each cell.
     """
@@ -62,6 +64,7 @@ def even_weights(q: FloatArray) -> FloatArray:
     Parameters
     ----------
     q : (n, 3) array
+        Vectors of any length.
 
     Returns
     -------
@@ -74,7 +77,10 @@ def even_weights(q: FloatArray) -> FloatArray:
 
 
 def coverage(u: FloatArray, w: FloatArray) -> float:
-    """Smallest eigenvalue of the weighted mean of f fᵀ, with the harmonics f to degree two.
+    """Coverage of the sphere by directions.
+
+    The coverage is the smallest eigenvalue of the weighted mean of f fᵀ, with the spherical
+    harmonics f to degree two.
 
     Parameters
     ----------
@@ -108,5 +114,5 @@ def empty_octants(u: FloatArray, w: FloatArray) -> tuple[str, ...]:
     tuple of str
         Names, e.g. '+x-y+z'.
     """
-    share = 8.0 * np.bincount(np.argmax(u @ _OCTANTS.T, axis=1), w, 8) / w.sum()
-    return tuple(_octant_name(signs) for signs in _OCTANTS[share < EMPTY_OCTANT])
+    weight = 8.0 * np.bincount(np.argmax(u @ _OCTANTS.T, axis=1), w, 8) / w.sum()
+    return tuple(_octant_name(signs) for signs in _OCTANTS[weight < EMPTY_OCTANT])

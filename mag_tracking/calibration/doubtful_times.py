@@ -7,7 +7,7 @@ DoubtfulTimes: TypeAlias = tuple[tuple[int, int | None], ...]
 """((begin, end) [ns], ...), oldest first, ends excluded; an end of None is not known yet."""
 
 MAX_INTERVALS = 16
-"""Maximum number of intervals; the latest ones are kept."""
+"""Maximum number of intervals; the oldest intervals are removed."""
 
 
 def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
@@ -21,7 +21,7 @@ def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
         Start of the state.
     is_doubtful : bool
     max_intervals : int
-        Maximum number of intervals; the latest ones are kept.
+        Maximum number of intervals; the oldest intervals are removed.
 
     Returns
     -------
@@ -58,9 +58,10 @@ def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTi
            ) -> dict[str, DoubtfulTimes]:
     """Merge two records of the same sensors.
 
-    An interval in `latest` replaces an earlier one that begins at the same time or during it. If
-    the end of an earlier interval is missing, it ends where the next begins. If `latest` has no
-    interval of a sensor, its background was replaced, and an open interval is removed.
+    An interval in `latest` replaces an earlier interval that begins at the same time or within it.
+    If the end of an earlier interval is missing, the interval ends where the next one begins. If
+    `latest` has no interval of a sensor, the background was replaced, and an open interval is
+    removed.
 
     Parameters
     ----------
@@ -74,10 +75,10 @@ def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTi
     """
     out = dict(earlier)
     for name, times in latest.items():
-        kept = [(begin, end) for begin, end in earlier.get(name, ())
-                if not any(b <= begin and (e is None or begin < e or b == begin) for b, e in times)]
+        retained = [(begin, end) for begin, end in earlier.get(name, ()) if not any(
+            b <= begin and (e is None or begin < e or b == begin) for b, e in times)]
         segments: list[tuple[int, int | None]] = []
-        for begin, end in sorted([*kept, *times], key=lambda segment: segment[0]):
+        for begin, end in sorted([*retained, *times], key=lambda segment: segment[0]):
             if segments and segments[-1][1] is None:
                 segments[-1] = (segments[-1][0], begin)
             segments.append((begin, end))
@@ -94,6 +95,7 @@ def shifted(times: DoubtfulTimes, ns: int) -> DoubtfulTimes:
     ----------
     times : DoubtfulTimes
     ns : int, ns
+        Offset that is added to all times.
 
     Returns
     -------

@@ -11,15 +11,15 @@ TYPICAL_DRIFT = 3e-9
 """[T/s] Typical drift of a background."""
 
 STEEP_DRIFT = 1e-8
-"""[T/s] Maximum drift of a background, that of a sensor that is warming up. A faster change may be
-an approaching target."""
+"""[T/s] Maximum drift of a background, reached by a sensor that is warming up. A faster change may
+be due to an approaching target."""
 
 MAX_AGE_S = 600.0
 """[s] Maximum age of a former level."""
 
 MAX_DRIFT = 4.0
-"""Maximum drift of a former level, in block limits. With a wider tolerance, any vehicle that stops
-would match it."""
+"""Maximum drift of a former level, in multiples of the limits of a block mean. With a wider
+tolerance, any stopped vehicle would match a former level."""
 
 MIN_SLOPE_STDS = 4.0
 """Number of standard deviations by which a drift must exceed the maximum."""
@@ -32,9 +32,9 @@ class FormerLevel:
     until: float
     """[s] End of the level."""
     level: FloatArray
-    """(3,) [T]"""
+    """(3,) [T] Field of the level."""
     seen_s: float
-    """[s] Duration for which it was observed."""
+    """[s] Duration for which the level was observed."""
 
     def is_at(self, block: Block, limits: FloatArray) -> bool:
         """Whether a block is at this level.

@@ -1,8 +1,8 @@
 """Hard and soft iron of a three-axis magnetometer that is tumbled in a uniform field.
 
 In a uniform field, the readings y of a rotating sensor lie on an ellipsoid; B = C (y - o) maps them
-to a sphere. A rotation of B does not change its size, so C is chosen symmetric: the orientation of
-the sensor's axes relative to its case is not observable from field sizes.
+to a sphere. A rotation of B does not change its magnitude, so C is chosen symmetric: the
+orientation of the sensor's axes relative to its case is not observable from field magnitudes.
 """
 
 from dataclasses import dataclass
@@ -26,46 +26,48 @@ MIN_COVERAGE = 0.01
 times."""
 
 GOOD_COVERAGE = 0.1
-"""Coverage below which there is a warning; at this value, the amplification is three times."""
+"""Coverage below which a warning is issued; at this value, errors are amplified three times."""
 
 MIN_THICKNESS = 0.05
-"""Minimum ratio of smallest to largest spread of the readings about their mean; a flatter set is a
-rotation in a plane."""
+"""Minimum ratio of smallest to largest spread of the readings about their mean; a flatter set is
+due to a rotation about a single axis."""
 
 MAX_AXIS_RATIO = 5.0
 """Maximum ratio of longest to shortest axis; soft iron on a sensor's board causes a ratio of two or
 slightly more."""
 
 MAX_SCATTER = 0.1
-"""Maximum scatter about the ellipsoid relative to its radius, without outliers. A sensor at rest
-gives a ball of noise, with a scatter of 0.3 to 0.4 about any ellipsoid; 0.01 to 0.03 is typical."""
+"""Maximum scatter about the ellipsoid relative to its radius, without outliers; 0.01 to 0.03 is
+typical. The noise of a sensor at rest fills a ball, with a scatter of 0.3 to 0.4 about any
+ellipsoid."""
 
 MAX_OFFSET_STD = 0.1
 """Maximum standard deviation of the offset relative to the radius, in the worst direction."""
 
 GOOD_RESIDUAL = 0.05
-"""std/mean of the corrected sizes above which there is a warning: the field was not uniform."""
+"""std/mean of the corrected magnitudes above which a warning is issued: the field was not
+uniform."""
 
-GOOD_OUTLIER_SHARE = 0.01
-"""Share of outliers above which there is a warning."""
+GOOD_OUTLIER_FRACTION = 0.01
+"""Fraction of outliers above which a warning is issued."""
 
-MAX_OUTLIER_SHARE = 0.2
-"""Maximum share of outliers; beyond it, the robust scatter is not meaningful."""
+MAX_OUTLIER_FRACTION = 0.2
+"""Maximum fraction of outliers; beyond it, the robust scatter is not meaningful."""
 
 MIN_GLITCH_DISTANCE = 5.0
-"""A reading is a glitch of the transfer if its distance from the median reading exceeds this number
-of median distances ..."""
+"""Minimum distance of a glitch (an error of the transfer) from the median reading, in multiples of
+the median distance."""
 
-MAX_GLITCH_SHARE = 0.02
-"""... and the share of such readings is at most this. If the sensor was at rest most of the time,
-all other readings are far from the median."""
+MAX_GLITCH_FRACTION = 0.02
+"""Maximum fraction of readings at such a distance that are glitches. If the sensor was at rest most
+of the time, all other readings are far from the median."""
 
 
 @dataclass(frozen=True)
 class EllipsoidFit:
     """Calibration B = correction (y - offset), its accuracy, and its warnings.
 
-    Quantities that a rejected fit could not compute are NaN.
+    Quantities that were not computed for a rejected fit are NaN.
     """
 
     offset: FloatArray
@@ -74,19 +76,19 @@ class EllipsoidFit:
     """(3, 3) symmetric positive definite, field unit per reading unit: soft iron, scale factors and
     non-orthogonality, up to a rotation."""
     field_size: float
-    """Size of B after correction, as given; otherwise the mean radius for det(correction) = 1, in
-    the unit of the readings."""
+    """Magnitude of B after correction: the given value, or the mean radius for det(correction) = 1,
+    in the unit of the readings."""
     residual: float
     """std/mean of ‖B‖ over all readings after correction, including outliers and saturated
     readings."""
     residual_before: float
     """std/mean of ‖y‖."""
     offset_std: FloatArray
-    """(3,), unit of the readings."""
+    """(3,), unit of the readings: standard deviation of `offset`."""
     correction_std: FloatArray
-    """(3, 3), of each entry of `correction`."""
+    """(3, 3) Standard deviation of each entry of `correction`."""
     field_size_std: float
-    """Zero if the field size was given."""
+    """Standard deviation of `field_size`; zero if it was given."""
     coverage: float
     """0 to 1: smallest eigenvalue of the weighted mean of f fᵀ over the directions, with the nine
     spherical harmonics f to degree two, which are the effects of the nine parameters on ‖B‖. One
@@ -96,18 +98,18 @@ class EllipsoidFit:
     empty_octants: tuple[str, ...]
     """Names of octants of the corrected directions, e.g. '+x-y+z', sensor frame."""
     n_readings: int
-    """Number of readings of the fit."""
+    """Number of readings used by the fit."""
     n_missing: int
-    """Number of rows excluded because of a NaN."""
+    """Number of readings excluded because of a NaN."""
     n_saturated: int
-    """Number of rows excluded because they are saturated."""
+    """Number of readings excluded because of saturation."""
     n_outliers: int
-    """Number of glitches, which are excluded, and of readings further than OUTLIER robust standard
-    deviations from the ellipsoid, whose influence the loss limits."""
+    """Number of excluded glitches, plus the number of readings further than OUTLIER robust standard
+    deviations from the ellipsoid. The loss limits the influence of the latter."""
     converged: bool
     """Whether the calibration is valid."""
     reason: str
-    """Why the fit is rejected; empty if it is not."""
+    """Why the fit is rejected; empty if it is accepted."""
     warnings: tuple[str, ...]
     """Warnings about readings and accuracy."""
 
@@ -148,20 +150,20 @@ class _Parameters(TypedDict):
 
 
 def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> EllipsoidFit:
-    """Offset and symmetric correction that give all readings the same size.
+    """Fit the offset and the symmetric correction that map all readings to the same magnitude.
 
     A linear quadric fit initialises a robust geometric least-squares fit of ‖C (y - o)‖. Readings
     are weighted by direction: crowded directions, e.g. of a sensor at rest, have smaller weights.
-    Noise of relative size s increases the radius by s², which is not corrected. The standard
-    deviations are from a block jackknife in time.
+    Noise of relative standard deviation s increases the radius by s², which is not corrected. The
+    standard deviations are from a block jackknife in time.
 
     Parameters
     ----------
     readings : (n, 3) array, any unit, sensor frame
-        In order of time, of a sensor that is rotated in a uniform field. Rows with a NaN are
-        excluded.
+        Chronological readings of a sensor that is rotated in a uniform field. Readings with a NaN
+        are excluded.
     field_size : float, optional
-        True field size, in the requested unit of the corrected field.
+        True magnitude of the field, in the requested unit of the corrected field.
 
     Returns
     -------
@@ -178,44 +180,45 @@ def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> Elli
     [Renaudin10]_ and [KokSchon16]_ section V.A for the conversion of the quadric into offset and
     correction. The measure of coverage and the rejection criteria are additions of this package.
     """
-    readings = _checked(readings, field_size)
+    readings = _validated(readings, field_size)
     present: BoolArray = ~np.any(np.isnan(readings), axis=1)
-    cut = np.stack([saturated_readings(axis) for axis in readings.T], axis=1) & present[:, None]
-    used = readings[present & ~cut.any(axis=1)]
-    glitches = _glitches(used)
-    used = used[~glitches]
+    is_saturated = np.stack([saturated_readings(axis) for axis in readings.T], axis=1) \
+        & present[:, None]
+    valid = readings[present & ~is_saturated.any(axis=1)]
+    glitches = _glitches(valid)
+    valid = valid[~glitches]
     counts: _Counts = {
-        'n_readings': len(used), 'n_missing': int((~present).sum()),
-        'n_saturated': int(cut.any(axis=1).sum()), 'n_outliers': int(glitches.sum()),
-        'residual_before': _spread(np.linalg.norm(readings[present], axis=1))}
-    notes = _notes_on_input(counts, cut)
-    reason = _insufficient_data(used)
+        'n_readings': len(valid), 'n_missing': int((~present).sum()),
+        'n_saturated': int(is_saturated.any(axis=1).sum()), 'n_outliers': int(glitches.sum()),
+        'residual_before': _relative_spread(np.linalg.norm(readings[present], axis=1))}
+    notes = _notes_on_input(counts, is_saturated)
+    reason = _insufficient_data(valid)
     if reason:
-        return _rejected(reason, counts, notes)
-    centre, scale = used.mean(axis=0), float(np.sqrt(used.var(axis=0).sum()))
-    z = (used - centre) / scale
+        return _rejected_fit(reason, counts, notes)
+    centre, scale = valid.mean(axis=0), float(np.sqrt(valid.var(axis=0).sum()))
+    z = (valid - centre) / scale
     o, C, reason = fit_quadric(z)
     if reason:
-        return _rejected(reason, counts, notes)
+        return _rejected_fit(reason, counts, notes)
     o, C, P, quality = refine_ellipsoid(z, o, C)
     axes = np.linalg.eigvalsh(C)
     if not axes[0] * MAX_AXIS_RATIO >= axes[2]:
-        return _rejected(f'the axes of the ellipsoid have a ratio of {axes[0]:.2g} to '
-                         f'{axes[2]:.2g}, maximum 1 to {MAX_AXIS_RATIO:g}; {POSSIBLE_CAUSES}',
-                         counts, notes)
+        return _rejected_fit(f'the axes of the ellipsoid have a ratio of {axes[0]:.2g} to '
+                             f'{axes[2]:.2g}, maximum 1 to {MAX_AXIS_RATIO:g}; {POSSIBLE_CAUSES}',
+                             counts, notes)
     counts['n_outliers'] += quality['n_outliers']
     out = _in_units(o, C, P, centre, scale, field_size)
-    residual = _spread(np.linalg.norm((readings[present] - out['offset']) @ out['correction'],
-                                      axis=1))
-    share = counts['n_outliers'] / (len(used) + glitches.sum())
-    reason = _rejection_reason(C, P, quality, share)
+    residual = _relative_spread(np.linalg.norm(
+        (readings[present] - out['offset']) @ out['correction'], axis=1))
+    outlier_fraction = counts['n_outliers'] / (len(valid) + glitches.sum())
+    reason = _rejection_reason(C, P, quality, outlier_fraction)
     return EllipsoidFit(**out, **counts, residual=residual, coverage=quality['coverage'],
                         empty_octants=quality['empty'], converged=not reason, reason=reason,
-                        warnings=notes + _notes_on_fit(residual, quality, share))
+                        warnings=notes + _notes_on_fit(residual, quality, outlier_fraction))
 
 
-def _checked(readings: FloatArray, field_size: float | None) -> FloatArray:
-    """Readings as an array (n, 3); raises ValueError for invalid arguments."""
+def _validated(readings: FloatArray, field_size: float | None) -> FloatArray:
+    """Convert readings to an array (n, 3); raise ValueError for invalid arguments."""
     readings = np.asarray(readings, dtype=float)
     if readings.ndim != 2 or readings.shape[1] != 3:
         raise ValueError(f'expected readings (n, 3), got {readings.shape}')
@@ -227,34 +230,34 @@ def _checked(readings: FloatArray, field_size: float | None) -> FloatArray:
     return readings
 
 
-def _spread(sizes: FloatArray) -> float:
-    """std/mean; NaN without readings or if all are zero."""
-    return float(sizes.std() / sizes.mean()) if sizes.any() else float('nan')
+def _relative_spread(magnitudes: FloatArray) -> float:
+    """std/mean of magnitudes; NaN without readings or if all readings are zero."""
+    return float(magnitudes.std() / magnitudes.mean()) if magnitudes.any() else float('nan')
 
 
-def _notes_on_input(counts: _Counts, cut: BoolArray) -> tuple[str, ...]:
+def _notes_on_input(counts: _Counts, is_saturated: BoolArray) -> tuple[str, ...]:
     """Warnings about excluded readings."""
     notes: tuple[str, ...] = ()
     if counts['n_missing']:
-        notes += (f'{counts["n_missing"]} readings with a missing axis are excluded',)
+        notes += (f'readings excluded because of a missing axis: {counts["n_missing"]}',)
     if counts['n_saturated']:
-        axes = ', '.join(name for name, is_cut in zip('xyz', np.any(cut, axis=0), strict=True)
-                         if is_cut)
-        notes += (f'{counts["n_saturated"]} readings with saturation of {axes} are excluded',)
+        axes = ', '.join(name for name, is_cut in zip('xyz', np.any(is_saturated, axis=0),
+                                                      strict=True) if is_cut)
+        notes += (f'readings excluded because of saturation of {axes}: {counts["n_saturated"]}',)
     return notes
 
 
 def _glitches(y: FloatArray) -> BoolArray:
-    """Whether a reading is one of few that are far from all others, (n,)."""
+    """Whether each reading is one of few readings that are far from the median, (n,)."""
     distance = np.linalg.norm(y - np.median(y, axis=0), axis=1) if len(y) else np.zeros(0)
-    far = distance > MIN_GLITCH_DISTANCE * np.median(distance) if len(y) \
+    is_far = distance > MIN_GLITCH_DISTANCE * np.median(distance) if len(y) \
         else np.zeros(0, dtype=bool)
-    few: BoolArray = far & (far.sum() <= MAX_GLITCH_SHARE * len(y))
-    return few
+    is_glitch: BoolArray = is_far & (is_far.sum() <= MAX_GLITCH_FRACTION * len(y))
+    return is_glitch
 
 
 def _insufficient_data(y: FloatArray) -> str:
-    """Why no quadric can be fitted; empty if one can."""
+    """Why a quadric cannot be fitted; empty if it can."""
     if len(y) < MIN_READINGS:
         return f'{len(y)} readings, minimum {MIN_READINGS}'
     largest = np.abs(y - y[0]).max()
@@ -287,13 +290,13 @@ def _in_units(o: FloatArray, C: FloatArray, P: FloatArray, centre: FloatArray, s
 
 
 def _rejection_reason(C: FloatArray, P: FloatArray, quality: Quality, outliers: float) -> str:
-    """Why a fit is rejected; empty if it is not."""
+    """Why a fit is rejected; empty if it is accepted."""
     if quality['scatter'] > MAX_SCATTER:
         return (f'the scatter about the ellipsoid is {quality["scatter"]:.2g} of the radius, '
                 f'maximum {MAX_SCATTER}; {POSSIBLE_CAUSES}')
-    if outliers > MAX_OUTLIER_SHARE:
-        return (f'a share of {outliers:.2g} of the readings are outliers, maximum '
-                f'{MAX_OUTLIER_SHARE}')
+    if outliers > MAX_OUTLIER_FRACTION:
+        return (f'the fraction of outliers is {outliers:.2g}, maximum '
+                f'{MAX_OUTLIER_FRACTION}')
     if quality['directions'] < MIN_DIRECTIONS:
         return f'{quality["directions"]} different directions, minimum {MIN_DIRECTIONS}'
     if quality['coverage'] < MIN_COVERAGE:
@@ -314,12 +317,12 @@ def _notes_on_fit(residual: float, quality: Quality, outliers: float) -> tuple[s
         f'few or no readings from {", ".join(quality["empty"])}': quality['empty'],
         f'residual {residual:.2g} after correction, recommended at most {GOOD_RESIDUAL}':
             residual > GOOD_RESIDUAL,
-        f'a share of {outliers:.2g} of the readings are outliers': outliers > GOOD_OUTLIER_SHARE}
+        f'the fraction of outliers is {outliers:.2g}': outliers > GOOD_OUTLIER_FRACTION}
     return tuple(note for note, holds in checks.items() if holds)
 
 
-def _rejected(reason: str, counts: _Counts, notes: tuple[str, ...]) -> EllipsoidFit:
-    """A fit without results, only with a reason."""
+def _rejected_fit(reason: str, counts: _Counts, notes: tuple[str, ...]) -> EllipsoidFit:
+    """Create a rejected fit, with a reason and without results."""
     nan = float('nan')
     return EllipsoidFit(
         offset=np.full(3, nan), correction=np.full((3, 3), nan), field_size=nan, residual=nan,

@@ -14,8 +14,8 @@ LOSS_SCALE = 2.0
 Gaussian noise is small."""
 
 N_BLOCKS = 40
-"""Number of intervals of the block jackknife for the covariance. Each must be long compared with
-the correlation time of the residuals."""
+"""Number of intervals of the block jackknife for the covariance. Each interval must be long
+compared with the correlation time of the residuals."""
 
 _UPPER = np.triu_indices(3)
 _ROWS, _COLUMNS = _UPPER
@@ -39,7 +39,7 @@ class Quality(TypedDict):
     """Scatter about the ellipsoid relative to its radius, without outliers."""
     n_outliers: int
     empty: tuple[str, ...]
-    """Octants with hardly any reading."""
+    """Octants that contain hardly any reading."""
 
 
 def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
@@ -60,7 +60,7 @@ def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
     offset : (3,) array
     correction : (3, 3) array
     covariance : (9, 9) array
-        Of the offset and the six entries of the correction.
+        Covariance of the offset and the six entries of the correction.
     quality : Quality
 
     References
@@ -72,19 +72,19 @@ def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
     for _ in range(2):
         w = even_weights(_model(theta, z)[0])
         scale = LOSS_SCALE * robust_std(_model(theta, z)[1], w)
-        fit = least_squares(  # type: ignore[operator]  # mypy takes the stubs' module of that name
+        fit = least_squares(  # type: ignore[operator]  # mypy finds a module of that name
             lambda p, s=scale: _model(p, z)[1] / s, theta,
             jac=lambda p, s=scale: _model(p, z)[2] / s,
             loss=lambda square, w=w: _loss(square, w), max_nfev=100)
         theta = fit.x
     q, d, J = _model(theta, z)
-    fine = np.abs(d) <= OUTLIER * robust_std(d, w)
-    u, _, n = binned(q[fine])
+    is_inlier = np.abs(d) <= OUTLIER * robust_std(d, w)
+    u, _, n = binned(q[is_inlier])
     quality: Quality = {
         'solved': fit.status > 0, 'directions': int((n > 0).sum()),
-        'coverage': coverage(u, w[fine]),
-        'scatter': float(np.sqrt(np.average(d[fine]**2, weights=w[fine]))),
-        'n_outliers': int((~fine).sum()), 'empty': empty_octants(u, w[fine])}
+        'coverage': coverage(u, w[is_inlier]),
+        'scatter': float(np.sqrt(np.average(d[is_inlier]**2, weights=w[is_inlier]))),
+        'n_outliers': int((~is_inlier).sum()), 'empty': empty_octants(u, w[is_inlier])}
     C = _symmetric(theta)
     return theta[:3], C, _covariance(d / scale, J / scale, w), quality
 
@@ -95,7 +95,7 @@ def _symmetric(theta: FloatArray) -> FloatArray:
 
 
 def _model(theta: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Corrected readings (n, 3), their sizes minus one (n,), and its Jacobian (n, 9)."""
+    """Corrected readings (n, 3), their magnitudes minus one (n,), and the Jacobian (n, 9)."""
     C = _symmetric(theta)
     y = z - theta[:3]
     q = y @ C
@@ -113,8 +113,8 @@ def _loss(square: FloatArray, w: FloatArray) -> FloatArray:
 def _covariance(f: FloatArray, J: FloatArray, w: FloatArray) -> FloatArray:
     """Covariance (9, 9) by a block jackknife in time, one Newton step per block.
 
-    The residuals of a real sensor are correlated in time, so their number overstates the
-    information. Infinite if a block is indispensable.
+    The residuals of a real sensor are correlated in time, so the number of residuals overstates
+    the information. The covariance is infinite if the fit is singular without one of the blocks.
     """
     n_blocks = min(N_BLOCKS, len(f))
     starts = np.arange(n_blocks) * len(f) // n_blocks

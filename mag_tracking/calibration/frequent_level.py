@@ -9,8 +9,8 @@ from mag_tracking.calibration.blocks import Blocks, line_through, pooled_covaria
 from mag_tracking.calibration.resolution import TOGGLE
 
 MAX_CALM_RATIO = 3.0
-"""Maximum standard deviation of a calm block relative to that of the quietest fifth of the blocks;
-while a target moves by, the field changes within a block."""
+"""Maximum standard deviation of a calm block relative to the quietest fifth of the blocks.
+A passing target changes the field within a block."""
 
 LEVEL_WIDTH = 4.0
 """Maximum difference of the means of blocks of one level, in standard deviations of a mean, per
@@ -19,22 +19,22 @@ axis."""
 MIN_WIDTH = 5e-9
 """[T] Minimum tolerance of a level, which allows for drift."""
 
-MIN_REPORTED_SHARE = 0.5
-"""Minimum share of the blocks in which a used axis is reported."""
+MIN_REPORTED_FRACTION = 0.5
+"""Minimum fraction of the blocks in which a used axis is reported."""
 
 MIN_BLOCKS = 4
 """Minimum number of blocks of a level."""
 
 MIN_LEVEL_DISTANCE = 3.0
-"""Minimum distance of another level, in widths. A smaller difference is the same level with a
-target far away."""
+"""Minimum distance of another level, in widths. A smaller difference may be due to a
+distant target at the same level."""
 
 MIN_DURATION_RATIO = 4.0
-"""Minimum ratio of the duration of a level to that of the initial level for replacing it: a target
-that was present at the start has left."""
+"""Minimum ratio of the duration of a level to the duration of the initial level for replacing the
+initial level: a target that was present at the start has left."""
 
 BATCH_SIZE = 64
-"""Number of blocks that are compared with all others at once, to limit memory."""
+"""Number of blocks that are compared with all other blocks at once, to limit memory."""
 
 
 @dataclass(frozen=True)
@@ -44,26 +44,27 @@ class QuietLevel:
     n_blocks: int
     """Number of blocks of the level."""
     n_rival: int
-    """Number of blocks of the most frequent level among the others."""
+    """Number of blocks of the second most frequent level."""
     begin: float
-    """[s] Time of the first of the blocks."""
+    """[s] Time of the first block of the level."""
     end: float
-    """[s] Time of the last of the blocks."""
+    """[s] Time of the last block of the level."""
     level: FloatArray
     """(3,) [T] Level of the earliest blocks; NaN = axis not reported."""
     covariance: FloatArray
-    """(3, 3) [T²] Scatter of its readings; NaN = axis not reported."""
+    """(3, 3) [T²] Scatter of the readings of the level; NaN = axis not reported."""
     block_s: float
     """[s] Typical length of a block."""
     width: FloatArray
     """(3,) [T] Maximum difference of the means of blocks of one level."""
 
     def is_at(self, level: FloatArray) -> bool:
-        """Whether another level is the same.
+        """Whether another level is the same within the tolerance.
 
         Parameters
         ----------
         level : (3,) array, T
+            Level to compare; NaN = axis not reported.
 
         Returns
         -------
@@ -72,22 +73,22 @@ class QuietLevel:
         return not bool((np.abs(self.level - level) > MIN_LEVEL_DISTANCE * self.width).any())
 
 
-def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLevel | None:
-    """Find the level of the largest number of blocks of a sensor.
+def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int) -> QuietLevel | None:
+    """Find the most frequent level of the blocks of a sensor.
 
     Parameters
     ----------
     blocks : Blocks
-        In order of time.
+        Chronological.
     steps : (3,) array, T
         Smallest change of each axis; 0 = unknown.
-    most : int
-        Maximum number of blocks, the earliest ones, that determine the level.
+    max_blocks : int
+        Maximum number of blocks that determine the level; the earliest blocks are used.
 
     Returns
     -------
     QuietLevel or None
-        None if fewer than `MIN_BLOCKS` have one level.
+        None if no level has at least `MIN_BLOCKS` blocks.
     """
     n = np.maximum(blocks.n, 1.0)
     variance = np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1.0, 1.0)
@@ -95,44 +96,44 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, most: int) -> QuietLe
     if np.isnan(variance).all():
         return None
     # An axis that is rarely reported would exclude the blocks without it.
-    known = (~np.isnan(variance)).mean(axis=0) > MIN_REPORTED_SHARE
-    if not known.any():
+    is_used = (~np.isnan(variance)).mean(axis=0) > MIN_REPORTED_FRACTION
+    if not is_used.any():
         return None
-    quietest = np.nanquantile(variance[:, known], 0.2, axis=0)
-    calm = (variance[:, known] <= MAX_CALM_RATIO**2 * quietest).all(axis=1)
+    quietest = np.nanquantile(variance[:, is_used], 0.2, axis=0)
+    calm = (variance[:, is_used] <= MAX_CALM_RATIO**2 * quietest).all(axis=1)
     width = np.full(3, np.nan)
-    width[known] = np.maximum(LEVEL_WIDTH * np.sqrt(quietest / np.median(n[:, known], axis=0)),
-                              np.maximum(TOGGLE * steps[known], MIN_WIDTH))
+    width[is_used] = np.maximum(LEVEL_WIDTH * np.sqrt(quietest / np.median(n[:, is_used], axis=0)),
+                                np.maximum(TOGGLE * steps[is_used], MIN_WIDTH))
     rows = np.flatnonzero(calm)
     if len(rows) < MIN_BLOCKS:
         return None
-    means = blocks.mean[rows][:, known]
-    densest = _densest(means, width[known])
+    means = blocks.mean[rows][:, is_used]
+    densest = _densest(means, width[is_used])
     chosen = rows[densest]
     if len(chosen) < MIN_BLOCKS:
         return None
     centre = np.median(means[densest], axis=0)
-    others = means[(np.abs(means - centre) > MIN_LEVEL_DISTANCE * width[known]).any(axis=1)]
+    other_means = means[(np.abs(means - centre) > MIN_LEVEL_DISTANCE * width[is_used]).any(axis=1)]
     time = blocks.time[chosen]
-    first = chosen[time <= time[0] + (time[-1] - time[0]) * most / len(chosen)][:most]
+    first = chosen[time <= time[0] + (time[-1] - time[0]) * max_blocks / len(chosen)][:max_blocks]
     early = Blocks(*(values[first] for values in blocks))
     covariance = pooled_covariance(Blocks(*(values[chosen] for values in blocks)))
     if covariance is None:
         return None
     _, mean, _ = line_through(early)
-    n_rival = len(_densest(others, width[known])) if len(others) else 0
+    n_rival = len(_densest(other_means, width[is_used])) if len(other_means) else 0
     return QuietLevel(len(chosen), n_rival, float(time[0]), float(time[-1]), mean, covariance,
                       float(np.median(np.diff(blocks.time))), width)
 
 
 def _densest(means: FloatArray, width: FloatArray) -> IntArray:
-    """Rows of `means` (n, k) within `width` (k,) of the mean that has the most such rows."""
+    """Indices of the `means` (n, k) in the densest box of half-width `width` (k,)."""
     best: BoolArray = np.zeros(len(means), dtype=bool)
     for first in range(0, len(means), BATCH_SIZE):
-        near: BoolArray = np.ones((len(means[first:first + BATCH_SIZE]), len(means)), dtype=bool)
+        is_near: BoolArray = np.ones((len(means[first:first + BATCH_SIZE]), len(means)), dtype=bool)
         for axis, widest in zip(means.T, width, strict=True):
-            near &= np.abs(axis[first:first + BATCH_SIZE, None] - axis) <= widest
-        most = near[np.argmax(np.count_nonzero(near, axis=1))]
-        best = most if np.count_nonzero(most) > np.count_nonzero(best) else best
+            is_near &= np.abs(axis[first:first + BATCH_SIZE, None] - axis) <= widest
+        densest = is_near[np.argmax(np.count_nonzero(is_near, axis=1))]
+        best = densest if np.count_nonzero(densest) > np.count_nonzero(best) else best
     centre = np.median(means[best], axis=0)
     return np.flatnonzero((np.abs(means - centre) <= width).all(axis=1))

@@ -1,9 +1,9 @@
 """Growth rate of a field change, which distinguishes approaching from starting targets.
 
 The field of a vehicle that approaches at constant speed grows with the inverse cube of its
-distance: faster and faster. The change due to a vehicle that starts or stops grows with the
-distance travelled, the square of time: more and more slowly. The test is an addition of this
-package.
+distance; its relative growth accelerates. The change due to a vehicle that starts or stops grows
+with the distance travelled, the square of time; its relative growth decelerates. The test is an
+addition of this package.
 """
 
 from dataclasses import dataclass
@@ -20,50 +20,50 @@ unknown."""
 
 @dataclass(frozen=True)
 class Growth:
-    """Time that a change takes to grow from one size to another.
+    """Duration of the growth of a change from one magnitude to another, in quarters.
 
-    For a ratio q of the two sizes, each quarter takes q**(1/12) times as long as the next one if
-    the size grows with the inverse cube of a distance, and the next one takes q**(1/8) times as
-    long if the size grows with the square of time.
+    Let q be the ratio of the two magnitudes. If the magnitude grows with the inverse cube of a
+    distance, each quarter takes q**(1/12) times as long as the next quarter. If it grows with the
+    square of time, each quarter takes q**(1/8) times as long as the previous quarter.
     """
 
     quarters: tuple[float, ...]
-    """(4,) [s] Time of each quarter of the growth, on a logarithmic scale of the size."""
+    """(4,) [s] Duration of each quarter of the growth, on a logarithmic scale of the magnitude."""
 
     @property
     def early(self) -> float:
-        """Time of the first two quarters [s]."""
+        """Duration of the first two quarters [s]."""
         return self.quarters[0] + self.quarters[1]
 
     @property
     def late(self) -> float:
-        """Time of the last two quarters [s]."""
+        """Duration of the last two quarters [s]."""
         return self.quarters[2] + self.quarters[3]
 
     @property
     def whole(self) -> float:
-        """Total time [s]."""
+        """Total duration [s]."""
         return self.early + self.late
 
 
 def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Growth | None:
-    """Time that a change takes to grow from one size to another.
+    """Measure the duration of the growth of a change from one magnitude to another.
 
     Parameters
     ----------
     time : (k,) array, s
         Increasing.
     size : (k,) array
-        Size of the change.
+        Magnitude of the change.
     low, high : float
-        The interval ends where `size` first exceeds `high`, and starts where it was last below
-        `low` before.
+        The growth ends where `size` first exceeds `high`. It starts where `size` was last below
+        `low` before that time.
 
     Returns
     -------
     Growth or None
-        None if `size` never exceeds `high`, was never below `low` before, or is missing in
-        between.
+        None if `size` never exceeds `high`, was never below `low` before that time, or is missing
+        in between.
     """
     times, end, begin = [], int(np.flatnonzero(size > high).min(initial=len(size))), 0
     for level in np.geomspace(low, high, 5):

@@ -7,7 +7,7 @@ from mag_tracking.calibration.blocks import Block
 
 
 class LearningWindow:
-    """Collects blocks until there is a quiet interval of sufficient length.
+    """Collector of blocks that finds quiet intervals of sufficient length.
 
     Parameters
     ----------
@@ -16,22 +16,22 @@ class LearningWindow:
     length : float, s
         Length of a block.
     max_blocks : int
-        Maximum number of constant blocks that are kept.
+        Maximum number of stored constant blocks.
     """
 
     def __init__(self, learn: float, length: float, max_blocks: int) -> None:
         # Measured between block centres; the blocks of a slow sensor may be longer than `length`.
         self._min_duration = learn - 1.5 * length
-        self._constant: deque[Block] = deque(maxlen=max_blocks)
-        self._changing: deque[Block] = deque()
+        self._constant_blocks: deque[Block] = deque(maxlen=max_blocks)
+        self._recent: deque[Block] = deque()
 
     def clear(self) -> None:
         """Discard all blocks."""
-        self._constant.clear()
-        self._changing.clear()
+        self._constant_blocks.clear()
+        self._recent.clear()
 
     def segments(self, block: Block, is_stuck: bool) -> Iterator[deque[Block]]:
-        """Add a block and yield the intervals that are long enough, the best one first.
+        """Add a block and yield the intervals that are long enough, best first.
 
         Parameters
         ----------
@@ -43,14 +43,15 @@ class LearningWindow:
         ------
         deque of Block
         """
-        self._changing.append(block)
+        self._recent.append(block)
         if is_stuck:
             # The steps are unknown until the first change, which may be due to a target.
-            self._constant.append(block)
-        elif self._constant \
-                and self._constant[-1].time - self._constant[0].time >= self._min_duration:
-            yield self._constant
-        while len(self._changing) > 3 and block.time - self._changing[1].time >= self._min_duration:
-            self._changing.popleft()
-        if len(self._changing) >= 3 and block.time - self._changing[0].time >= self._min_duration:
-            yield self._changing
+            self._constant_blocks.append(block)
+        elif self._constant_blocks \
+                and self._constant_blocks[-1].time - self._constant_blocks[0].time \
+                >= self._min_duration:
+            yield self._constant_blocks
+        while len(self._recent) > 3 and block.time - self._recent[1].time >= self._min_duration:
+            self._recent.popleft()
+        if len(self._recent) >= 3 and block.time - self._recent[0].time >= self._min_duration:
+            yield self._recent

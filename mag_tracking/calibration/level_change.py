@@ -2,9 +2,9 @@
 
 A vehicle approaches from far away, where its field grows with the inverse cube of its distance, and
 brakes to a stop. A departing vehicle starts slowly, and its field decays with the inverse cube of
-its distance. A change is therefore small for longer at its far end than at its near end, and its
-growth accelerates at the far end and decelerates at the near end. The test is an addition of this
-package.
+its distance. The far end of a change (distant vehicle) therefore lasts longer than the near end
+(vehicle at the sensor). The growth accelerates at the far end and decelerates at the near end. The
+test is an addition of this package.
 """
 
 from collections.abc import Callable
@@ -17,34 +17,34 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.blocks import Blocks
 from mag_tracking.calibration.growth import growth_of
 
-MAX_SMALL_SHARE = 0.3
-"""Maximum size of the evaluated parts at the beginning and end of a change, relative to its
-size."""
+MAX_SMALL_FRACTION = 0.3
+"""Maximum magnitude of the evaluated ends of a change, as a fraction of the magnitude of the whole
+change."""
 
 DETECTION_STDS = 3.0
 """Detection limit of a change in standard deviations of the mean of a block, per axis."""
 
 MIN_ASYMMETRY = 0.8
-"""Minimum sum of the binary logarithms of both ratios for a decision; it is 0 for equal ends."""
+"""Minimum asymmetry of a change (a binary logarithm) for a decision; 0 = equal ends."""
 
 MIN_GROWTH = 3.5
-"""Minimum ratio of the small part of a change to the detection limit."""
+"""Minimum ratio of the largest evaluated magnitude to the detection limit."""
 
-MAX_QUARTER_SHARE = 0.5
-"""Maximum share of a quarter, less one block, of the total growth time; a longer quarter is a
-stall. The theoretical share is 0.3 to 0.54 for growth by a factor of 4 to 300, half of it within
-few blocks."""
+MAX_QUARTER_FRACTION = 0.5
+"""Maximum duration of a quarter, less one block, as a fraction of the total growth time; a longer
+quarter is a stall. The theoretical fraction is 0.3 to 0.54 for growth by a factor of 4 to 300. Half
+of that growth takes only a few blocks."""
 
 MAX_START_RATIO = 0.9
 """Maximum ratio of the first to the second half of the growth time at the near end. The theoretical
 ratio is 0.7 to 0.24 at the near end and 1.3 to 2.6 at the far end."""
 
 MIN_BLOCKS = 2.0
-"""Minimum duration of the far end in blocks; a step is neither an arrival nor a departure."""
+"""Minimum duration of the longer end in blocks; a step is neither an arrival nor a departure."""
 
 CLEAR_SIZE = 60.0
-"""Minimum size of a clear change in standard deviations of one reading. A clear change is evaluated
-alone; a smaller one also by a larger one at another sensor."""
+"""Minimum magnitude of a clear change in standard deviations of one reading. A clear change is
+classified alone; a smaller change may be classified by a larger change at another sensor."""
 
 MAX_TIME_DIFFERENCE_S = 3.0
 """[s] Maximum time between the new levels of sensors that are changed by the same target."""
@@ -57,14 +57,14 @@ class LevelChange:
     since: float
     """[s] Start of the later level."""
     size: float
-    """Size of the change in standard deviations of one reading."""
+    """Magnitude of the change in standard deviations of one reading."""
     has_departed: bool | None
-    """Whether a vehicle that caused the earlier level has departed. False: one that causes the
+    """True: a vehicle that caused the earlier level has departed. False: a vehicle that causes the
     later level has arrived. None: unknown."""
 
 
 ChangeEvaluator: TypeAlias = Callable[[LevelChange], bool | None]
-"""Takes the `LevelChange` of a sensor; returns whether a vehicle has departed, as
+"""Function of the `LevelChange` of a sensor that returns whether a vehicle has departed, as
 `LevelChange.has_departed`."""
 
 
@@ -75,55 +75,56 @@ def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: F
     Parameters
     ----------
     blocks : Blocks
-        From the earlier level on, in order of time.
+        Chronological, from the earlier level on.
     n_steady : int
-        Number of blocks at the end that are of the later level.
+        Number of blocks at the end that are at the later level.
     before : (k, 3) array, T
         Earlier level at the times of the blocks; NaN = axis not reported.
     noise_std : (3,) array, T
         Standard deviation of one reading.
     origin : float, s
-        Time zero of the blocks, by the clock of all sensors.
+        Zero of the block times, in the time common to all sensors.
 
     Returns
     -------
     LevelChange
     """
     after = np.average(blocks.mean[-n_steady:], axis=0)
-    off_before, off_after = (_size((blocks.mean - level) / noise_std) for level in (before, after))
-    size = float(_size((after - before[-1]) / noise_std))
+    off_before, off_after = (
+        _magnitude((blocks.mean - level) / noise_std) for level in (before, after))
+    size = float(_magnitude((after - before[-1]) / noise_std))
     n_axes, n_readings = np.count_nonzero(~np.isnan(after)), np.median(blocks.n[blocks.n > 0.0])
     detectable = DETECTION_STDS * float(np.sqrt(n_axes / n_readings))
     end = int(np.flatnonzero(off_after > detectable).max(initial=-1)) + 1
     since = origin + float(blocks.time[min(end, len(blocks.time) - 1)])
     # If the latest blocks still approach the level, the change is not complete.
-    is_there = not (off_after[-n_steady:] > detectable).any()
+    is_complete = not (off_after[-n_steady:] > detectable).any()
     asymmetry = _asymmetry(blocks.time, off_before, off_after, detectable,
-                           MAX_SMALL_SHARE * size) if is_there else 0.0
+                           MAX_SMALL_FRACTION * size) if is_complete else 0.0
     return LevelChange(since, size, None if abs(asymmetry) < MIN_ASYMMETRY else asymmetry > 0.0)
 
 
-def _size(off: FloatArray) -> FloatArray:
-    """Norm over the reported axes."""
+def _magnitude(off: FloatArray) -> FloatArray:
+    """Norm over the reported axes, (...)."""
     size: FloatArray = np.sqrt(np.nansum(np.square(off), axis=-1))
     return size
 
 
 def _asymmetry(time: FloatArray, off_before: FloatArray, off_after: FloatArray, detectable: float,
-           small: float) -> float:
+               small: float) -> float:
     """Binary logarithm of the asymmetry of a change; positive for a departure.
 
-    Zero if the growth stalls at one end, as when a second vehicle stops behind a first one, and if
-    neither end is that of a starting or stopping vehicle. `off_before` and `off_after` (k,) are
-    the distances from both levels in standard deviations of a reading; the ends are evaluated
-    from `detectable` to `small`.
+    Zero if the growth stalls at one end, for example because a second vehicle stops behind the
+    first one. Zero also if neither end matches a starting or stopping vehicle. `off_before` and
+    `off_after` (k,) are the distances from both levels in standard deviations of a reading. The
+    ends are evaluated from `detectable` to `small`.
     """
     length = float(np.median(np.diff(time)))
     first = growth_of(time, off_before, detectable, small)
     last = growth_of(-time[::-1], off_after[::-1], detectable, small)
     if small < MIN_GROWTH * detectable or first is None or last is None \
             or max(first.whole, last.whole) < MIN_BLOCKS * length \
-            or any(max(end.quarters) > MAX_QUARTER_SHARE * end.whole + length
+            or any(max(end.quarters) > MAX_QUARTER_FRACTION * end.whole + length
                    for end in (first, last)):
         return 0.0
     # The position of an end within a block is unknown.
@@ -135,24 +136,24 @@ def _asymmetry(time: FloatArray, off_before: FloatArray, off_after: FloatArray, 
 
 
 NO_CHANGE = LevelChange(np.nan, 0.0, None)
-"""Replaces an earlier change that is over."""
+"""Value that replaces an earlier change of a sensor after the end of that change."""
 
 
 class SharedChanges:
     """The latest `LevelChange` of each sensor of a network."""
 
     def __init__(self) -> None:
-        self._latest: dict[int, LevelChange] = {}
+        self._latest_changes: dict[int, LevelChange] = {}
 
     def evaluate_change(self, sensor: int, change: LevelChange) -> bool | None:
-        """Evaluate a change of a sensor together with those of the other sensors.
+        """Evaluate a change of a sensor together with the changes of the other sensors.
 
-        A change that is not clear is classified by the largest simultaneous one.
+        A change that is not clear is classified by the largest simultaneous change.
 
         Parameters
         ----------
         sensor : int
-            Row of the network.
+            Index of the sensor in the network.
         change : LevelChange
 
         Returns
@@ -160,9 +161,10 @@ class SharedChanges:
         bool or None
             Whether a vehicle has departed, as `LevelChange.has_departed`.
         """
-        self._latest[sensor] = change
+        self._latest_changes[sensor] = change
         if change.size >= CLEAR_SIZE and change.has_departed is not None:
             return change.has_departed
-        together = [other for other in self._latest.values() if other.has_departed is not None
-                    and abs(other.since - change.since) < MAX_TIME_DIFFERENCE_S]
-        return max(together, key=lambda other: other.size).has_departed if together else None
+        candidates = [other for other in self._latest_changes.values()
+                      if other.has_departed is not None
+                      and abs(other.since - change.since) < MAX_TIME_DIFFERENCE_S]
+        return max(candidates, key=lambda other: other.size).has_departed if candidates else None

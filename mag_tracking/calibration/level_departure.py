@@ -1,4 +1,4 @@
-"""Interval in which a sensor departs from its background, and the level at its end."""
+"""Interval in which a sensor departs from its background, and the level at the end."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -13,12 +13,12 @@ from mag_tracking.calibration.level_change import NO_CHANGE, ChangeEvaluator, le
 from mag_tracking.units import NS
 
 MIN_RELEARN_S = 10.0
-"""[s] Minimum time on another steady level that replaces a background that was resumed or observed
-only briefly."""
+"""[s] Minimum duration of another steady level that replaces a resumed or briefly observed
+background."""
 
-SHORTENED_SHARE = 2.0 / 3.0
-"""Share of the usual time that a level has to last after a vehicle has departed, or if it is a
-former level."""
+SHORTENED_FRACTION = 2.0 / 3.0
+"""Required duration of a level after a departure, and of a former level, relative to the usual
+duration."""
 
 MAX_EVALUATED_BLOCKS = 240
 """Maximum number of blocks (a minute of the usual length) for which arrivals and departures are
@@ -26,15 +26,18 @@ evaluated, since each evaluation uses all blocks."""
 
 
 class LevelDeparture:
-    """Blocks that depart from the background since it was frozen.
+    """Blocks that depart from a frozen background.
 
     Parameters
     ----------
     learn, relearn : float, s
         As for `RunningBackground`.
     state : SENSOR record
+        State of the sensor.
     level : BackgroundLevel
+        Background of the sensor.
     evaluate_change : ChangeEvaluator
+        Classifies a level change of the sensor.
 
     Attributes
     ----------
@@ -44,9 +47,9 @@ class LevelDeparture:
     has_arrived : bool
         Whether a vehicle has arrived and is present.
     was_steady : bool
-        Whether the sensor was at another level for long enough.
+        Whether the sensor was at another steady level for long enough.
     departed_at : float or None, s
-        Time at which a vehicle present from the start had departed.
+        Time by which a vehicle present at the start had departed.
     """
 
     def __init__(self, learn: float, relearn: float, state: Record, level: BackgroundLevel,
@@ -57,17 +60,17 @@ class LevelDeparture:
         self.forget()
 
     def forget(self) -> None:
-        """Discard everything, including the former level."""
+        """Reset all attributes, including the former level."""
         self.departed_at: float | None = None
         self.former: FormerLevel | None = None
         self._evaluate_change(NO_CHANGE)
         self.end()
 
     def end(self) -> None:
-        """Reset, since the sensor is at its background again."""
+        """End the departure, because the sensor is at its background again."""
         self.blocks: deque[Block] = deque()
-        self._before: list[Block] = []
-        self._has_begin = True
+        self._blocks_before: list[Block] = []
+        self._has_first_block = True
         self.has_arrived = self.was_steady = False
 
     def add(self, block: Block, before: Iterable[Block]) -> None:
@@ -77,35 +80,36 @@ class LevelDeparture:
         ----------
         block : Block
         before : iterable of Block
-            The blocks before the first one that departs.
+            Blocks immediately before the departure; read with its first block only.
         """
         if not self.blocks:
-            self._before = list(before)
+            self._blocks_before = list(before)
         self.blocks.append(block)
 
     def shorten(self) -> None:
-        """Discard the first block; those after it may be steady."""
+        """Discard the first block; the later blocks may be steady."""
         self.blocks.popleft()
-        self._has_begin = False
+        self._has_first_block = False
 
-    def steady_end(self, share: float = 1.0) -> deque[Block] | None:
-        """Latest blocks if they are of a steady level.
+    def steady_end(self, ratio: float = 1.0) -> deque[Block] | None:
+        """Return the latest blocks if they are at a steady level, and update `was_steady`.
 
         Parameters
         ----------
-        share : float
-            Required duration relative to the usual one.
+        ratio : float
+            Required duration relative to the usual duration.
 
         Returns
         -------
         deque of Block or None
+            None if they are not steady.
         """
-        latest = self._level.steady_end(self.blocks, share * self._learn)
-        self.was_steady |= latest is not None
-        return latest
+        new_blocks = self._level.steady_end(self.blocks, ratio * self._learn)
+        self.was_steady |= new_blocks is not None
+        return new_blocks
 
     def relearn_time(self, seen_s: float, relearns_soon: bool) -> float:
-        """Time on another steady level after which it becomes the background.
+        """Time on another steady level after which that level becomes the background.
 
         Parameters
         ----------
@@ -128,7 +132,7 @@ class LevelDeparture:
             self._relearn, max(self._learn, MIN_RELEARN_S, MIN_DURATION_RATIO * seen_s))
 
     def former_seen_s(self) -> float:
-        """Duration for which the former level was observed, if the latest block is at it.
+        """Duration for which the former level was observed, if the latest block is at that level.
 
         Returns
         -------
@@ -139,28 +143,26 @@ class LevelDeparture:
         is_at_it = former is not None and former.is_at(self.blocks[-1], self._level.limits)
         return former.seen_s if former is not None and is_at_it else 0.0
 
-    def has_departed(self, latest: deque[Block]) -> bool | None:
-        """Whether a vehicle that was part of the background has departed.
-
-        The result is remembered.
+    def has_departed(self, new_blocks: deque[Block]) -> bool | None:
+        """Determine and store whether a vehicle that was part of the background has departed.
 
         Parameters
         ----------
-        latest : deque of Block
+        new_blocks : deque of Block
             Blocks of the new level.
 
         Returns
         -------
         bool or None
-            False: a vehicle has arrived. None: unknown.
+            True: a vehicle has departed. False: a vehicle has arrived. None: unknown.
         """
-        if self.has_arrived or not self._has_begin or len(self.blocks) > MAX_EVALUATED_BLOCKS:
+        if self.has_arrived or not self._has_first_block or len(self.blocks) > MAX_EVALUATED_BLOCKS:
             return False if self.has_arrived else None
-        blocks = stacked([*self._before, *self.blocks])
+        blocks = stacked([*self._blocks_before, *self.blocks])
         has_departed = self._evaluate_change(level_change(
-            blocks, len(latest), self._level.at_all(blocks.time), self._state['noise_std'],
+            blocks, len(new_blocks), self._level.at_all(blocks.time), self._state['noise_std'],
             int(self._state['first_ns']) / NS))
         self.has_arrived = has_departed is False
         if has_departed and self.former is None and self.departed_at is None:
-            self.departed_at = latest[0].time
+            self.departed_at = new_blocks[0].time
         return has_departed

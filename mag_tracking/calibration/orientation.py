@@ -15,47 +15,47 @@ from mag_tracking.geometry import (
 )
 
 GRAVITY = 9.81
-"""[m/s²], to 1 % anywhere on Earth."""
+"""[m/s²] Gravity, accurate to 1 % anywhere on Earth."""
 
 MAX_GRAVITY_DIFFERENCE = 1.0
-"""[m/s²] Maximum difference of the size of the acceleration at rest from gravity."""
+"""[m/s²] Maximum difference between the magnitude of the acceleration at rest and gravity."""
 
 OUTLIER_STDS = 5.0
 """Distance from the median, in standard deviations, beyond which a reading is a knock and is
 excluded."""
 
 MAX_RIVAL_COST = 9.0
-"""Maximum cost difference of a rival heading from the best heading."""
+"""Maximum cost difference between a rival heading and the best heading."""
 
 MAX_EQUAL_COST = 1.0
-"""Maximum cost difference of headings that fit equally well; the one closest to the stated heading
-is used."""
+"""Maximum cost difference of headings that fit equally well; the heading closest to the nominal
+heading is used."""
 
 MAX_HEADING_STD = np.deg2rad(60.0)
 """[rad] Maximum standard deviation of a heading."""
 
 _Fit: TypeAlias = Callable[[float], tuple[FloatArray, FloatArray]]
-"""Maps a yaw [rad] to the residual and to the derivative of the field by the yaw, both (n,)."""
+"""Function of a yaw [rad] that returns the residual and the derivative of the field, both (n,)."""
 
 
 @dataclass(frozen=True)
 class UpDirection:
-    """Direction of up for a sensor at rest."""
+    """Up direction of a sensor at rest."""
 
     direction: FloatArray
     """(3,) unit vector, sensor frame."""
     size: float
-    """[m/s²] Measured size of gravity."""
+    """[m/s²] Measured magnitude of gravity."""
     std: float
     """[rad] Standard deviation of the direction, about each level axis."""
     n: int
     """Number of readings used."""
     n_left_out: int
-    """Number of excluded readings: knocks and readings that are not finite."""
+    """Number of readings excluded as knocks or because they are not finite."""
 
 
 def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
-    """Direction of up from the accelerometer of a sensor at rest.
+    """Up direction from the accelerometer of a sensor at rest.
 
     At rest, an accelerometer measures the reaction to gravity.
 
@@ -73,28 +73,28 @@ def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
     Raises
     ------
     ValueError
-        If fewer than 8 readings are at rest, or their size is not that of gravity.
+        If fewer than 8 readings are at rest, or the magnitude of the mean differs from gravity.
     """
     a = np.asarray(acceleration, dtype=float).reshape(-1, 3)
     finite = a[np.isfinite(a).all(axis=1)]
     if len(finite) < 8:
-        raise ValueError(f'{len(finite)} accelerations are too few for the tilt, 8 are required')
-    deviation = finite - np.median(finite, axis=0)
-    scale = 1.4826 * np.median(np.abs(deviation), axis=0)
+        raise ValueError(f'the tilt requires at least 8 valid accelerations, got {len(finite)}')
+    distance = finite - np.median(finite, axis=0)
+    scale = 1.4826 * np.median(np.abs(distance), axis=0)
     # The scatter of a coarse accelerometer at rest can be zero.
-    quiet = (np.abs(deviation) <= OUTLIER_STDS * np.maximum(scale, 1e-3)).all(axis=1)
-    used = finite[quiet]
-    if len(used) < 8:
-        raise ValueError(f'only {len(used)} of {len(finite)} accelerations are at rest, 8 are '
+    quiet = (np.abs(distance) <= OUTLIER_STDS * np.maximum(scale, 1e-3)).all(axis=1)
+    at_rest = finite[quiet]
+    if len(at_rest) < 8:
+        raise ValueError(f'only {len(at_rest)} of {len(finite)} accelerations are at rest, 8 are '
                          'required')
-    mean = used.mean(axis=0)
+    mean = at_rest.mean(axis=0)
     size = float(np.linalg.norm(mean))
     if abs(size - GRAVITY) > MAX_GRAVITY_DIFFERENCE:
         raise ValueError(f'the acceleration at rest is {size:.3g}, not {GRAVITY} m/s^2'
                          + (' (is its unit g?)' if 0.8 < size < 1.2 else ''))
-    scatter = float(used.std(axis=0).max()) / np.sqrt(len(used))
-    return UpDirection(mean / size, size, float(np.hypot(scatter, bias)) / GRAVITY, len(used),
-              len(a) - len(used))
+    scatter = float(at_rest.std(axis=0).max()) / np.sqrt(len(at_rest))
+    return UpDirection(mean / size, size, float(np.hypot(scatter, bias)) / GRAVITY, len(at_rest),
+                       len(a) - len(at_rest))
 
 
 @dataclass(frozen=True)
@@ -104,30 +104,30 @@ class Orientation:
     R_ws: FloatArray
     """(3, 3), sensor to world."""
     std: FloatArray
-    """(3,) [rad] standard deviations of small rotations about the world axes."""
+    """(3,) [rad] Standard deviations of small rotations about the world axes."""
     bias: FloatArray
     """(3,) [T], sensor frame: measured field minus the Earth's field; NaN for an axis not reported.
     The component across the heading is not included, since it is absorbed by the heading."""
     rival: float
-    """[rad] Difference to another heading that fits equally well; NaN if the heading is unique."""
+    """[rad] Angle to another heading that fits equally well; NaN if the heading is unique."""
 
 
 def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatArray,
                         bias_std: float, stated: FloatArray | None = None) -> Orientation:
-    """Orientation of a sensor from the direction of up and the Earth's field.
+    """Orientation of a sensor from the up direction and the Earth's field.
 
     Parameters
     ----------
     up : UpDirection
     field : (3,) array, T, sensor frame
-        Without a target; NaN = axis not reported.
+        Measured without a target; NaN = axis not reported.
     earth_field : (3,) array, T, world frame
     bias_std : float, T
         Standard deviation of the bias of the sensor, including nearby iron, per axis. A bias is
         not distinguishable from a heading error: 0.6 uT rotates a compass by two degrees.
     stated : (3, 3) array, optional
-        Stated orientation, sensor to world. It selects one of several headings that fit equally
-        well (two for a sensor with one axis); otherwise the best is used.
+        Nominal orientation, sensor to world. It selects one of several headings that fit equally
+        well (two for a sensor with one axis). Default: the best heading is selected.
 
     Returns
     -------
@@ -148,15 +148,15 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
     across = np.cross([0.0, 0.0, 1.0], B0)
 
     def fit(yaw: float) -> tuple[FloatArray, FloatArray]:
-        """Residual on the reported axes, and the derivative of the field by the yaw."""
+        """Residual on the reported axes, and derivative of the field with respect to the yaw."""
         R_sw = (rotation_about_z(yaw) @ R_level).T
         return (y - R_sw @ B0)[reported], -(R_sw @ across)[reported]
 
-    yaws = [_refined(fit, start) for start in np.deg2rad(np.arange(0.0, 360.0, 30.0))]
+    yaws = [_refined_yaw(fit, start) for start in np.deg2rad(np.arange(0.0, 360.0, 30.0))]
     costs = np.array([np.sum(fit(yaw)[0]**2) for yaw in yaws]) / bias_std**2
-    away = costs if stated is None else np.array(
+    preference = costs if stated is None else np.array(
         [abs(yaw_between(rotation_about_z(yaw) @ R_level, stated)) for yaw in yaws])
-    yaw = yaws[int(np.argmin(np.where(costs <= costs.min() + MAX_EQUAL_COST, away, np.inf)))]
+    yaw = yaws[int(np.argmin(np.where(costs <= costs.min() + MAX_EQUAL_COST, preference, np.inf)))]
     slope = fit(yaw)[1]
     level, upright = np.hypot(*B0[:2]), abs(B0[2])
     information = slope @ slope / bias_std**2
@@ -165,16 +165,16 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
                          f'of {level:.2g} T is too small for a bias of {bias_std:.2g} T')
     # A tilt error projects part of the vertical field onto the horizontal plane.
     heading_std = np.sqrt(1.0 / information + (up.std * upright / level)**2)
-    others = [np.angle(np.exp(1j * (other - yaw))) for other in yaws]
-    rivals = [d for d, c in zip(others, costs, strict=True)
+    differences = [np.angle(np.exp(1j * (other - yaw))) for other in yaws]
+    rivals = [d for d, c in zip(differences, costs, strict=True)
               if abs(d) > 0.1 and c < costs.min() + MAX_RIVAL_COST]
     R_ws = rotation_about_z(yaw) @ R_level
     return Orientation(R_ws, np.array([up.std, up.std, heading_std]), y - R_ws.T @ B0,
                        min(rivals, key=abs) if rivals else float('nan'))
 
 
-def _refined(fit: _Fit, yaw: float) -> float:
-    """Yaw after Gauss-Newton steps of at most half a radian."""
+def _refined_yaw(fit: _Fit, yaw: float) -> float:
+    """Refine a yaw by Gauss-Newton steps of at most half a radian."""
     for _ in range(30):
         residual, slope = fit(yaw)
         square = slope @ slope
@@ -189,25 +189,26 @@ def _refined(fit: _Fit, yaw: float) -> float:
 
 def levelled(up: UpDirection | None, stated: FloatArray,
              stated_std: FloatArray) -> Orientation | None:
-    """Correct the tilt of a stated orientation.
+    """Correct the tilt of a nominal orientation.
 
     Parameters
     ----------
     up : UpDirection or None
     stated : (3, 3) array
-        Sensor to world.
+        Nominal orientation, sensor to world.
     stated_std : (3,) array, rad
-        About the world axes.
+        Standard deviations about the world axes.
 
     Returns
     -------
     Orientation or None
-        With a bias of NaN; None without `up`.
+        Its bias is NaN. None if `up` is None.
     """
     if up is None:
         return None
-    turn = rotation_from_quaternion(quaternion_between(stated @ up.direction, [0.0, 0.0, 1.0]))
-    return Orientation(turn @ stated, np.array([up.std, up.std, stated_std[2]]),
+    correction = rotation_from_quaternion(
+        quaternion_between(stated @ up.direction, [0.0, 0.0, 1.0]))
+    return Orientation(correction @ stated, np.array([up.std, up.std, stated_std[2]]),
                        np.full(3, np.nan), float('nan'))
 
 
@@ -215,50 +216,51 @@ def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
                     weight: float = 4.0) -> float:
     """Standard deviation of the biases of a network's sensors.
 
-    The biases along the heading and the vertical are observable, that across the heading is not.
-    Each sensor therefore counts with one axis less.
+    The bias is observable along the heading and the vertical, but not across the heading. Each
+    sensor therefore contributes one axis less.
 
     Parameters
     ----------
     orientations : sequence of Orientation
     bias_std : float, T
-        Prior standard deviation; it counts as `weight` values.
+        Prior standard deviation.
     weight : float
+        Number of values that the prior counts as.
 
     Returns
     -------
     float, T
     """
     square = sum(float(np.nansum(o.bias**2)) for o in orientations)
-    seen = sum(np.count_nonzero(~np.isnan(o.bias)) - 1 for o in orientations)
-    return float(np.sqrt((weight * bias_std**2 + square) / (weight + seen)))
+    n_observed = sum(np.count_nonzero(~np.isnan(o.bias)) - 1 for o in orientations)
+    return float(np.sqrt((weight * bias_std**2 + square) / (weight + n_observed)))
 
 
 def with_stated_heading(orientation: Orientation, stated: FloatArray, stated_std: float,
                         limit: float = 3.0) -> Orientation | None:
-    """Fuse the compass heading with a stated heading.
+    """Fuse the compass heading with a nominal heading.
 
     Parameters
     ----------
     orientation : Orientation
         From accelerometer and compass.
     stated : (3, 3) array
-        Sensor to world.
+        Nominal orientation, sensor to world.
     stated_std : float, rad
-        Standard deviation of the stated heading.
+        Standard deviation of the nominal heading.
     limit : float
-        Maximum difference in standard deviations; beyond it, the stated heading is wrong.
+        Maximum difference in standard deviations; beyond it, the nominal heading is wrong.
 
     Returns
     -------
     Orientation or None
-        None if the difference is beyond the limit.
+        None if the difference exceeds the limit.
     """
     difference = yaw_between(orientation.R_ws, stated)
     compass = orientation.std[2]
     if abs(difference) > limit * np.hypot(compass, stated_std):
         return None
-    share = compass**2 / (compass**2 + stated_std**2)
+    weight_of_stated = compass**2 / (compass**2 + stated_std**2)
     std = np.append(orientation.std[:2], compass * stated_std / np.hypot(compass, stated_std))
-    return Orientation(rotation_about_z(share * difference) @ orientation.R_ws, std,
+    return Orientation(rotation_about_z(weight_of_stated * difference) @ orientation.R_ws, std,
                        orientation.bias, orientation.rival)

@@ -1,6 +1,7 @@
 """Provisional background before a quiet interval is long enough: the most frequent level so far.
 
-In dense traffic no interval is quiet for seconds, and a sensor without a background is useless.
+In dense traffic no interval is quiet for several seconds, and a sensor without a background cannot
+contribute to tracking.
 """
 
 from collections import deque
@@ -23,14 +24,14 @@ MIN_BLOCKS = 12
 """Minimum number of blocks, independent of the rate of the sensor."""
 
 MAX_BLOCKS = 240
-"""Maximum number of blocks, the latest ones: a minute of the usual length."""
+"""Maximum number of stored blocks: a minute of blocks of the usual length."""
 
 SEARCH_GROWTH = 1.1
 """Growth of the number of blocks after which the level is determined again."""
 
 MIN_SEEN_S = 10.0
-"""[s] Minimum total duration of a certain level, which must also be far longer than that of any
-other."""
+"""[s] Minimum total duration of a certain level, which must also last far longer than any other
+level."""
 
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution relative to its median absolute deviation."""
@@ -46,7 +47,7 @@ class FrequentLevel:
     level observed for less than half of the time may not be the background. NaN = axis not
     reported."""
     is_certain: bool
-    """Whether it was observed for long enough, and far longer than any other level."""
+    """Whether the level was observed for long enough, and far longer than any other level."""
 
     @property
     def seen_s(self) -> float:
@@ -55,7 +56,7 @@ class FrequentLevel:
 
 
 class ProvisionalLevel:
-    """Collects the blocks of a sensor and determines their most frequent level from time to time.
+    """Collects the blocks of a sensor and periodically determines their most frequent level.
 
     Parameters
     ----------
@@ -64,13 +65,13 @@ class ProvisionalLevel:
     """
 
     def __init__(self, learn_s: float) -> None:
-        self._patience_s = WAIT_RATIO * learn_s
+        self._min_duration_s = WAIT_RATIO * learn_s
         self.clear()
 
     def clear(self) -> None:
         """Discard all blocks."""
         self._blocks: deque[Block] = deque(maxlen=MAX_BLOCKS)
-        self._since_last, self._due = 0, MIN_BLOCKS
+        self._n_new, self._n_required = 0, MIN_BLOCKS
 
     def collect(self, block: Block) -> None:
         """Add the next block.
@@ -80,10 +81,10 @@ class ProvisionalLevel:
         block : Block
         """
         self._blocks.append(block)
-        self._since_last += 1
+        self._n_new += 1
 
-    def found(self, steps: FloatArray) -> FrequentLevel | None:
-        """Most frequent level, if it is due.
+    def frequent_level(self, steps: FloatArray) -> FrequentLevel | None:
+        """Determine the most frequent level if enough blocks have been added.
 
         Parameters
         ----------
@@ -93,17 +94,20 @@ class ProvisionalLevel:
         Returns
         -------
         FrequentLevel or None
+            None if the level is not due or no level is frequent enough.
         """
         blocks = self._blocks
-        if self._since_last < self._due or blocks[-1].time - blocks[0].time < self._patience_s:
+        if self._n_new < self._n_required \
+                or blocks[-1].time - blocks[0].time < self._min_duration_s:
             return None
-        self._since_last, self._due = 0, max(1, int((SEARCH_GROWTH - 1.0) * len(blocks)))
-        all_of = stacked(blocks)
-        level = most_frequent_level(all_of, np.where(np.isfinite(steps), steps, 0.0), MAX_BLOCKS)
+        self._n_new, self._n_required = 0, max(1, int((SEARCH_GROWTH - 1.0) * len(blocks)))
+        stored = stacked(blocks)
+        level = most_frequent_level(stored, np.where(np.isfinite(steps), steps, 0.0), MAX_BLOCKS)
         if level is None:
             return None
-        apart, known = np.full(3, np.nan), ~np.isnan(level.level)
-        apart[known] = np.nanmedian(np.abs(all_of.mean[:, known] - level.level[known]), axis=0)
+        distance, is_known = np.full(3, np.nan), ~np.isnan(level.level)
+        distance[is_known] = np.nanmedian(
+            np.abs(stored.mean[:, is_known] - level.level[is_known]), axis=0)
         is_certain = level.n_blocks * level.block_s >= MIN_SEEN_S \
             and level.n_blocks >= MIN_DURATION_RATIO * level.n_rival
-        return FrequentLevel(level, MAD_TO_STD * apart, is_certain)
+        return FrequentLevel(level, MAD_TO_STD * distance, is_certain)

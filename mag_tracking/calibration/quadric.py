@@ -9,26 +9,27 @@ OUTLIER = 4.0
 """[std] Distance from the ellipsoid beyond which a reading is an outlier."""
 
 MIN_SCALE = 1e-9
-"""Residual std relative to the radius below which it is due to rounding."""
+"""Standard deviation of residuals, relative to the radius, below which the cause is rounding."""
 
 POSSIBLE_CAUSES = ('possible causes are too few directions, a sensor at rest, or a field that is '
                    'not uniform')
-"""Possible causes of a fit without an ellipsoid."""
+"""Possible causes if the readings do not fit an ellipsoid."""
 
 
 def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
-    """Fit an ellipsoid to normalised readings, without outliers.
+    """Fit an ellipsoid to normalised readings, excluding outliers.
 
     Parameters
     ----------
     z : (n, 3) array
+        Normalised readings.
 
     Returns
     -------
     offset : (3,) array
     correction : (3, 3) array
     reason : str
-        Why there is no ellipsoid; empty if there is one.
+        Why no ellipsoid was found; empty if one was found.
 
     References
     ----------
@@ -73,6 +74,7 @@ def robust_std(d: FloatArray, w: FloatArray) -> float:
     Parameters
     ----------
     d : (n,) array
+        Residuals.
     w : (n,) array
         Weights.
 

@@ -16,7 +16,7 @@ from mag_tracking.calibration.blocks import (
 
 
 class QuietInterval:
-    """The latest quiet blocks, delayed because a target approaches gradually.
+    """Latest quiet blocks, delayed because a target approaches gradually.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class QuietInterval:
     Attributes
     ----------
     pending : deque of Block
-        Blocks that are not delayed long enough.
+        Latest blocks, which have not been delayed long enough.
     """
 
     def __init__(self, guard: float, max_blocks: int) -> None:
@@ -45,7 +45,7 @@ class QuietInterval:
         self.pending.clear()
 
     def begin(self, blocks: Iterable[Block]) -> None:
-        """Restart with some blocks.
+        """Restart the interval with the given blocks.
 
         Parameters
         ----------
@@ -65,7 +65,7 @@ class QuietInterval:
         Yields
         ------
         Blocks
-            All blocks of the interval, after each one that has been delayed long enough.
+            All blocks of the interval, after the addition of each sufficiently delayed block.
         """
         self.pending.append(block)
         while self.pending and self.pending[0].time <= block.time - self._guard:
@@ -89,12 +89,12 @@ class QuietInterval:
         (3,) array, T²
             NaN = unknown.
         """
-        found = pooled_covariance(self.blocks()) if self else None
-        return np.full(3, np.nan) if found is None else found.diagonal()
+        covariance = pooled_covariance(self.blocks()) if self else None
+        return np.full(3, np.nan) if covariance is None else covariance.diagonal()
 
 
 def line_of(blocks: Blocks) -> tuple[float, FloatArray, FloatArray, float]:
-    """Fit a line to blocks, as for `BackgroundLevel`.
+    """Fit the line of a `BackgroundLevel` to blocks.
 
     The drift is extrapolated for at most twice the duration of the blocks.
 

@@ -16,10 +16,10 @@ from mag_tracking.calibration.frequent_level import (
 from mag_tracking.calibration.resolution import corrected_steps, raw_steps
 
 NEAR_STDS = 8.0
-"""Maximum difference between the initial and the most frequent level, in standard deviations of a
-reading, that an approaching target may cause."""
+"""Maximum difference between the initial and the most frequent level that an approaching target may
+cause, in standard deviations of a reading."""
 NEAR_DURATION_RATIO = 1.5
-"""Ratio of durations that replaces `MIN_DURATION_RATIO` for such levels."""
+"""Value that replaces `MIN_DURATION_RATIO` for levels that differ by at most `NEAR_STDS`."""
 
 LEVEL_WEIGHT = 0.3
 """Weight of the latest block in the exponential average of a drifting level."""
@@ -29,7 +29,7 @@ MAX_BLOCKS = 4000
 
 
 class BlockRecorder(RunningBackground):
-    """Collects the blocks of a sensor in the first pass over a recording; never ready."""
+    """Background that only collects the blocks of a sensor, in a first pass over a recording."""
 
     def evaluate_block(self) -> None:
         """Store the current block if it is complete."""
@@ -43,7 +43,7 @@ class BlockRecorder(RunningBackground):
         super().forget()
 
     def quiet_level(self, since: float = 0.0) -> QuietLevel | None:
-        """Most frequent level of the sensor.
+        """Most frequent level of the collected blocks.
 
         Parameters
         ----------
@@ -57,22 +57,23 @@ class BlockRecorder(RunningBackground):
         blocks = [block for block in self._blocks if block.time >= since]
         if len(blocks) < MIN_BLOCKS:
             return None
-        every = 1 + len(blocks) // MAX_BLOCKS
+        stride = 1 + len(blocks) // MAX_BLOCKS
         steps = corrected_steps(self._sensors)
-        return most_frequent_level(stacked(blocks[::every]),
+        return most_frequent_level(stacked(blocks[::stride]),
                                    np.where(np.isfinite(steps), steps, 0.0), self._max_blocks)
 
     def is_known_level(self, initial: FloatArray, found: QuietLevel) -> bool:
-        """Whether the initial level is that of the background.
+        """Whether the initial level is the level of the background.
 
         True if the field drifts from the initial level to the most frequent level, or is at the
-        latter for hardly longer.
+        most frequent level for only slightly longer.
 
         Parameters
         ----------
         initial : (3,) array, T
+            Level at the start of the recording.
         found : QuietLevel
-            The most frequent level.
+            Most frequent level.
 
         Returns
         -------
@@ -89,7 +90,7 @@ class BlockRecorder(RunningBackground):
             if found.begin <= block.time <= found.end \
                     and not (np.abs(level - found.level) > found.width).any():
                 return True
-        # An approaching target changes the level slightly; a stationary one changes it by more.
+        # An approaching target changes the level slightly; a stationary target changes it more.
         noise = np.sqrt(found.covariance.diagonal() + (found.width / LEVEL_WIDTH)**2)
         is_near = not (np.abs(initial - found.level) > NEAR_STDS * noise).any()
         return (NEAR_DURATION_RATIO if is_near else MIN_DURATION_RATIO) * n > found.n_blocks
@@ -100,8 +101,9 @@ class BlockRecorder(RunningBackground):
         Parameters
         ----------
         initial : (3,) array, T
+            Level at the start of the recording.
         found : QuietLevel
-            The level whose width is used.
+            Level whose width is used as the tolerance.
         since : float, s
             Start of the evaluated blocks.
 
@@ -109,8 +111,9 @@ class BlockRecorder(RunningBackground):
         -------
         bool
         """
-        off = [np.abs(b.mean - initial) > found.width for b in self._blocks if b.time >= since]
-        return sum(not o.any() for o in off) >= MIN_BLOCKS
+        is_different = [np.abs(b.mean - initial) > found.width
+                        for b in self._blocks if b.time >= since]
+        return sum(not o.any() for o in is_different) >= MIN_BLOCKS
 
     @property
     def steps(self) -> FloatArray:

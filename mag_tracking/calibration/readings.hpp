@@ -27,9 +27,9 @@ enum Reason {
     SPIKES = 30, PASSED
 };
 
-// Maximum difference between the correlation of two axes in a message and the measured one.
+// Maximum difference between the correlation of two axes in a message and the measured correlation.
 constexpr double MAX_CORRELATION = 0.7;
-// Maximum ratio between the variance in a message and the measured one.
+// Maximum ratio between the variance in a message and the measured variance.
 constexpr double MAX_VARIANCE_RATIO = 25.0;
 
 // Whether a reading has its own covariance.
@@ -43,15 +43,16 @@ struct Limits {
     int64_t is_decimated, trust_covariances;
 };
 
-// Progress within a batch: next reading; sensor and timestamp of the reading that a reason refers
-// to; numbers of calibrated readings, of spikes, of readings whose background (or that of one axis)
-// is not known yet, and of readings whose covariance was overruled.
+// Progress within a batch: index of the next reading; sensor and timestamp of the reading that a
+// reason refers to; numbers of calibrated readings, of spikes, of readings without a background
+// yet, of readings with an axis without a background yet, and of readings whose covariance was
+// overruled.
 struct Batch {
     int64_t next, row, n_out, n_spikes, n_learning, n_partly_learning, n_overruled, stamp_ns;
 };
 
-// n readings: their sensors (negative: unknown), timestamps [ns], raw fields (n, 3) [T], `Own`, and
-// covariances (n, 3, 3) [T^2], which are read if `own` is not NONE.
+// n readings: indices of their sensors (negative: unknown), timestamps [ns], raw fields (n, 3) [T],
+// `Own`, and covariances (n, 3, 3) [T^2], which are read if `own` is not NONE.
 struct RawReadings {
     int64_t n;
     const int64_t *rows, *stamps;
@@ -86,7 +87,7 @@ inline double product(double coefficient, double value) {
 
 // Correct hard and soft iron of the sensor, from `raw` into `field`; false if no axis remains.
 //
-// A missing raw axis makes all corrected axes missing that depend on it.
+// All corrected axes that depend on a missing raw axis are missing.
 inline bool remove_iron(const Sensor& s, const double* raw, double* field) {
     double v[3];
     bool is_known = false;
@@ -154,7 +155,7 @@ inline bool is_credible(const Sensor& s, const double* C) {
         if (stated > MAX_VARIANCE_RATIO * known || known > MAX_VARIANCE_RATIO * stated)
             return false;
         for (int b = 0; b < a; ++b) {
-            // The correlation in the message must be close to the measured one.
+            // The correlation in the message must be close to the measured correlation.
             const double both = std::sqrt(stated * C[4 * b]);
             const double measured = s.noise[a][b]
                                     / std::sqrt(known * (s.noise[b][b] + s.step_variance[b]));
@@ -164,8 +165,8 @@ inline bool is_credible(const Sensor& s, const double* C) {
     return true;
 }
 
-// Covariance of a reading, into `out` (3, 3): its own if credible, otherwise that of the sensor,
-// plus that of a provisional background.
+// Covariance of a reading, into `out` (3, 3): the covariance in the message if it is credible,
+// otherwise the noise of the sensor. The variance of a provisional background is added.
 inline void attach_covariance(Sensor& s, const Limits& limits, Batch& batch, const Reading& reading,
                               double* out) {
     const double* C = reading.covariance;
@@ -196,7 +197,7 @@ inline bool use(Sensor& s, const Limits& limits, Batch& batch, int64_t row, cons
         return true;
     }
     const int64_t k = batch.n_out;
-    if (k < 0 || k >= out.n) throw std::out_of_range("no room for the calibrated readings");
+    if (k < 0 || k >= out.n) throw std::out_of_range("the output arrays are full");
     double *field = out.fields + 3 * k, *C = out.covariances + 9 * k;
     subtract_background(s, time, reading.field, field);
     attach_covariance(s, limits, batch, reading, C);
@@ -254,7 +255,7 @@ inline Reason calibrate(Sensor* sensors, const Limits& limits, const RawReadings
                 if (batch.n_spikes) return SPIKES;
                 continue;
             }
-            // The reading passes, but cannot be used before Python has been called.
+            // The reading passes, but it cannot be used until Python has handled it.
             store(s, 0, reading);
             s.n_held = s.n_released = 1;
         } else if (verdict != HELD) {

@@ -20,10 +20,10 @@ constexpr double MIN_STD = 1e-11;
 constexpr double TOGGLE = 1.2;
 // Minimum number of repetitions per change of an axis whose steps are larger than its noise.
 constexpr double MIN_REPEATS = 0.2;
-// Maximum duration of a rest that counts as one measurement; a longer one counts as several.
+// Maximum duration of a rest that counts as one measurement; a longer rest counts as several.
 constexpr int64_t MAX_REST_NS = 300'000'000;
 
-// Update the steps of a sensor, and the time since which each axis is constant. `raw` (3) [T] is
+// Update the steps of a sensor, and the time of the latest change of each axis. `raw` (3) [T] is
 // the raw reading; NaN = missing axis.
 inline void note_step(Sensor& s, int64_t stamp, const double* raw) {
     for (int a = 0; a < 3; ++a) {
@@ -46,8 +46,8 @@ inline void note_step(Sensor& s, int64_t stamp, const double* raw) {
 }
 
 // Step [T] of raw axis `a`; 0 if it is too fine to be observed. The smallest change is the step
-// only if the axis repeats values; a field that changes with every reading has a smallest change as
-// well.
+// only if the axis repeats values; a field that changes with every reading also has a smallest
+// change.
 inline double seen_step(const Sensor& s, int a) {
     return double(s.n_same[a]) >= MIN_REPEATS * double(s.n_changed[a]) ? s.step[a] : 0.0;
 }
@@ -72,7 +72,7 @@ inline void corrected_steps(const Sensor& s, double* out) {
     }
 }
 
-// Number of readings since axis `a`, after the correction, is constant: the mean over the raw axes,
+// Number of readings for which corrected axis `a` has been constant: the mean over the raw axes,
 // weighted by the variances due to their steps.
 inline double rest_of(const Sensor& s, int a) {
     if (!s.has_correction) return double(s.n_rest[a]);
@@ -89,7 +89,7 @@ inline double rest_of(const Sensor& s, int a) {
 // Whether an axis with this step [T] and noise variance [T^2], possibly NaN, repeats values.
 inline bool rests(double variance, double step) { return variance <= DITHERED * (step * step); }
 
-// Complete the `steps` (3) [T]: an unknown (infinite) step is taken from the other axes if those
+// Complete the `steps` (3) [T]: an unknown (infinite) step is copied from the other axes if these
 // are at rest. An axis that has never changed is dead (NaN) if another axis of the same sensor
 // changes with every reading. If no axis has changed, it may be at rest.
 inline void complete_steps(const double* variance, double* steps) {
@@ -106,8 +106,8 @@ inline void complete_steps(const double* variance, double* steps) {
 }
 
 // Add the variance due to the steps of a sensor to its noise: reads `noise`, writes `step_variance`
-// and `noise_std`, and writes the maximum deviation of the mean of a block, `freeze_std` standard
-// deviations, to `limits` (3) [T].
+// and `noise_std`, and writes the maximum difference between the mean of a block and the
+// background, `freeze_std` standard deviations, to `limits` (3) [T].
 inline void apply_steps(Sensor& s, double freeze_std, double* limits) {
     double steps[3], variance[3];
     for (int a = 0; a < 3; ++a) variance[a] = s.noise[a][a];

@@ -52,10 +52,10 @@ def raw_steps(sensors: StructArray) -> FloatArray:
 
 
 def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
-    """Steps of all axes, with unknown steps taken from the other axes if those are at rest.
+    """Steps of all axes; unknown steps are copied from other axes at rest.
 
     An axis that has never changed is dead if another axis of the same sensor changes with every
-    reading. If no axis has changed, it may be at rest.
+    reading. If no axis has changed, all axes may be at rest.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def smallest_steps(fields: FloatArray) -> FloatArray:
     Parameters
     ----------
     fields : (n, 3) array, T
-        In order of time; NaN = missing.
+        Chronological; NaN = missing.
 
     Returns
     -------

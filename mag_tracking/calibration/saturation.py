@@ -6,29 +6,29 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.screening import COARSE
 
 MIN_RUN = 3
-"""Minimum number of equal consecutive readings at an extreme of a saturated axis ..."""
+"""Minimum number of consecutive equal readings at the limit of a saturated axis."""
 
 MIN_JUMP = 3.0
-"""... that are reached by a jump of at least this number of smallest steps; a smooth curve in
-coarse steps reaches its top by one step."""
+"""Minimum jump to that limit, in multiples of the smallest step; a smooth curve in coarse steps
+reaches its extreme by single steps."""
 
 MARGIN = 6
-"""Number of readings before and after a saturated one that are not trusted either: noise takes some
-of them over the limit, which biases the others."""
+"""Number of readings excluded before and after each saturated reading. Noise pushes some of these
+readings beyond the limit, which biases the remaining readings."""
 
 
 MIN_ISOLATION = 10.0
-"""Minimum ratio of the differences of a reading from both neighbours to the differences between and
-around those neighbours. Beyond it, the reading is a bus error."""
+"""Minimum difference of a bus error from both neighbours, relative to the differences between and
+around these neighbours."""
 
 
 def isolated_readings(values: FloatArray) -> IntArray:
-    """Find readings of one axis that differ from both neighbours, which agree.
+    """Find single readings of one axis that differ from both neighbours while these agree.
 
     Parameters
     ----------
     values : (n,) array
-        In order of time, without NaN.
+        Chronological, without NaN.
 
     Returns
     -------
@@ -38,26 +38,26 @@ def isolated_readings(values: FloatArray) -> IntArray:
     if len(values) < 5:
         return np.zeros(0, dtype=np.int64)
     change = np.diff(values)
-    before, after = change[1:-2], change[2:-1]
+    change_before, change_after = change[1:-2], change[2:-1]
     around = np.maximum(np.abs(change[:-3]), np.abs(change[3:]))
-    around = np.maximum(around, np.abs(before + after))
-    height = np.minimum(np.abs(before), np.abs(after))
-    least = np.min(np.abs(change[change != 0.0]), initial=np.inf)
-    found: IntArray = 2 + np.flatnonzero((before * after < 0.0) & (
-        height > MIN_ISOLATION * np.maximum(around, least)))
-    return found
+    around = np.maximum(around, np.abs(change_before + change_after))
+    height = np.minimum(np.abs(change_before), np.abs(change_after))
+    smallest_change = np.min(np.abs(change[change != 0.0]), initial=np.inf)
+    indices: IntArray = 2 + np.flatnonzero((change_before * change_after < 0.0) & (
+        height > MIN_ISOLATION * np.maximum(around, smallest_change)))
+    return indices
 
 
 def saturated_readings(values: FloatArray) -> BoolArray:
-    """Find readings of one axis at the end of its range, and those next to them.
+    """Find readings of one axis at the limit of its range, and adjacent readings.
 
     Noise makes equal neighbours rare, and a curve in coarse steps reaches its extreme step by step.
-    Only saturation gives several equal readings directly after a jump.
+    Only saturation produces several equal readings directly after a jump.
 
     Parameters
     ----------
     values : (n,) array
-        Raw readings in order of time; NaN = missing.
+        Chronological raw readings; NaN = missing.
 
     Returns
     -------
@@ -79,15 +79,16 @@ def saturated_readings(values: FloatArray) -> BoolArray:
     step = jumps[jumps > 0.0].min()
     level = float(np.median(v))
     for extreme in (v.min(), v.max()):
-        at = v == extreme
-        if extreme == level and np.mean(jumps[~(at[1:] & at[:-1])] == 0.0) >= COARSE:
+        is_extreme = v == extreme
+        if extreme == level \
+                and np.mean(jumps[~(is_extreme[1:] & is_extreme[:-1])] == 0.0) >= COARSE:
             # An axis with coarse steps is at rest at its median.
             continue
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]])))
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], is_extreme, [False]])))
         for first, end in edges.reshape(-1, 2):
             sides = [jumps[i] for i in (first - 1, end - 1) if 0 <= i < len(jumps)]
             if end - first >= MIN_RUN and max(sides) >= MIN_JUMP * step:
-                near = np.flatnonzero(at)[:, None] + np.arange(-MARGIN, MARGIN + 1)
-                out[present[np.clip(near, 0, len(v) - 1)]] = True
+                nearby = np.flatnonzero(is_extreme)[:, None] + np.arange(-MARGIN, MARGIN + 1)
+                out[present[np.clip(nearby, 0, len(v) - 1)]] = True
                 break
     return out

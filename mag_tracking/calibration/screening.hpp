@@ -1,6 +1,7 @@
 // Rejection of faulty readings of one sensor: spikes and stuck sensors.
 //
-// Only a suspect reading is held until the next ones decide; all others pass at once.
+// Only a suspect reading is held until the next readings permit a decision; other readings pass at
+// once.
 
 #pragma once
 
@@ -12,16 +13,17 @@
 
 namespace mag_tracking {
 
-// Approximate number of readings over which the typical share of repetitions is determined.
+// Approximate number of readings over which the typical fraction of repetitions is determined.
 constexpr double MEMORY = 20'000.0;
-// Minimum number of changes of a sensor; with fewer, its steps may be so coarse that it repeats
-// itself for long.
+// Minimum number of changes of a sensor; with fewer changes, its steps may be so coarse that long
+// repetitions are normal.
 constexpr double MIN_CHANGES = 50.0;
 // Log-probability below which a run of equal readings is a fault.
 const double MIN_LOG_PROBABILITY = std::log(1e-9);
 constexpr int MIN_RUN = 4;
-// Share of repeated readings above which the steps of a sensor are coarse, so that it may repeat
-// itself indefinitely at rest. With a noise of one step or more on three axes, the share is lower.
+// Fraction of repeated readings above which the steps of a sensor are coarse: at rest, it may
+// repeat a reading indefinitely. With a noise of one step or more on three axes, the fraction is
+// lower.
 constexpr double COARSE = 0.05;
 // Minimum ratio of a spike to the largest recent difference; larger if the rate is low.
 constexpr double MIN_RATIO = 8.0;
@@ -30,17 +32,18 @@ constexpr double MAX_RATE = 30.0;
 // Mean of the largest of `RECENT` differences between readings of white noise, in its standard
 // deviations.
 constexpr double MAX_OF_RECENT = 2.4;
-// If a dipole moves by the share s > 0.4 of its distance between two readings, the ratio of their
-// difference to the previous ones is less than this times s^3 in 99.9 % of the cases (simulated).
+// If a dipole moves by the fraction s > 0.4 of its distance between two readings, the ratio of
+// their difference to the previous differences is less than this times s^3 in 99.9 % of the cases
+// (simulated).
 constexpr double RATIO_PER_CUBE = 130.0;
 // [T] Typical maximum step of magnetometers. With the default threshold, steps of up to 1.3e-5 T
 // are not classified as spikes.
 constexpr double MAX_STEP = 1.5e-6;
-// Maximum difference of the field after a spike from that before it, relative to the spike.
+// Maximum difference between the fields after and before a spike, relative to the spike.
 constexpr double MAX_RETURN = 0.3;
 
 // The reading passes; it is held; the held readings are a spike (call again for the reading
-// itself); the held readings and this one pass, in order.
+// itself); the held readings and the current reading pass, in order.
 enum Verdict { PASSES, HELD, SPIKE, RELEASED };
 
 // Whether the current run of equal readings is too long to be due to chance.
@@ -86,15 +89,15 @@ inline double largest_recent(const Sensor& s, int a) {
 // Standard deviation [T] of axis `a`; before the noise is known, from recent differences.
 inline double usual_noise(const Sensor& s, int a) {
     if (s.is_ready) return s.noise_std[a];
-    // An axis that has been constant so far is assumed to have the steps of the others.
+    // An axis that has been constant so far is assumed to have the steps of the other axes.
     const double step = std::isfinite(s.step[a])
                             ? s.step[a]
                             : std::min({s.step[0], s.step[1], s.step[2], MAX_STEP});
     return std::max(largest_recent(s, a) / MAX_OF_RECENT, step / std::sqrt(12.0));
 }
 
-// Whether the differences `steps` (3) [T] from the previous reading are larger than those of a
-// target.
+// Whether the differences `steps` (3) [T] from the previous reading are larger than a target can
+// cause.
 inline bool is_off(const Sensor& s, double threshold, int64_t stamp, const double* steps) {
     // A comparison with NaN is false: a missing axis is no spike.
     bool is_high = false;
@@ -139,7 +142,7 @@ inline void hold(Sensor& s, const Reading& reading, const double* steps) {
     ++s.n_held;
 }
 
-// Record a reading that passes; the next one is compared with it. `steps` may be nullptr.
+// Record a reading that passes, for comparison with the next reading. `steps` may be nullptr.
 inline void pass(Sensor& s, const Reading& reading, const double* steps) {
     double* place = s.steps[s.n_steps % RECENT];
     for (int a = 0; a < 3; ++a) {
@@ -173,8 +176,8 @@ inline bool has_returned(const Sensor& s, const double* steps) {
 // differences.
 inline Verdict screen_spike(Sensor& s, double threshold, const Reading& reading) {
     double steps[3] = {NAN, NAN, NAN};
-    // There are never more when a reading arrives.
-    if (s.n_held > MAX_HELD) throw std::out_of_range("n_held of a sensor: no room for another");
+    // At most MAX_HELD readings are held when a reading arrives.
+    if (s.n_held > MAX_HELD) throw std::out_of_range("n_held of a sensor exceeds its maximum");
     if (s.before_ns == NEVER) {
         if (s.n_held) {
             hold(s, reading, steps);

@@ -1,7 +1,7 @@
 """Rejection of faulty readings of one sensor: spikes and stuck sensors.
 
-Only a suspect reading is held until the next ones decide; all others pass at once. The rules are
-compiled: `screening.hpp`.
+Only a suspect reading is held until the next readings permit a decision; other readings pass at
+once. The rules are compiled: `screening.hpp`.
 """
 
 from mag_tracking.arrays import Record
@@ -9,15 +9,16 @@ from mag_tracking.calibration import core
 from mag_tracking.units import NEVER
 
 MIN_CHANGES = core.MIN_CHANGES
-"""Minimum number of changes of a sensor; with fewer, its steps may be so coarse that it repeats
-itself for long."""
+"""Minimum number of changes of a sensor; with fewer changes, its steps may be so coarse that long
+repetitions are normal."""
 COARSE = core.COARSE
-"""Share of repeated readings above which the steps of a sensor are coarse, so that it may repeat
-itself indefinitely at rest. With a noise of one step or more on three axes, the share is lower."""
+"""Fraction of repeated readings above which the steps of a sensor are coarse: at rest, it may
+repeat a reading indefinitely. With a noise of one step or more on three axes, the fraction is
+lower."""
 
 PASSES, HELD, SPIKE, RELEASED = core.PASSES, core.HELD, core.SPIKE, core.RELEASED
-"""Verdicts: the reading passes; it is held; the held readings are a spike; the held readings and
-this one pass."""
+"""Verdicts: the reading passes; the reading is held; the held readings are a spike; the held
+readings and the current reading pass."""
 
 
 def clear_spikes(sensor: Record) -> None:

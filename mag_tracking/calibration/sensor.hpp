@@ -28,17 +28,19 @@ struct Sensor {
     // a stored background may be restored at the next reading.
     int64_t first_ns, last_ns, unconfirmed_ns, is_restorable, accepted;
     // Repetition: the latest reading, the length of the current run of equal readings, and the
-    // numbers of readings that were equal to the previous one, or differed.
+    // numbers of readings that were equal to the previous reading, or differed.
     double last[3];
     int64_t run;
     double repeats, changes;
-    // Resolution: the latest value of each raw axis, the time and number of readings since it is
-    // constant, the numbers of repetitions and changes, the smallest change, and the variance due
-    // to the steps; the number of readings of a decimated one.
+    // Resolution: the latest value of each raw axis, the time of its latest change and
+    // the number of readings since then, the numbers of repetitions and changes, the smallest
+    // change, and the variance due to the steps; the number of raw readings in a decimated
+    // reading.
     double raw[3];
     int64_t rest_since_ns[3], n_rest[3], n_same[3], n_changed[3];
     double step[3], step_variance[3], n_averaged;
-    // Covariances of the messages: the latest standard deviations, and the number overruled.
+    // Covariances of the messages: the latest overruled standard deviations, and the number of
+    // overruled covariances.
     double stated_std[3];
     int64_t n_overruled;
     // Spikes: the latest reading that passed, the differences before it, and the held readings, of
@@ -51,13 +53,13 @@ struct Sensor {
     double held_field[MAX_HELD + 1][3], held_steps[MAX_HELD + 1][3];
     int64_t held_own[MAX_HELD + 1];
     double held_covariance[MAX_HELD + 1][3][3];
-    // Blocks: length of a block, relative extra length of the first one (NaN: blocks are not
-    // staggered, and each is evaluated at once), end of the current one, index of the sum that is
-    // being collected, and whether the other one is complete.
+    // Blocks: length of a block, relative extra length of the first block (NaN: blocks are
+    // not staggered, and each is evaluated at once), end of the current block, index of the current
+    // block, and whether the other block is complete.
     double length, phase, end;
     int64_t now, is_full;
-    // Both sums, relative to their first reading; each pair of axes over the readings that have
-    // both.
+    // Sums of both blocks, relative to the first reading of each block. The sums of a pair of axes
+    // include the readings with both axes.
     int64_t n[2];
     double time[2], origin[2][3], count[2][3][3], sum[2][3][3], product[2][3][3];
 };

@@ -25,6 +25,7 @@ def new_sensors(n: int) -> StructArray:
     Parameters
     ----------
     n : int
+        Number of sensors.
 
     Returns
     -------

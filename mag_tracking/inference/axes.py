@@ -39,7 +39,7 @@ def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]
     ----------
     [T10]_ eq. (5.16).
     """
-    y, C = _checked(y, C)
+    y, C = _contiguous(y, C)
     energy, axes = np.empty(len(y)), np.empty(len(y), dtype=np.int64)
     if not core.energies(y, C, energy, axes):
         raise np.linalg.LinAlgError('a covariance is not positive definite')
@@ -68,7 +68,7 @@ def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     ValueError
         If the shapes do not match.
     """
-    y, C = _checked(y, C)
+    y, C = _contiguous(y, C)
     out = np.empty(len(y))
     core.smallest_pivots(y, C, out)
     return out
@@ -93,20 +93,20 @@ def are_valid_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
     ValueError
         If the shapes do not match.
     """
-    y, C = _checked(y, C)
-    there = ~np.isnan(y)
+    y, C = _contiguous(y, C)
+    is_measured = ~np.isnan(y)
     finite = np.isfinite(C)
-    read = there[:, :, None] & there[:, None, :]
-    known = np.where(read & finite, C, 0.0)
-    largest = np.abs(known).max(axis=(1, 2), initial=0.0)
-    asymmetry = np.abs(known - np.swapaxes(known, 1, 2)).max(axis=(1, 2), initial=0.0)
-    valid: BoolArray = (finite | ~read).all(axis=(1, 2)) & (asymmetry <= 1e-6 * largest) \
+    is_used = is_measured[:, :, None] & is_measured[:, None, :]
+    used_C = np.where(is_used & finite, C, 0.0)
+    largest = np.abs(used_C).max(axis=(1, 2), initial=0.0)
+    asymmetry = np.abs(used_C - np.swapaxes(used_C, 1, 2)).max(axis=(1, 2), initial=0.0)
+    valid: BoolArray = (finite | ~is_used).all(axis=(1, 2)) & (asymmetry <= 1e-6 * largest) \
         & (smallest_pivots(y, C) > MIN_PIVOT)
     return valid
 
 
-def _checked(y: FloatArray, C: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Both as contiguous arrays for compiled code; ValueError if the shapes do not match."""
+def _contiguous(y: FloatArray, C: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Convert `y` and `C` to contiguous arrays; raise ValueError if the shapes do not match."""
     if y.shape != (len(y), 3) or C.shape != (len(y), 3, 3):
         raise ValueError('expected measurements (n, 3) and covariances (n, 3, 3), got '
                          f'{y.shape} and {C.shape}')

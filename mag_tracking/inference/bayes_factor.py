@@ -9,24 +9,24 @@ WINDOW_S = 1.0
 """Length of the sliding window in which a target must not be disfavoured [s]."""
 
 MIN_LOG_RATIO = -30.0
-"""Log Bayes factor [nats] at or below which a track cannot become a target again, whatever its fit.
-"""
+"""Log Bayes factor [nats] at or below which a track cannot become a target again, regardless of its
+fit."""
 
 
 class TargetBayesFactor:
-    """Log Bayes factor of a target against an alternative explanation.
+    """Bayes factor of a target against an alternative explanation, updated by each frame.
 
     Attributes
     ----------
     log_ratio : float, nats
-        Over the whole track.
+        Log Bayes factor over the whole track.
     """
 
     def __init__(self) -> None:
         self.log_ratio = 0.0
         self._is_known, self._was_favoured = True, False
         self._disfavoured_since_ns: int | None = None
-        self._latest = SlidingSum(WINDOW_S)
+        self._recent_sum = SlidingSum(WINDOW_S)
 
     def add(self, log_ratio: float, stamp_ns: int, ratio: float) -> None:
         """Add a frame.
@@ -34,7 +34,7 @@ class TargetBayesFactor:
         Parameters
         ----------
         log_ratio : float, nats
-            Log-density of the frame with a target, minus that with the alternative.
+            Log-density of the frame with a target, minus the log-density with the alternative.
         stamp_ns : int, ns
             Timestamp of the frame.
         ratio : float
@@ -42,7 +42,8 @@ class TargetBayesFactor:
 
         Notes
         -----
-        After a value that is not finite the Bayes factor stays unknown: no target is favoured.
+        After a value that is not finite, the Bayes factor remains unknown, and no target is
+        favoured.
         """
         if not np.isfinite(log_ratio):
             self._is_known = False
@@ -53,7 +54,7 @@ class TargetBayesFactor:
             self._disfavoured_since_ns = None
         elif self._disfavoured_since_ns is None:
             self._disfavoured_since_ns = stamp_ns
-        self._latest.add(stamp_ns, log_ratio)
+        self._recent_sum.add(stamp_ns, log_ratio)
 
     def would_be_favoured(self, log_ratio: float, ratio: float) -> bool:
         """Whether a target with a better fit would be favoured.
@@ -68,7 +69,7 @@ class TargetBayesFactor:
         Returns
         -------
         bool
-            False if the Bayes factor is at or below `MIN_LOG_RATIO`, or not known.
+            False if the Bayes factor is unknown, or at or below `MIN_LOG_RATIO`.
         """
         return self._is_known and self.log_ratio > MIN_LOG_RATIO \
             and self.log_ratio + log_ratio >= float(np.log(ratio))
@@ -99,7 +100,7 @@ class TargetBayesFactor:
         -------
         bool
         """
-        return bool(self._latest.total < -np.log(ratio))
+        return bool(self._recent_sum.total < -np.log(ratio))
 
     def disfavoured_s(self, stamp_ns: int) -> float:
         """Time for which the alternative has been favoured over the whole track.
@@ -112,8 +113,8 @@ class TargetBayesFactor:
         Returns
         -------
         float, s
-            0 if a target has been favoured before: the vehicle may have stopped, and its field is
-            then as smooth as any other.
+            0 if a target has been favoured before: the field of a vehicle that has stopped is as
+            smooth as the alternative.
         """
         if self._was_favoured or self._disfavoured_since_ns is None or not self._is_known:
             return 0.0

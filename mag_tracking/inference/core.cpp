@@ -34,7 +34,7 @@ double step_vectors(Array x, Array P, Array log_w, Array densities, Integers vec
     length_of(x, "x", 3);
     const Size n_x = x.shape(2);
     if (n_x < m || n_x > 2 * m)
-        throw py::value_error("x: must hold all levels and no more rates than levels");
+        throw py::value_error("x: must contain all levels and at most as many rates as levels");
     const VectorBank bank{int(n), int(n_strengths), int(m), int(n_x - m),
                           data_of(x, "x", {n, n_strengths, n_x}),
                           data_of(P, "P", {n, n_strengths, n_x, n_x}), log_w.mutable_data(),
@@ -56,7 +56,7 @@ bool inverses(Array A, double least, Array out) {
 Size best(Array x, Array P, Array log_w, Integers label, Integers kind, double negligible) {
     const Size n = length_of(log_w, "log_w", 1), n_x = length_of(x, "x", 2) ? x.shape(1) : 0;
     if (n < 1 || n_x < 3)
-        throw py::value_error("x: must hold at least one hypothesis with a position");
+        throw py::value_error("x: must contain at least one hypothesis with a position");
     return best_of({std::size_t(n), std::size_t(n_x), input_of(x, "x", {n, n_x}),
                     input_of(P, "P", {n, n_x, n_x}), input_of(log_w, "log_w", {n}),
                     input_of(label, "label", {n}), input_of(kind, "kind", {n})}, negligible);

@@ -3,29 +3,33 @@
 from mag_tracking.arrays import FloatArray, IntArray
 
 def energies(y: FloatArray, C: FloatArray, energy: FloatArray, axes: IntArray) -> bool:
-    """`axes.whitened_energy`, written to `energy` and `axes`; False if a covariance is not positive
-    definite.
+    """Write `axes.whitened_energy` to `energy` and `axes`.
+
+    Return False if a covariance is not positive definite.
     """
 
 def smallest_pivots(y: FloatArray, C: FloatArray, out: FloatArray) -> None:
-    """`axes.smallest_pivots`, written to `out`."""
+    """Write `axes.smallest_pivots` to `out`."""
 
 def step_vectors(x: FloatArray, P: FloatArray, log_w: FloatArray, densities: FloatArray,
                  vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray, dt: float,
                  switch_s: float) -> float:
-    """`GaussMarkovVectors.log_density`; updates the states `x` (n, n_strengths, n_x), their
-    covariances `P` and the log-weights (n, n_strengths) in place.
+    """Return `GaussMarkovVectors.log_density`.
+
+    Update the states `x` (n, n_strengths, n_x), their covariances `P` and the log-weights
+    (n, n_strengths) in place.
     """
 
 def inverses(A: FloatArray, least: float, out: FloatArray) -> bool:
-    """Inverses of symmetric matrices `A` (n, k, k), written to `out`.
+    """Write the inverses of symmetric matrices `A` (n, k, k) to `out`.
 
-    False if a matrix is not finite, or if the root of a pivot of one, at unit diagonal, is not
-    above `least`.
+    Return False if a matrix is not finite. Return False also if the root of a pivot, at unit
+    diagonal, does not exceed `least`.
     """
 
 def best(x: FloatArray, P: FloatArray, log_w: FloatArray, label: IntArray, kind: IntArray,
          negligible: float) -> int:
-    """`FilterBank.best`, ignoring hypotheses lighter than the heaviest by more than `negligible`
-    [nats].
+    """Return `FilterBank.best`.
+
+    Hypotheses lighter than the heaviest one by more than `negligible` [nats] are ignored.
     """

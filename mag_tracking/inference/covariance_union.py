@@ -1,7 +1,7 @@
 """Covariance union: a covariance inflated to cover a second estimate.
 
-Used if two estimates of one state contradict each other and it is not known which one is wrong: the
-covariance of the estimate that is kept grows until it covers the other.
+If two estimates of one state contradict each other and the wrong estimate is unknown, the
+covariance of one estimate is inflated until it covers the other estimate.
 """
 
 import numpy as np
@@ -10,9 +10,9 @@ from mag_tracking.arrays import FloatArray
 
 
 def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
-    """Covariance of a state, inflated until its horizontal position covers another estimate.
+    """Inflate the covariance of a state until its horizontal position covers another estimate.
 
-    The standard deviation along the horizontal difference becomes no smaller than the difference.
+    The standard deviation along the horizontal difference becomes at least the difference.
     Other components are inflated in proportion to their own difference, fully correlated with it.
 
     Parameters
@@ -20,16 +20,16 @@ def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
     P : (n, n) array
         Covariance of a state that begins with x and y [m].
     difference : (k,) array
-        The other estimate minus this one, of the first k <= n components.
+        Other estimate minus this estimate, for the first k <= n components.
 
     Returns
     -------
     (n, n) array
-        `P` itself if it covers the other estimate already.
+        `P` itself if it already covers the other estimate.
 
     Notes
     -----
-    Only the horizontal position decides, and the other estimate has no covariance.
+    Only the horizontal position determines the inflation, and the other estimate has no covariance.
 
     References
     ----------
@@ -39,6 +39,6 @@ def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
     square, variance = float(d @ d), float(d @ P[:2, :2] @ d)
     if not square > 0.0 or square**2 <= variance:
         return P
-    whole = np.zeros(len(P))
-    whole[:len(difference)] = difference
-    return P + (1.0 - variance / square**2) * np.outer(whole, whole)
+    all_components = np.zeros(len(P))
+    all_components[:len(difference)] = difference
+    return P + (1.0 - variance / square**2) * np.outer(all_components, all_components)

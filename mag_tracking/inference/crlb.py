@@ -1,7 +1,7 @@
 """Fisher information, observability and the Cramér-Rao bound.
 
 The model is given by its Jacobians H = dh/dx. A row of H that is all NaN is an axis that was not
-measured; a dipole located at the sensor gives such rows as well. Ranks are determined on matrices
+measured; a dipole located at the sensor also gives such rows. Ranks are determined on matrices
 scaled to unit diagonal, because the units of the states differ by decades; only `observability`
 leaves the scale to the caller. Matrices that do not match in shape, are not finite, not symmetric
 or not positive (semi)definite raise ValueError.
@@ -26,14 +26,14 @@ RANK_TOLERANCE = 1e-12
 """Eigenvalues below this fraction of the largest one count as zero."""
 
 _KERNEL_TOLERANCE = 1e-6
-"""Minimum component, along its axis, at which a state belongs to a kernel."""
+"""Minimum component of a kernel along the axis of a state at which the state is unobservable."""
 
 _K_DIPOLE = 1e-7
 """mu0 / (4 pi) [T m/A]; the constant in `physics` must not be imported here."""
 
 
 def information(H: ArrayLike, C: ArrayLike | None = None) -> FloatArray:
-    """Fisher information of independent measurements, summed over all of them.
+    """Fisher information of independent measurements, summed over all measurements.
 
     Parameters
     ----------
@@ -90,10 +90,9 @@ def observability(information: ArrayLike, names: Sequence[str],
     names : sequence of str
         Names of the n_x states.
     scale : (n_x,) array, optional
-        Typical magnitude of each state, in its unit. Eigenvalues, condition number and rank are
-        those of diag(scale) information diag(scale), the information about x / scale. Omitted, they
-        are those of the matrix as it is, which are of little use if units differ by decades (metres
-        next to backgrounds in tesla).
+        Typical magnitude of each state, in its unit. Eigenvalues, condition number and rank
+        refer to diag(scale) information diag(scale), the information about x / scale. Default: 1,
+        which is of little use if units differ by decades (metres and tesla).
 
     Returns
     -------
@@ -147,35 +146,35 @@ def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
     J = np.asarray(information, dtype=float)
     unit_diagonal('information', J)
     prior = leading_broadcast('prior', np.zeros(J.shape) if prior is None else prior, J.shape)
-    known = np.isposinf(np.diagonal(prior))
-    free = np.ix_(~known, ~known)
+    is_exact = np.isposinf(np.diagonal(prior))
+    free = np.ix_(~is_exact, ~is_exact)
     unit_diagonal('prior', prior[free])
     scale, root, kernel = _inverse_root(J[free] + prior[free])
     P = root @ root.T / (scale[:, None] * scale)
-    lost = _is_in_kernel(kernel)
-    P[lost] = P[:, lost] = np.nan
-    P[lost, lost] = np.inf
+    is_unobservable = _is_in_kernel(kernel)
+    P[is_unobservable] = P[:, is_unobservable] = np.nan
+    P[is_unobservable, is_unobservable] = np.inf
     covariance = np.zeros(J.shape)
     covariance[free] = P
     return covariance
 
 
 def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
-    """Information about some states if all others are unknown as well.
+    """Fisher information about some states if all other states are unknown.
 
     Parameters
     ----------
     information : (n_x, n_x) array
         Fisher information.
     keep : (k,) int array or (n_x,) bool array
-        States of interest. The others (backgrounds, moments) are eliminated and need not be
+        States of interest. The other states (backgrounds, moments) are eliminated and need not be
         observable.
 
     Returns
     -------
     (k, k) array
-        Schur complement J_kk - J_ko J_oo^-1 J_ok, in the order of `keep`; its inverse is that block
-        of the bound. Zero in directions that `bound` finds unobservable.
+        Schur complement J_kk - J_ko J_oo^-1 J_ok, in the order of `keep`; its inverse is the
+        corresponding block of the bound. Zero in directions that `bound` finds unobservable.
 
     Raises
     ------
@@ -188,26 +187,26 @@ def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
     """
     J = np.asarray(information, dtype=float)
     try:
-        kept = np.arange(len(J))[np.asarray(keep)]
+        selected = np.arange(len(J))[np.asarray(keep)]
     except IndexError as error:
         raise ValueError(f'keep is not valid for {len(J)} states: {error}') from error
-    if len(set(kept.tolist())) != kept.size:
-        raise ValueError(f'keep contains a state twice: {kept.tolist()}')
+    if len(set(selected.tolist())) != selected.size:
+        raise ValueError(f'keep contains a state twice: {selected.tolist()}')
     scale, root, kernel = _inverse_root(J)
     # The complement is not computed by subtraction: eliminated states that are barely observable
     # would leave rounding errors that look like information. First find the directions (columns
     # of U) outside the kernel ...
-    U, reach, _ = np.linalg.svd(kernel[kept])
-    U = U[:, np.count_nonzero(reach > _KERNEL_TOLERANCE):]
+    U, kernel_components, _ = np.linalg.svd(kernel[selected])
+    U = U[:, np.count_nonzero(kernel_components > _KERNEL_TOLERANCE):]
     U = np.where(np.linalg.norm(U, axis=1, keepdims=True) > _KERNEL_TOLERANCE, U, 0.0)
-    # ... then invert the bound in them, U (U'PU)^-1 U'.
-    R = triangular_factor((U.T @ root[kept]).T)
-    W = scale[kept, None] * np.linalg.solve(R.T, U.T).T
+    # ... then invert the bound in these directions, U (U'PU)^-1 U'.
+    R = triangular_factor((U.T @ root[selected]).T)
+    W = scale[selected, None] * np.linalg.solve(R.T, U.T).T
     return W @ W.T
 
 
 def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
-    """Information of a known range at the closest point of approach (CPA).
+    """Fisher information of a known range at the closest point of approach (CPA).
 
     Parameters
     ----------
@@ -217,12 +216,12 @@ def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
     v0 : (3,) array, m/s
         Velocity of the target.
     std : float, m
-        Standard deviation of the range; TSP14 takes the limit of zero.
+        Standard deviation of the range; TSP14 uses the limit of zero.
 
     Returns
     -------
     (9, 9) array
-        For the states [r0, v0, m]; of rank one.
+        Information about the states [r0, v0, m]; rank one.
 
     Raises
     ------
@@ -246,20 +245,20 @@ def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
                          f'{std} and {v0.tolist()}')
     t_cpa = -(r0 @ v0) / (v0 @ v0)
     r_cpa = r0 + t_cpa * v0
-    size = np.linalg.norm(r_cpa)
-    if not size > 1e-9 * np.linalg.norm(r0):
+    cpa_range = np.linalg.norm(r_cpa)
+    if not cpa_range > 1e-9 * np.linalg.norm(r0):
         raise ValueError(f'r0 = {r0.tolist()} is parallel to v0 = {v0.tolist()}: a CPA range of '
                          'zero does not make the scale observable (TSP14 Proposition 2)')
-    gradient = np.concatenate([r_cpa, t_cpa * r_cpa, np.zeros(3)]) / (size * std)
+    gradient = np.concatenate([r_cpa, t_cpa * r_cpa, np.zeros(3)]) / (cpa_range * std)
     return np.outer(gradient, gradient)
 
 
 def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
                P0: ArrayLike) -> FloatArray:
-    """Posterior bound of a filter along a given path.
+    """Posterior Cramér-Rao bound of a filter along a given path.
 
-    It is the covariance of an extended Kalman filter linearised at the truth. Step k predicts with
-    F[k] and Q[k], then updates with H[k] and C[k].
+    The bound is the covariance of an extended Kalman filter that is linearised at the truth. Step k
+    predicts with F[k] and Q[k], then updates with H[k] and C[k].
 
     Parameters
     ----------
@@ -291,7 +290,7 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
     """
     A = whitened(H, C)
     if A.ndim < 3:
-        raise ValueError(f'H needs a leading axis of steps, got {np.shape(H)}')
+        raise ValueError(f'H requires a leading axis of steps, got {np.shape(H)}')
     n_steps, n_x = len(A), A.shape[-1]
     F = leading_broadcast('F', F, (n_steps, n_x, n_x))
     Q = leading_broadcast('Q', Q, (n_steps, n_x, n_x))
@@ -302,7 +301,7 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
     for k in range(n_steps):
         P = F[k] @ P @ F[k].T + Q[k]
         _, w, V = unit_diagonal(f'covariance of step {k}', P)
-        # The scale of `unit_diagonal` is 1 at zero variance; an exactly known state must stay so.
+        # The scale of `unit_diagonal` is 1 at zero variance; an exactly known state must remain so.
         L = np.sqrt(np.diagonal(P))[:, None] * V * np.sqrt(np.maximum(w, 0.0))
         # P = L L' becomes L (I + L'A'A L)^-1 L'; QR avoids squares and subtractions.
         R = triangular_factor(np.vstack([A[k].reshape(-1, n_x) @ L, np.eye(n_x)]))
@@ -314,7 +313,7 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
 def snr(h: ArrayLike, C: ArrayLike) -> FloatArray:
     """Signal-to-noise ratio (of energies) h' C^-1 h of a field.
 
-    It is the non-centrality parameter of `detection_theory.detection_probability`.
+    The ratio is the non-centrality parameter of `detection_theory.detection_probability`.
 
     Parameters
     ----------
@@ -371,7 +370,7 @@ def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
               ratio: float | FloatArray) -> FloatArray:
     """Distance at which `snr_at_distance` reaches a given ratio.
 
-    Along the axis of the dipole the distance is larger by 2^(1/3).
+    Along the axis of the dipole the distance is larger by a factor of 2^(1/3).
 
     Parameters
     ----------
@@ -395,13 +394,13 @@ def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
 
 
 def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scale, root G of the pseudo-inverse G G', and kernel basis, both of J at unit diagonal."""
+    """Scale, root G of the pseudo-inverse G G' and kernel basis of J at unit diagonal."""
     scale, w, V = unit_diagonal('information', J)
     zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
     return scale, V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]
 
 
 def _is_in_kernel(kernel: FloatArray) -> BoolArray:
-    """Which states (n,) belong to an orthonormal kernel basis (n, k)."""
-    reached: BoolArray = np.linalg.norm(kernel, axis=1) > _KERNEL_TOLERANCE
-    return reached
+    """Whether each state has a component in an orthonormal kernel basis (n, k), (n,)."""
+    in_kernel: BoolArray = np.linalg.norm(kernel, axis=1) > _KERNEL_TOLERANCE
+    return in_kernel

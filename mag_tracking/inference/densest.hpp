@@ -71,7 +71,7 @@ struct Mixture {
     const std::int64_t *label, *kind;
 };
 
-// Keeps the `rows` of the heaviest class; `of` (n) holds the class of each hypothesis.
+// Keeps the `rows` of the heaviest class; `of` (n) contains the class of each hypothesis.
 inline void keep_heaviest(std::vector<std::size_t>& rows, const std::int64_t* of,
                           const double* log_w) {
     double top = -std::numeric_limits<double>::infinity();
@@ -86,8 +86,8 @@ inline void keep_heaviest(std::vector<std::size_t>& rows, const std::int64_t* of
     }), rows.end());
 }
 
-// Row to publish, of at least one hypothesis. Hypotheses lighter than the heaviest by more than
-// `negligible` are ignored.
+// Index of the hypothesis to publish; the bank must not be empty. Hypotheses lighter than the
+// heaviest one by more than `negligible` are ignored.
 inline std::size_t best_of(const Mixture& bank, double negligible) {
     std::vector<std::size_t> rows(bank.n);
     for (std::size_t i = 0; i < bank.n; ++i) rows[i] = i;

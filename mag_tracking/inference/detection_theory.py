@@ -44,7 +44,7 @@ def false_alarm_probability(threshold: float | FloatArray,
     Returns
     -------
     float or (...) array
-        The inverse of `energy_threshold`.
+        Inverse of `energy_threshold`.
     """
     return cast(FloatArray, chdtrc(degrees_of_freedom, threshold))
 
@@ -85,15 +85,15 @@ def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray
     Returns
     -------
     (...) array
-        Exact: propagates the distribution of the current number of consecutive detections.
+        Computed exactly from the distribution of the current number of consecutive detections.
     """
     p = np.asarray(probability, dtype=float)
-    waiting = np.zeros((run, *p.shape[1:]))
-    waiting[0] = 1.0
+    run_probability = np.zeros((run, *p.shape[1:]))
+    run_probability[0] = 1.0
     for detected in p:
         # The count of consecutive detections grows by one or restarts at zero. The probability
-        # that leaves the last entry is that of an onset.
-        waiting = np.concatenate([((1.0 - detected) * waiting.sum(axis=0))[None],
-                                  detected * waiting[:-1]])
-    missed: FloatArray = waiting.sum(axis=0)
+        # that leaves the last entry is the probability of an onset.
+        run_probability = np.concatenate([((1.0 - detected) * run_probability.sum(axis=0))[None],
+                                          detected * run_probability[:-1]])
+    missed: FloatArray = run_probability.sum(axis=0)
     return missed

@@ -1,7 +1,7 @@
 """Driving direction from the sense of rotation of a target's horizontal field.
 
-Seen from the sensor towards the target, a target that moves from left to right rotates the field
-clockwise and a target that moves from right to left rotates it anticlockwise, whatever its moment.
+Viewed from the sensor, a target that moves from left to right rotates the field clockwise, and a
+target that moves from right to left rotates it anticlockwise, whatever the moment of the target.
 This is exact for a target at the height of the sensor. A sensor in the lane does not observe the
 direction.
 """
@@ -23,10 +23,11 @@ MIN_SAMPLES = 8
 
 MAX_CONFIDENCE = 0.98
 """Upper limit of the probability of a direction. The sign of the correlation is exact only for a
-target at the height of the sensor. For a target above the sensor by half its lateral distance, 0.6
-% of random moments rotate the other way; by the whole distance, 2.2 %."""
+target at the height of the sensor. The field of 0.6 % of
+random moments rotates in the opposite direction if the target is above the sensor by half its
+lateral distance, and of 2.2 % if it is above by the whole distance."""
 
-MAX_VERTICAL_SHARE = 0.2
+MAX_VERTICAL_COSINE = 0.2
 """Maximum direction cosine between a missing axis and a horizontal axis at which the missing axis
 is treated as vertical."""
 
@@ -35,13 +36,14 @@ class FieldRotation(NamedTuple):
     """Statistic of the sense of rotation, treated as normally distributed."""
 
     correlation: float
-    """T²; negative for a target that moves from left to right."""
+    """Correlation of the horizontal axes, T²; negative for a target that moves from left to
+    right."""
     variance: float
     """Variance of the correlation, T⁴."""
 
     @property
     def error_probability(self) -> float:
-        """Probability that the sign is wrong; PHD15 Paper B eq. (17), (18)."""
+        """Probability that the sign of the correlation is wrong; PHD15 Paper B eq. (17), (18)."""
         return float(ndtr(-abs(self.correlation) / np.sqrt(self.variance)))
 
     @property
@@ -72,7 +74,7 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
     Returns
     -------
     FieldRotation
-        The variance is not below that of noise alone.
+        Its variance is at least the variance of noise alone.
 
     Raises
     ------
@@ -117,9 +119,9 @@ def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRo
 
 
 def _correlation(field: FloatArray, lag: int) -> float:
-    """PHD15 Paper B eq. (5a) over all but the first and last `lag` samples."""
-    now, later = field[lag:-lag], field[2 * lag:]
-    return float(np.sum(now[:, 0] * later[:, 1] - now[:, 1] * later[:, 0])) / lag
+    """Correlation of PHD15 Paper B eq. (5a), without the first and last `lag` samples."""
+    current, delayed = field[lag:-lag], field[2 * lag:]
+    return float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
 
 
 def _spread(field: FloatArray, lag: int) -> float:
@@ -127,7 +129,7 @@ def _spread(field: FloatArray, lag: int) -> float:
     return float(np.sum(np.square(field[2 * lag:] - field[:-2 * lag])))
 
 
-def lag_of(field: FloatArray, noise_std: float, most: int) -> int:
+def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     """Lag matched to the width of a pass.
 
     Parameters
@@ -136,21 +138,22 @@ def lag_of(field: FloatArray, noise_std: float, most: int) -> int:
         As for `field_rotation`.
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
-    most : int
-        Maximum lag: number of samples at each end that are free of the target.
+    max_lag : int
+        Maximum lag, the number of samples at each end that are free of the target.
 
     Returns
     -------
     int
         From 1 to a quarter of the window; 0 if the field does not exceed the noise.
     """
-    around = 1 + len(field) // 20
-    energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(around), 'same')
-    # The samples are counted because another target may be at an end of the window.
+    window = 1 + len(field) // 20
+    energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(window), 'same')
+    # Another target at an end of the window extends the span of strong samples, but hardly the
+    # count.
     width = np.count_nonzero(energy > 0.5 * energy.max())
     if not width:
         return 0
-    return int(np.clip(round(LAG * width), 1, max(1, min(most, len(field) // 4))))
+    return int(np.clip(round(LAG * width), 1, max(1, min(max_lag, len(field) // 4))))
 
 
 def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int]) -> int:
@@ -185,22 +188,22 @@ def fused_log_odds(log_odds: Iterable[float], same_side: Iterable[bool]) -> floa
     Parameters
     ----------
     log_odds : iterable of float
-        Log-odds of left to right, as seen by each sensor.
+        Log-odds of left to right, as viewed from each sensor.
     same_side : iterable of bool
         False for a sensor on the opposite side of the road, where left and right are exchanged.
 
     Returns
     -------
     float
-        Log-odds of left to right, as seen from the side for which `same_side` is true. The errors
+        Log-odds of left to right, as viewed from the side for which `same_side` is true. The errors
         of the sensors are treated as independent.
 
     References
     ----------
     [PHD15]_ Paper B eq. (20)-(23).
     """
-    return float(sum(value if same else -value
-                     for value, same in zip(log_odds, same_side, strict=True)))
+    return float(sum(value if is_same_side else -value
+                     for value, is_same_side in zip(log_odds, same_side, strict=True)))
 
 
 def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
@@ -224,14 +227,14 @@ def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
         for b in range(2):
             part = R_ws[b, a] * field[:, a]
             out[:, b] += np.where(
-                missing, 0.0 if abs(R_ws[b, a]) < MAX_VERTICAL_SHARE else np.nan, part)
+                missing, 0.0 if abs(R_ws[b, a]) < MAX_VERTICAL_COSINE else np.nan, part)
     return out
 
 
 def rotation_of_pass(field: FloatArray, noise_std: float, n_quiet: int) -> FieldRotation | None:
     """`field_rotation` at the lag matched to the width of a pass.
 
-    The prior of the correlation is uniform, so that the probability of the direction is
+    The prior of the correlation is uniform. The probability of the direction is therefore
     overconfident for a target below the noise.
 
     Parameters

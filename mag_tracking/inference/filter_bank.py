@@ -1,6 +1,6 @@
 """Bank of filters: hypotheses as arrays, with logarithmic weights.
 
-The bank follows T10 section 2.6 and Alg. 3. Weights are kept as logarithms because two hypotheses
+The bank follows T10 section 2.6 and Alg. 3. Weights are stored as logarithms because two hypotheses
 may differ by thousands of nats.
 """
 
@@ -13,8 +13,8 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference import core
 
 _NEGLIGIBLE_LOG_RATIO = np.log(100.0)
-"""Hypotheses lighter than the heaviest by more than this [nats] do not affect which one is
-published."""
+"""Hypotheses lighter than the heaviest one by more than this [nats] do not affect the choice of the
+published hypothesis."""
 _SINGULAR_TOLERANCE = 1e-15
 """A variance below this fraction of the largest counts as zero, as in `numpy.linalg.pinv`."""
 
@@ -61,7 +61,7 @@ class FilterBank:
     kind: IntArray
     """Assumed kind of target, (n_hyp,); for several targets (n_hyp, n_targets)."""
     origin: IntArray
-    """Row of each hypothesis at the creation of the bank, (n_hyp,)."""
+    """Index of each hypothesis at the creation of the bank, (n_hyp,)."""
     nis: FloatArray
     """Normalised innovation squared of the latest measurement, (n_hyp, n_sensors); NaN before the
     first measurement and for missing sensors."""
@@ -73,7 +73,7 @@ class FilterBank:
         """Create a bank with equal weights from target states.
 
         Each sensor's own states and then three backgrounds per sensor are appended to the target
-        states; all of them are zero.
+        states. All appended states are zero.
 
         Parameters
         ----------
@@ -115,14 +115,15 @@ class FilterBank:
         return len(self.log_w)
 
     def best(self) -> int:
-        """Row of the hypothesis to publish.
+        """Index of the hypothesis to publish.
 
         Returns
         -------
         int
-            Among the hypotheses of the heaviest label, and of the heaviest kind within it, the one
-            at whose position their mixture is densest, near the mode of the posterior. The heaviest
-            hypothesis would be a random choice if many neighbours share the weight.
+            The candidates are the hypotheses of the heaviest label and, within that label, of the
+            heaviest kind. The best candidate is at the maximum density of their mixture, near the
+            mode of the posterior. If many neighbours share the weight, the heaviest hypothesis
+            would be a random choice.
         """
         return core.best(self.x, self.P, self.log_w, _classes(self.label), _classes(self.kind),
                          _NEGLIGIBLE_LOG_RATIO)
@@ -133,7 +134,7 @@ class FilterBank:
         Parameters
         ----------
         i : int
-            Number of the target.
+            Index of the target.
         n_one : int
             Number of states per target.
 
@@ -145,19 +146,19 @@ class FilterBank:
         """
         if self.label.ndim == 1:
             return self
-        others = n_one * self.label.shape[1]
+        n_target_states = n_one * self.label.shape[1]
         columns = np.append(np.arange(i * n_one, (i + 1) * n_one),
-                            np.arange(others, self.x.shape[1]))
+                            np.arange(n_target_states, self.x.shape[1]))
         return FilterBank(*_of_columns(self.x, self.P, columns), self.log_w,
                           self.label[:, i].copy(), self.kind[:, i].copy(), self.origin, self.nis)
 
     def without_target(self, i: int, n_one: int) -> 'FilterBank':
-        """Marginal bank of all other targets of a joint bank.
+        """Marginal bank of a joint bank without one target.
 
         Parameters
         ----------
         i : int
-            Number of the target to be marginalised out.
+            Index of the target to be marginalised out.
         n_one : int
             Number of states per target.
 
@@ -184,20 +185,20 @@ class FilterBank:
         return FilterBank(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
     def rows(self, rows: IntArray) -> 'FilterBank':
-        """Select hypotheses and give them equal weights.
+        """Select hypotheses and assign equal weights.
 
         Parameters
         ----------
         rows : (n,) int array
-            Rows to select; may repeat.
+            Indices of the hypotheses; may repeat.
 
         Returns
         -------
         FilterBank
             Its arrays are copies.
         """
-        chosen = {f.name: np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(self)}
-        return FilterBank(**{**chosen, 'log_w': np.full(len(rows), -np.log(len(rows)))})
+        selected = {f.name: np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(self)}
+        return FilterBank(**{**selected, 'log_w': np.full(len(rows), -np.log(len(rows)))})
 
     def alone(self, i: int) -> 'FilterBank':
         """Bank of a single hypothesis.
@@ -205,7 +206,7 @@ class FilterBank:
         Parameters
         ----------
         i : int
-            Row of the hypothesis.
+            Index of the hypothesis.
 
         Returns
         -------
@@ -215,7 +216,7 @@ class FilterBank:
         return self.rows(np.array([i]))
 
     def weight(self, rows: BoolArray) -> float:
-        """Total weight of some hypotheses.
+        """Total weight of the selected hypotheses.
 
         Parameters
         ----------
@@ -228,41 +229,41 @@ class FilterBank:
         """
         return float(np.exp(log_sum_exp(self.log_w[rows]))) if rows.any() else 0.0
 
-    def is_concentrated_in(self, n: int, share: float) -> bool:
-        """Whether the heaviest hypotheses hold a given share of the weight.
+    def is_concentrated_in(self, n: int, fraction: float) -> bool:
+        """Whether the heaviest hypotheses have at least a given fraction of the weight.
 
         Parameters
         ----------
         n : int
             Number of hypotheses.
-        share : float
-            Required share of the total weight.
+        fraction : float
+            Required fraction of the total weight.
 
         Returns
         -------
         bool
         """
-        return bool(np.exp(np.sort(self.log_w)[-n:]).sum() >= share)
+        return bool(np.exp(np.sort(self.log_w)[-n:]).sum() >= fraction)
 
     def apart(self, i: int, distance: float = 3.0) -> BoolArray:
-        """Whether the positions of hypotheses differ significantly from that of one hypothesis.
+        """Whether hypotheses differ significantly in position from a reference hypothesis.
 
         Parameters
         ----------
         i : int
-            Row of the reference hypothesis.
+            Index of the reference hypothesis.
         distance : float
             Minimum Mahalanobis distance, with the sum of both covariances.
 
         Returns
         -------
         (n_hyp,) bool array
-            True where neither hypothesis explains the other.
+            True where the positions differ.
         """
         difference = self.x[:, :3] - self.x[i, :3]
         C = self.P[:, :3, :3] + self.P[i, :3, :3]
         try:
-            # Nearly always possible; eigenvalues would take five times as long.
+            # Nearly always positive definite; eigenvalues would take five times as long.
             z = np.square(np.linalg.solve(np.linalg.cholesky(C), difference[:, :, None])[:, :, 0]
                           ).sum(axis=1)
         except np.linalg.LinAlgError:
@@ -280,28 +281,28 @@ class FilterBank:
         Parameters
         ----------
         log_likelihood : (n_hyp,) array
-            Log-likelihood of a frame. A hypothesis whose value is not finite loses all its weight.
+            Log-likelihood of a frame. A hypothesis whose value is not finite gets zero weight.
 
         Returns
         -------
         float
-            Log-evidence of the frame. If no hypothesis is left, it is -inf and the weights do not
-            change.
+            Log-evidence of the frame. If no value is finite, the evidence is -inf and the weights
+            do not change.
         """
         log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, -np.inf)
-        joint = self.log_w + log_likelihood
-        evidence = float(log_sum_exp(joint))
+        joint_log_w = self.log_w + log_likelihood
+        evidence = float(log_sum_exp(joint_log_w))
         if np.isfinite(evidence):
-            self.log_w = joint - evidence
+            self.log_w = joint_log_w - evidence
         return evidence
 
     def keep(self, mask: BoolArray) -> int:
-        """Keep some hypotheses and normalise their weights.
+        """Remove all hypotheses except the selected ones, and normalise the weights.
 
         Parameters
         ----------
         mask : (n_hyp,) bool array
-            Hypotheses to keep.
+            True for the selected hypotheses.
 
         Returns
         -------
@@ -313,23 +314,23 @@ class FilterBank:
         The arrays `x` and `P` may be overwritten in place.
         """
         rows = np.flatnonzero(mask)
-        gone = len(mask) - len(rows)
-        if gone:
+        n_removed = len(mask) - len(rows)
+        if n_removed:
             self.x, self.P = (_compacted(a, rows) for a in (self.x, self.P))
             self.log_w = self.log_w[mask] - log_sum_exp(self.log_w[mask])
             for name in ('label', 'kind', 'origin', 'nis'):
                 setattr(self, name, getattr(self, name)[mask])
-        return gone
+        return n_removed
 
     def prune(self, log_ratio: float, most: int) -> int:
-        """Remove light hypotheses.
+        """Remove hypotheses of low weight.
 
         Parameters
         ----------
         log_ratio : float, nats
-            Maximum difference of the log-weight from that of the heaviest hypothesis.
+            Maximum difference from the log-weight of the heaviest hypothesis.
         most : int
-            Maximum number of hypotheses; the heaviest are kept.
+            Maximum number of hypotheses; the lightest are removed.
 
         Returns
         -------
@@ -345,13 +346,13 @@ class FilterBank:
 
 
 def _of_columns(x: FloatArray, P: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Copies of some of the states (n_hyp, n_x) and of their covariances."""
+    """Copies of the selected states (n_hyp, n_x) and of their covariances."""
     return (np.ascontiguousarray(x[:, columns]),
             np.ascontiguousarray(P[:, columns[:, None], columns]))
 
 
 def _classes(labels: IntArray) -> IntArray:
-    """Class number (n,) of each row of labels, (n,) or (n, n_targets)."""
+    """Class index (n,) of each row of labels, (n,) or (n, n_targets)."""
     if labels.ndim == 1:
         return labels
     classes: IntArray = np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1)
@@ -359,15 +360,15 @@ def _classes(labels: IntArray) -> IntArray:
 
 
 def _compacted(a: FloatArray, rows: IntArray) -> FloatArray:
-    """Move the ascending `rows` (n,) of an array to its beginning, which is faster than a new
-    array.
+    """Select the ascending `rows` (n,) of an array by moving them to its beginning.
 
-    A new array is returned if the old one would hold more than twice the memory.
+    This is faster than a new array. A new array is returned if the old array would occupy more
+    than twice the memory.
     """
-    held = a if a.base is None else a.base
-    if len(rows) * a[:1].nbytes < held.nbytes // 2:
+    buffer = a if a.base is None else a.base
+    if len(rows) * a[:1].nbytes < buffer.nbytes // 2:
         return a[rows]
-    for new, old in enumerate(rows.tolist()):
-        if new != old:
-            a[new] = a[old]
+    for target, source in enumerate(rows.tolist()):
+        if target != source:
+            a[target] = a[source]
     return a[:len(rows)]

@@ -14,8 +14,8 @@
 namespace mag_tracking {
 
 // n vectors of m components, the first n_moving of which change. Each vector has a bank of
-// strengths: states (n, n_strengths, n_x), which are the levels and then the rates of the changing
-// components, n_x = m + n_moving; covariances (n, n_strengths, n_x, n_x); log-weights
+// strengths: states (n, n_strengths, n_x), n_x = m + n_moving (all levels, then the rates of the
+// changing components); covariances (n, n_strengths, n_x, n_x); log-weights
 // (n, n_strengths). `densities` (n_strengths, m) are spectral densities.
 struct VectorBank {
     int n, n_strengths, m, n_moving;
@@ -25,7 +25,7 @@ struct VectorBank {
     INLINE int n_x() const { return m + n_moving; }
 };
 
-// Scalar measurements: number of the `vector` of each, ascending; rows `H` (n_y, m), values and
+// Scalar measurements: index of the `vector` of each, ascending; rows `H` (n_y, m), values and
 // variances.
 struct ScalarMeasurements {
     int n;
@@ -93,7 +93,7 @@ INLINE double update(double* x, double* __restrict P, const double* h, int m, in
 }
 
 // Predicts by `dt` [s] and updates. Returns the log-density of the measurements given the previous
-// ones. `switch_s` is the mean time between switches of the strength.
+// measurements. `switch_s` is the mean time between switches of the strength.
 FOR_PROCESSORS static double step(const VectorBank& bank, const ScalarMeasurements& in, double dt,
                           double switch_s) {
     const int n = bank.n_strengths, m = bank.m, n_x = bank.n_x();

@@ -1,9 +1,9 @@
-"""Filters of vectors that change smoothly, without a model of their cause.
+"""Filters for vectors that change smoothly, without a model of the cause.
 
 Each component is an integrated random walk: its rate of change is a Wiener process. The strength of
 the process is unknown and may change: a bank of strengths is weighted by the data, and each
-strength switches to another one at a constant rate. The states of different strengths are not
-mixed, because all of them follow the same data.
+strength switches to another strength at a constant rate. The states of different strengths are not
+mixed, because all states follow the same data.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ SWITCH_S = 0.75
 
 
 class GaussMarkovVectors:
-    """Filters of vectors that change independently of each other and start at zero.
+    """Filters for vectors that change independently of each other and start at zero.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class GaussMarkovVectors:
     Raises
     ------
     ValueError
-        If a constant component precedes one that changes.
+        If a constant component precedes a changing component.
 
     References
     ----------
@@ -44,7 +44,7 @@ class GaussMarkovVectors:
     def __init__(self, n: int, scale: FloatArray, std: float) -> None:
         m, n_moving, n_strengths = len(scale), np.count_nonzero(scale), len(STRENGTHS)
         if not scale[:n_moving].all():
-            raise ValueError('scale: constant components, which have zero, must come last')
+            raise ValueError('scale: the zeros of constant components must come last')
         # [k, i]: strength k, component i.
         self._densities = np.square(STRENGTHS[:, None] * scale)
         # Constant components have no rate state: it would be exactly zero.
@@ -57,7 +57,7 @@ class GaussMarkovVectors:
 
     def log_density(self, vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray,
                     dt: float) -> float:
-        """Update with scalar measurements and return their log-density given the previous ones.
+        """Update with scalar measurements, and return their log-density given earlier measurements.
 
         Parameters
         ----------

@@ -2,8 +2,8 @@
 //
 // The state consists of the target state (n_t), which affects all sensors, n_own states of each
 // sensor, which affect only that sensor, and three backgrounds of each sensor. The update processes
-// the sensors one after the other, linearised at one common point. The result is that of the
-// stacked update, at a fraction of its cost.
+// the sensors one after the other, linearised at one common point. The result equals the stacked
+// update, at a fraction of the cost.
 
 #pragma once
 
@@ -216,7 +216,7 @@ INLINE void before_update(double* __restrict after, const Sizes& n, const Gains&
     }
 }
 
-// The same over a prediction.
+// Propagates the adjoint state `after` backwards over a prediction, in place.
 INLINE void before_move(double* after, const Sizes& n, const Motion& motion, const double* decay) {
     double moved[MAX_ROWS];
     for (int r = 0; r < motion.n; ++r) {
@@ -279,7 +279,8 @@ INLINE void information_before_update(double* __restrict after, const Sizes& n,
     }
 }
 
-// The same over a prediction: F' after F. `T` (motion.n, wide) is overwritten.
+// Propagates the adjoint information `after` backwards over a prediction, in place: F' after F.
+// `T` (motion.n, wide) is overwritten.
 INLINE void information_before_move(double* __restrict after, const Sizes& n,
                                     const Motion& motion, const double* decay,
                                     double* __restrict T) {

@@ -32,17 +32,17 @@ class EnrolledVehicle:
     name: str
     """Name of the vehicle."""
     iron: Iron | None
-    """Hard and soft iron; None if the passes have a single heading."""
+    """Hard and soft iron; None if all passes have one heading."""
     heading: float
-    """Single heading of the passes, rad, world frame; else NaN."""
+    """Heading of all passes, rad, world frame; NaN if `iron` is known."""
     moment: FloatArray
-    """Moment at that heading, (3,) A m², world frame; else NaN."""
+    """Moment at `heading`, (3,) A m², world frame; NaN if `iron` is known."""
     covariance: FloatArray
-    """Covariance of `moment`, (3, 3) A² m⁴; else NaN."""
+    """Covariance of `moment`, (3, 3) A² m⁴; NaN if `iron` is known."""
 
     def moment_at(self, heading: float, heading_std: float, induction: FloatArray
                   ) -> tuple[FloatArray, FloatArray] | None:
-        """Predict the moment of the next pass.
+        """Predict the moment of a pass at a given heading.
 
         Parameters
         ----------
@@ -55,8 +55,8 @@ class EnrolledVehicle:
         Returns
         -------
         (moment, covariance) or None
-            Moment (3,) [A m², world frame] and covariance of the prediction (3, 3), without that of
-            the measurement. None if the vehicle was enrolled at another heading only.
+            Moment (3,) [A m², world frame] and covariance of the prediction (3, 3), without the
+            measurement noise. None if the vehicle was enrolled at another heading only.
 
         References
         ----------
@@ -112,20 +112,21 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
     Raises
     ------
     ValueError
-        If there is no pass, a value is not finite, or the headings neither agree nor differ enough.
+        If there is no pass, a value is not finite, or the headings neither agree nor differ by at
+        least `MIN_HEADING_SEPARATION`.
     """
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
     if not len(moments):
         raise ValueError(f'{name}: enrolment requires at least one pass')
     spread = np.asarray(covariances, dtype=float) + PASS_TO_PASS_STD**2 * np.eye(3)
-    apart = np.abs(_wrapped(headings[:, None] - headings)).max()
-    if apart >= MIN_HEADING_SEPARATION:
+    separation = np.abs(_wrapped(headings[:, None] - headings)).max()
+    if separation >= MIN_HEADING_SEPARATION:
         iron = hard_and_soft_iron(moments, headings, induction, spread)
         return EnrolledVehicle(name, iron, np.nan, np.full(3, np.nan), np.full((3, 3), np.nan))
-    if not np.isfinite(moments).all() or apart > HEADING_TOLERANCE:
+    if not np.isfinite(moments).all() or separation > HEADING_TOLERANCE:
         raise ValueError(f'{name}: expected finite moments at one heading, or at headings at least '
                          f'{np.rad2deg(MIN_HEADING_SEPARATION):.0f} degrees apart; got headings '
-                         f'{np.rad2deg(apart):.0f} degrees apart')
+                         f'{np.rad2deg(separation):.0f} degrees apart')
     information = np.linalg.inv(spread)
     covariance = np.linalg.inv(information.sum(axis=0))
     mean = covariance @ np.einsum('nij,nj->i', information, moments)
@@ -155,25 +156,25 @@ def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance
     -------
     Identification
     """
-    log_p, distances, others = {}, {}, []
+    log_p, distances, skipped = {}, {}, []
     for vehicle in vehicles:
         predicted = vehicle.moment_at(heading, heading_std, induction)
         if predicted is None:
-            others.append(vehicle.name)
+            skipped.append(vehicle.name)
             continue
         e, P = moment - predicted[0], predicted[1] + covariance
         distances[vehicle.name] = float(e @ np.linalg.solve(P, e))
         log_p[vehicle.name] = -0.5 * (distances[vehicle.name] + float(np.linalg.slogdet(P)[1]))
     if not log_p:
-        return Identification(UNKNOWN, {}, {}, tuple(others))
+        return Identification(UNKNOWN, {}, {}, tuple(skipped))
     p = np.exp(np.array(list(log_p.values())) - max(log_p.values()))
     best = max(log_p, key=lambda name: log_p[name])
     return Identification(
         best if min(distances.values()) <= chdtri(3, SIGNIFICANCE_LEVEL) else UNKNOWN,
-        dict(zip(log_p, (p / p.sum()).tolist(), strict=True)), distances, tuple(others))
+        dict(zip(log_p, (p / p.sum()).tolist(), strict=True)), distances, tuple(skipped))
 
 
 def _wrapped(angle: FloatArray | float) -> FloatArray:
     """Angle wrapped to the interval from -pi to pi."""
-    turned: FloatArray = np.angle(np.exp(1j * np.asarray(angle)))
-    return turned
+    wrapped: FloatArray = np.angle(np.exp(1j * np.asarray(angle)))
+    return wrapped

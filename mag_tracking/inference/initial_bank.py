@@ -1,7 +1,7 @@
 """Compact copy of a filter bank at its start, before target and sensor states are correlated.
 
 Smoothing and relinearisation restart at the beginning of a track. Storing the full covariances of
-all hypotheses would need as much memory as the bank.
+all hypotheses would require as much memory as the bank.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class InitialBank:
     """
 
     x: FloatArray
-    """States, (n_hyp, n_x): of the target, then of the sensors."""
+    """States of the target, then of the sensors, (n_hyp, n_x)."""
     P: FloatArray
     """Covariances of the target states, (n_hyp, n_t, n_t)."""
     P_sensors: FloatArray
@@ -36,7 +36,7 @@ class InitialBank:
 
     @classmethod
     def of(cls, bank: FilterBank, n_target: int) -> 'InitialBank':
-        """Copy the start of a bank.
+        """Copy a bank at its start.
 
         Parameters
         ----------
@@ -58,12 +58,12 @@ class InitialBank:
         return len(self.x)
 
     def rows(self, rows: IntArray) -> FilterBank:
-        """Restore some hypotheses with equal weights.
+        """Restore selected hypotheses with equal weights.
 
         Parameters
         ----------
         rows : (n,) int array
-            Rows to restore.
+            Indices of the hypotheses to restore.
 
         Returns
         -------
@@ -77,12 +77,12 @@ class InitialBank:
                           self.kind[rows], self.origin[rows], np.full((n, self.n_sensors), np.nan))
 
     def keep(self, mask: BoolArray) -> None:
-        """Keep some hypotheses.
+        """Remove all hypotheses except the selected ones.
 
         Parameters
         ----------
         mask : (n_hyp,) bool array
-            Hypotheses to keep.
+            True for the selected hypotheses.
         """
         for name in ('x', 'P', 'label', 'kind', 'origin'):
             setattr(self, name, getattr(self, name)[mask])

@@ -1,8 +1,9 @@
 """Innovation consistency: whether the innovations of a track match their covariance, over time.
 
-The normalised innovations squared (NIS) of a consistent filter are chi-square distributed; those of
-a filter that allows for model errors are smaller. A single frame is not conclusive. The test covers
-the frames of a short window and the whole track, for the network as a whole and for each sensor.
+The normalised innovations squared (NIS) of a consistent filter are chi-square distributed; a
+filter that allows for model errors has smaller NIS. A single frame is not conclusive. The test
+covers the frames of a short window and the whole track, for the network as a whole and for each
+sensor.
 """
 
 import numpy as np
@@ -35,7 +36,7 @@ class InnovationConsistency:
         self._n_sensors = n_sensors
         # (2, n_sensors + 1): NIS and degrees of freedom, of each sensor and of the network.
         self._total = np.zeros((2, n_sensors + 1))
-        self._latest = SlidingSum(WINDOW_S)
+        self._recent_sum = SlidingSum(WINDOW_S)
 
     def add(self, nis: FloatArray, n_axes: FloatArray, stamp_ns: int) -> None:
         """Add a frame.
@@ -52,16 +53,16 @@ class InnovationConsistency:
         values = np.stack([np.nan_to_num(nis), np.where(np.isnan(nis), 0, n_axes)])
         values = np.column_stack([values, values.sum(axis=1)])
         self._total += values
-        self._latest.add(stamp_ns, values)
+        self._recent_sum.add(stamp_ns, values)
 
     @property
     def excess(self) -> float:
         """Factor by which the latest innovation variances exceed their covariance; 1 = consistent.
         """
-        latest = self._latest.total
-        fails = self._fails(latest)
+        recent = self._recent_sum.total
+        fails = self._fails(recent)
         with np.errstate(invalid='ignore', divide='ignore'):
-            ratio = np.where(fails, latest[0] / latest[1], 1.0)
+            ratio = np.where(fails, recent[0] / recent[1], 1.0)
         return float(ratio.max())
 
     @property

@@ -21,8 +21,8 @@ class Iron:
     residuals: FloatArray
     """Moments minus their prediction, (n, 3) A m², world frame."""
     normalised_cost: float
-    """Weighted sum of squared residuals over the degrees of freedom; about one if the model and the
-    covariances are right. NaN without covariances."""
+    """Weighted sum of squared residuals over the degrees of freedom; about 1 if the model and the
+    covariances are correct. NaN without covariances."""
 
 
 def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: ArrayLike,
@@ -34,12 +34,12 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
     moments : (n, 3) array, A m², world frame
         Fitted moments of the passes.
     headings : (n,) array, rad, world frame
-        From x, anticlockwise seen from above.
+        Angle from x, anticlockwise when viewed from above.
     induction : (3,) array, A/m, world frame
-        B0/mu0. With 3 B0/mu0 the resulting D is that of T10.
+        B0/mu0. With 3 B0/mu0, the result is D as defined in T10.
     covariances : (n, 3, 3) array, A² m⁴, optional
-        Covariances of the moments. Omitted, all moments have equal weight and the covariance is
-        estimated from the residuals.
+        Covariances of the moments. Default: all moments have equal weight, and the covariance of
+        the result is estimated from the residuals.
 
     Returns
     -------
@@ -82,8 +82,8 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
     y = (W @ moments[:, :, None]).ravel()
     theta = np.linalg.lstsq(whitened / scale, y, rcond=None)[0] / scale
     covariance = np.linalg.inv((whitened / scale).T @ (whitened / scale)) / np.outer(scale, scale)
-    left = y - whitened @ theta
-    cost = float(left @ left) / (3 * n - 4)
+    residual = y - whitened @ theta
+    cost = float(residual @ residual) / (3 * n - 4)
     if covariances is None:
         covariance, cost = covariance * cost, float('nan')
     return Iron(theta[:3], float(theta[3]), covariance, moments - A @ theta, cost)

@@ -1,6 +1,6 @@
 """Non-linear least squares from many starting points at once.
 
-The model is passed as a function or an object.
+A model is a function that returns residuals and Jacobians.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,13 +21,15 @@ CORRELATION_TIME_S = 0.2
 
 def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iterations: int = 40,
            tolerance: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Levenberg-Marquardt from many starting points at once, each with its own damping.
+    """Minimise sums of squares by Levenberg-Marquardt from many starting points at once.
+
+    Each starting point has its own damping.
 
     Parameters
     ----------
     residual_and_jacobian : callable
-        Takes points (n, n_x). Returns whitened residuals (n, n_y), measured minus predicted, and
-        the Jacobians (n, n_y, n_x) of the prediction.
+        Function of points (n, n_x) that returns whitened residuals (n, n_y), measured minus
+        predicted, and the Jacobians (n, n_y, n_x) of the prediction.
     x : (n, n_x) array
         Starting points.
     n_iterations : int
@@ -55,29 +57,28 @@ def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iteration
     residual, J, cost = _evaluate(residual_and_jacobian, x)
     damping = np.full(len(x), 1e-3)
     converged = np.zeros(len(x), dtype=bool)
-    busy = np.flatnonzero(np.isfinite(cost))
+    active = np.flatnonzero(np.isfinite(cost))
     for _ in range(n_iterations):
-        if not len(busy):
+        if not len(active):
             break
-        step = _damped_step(J[busy], residual[busy], damping[busy])
-        trial = x[busy] + step
+        step = _damped_step(J[active], residual[active], damping[active])
+        trial = x[active] + step
         trial_residual, trial_J, trial_cost = _evaluate(residual_and_jacobian, trial)
-        better = trial_cost < cost[busy]
-        gain = cost[busy] - trial_cost
-        done = (np.abs(step) <= 1e-10 * np.abs(x[busy])).all(axis=1)
-        done |= better & (gain <= tolerance * cost[busy])
-        moved = busy[better]
-        x[moved], cost[moved] = trial[better], trial_cost[better]
-        residual[moved], J[moved] = trial_residual[better], trial_J[better]
-        damping[busy] *= np.where(better, 0.2, 5.0)
-        converged[busy[done]] = True
-        busy = busy[~done & (damping[busy] < MAX_DAMPING)]
+        is_better = trial_cost < cost[active]
+        gain = cost[active] - trial_cost
+        is_done = (np.abs(step) <= 1e-10 * np.abs(x[active])).all(axis=1)
+        is_done |= is_better & (gain <= tolerance * cost[active])
+        improved = active[is_better]
+        x[improved], cost[improved] = trial[is_better], trial_cost[is_better]
+        residual[improved], J[improved] = trial_residual[is_better], trial_J[is_better]
+        damping[active] *= np.where(is_better, 0.2, 5.0)
+        converged[active[is_done]] = True
+        active = active[~is_done & (damping[active] < MAX_DAMPING)]
     return x, cost, pseudo_inverse(np.einsum('nyi,nyj->nij', J, J)), converged
 
 
 MAX_DAMPING = 1e12
-"""Damping at which a search is abandoned: steps this small that do not lower the cost never will.
-"""
+"""Damping at which a search is abandoned, because even tiny steps do not lower the cost."""
 
 
 def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> FloatArray:
@@ -94,18 +95,18 @@ def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> Fl
 
 def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
               ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals, Jacobians and costs; an unusable point has infinite cost."""
+    """Evaluate residuals, Jacobians and costs; an unusable point has infinite cost."""
     with ignoring_overflow():
         residual, J = residual_and_jacobian(x)
         cost = np.einsum('ni,ni->n', residual, residual)
-    bad = ~(np.isfinite(cost) & np.isfinite(J).all(axis=(1, 2)))
-    residual[bad], J[bad], cost[bad] = 0.0, 0.0, np.inf
+    is_unusable = ~(np.isfinite(cost) & np.isfinite(J).all(axis=(1, 2)))
+    residual[is_unusable], J[is_unusable], cost[is_unusable] = 0.0, 0.0, np.inf
     return residual, J, cost
 
 
 def project_out_linear(A: FloatArray, y: FloatArray
                        ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Best linear parameters of many linear models y = A p + e, e ~ N(0, I).
+    """Estimate the linear parameters p of many models y = A p + e, e ~ N(0, I).
 
     Parameters
     ----------
@@ -130,7 +131,7 @@ def project_out_linear(A: FloatArray, y: FloatArray
 
 
 LINEAR_RANK_TOLERANCE = 1e-11
-"""Relative eigenvalue below which a linear direction is left out. Dipoles at nearly the same
+"""Relative eigenvalue below which a linear direction is excluded. Dipoles at nearly the same
 position would otherwise cancel each other with unbounded moments."""
 
 
@@ -140,14 +141,14 @@ def score_sum_covariance(scores: FloatArray, lag: int) -> FloatArray:
     Parameters
     ----------
     scores : (n, n_x) array
-        Gradient of the cost of each sample at the minimum, in order of time.
+        Gradient of the cost of each sample at the minimum, chronological.
     lag : int
         Samples further apart than this are treated as independent.
 
     Returns
     -------
     (n_x, n_x) array
-        Positive semidefinite; approximately the information if model and noise are right.
+        Positive semidefinite; approximately the information if model and noise are correct.
 
     References
     ----------
@@ -161,12 +162,12 @@ def score_sum_covariance(scores: FloatArray, lag: int) -> FloatArray:
 
 
 def model_error_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatArray],
-                        left: Sequence[FloatArray], covariance: FloatArray) -> FloatArray:
-    """Covariance to be added to that of the noise for the error of the model.
+                           residuals: Sequence[FloatArray], covariance: FloatArray) -> FloatArray:
+    """Additional covariance of an estimate due to errors of the model.
 
-    Residuals caused by model errors are correlated over `CORRELATION_TIME_S`, so that they carry
-    less information than their number suggests. The covariance is never reduced, even if the
-    residuals are by chance smaller than the noise.
+    Residuals caused by model errors are correlated over `CORRELATION_TIME_S`, so they contain less
+    information than their number suggests. The result is positive semidefinite, even if the
+    residuals are smaller than the noise by chance.
 
     Parameters
     ----------
@@ -174,7 +175,7 @@ def model_error_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatA
         Timestamps of each sensor, ascending.
     derivatives : sequence of (n, k, n_x) array
         Whitened derivatives of each sensor.
-    left : sequence of (n, k) array
+    residuals : sequence of (n, k) array
         Whitened residuals of each sensor.
     covariance : (n_x, n_x) array
         Covariance due to noise alone.
@@ -186,15 +187,15 @@ def model_error_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatA
     """
     scale = np.sqrt(np.diagonal(covariance))
     excess = np.zeros_like(covariance)
-    for times, H, r in zip(t, derivatives, left, strict=True):
+    for times, H, r in zip(t, derivatives, residuals, strict=True):
         columns = H * scale
         step = np.median(np.diff(times)) if len(times) > 1 else CORRELATION_TIME_S
         excess += score_sum_covariance(np.einsum('nai,na->ni', columns, r),
-                                    int(CORRELATION_TIME_S / max(step, 1e-9)))
+                                       int(CORRELATION_TIME_S / max(step, 1e-9)))
         excess -= np.einsum('nai,naj->ij', columns, columns)
     if not np.isfinite(excess).all():
         return np.full_like(covariance, np.nan)
     w, V = np.linalg.eigh(excess)
     root = (covariance / np.outer(scale, scale)) @ (V * np.sqrt(np.maximum(w, 0.0)))
-    missing: FloatArray = np.outer(scale, scale) * (root @ root.T)
-    return missing
+    addition: FloatArray = np.outer(scale, scale) * (root @ root.T)
+    return addition

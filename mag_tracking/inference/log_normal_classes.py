@@ -28,10 +28,10 @@ class Feature(NamedTuple):
 
 
 class ClassPosterior(NamedTuple):
-    """Class of an object."""
+    """Most probable class of an object, and the probabilities of all classes."""
 
     name: str
-    """The most probable class; `UNKNOWN` for an object that fits no class."""
+    """Most probable class; `UNKNOWN` if the object fits no class."""
     probabilities: FloatArray
     """Posterior probabilities, (n_classes,), in the order of the names."""
 

@@ -1,7 +1,7 @@
 """Whitening of measurements with linear nuisance terms that have a Gaussian prior.
 
-With y = C c + e and c, e standard normal, the covariance of y is I + C C'. Its inverse root is I in
-all directions outside the few that C spans, so that whitening a large problem is cheap.
+For y = C c + e with standard normal c and e, the covariance of y is I + C C'. Its inverse root is
+the identity outside the few directions spanned by C. Whitening a large problem is therefore cheap.
 """
 
 import numpy as np
@@ -10,22 +10,22 @@ from mag_tracking.arrays import FloatArray
 
 
 class MarginalWhitener:
-    """Inverse root of the covariance I + C C'.
+    """Whitening by the inverse root of the covariance I + C C'.
 
     Parameters
     ----------
     columns : (n_y, q) array
-        C: columns of the nuisance terms, each times the standard deviation of its coefficient.
+        C: columns of the nuisance terms, each scaled by the standard deviation of its coefficient.
     """
 
     def __init__(self, columns: FloatArray) -> None:
-        self._U, size, _ = np.linalg.svd(columns, full_matrices=False)
-        self._size = size
-        self._taken: FloatArray = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
+        self._U, singular_values, _ = np.linalg.svd(columns, full_matrices=False)
+        self._singular_values = singular_values
+        self._attenuation: FloatArray = 1.0 - 1.0 / np.sqrt(1.0 + singular_values**2)
 
     def __call__(self, A: FloatArray) -> FloatArray:
         """Whiten `A` (..., n_y, k), or (n_y,)."""
-        whitened: FloatArray = A - (self._U * self._taken) @ (self._U.T @ A)
+        whitened: FloatArray = A - (self._U * self._attenuation) @ (self._U.T @ A)
         return whitened
 
     def correction_factor(self, A: FloatArray) -> FloatArray:
@@ -34,10 +34,11 @@ class MarginalWhitener:
         Parameters
         ----------
         A : (n_y, k) array
+            Matrix A of the product; the same function is applied to B.
 
         Returns
         -------
         (q, k) array
         """
-        share: FloatArray = self._size / np.sqrt(1.0 + self._size**2)
-        return share[:, None] * (self._U.T @ A)
+        gain: FloatArray = self._singular_values / np.sqrt(1.0 + self._singular_values**2)
+        return gain[:, None] * (self._U.T @ A)

@@ -1,10 +1,10 @@
 """Matched filter: detection of a known signal in coloured noise, by one or several sensors.
 
-It bounds the detectability of a pass whose signature is known; the energy test (`detection_theory`)
-needs no signature and detects less. The equations are those of MITRE12 section 3 and appendix B.
+It bounds the detectability of a pass with a known signature; the energy test (`detection_theory`)
+requires no signature and detects less. The equations are from MITRE12 section 3 and appendix B.
 Spectral densities are two-sided: the noise power is their integral over negative and positive
-frequencies. NaN means not measured: an axis, or a detector without any axis. Invalid values raise
-ValueError with the value.
+frequencies. NaN marks an axis that was not measured, or a detector without axes. Invalid values
+raise ValueError.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,
     Parameters
     ----------
     frequency : (...) array, Hz
-        Of either sign.
+        Positive or negative.
     background : float, T/sqrt(Hz)
         Level of the geomagnetic noise at 1 Hz; 1e-12 in rural areas, 1e-10 in towns.
     resolution : float, T
@@ -41,8 +41,8 @@ def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,
 
     Notes
     -----
-    MITRE12 eq. (B.10) is two-sided; eq. (B.8), for which this is not stated, is treated as
-    two-sided as well. Its denominator is the frequency in Hz, as a pure number.
+    MITRE12 eq. (B.10) is two-sided; eq. (B.8) is assumed to be two-sided, too. The denominator of
+    eq. (B.8) is the frequency in Hz, as a pure number.
 
     References
     ----------
@@ -71,10 +71,10 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
         Signal without noise, n samples in time. An axis that is NaN at all times is not measured.
     sampling_rate : float, Hz
     spectrum : callable, (n_f,) array, Hz -> (n_f,) array, T²/Hz
-        Two-sided noise density, positive, equal and independent on all axes. It is called for the
-        frequencies in the band only. Frequencies with an infinite density do not contribute.
+        Two-sided noise density, positive, equal and independent on all axes. The function is called
+        for frequencies in the band only. Frequencies with an infinite density do not contribute.
     band : (2,) sequence, Hz
-        Lowest and highest frequency kept, both included; infinity = no upper limit.
+        Lowest and highest frequency, both included; infinity = no upper limit.
 
     Returns
     -------
@@ -88,12 +88,12 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
 
     Notes
     -----
-    The transform is the continuous one, the DFT divided by the sampling rate. With the DFT itself,
-    as printed, the deflection would depend on the sampling rate and be too large by this factor.
-    The sum runs over both signs of the frequency, as the density is two-sided; the paper does not
-    state this, and a one-sided sum would give a deflection smaller by sqrt(2). The figures of the
-    paper are reproduced with the DFT divided by n instead, which gives a deflection larger by
-    `sampling_rate` / n [1/s]: see examples/mitre12.py.
+    The transform approximates the continuous transform: the DFT is divided by the sampling rate.
+    With the plain DFT, as printed, the deflection would be too large by a factor of the sampling
+    rate. The sum includes both signs of the frequency, as the density is two-sided. The paper does
+    not mention this; a one-sided sum would make the deflection smaller by a factor of sqrt(2). The
+    figures of the paper are reproduced if the DFT is divided by n instead, which makes the
+    deflection larger by a factor of `sampling_rate` / n [1/s]: see examples/mitre12.py.
 
     References
     ----------
@@ -104,23 +104,23 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
         raise ValueError(f'B must have shape (..., n, n_axes), got {B.shape}')
     missing = np.isnan(B).all(axis=-2)
     _raise_for_invalid('B', 'finite, or NaN on a whole axis', B,
-            ~np.isfinite(B) & ~missing[..., None, :])
+                       ~np.isfinite(B) & ~missing[..., None, :])
     _raise_for_invalid('sampling_rate', 'above 0 and finite', sampling_rate,
-            not 0.0 < sampling_rate < np.inf)
+                       not 0.0 < sampling_rate < np.inf)
     low, high = band
     _raise_for_invalid('band', 'two ascending frequencies, the first at least 0', list(band),
-            not 0.0 <= low < high)
+                       not 0.0 <= low < high)
     n = B.shape[-2]
     f = np.arange(n // 2 + 1) * sampling_rate / n
-    kept = (f >= low * (1.0 - _BAND_EDGE_TOLERANCE)) & (f <= high * (1.0 + _BAND_EDGE_TOLERANCE))
-    if not kept.any():
+    in_band = (f >= low * (1.0 - _BAND_EDGE_TOLERANCE)) & (f <= high * (1.0 + _BAND_EDGE_TOLERANCE))
+    if not in_band.any():
         raise ValueError(f'{n} samples at {sampling_rate} Hz have no frequency in the band '
                          f'{list(band)} Hz: the frequency spacing is {sampling_rate / n} Hz')
-    S = np.broadcast_to(np.asarray(spectrum(f[kept]), dtype=float), f[kept].shape)
+    S = np.broadcast_to(np.asarray(spectrum(f[in_band]), dtype=float), f[in_band].shape)
     _raise_for_invalid('spectrum', 'above 0', S, ~(S > 0.0))
     # Negative frequencies mirror the positive ones; zero and half the rate have no counterpart.
-    signs = np.where((f == 0.0) | (2 * np.arange(len(f)) == n), 1.0, 2.0)[kept]
-    F = np.fft.rfft(np.where(missing[..., None, :], 0.0, B), axis=-2)[..., kept, :]
+    signs = np.where((f == 0.0) | (2 * np.arange(len(f)) == n), 1.0, 2.0)[in_band]
+    F = np.fft.rfft(np.where(missing[..., None, :], 0.0, B), axis=-2)[..., in_band, :]
     # Amplitudes are divided before they are squared: squares of picoteslas are tiny.
     weight = np.sqrt(signs / (sampling_rate * n * S))
     d = np.sqrt(np.sum(np.abs(F * weight[:, None]) ** 2, axis=(-2, -1)))
@@ -171,15 +171,15 @@ def any_detection_probability(probability: ArrayLike,
     Parameters
     ----------
     probability : (...) array
-        Detection probability of each sensor and period; NaN = missing, never detects.
+        Detection probability of each sensor and period; NaN = missing, treated as 0.
     axis : int or tuple of int, optional
         Axes to combine. Default: all axes.
 
     Returns
     -------
     (...) array
-        Probability without the combined axes. Probabilities far below the rounding error of 1 are
-        preserved: three times 1e-30 gives 3e-30.
+        Array without the combined axes. Probabilities far below the rounding error of 1 are
+        preserved: three detectors with 1e-30 give 3e-30.
 
     Raises
     ------
@@ -197,16 +197,16 @@ def any_detection_probability(probability: ArrayLike,
     p = np.asarray(probability, dtype=float)
     _raise_for_invalid('probability', 'from 0 to 1', p, (p < 0.0) | (p > 1.0))
     with np.errstate(divide='ignore'):
-        silent = np.sum(np.log1p(-np.where(np.isnan(p), 0.0, p)), axis=axis)
-    any_of_them: FloatArray = -np.expm1(silent)
-    return any_of_them
+        log_missed = np.sum(np.log1p(-np.where(np.isnan(p), 0.0, p)), axis=axis)
+    detected: FloatArray = -np.expm1(log_missed)
+    return detected
 
 
-def _raise_for_invalid(name: str, needed: str, value: ArrayLike, bad: bool | BoolArray) -> None:
-    """Raise ValueError for the first entry of `value` flagged in `bad`, one flag or of its shape.
-    """
-    if np.any(bad):
-        at = np.argwhere(bad)[0].tolist() if np.ndim(bad) else []
-        where = at if at else ''
-        got = np.asarray(value)[tuple(at)].tolist()
-        raise ValueError(f'{name}{where} must be {needed}, got {got}')
+def _raise_for_invalid(name: str, requirement: str, value: ArrayLike,
+                       is_invalid: bool | BoolArray) -> None:
+    """Raise ValueError for the first entry of `value` that is flagged in `is_invalid`, if any."""
+    if np.any(is_invalid):
+        index = np.argwhere(is_invalid)[0].tolist() if np.ndim(is_invalid) else []
+        where = index if index else ''
+        actual = np.asarray(value)[tuple(index)].tolist()
+        raise ValueError(f'{name}{where} must be {requirement}, got {actual}')

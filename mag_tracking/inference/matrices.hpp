@@ -119,8 +119,8 @@ class Eigen {
 // `matrices.pseudo_inverse` for matrices of one size, one at a time.
 class PseudoInverter {
   public:
-    // Matrices that `Inverter` inverts with `least` have full rank. For the others, directions with
-    // an eigenvalue below the fraction `rank` of the largest are left out.
+    // Matrices that `Inverter` inverts with `least` have full rank. For other matrices, directions
+    // with an eigenvalue below the fraction `rank` of the largest are excluded.
     PseudoInverter(std::size_t n, double least, double rank)
         : n_(n), least_(least), rank_(rank), inverter_(n), eigen_(n), unit_(n * n), scale_(n) {}
 

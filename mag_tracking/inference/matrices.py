@@ -35,7 +35,7 @@ def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
     if H.ndim < 2:
         raise ValueError(f'H must have shape (..., n_y, n_x), got {H.shape}')
     missing = np.isnan(H).all(axis=-1)
-    raise_for_invalid('row of H ', 'finite or wholly NaN', H,
+    raise_for_invalid('row of H ', 'finite or all NaN', H,
                       ~np.isfinite(H).all(axis=-1) & ~missing)
     H = np.where(missing[..., None], 0.0, H)
     if C is None:
@@ -80,7 +80,8 @@ def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatA
     raise ValueError(f'{name} has shape {A.shape}, expected {shape}')
 
 
-def raise_for_invalid(name: str, fault: str, A: FloatArray, bad: BoolArray | np.bool_) -> None:
+def raise_for_invalid(name: str, fault: str, A: FloatArray,
+                      is_invalid: BoolArray | np.bool_) -> None:
     """Raise ValueError for the first invalid matrix.
 
     Parameters
@@ -91,7 +92,7 @@ def raise_for_invalid(name: str, fault: str, A: FloatArray, bad: BoolArray | np.
         Property that is violated, such as 'symmetric'.
     A : (..., n, n) array
         Matrices.
-    bad : (...) bool array
+    is_invalid : (...) bool array
         Flags of the invalid matrices.
 
     Raises
@@ -99,8 +100,8 @@ def raise_for_invalid(name: str, fault: str, A: FloatArray, bad: BoolArray | np.
     ValueError
         If any flag is set.
     """
-    for at in np.argwhere(bad).tolist():
-        raise ValueError(f'{name}{at or ""} is not {fault}: {A[tuple(at)].tolist()}')
+    for index in np.argwhere(is_invalid).tolist():
+        raise ValueError(f'{name}{index or ""} is not {fault}: {A[tuple(index)].tolist()}')
 
 
 def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -133,8 +134,8 @@ def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, Flo
     diagonal = np.einsum('...ii->...i', A)
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     unit = A / (scale[..., :, None] * scale[..., None, :])
-    skew = np.abs(unit - np.swapaxes(unit, -1, -2))
-    raise_for_invalid(name, 'symmetric', A, (skew > 1e-9).any(axis=(-2, -1)))
+    asymmetry = np.abs(unit - np.swapaxes(unit, -1, -2))
+    raise_for_invalid(name, 'symmetric', A, (asymmetry > 1e-9).any(axis=(-2, -1)))
     w, V = np.linalg.eigh(unit)
     raise_for_invalid(name, 'positive semidefinite', A,
                       (w < -1e-9).any(-1) | (diagonal < 0.0).any(-1))
@@ -142,7 +143,7 @@ def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, Flo
 
 
 def triangular_factor(A: FloatArray) -> FloatArray:
-    """R of the QR decomposition A = Q R.
+    """Triangular factor R of the QR decomposition A = Q R.
 
     Parameters
     ----------
@@ -158,7 +159,7 @@ def triangular_factor(A: FloatArray) -> FloatArray:
 
 
 def ignoring_overflow() -> AbstractContextManager[None]:
-    """Context in which overflow is not reported: a diverging search has infinite cost.
+    """Context that suppresses overflow warnings, because a diverging search has infinite cost.
 
     Returns
     -------
@@ -181,7 +182,7 @@ def pseudo_inverse(A: FloatArray, rank: float = PSEUDO_INVERSE_TOLERANCE) -> Flo
     A : (n, k, k) array
         Symmetric positive semidefinite matrices.
     rank : float
-        Directions with an eigenvalue below this fraction of the largest are left out.
+        Directions with an eigenvalue below this fraction of the largest are excluded.
 
     Returns
     -------

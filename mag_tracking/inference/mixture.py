@@ -12,7 +12,7 @@ def second_moment(weights: FloatArray, differences: FloatArray,
     Parameters
     ----------
     weights : (n,) array
-        Weights of the components; they need not sum to one.
+        Weights of the components, not necessarily normalised.
     differences : (n, d) array
         Means of the components minus the estimate.
     covariances : (n, d, d) array

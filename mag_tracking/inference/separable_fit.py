@@ -1,6 +1,6 @@
 """Fits of models that are linear in most of their parameters, from many starting points.
 
-The model is passed as an object.
+A model is an object with the methods of `SeparableModel`.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ class SeparableModel(Protocol):
         """
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of basis(theta) p by theta.
+        """Derivative of basis(theta) p with respect to theta.
 
         Parameters
         ----------
@@ -57,7 +57,7 @@ class SeparableProblem:
     nuisance : (n_y, q) array, optional
         Whitened linear terms that do not depend on theta, such as backgrounds.
     prior : (mean, std) of (n_theta,) arrays, optional
-        Gaussian prior of theta; an infinite standard deviation is no prior.
+        Gaussian prior of theta; an infinite standard deviation means no prior.
 
     Attributes
     ----------
@@ -102,7 +102,8 @@ class SeparableProblem:
         with ignoring_overflow():
             A = self._without_nuisance(self._model.basis(theta))
             p, _, _ = project_out_linear(A, self._y)
-            # Cheaper than from the residuals, and accurate enough for a grid of starting points.
+            # Cheaper than the sum of the squared residuals, and accurate enough for a grid of
+            # starting points.
             cost = self.energy - np.einsum('ni,ni->n', p, self._y @ A)
             if self._prior is not None:
                 cost = cost + np.square(self._prior.residual(theta)).sum(axis=1)
@@ -119,9 +120,9 @@ class SeparableProblem:
         Returns
         -------
         residual : (n, n_y) array
-            Whitened; with a prior, its residuals are appended.
+            Whitened; the residuals of the prior, if any, are appended.
         jacobian : (n, n_y, n_theta) array
-            Derivative of the prediction by theta.
+            Derivative of the prediction with respect to theta.
         """
         A = self._without_nuisance(self._model.basis(theta))
         p, residual, inverse = project_out_linear(A, self._y)
@@ -129,13 +130,13 @@ class SeparableProblem:
         J = D - A @ (inverse @ (np.swapaxes(A, 1, 2) @ D))
         if self._prior is None:
             return residual, J
-        known = self._prior.residual(theta)
-        return (np.hstack([residual, known]), np.concatenate(
+        prior_residual = self._prior.residual(theta)
+        return (np.hstack([residual, prior_residual]), np.concatenate(
             [J, np.broadcast_to(self._prior.jacobian, (len(J), *self._prior.jacobian.shape))],
             axis=1))
 
     def linear(self, theta: FloatArray) -> FloatArray:
-        """Best linear parameters.
+        """Linear parameters that minimise the cost.
 
         Parameters
         ----------
@@ -155,20 +156,20 @@ class _Prior:
     """Gaussian prior as whitened measurements of theta."""
 
     def __init__(self, mean: FloatArray, std: FloatArray) -> None:
-        self._known = np.flatnonzero(np.isfinite(std))
-        self._mean, self._std = mean[self._known], std[self._known]
-        self.jacobian = (np.eye(len(mean)) / std)[self._known]
+        self._prior_indices = np.flatnonzero(np.isfinite(std))
+        self._mean, self._std = mean[self._prior_indices], std[self._prior_indices]
+        self.jacobian = (np.eye(len(mean)) / std)[self._prior_indices]
         """Derivative of the whitened measurements, (n_known, n_theta)."""
 
     def residual(self, theta: FloatArray) -> FloatArray:
         """Whitened residuals (n, n_known) for theta (n, n_theta)."""
-        left: FloatArray = (self._mean - theta[:, self._known]) / self._std
-        return left
+        residual_of_prior: FloatArray = (self._mean - theta[:, self._prior_indices]) / self._std
+        return residual_of_prior
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """Lowest minimum found by a search."""
+    """Result of a search for the lowest minimum."""
 
     theta: FloatArray
     """Non-linear parameters, (n_theta,)."""
@@ -177,13 +178,13 @@ class Minimum:
     converged: bool
     """Whether the final search converged."""
     rivals: tuple[tuple[FloatArray, float], ...] = ()
-    """(theta, cost) of other minima found, best first."""
+    """Other minima as (theta, cost), best first."""
 
 
 def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparableProblem,
-           starts: FloatArray, apart: FloatArray,
+           starts: FloatArray, min_difference: FloatArray,
            companions: Callable[[FloatArray], FloatArray] | None = None) -> Minimum:
-    """Search the lowest minimum of a separable problem from many starting points.
+    """Search for the lowest minimum of a separable problem from many starting points.
 
     Parameters
     ----------
@@ -195,28 +196,28 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
         Problem to be solved; see `fine_minimum`.
     starts : (n, n_theta) array
         Starting points.
-    apart : (n_theta,) array
-        Points are distinct if they differ by more than this in any parameter.
+    min_difference : (n_theta,) array
+        Difference in any parameter beyond which points are distinct.
     companions : callable, (n_theta,) array -> (n, n_theta) array, optional
-        Takes the best point of the coarse problem and returns points whose minima are often
-        mistaken for it. The search continues from them as well.
+        Function of the best point of the coarse problem that returns points near minima that are
+        often confused with the best minimum. The search also starts from these points.
 
     Returns
     -------
     Minimum
     """
-    theta, cost = coarse_minima(smooth, coarse, starts, apart)
+    theta, cost = coarse_minima(smooth, coarse, starts, min_difference)
     if companions is not None:
-        more, more_cost, _, _ = refine(coarse.residual_and_jacobian,
-                                       companions(theta[np.argmin(cost)]), 40, 1e-6)
-        theta, cost = np.vstack([theta, more]), np.append(cost, more_cost)
-    return fine_minimum(fine, theta, cost, apart)
+        added, added_cost, _, _ = refine(coarse.residual_and_jacobian,
+                                         companions(theta[np.argmin(cost)]), 40, 1e-6)
+        theta, cost = np.vstack([theta, added]), np.append(cost, added_cost)
+    return fine_minimum(fine, theta, cost, min_difference)
 
 
 def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: FloatArray,
-                  apart: FloatArray, n_refined: int = 60, n_steps: int = 4,
+                  min_difference: FloatArray, n_refined: int = 60, n_steps: int = 4,
                   n_distinct: int = 8) -> tuple[FloatArray, FloatArray]:
-    """Minima of a reduced separable problem.
+    """Find the minima of a reduced separable problem.
 
     All starting points are evaluated with the smooth problem, and the best `n_refined` are refined
     by `n_steps` Levenberg-Marquardt steps. The best `n_distinct` distinct points are then refined
@@ -230,8 +231,8 @@ def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: Fl
         Problem whose minima are returned.
     starts : (n, n_theta) array
         Starting points.
-    apart : (n_theta,) array
-        Points are distinct if they differ by more than this in any parameter.
+    min_difference : (n_theta,) array
+        Difference in any parameter beyond which points are distinct.
     n_refined : int
         Number of starting points to refine.
     n_steps : int
@@ -249,14 +250,14 @@ def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: Fl
     theta, cost = starts, smooth.cost(starts)
     theta = theta[np.argsort(cost, kind='stable')[:n_refined]]
     theta, cost, _, _ = refine(smooth.residual_and_jacobian, theta, n_steps)
-    theta = theta[distinct(theta, cost, apart, n_distinct)]
+    theta = theta[distinct(theta, cost, min_difference, n_distinct)]
     theta, cost, _, _ = refine(coarse.residual_and_jacobian, theta, 40, 1e-6)
     return theta, cost
 
 
-def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray, apart: FloatArray,
-                 n_best: int = 4) -> Minimum:
-    """Lowest minimum of a separable problem, from points near its minima.
+def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray,
+                 min_difference: FloatArray, n_best: int = 4) -> Minimum:
+    """Find the lowest minimum of a separable problem from points near its minima.
 
     Parameters
     ----------
@@ -266,8 +267,8 @@ def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray, ap
         Starting points.
     cost : (n,) array
         Costs by which the starting points are ranked.
-    apart : (n_theta,) array
-        Points are distinct if they differ by more than this in any parameter.
+    min_difference : (n_theta,) array
+        Difference in any parameter beyond which points are distinct.
     n_best : int
         Maximum number of distinct starting points.
 
@@ -275,19 +276,20 @@ def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray, ap
     -------
     Minimum
     """
-    theta = theta[distinct(theta, cost, apart, n_best)]
+    theta = theta[distinct(theta, cost, min_difference, n_best)]
     theta, cost, _, converged = refine(fine.residual_and_jacobian, theta, 100, 1e-8)
     order = np.argsort(cost, kind='stable')
     best = order[0]
     rivals: list[tuple[FloatArray, float]] = []
     for k in order[1:]:
-        if all((np.abs(theta[k] - x) > apart).any()
+        if all((np.abs(theta[k] - x) > min_difference).any()
                for x in (theta[best], *(x for x, _ in rivals))):
             rivals.append((theta[k], float(cost[k])))
     return Minimum(theta[best], float(cost[best]), bool(converged[best]), tuple(rivals))
 
 
-def distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) -> IntArray:
+def distinct(theta: FloatArray, cost: FloatArray, min_difference: FloatArray,
+             max_points: int) -> IntArray:
     """Select the best distinct points.
 
     Parameters
@@ -296,20 +298,20 @@ def distinct(theta: FloatArray, cost: FloatArray, apart: FloatArray, most: int) 
         Points.
     cost : (n,) array
         Costs by which the points are ranked.
-    apart : (n_theta,) array
-        Points are distinct if they differ by more than this in any parameter.
-    most : int
+    min_difference : (n_theta,) array
+        Difference in any parameter beyond which points are distinct.
+    max_points : int
         Maximum number of points.
 
     Returns
     -------
     (k,) int array
-        Rows of the selected points, best first.
+        Indices of the selected points, best first.
     """
-    kept: list[int] = []
-    for row in np.argsort(cost, kind='stable').tolist():
-        if all((np.abs(theta[row] - theta[other]) > apart).any() for other in kept):
-            kept.append(row)
-            if len(kept) == most:
+    selected: list[int] = []
+    for i in np.argsort(cost, kind='stable').tolist():
+        if all((np.abs(theta[i] - theta[other]) > min_difference).any() for other in selected):
+            selected.append(i)
+            if len(selected) == max_points:
                 break
-    return np.array(kept, dtype=np.int64)
+    return np.array(selected, dtype=np.int64)

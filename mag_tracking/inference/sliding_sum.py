@@ -30,7 +30,7 @@ class SlidingSum:
         stamp_ns : int, ns
             Timestamp of the frame.
         value : (...) array
-            Must have the same shape for all frames.
+            Value with the same shape for all frames.
         """
         self._frames.append((stamp_ns, np.asarray(value, dtype=float)))
         while self._frames[0][0] < stamp_ns - self._window_ns:
@@ -38,6 +38,6 @@ class SlidingSum:
 
     @property
     def total(self) -> FloatArray:
-        """Sum of the values, of their shape; a scalar 0 before the first value."""
+        """Sum of the values in the window, in the shape of one value; 0 before the first value."""
         total: FloatArray = np.sum([value for _, value in self._frames], axis=0)
         return total

@@ -59,7 +59,7 @@ INLINE void from_wide(const double* from, const Sizes& n, double* to) {
     copy_rows(from, n.wide, to, n.n_x, n.n_x);
 }
 
-// Fills the elements of rows [first, last) that an update has skipped from the columns.
+// Fills the elements of rows [first, last) that an update has skipped, from the other triangle.
 INLINE void complete_rows(double* P, const Sizes& n, int first, int last) {
     for (int k = 0; k < (last - 1) / EIGHT * EIGHT; ++k)
         for (int i = std::max(first, (k / EIGHT + 1) * EIGHT); i < last; ++i)

@@ -62,11 +62,11 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
     ready = background.ready and calibrate.last_stamp_ns(name) is not None
     C = background.covariance if ready else None
     q, std = quaternion_from_rotation(network.R_ws[j]), network.orientation_std[j]
-    done = network.calibrated[j]
-    since, until = background.doubtful_times[-1] if background.doubtful_times else (None, None)
+    record = network.calibrated[j]
+    begin, end = background.doubtful_times[-1] if background.doubtful_times else (None, None)
     return {'sensor': name, 'ready': ready, 'frozen': background.frozen,
             'doubtful': background.doubtful,
-            'doubtful_since': stamp_dict(since or 0), 'doubtful_until': stamp_dict(until or 0),
+            'doubtful_since': stamp_dict(begin or 0), 'doubtful_until': stamp_dict(end or 0),
             'background': xyz(calibrate.background(name) if ready else np.full(3, np.nan)),
             'covariance': (np.full((3, 3), np.nan) if C is None else C).ravel().tolist(),
             'n_samples': counts['accepted'], 'n_rejected': counts['rejected'],
@@ -74,9 +74,9 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
             'orientation': {**xyz(q), 'w': float(q[3])},
             'orientation_std': (np.full(3, np.nan) if std is None else std).tolist(),
             'clock_offset': float(network.clock_offset[j]),
-            'clock_offset_std': float('nan') if done is None else done.clock_offset_std,
-            'calibrated_at': '' if done is None else done.date,
-            'calibrated_by': '' if done is None else done.by}
+            'clock_offset_std': float('nan') if record is None else record.clock_offset_std,
+            'calibrated_at': '' if record is None else record.date,
+            'calibrated_by': '' if record is None else record.by}
 
 
 def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
@@ -93,13 +93,13 @@ def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
     """
     times: dict[str, DoubtfulTimes] = {}
     for s in message.sensors:
-        since, until = stamp_ns(s.doubtful_since), stamp_ns(s.doubtful_until)
-        times[s.sensor] = ((since, until or None),) if since else ()
+        begin, end = stamp_ns(s.doubtful_since), stamp_ns(s.doubtful_until)
+        times[s.sensor] = ((begin, end or None),) if begin else ()
     return times
 
 
 def with_orientations(network: SensorNetwork, message: CalibrationState) -> SensorNetwork:
-    """Copy of a network with the sensor orientations of a CalibrationState.
+    """Copy a network with the sensor orientations of a CalibrationState.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ class Bytes {
 
     void add_length(std::size_t n) {
         if (n > std::numeric_limits<std::uint32_t>::max())
-            throw py::value_error("longer than CDR can say");
+            throw py::value_error("more elements than CDR can encode");
         add(std::uint32_t(n));
     }
 
@@ -176,7 +176,7 @@ class Message : public Value {
 
     void add(const py::handle& value, Bytes& out) const override {
         if (!value.is_none() && !PyDict_Check(value.ptr()))
-            throw py::type_error("a message that is not a dict");
+            throw py::type_error("expected a message as a dict");
         // A message without fields is one byte, because IDL has no empty structures.
         if (fields_.empty()) out.add(std::uint8_t(0));
         for (const Field& field : fields_) {

@@ -14,8 +14,8 @@ class Encoder:
     Parameters
     ----------
     fields : sequence of (str, int, str or Encoder, object)
-        Name, array length (`SEQUENCE` and `ONE` are special values), built-in type or encoder of
-        the contained message, and default (None: zero or empty).
+        Name; array length, `SEQUENCE` or `ONE`; built-in type or encoder of the contained message;
+        default (None: zero or empty).
     """
 
     def __init__(self, fields: Sequence[tuple[str, int, str | Encoder, Any]]) -> None: ...

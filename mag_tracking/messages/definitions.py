@@ -1,7 +1,7 @@
 """Message definitions without comments, for recordings that are written without ROS.
 
-The standard types are those of ROS 2 Jazzy; those of this package come from `msg_defs/`. A test
-compares them.
+The standard types are from ROS 2 Jazzy, the types of this package from `msg_defs/`. A test compares
+the definitions with these sources.
 """
 
 DEFINITIONS: dict[str, str] = {
@@ -91,4 +91,4 @@ DEFINITIONS: dict[str, str] = {
     'mag_tracking_msgs/msg/TrackArray': (
         'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
 }
-"""{type: text of its definition}."""
+"""{message type: definition}."""

@@ -70,9 +70,9 @@ def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
                              f'has {", ".join(network.names)}')
     lengths = {name: len(getattr(message, name)) for name in (
         'field', 'covariance', 'n_samples', 'time_offset')}
-    expected = dict(zip(lengths, (3 * n, 9 * n, n, n), strict=True))
-    if lengths != expected:
-        raise RecordingError(f'NetworkFrame of {n} sensors: expected array lengths {expected}; '
+    required = dict(zip(lengths, (3 * n, 9 * n, n, n), strict=True))
+    if lengths != required:
+        raise RecordingError(f'NetworkFrame of {n} sensors: expected array lengths {required}; '
                              f'got {lengths}')
     frame = FieldFrame(
         stamp_ns(message.header.stamp), np.array(message.field).reshape(n, 3),
@@ -84,7 +84,7 @@ def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
 
 
 def _check_numbers(frame: FieldFrame) -> None:
-    """Raise RecordingError if a frame holds values that the alignment stage never outputs."""
+    """Raise RecordingError if a frame contains values that the alignment stage never outputs."""
     if np.isinf(frame.field).any():
         raise RecordingError('NetworkFrame: a field is infinite; expected finite values, or NaN '
                              'for a missing axis')

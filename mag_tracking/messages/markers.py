@@ -1,7 +1,7 @@
 """RViz markers of tracks (90 % ellipsoid, moment arrow, label) and sensors.
 
-Each kind of marker has its own namespace, so that a viewer can hide it, and each track its own id.
-Markers of a track expire if they are not deleted.
+Each kind of marker has its own namespace, which a viewer can hide. Each track has its own marker
+id. Markers of a track expire if they are not deleted.
 """
 
 from typing import Any
@@ -25,7 +25,8 @@ _ADD, _DELETE = 0, 2
 _SCALE_3D = 2.5003
 """Standard deviations to the surface of the 90 % region (chi-square, 3 degrees of freedom)."""
 SENSOR_SIZE_M = 0.3
-"""[m] Maximum size of a sensor marker; half of the smallest sensor distance if that is less."""
+"""[m] Maximum length of a sensor marker; the length is at most half the smallest sensor
+distance."""
 _UPRIGHT = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
 _BLUE, _RED = {'r': 0.0, 'g': 0.45, 'b': 0.7}, {'r': 0.84, 'g': 0.37, 'b': 0.0}
 """Colours that remain distinguishable with colour blindness (Okabe and Ito)."""
@@ -33,10 +34,10 @@ _GREY = {'r': 0.35, 'g': 0.35, 'b': 0.35, 'a': 1.0}
 
 
 def track_markers(track: Track, frame: str) -> dict[str, Any]:
-    """Markers of a `Track`.
+    """Markers of a `Track`: ellipsoid, moment and label.
 
-    The ellipsoid shows the covariance of the pose topics. If the track is ambiguous, that covers
-    all hypotheses.
+    The ellipsoid shows the covariance of the pose topics. If the track is ambiguous, this
+    covariance covers all hypotheses.
 
     Parameters
     ----------
@@ -52,7 +53,7 @@ def track_markers(track: Track, frame: str) -> dict[str, Any]:
 
 
 def delete_markers(track: Track, frame: str) -> dict[str, Any]:
-    """Markers that delete those of an ended `Track`.
+    """Markers that delete the markers of an ended `Track`.
 
     Parameters
     ----------
@@ -102,19 +103,20 @@ def _smallest_distance(positions: FloatArray) -> float:
     return float(distances.min())
 
 
-def _marker(track: Track, frame: str, kind: str, shape: int, **content: Any) -> dict[str, Any]:
-    """visualization_msgs/Marker as a dict."""
+def _marker(track: Track, frame: str, kind: str, shape: int,
+            **message_fields: Any) -> dict[str, Any]:
+    """Build a visualization_msgs/Marker as a dict."""
     return {'header': header_dict(track.stamp_ns, frame), 'ns': kind, 'id': track.id,
-            'type': shape, **content}
+            'type': shape, **message_fields}
 
 
 def _quaternion(R: FloatArray) -> dict[str, float]:
-    """geometry_msgs/Quaternion of a rotation matrix, as a dict."""
+    """Convert a rotation matrix to a geometry_msgs/Quaternion as a dict."""
     return dict(zip('xyzw', quaternion_from_rotation(R).tolist(), strict=True))
 
 
 def _ellipsoid(track: Track, frame: str) -> dict[str, Any]:
-    """90 % region of the position."""
+    """Marker of the 90 % region of the position."""
     uncertainty: Track | PoseUncertainty = track.topic_uncertainty or track
     values, R = np.linalg.eigh(uncertainty.covariance[:3, :3])
     if np.linalg.det(R) < 0.0:
@@ -129,7 +131,7 @@ def _ellipsoid(track: Track, frame: str) -> dict[str, Any]:
 
 
 def _arrow(track: Track, frame: str) -> dict[str, Any]:
-    """Arrow along the moment; its length is three standard deviations of the position."""
+    """Arrow marker along the moment; the length is three standard deviations of the position."""
     length = max(float(np.sqrt(np.trace(track.covariance[:3, :3]))), 1e-3) * 3.0
     tip = track.position + length * track.moment / np.linalg.norm(track.moment)
     return _marker(
@@ -140,7 +142,7 @@ def _arrow(track: Track, frame: str) -> dict[str, Any]:
 
 
 def _label(track: Track, frame: str) -> dict[str, Any]:
-    """Track id, kind and speed; a question mark is appended if the track is ambiguous."""
+    """Text marker with track id, kind and speed; a question mark means an ambiguous track."""
     size = float(np.clip(np.sqrt(np.trace(track.covariance[:3, :3])), 0.005, 0.5))
     words = [word for word in (f'{track.id}', track.kind,
                                f'{np.hypot(*track.velocity[:2]):.1f} m/s') if word]

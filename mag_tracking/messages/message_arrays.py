@@ -1,7 +1,7 @@
 """Decoding of many messages of one type at once, from their CDR bytes.
 
 A message that consists of a header and numbers has a fixed size, except for the frame name. Many
-messages can therefore be decoded as arrays, twenty times faster than one by one.
+messages can therefore be decoded as arrays, twenty times faster than individually.
 """
 
 from typing import NamedTuple
@@ -25,22 +25,22 @@ class FieldArrays(NamedTuple):
     """Contents of sensor_msgs/MagneticField messages as arrays."""
 
     is_decoded: BoolArray
-    """(n,) False for an unusual or damaged message, which has to be decoded on its own. The
+    """(n,) False for an unusual or damaged message, which must be decoded individually. The
     corresponding elements of the other arrays are meaningless."""
     stamp_ns: IntArray
     """(n,) Timestamps."""
     field: FloatArray
-    """(n, 3) [T], sensor frame."""
+    """(n, 3) [T] Field, sensor frame."""
     covariance: FloatArray | None
-    """(n, 3, 3) [T^2], as in `Readings`."""
+    """(n, 3, 3) [T^2] Covariance, as in `Readings`."""
 
 
 class PoseArrays(NamedTuple):
     """Contents of geometry_msgs/PoseStamped messages as arrays."""
 
     is_decoded: BoolArray
-    """(n,) False for a message in another frame, or an unusual or damaged one, which has to be
-    decoded on its own. The corresponding elements of the other arrays are meaningless."""
+    """(n,) False for a message in another frame and for an unusual or damaged message, which must
+    be decoded individually. The corresponding elements of the other arrays are meaningless."""
     stamp_ns: IntArray
     """(n,) Timestamps."""
     pose: FloatArray
@@ -55,7 +55,7 @@ def magnetic_fields(content: bytes, begins: IntArray, ends: IntArray) -> FieldAr
     content : bytes
         CDR bytes of all messages.
     begins, ends : (n,) int array
-        First byte of each message in `content`, and the byte after its last.
+        Index of the first byte of each message in `content`, and of the byte after its last byte.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def poses(content: bytes, begins: IntArray, ends: IntArray, frame: str) -> PoseA
     content : bytes
         CDR bytes of all messages.
     begins, ends : (n,) int array
-        First byte of each message in `content`, and the byte after its last.
+        Index of the first byte of each message in `content`, and of the byte after its last byte.
     frame : str
         Messages in other frames are not decoded.
 
@@ -99,6 +99,7 @@ class _StampedMessages:
     is_decoded : (n,) bool array
         False for a message that is truncated or not little-endian CDR.
     stamp_ns : (n,) int array
+        Timestamps.
     """
 
     def __init__(self, content: bytes, begins: IntArray, ends: IntArray, n_doubles: int) -> None:
@@ -124,9 +125,9 @@ class _StampedMessages:
         """Whether the frame names of `rows` are zero-terminated ASCII: (k,) array."""
         out = np.zeros(len(rows), dtype=bool)
         for length in np.unique(self._length[rows]):
-            same = np.flatnonzero(self._length[rows] == length)
-            text = self._frames(rows[same], length)
-            out[same] = (text[:, -1] == 0) & (text < 128).all(axis=1)
+            same_length = np.flatnonzero(self._length[rows] == length)
+            names = self._frames(rows[same_length], length)
+            out[same_length] = (names[:, -1] == 0) & (names < 128).all(axis=1)
         return out
 
     def have_frame(self, rows: IntArray, frame: str) -> BoolArray:
@@ -137,7 +138,7 @@ class _StampedMessages:
         return out
 
     def numbers(self) -> FloatArray:
-        """Values of the decoded messages, (n, n_doubles); 0 for the others."""
+        """Values of the decoded messages, (n, n_doubles); 0 for messages that are not decoded."""
         out = np.zeros((len(self._begins), self._n_doubles))
         rows = np.flatnonzero(self.is_decoded)
         if len(rows):

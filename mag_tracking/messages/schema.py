@@ -81,8 +81,8 @@ def reading_of(message: MagneticField, sensor: str) -> Readings:
 def known_covariances(C: FloatArray) -> FloatArray | None:
     """Convert the covariances of messages to those of `Readings`.
 
-    A NaN covariance means "unknown" in `Readings` only. In a message it is a fault: it becomes
-    zero, which the calibration stage rejects.
+    A NaN covariance means "unknown" in `Readings` only. In a message, NaN is a fault: it is
+    replaced by zero, which the calibration stage rejects.
 
     Parameters
     ----------
@@ -94,11 +94,11 @@ def known_covariances(C: FloatArray) -> FloatArray | None:
     (n, 3, 3) array or None, T²
         NaN where unknown; None if all are unknown.
     """
-    known = (C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))
-    if not known.any():
+    is_known = (C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))
+    if not is_known.any():
         return None
     C = np.where(np.isnan(C).all(axis=(1, 2), keepdims=True), 0.0, C)
-    return np.where(known[:, None, None], C, np.nan)
+    return np.where(is_known[:, None, None], C, np.nan)
 
 
 def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
@@ -114,7 +114,7 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
     Returns
     -------
     AccelerationSample
-        NaN if the message carries no acceleration (its covariance begins with -1).
+        NaN if the message contains no acceleration (its covariance begins with -1).
     """
     a = message.linear_acceleration
     is_present = message.linear_acceleration_covariance[0] != -1.0
@@ -123,9 +123,9 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
 
 
 def float64_array(values: ArrayLike) -> 'array[float]':
-    """Convert numbers to the array type that a float64[] field takes without conversion.
+    """Convert numbers to the array type that a float64[] field accepts without conversion.
 
-    A message would check a list number by number.
+    The elements of a list would be checked one by one.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def readings_dict(readings: Readings) -> MessageDict:
     """
     C = readings.covariance
     if not len(readings) or C is not None and np.isnan(C).all(axis=(1, 2)).any():
-        raise RecordingError('FieldReadings needs at least one reading, and covariances of all '
+        raise RecordingError('FieldReadings requires at least one reading, and covariances of all '
                              'readings or of none')
     return {'header': header_dict(int(readings.stamp_ns.max()), ''),
             'sensors': list(readings.names),
@@ -244,13 +244,13 @@ def readings_of(message: FieldReadings) -> Readings:
         If array lengths, sensor names, indices or timestamps are invalid.
     """
     n, names = len(message.sensor), tuple(message.sensors)
-    sizes = len(message.stamp), len(message.field), len(message.covariance)
-    if sizes not in ((n, 3 * n, 0), (n, 3 * n, 9 * n)):
-        raise RecordingError(f'FieldReadings of {n} readings: got {sizes[0]} timestamps, '
-                             f'{sizes[1]} field values and {sizes[2]} covariance values; expected '
-                             'one, 3 and 9 (or no covariances) per reading')
+    lengths = len(message.stamp), len(message.field), len(message.covariance)
+    if lengths not in ((n, 3 * n, 0), (n, 3 * n, 9 * n)):
+        raise RecordingError(f'FieldReadings of {n} readings: got {lengths[0]} timestamps, '
+                             f'{lengths[1]} field values and {lengths[2]} covariance values; '
+                             'expected one, 3 and 9 (or no covariances) per reading')
     if len(set(names)) < len(names):
-        raise RecordingError(f'FieldReadings names a sensor twice: {", ".join(names)}')
+        raise RecordingError(f'FieldReadings lists a sensor twice: {", ".join(names)}')
     sensor = np.array(message.sensor, dtype=np.int64)
     if n and not 0 <= sensor.min() <= sensor.max() < len(names):
         raise RecordingError(f'FieldReadings: sensor index {sensor.max()} is out of range; there '
@@ -307,13 +307,13 @@ def pose_dict(ns: int, frame: str, position: FloatArray, quaternion: FloatArray)
 
 
 def _pose(position: FloatArray, quaternion: FloatArray) -> MessageDict:
-    """geometry_msgs/Pose as a dict."""
+    """Build a geometry_msgs/Pose as a dict."""
     return {'position': xyz(position),
             'orientation': {**xyz(quaternion), 'w': float(quaternion[3])}}
 
 
 def pose_covariance(uncertainty: Track | SmoothedPose | PoseUncertainty) -> FloatArray:
-    """Covariance of position and small rotations about the fixed axes, in the order of ROS.
+    """Covariance of position and small rotations about the fixed axes, in the element order of ROS.
 
     Parameters
     ----------
@@ -418,7 +418,7 @@ def hypotheses_dict(track: Track, frame: str) -> MessageDict:
 
 
 def _hypothesis_dict(h: Hypothesis) -> MessageDict:
-    """mag_tracking_msgs/Hypothesis of a `Hypothesis`, as a dict."""
+    """Convert a `Hypothesis` to mag_tracking_msgs/Hypothesis."""
     return {'arrival': h.arrival, 'kind': h.kind, 'weight': h.weight,
             'position': xyz(h.position), 'velocity': xyz(h.velocity),
             'covariance': h.covariance.ravel().tolist(), 'moment': xyz(h.moment)}
@@ -446,7 +446,7 @@ def smoothed_track_dict(poses: Sequence[SmoothedPose], frame: str) -> MessageDic
     Parameters
     ----------
     poses : sequence of SmoothedPose
-        In order of time, at least one.
+        Chronological, at least one.
     frame : str
         World frame.
 
@@ -528,7 +528,7 @@ def vehicle_passage_dict(p: VehiclePassage, class_names: Sequence[str],
     ----------
     p : VehiclePassage
     class_names : sequence of str
-        Names that belong to `p.class_probabilities`.
+        Class name of each entry of `p.class_probabilities`.
     frame : str
         World frame.
 

@@ -1,4 +1,4 @@
-"""Magnetic fields in JSON or protobuf messages, which are described by their schema.
+"""Magnetic fields in JSON or protobuf messages, decoded by means of their schema.
 
 Such messages are written by Foxglove's tools and by programs without ROS. A message is treated as
 a magnetic field if it has `magnetic_field` with x, y and z [T], and a time in `header.stamp`,
@@ -22,11 +22,11 @@ _SECONDS = ('sec', 'secs', 'seconds')
 _NANOSECONDS = ('nanosec', 'nsec', 'nsecs', 'nanos')
 
 SCHEMAS = ('jsonschema', 'protobuf')
-"""Schema encodings that are supported."""
+"""Supported schema encodings."""
 
 
 def type_of(schema: Schema) -> str:
-    """Message type that a schema describes.
+    """Message type of a schema.
 
     Parameters
     ----------
@@ -49,6 +49,7 @@ def cdr_of(schema: Schema, data: bytes) -> bytes:
     ----------
     schema : Schema
     data : bytes
+        Message in the encoding of the schema.
 
     Returns
     -------
@@ -64,7 +65,7 @@ def cdr_of(schema: Schema, data: bytes) -> bytes:
 
 @functools.cache
 def decode_errors() -> tuple[type[Exception], ...]:
-    """Exceptions that invalid message bytes cause.
+    """Exceptions raised for invalid message bytes.
 
     Returns
     -------
@@ -86,7 +87,7 @@ def field_decoder(encoding: str, name: str, content: bytes) -> Callable[[bytes],
     encoding, name : str
         Encoding and name of the schema.
     content : bytes
-        Text or descriptor of the schema.
+        JSON schema or protobuf descriptor.
 
     Returns
     -------
@@ -122,15 +123,15 @@ def _field(message: Any) -> MessageDict:
     if len(covariance) not in (0, 9):
         raise ValueError(f'magnetic_field_covariance has {len(covariance)} elements; expected 9')
     return {
-        'header': {'stamp': {'sec': _whole(stamp, _SECONDS, 2**31),
-                             'nanosec': _whole(stamp, _NANOSECONDS, 10**9)},
+        'header': {'stamp': {'sec': _time_part(stamp, _SECONDS, 2**31),
+                             'nanosec': _time_part(stamp, _NANOSECONDS, 10**9)},
                    'frame_id': str(getattr(header, 'frame_id', ''))},
-        'magnetic_field': {axis: _number(field, axis) for axis in 'xyz'},
+        'magnetic_field': {axis: _axis_value(field, axis) for axis in 'xyz'},
         'magnetic_field_covariance': covariance or [0.0] * 9}
 
 
-def _whole(stamp: Any, names: tuple[str, ...], limit: int) -> int:
-    """First of the fields `names` that a time has; raise ValueError unless it is in [0, limit)."""
+def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
+    """Return the first existing field of `names`; raise ValueError unless in [0, limit)."""
     for name in names:
         value = getattr(stamp, name, None)
         if isinstance(value, int) and not isinstance(value, bool):
@@ -140,8 +141,8 @@ def _whole(stamp: Any, names: tuple[str, ...], limit: int) -> int:
     raise ValueError(f'timestamp: {names[0]} is missing')
 
 
-def _number(field: Any, axis: str) -> float:
-    """Field of one axis [T]; null becomes NaN (not measured). Raise ValueError if it is missing."""
+def _axis_value(field: Any, axis: str) -> float:
+    """Return the field of one axis [T], NaN for null; raise ValueError if it is missing."""
     if not hasattr(field, axis):
         raise ValueError(f'magnetic_field.{axis} is missing')
     value = getattr(field, axis)

@@ -23,8 +23,7 @@ def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageD
     Returns
     -------
     dict (tf2_msgs/TFMessage) or None
-        None if the pose is ambiguous, because a transform has neither a flag
-        nor a covariance.
+        None if the pose is ambiguous, because a transform has neither a flag nor a covariance.
     """
     if track.ambiguous:
         return None
@@ -41,6 +40,7 @@ def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[Messag
     ----------
     network : SensorNetwork
     stamp_ns : int, ns
+        Timestamp of the transforms.
 
     Returns
     -------
@@ -59,8 +59,10 @@ def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[Messag
 def detections_3d_dict(track: Track, frame: str) -> MessageDict:
     """Convert a `Track` to vision_msgs/Detection3DArray.
 
-    The results are the kinds of target with their probabilities; each has the pose of the track.
-    The box has the length of the row of dipoles; width and height are not observable and set to 0.
+    The results are the kinds of target with their probabilities; each result has the pose of the
+    track.
+    The box has the length of the line of dipoles; its width and height are not observable and set
+    to 0.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""Message definitions as text, and encoding and decoding of CDR bytes, without ROS.
+"""Message schemas, and encoding and decoding of CDR bytes, without ROS.
 
-Recordings carry the texts of `definitions` as their schemas.
+The schemas are built from the message definitions of `definitions`.
 """
 
 import functools
@@ -34,7 +34,7 @@ TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 
 RAW_READINGS = 'field_readings'
 """Topic of raw readings of many sensors. Like the topics below, it is relative to the namespace of
-the nodes and independent of their names."""
+the nodes and independent of the node names."""
 CALIBRATED_READINGS = 'field_readings_calibrated'
 """Topic of calibrated readings of many sensors."""
 CALIBRATION_STATE = 'calibration_state'
@@ -49,17 +49,17 @@ _FIELD = re.compile(r'\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?P<array>(?:<=)
 
 
 def _full_name(kind: str, package: str) -> str:
-    """Full name of a type that a definition of `package` refers to."""
+    """Full name of a type that is referenced by a definition of `package`."""
     owner, _, leaf = kind.rpartition('/')
     return f'{(owner or package).partition("/")[0]}/msg/{leaf}'
 
 
-def referenced_types(text: str, package: str) -> list[str]:
-    """Message types that a definition refers to.
+def referenced_types(message_definition: str, package: str) -> list[str]:
+    """Message types that are referenced by a definition.
 
     Parameters
     ----------
-    text : str
+    message_definition : str
         Definition of a message type.
     package : str
         Package of that type.
@@ -70,7 +70,7 @@ def referenced_types(text: str, package: str) -> list[str]:
         Full names without duplicates, in order of appearance.
     """
     out: list[str] = []
-    for line in text.splitlines():
+    for line in message_definition.splitlines():
         field = _FIELD.match(line.partition('#')[0])
         if field and not field['is_constant'] and field['type'] not in _BUILT_IN:
             name = _full_name(field['type'], package)
@@ -81,18 +81,18 @@ def referenced_types(text: str, package: str) -> list[str]:
 
 def _dependencies(type_name: str) -> list[str]:
     """Types that `type_name` contains, without duplicates, breadth first."""
-    seen: list[str] = []
+    visited: list[str] = []
     queue = [type_name]
     while queue:
         name = queue.pop(0)
-        if name not in seen:
-            seen.append(name)
+        if name not in visited:
+            visited.append(name)
             queue += referenced_types(DEFINITIONS[name], name.partition('/')[0])
-    return seen[1:]
+    return visited[1:]
 
 
 def definition(type_name: str) -> str:
-    """Definition of a type with those of all contained types, in the format of a `ros2msg` schema.
+    """Definition of a type and of all contained types, in the format of a `ros2msg` schema.
 
     Parameters
     ----------
@@ -110,11 +110,11 @@ def definition(type_name: str) -> str:
     """
     if type_name not in DEFINITIONS:
         raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
-    text = DEFINITIONS[type_name]
+    message_definition = DEFINITIONS[type_name]
     for name in _dependencies(type_name):
         package, _, leaf = name.split('/')
-        text += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name]}'
-    return text
+        message_definition += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name]}'
+    return message_definition
 
 
 @functools.cache
@@ -130,9 +130,9 @@ def schema_of(type_name: str) -> Schema:
     Schema
         Empty if `definitions` does not contain the type.
     """
-    known = type_name in DEFINITIONS
-    return Schema(1, definition(type_name).encode() if known else b'',
-                  'ros2msg' if known else '', type_name)
+    is_defined = type_name in DEFINITIONS
+    return Schema(1, definition(type_name).encode() if is_defined else b'',
+                  'ros2msg' if is_defined else '', type_name)
 
 
 @functools.cache

@@ -1,7 +1,7 @@
 """Simulated scenarios with ground truth: bodies that move past a sensor network.
 
-A simulated vehicle is a cloud of magnetised parts rather than one dipole, so that a point target
-model is subject to a realistic model error. A matched point target is a cloud of one part.
+A simulated vehicle is a cloud of magnetised parts rather than one dipole, so a point target model
+has a realistic model error. A matched point target is a cloud of one part.
 """
 
 from collections.abc import Sequence
@@ -174,21 +174,21 @@ def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float =
                      rng.uniform(-0.5, 0.5, n_parts))
     parts = np.stack([length * np.clip(along, -0.5, 0.5), width * rng.uniform(-0.5, 0.5, n_parts),
                       0.2 + (height - 0.2) * rng.beta(1.5, 3.0, n_parts)], axis=1)
-    share = rng.dirichlet(np.full(n_parts, 1.5))
+    fraction = rng.dirichlet(np.full(n_parts, 1.5))
     common = rng.standard_normal(3)
-    permanent = (share[:, None] * (common / np.linalg.norm(common)
-                                   + 0.7 * rng.standard_normal((n_parts, 3)))
+    permanent = (fraction[:, None] * (common / np.linalg.norm(common)
+                                      + 0.7 * rng.standard_normal((n_parts, 3)))
                  * moment / 1.4)
     # Sheet metal is easier to magnetise along the vehicle than across it.
     easy = np.array([1.3, 1.0, 0.7]) * rng.uniform(0.8, 1.2, (n_parts, 3))
     total = moment / 1.4 * MU0 / 50e-6
-    susceptibility = np.einsum('n,ni,ij->nij', share * total, easy, np.eye(3))
+    susceptibility = np.einsum('n,ni,ij->nij', fraction * total, easy, np.eye(3))
     return MagneticBody(parts, permanent, susceptibility)
 
 
 @dataclass(frozen=True)
 class Path:
-    """A planar path at constant speed: straight, or straight - arc - straight."""
+    """Planar path at constant speed: straight, or straight - arc - straight."""
 
     start: FloatArray
     """Position at t = 0, (2,) m, world frame."""
@@ -227,9 +227,10 @@ class Path:
         # In the frame of the start pose: x forward, y left.
         side = np.sign(self.turn)
         forward = lead + self.radius * np.sin(np.abs(angle)) + tail * np.cos(angle)
-        left = side * self.radius * (1.0 - np.cos(angle)) + tail * np.sin(angle)
+        sideways = side * self.radius * (1.0 - np.cos(angle)) + tail * np.sin(angle)
         c, w = np.cos(self.heading), np.sin(self.heading)
-        position = self.start + np.stack([c * forward - w * left, w * forward + c * left], axis=1)
+        position = self.start + np.stack([c * forward - w * sideways,
+                                          w * forward + c * sideways], axis=1)
         return position, self.heading + angle
 
 
@@ -246,7 +247,7 @@ class SensorErrorModel:
     tilt_std: float = 0.0
     """Mounting error about each axis, relative to the network file, rad."""
     clock_std: float = 0.0
-    """Constant clock offset, s; the first sensor has none."""
+    """Constant clock offset, s; 0 for the first sensor."""
     gain_std: float = 0.0
     """Relative gain error of each axis."""
 
@@ -274,9 +275,9 @@ def simulate(network: SensorNetwork, body: Body, path: Trajectory, rate: float, 
     Returns
     -------
     readings : Readings
-        In order of their timestamps.
+        Chronological.
     t : (n,) array, s
-        Time of each sample, from the start.
+        Time of each sample since the start.
     position : (n, 2) array, m, world frame
         True position at `t`.
     heading : (n,) array, rad
@@ -287,24 +288,24 @@ def simulate(network: SensorNetwork, body: Body, path: Trajectory, rate: float, 
     ValueError
         If the network has no earth field.
     """
-    flaws, earth_field = sensor_errors or SensorErrorModel(), network.earth_field
+    errors, earth_field = sensor_errors or SensorErrorModel(), network.earth_field
     if earth_field is None:
-        raise ValueError('simulate requires a network with an earth field')
+        raise ValueError('the simulation requires a network with an earth field; set earth_field')
     t = np.arange(0.0, duration, 1.0 / rate, dtype=float)
     fields = []
     for j in range(len(network)):
-        offset = flaws.clock_std * rng.standard_normal() if j else 0.0
+        offset = errors.clock_std * rng.standard_normal() if j else 0.0
         position, heading = path.at(t + offset)
         B = earth_field + body.field(earth_field, position, heading,
                                      network.positions[j:j + 1])[:, 0]
-        a, b, c = flaws.tilt_std * rng.standard_normal(3)
+        a, b, c = errors.tilt_std * rng.standard_normal(3)
         tilt = np.array([[1.0, -c, b], [c, 1.0, -a], [-b, a, 1.0]])
         y = B @ network.R_ws[j] @ tilt
-        if flaws.gain_std:
-            y *= 1.0 + flaws.gain_std * rng.standard_normal(3)
-        y += flaws.bias_std * rng.standard_normal(3)
-        y += flaws.drift_std * rng.standard_normal(3) * t[:, None]
-        y += flaws.noise_std * rng.standard_normal(y.shape)
+        if errors.gain_std:
+            y *= 1.0 + errors.gain_std * rng.standard_normal(3)
+        y += errors.bias_std * rng.standard_normal(3)
+        y += errors.drift_std * rng.standard_normal(3) * t[:, None]
+        y += errors.noise_std * rng.standard_normal(y.shape)
         fields.append(y)
     n = len(network)
     stamps = np.array([int(round((start_s + s) * 1e9)) for s in t], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""State of a live page: recent tracks, latest frame, health."""
+"""State of a live page: recent tracks, latest frame and health."""
 
 import threading
 from collections import OrderedDict
@@ -18,17 +18,17 @@ from mag_tracking.units import NS
 from mag_tracking.web.live_track import LiveTrack
 
 HISTORY_S = 600.0
-"""[s] Tracks that ended earlier are removed."""
+"""[s] Time from the end of a track to its removal."""
 MAX_POSES = 30_000
 """Maximum number of poses over all tracks; the oldest tracks are removed first."""
 MAX_FRAMES = 64
-"""Number of recent frames kept for matching with tracks."""
+"""Number of recent frames that are stored for matching with tracks."""
 JUMP_BACK_S = 1.0
 """[s] A larger backward jump of frames starts a new scene, for example when a bag is looped."""
 
 
 class LiveScene:
-    """Collects records and creates messages for the page. Thread-safe.
+    """Thread-safe state of a live page: collects records and creates messages for viewers.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class LiveScene:
         self._is_frame_new = False
         self._tracks: dict[int, LiveTrack] = {}
         # {track id: latest track with this id}
-        self._latest: dict[int, LiveTrack] = {}
+        self._latest_by_id: dict[int, LiveTrack] = {}
         self._is_new = True
 
     def add_frame(self, frame: FieldFrame) -> None:
@@ -101,19 +101,19 @@ class LiveScene:
         track : Track
         """
         with self._lock:
-            live = self._latest.get(track.id)
+            live = self._latest_by_id.get(track.id)
             if live is None or not live.continues(track):
                 if track.ended:
                     return
                 self._n_tracks += 1
                 live = LiveTrack(self._n_tracks, track.id)
-                self._tracks[live.key] = self._latest[track.id] = live
+                self._tracks[live.key] = self._latest_by_id[track.id] = live
             self._extend_time(track.stamp_ns)
-            live.add(track, self._frames.get(track.stamp_ns) or self._no_frame(track))
-            self._forget()
+            live.add(track, self._frames.get(track.stamp_ns) or self._empty_frame(track))
+            self._remove_old_tracks()
 
-    def _no_frame(self, track: Track) -> FieldFrame:
-        """Empty frame, used if the frame of a track was not received."""
+    def _empty_frame(self, track: Track) -> FieldFrame:
+        """Empty frame that replaces a missing frame of a track."""
         n = len(self._network)
         return FieldFrame(track.stamp_ns, np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan),
                           np.zeros(n, dtype=int), np.zeros(n))
@@ -125,9 +125,10 @@ class LiveScene:
         ----------
         track_id : int
         points : (n, 3) array, m
+            Smoothed positions.
         """
         with self._lock:
-            live = self._latest.get(track_id)
+            live = self._latest_by_id.get(track_id)
             if live is not None:
                 live.smoothed = {**path_entry(track_id, points), 'key': live.key}
                 live.is_smoothed_new = True
@@ -146,7 +147,7 @@ class LiveScene:
                 self._notes, self._tables, self._is_health_new = notes, tables, True
 
     def whole(self) -> list[str]:
-        """Messages with everything sent so far, for a new viewer.
+        """Messages with the complete state that has been sent, for a new viewer.
 
         Returns
         -------
@@ -156,10 +157,11 @@ class LiveScene:
         with self._lock:
             begin_ns = self._begin_ns or 0
             tracks = [live.sent(begin_ns) for live in self._tracks.values()]
-            return [*self._scene([t for t in tracks if t is not None]), self._health()]
+            return [*self._scene_messages([t for t in tracks if t is not None]),
+                    self._health_message()]
 
     def news(self) -> list[str]:
-        """Messages with everything new since the last call.
+        """Return messages with all changes since the last call.
 
         Returns
         -------
@@ -169,8 +171,8 @@ class LiveScene:
         with self._lock:
             if self._is_new:
                 self._is_new = False
-                return self._scene([])
-            out = [self._health()] if self._is_health_new else []
+                return self._scene_messages([])
+            out = [self._health_message()] if self._is_health_new else []
             self._is_health_new = False
             begin_ns, frame = self._begin_ns or 0, None
             tracks = [live.news(begin_ns) for live in self._tracks.values() if live.has_unsent]
@@ -188,8 +190,8 @@ class LiveScene:
             self._is_frame_new = False
             return out
 
-    def _scene(self, tracks: list[dict[str, Any]]) -> list[str]:
-        """Message that replaces the scene; empty while the sensors are unknown."""
+    def _scene_messages(self, tracks: list[dict[str, Any]]) -> list[str]:
+        """List of the message that replaces the scene; empty while the sensors are unknown."""
         if not len(self._network):
             return []
         begin_ns = self._begin_ns or 0
@@ -197,8 +199,8 @@ class LiveScene:
         return [json_text({'type': 'scene', 'title': self.title, 'subtitle': self.subtitle,
                            'scene': scene})]
 
-    def _health(self) -> str:
-        """Message with notes and tables."""
+    def _health_message(self) -> str:
+        """Health message: notes and tables."""
         return json_text({'type': 'health', 'notes': [asdict(note) for note in self._notes],
                           'tables': [asdict(table) for table in self._tables]})
 
@@ -206,17 +208,17 @@ class LiveScene:
         """Extend the time range of the scene."""
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
-            # An empty scene that was sent before had no start time.
+            # An empty scene that may have been sent earlier had no start time.
             self._is_new = True
         self._end_ns = max(self._end_ns, stamp_ns)
 
-    def _forget(self) -> None:
+    def _remove_old_tracks(self) -> None:
         """Remove tracks that ended long ago, and the oldest tracks if there are too many poses."""
         n = sum(len(live.log.stamp_ns) for live in self._tracks.values())
         for key, live in list(self._tracks.items())[:-1]:
-            old = (self._end_ns - live.end_ns) / NS > HISTORY_S
-            if old or n > MAX_POSES:
+            is_old = (self._end_ns - live.end_ns) / NS > HISTORY_S
+            if is_old or n > MAX_POSES:
                 n -= len(live.log.stamp_ns)
                 del self._tracks[key]
-                if self._latest.get(live.log.id) is live:
-                    del self._latest[live.log.id]
+                if self._latest_by_id.get(live.log.id) is live:
+                    del self._latest_by_id[live.log.id]

@@ -1,4 +1,4 @@
-"""Track of a live page, and which part of it has been sent to the viewers."""
+"""Track of a live page, with a record of the part that has been sent to viewers."""
 
 from typing import Any
 
@@ -8,12 +8,12 @@ from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
 MAX_TRACK_POSES, N_REMOVED = 8_000, 1_000
-"""Maximum number of poses of one track, and number removed when it is exceeded. `scene.js` uses the
+"""Maximum number of poses of one track, and number of poses removed beyond it. `scene.js` uses the
 same numbers."""
 MAX_GAP_S = 60.0
 """[s] A pose after a longer gap belongs to another track with the same id."""
 N_RECENT = 100
-"""Number of latest poses by which the sensors are selected whose fields are sent."""
+"""Number of latest poses used to select the sensors whose fields are sent."""
 
 
 class LiveTrack:
@@ -22,7 +22,7 @@ class LiveTrack:
     Parameters
     ----------
     key : int
-        Unique on the page. Track ids are not, because a restarted tracker begins at 1 again.
+        Unique on the page. Track ids are not unique, because a restarted tracker begins at 1.
     track_id : int
 
     Attributes
@@ -30,7 +30,7 @@ class LiveTrack:
     key : int
     log : TrackLog
     smoothed : dict or None
-        Smoothed path, as JSON.
+        Smoothed path as a JSON object.
     is_smoothed_new : bool
         Whether the smoothed path has not been sent yet.
     """
@@ -48,7 +48,7 @@ class LiveTrack:
 
     @property
     def has_unsent(self) -> bool:
-        """Whether there are poses, or an end, that have not been sent yet."""
+        """Whether poses or the end of the track have not been sent yet."""
         return self._sent < len(self.log.stamp_ns) or self.log.ended and not self._is_end_sent
 
     def continues(self, track: Track) -> bool:
@@ -65,7 +65,7 @@ class LiveTrack:
         return not self.log.ended and abs(track.stamp_ns - self.end_ns) <= MAX_GAP_S * NS
 
     def add(self, track: Track, frame: FieldFrame) -> None:
-        """Add a pose. The oldest poses of a very long track are removed.
+        """Add a pose, and remove the oldest poses of a very long track.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class LiveTrack:
             self._sent = max(0, self._sent - N_REMOVED)
 
     def news(self, begin_ns: int) -> dict[str, Any]:
-        """Entry with everything that has not been sent yet; it counts as sent from now on.
+        """Return an entry with all unsent poses, and mark the poses as sent.
 
         Parameters
         ----------
@@ -89,14 +89,14 @@ class LiveTrack:
         Returns
         -------
         dict
-            JSON.
+            JSON object.
         """
         first, self._sent = self._sent, len(self.log.stamp_ns)
         self._is_end_sent = self.log.ended
         return self._entry(begin_ns, range(first, self._sent))
 
     def sent(self, begin_ns: int) -> dict[str, Any] | None:
-        """Entry with everything that has been sent.
+        """Entry with all poses that have been sent.
 
         Parameters
         ----------
@@ -106,12 +106,12 @@ class LiveTrack:
         Returns
         -------
         dict or None
-            JSON; None if nothing has been sent.
+            JSON object; None if nothing has been sent.
         """
         return self._entry(begin_ns, range(self._sent)) if self._sent else None
 
     def _entry(self, begin_ns: int, rows: range) -> dict[str, Any]:
-        """JSON of some poses, with the fields that were strongest during the latest of them."""
+        """JSON object of selected poses, with the fields of the recently strongest sensors."""
         recent = range(max(0, rows.stop - max(N_RECENT, len(rows))), rows.stop)
         entry = track_entry(self.log, begin_ns, strongest_sensors(self.log, recent), rows)
         entry['key'], entry['smoothed'] = self.key, self.smoothed

@@ -29,11 +29,11 @@ MAX_BUFFERED = 1_000_000
 """[bytes] Maximum size of a viewer's send buffer. A viewer that exceeds it receives no messages
 until the buffer is empty."""
 LAG_TIMEOUT_S = 20.0
-"""[s] A lagging viewer whose buffer does not shrink for this time is disconnected."""
+"""[s] Time after which a lagging viewer is disconnected if its buffer does not shrink."""
 MAX_VIEWERS = 100
 MAX_PORT = 65535
-START_S = 10.0
-"""[s] Maximum time to wait for the server thread to end."""
+STOP_TIMEOUT_S = 10.0
+"""[s] Maximum time to wait for the end of the server thread."""
 PAGE, STREAM = '/', '/stream'
 LOG = getLogger('mag_tracking.web')
 
@@ -75,7 +75,7 @@ class PageServer:
         Address of the page, including the token if there is one.
     port : int
     n_lagged : int
-        Number of times a viewer lagged and had to wait.
+        Number of times that messages to a lagging viewer were suspended.
 
     Raises
     ------
@@ -87,16 +87,16 @@ class PageServer:
         self._source, self._host = source, host
         self._token = '' if is_loopback(host) else secrets.token_urlsafe(16)
         self._page = gzip.compress(live_html().encode('utf-8'), 6)
-        # {viewer: permitted size of its buffer [bytes]}
+        # {viewer: permitted size of its send buffer [bytes]}
         self._viewers: dict[ServerConnection, int] = {}
         # {viewer: (time of the latest progress [s], size of its buffer at that time [bytes])}
         self._lagging: dict[ServerConnection, tuple[float, int]] = {}
-        self._faults: set[str] = set()
+        self._logged_errors: set[str] = set()
         self.n_lagged = 0
         self._socket = _open_socket(host, port)
         self.port = int(self._socket.getsockname()[1])
-        shown = _reachable_name(host)
-        self.url = f'http://{shown}:{self.port}/' + (
+        host_name = _reachable_name(host)
+        self.url = f'http://{host_name}:{self.port}/' + (
             f'?token={self._token}' if self._token else '')
         self._loop = asyncio.new_event_loop()
         self._stop = asyncio.Event()
@@ -117,7 +117,7 @@ class PageServer:
         """Disconnect all viewers and release the port."""
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._stop.set)
-            self._thread.join(START_S)
+            self._thread.join(STOP_TIMEOUT_S)
 
     def __enter__(self) -> 'PageServer':
         return self
@@ -149,48 +149,49 @@ class PageServer:
                 except asyncio.TimeoutError:
                     continue
 
-    def _messages(self, ask: Callable[[], list[str]]) -> list[str]:
-        """Messages of the source; an error is logged once and shown on the page."""
+    def _messages(self, get_messages: Callable[[], list[str]]) -> list[str]:
+        """Get messages from the source; log an error once and show it on the page."""
         try:
-            return ask()
+            return get_messages()
         except Exception as error:
-            # The page is optional: an error in it must stop neither the server nor the nodes.
-            text = f'{type(error).__name__}: {error}'
-            if text not in self._faults:
-                self._faults.add(text)
+            # The page is optional: its errors must stop neither the server nor the nodes.
+            description = f'{type(error).__name__}: {error}'
+            if description not in self._logged_errors:
+                self._logged_errors.add(description)
                 LOG.exception('error in the live page')
-            return [json_text({'type': 'fault', 'text': text})]
+            return [json_text({'type': 'fault', 'text': description})]
 
     def _send_updates(self) -> None:
-        """Send new messages to all viewers, and the complete scene to those that have caught up."""
+        """Send new messages to all viewers, and the complete scene to viewers after a lag."""
         if not self._viewers and not self._lagging:
             return
         now = self._loop.time()
         for viewer, allowed in list(self._viewers.items()):
-            waiting = _buffered_bytes(viewer)
-            if waiting > allowed:
+            n_buffered = _buffered_bytes(viewer)
+            if n_buffered > allowed:
                 del self._viewers[viewer]
-                self._lagging[viewer] = now, waiting
+                self._lagging[viewer] = now, n_buffered
                 self.n_lagged += 1
             else:
                 # A complete scene may exceed MAX_BUFFERED; the excess is allowed until it is sent.
-                self._viewers[viewer] = max(MAX_BUFFERED, min(allowed, waiting + MAX_BUFFERED))
+                self._viewers[viewer] = max(MAX_BUFFERED, min(allowed, n_buffered + MAX_BUFFERED))
         for message in self._messages(self._source.news):
             broadcast(self._viewers, message)
-        for viewer, (since, least) in list(self._lagging.items()):
-            waiting = _buffered_bytes(viewer)
-            if not waiting:
+        for viewer, (progress_time, buffered_before) in list(self._lagging.items()):
+            n_buffered = _buffered_bytes(viewer)
+            if not n_buffered:
                 del self._lagging[viewer]
                 self._send_snapshot(viewer)
-            elif waiting < least:
-                self._lagging[viewer] = now, waiting
-            elif now - since > LAG_TIMEOUT_S:
+            elif n_buffered < buffered_before:
+                self._lagging[viewer] = now, n_buffered
+            elif now - progress_time > LAG_TIMEOUT_S:
                 del self._lagging[viewer]
                 viewer.transport.abort()
 
     def _send_snapshot(self, viewer: ServerConnection) -> None:
         """Send the complete scene to a viewer; new messages follow."""
-        # Pending messages are sent first: the scene contains them, so they must not follow it.
+        # Pending messages are sent first: the scene contains them, so they must not follow the
+        # scene.
         for message in self._messages(self._source.news):
             broadcast(self._viewers, message)
         for message in self._messages(self._source.whole):
@@ -213,7 +214,7 @@ class PageServer:
             self._lagging.pop(viewer, None)
 
     def _process_request(self, _: ServerConnection, request: Request) -> Response | None:
-        """Response to an HTTP request; None accepts a WebSocket."""
+        """Return the response to an HTTP request, or None to accept a WebSocket connection."""
         address = urlsplit(request.path)
         refusal = self._refusal(request, parse_qs(address.query).get('token', [''])[0])
         if refusal:
@@ -226,7 +227,7 @@ class PageServer:
         return _response(HTTPStatus.OK, self._page, 'text/html', 'gzip')
 
     def _refusal(self, request: Request, token: str) -> str:
-        """Reason for refusing a request; empty if it is permitted."""
+        """Reason for refusing a request; empty if the request is permitted."""
         host = request.headers.get('Host', '')
         if self._token:
             if not secrets.compare_digest(token.encode('utf-8'), self._token.encode('utf-8')):
@@ -296,10 +297,10 @@ def _buffered_bytes(viewer: ServerConnection) -> int:
 
 
 def _open_socket(host: str, port: int) -> socket.socket:
-    """Listening socket; raises DeviceError if it cannot be opened."""
+    """Open a listening socket; raise DeviceError if this fails."""
     if not 0 <= port <= MAX_PORT:
-        raise DeviceError(f'the live page cannot be served on port {port}: expected a number up '
-                          f'to {MAX_PORT}')
+        raise DeviceError(f'the live page cannot be served on port {port}: expected a number from '
+                          f'0 to {MAX_PORT}')
     try:
         family, _, _, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]

@@ -1,4 +1,4 @@
-"""Comparison of sensors with the Earth field: identified faults, and no false alarms."""
+"""Comparison of sensors with the Earth's field: identification of faults, and false alarms."""
 
 from itertools import combinations
 
@@ -36,7 +36,7 @@ def correct_fields(rng=None, R_ws=R_WS, std=STD):
 
 
 def explanations_of(fields, R_ws=R_WS, std=STD, earth=EARTH, bias_std=BIAS):
-    """{sensor: explanations}."""
+    """Explanations of each disagreement: {sensor: explanations}."""
     n = len(fields)
     found = disagreements(NAMES[:n], fields, R_ws, np.tile(std, (n, 1)), earth, bias_std)
     return {d.sensor: d.explanations for d in found}
@@ -65,7 +65,7 @@ def test_a_swapped_pair_is_identified(pair, seed):
 
 @pytest.mark.parametrize('order, text', [([2, 0, 1], 'z, x, y'), ([1, 2, 0], 'y, z, x')])
 def test_axes_in_another_order_are_identified(order, text):
-    """In the first case, the sensor sends its z as x, its x as y and its y as z."""
+    """In the first case, the sensor reports its z as x, its x as y and its y as z."""
     fields = correct_fields()
     fields[0] = fields[0][order]
     assert explanations_of(fields) == {'a': (f'its axes are in the order {text}',)}
@@ -93,7 +93,7 @@ def test_exchanged_sensors_are_identified(i, j):
 
 
 def test_a_match_in_one_direction_is_not_an_exchange():
-    """The other sensor is faulty, too, but does not match the first one."""
+    """The other sensor is also faulty, but an exchange does not explain its readings."""
     fields = correct_fields()
     fields[0], fields[1] = fields[1], fields[1] + [9e-6, -7e-6, 8e-6]
     assert explanations_of(fields) == {'a': (), 'b': ()}
@@ -101,7 +101,7 @@ def test_a_match_in_one_direction_is_not_an_exchange():
 
 @pytest.mark.parametrize('turn', [90.0, 180.0])
 def test_exchanged_sensors_at_right_angles_are_identified(turn):
-    """Most sensors are installed so; two sensors with the same two flipped axes are less likely."""
+    """Most sensors are installed at right angles; two sensors with two flipped axes are rare."""
     R_ws = np.array([np.eye(3), rotation_about_z(np.deg2rad(turn)), *R_WS[2:]])
     fields = correct_fields(None, R_ws)
     fields[[0, 1]] = fields[[1, 0]]
@@ -116,7 +116,7 @@ def test_iron_near_a_sensor_has_no_explanation():
     (d,) = disagreements(NAMES, fields, R_WS, np.tile(STD, (4, 1)), EARTH, BIAS)
     assert (d.sensor, d.explanations) == ('b', ())
     assert d.size == pytest.approx(np.sqrt(194.0) * 1e-6, rel=1e-9)
-    assert str(d).startswith("b differs from the Earth's field by 13.9 uT: no axis, unit or")
+    assert str(d).startswith("b differs from the Earth's field by 13.9 uT: no change of axes,")
 
 
 def test_message_contains_the_explanation():
@@ -127,7 +127,7 @@ def test_message_contains_the_explanation():
 
 
 def test_faults_that_are_not_observable_are_not_reported():
-    """Upright sensors with x to the east: 2 uT on x, within a heading error and a bias."""
+    """On an upright sensor with x to the east, 2 uT on x is within heading error and bias."""
     R_ws = np.tile(np.eye(3), (3, 1, 1))
     fields = correct_fields(None, R_ws)
     fields[0, 0] *= -1.0
@@ -140,7 +140,7 @@ def test_faults_that_are_not_observable_are_not_reported():
 
 @pytest.mark.parametrize('yaw', [10.0, 30.0, 45.0, 90.0, 180.0])
 def test_an_unknown_heading_is_no_fault(yaw):
-    """The heading is within its std; a flipped vertical axis is detected nevertheless."""
+    """The heading is within its std; a flipped vertical axis is still detected."""
     R_ws, std = np.tile(np.eye(3), (3, 1, 1)), np.deg2rad([0.3, 0.3, 180.0])
     fields = correct_fields(None, R_ws)
     fields[0] = rotation_about_z(np.deg2rad(yaw)).T @ EARTH
@@ -151,8 +151,8 @@ def test_an_unknown_heading_is_no_fault(yaw):
 
 @pytest.mark.parametrize('std', [np.deg2rad([0.3, 0.3, 5.0]), np.deg2rad([2.0, 2.0, 2.0])])
 @pytest.mark.parametrize('missing', [None, 2])
-def test_false_alarms_are_as_rare_as_stated(std, missing, n=300):
-    """Number of alarms within the 99.9 % quantile for the stated probability per sensor."""
+def test_false_alarm_rate_does_not_exceed_the_nominal_rate(std, missing, n=300):
+    """The number of alarms is within the 99.9 % quantile of the nominal probability per sensor."""
     rng = np.random.default_rng(11)
     alarms = 0
     for k in range(n):
@@ -165,7 +165,7 @@ def test_false_alarms_are_as_rare_as_stated(std, missing, n=300):
 
 
 def test_the_statistic_is_chi_square(monkeypatch, n=200):
-    """With a false-alarm probability of 0.1, the rate of alarms agrees with it."""
+    """With a false-alarm probability of 0.1, the rate of alarms agrees with the probability."""
     monkeypatch.setattr('mag_tracking.calibration.agreement.FALSE_ALARM_PROBABILITY', 0.1)
     std, rng = np.deg2rad([0.3, 0.5, 2.0]), np.random.default_rng(12)
     for missing in ([], [2]):
@@ -183,10 +183,10 @@ def test_consensus_does_not_need_the_earth_field():
     fields = correct_fields(np.random.default_rng(2))
     fields[1] *= -1.0
     fields[3, 1] = np.nan
-    with pytest.raises(ValueError, match='three sensors with three axes .* there are 2'):
+    with pytest.raises(ValueError, match='three sensors that report all axes, but there are 2'):
         consensus(fields[[0, 1, 3]], R_WS[[0, 1, 3]])
     five, R = np.vstack([fields, correct_fields(R_ws=R_WS[:1])]), np.vstack([R_WS, R_WS[:1]])
-    # The faulty sensor and the one with two axes do not contribute.
+    # The faulty sensor and the sensor with two axes do not contribute.
     assert np.abs(consensus(five, R) - EARTH).max() < 3e-6
     np.testing.assert_allclose(consensus(correct_fields(), R_WS), EARTH, rtol=1e-9)
 
@@ -218,7 +218,7 @@ def test_two_faults_are_identified_separately():
 @pytest.mark.parametrize('sensor, axis', [
     (j, a) for j, a in np.argwhere(np.abs(correct_fields()) > 2e-5)])
 def test_a_flipped_axis_is_identified_with_iron_nearby(sensor, axis):
-    """Only axes with a large part of the field; flipping another one explains little."""
+    """Axes with a small part of the field are not tested: flipping these explains little."""
     first_explanations = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -228,7 +228,7 @@ def test_a_flipped_axis_is_identified_with_iron_nearby(sensor, axis):
         fields[sensor, axis] *= -1.0
         first_explanations += explanations_of(fields)[NAMES[sensor]][:1]
     named = [text for text in first_explanations if text.startswith(f'{"xyz"[axis]} is flipped')]
-    # By chance, with the iron, two flipped axes may fit as well.
+    # With the iron, two flipped axes may also fit by chance.
     assert len(named) >= 18 and sum(' uT' in text for text in named) > 10
 
 

@@ -1,4 +1,4 @@
-"""Clock offsets from knocks: laws, statistics, and recordings that yield no offset."""
+"""Clock offsets from knocks: properties, statistics, and recordings that yield no offset."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ NOISE = 0.02
 
 
 def double_sided(t):
-    """Shape as in the recordings: exponential, 30 ms on both sides."""
+    """Double-sided exponential of 30 ms, as in the recordings."""
     return np.exp(-np.abs(t) / 0.03)
 
 
@@ -43,7 +43,7 @@ def times(rng, rate, end=5.0):
 
 
 def pair(offset, seed=0, rates=(100.0, 100.0), noise=NOISE, is_rotated=True, **kwargs):
-    """(t, shock, t, shock) of two sensors; the clock of the second is `offset` ahead."""
+    """(t, shock, t, shock) of two sensors; the clock of the second is ahead by `offset` [s]."""
     rng = np.random.default_rng(seed)
     out = []
     for ahead, rate in zip((0.0, offset), rates, strict=True):
@@ -57,7 +57,7 @@ def pair(offset, seed=0, rates=(100.0, 100.0), noise=NOISE, is_rotated=True, **k
 def test_offset_is_positive_if_the_clock_is_ahead(offset):
     lag = knock_lag(*pair(offset, rates=(400.0, 400.0)), 0.5)
     assert lag.reason == '' and lag.correlation > 0.99
-    # A tenth of a sample.
+    # The error is at most a tenth of a sample.
     assert abs(lag.offset - offset) < 0.25e-3
 
 
@@ -72,7 +72,7 @@ def test_exchanged_sensors_have_the_opposite_lag(seed):
     p = pair(0.0237, seed, rates=(100.0, 100.0))
     there, back = knock_lag(*p, 0.5), knock_lag(*p[2:], *p[:2], 0.5)
     assert there.reason == back.reason == ''
-    # The other sensor is interpolated, so a fraction of a sample remains.
+    # The other sensor is interpolated, so a difference of a fraction of a sample remains.
     assert abs(there.offset + back.offset) < 1.5e-3 and there.offset > 0.02
 
 
@@ -82,7 +82,7 @@ def test_a_common_shift_of_the_times_has_no_effect():
     assert b.offset == pytest.approx(a.offset, abs=3e-6)
 
 
-def test_size_of_the_knock_has_no_effect():
+def test_magnitude_of_the_knock_has_no_effect():
     t, s, u, v = pair(0.02)
     a, b = knock_lag(t, s, u, v, 0.5), knock_lag(t, s, u, 3.0 * v, 0.5)
     assert b.offset == pytest.approx(a.offset, abs=3e-6)
@@ -95,7 +95,7 @@ def test_shock_does_not_depend_on_the_orientation():
     for seed in range(5):
         R = Rotation.random(random_state=seed)
         np.testing.assert_allclose(shock(R.apply(a)), shock(a), atol=1e-12)
-    # The shock at rest is zero, and missing values stay missing.
+    # The shock at rest is zero, and missing values remain missing.
     a[7] = np.nan
     s = shock(a)
     assert np.isnan(s[7]) and np.nanmedian(s) == 0.0
@@ -107,15 +107,15 @@ SHAPES = {'double-sided': double_sided, 'ringing': ringing, 'smooth': smooth}
 
 
 UNRESOLVED = pytest.mark.xfail(strict=True, reason=(
-    'mean square 2.0: the size of a ringing at 10 Hz has a cusp every 50 ms, which is not resolved '
-    'at 100 Hz'))
+    'mean square 2.0: the magnitude of a 10 Hz ringing has a cusp every 50 ms, which is not '
+    'resolved at 100 Hz'))
 
 
 @pytest.mark.parametrize('shape, rates', [
     pytest.param(shape, rates, marks=[UNRESOLVED] * (shape == 'ringing' and rates[0] == 100.0))
     for shape in SHAPES for rates in [(100.0, 100.0), (200.0, 100.0), (400.0, 400.0)]])
 def test_error_agrees_with_its_std(shape, rates, n=60):
-    """The sum of n squares is below its chi-square limit, and the std is not far too large."""
+    """The sum of n normalised squares is below its limit, and the std is not far too large."""
     squares, missed = [], 0
     for seed in range(n):
         rng = np.random.default_rng(1000 + seed)
@@ -144,7 +144,7 @@ def test_error_is_a_fraction_of_a_sample(shape, rates):
 
 
 def test_lag_is_exact_with_10_hz_at_rest_and_100_hz_near_knocks():
-    """The recordings are sampled so."""
+    """The recordings have these sampling rates."""
     for seed in range(10):
         t, s, u, v = pair(-0.0213, seed)
         keep = []
@@ -187,7 +187,7 @@ def test_clocks_decades_apart_yield_no_lag():
 def test_a_lag_beyond_the_maximum_is_never_wrong(offset):
     lag = knock_lag(*pair(offset, knocks=(2.0, 2.8)), 0.5)
     assert lag.reason or abs(lag.offset - offset) < max(5.0 * lag.std, 1e-3)
-    # A lag up to two samples beyond may be correct; larger ones are not searched.
+    # A lag up to two samples beyond the maximum may be correct; larger lags are not searched.
     assert lag.reason or abs(offset) < 0.54
 
 
@@ -203,7 +203,7 @@ def test_a_gap_in_the_readings_does_not_affect_the_lag():
     t, s, u, v = pair(0.02)
     keep = (u < 2.4) | (u > 2.9)
     assert knock_lag(t, s, u[keep], v[keep], 0.5).offset == pytest.approx(0.02, abs=5e-4)
-    # A gap over a knock of one sensor: no lag, or the correct one.
+    # With a gap over a knock of one sensor, there is no lag or the correct lag.
     keep = (u < 1.8) | (u > 2.3)
     lag = knock_lag(t, s, u[keep], v[keep], 0.5)
     assert lag.reason or lag.offset == pytest.approx(0.02, abs=1e-3)

@@ -51,7 +51,7 @@ def test_a_hum_is_not_aliased():
     assert np.abs(hum[::16]).max() > 0.9
 
 
-def test_noise_is_reduced_by_the_stated_gain():
+def test_noise_is_reduced_by_the_noise_gain():
     rng = np.random.default_rng(0)
     d = Decimator(20.0)
     with pytest.raises(ValueError, match='not known'):
@@ -69,7 +69,7 @@ def test_a_gap_or_a_clock_step_restarts_the_filter():
     level = np.zeros((600, 3))
     level[300:] = 1.0
     stamps, fields = run(Decimator(10.0), t, level)
-    # No value mixes both sides of a gap.
+    # No output mixes samples from both sides of a gap.
     assert set(np.round(fields[:, 0], 6)) <= {0.0, 1.0}
     before = stamps < 2.99
     assert 20 < before.sum() < len(stamps) - 10

@@ -36,7 +36,7 @@ def scattered(n, seed=0):
 
 
 def readings(u, noise=0.01, seed=1, correction=CORRECTION, offset=OFFSET):
-    """Readings (n, 3) of a field of size one from directions `u`."""
+    """Readings (n, 3) of a field of magnitude one in the directions `u`."""
     field = u + noise * np.random.default_rng(seed).standard_normal(u.shape)
     return offset + np.linalg.solve(correction, field.T).T
 
@@ -58,7 +58,8 @@ def recordings():
 
 RECORDINGS = [('tumbled', 0.015, 0.31951, [0.148, 0.389, -0.059], 5e-4),
               ('counts', 0.03, 0.09519, [6195.0, 250.0, 3480.0], 0.5)]
-"""Maximum residual, residual before, offset by another program and half of its last digit."""
+"""Maximum residual, residual before correction, and offset from another program with half of its
+last digit."""
 
 
 @pytest.mark.parametrize('name, limit, before, offset, digit', RECORDINGS)
@@ -151,7 +152,7 @@ def test_rotated_and_shifted_readings_rotate_and_shift_the_fit():
 
 
 def test_optimum_is_that_of_a_general_solver():
-    """Soft L1 loss of the sizes, numerical Jacobian; evenly spread readings have unit weights."""
+    """The oracle minimises the soft L1 loss with a numerical Jacobian and unit weights."""
     y = readings(scattered(2000), 0.03)
     y[::30] = OFFSET + 1.3 * (y[::30] - OFFSET)
     rows, columns = np.triu_indices(3)
@@ -173,9 +174,9 @@ def test_optimum_is_that_of_a_general_solver():
 
 @pytest.mark.parametrize('correlation', studied([0.0, 0.8], [0.0]))
 def test_stated_stds_cover_the_truth(correlation):
-    """Also for noise that is correlated in time, as that of real sensors.
+    """The noise may be correlated in time, as in real sensors.
 
-    The noise is small, because the radius is biased by its square.
+    The noise is small, because the square of the noise biases the radius.
     """
     n_runs, n, rng = 150, 1500, np.random.default_rng(3)
     u, errors = tumbling(n), []
@@ -196,7 +197,7 @@ def test_stated_stds_cover_the_truth(correlation):
 
 
 def test_a_varying_field_size_does_not_affect_the_std_of_the_shape():
-    """Each time block covers the whole sphere with its own field size; det(correction) is one."""
+    """Each time block covers the sphere with its own field magnitude; det(correction) is one."""
     size = 1.0 + 0.02 * np.random.default_rng(6).standard_normal(N_BLOCKS)
     fit = fit_ellipsoid(readings(tumbling(20000) * np.repeat(size, 20000 // N_BLOCKS)[:, None]))
     assert fit.field_size_std == pytest.approx(0.02 / np.sqrt(N_BLOCKS), rel=0.4)
@@ -211,7 +212,7 @@ def test_readings_at_rest_weigh_no_more_than_one_direction():
     still = readings(np.tile([0.0, 0.0, 1.03], (6000, 1)), 0.002, seed=5)
     even, piled = fit_ellipsoid(bent), fit_ellipsoid(np.concatenate([still, bent]))
     assert piled.converged
-    # The readings at rest weigh as 3 of 500 cells, although they are 3 of 4 readings.
+    # The readings at rest, three quarters of all readings, have the weight of 3 of 500 cells.
     assert np.abs(piled.offset - even.offset).max() < 0.001
 
 
@@ -222,7 +223,7 @@ def test_outliers_are_bounded_and_counted(factor):
     y[::25] = OFFSET + factor * (y[::25] - OFFSET)
     fit = fit_ellipsoid(y)
     assert fit.converged and fit.n_outliers == 80 and fit.n_readings == 2000
-    assert fit.warnings[-1] == 'a share of 0.04 of the readings are outliers'
+    assert fit.warnings[-1] == 'the fraction of outliers is 0.04'
     assert (np.abs(fit.offset - OFFSET) < 4.0 * fit.offset_std).all()
     assert (fit.offset_std < 1.5 * clean.offset_std).all()
     assert fit.residual == pytest.approx(spread(fit.correct(y)), rel=1e-12)
@@ -244,7 +245,7 @@ def test_missing_readings_are_excluded_and_counted():
     gaps = np.insert(y, range(0, 1000, 10), [np.nan, 1.0, 1.0], axis=0)
     fit, whole = fit_ellipsoid(gaps), fit_ellipsoid(y)
     assert fit.n_missing == 100 and fit.n_readings == 1000 and fit.converged
-    assert fit.warnings == ('100 readings with a missing axis are excluded',)
+    assert fit.warnings == ('readings excluded because of a missing axis: 100',)
     np.testing.assert_array_equal(fit.offset, whole.offset)
     assert fit.residual == whole.residual and fit.residual_before == whole.residual_before
 
@@ -257,7 +258,7 @@ def test_saturated_readings_are_excluded_and_reported():
     fit = fit_ellipsoid(y)
     assert fit.n_readings + fit.n_missing + fit.n_saturated == 20000 and fit.n_missing == 400
     assert fit.converged and fit.n_saturated > (y[:, 1] == top).sum() > 1000
-    assert fit.warnings[1] == f'{fit.n_saturated} readings with saturation of y are excluded'
+    assert fit.warnings[1] == f'readings excluded because of saturation of y: {fit.n_saturated}'
     assert (np.abs(fit.offset - OFFSET) < 4.0 * fit.offset_std).all()
     assert fit.residual == pytest.approx(spread(fit.correct(y[~np.isnan(y[:, 0])])), rel=1e-12)
 
@@ -297,7 +298,7 @@ LONG = np.diag([1.0, 1.0, 8.0])
     (readings(ball(3000)), 'scatter about the ellipsoid is 0.* of the radius, maximum 0.1'),
     (readings(POSES, 1e-4), '^15 different directions, minimum 18'),
     (readings(EVEN) * np.where(np.arange(1500) % 25 == 0, 100.0, 1.0)[:, None],
-     'share of 0.96 of the readings are outliers, maximum 0.2')])
+     'fraction of outliers is 0.96, maximum 0.2')])
 def test_readings_that_cannot_be_fitted_are_rejected(y, reason):
     fit = fit_ellipsoid(y)
     print(fit.reason)
@@ -306,7 +307,7 @@ def test_readings_that_cannot_be_fitted_are_rejected(y, reason):
 
 @pytest.mark.parametrize('seed', range(40))
 def test_an_accepted_fit_is_near_the_truth(seed):
-    """Parts of the sphere of any shape, few readings, much noise."""
+    """Random parts of the sphere, few readings and large noise."""
     rng = np.random.default_rng(seed)
     u = scattered(1200, seed)
     along = u @ scattered(1, seed + 1000)[0]
@@ -343,7 +344,7 @@ def test_readings_of_poor_quality_raise_a_warning(y, warning):
 
 
 def test_coverage_equals_the_known_values():
-    """Known values: harmonics up to degree two, integrated over part of a sphere."""
+    """The known values are integrals of harmonics up to degree two over part of a sphere."""
     u = scattered(60000)
     for min_x, known in [(-1.0, 1.0), (-0.5, 0.10852), (0.0, 0.0078433)]:
         fit = fit_ellipsoid(readings(u[u[:, 0] > min_x], 0.0))

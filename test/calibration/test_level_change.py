@@ -23,10 +23,10 @@ BLOCK_S = 0.25
 
 @pytest.mark.parametrize('ratio', [4.0, 10.0, 40.0])
 def test_growth_of_an_approach_and_of_a_start_agrees_with_theory(ratio):
-    """Sizes: distance^-3 at constant speed, and the square of the time."""
+    """The magnitude is distance^-3 at constant speed, or the square of the time."""
     t = np.linspace(0.0, 1.0, 4001)
     near = ratio**(-1.0 / 3.0)
-    # The size grows from slightly below 1 to slightly above the ratio.
+    # The magnitude grows from slightly below 1 to slightly above the ratio.
     distance = 1.02 - (1.05 - 0.98 * near) * t
     for size, each in ((distance**-3.0, ratio**(1.0 / 12.0)),
                        (1.1 * ratio * t**2, ratio**-0.125)):
@@ -59,7 +59,7 @@ def ride(t, at, acceleration, top, stops):
 
 
 def vehicle(seed, stops, at=12.0):
-    """Signal (3,) [T] over t [s] of a vehicle that stops at a sensor, or starts from there."""
+    """Signal (3,) [T], a function of t [s], of a vehicle that stops at a sensor or starts there."""
     rng = np.random.default_rng(seed)
     moment = rng.uniform(200.0, 600.0) * _direction(rng)
     place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
@@ -77,7 +77,7 @@ def _direction(rng):
 
 
 def blocks_of(signal, seconds, seed=0):
-    """`Blocks` of a signal, each with the noise of the mean of 25 readings."""
+    """`Blocks` of a signal; each block mean has the noise of 25 averaged readings."""
     time = np.arange(0.5 * BLOCK_S, seconds, BLOCK_S)
     noise = np.random.default_rng(seed).standard_normal((len(time), 3)) * SIGMA / 5.0
     mean = np.array([signal(t) for t in time]) + noise
@@ -95,7 +95,7 @@ def time_reversed(blocks):
 
 @pytest.mark.parametrize('stops', [True, False])
 def test_a_stopping_vehicle_has_arrived_and_a_starting_one_has_departed(stops):
-    """Eighty vehicles each; in reversed time, the same change gives the opposite result."""
+    """Eighty vehicles of each kind are simulated; the reversed change has the opposite result."""
     verdicts = []
     for seed in range(80):
         begin, end = (0.0, 16.0) if stops else (8.0, 30.0)
@@ -107,13 +107,13 @@ def test_a_stopping_vehicle_has_arrived_and_a_starting_one_has_departed(stops):
             assert found.has_departed is None \
                 or reverse.has_departed in (None, not found.has_departed)
     assert len(verdicts) > 20
-    # Wrong is worse than undecided.
+    # A wrong decision is worse than no decision.
     assert verdicts.count(stops) == 0
     assert verdicts.count(not stops) >= 0.9 * len(verdicts)
 
 
 def queue(seed):
-    """(signal, end [s]): a vehicle stops at a sensor, and soon another one behind it."""
+    """Signal and its end [s]: a vehicle stops at a sensor, and another one stops behind it."""
     rng = np.random.default_rng(seed)
     gap, delay = rng.uniform(6.0, 8.0), rng.uniform(1.5, 5.0)
     place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
@@ -129,7 +129,7 @@ def queue(seed):
 
 @pytest.mark.parametrize('case', ['queue', 'reverse'])
 def test_a_queue_or_a_reversing_vehicle_has_not_departed(case):
-    """Evaluated whenever the latest two seconds are steady.
+    """The change is evaluated whenever the latest two seconds are steady.
 
     One of fifty queues is classified as a departure; the aim is zero.
     """
@@ -148,7 +148,7 @@ def test_a_queue_or_a_reversing_vehicle_has_not_departed(case):
 
 
 def reverse(seed):
-    """(signal, end [s]): a vehicle overshoots by 6 m, stands for a second, and reverses."""
+    """Signal and its end [s]: a vehicle overshoots by 6 m, stands for a second, and reverses."""
     rng = np.random.default_rng(seed)
     moment = rng.uniform(200.0, 600.0) * _direction(rng)
     place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
@@ -192,7 +192,7 @@ CLEAR = [seed for seed in range(20) if is_clear(seed)][:4]
 @pytest.mark.parametrize('seed', CLEAR)
 @pytest.mark.parametrize('rate', [100.0, 20.0])
 def test_a_departed_vehicle_is_removed_from_the_background_in_seconds(seed, rate):
-    """By then the vehicle is at least 30 m away and its field is within the noise of one reading.
+    """The vehicle is then at least 30 m away, and its field is within the noise of one reading.
 
     At 20 Hz, with blocks of 0.4 s, the replacement takes a second longer.
     """
@@ -202,7 +202,7 @@ def test_a_departed_vehicle_is_removed_from_the_background_in_seconds(seed, rate
     end = 22.5 if rate == 100.0 else 23.5
     feed(b, np.arange(0.0, end, 1.0 / rate), signal=signal)
     assert b.n_relearnt == 1 and (np.abs(b.level(end) - EARTH - signal(end)) < 2.0 * SIGMA).all()
-    # All readings with the replaced background are doubtful, later ones are not.
+    # All readings with the replaced background are doubtful, later readings are not.
     (begin, end_ns), = b.doubtful_times
     assert 0 < begin < 1e9 and end_ns is not None and not b.doubtful
     assert b.departed_at == pytest.approx(19.5, abs=2.5)
@@ -210,7 +210,7 @@ def test_a_departed_vehicle_is_removed_from_the_background_in_seconds(seed, rate
 
 @pytest.mark.parametrize('seed', CLEAR)
 def test_a_vehicle_at_a_red_light_does_not_become_the_background(seed):
-    """The background is not doubted, although it was measured for a few seconds only."""
+    """The background is not doubtful, although it was measured for only a few seconds."""
     b = running(relearn=120.0)
     feed(b, np.arange(0.0, 70.0, 0.02), signal=vehicle(seed, stops=True, at=12.0))
     assert b.frozen and not b.n_relearnt and not b.doubtful and b.departed_at is None

@@ -1,4 +1,4 @@
-"""Tilt and heading: laws, consistent standard deviations, and unobservable headings."""
+"""Tilt and heading: properties, consistent standard deviations, and unobservable headings."""
 
 import numpy as np
 import pytest
@@ -77,9 +77,9 @@ def test_knocks_and_readings_that_are_not_finite_are_excluded():
 
 
 @pytest.mark.parametrize('a, message', [
-    (np.zeros((0, 3)), '0 accelerations are too few'),
-    (at_rest(np.eye(3), 7), '7 accelerations are too few'),
-    (np.full((50, 3), np.nan), '0 accelerations are too few'),
+    (np.zeros((0, 3)), '8 valid accelerations, got 0'),
+    (at_rest(np.eye(3), 7), '8 valid accelerations, got 7'),
+    (np.full((50, 3), np.nan), '8 valid accelerations, got 0'),
     (at_rest(np.eye(3)) / GRAVITY, r'is its unit g\?'),
     (np.zeros((50, 3)), 'at rest is 0, not 9.81'),
     (1.2 * at_rest(np.eye(3)), 'at rest is 11.8, not 9.81')])
@@ -97,7 +97,7 @@ def test_tilt_error_agrees_with_its_std(n=400):
         off = np.cross(R @ up.direction, UP)[:2]
         squares.append(off @ off / up.std**2)
     low, high = chi2.ppf([0.001, 0.999], 2 * n)
-    # The scatter is known to a sixth from 20 readings; it is a seventh of the variance.
+    # With 20 readings, the scatter is known to one sixth; it is one seventh of the variance.
     assert 0.9 * low < np.sum(squares) < 1.1 * high
 
 
@@ -140,7 +140,7 @@ def test_orientation_rotates_with_the_world():
 
 @pytest.mark.parametrize('lean, missing', [(0.3, None), (3.0, None), (0.3, 2), (3.0, 2)])
 def test_heading_error_agrees_with_its_std(lean, missing, n=300):
-    """Many mountings, each with an unknown bias per axis and an accelerometer error."""
+    """Many mountings are simulated, each with a bias per axis and an accelerometer error."""
     rng = np.random.default_rng(5)
     heading, tilt, gross = [], [], 0
     for k in range(n):
@@ -154,7 +154,7 @@ def test_heading_error_agrees_with_its_std(lean, missing, n=300):
             found = compass_orientation(up, y, EARTH, BIAS)
         except ValueError:
             continue
-        # A missing horizontal axis leaves two headings, or a poorly known one.
+        # With a missing horizontal axis, there are two headings or one uncertain heading.
         if not np.isnan(found.rival) or found.std[2] > np.deg2rad(5.0):
             continue
         off = angles_between(found.R_ws, R)
@@ -170,7 +170,7 @@ def test_heading_error_agrees_with_its_std(lean, missing, n=300):
         low, high = chi2.ppf([0.001, 0.999], each * len(squares))
         assert low < np.sum(squares) < high
     assert len(heading) > (0.95 if missing is None or lean < 1.0 else 0.4) * n
-    # The true one of two headings is dropped if the cost of its bias exceeds MAX_RIVAL_COST.
+    # The true heading is not reported if the cost of its bias exceeds MAX_RIVAL_COST.
     assert gross <= binom.ppf(0.999, n, chi2.sf(MAX_RIVAL_COST, 1)) * (missing is not None)
 
 
@@ -267,7 +267,7 @@ def test_headings_are_weighted_by_their_variances(compass, stated, expected, std
                                np.deg2rad(stated))
     assert np.degrees(yaw_between(R, both.R_ws)) == pytest.approx(expected, rel=1e-3)
     np.testing.assert_allclose(np.degrees(both.std), [0.3, 0.4, std], rtol=1e-3)
-    # The tilt is that of the accelerometer.
+    # The tilt is measured by the accelerometer.
     np.testing.assert_allclose(both.R_ws.T @ UP, R.T @ UP, atol=1e-12)
     assert both.bias[0] == 1e-7
 

@@ -1,4 +1,4 @@
-"""Live background without a quiet beginning: provisional, doubtful and replaced."""
+"""Live background without a quiet beginning: provisional or doubtful, and replaced later."""
 
 import dataclasses
 
@@ -23,14 +23,14 @@ from support.samples import MagSample, batch
 RATE = 50.0
 
 
-def fed(signal, seconds, **changes):
+def run_on(signal, seconds, **changes):
     """Background after `seconds` [s] of a signal [T] added to the Earth field."""
     b = running(**changes)
     feed(b, np.arange(0.0, seconds, 1.0 / RATE), signal=signal)
     return b
 
 
-def level_deviation(b):
+def level_error(b):
     return np.sqrt(b.sensors[0]['level_variance'])
 
 
@@ -38,24 +38,24 @@ def level_deviation(b):
 def test_a_provisional_background_is_found_between_vehicles(seed):
     """No interval of three seconds is quiet; the level is correct within its std."""
     signal = traffic(2.0, seed=seed)
-    assert not fed(signal, 5.5).ready
-    b = fed(signal, 14.0)
+    assert not run_on(signal, 5.5).ready
+    b = run_on(signal, 14.0)
     assert b.ready and b.doubtful and not b.certain
-    assert (np.abs(b.level(14.0) - EARTH) < 3.0 * level_deviation(b) + SIGMA).all()
-    assert (level_deviation(b) > 0.0).all()
+    assert (np.abs(b.level(14.0) - EARTH) < 3.0 * level_error(b) + SIGMA).all()
+    assert (level_error(b) > 0.0).all()
 
 
 @pytest.mark.parametrize('seed', range(5))
 def test_a_provisional_background_becomes_certain(seed):
     signal = traffic(2.0, seed=seed)
-    b = fed(signal, 60.0)
-    assert b.certain and (level_deviation(b) == 0.0).all()
+    b = run_on(signal, 60.0)
+    assert b.certain and (level_error(b) == 0.0).all()
     # Tails of vehicles within the noise of a block of 12 readings are not detected.
     assert (np.abs(b.level(60.0) - EARTH) < 2.0 * SIGMA).all()
 
 
 def test_a_quiet_interval_makes_the_background_certain():
-    b = fed(traffic(2.0, end=12.0), 18.0)
+    b = run_on(traffic(2.0, end=12.0), 18.0)
     assert b.certain
     assert (np.abs(b.level(18.0) - EARTH) < SIGMA).all()
 
@@ -64,7 +64,7 @@ def test_a_quiet_interval_makes_the_background_certain():
 @pytest.mark.parametrize('signal', [
     0.0, lambda t: np.array([2e-6, 0.0, 0.0]) / (1 + ((t - 12.0) / 0.8)**2)**2.5])
 def test_after_a_quiet_beginning_nothing_is_doubtful(signal, relearn):
-    b = fed(signal, 30.0, relearn=relearn)
+    b = run_on(signal, 30.0, relearn=relearn)
     assert b.certain and not b.doubtful_times
 
 
@@ -72,45 +72,45 @@ def standing_vehicle(until):
     return lambda t: np.array([2e-6, -1e-6, 0.0]) * (t < until)
 
 
-def test_a_vehicle_present_at_the_start_is_doubted_and_replaced():
-    """It stands for four seconds; after as long without it, the background is ambiguous."""
+def test_a_background_with_a_vehicle_at_the_start_is_doubtful_and_replaced():
+    """The vehicle stands for four seconds; four seconds later, the background is ambiguous."""
     for seconds, is_doubtful, has_departed in ((4.0, False, False), (9.5, True, False),
                                            (24.0, False, True)):
-        b = fed(standing_vehicle(4.0), seconds)
+        b = run_on(standing_vehicle(4.0), seconds)
         assert b.ready and b.doubtful == is_doubtful
         error = np.abs(b.level(seconds) - EARTH)
         assert (error < SIGMA).all() == has_departed
 
 
 @pytest.mark.parametrize('stood_s', [4.0, 20.0])
-def test_a_vehicle_present_before_dense_traffic_is_doubted_and_replaced(stood_s):
-    """There is no quiet interval any more, but the most frequent level is another one."""
+def test_a_background_with_a_vehicle_before_dense_traffic_is_doubtful_and_replaced(stood_s):
+    """There is no further quiet interval, but the most frequent level changes."""
     vehicles = traffic(2.0, begin=stood_s)
 
     def signal(t):
         return standing_vehicle(stood_s)(t) + vehicles(t)
 
-    doubted = fed(signal, stood_s + 55.0)
-    assert doubted.doubtful or (np.abs(doubted.level(60.0) - EARTH) < 2.0 * SIGMA).all()
-    b = fed(signal, 140.0)
+    b_early = run_on(signal, stood_s + 55.0)
+    assert b_early.doubtful or (np.abs(b_early.level(60.0) - EARTH) < 2.0 * SIGMA).all()
+    b = run_on(signal, 140.0)
     assert b.certain and (np.abs(b.level(140.0) - EARTH) < 2.0 * SIGMA).all()
 
 
 def test_a_wrong_given_background_is_replaced_once():
-    b = fed(traffic(2.0), 140.0, background=EARTH + 2e-6, noise_std=SIGMA)
+    b = run_on(traffic(2.0), 140.0, background=EARTH + 2e-6, noise_std=SIGMA)
     assert b.n_relearnt == 1 and (np.abs(b.level(140.0) - EARTH) < 2.0 * SIGMA).all()
 
 
 def test_a_vehicle_that_stood_in_dense_traffic_is_replaced():
-    """It is the only level for half a minute; then it departs, and the traffic continues."""
+    """The vehicle stands for half a minute and departs; the traffic continues."""
     vehicles = traffic(2.0, begin=40.0)
-    b = fed(lambda t: standing_vehicle(40.0)(t) + vehicles(t) + traffic(2.0, end=6.0)(t), 170.0)
+    b = run_on(lambda t: standing_vehicle(40.0)(t) + vehicles(t) + traffic(2.0, end=6.0)(t), 170.0)
     assert b.certain and (np.abs(b.level(170.0) - EARTH) < 2.0 * SIGMA).all()
 
 
 @pytest.mark.parametrize('later', [60.0, 700.0])
 def test_another_stopping_car_is_not_a_former_background(later):
-    """One car parks for 100 s; later another one stops for 5 s, with 0.6 times its field."""
+    """One car parks for 100 s; later another car with 0.6 times its field stops for 5 s."""
     def signal(t):
         halts = 120.0 + later
         return np.array([2e-6, 0.0, 1e-6]) * ((20.0 < t < 120.0)
@@ -126,25 +126,25 @@ def test_an_axis_that_stops_early_does_not_delay_the_others():
     for t in np.arange(0.0, 14.0, 1.0 / RATE):
         field = EARTH + vehicles(t) + SIGMA * rng.standard_normal(3)
         b.add(t, np.where([False, False, t > 1.5], np.nan, field))
-    assert b.ready and (np.abs(b.level(14.0) - EARTH)[:2] < 3.0 * level_deviation(b)[:2]).all()
+    assert b.ready and (np.abs(b.level(14.0) - EARTH)[:2] < 3.0 * level_error(b)[:2]).all()
 
 
 def test_a_former_background_is_restored_at_once():
     """A car parks for two minutes and departs."""
     def parked(t):
         return np.array([2e-6, 0.0, 1e-6]) * (20.0 < t < 140.0)
-    assert (np.abs(fed(parked, 130.0).level(130.0) - EARTH - parked(130.0)) < SIGMA).all()
-    b = fed(parked, 146.0)
+    assert (np.abs(run_on(parked, 130.0).level(130.0) - EARTH - parked(130.0)) < SIGMA).all()
+    b = run_on(parked, 146.0)
     assert not b.frozen and b.n_relearnt == 2
     assert (np.abs(b.level(146.0) - EARTH) < SIGMA).all()
 
 
-def test_a_drift_too_large_for_a_sensor_is_doubted():
-    """A vehicle that approaches is doubted; the smaller drift of a warming sensor is not."""
+def test_a_drift_too_large_for_a_sensor_is_doubtful():
+    """The drift due to an approaching vehicle is doubtful; the drift of a warming sensor is not."""
     for rate, is_doubtful in ((2e-8, True), (1e-9, False)):
-        b = fed(lambda t, rate=rate: rate * t * np.ones(3), 6.0)
+        b = run_on(lambda t, rate=rate: rate * t * np.ones(3), 6.0)
         assert b.ready and b.doubtful == is_doubtful
-        assert ((level_deviation(b) > 0.0) == is_doubtful).all()
+        assert ((level_error(b) > 0.0) == is_doubtful).all()
 
 
 def readings(signal, seconds, seed=0):
@@ -188,7 +188,7 @@ def test_doubtful_intervals_follow_the_clock():
     assert stage.doubtful_intervals()['mag_1'] == ((begin - 500_000_000, None),)
 
 
-def test_a_given_background_is_not_doubted():
+def test_a_given_background_is_not_doubtful():
     network = dataclasses.replace(line_network(1), background=(EARTH,))
     stage, covariance, _ = calibrated([readings(traffic(2.0), 30.0)], network)
     assert stage.doubtful_intervals() == {}
@@ -213,16 +213,16 @@ def test_doubtful_intervals_are_recorded_and_merged():
         times = updated(times, 10 + k, k % 2 == 1)
     assert len(times) == 16 and times[-1] == (109, None)
     assert shifted(times, 5)[-1] == (114, None)
-    # An interval that began earlier replaces the open one.
+    # An interval that began earlier replaces the open interval.
     assert merged({'a': ((1, 2), (4, None))}, {'a': ((3, 6),)}) == {'a': ((1, 2), (3, 6))}
     assert doubtful_since(((1, 2), (4, 5), (6, None)), 3) == ((1, 2), (3, None))
     assert doubtful_since(((1, 4),), 3) == ((1, None),)
     assert merged({'a': ((1, 2), (4, None))}, {'a': ((4, 6),), 'b': ((3, None),)}) \
         == {'a': ((1, 2), (4, 6)), 'b': ((3, None),)}
-    # An interval without an end is closed at the start of the next one.
+    # An interval without an end is closed at the start of the next interval.
     assert merged({'a': ((1, None),)}, {'a': ((4, 6),)}) == {'a': ((1, 4), (4, 6))}
-    # An interval that begins and ends with the same reading, and its successor.
+    # An interval that begins and ends with the same reading, and the next interval.
     assert merged({'a': ((4, None),)}, {'a': ((4, 4),)}) == {'a': ((4, 4),)}
     assert merged({'a': ((4, 4),)}, {'a': ((4, None),)}) == {'a': ((4, None),)}
-    # The doubtful background was replaced by one that was never doubtful.
+    # The doubtful background was replaced by a background that was never doubtful.
     assert merged({'a': ((1, 2), (4, None))}, {'a': ()}) == {'a': ((1, 2),)}

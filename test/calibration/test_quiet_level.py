@@ -1,4 +1,4 @@
-"""Prescan of a recording for the most frequent level of a sensor, and when it is needed."""
+"""Prescan of a recording for the most frequent level of a sensor, and conditions for its use."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ NETWORK, SETTINGS = line_network(1), CalibrateSettings()
 
 
 def readings(signal, seconds=60.0, rate=50.0, seed=0, step=0.0):
-    """Readings of one sensor: noise, the Earth field, and `signal(t)`, (3,) or a number [T]."""
+    """Readings of one sensor: noise, the Earth's field, and `signal(t)` [T], (3,) or a scalar."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 1.0 / rate)
     fields = [EARTH + signal(s) + SIGMA * rng.standard_normal(3) for s in t]
     if step:
@@ -26,7 +26,7 @@ def readings(signal, seconds=60.0, rate=50.0, seed=0, step=0.0):
     return batch([MagSample(int(s * 1e9), 'mag_1', f) for s, f in zip(t, fields, strict=True)])
 
 
-def found(signal, settings=SETTINGS, network=NETWORK, **more):
+def prescan_of(signal, settings=SETTINGS, network=NETWORK, **more):
     return prescan([readings(signal, **more)], network, settings)
 
 
@@ -43,7 +43,7 @@ def departing(until):
     lambda t: 0.0, passing(20.0), passing(7.0, 12.0, 17.0, 30.0), lambda t: 3e-9 * t,
     lambda t: 1e-8 * t, lambda t: 2e-6 * (25.0 < t < 40.0)])
 def test_no_level_is_needed_after_a_quiet_beginning(signal):
-    assert found(signal).levels == {}
+    assert prescan_of(signal).levels == {}
 
 
 @pytest.mark.parametrize('signal', [
@@ -51,13 +51,13 @@ def test_no_level_is_needed_after_a_quiet_beginning(signal):
     departing(10.0), lambda t: departing(8.0)(t) + passing(11.0)(t)])
 @pytest.mark.parametrize('step', [0.0, 1e-7])
 def test_the_most_frequent_level_is_that_between_the_targets(signal, step):
-    level = found(signal, step=step).levels['mag_1']
+    level = prescan_of(signal, step=step).levels['mag_1']
     np.testing.assert_allclose(level.level, EARTH, atol=5e-9 if not step else 0.6 * step)
     assert not step or (np.sqrt(level.covariance.diagonal()) < step).all()
 
 
 def test_a_target_present_at_the_start_is_not_the_background():
-    """The background is the level after its departure."""
+    """The background is the level after the departure of the target."""
     signal = readings(departing(10.0))
     stage = Calibrate(NETWORK, SETTINGS)
     prescan([signal], NETWORK, SETTINGS).apply(stage)
@@ -72,27 +72,27 @@ def test_a_target_present_at_the_start_is_not_the_background():
 def test_a_target_that_arrives_later_and_stays_is_not_the_background(arrives, until):
     def signal(t):
         return 2e-6 - departing(arrives)(t)
-    assert found(signal, seconds=until).levels == {}
-    # Without relearning, a level stays the background even if another one lasts longer.
+    assert prescan_of(signal, seconds=until).levels == {}
+    # Without relearning, a level stays the background even if another level lasts longer.
     never = replace(SETTINGS, {'relearn_s': 0.0})
-    assert found(signal, never, seconds=10.0 * until).levels == {}
+    assert prescan_of(signal, never, seconds=10.0 * until).levels == {}
 
 
 def test_a_level_that_lasts_most_of_the_recording_is_not_the_background():
-    """The vehicle departs, so the short level after it is the background."""
+    """The vehicle departs, so the short level after the departure is the background."""
     def shutdown(t):
         way = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
         return 4e-6 / (1.0 + (way / 5.0)**2)**1.5
-    level, = found(shutdown, seconds=44.0).levels.values()
+    level, = prescan_of(shutdown, seconds=44.0).levels.values()
     assert (np.abs(level.level - EARTH) < SIGMA).all() and level.begin > 33.0
 
 
 def test_a_first_level_that_returns_is_the_background():
-    """Two vehicles arrive; after one has departed, half of their field remains until 60 s."""
+    """Two vehicles arrive; one vehicle departs, and half of the field remains until 60 s."""
     def queue(t):
         way = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
         return (2e-6 + 2e-6 / (1.0 + (way / 5.0)**2)**1.5) * (20.0 < t < 60.0)
-    assert found(queue, seconds=80.0).levels == {}
+    assert prescan_of(queue, seconds=80.0).levels == {}
 
 
 @pytest.mark.parametrize('rates', [(50.0, 1.0), (2.0, 2.0), (100.0, 5.0)])
@@ -119,13 +119,13 @@ def test_a_sensor_that_never_changes_has_no_background(value):
 
 def test_no_level_is_searched_if_the_background_is_given_or_disabled():
     given = dataclasses.replace(NETWORK, background=(EARTH,))
-    assert found(passing(1.0), network=given).levels == {}
-    assert found(passing(1.0), replace(SETTINGS, {'look_ahead_s': 0.0})).levels == {}
+    assert prescan_of(passing(1.0), network=given).levels == {}
+    assert prescan_of(passing(1.0), replace(SETTINGS, {'look_ahead_s': 0.0})).levels == {}
 
 
 def test_a_recording_of_only_a_target_has_no_level():
-    assert found(lambda t: 1e-7 * t, seconds=20.0).levels == {}
-    assert found(lambda t: 0.0, seconds=0.5).levels == {}
+    assert prescan_of(lambda t: 1e-7 * t, seconds=20.0).levels == {}
+    assert prescan_of(lambda t: 0.0, seconds=0.5).levels == {}
 
 
 def test_level_does_not_depend_on_the_batches():

@@ -1,4 +1,4 @@
-"""Resolution of a sensor: steps found in its readings, and the error that they add."""
+"""Resolution of a sensor: steps of its readings, and the resulting error."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ MS = 1_000_000
 
 
 def sensor_after(fields, interval=10 * MS):
-    """(1,) SENSOR after `fields` (n, 3)."""
+    """State of a sensor after `fields` (n, 3), (1,) SENSOR."""
     sensors = new_sensors(1)
     for k, field in enumerate(fields):
         core.note_step(sensors, k * interval, np.array(field, dtype=float))
@@ -56,7 +56,7 @@ def test_a_field_that_changes_with_every_reading_shows_no_steps():
     assert np.isinf(raw_steps(sensor_after(np.ones((5, 3))))).all()
 
 
-def test_the_compiled_rule_agrees_with_the_plain_one():
+def test_the_compiled_rule_agrees_with_a_plain_implementation():
     background = FedBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0)
     y = coarse(4e-8, 1e-7, seed=3)
     y[::11, 0] = np.nan
@@ -78,8 +78,8 @@ def test_a_rest_counts_as_one_measurement_for_a_limited_time():
 
 
 @pytest.mark.parametrize('sigma', [0.01, 0.1, 0.2, 0.4, 0.5, 1.0, 3.0])
-def test_mean_of_readings_has_the_stated_error(sigma):
-    """Over all levels, the mean of `n` readings has the error stated by noise and steps."""
+def test_mean_of_readings_has_the_predicted_error(sigma):
+    """The mean of `n` readings has the error predicted from noise and steps, over all levels."""
     rng, n, errors, stated = np.random.default_rng(0), 8, [], []
     for level in rng.uniform(-0.5, 0.5, 4000):
         y = np.round(level + sigma * rng.standard_normal((n, 1)))
@@ -92,7 +92,7 @@ def test_mean_of_readings_has_the_stated_error(sigma):
         errors.append(y.mean() - level)
         stated.append(np.sum(variance[0] + at_rest * np.array(runs) / 12.0) / n**2)
     ratio = np.mean(np.square(errors)) / np.mean(stated)
-    # The stated error is too large if noise crosses the edge of a step, and rarely too small.
+    # The predicted error is too large if noise crosses the edge of a step, and rarely too small.
     assert 0.2 < ratio < 1.8, ratio
 
 
@@ -109,7 +109,7 @@ def test_an_axis_that_never_changed_is_at_rest_or_dead():
 
 
 def test_an_axis_at_rest_keeps_its_steps_if_another_gets_noisy():
-    """Otherwise its readings would have zero noise."""
+    """Without steps, the readings of the axis would have zero noise."""
     sensors = new_sensors(1)
     sensors['noise'], sensors['step'] = np.zeros((3, 3)), [np.inf, 1e-6, np.inf]
     limits = np.empty(3)

@@ -46,7 +46,7 @@ def test_missing_or_stuck_readings_are_no_limit():
 
 
 def test_a_saturated_segment_is_excluded_from_a_pass_and_reported():
-    """Clipped at a third of its peak; the fit of the rest agrees with its covariance."""
+    """The pass is clipped at a third of its peak; the fit agrees within its covariance."""
     from mag_tracking.analysis.pass_fit import fit_pass
 
     rng = np.random.default_rng(11)

@@ -24,7 +24,7 @@ def quantised(fields, step):
 
 
 class SpikeScreen:
-    """Follows which readings `core.screen_spike` holds and releases."""
+    """Records which readings `core.screen_spike` holds and releases."""
 
     def __init__(self, threshold, std=SIGMA, step=np.inf):
         self.sensors, self._threshold, self._held = new_sensors(1), threshold, []
@@ -32,7 +32,7 @@ class SpikeScreen:
         self.sensors['is_ready'], self.sensors['noise_std'] = std is not None, std or np.nan
 
     def feed(self, row, stamp, field):
-        """[(row, whether it is a spike)] of the readings that are decided by this one."""
+        """Readings that are decided by this reading: [(index, whether it is a spike)]."""
         verdict, out = core.screen_spike(self.sensors, self._threshold, stamp, field), []
         if verdict == SPIKE:
             assert self.sensors['n_held'][0] == len(self._held)
@@ -52,15 +52,15 @@ class SpikeScreen:
 
 
 def screened(fields, rate=100.0, std=SIGMA, threshold=30.0, step=np.inf):
-    """([rows of spikes], maximum number of held readings, [rows that were released late])."""
+    """Indices of spikes, maximum number of held readings, and indices of late releases."""
     spikes, max_held, late, out, f = [], 0, [], 0, SpikeScreen(threshold, std, step)
     for k, field in enumerate(fields):
-        got = f.feed(k, round(k * NS / rate), field)
-        assert [row for row, _ in got] == list(range(out, out + len(got)))
-        out += len(got)
+        decided = f.feed(k, round(k * NS / rate), field)
+        assert [row for row, _ in decided] == list(range(out, out + len(decided)))
+        out += len(decided)
         max_held = max(max_held, k + 1 - out)
-        spikes += [row for row, is_spike in got if is_spike]
-        late += [row for row, _ in got if row < k]
+        spikes += [row for row, is_spike in decided if is_spike]
+        late += [row for row, _ in decided if row < k]
     rest = f.flush()
     assert [row for row, _ in rest] == list(range(out, len(fields)))
     assert not any(is_spike for _, is_spike in rest)
@@ -68,7 +68,7 @@ def screened(fields, rate=100.0, std=SIGMA, threshold=30.0, step=np.inf):
 
 
 def stuck(fields):
-    """[rows that are rejected as repetitions]."""
+    """Indices of the readings that are rejected as repetitions."""
     sensors = new_sensors(1)
     return [k for k, field in enumerate(fields) if core.is_stuck(sensors, field)]
 
@@ -79,9 +79,9 @@ def stuck(fields):
 @pytest.mark.parametrize('slope', [0.0, 2e-11])
 @pytest.mark.parametrize('rate', [10.0, 100.0])
 def test_noise_and_coarse_steps_at_rest_pass_at_once(step, slope, rate):
-    """10 000 readings, also with a background that drifts from one step of the sensor to the next.
+    """Ten thousand readings pass; the background may drift from one step of the sensor to the next.
 
-    There, a sensor with coarse steps was formerly classified as stuck.
+    During such a drift, a sensor with coarse steps must not be classified as stuck.
     """
     y = noise(10_000) + slope * np.arange(10_000)[:, None] * [1.0, 0.8, -0.6]
     y = quantised(y, step)
@@ -91,7 +91,7 @@ def test_noise_and_coarse_steps_at_rest_pass_at_once(step, slope, rate):
 
 @functools.cache
 def passes(rate, speed, n=4):
-    """Readings of a sensor that `n` vehicles pass at a distance of one metre, in sequence."""
+    """Readings of a sensor while `n` vehicles pass at one metre, one after the other."""
     rng, fields = np.random.default_rng(1), []
     network = line_network(1)
     for k in range(n):
@@ -109,9 +109,9 @@ def passes(rate, speed, n=4):
 @pytest.mark.parametrize('step', [0.0, 1.0, 3.0, 10.0])
 @pytest.mark.parametrize('rate', [10.0, 50.0, 100.0])
 def test_vehicles_at_a_metre_are_no_spikes(rate, step):
-    """Formerly, a whole pass was rejected at 10 Hz.
+    """At 10 Hz, a whole pass must not be rejected as a spike.
 
-    After it, a sensor with coarse steps was classified as stuck for as long as it was at rest.
+    After the pass, a sensor with coarse steps at rest must not be classified as stuck.
     """
     for speed in (6.0, 13.0, 25.0):
         y = quantised(passes(rate, speed), step)
@@ -140,7 +140,7 @@ def test_spikes_of_changing_sign_and_axis_are_rejected():
 
 
 def test_spikes_in_quick_succession_are_rejected():
-    """A spike does not affect the comparison of the next one."""
+    """A spike does not affect the comparison of the next spike."""
     y = noise(200)
     rows = [20, 22, 24, 40, 41, 43, 100, 105]
     y[rows] += 5e-6
@@ -171,7 +171,7 @@ def test_a_spike_is_steeper_than_preceding_changes(before, found):
 @pytest.mark.parametrize('rate, size, found', [
     (50.0, 25.0, False), (50.0, 35.0, True), (10.0, 3300.0, False), (10.0, 3700.0, True)])
 def test_a_lower_rate_requires_a_larger_spike(rate, size, found):
-    """Limit for 30 m/s at 1 m: 130 (30 / rate)^3 noise stds, but at least 30."""
+    """The limit for 30 m/s at 1 m is 130 (30 / rate)^3 noise stds, but at least 30."""
     y = np.tile(EARTH, (40, 1))
     y[30, 1] += size * SIGMA
     assert screened(y, rate)[0] == ([30] if found else [])
@@ -253,7 +253,7 @@ def test_recent_differences_replace_an_unknown_noise():
     y[300:2900:100] += 5e-6
     rows, max_held, _ = screened(y, std=None, step=1e-11)
     assert rows == list(range(300, 2900, 100)) and max_held == 1
-    # Without a known step, a change may be the first one of a sensor at rest.
+    # Without a known step, a change may be the first change of a sensor at rest.
     assert screened(y, std=None) == ([], 0, [])
     coarse = 2e-7 * np.round(y / 2e-7)
     assert screened(coarse, std=None, step=2e-7)[0] == rows
@@ -314,7 +314,7 @@ def test_repetitions_need_enough_changes_and_a_minimum_number():
 
 
 def test_limit_depends_on_the_usual_rate_of_repetitions():
-    """If one in 30 readings repeats the previous one, seven in a row are a fault, six are not."""
+    """If one in 30 readings is a repetition, a run of seven is a fault, a run of six is not."""
     y = noise(9000)
     y[29::30] = y[28::30]
     assert stuck(y) == []
@@ -324,7 +324,7 @@ def test_limit_depends_on_the_usual_rate_of_repetitions():
 
 
 def test_old_repetitions_are_forgotten():
-    """A sensor that repeated itself at the start is later evaluated as any other."""
+    """A sensor with many repetitions at the start is later evaluated like any other sensor."""
     y = noise(70_000)
     y[60:2000] = y[59]
     begin, end = stuck(y), 30_000
@@ -338,7 +338,7 @@ def test_old_repetitions_are_forgotten():
 
 
 def test_coarse_steps_are_not_classified_as_stuck():
-    """At rest on one step, such a sensor repeats itself forever after any number of changes."""
+    """At rest, a sensor with coarse steps may repeat a reading forever after many changes."""
     rng = np.random.default_rng(0)
     changes = np.eye(3)[rng.integers(0, 3, 4000)] * rng.choice([-1.0, 0.0, 1.0], (4000, 1))
     moving = np.cumsum(changes, axis=0) * 1e-7
@@ -348,7 +348,7 @@ def test_coarse_steps_are_not_classified_as_stuck():
 
 
 def test_a_coarse_sensor_that_starts_in_a_pass_recovers():
-    """A hundred changes, then rests with few changes in between: it is not stuck permanently."""
+    """After a hundred changes and rests with few changes, the sensor is not stuck permanently."""
     moving = np.arange(100.0)[:, None] * np.array([1e-7, 2e-7, -1e-7])
     rest = [np.tile(moving[-1] + (k % 2) * 1e-7, (500, 1)) for k in range(20)]
     rows = np.array(stuck(np.concatenate([moving, *rest])))

@@ -121,16 +121,16 @@ def test_best_is_of_the_heaviest_kind_of_the_heaviest_arrival():
 
 
 def test_best_is_at_the_maximum_of_the_mixture_density():
-    """The more certain one of two distant hypotheses of equal weight is the best one.
+    """The best of two distant hypotheses of equal weight is the more certain hypothesis.
 
-    If a covariance is invalid, the heaviest hypothesis is the best one.
+    If a covariance is invalid, the heaviest hypothesis is the best.
     """
     b = bank(3, spread=100.0, label=[0, 0, 0])
     b.P[1, :3, :3] *= 0.5
     assert b.best() == 1
     b.log_w = np.log([0.2, 0.3, 0.5])
-    for wrong in (np.nan, np.inf, -1.0):
-        b.P[0, 0, 0] = wrong
+    for invalid in (np.nan, np.inf, -1.0):
+        b.P[0, 0, 0] = invalid
         assert b.best() == 2
 
 
@@ -157,7 +157,7 @@ def test_separated_weight_counts_distant_hypotheses_only():
 
 
 def initial_bank(network, earth, offset_std=0.5):
-    """Bank of 126 hypotheses with a tight prior, all of one arrival along x."""
+    """Bank of 126 hypotheses with a tight prior, all with an arrival along x."""
     x, P = [], []
     for m in 300.0 * moment_directions():
         for lateral in (-1.0, 0.0, 1.0):
@@ -200,7 +200,7 @@ def matched_run(rng, network, model, sigma):
 
 
 def test_anees_of_matched_runs_is_near_one():
-    """Position and velocity; 200 runs, two sensors, 12.5 Hz, tight prior, 126 hypotheses."""
+    """The states are position and velocity; 200 runs with two sensors at 12.5 Hz."""
     earth = np.array([2e-6, 1.55e-5, -4.9e-5])
     network = line_network(2, tilt=0.0)
     model = RowVehicle(earth, np.array([0.1, 0.1, 1e-4]), 0.003, n_dipoles=1)
@@ -234,7 +234,7 @@ def test_keep_leaves_the_remaining_hypotheses_unchanged(removed):
 
 
 def test_an_initial_bank_returns_the_rows_of_its_source_bank():
-    """Later changes of that bank and of a copy with the same arrays have no effect."""
+    """Later changes of the source bank and of a copy with the same arrays have no effect."""
     from_targets = random_bank(5, 4)
     own = np.array([np.diag([1.0, 2.0]), np.diag([3.0, 4.0])])
     bank = FilterBank.from_targets(from_targets.x, from_targets.P, from_targets.label, 2, 1e-8, own,
@@ -243,8 +243,9 @@ def test_an_initial_bank_returns_the_rows_of_its_source_bank():
     other = copy(start)
     bank.x[:], bank.P[:] = np.nan, np.nan
     other.keep(np.array([False, False, True, False, True]))
-    for made, rows in ((start.rows(np.array([4, 1])), [4, 1]), (other.rows(np.arange(2)), [2, 4])):
+    for copy_of_rows, rows in ((start.rows(np.array([4, 1])), [4, 1]),
+                               (other.rows(np.arange(2)), [2, 4])):
         for name in ('x', 'P', 'label', 'kind', 'origin', 'nis'):
-            np.testing.assert_array_equal(getattr(made, name), getattr(before, name)[rows])
-        np.testing.assert_allclose(np.exp(made.log_w), 0.5)
+            np.testing.assert_array_equal(getattr(copy_of_rows, name), getattr(before, name)[rows])
+        np.testing.assert_allclose(np.exp(copy_of_rows.log_w), 0.5)
     assert len(start) == 5 and len(other) == 2

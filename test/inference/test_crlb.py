@@ -1,4 +1,4 @@
-"""Information, observability and bounds: check values of TSP14, laws and oracles."""
+"""Information, observability and bounds: check values of TSP14, properties and oracles."""
 
 import numpy as np
 import pytest
@@ -23,11 +23,11 @@ R0, V0, ONES, UP = ([-3.0, 1.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.0, 0.
 ONE, TWO = [[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
 CAR, ROAD = [-20.0, 5.0, 0.4, 10.0, 0.3, 0.0, 200.0, -150.0, 250.0], [[0.0] * 3, [0.0, 9.0, 0.0]]
 NOISE = 1.3e-16
-"""[T^2], TSP14 section VI.B."""
+"""[T^2] Noise variance of TSP14 section VI.B."""
 
 
 def jacobian(m, positions, r0=R0, v0=V0, n_t=60):
-    """(n_t, n_sensors, 3, 9) by [r0, v0, m], tesla; the source moves, hence the minus."""
+    """Jacobian (n_t, n_sensors, 3, 9) by [r0, v0, m]; the minus is due to the moving source."""
     t = 0.1 * np.arange(n_t)[:, None, None]
     d = np.asarray(positions) - (np.asarray(r0) + t * np.asarray(v0))
     dB_dd, dB_dm = dipole_jacobians(d, np.asarray(m))
@@ -40,7 +40,7 @@ def unitless(m, positions):
 
 
 def car(positions):
-    """Jacobian by [r0, v0, m, b] of a car, b each sensor's background, 40 samples in tesla."""
+    """Jacobian of 40 samples of a car by [r0, v0, m, b], with the background b of each sensor."""
     H, n = jacobian(CAR[6:], positions, CAR[:3], CAR[3:6], n_t=40), len(positions)
     H_b = np.broadcast_to(np.eye(3 * n).reshape(n, 3, 3 * n), (40, n, 3, 3 * n))
     return np.concatenate([H, H_b], axis=-1)
@@ -62,7 +62,7 @@ ROTATION_KERNEL = [*np.cross(UP, R0), *np.cross(UP, V0), 0.0, 0.0, 0.0]
 ])
 def test_observability_of_the_published_example(m, sensors, kernel, smallest, condition,
                                               unobservable):
-    """Check values of an example of TSP14 Proposition 1, to the given digits."""
+    """Check values of an example of TSP14 Proposition 1, to the published digits."""
     o, k = observability(unitless(m, sensors), NAMES), len(kernel)
     print(f'{len(sensors)} sensors, m = {m}:', o.eigenvalues, o.condition_number)
     assert np.all(np.abs(o.eigenvalues[:k]) < 1e-12 * o.eigenvalues[-1])
@@ -95,7 +95,7 @@ def test_scaled_observability_does_not_depend_on_units():
 def test_known_cpa_range_makes_one_sensor_observable():
     J, prior = unitless(ONES, ONE), cpa_information(R0, V0, 0.1)
     assert observability(J + prior, NAMES).kernel_dimension == 0
-    # Only the prior determines the range, so its bound is that of the prior.
+    # Only the prior determines the range, so the bound of the range equals the prior.
     gradient = np.array([0.0, 1.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 0.0])
     assert gradient @ bound(J, prior) @ gradient == pytest.approx(0.1**2, rel=1e-9)
     # With a kernel of two dimensions, the heading remains unobservable.
@@ -129,7 +129,7 @@ def test_estimate_of_a_linear_model_reaches_the_bound():
     low, high = chi2.ppf([0.005, 0.995], 15 * n) / (15 * n)
     print(f'NEES per state {nees / (15 * n):.4f}, limits {low:.4f} .. {high:.4f}')
     assert low <= nees / (15 * n) <= high
-    # Each variance separately, at a significance of 1 % over all fifteen.
+    # Each variance is tested separately; the total significance is 1 % for all fifteen.
     low, high = chi2.ppf([0.005 / 15, 1.0 - 0.005 / 15], n) / n
     ratio = (e**2).mean(axis=0) / np.diag(P)
     assert np.all((low <= ratio) & (ratio <= high)), ratio
@@ -150,7 +150,7 @@ def test_unobservable_states_have_infinite_variance(m):
 
 
 def test_a_state_with_a_small_part_in_the_kernel_is_unobservable():
-    """Its part is so small that the other states alone appear unobservable."""
+    """The part in the kernel is so small that the other states alone appear unobservable."""
     A = np.random.default_rng(4).standard_normal((20, 6))
     n = np.array([1e-5, 1.0, -2.0, 1.0, 0.0, 3.0])
     A -= np.outer(A @ n, n) / (n @ n)
@@ -159,7 +159,7 @@ def test_a_state_with_a_small_part_in_the_kernel_is_unobservable():
     assert np.array_equal(np.isinf(np.diag(bound(J))), unobservable)
     for i in range(6):
         assert np.isinf(bound(marginal(J, [i]))[0, 0]) == unobservable[i]
-    # A state without any information, next to units that differ by many decades.
+    # One state has no information, and the units differ by many decades.
     np.testing.assert_allclose(bound(np.diag([4.0, 0.0, 1e16])), [
         [0.25, np.nan, 0.0], [np.nan, np.inf, np.nan], [0.0, np.nan, 1e-16]], rtol=1e-12)
 
@@ -172,7 +172,7 @@ def test_bound_of_an_observable_case_is_the_inverse_in_any_units():
 
 
 def test_bound_never_exceeds_the_prior():
-    """MITRE12 figure 5: far away, the bounds approach those of the prior."""
+    """MITRE12 figure 5: far away, the bounds approach the prior."""
     std = np.array([30.0, 5.0, 1.0, 4.5, 1.0, 0.1, 100.0, 100.0, 100.0])
     near, far = (np.sqrt(np.diag(bound(information(
         jacobian(CAR[6:], ONE, [-20.0, y, 0.0], [11.0, 0.0, 0.0]), NOISE * np.eye(3)),
@@ -182,7 +182,7 @@ def test_bound_never_exceeds_the_prior():
 
 
 def test_states_known_exactly_are_treated_as_not_estimated():
-    """MITRE12 section 4.3: their variance is zero."""
+    """MITRE12 section 4.3: the variance of such states is zero."""
     J, free = unitless(ONES, ONE), np.ix_([1, 2, 3, 5, 6, 7, 8], [1, 2, 3, 5, 6, 7, 8])
     expected = np.zeros((9, 9))
     expected[free] = np.linalg.inv(J[free])
@@ -204,7 +204,7 @@ def test_marginal_information_is_the_schur_complement():
 @pytest.mark.parametrize('keep', [[0], [2], [2, 0], [0, 1, 2], [3, 4, 5], [6, 7, 8], range(9)])
 @pytest.mark.parametrize('m', [ONES, UP])
 def test_unobservable_states_stay_unobservable_in_marginal_information(m, keep):
-    """Rounding errors must not turn an infinite bound into a large finite one."""
+    """Rounding errors must not turn an infinite bound into a large finite bound."""
     J, keep = unitless(m, ONE), np.array(keep)
     whole, part = bound(J)[np.ix_(keep, keep)], bound(marginal(J, keep))
     assert np.array_equal(np.isinf(np.diag(part)), np.isinf(np.diag(whole)))
@@ -226,7 +226,7 @@ def plain_kalman(F, Q, H, C, P):
 
 
 def filter_problem():
-    """A car as [r, v, m, b]: models and Jacobians along its path, some sensors and axes missing."""
+    """Models and Jacobians along the path of a car, states [r, v, m, b]; some axes are missing."""
     dt, n = 0.1, 40
     F, Q, H = np.eye(15), np.zeros((15, 15)), car(ROAD)
     F[:3, 3:6] = dt * np.eye(3)
@@ -250,13 +250,13 @@ def test_path_bound_is_the_covariance_of_the_kalman_filter():
     print('path bound against the filter:', relative(P, expected))
     assert relative(P, expected) < 1e-7
     assert P[-1][0, 0] < 0.02 * P0[0, 0]
-    # Whitened Jacobians, and one F and Q for all steps.
+    # The same with whitened Jacobians, and with one F and Q for all steps.
     white = np.linalg.solve(np.linalg.cholesky(CORRELATED), H[:7])
     assert relative(path_bound(F[0], Q[0], white, None, P0), expected[:7]) < 1e-7
 
 
 def test_path_bound_accepts_states_known_exactly():
-    """Vertical components without initial variance and process noise."""
+    """The vertical components have neither initial variance nor process noise."""
     (F, Q, H, P0), known = filter_problem(), [2, 5, 8]
     Q[:, known] = Q[:, :, known] = P0[known, known] = 0.0
     P = path_bound(F, Q, H, CORRELATED, P0)
@@ -271,7 +271,7 @@ def test_path_bound_without_process_noise_ends_at_the_batch_bound():
     F, Q, H, P0 = filter_problem()
     F[0] = np.eye(15)
     P = path_bound(F, 0.0 * Q, H, CORRELATED, P0)
-    # The batch bound refers to the first sample, the last filter step to 39 samples later.
+    # The batch bound refers to the first sample; the last filter step is 39 samples later.
     H_batch = H.copy()
     H_batch[..., 3:6] = 0.1 * np.arange(40)[:, None, None, None] * H[..., :3]
     shift = np.eye(15) + 3.9 * np.eye(15, k=3) * (np.arange(15) < 6)
@@ -297,7 +297,7 @@ def test_missing_axes_and_sensors_add_no_information():
 
 
 def test_snr_is_the_energy_of_the_field_and_minimal_abeam():
-    """T10 eq. (5.21) is the minimum over all directions; along the axis the SNR is four times."""
+    """T10 eq. (5.21) is the minimum over directions; along the axis the SNR is 4 times larger."""
     h = 1e-8 * np.array([[1.0, -2.0, 0.5], [1.0, np.nan, 2.0], [np.nan] * 3])
     expected, _ = whitened_energy(h, np.repeat(CORRELATED[None], 3, axis=0))
     np.testing.assert_allclose(snr(h, CORRELATED), expected, rtol=1e-12)
@@ -311,7 +311,7 @@ def test_snr_is_the_energy_of_the_field_and_minimal_abeam():
 
 
 def test_range_of_a_magnetometer_is_about_ten_metres():
-    """T10 eq. (5.22)-(5.24), (6.1), and the same at the correct scale, that of TSP14."""
+    """T10 eq. (5.22)-(5.24) and (6.1) as published, and with the correct scale of TSP14."""
     t10 = snr_range(1.0, np.sqrt(1e-21), 9.2)
     cars = snr_range(np.array([300.0, 600.0, 1800.0]), np.sqrt(NOISE), 9.2)
     print(f'range: {t10:.2f} m; cars and truck {cars}')

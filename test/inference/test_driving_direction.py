@@ -24,7 +24,7 @@ def signal(distance=1.0, direction=1.0, n=N):
 
 
 def noise_for(h, snr_db):
-    """Standard deviation for a signal-to-noise ratio; PHD15 Paper B eq. (40)."""
+    """Noise standard deviation for a signal-to-noise ratio; PHD15 Paper B eq. (40)."""
     return float(np.sqrt(np.mean(np.sum(h**2, axis=1)) * 10.0**(-snr_db / 10.0)))
 
 
@@ -34,7 +34,7 @@ def test_expected_rotation_equals_the_published_simulation():
     assert np.mean(np.sum(h**2, axis=1)) == pytest.approx(0.583103, abs=1e-6)
     assert expected_rotation(h, 1.0, 1).correlation == pytest.approx(-8.73775, abs=1e-5)
     assert expected_rotation(h, 1.0, 15).correlation == pytest.approx(-1.12269, abs=1e-5)
-    # Agrees with 20 000 Monte Carlo runs.
+    # These values agree with 20 000 Monte Carlo runs.
     assert expected_rotation(h, noise_for(h, -10.0), 15).variance == pytest.approx(33.42, abs=5e-3)
     for snr_db, error in ((-20, 0.4919), (-15, 0.4747), (-10, 0.4230), (-5, 0.2881), (0, 0.0773),
                           (5, 0.00098)):
@@ -42,8 +42,8 @@ def test_expected_rotation_equals_the_published_simulation():
         assert found.error_probability == pytest.approx(error, abs=1e-4)
 
 
-def normalised_deviations(snr_db, lag, runs=4000):
-    """Deviations from theory in standard errors: mean, variance, error rate, variance estimate."""
+def normalised_errors(snr_db, lag, runs=4000):
+    """Errors of mean, variance, error rate and variance estimate, in standard errors."""
     rng, h = np.random.default_rng([snr_db + 50, lag]), signal()
     std = noise_for(h, snr_db)
     padded = np.pad(h, ((lag, lag), (0, 0)))
@@ -64,7 +64,7 @@ def normalised_deviations(snr_db, lag, runs=4000):
 
 def test_mean_variance_and_error_rate_agree_with_theory():
     """PHD15 Paper B eq. (12), (14), (17), (16), at six signal-to-noise ratios and four lags."""
-    z = np.abs([normalised_deviations(snr_db, lag) for snr_db in (-10, -5, 0, 5, 10, 20)
+    z = np.abs([normalised_errors(snr_db, lag) for snr_db in (-10, -5, 0, 5, 10, 20)
                 for lag in (3, 7, 11, 15)])
     # Of 24 values, one exceeds three standard errors with probability 1/16, two with 1/500.
     assert (np.count_nonzero(z > 3.0, axis=0) <= 1).all() and z.max() < 4.0, z
@@ -80,7 +80,7 @@ def test_sign_is_that_of_the_direction_for_any_yaw_of_the_sensor():
 
 
 def test_the_published_best_lag_requires_a_distance_of_two_metres():
-    """The best lag is 7 samples at the published distance of 1 m; at 2 m it is the published 15."""
+    """The best lag is 7 samples at the published distance of 1 m, and the published 15 at 2 m."""
     def best(distance):
         h = signal(distance)
         std, lags = noise_for(h, -5.0), list(range(1, 26))
@@ -118,5 +118,5 @@ def test_sensors_on_both_sides_are_fused():
     p, q = near.left_to_right, 1.0 - far.left_to_right
     fused = fused_log_odds([near.log_odds, far.log_odds], [True, False])
     assert fused == pytest.approx(np.log(p * q / ((1.0 - p) * (1.0 - q))))
-    # A log-odds whose probability rounds to one.
+    # The probability of this log-odds rounds to one.
     assert FieldRotation(-40.0, 1.0).log_odds > 800.0

@@ -1,4 +1,4 @@
-"""Bank of integrated random walks: against plain Kalman filters, and on data of its own model."""
+"""Bank of integrated random walks, compared with plain Kalman filters and with true models."""
 
 import numpy as np
 import pytest
@@ -10,14 +10,14 @@ from mag_tracking.inference.gauss_markov import STRENGTHS, SWITCH_S, GaussMarkov
 
 
 def plain_filter(density, std):
-    """filterpy filter of one component."""
+    """Filter of one component by filterpy."""
     kf = KalmanFilter(dim_x=2, dim_z=1)
     kf.H, kf.P = np.array([[1.0, 0.0]]), np.diag([std**2, density])
     return kf
 
 
 def by_plain_filters(series, variance, dt, scale, std):
-    """Log-densities of the vectors `series` (n, m), by plain filters of each component."""
+    """Log-densities of the vectors `series` (n, m) from one plain filter for each component."""
     banks = [[plain_filter((s * scale)**2, std) for _ in series[0]] for s in STRENGTHS]
     log_w = np.full(len(STRENGTHS), -np.log(len(STRENGTHS)))
     out = []
@@ -106,7 +106,7 @@ def test_densities_stay_finite_over_long_gaps_and_with_little_noise(gap, noise):
 
 
 def test_components_of_zero_strength_are_constant():
-    """One varying and one constant component, measured in combinations, against filterpy."""
+    """One varying and one constant component are measured in combinations; oracle: filterpy."""
     rng = np.random.default_rng(5)
     bank = GaussMarkovVectors(1, np.array([0.5, 0.0]), 2.0)
     H = np.array([[1.0, 0.3], [0.2, -1.0]])

@@ -1,4 +1,4 @@
-"""Identification of enrolled vehicles: published passes of one, and two cars of equal size."""
+"""Identification of enrolled vehicles: published passes of a vehicle, and two similar cars."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from mag_tracking.physics.dipole import MU0
 from support.vehicle_5 import TABLE
 
 SCALE = 450.0
-"""[A m^2] Unit of moment of T10: the ratio of TSP14 to T10 for the same vehicles."""
+"""[A m^2] Unit of moment of T10, from the moments of the same vehicles in TSP14 and T10."""
 MOMENTS = SCALE * TABLE[:, 1:4]
 COVARIANCES = np.array([np.diag((SCALE * std)**2) for std in TABLE[:, 4:7]])
 HEADINGS = np.deg2rad(TABLE[:, 0])
@@ -19,7 +19,7 @@ HARD, SOFT = SCALE * np.array([-0.47, 0.29, -0.56]), 1.22
 
 
 def distances(between_std, monkeypatch):
-    """Squared distance of each published pass from the prediction of the twelve others."""
+    """Squared distance of each published pass from the prediction by the twelve other passes."""
     monkeypatch.setattr('mag_tracking.inference.identification.PASS_TO_PASS_STD', between_std)
     out = []
     for k in range(len(TABLE)):
@@ -31,14 +31,14 @@ def distances(between_std, monkeypatch):
 
 
 def test_published_passes_are_consistent_with_the_spread_between_passes(monkeypatch):
-    """T10 Table 6.9, leaving one pass out; the stated standard deviations alone are too small."""
+    """Leave-one-out test of T10 Table 6.9; the published standard deviations are too small."""
     low, high = chi2.ppf([0.005, 0.995], 3 * len(TABLE)) / len(TABLE)
     assert low < distances(PASS_TO_PASS_STD, monkeypatch).mean() < high
     assert distances(1e-6, monkeypatch).mean() > high
 
 
 def test_a_pass_at_a_heading_not_enrolled_is_identified():
-    """T10 Table 6.9, leaving all passes of one heading out."""
+    """T10 Table 6.9; the vehicle is enrolled without the passes at the tested heading."""
     for heading in np.unique(HEADINGS):
         rest = heading != HEADINGS
         vehicle = enrol('5', MOMENTS[rest], COVARIANCES[rest], HEADINGS[rest], INDUCTION)
@@ -53,14 +53,14 @@ def moment_at(hard, heading):
 
 
 def rotated_hard_iron(degrees):
-    """Hard iron of a car of equal size."""
+    """Hard iron of a car of equal moment: HARD, rotated about the vertical."""
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ HARD
 
 
 @pytest.mark.parametrize('degrees', [60, 90, 120, 180])
 def test_two_cars_of_equal_size_are_distinguished(degrees):
-    """As T10 Fig. 7.1: enrolled at headings north and south, identified at any heading."""
+    """As in T10 Fig. 7.1, cars enrolled at two headings are identified at any heading."""
     rng, C = np.random.default_rng(degrees), np.diag([8.0, 8.0, 15.0])**2
     spread = np.linalg.cholesky(C + PASS_TO_PASS_STD**2 * np.eye(3))
     cars = {'vehicle 5': HARD, 'other': rotated_hard_iron(degrees)}
@@ -80,7 +80,7 @@ def test_two_cars_of_equal_size_are_distinguished(degrees):
     right = [identify(fleet, m, C, heading, 0.02, INDUCTION).name == name
              for name, hard in cars.items() for heading in np.deg2rad([90.0, 270.0, 20.0, 200.0])
              for m in passes(hard, [heading] * 10)]
-    # One in a hundred exceeds the threshold of `unknown`.
+    # One pass in a hundred exceeds the threshold of `unknown`.
     assert np.mean(right) > 0.99 - 3.0 * np.sqrt(0.01 * 0.99 / len(right))
 
 

@@ -14,14 +14,14 @@ AXES = np.array([3, 3])
 
 
 def run(nis):
-    """`InnovationConsistency` after frames (n, n_sensors)."""
+    """`InnovationConsistency` after adding the NIS of frames (n, n_sensors)."""
     consistency = InnovationConsistency(nis.shape[1])
     for k, row in enumerate(nis):
         consistency.add(row, AXES[:nis.shape[1]], round(k * DT * NS))
     return consistency
 
 
-def test_consistent_filters_fail_as_often_as_stated():
+def test_consistent_filters_fail_at_the_nominal_rate():
     rng = np.random.default_rng(0)
     n = 2500
     runs = [run(rng.chisquare(3, (30, 2))) for _ in range(n)]
@@ -32,7 +32,7 @@ def test_consistent_filters_fail_as_often_as_stated():
             < 2 * FALSE_ALARM * n + 4 * np.sqrt(2 * n * FALSE_ALARM)
 
 
-def test_innovations_twice_as_large_as_stated_are_detected_and_quantified():
+def test_innovations_twice_as_large_as_expected_are_detected_and_quantified():
     rng = np.random.default_rng(1)
     runs = [run(4.0 * rng.chisquare(3, (30, 2))) for _ in range(200)]
     assert all(r.fails for r in runs)

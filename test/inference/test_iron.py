@@ -13,14 +13,14 @@ HARD, SOFT = np.array([-200.0, 120.0, -270.0]), 4.0
 
 
 def moments_at(headings):
-    """(n, 3) [A m^2] of HARD and SOFT."""
+    """Moments (n, 3) [A m^2] of a vehicle with the iron HARD and SOFT."""
     c, s = np.cos(headings), np.sin(headings)
     x, y, z = HARD
     return np.stack([c * x - s * y, s * x + c * y, z + 0.0 * c], axis=1) + SOFT * INDUCTION
 
 
 def test_fit_reproduces_the_published_iron():
-    """Equal weights as in T10 eq. (6.16), with 3 B0/mu0 as in T10, which states D = 1.23."""
+    """The fit uses equal weights and 3 B0/mu0 as in T10 eq. (6.16); the published D is 1.23."""
     B0 = 1.7e-7 * np.array([0.0, 0.31, -0.95])
     fit = hard_and_soft_iron(TABLE[:, 1:4], np.deg2rad(TABLE[:, 0]), 3.0 * B0 / MU0)
     print(f'T10 Table 6.9: m0 = {fit.hard.round(3)}, D = {fit.soft:.3f}')

@@ -1,4 +1,4 @@
-"""Plain Kalman filter, the oracle of the compiled one: against a dense filter and filterpy."""
+"""Plain Kalman filter, an oracle in other tests, compared with a dense filter and filterpy."""
 
 import numpy as np
 import pytest
@@ -147,7 +147,7 @@ def test_update_linearised_away_from_the_mean():
 
 
 def test_nees_of_a_linear_gaussian_case_is_chi_square():
-    """Linear model, true prior and noise: the mean NEES lies in its 95 % band."""
+    """With a linear model, true prior and true noise, the mean NEES lies in its 95 % band."""
     rng = np.random.default_rng(11)
     runs, steps, n_t, n_sensors, dt = 400, 12, 6, 2, 0.1
     n_x = n_t + 3 * n_sensors
@@ -177,7 +177,7 @@ def test_nees_of_a_linear_gaussian_case_is_chi_square():
     low, high = chi2.ppf([0.025, 0.975], runs * n_x) / runs
     print(f'linear Gaussian NEES {nees.mean():.3f}, band {low:.3f} .. {high:.3f}')
     assert low <= nees.mean() <= high
-    # Innovations are white: in every step, those of each sensor have three degrees of freedom.
+    # Innovations are white: in every step, each sensor contributes three degrees of freedom.
     low, high = chi2.ppf([0.005, 0.995], 3 * len(nis)) / len(nis)
     by_sensor = np.mean(nis, axis=0)
     print(f'NIS by sensor {by_sensor.round(3)}, band {low:.3f} .. {high:.3f}')

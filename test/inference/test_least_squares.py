@@ -1,4 +1,4 @@
-"""Nonlinear least squares: divergent starts, infinite models and priors."""
+"""Non-linear least squares: divergent starts, infinite models and priors."""
 
 import warnings
 
@@ -77,7 +77,7 @@ def test_a_prior_counts_like_a_measurement():
     np.testing.assert_allclose(x[0], peer.x[:2], rtol=1e-5)
     assert converged[0] and np.isclose(cost[0], 2.0 * peer.cost)
     np.testing.assert_allclose(problem.cost(x), cost)
-    # A parameter that is not measured keeps its prior.
+    # A parameter that is not measured retains its prior.
     assert np.isclose(x[0, 1], 0.7) and np.isclose(P[0, 1, 1], 0.2**2)
     covariance = np.linalg.inv(peer.jac.T @ peer.jac)
     np.testing.assert_allclose(P[0, 0, 0], covariance[0, 0], rtol=1e-4)

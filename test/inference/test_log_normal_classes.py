@@ -48,7 +48,7 @@ def test_a_vehicle_that_fits_no_class_is_unknown():
 
 
 def test_posteriors_are_calibrated():
-    """Vehicles of the assumed distributions: stated probabilities equal the rates of success."""
+    """For vehicles of the assumed distributions, probabilities equal the rates of success."""
     rng, s = np.random.default_rng(0), SETTINGS
     stated, right = [], []
     for _ in range(4000):

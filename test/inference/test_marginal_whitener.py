@@ -1,4 +1,4 @@
-"""Marginalisation of linear terms of measurements, against the full covariance."""
+"""Marginalisation of linear terms of measurements, compared with the full covariance."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Matched filter: Parseval's theorem, oracles in time and by integration, measured rates."""
+"""Matched filter: Parseval's theorem, oracles in the time domain, and measured rates."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from mag_tracking.inference.matched_filter import (
 
 ALL = (0.0, np.inf)
 MITRE = {'background': 1e-10, 'resolution': 9e-10, 'bandwidth': 11.0}
-"""MITRE12 table 1."""
+"""Noise parameters of MITRE12 table 1."""
 
 
 def mitre(f):
@@ -23,7 +23,7 @@ def mitre(f):
 
 
 def white(density):
-    """A flat spectrum."""
+    """Flat spectrum of a given density."""
     return lambda f: np.full(f.shape, density)
 
 
@@ -34,7 +34,7 @@ def within_binomial(hits, n, p):
 
 
 def pulse(n, rate, rng=None):
-    """Two axes of a smooth signal [T], or of a random one if `rng` is given."""
+    """Two axes of a smooth signal [T], or of a random signal if `rng` is given."""
     t = np.arange(n) / rate
     if rng is not None:
         return 1e-9 * rng.standard_normal((n, 2))
@@ -42,7 +42,7 @@ def pulse(n, rate, rng=None):
 
 
 def test_noise_spectrum_equals_the_published_one():
-    """MITRE12 eq. (B.8) at 4 Hz in a town; (B.9): the density of steps integrates to step^2/12."""
+    """MITRE12 eq. (B.8) at 4 Hz in a town; the density of eq. (B.9) integrates to step^2/12."""
     # Not pytest.approx: its absolute tolerance of 1e-12 exceeds these values.
     np.testing.assert_allclose(noise_spectrum(4.0, 1e-10, 0.0, 11.0), 2.5e-21, rtol=1e-12)
     steps = noise_spectrum(np.array([0.0, 5.0]), 0.0, 9e-10, 11.0)
@@ -56,7 +56,7 @@ def test_noise_spectrum_equals_the_published_one():
 
 @pytest.mark.parametrize('n', [11, 12, 1, 2])
 def test_white_noise_gives_energy_over_noise_power(n):
-    """For odd and even numbers of samples; the power of a sample is S times the rate."""
+    """The noise power of a sample is S times the rate, for odd and even numbers of samples."""
     rate, power = 22.0, (3e-10)**2
     B = pulse(n, rate, np.random.default_rng(n))
     expected = np.sqrt(np.sum(B**2) / power)
@@ -78,7 +78,7 @@ def test_coloured_noise_gives_the_deflection_of_the_time_domain(n, rate):
 
 
 def test_a_long_smooth_signal_gives_the_deflection_of_the_integral():
-    """A Gaussian pulse with its known continuous transform, and a smooth density."""
+    """The signal is a Gaussian pulse with known continuous transform, and the density is smooth."""
     width, size = 0.1, 2e-9
     t = np.arange(-400, 400) / 50.0
     B = size * np.exp(-0.5 * (t / width)**2)[:, None]
@@ -151,7 +151,7 @@ def test_detection_probability_has_its_fixed_points_and_increases():
 
 
 def test_measured_rate_in_white_noise_agrees_with_theory():
-    """Filter in the time domain, s'y/sigma^2 above a threshold, with and without the signal."""
+    """The filter compares s'y/sigma^2 with a threshold, with and without the signal."""
     rng, n, sigma, rate = np.random.default_rng(7), 40_000, 4e-10, 22.0
     s = pulse(11, rate)
     noise = sigma * rng.standard_normal((n, 11, 2))
@@ -167,7 +167,7 @@ def test_measured_rate_in_white_noise_agrees_with_theory():
 
 
 def test_measured_rate_in_the_published_noise_agrees_with_theory():
-    """Noise as a sum of tones of power 2 S df, and the filter in the frequency domain."""
+    """The noise is a sum of tones of power 2 S df; the filter works in the frequency domain."""
     rng, n, rate, n_t = np.random.default_rng(8), 20_000, 22.0, 11
     s, f = 3.0 * pulse(n_t, rate)[:, 0], np.array([4.0, 6.0, 8.0, 10.0])
     t, df = np.arange(n_t) / rate, rate / n_t

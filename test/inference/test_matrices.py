@@ -1,4 +1,4 @@
-"""Pseudo-inverses compared with those of NumPy."""
+"""Pseudo-inverses compared with NumPy."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from mag_tracking.inference.matrices import pseudo_inverse
 
 
 def information(k, rank, rng, n=5):
-    """Symmetric matrices (n, k, k) of a rank, whose units differ by decades."""
+    """Symmetric matrices (n, k, k) of a given rank, with units that differ by decades."""
     A = rng.standard_normal((n, k, rank)) * 10.0**rng.uniform(-6.0, 6.0, (k, 1))
     return A @ np.swapaxes(A, 1, 2)
 
@@ -25,8 +25,8 @@ def test_pseudo_inverse_equals_that_of_numpy(k, missing):
     A = information(k, k + 20, rng)
     if missing:
         A[2] = information(k, k - missing, rng, 1)
-    got = pseudo_inverse(A, 1e-11)
-    for one, inverse in zip(A, got, strict=True):
+    inverses = pseudo_inverse(A, 1e-11)
+    for one, inverse in zip(A, inverses, strict=True):
         scale = np.sqrt(np.diagonal(one))
         np.testing.assert_allclose(inverse * np.outer(scale, scale),
                                    numpy_pseudo_inverse(one) * np.outer(scale, scale), atol=1e-9)
@@ -36,11 +36,11 @@ def test_pseudo_inverse_equals_that_of_numpy(k, missing):
 def test_a_matrix_that_is_not_finite_yields_nan_and_does_not_affect_others():
     A = information(4, 9, np.random.default_rng(0), 3)
     alone = pseudo_inverse(A)
-    for wrong in (np.nan, np.inf):
-        A[1, 2, 2] = wrong
-        got = pseudo_inverse(A)
-        assert np.isnan(got[1]).all()
-        np.testing.assert_allclose(got[[0, 2]], alone[[0, 2]], rtol=1e-7)
+    for invalid in (np.nan, np.inf):
+        A[1, 2, 2] = invalid
+        inverses = pseudo_inverse(A)
+        assert np.isnan(inverses[1]).all()
+        np.testing.assert_allclose(inverses[[0, 2]], alone[[0, 2]], rtol=1e-7)
 
 
 def test_zero_rows_stay_zero_in_the_pseudo_inverse():

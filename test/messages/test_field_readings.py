@@ -1,4 +1,4 @@
-"""Readings of several sensors in one message: conversion both ways, and recordings."""
+"""Readings of several sensors in one message: conversion in both directions, and recordings."""
 
 from array import array
 from collections import Counter
@@ -64,7 +64,7 @@ def test_a_round_trip_keeps_samples_and_their_order(n, known, seed):
 
 
 def test_arrays_follow_the_message_definition():
-    """Row by row; integers and single-precision numbers are accepted."""
+    """Arrays are in row-major order; integers and single-precision numbers are accepted."""
     samples = [MagSample(7, 'b', np.array([1, 2, 3]), np.diag([1, 2, 3])),
                MagSample(5, 'a', np.array([0.5, 1.5, 2.5], dtype=np.float32),
                          np.arange(9, dtype=np.float32).reshape(3, 3)),
@@ -113,7 +113,7 @@ def test_an_empty_message_has_no_readings():
 
 
 def recording(path, messages):
-    """Recording of [(topic, type, content)] at intervals of one second."""
+    """Write a recording of [(topic, type, content)] at intervals of one second."""
     path.parent.mkdir(exist_ok=True)
     with RecordingWriter(path) as writer:
         for k, (topic, kind, content) in enumerate(messages):
@@ -129,23 +129,23 @@ def test_a_recording_returns_the_same_samples(tmp_path, known):
         (BATCH_TOPIC, FIELD_READINGS, readings_dict(batch(g))) for g in groups]),
                           line_network(2))
     assert reader.missing_topics() == []
-    got = list(reader.readings_as_received())
-    assert identical(samples_of(*(r for r, _ in got)), [s for g in groups for s in g])
-    assert [t for _, t in got] == [START + k * 10**9 for k, g in enumerate(groups)]
+    batches = list(reader.readings_as_received())
+    assert identical(samples_of(*(r for r, _ in batches)), [s for g in groups for s in g])
+    assert [t for _, t in batches] == [START + k * 10**9 for k, g in enumerate(groups)]
     assert identical(samples_of(*reader.readings_and_accelerations()), recorded(reader))
     assert reader.rejected == Counter()
 
 
 def test_unknown_sensors_and_undecodable_messages_are_counted(tmp_path):
     rng = np.random.default_rng(2)
-    mine = random_samples(3, False, rng, ('mag_1',))
+    known_samples = random_samples(3, False, rng, ('mag_1',))
     other = random_samples(4, False, rng, ('elsewhere',))
-    broken = readings_dict(batch(mine))
+    broken = readings_dict(batch(known_samples))
     broken['stamp'] = broken['stamp'][:2]
     reader = SampleReader(recording(tmp_path / 'a.mcap', [
-        (BATCH_TOPIC, FIELD_READINGS, readings_dict(batch(other + mine))),
+        (BATCH_TOPIC, FIELD_READINGS, readings_dict(batch(other + known_samples))),
         (BATCH_TOPIC, FIELD_READINGS, broken)]), line_network(2))
-    assert identical(recorded(reader), mine)
+    assert identical(recorded(reader), known_samples)
     assert reader.rejected == {'reading of elsewhere, which is not in the network': 4,
                                f'undecodable message on {BATCH_TOPIC}': 1}
 

@@ -84,7 +84,7 @@ def test_no_messages_give_empty_arrays():
 
 
 def test_random_bytes_are_decoded_or_skipped():
-    """Valid beginnings and random bytes of any length: no error, no read beyond the message."""
+    """Valid beginnings and random bytes cause neither errors nor reads beyond the message."""
     rng = np.random.default_rng(3)
     data = [message(k)[:rng.integers(0, 130)] + rng.bytes(int(rng.integers(0, 40)))
             for k in range(2000)]
@@ -110,7 +110,7 @@ def poses_of(messages, frame='map'):
 
 @pytest.mark.parametrize('frame', ['map', '', 'a much longer name', 'möp'])
 def test_poses_of_a_frame_equal_the_decoded_messages(frame):
-    """Also if the name of another frame has the same length."""
+    """The name of another frame may have the same length."""
     frames = ['map', 'utm', '', 'a', 'a much longer name', 'möp', 'odom']
     data = [pose_message(k, frames[k % len(frames)]) for k in range(28)]
     found = poses_of(data, frame)

@@ -26,7 +26,7 @@ from support.track_runs import magnet_frames
 
 @pytest.fixture(scope='module')
 def tracks():
-    """{is ambiguous: last such `Track`} of one replay."""
+    """Last unambiguous and last ambiguous `Track` of a replay: {is ambiguous: track}."""
     from mag_tracking.network.file import read_network
     from mag_tracking.pipeline import Pipeline, settings_for
     from mag_tracking.recording.reader import Recording

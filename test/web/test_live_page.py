@@ -1,4 +1,4 @@
-"""Live page in Chromium, fed without ROS: values, delay, reconnection and memory."""
+"""Live page in Chromium without ROS: values, delay, reconnection and memory."""
 
 import threading
 import time
@@ -22,7 +22,7 @@ SECOND_NS = 1_000_000_000
 
 @needs_browser
 def test_the_page_shows_all_tracked_poses(chromium, scene, server, records):
-    """Half of the poses come before the page is opened."""
+    """Half of the poses are published before the page is opened."""
     half = len(records) // 2
     feed(scene, records[:half])
     page = Opened(chromium, server.url)
@@ -113,7 +113,7 @@ def test_markup_in_health_notes_is_shown_literally(chromium, scene, server):
 
 @needs_browser
 def test_a_target_that_stays_for_hours_needs_bounded_memory(chromium, scene, server, records):
-    """This applies to the server, with and without viewers, and to the browser."""
+    """The bound applies to the browser, and to the server with and without viewers."""
     template = [r for r in records if isinstance(r, FieldFrame)][-1]
     pose, stamp = poses(records)[30], template.stamp_ns
 

@@ -13,7 +13,7 @@ from support.live_records import NS, feed, later, poses
 
 
 class Viewer:
-    """State of a page built from the messages: `tracks` is {key: times of the poses}."""
+    """State of a page, built from messages; `tracks` is {key: times of the poses}."""
 
     def __init__(self):
         self.tracks, self.ended, self.scenes = {}, set(), 0
@@ -31,7 +31,7 @@ class Viewer:
 
 
 def follow(scene, records):
-    """A viewer that receives frequent updates from the start."""
+    """Create a viewer that receives frequent updates from the start."""
     viewer = Viewer().receive(scene.news())
     for k in range(0, len(records), 7):
         feed(scene, records[k:k + 7])
@@ -111,7 +111,7 @@ def test_old_tracks_and_excess_poses_are_removed(scene, records):
     first = min(times[-1] for times in late.tracks.values())
     last = max(times[-1] for times in late.tracks.values())
     assert last - first <= HISTORY_S
-    # Without a viewer, the smoothed poses of removed tracks are removed, too.
+    # Without a viewer, the smoothed poses of removed tracks are also removed.
     assert sum(len(json.loads(m).get('smoothed', ())) for m in rows) == len(late.tracks)
 
 

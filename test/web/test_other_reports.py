@@ -31,7 +31,7 @@ def open_page(chromium, path):
 
 
 def check_and_close(page, path):
-    """Check that the page logged no error and loaded no other file, and close it."""
+    """Check that the page logged no error and loaded no other file; close the page."""
     assert page.complaints == []
     assert page.requests == [path.as_uri()]
     page.page.close()
@@ -50,7 +50,7 @@ def test_a_fit_report_shows_the_paths_of_its_table(chromium, tmp_path):
                         for name in ('x', 'y', 'vx', 'vy'))
         np.testing.assert_allclose(vx, float(row['vx']))
         np.testing.assert_allclose(vy, float(row['vy']))
-        # The table holds the position at the strongest field, which is on the straight path.
+        # The table contains the position at the strongest field, which is on the straight path.
         d = [float(row['x']) - x[0], float(row['y']) - y[0]]
         assert abs(d[0] * vy[0] - d[1] * vx[0]) / np.hypot(vx[0], vy[0]) < 1e-6
     begin, end = page.value('(t => [t[0], t[t.length - 1]])(magTracking.scene.tracks[1].columns.t)')
@@ -151,7 +151,7 @@ def test_the_doctor_reports_on_a_single_reading(chromium, tmp_path):
 
 
 @pytest.mark.parametrize('where', ['missing/health.html', 'folder.html'])
-def test_an_unwritable_report_is_reported_before_the_work(tmp_path, capsys, where):
+def test_an_unwritable_report_is_reported_before_the_computation(tmp_path, capsys, where):
     (tmp_path / 'folder.html').mkdir()
     assert run('doctor', RECORDINGS[0], '--report', tmp_path / where) == 1
     out = capsys.readouterr()

@@ -19,7 +19,7 @@ from support.live_records import feed, poses
 
 
 def messages_until(url, until, seconds=60.0):
-    """Messages that a viewer receives until `until(message)`."""
+    """Messages that a viewer receives until `until(message)` is true."""
     out = []
     with connect(url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
         end = time.monotonic() + seconds
@@ -47,8 +47,8 @@ def test_ten_viewers_get_all_poses_although_another_disconnects(scene, server, r
 
 
 def test_a_slow_viewer_gets_the_whole_scene_later(scene, server, records, monkeypatch):
-    """Its buffer is bounded, other viewers are served, and it finally has all poses."""
-    # On a busy machine, this test may read late.
+    """The buffer is bounded, other viewers are served, and the slow viewer gets all poses."""
+    # On a busy machine, the viewer of this test may read late.
     monkeypatch.setattr('mag_tracking.web.page_server.LAG_TIMEOUT_S', 600.0)
     with reading_viewer(server) as quick, unreading_viewer(server) as slow:
         stamp = publish_until(scene, records, lambda: server.n_lagged, quick)
@@ -58,7 +58,7 @@ def test_a_slow_viewer_gets_the_whole_scene_later(scene, server, records, monkey
 
 
 def reading_viewer(server):
-    """A viewer that reads its messages."""
+    """Connect a viewer that reads its messages."""
     return connect(server.url.replace('http', 'ws') + 'stream', max_size=None)
 
 
@@ -76,7 +76,7 @@ def read_until(raw, pattern, n=1, seconds=120.0):
 
 
 def publish(scene, records, stamp, n=1):
-    """Publish `n` more poses; return the timestamp of the last."""
+    """Publish `n` more poses; return the timestamp of the last pose."""
     template = [r for r in records if isinstance(r, FieldFrame)][-1]
     for _ in range(n):
         stamp += 10_000_000
@@ -86,7 +86,7 @@ def publish(scene, records, stamp, n=1):
 
 
 def publish_until(scene, records, condition, quick, seconds=60.0):
-    """Publish poses until the condition holds; return the timestamp of the last."""
+    """Publish poses until the condition holds; return the timestamp of the last pose."""
     stamp, end = records[-1].stamp_ns, time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
@@ -98,7 +98,7 @@ def publish_until(scene, records, condition, quick, seconds=60.0):
 
 @contextmanager
 def unreading_viewer(server):
-    """A viewer that completes the handshake and does not read by itself."""
+    """Connect a viewer that completes the handshake and reads only on request."""
     with socket.socket() as raw:
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
         raw.connect(('127.0.0.1', server.port))
@@ -207,7 +207,7 @@ def status_of(url, **headers):
 
 
 def test_without_a_token_only_local_requests_are_served(server):
-    """A foreign page may point its host name here, or open the socket from a script."""
+    """A foreign page may resolve its host name to this server, or open the socket in a script."""
     assert 'token' not in server.url
     assert status_of(server.url) == 200
     assert status_of(server.url + 'etc/passwd') == 404

@@ -24,7 +24,7 @@ EVIL = '</script><script>window.broken = true</script><b>left</b>'
 
 @pytest.fixture(scope='module')
 def report(vehicle_replays, road_network):
-    """(path of the page, rows of poses.csv)."""
+    """Path of the page, and rows of poses.csv."""
     run, folder = vehicle_replays[RECORDING]
     path = write_report(run, road_network, folder)
     with open(folder / 'poses.csv', newline='') as stream:
@@ -33,7 +33,7 @@ def report(vehicle_replays, road_network):
 
 @pytest.fixture(scope='module')
 def shared_page(chromium, report):
-    """Page shared by several tests, each of which moves the slider as it needs."""
+    """Page that is shared by several tests; each test moves the slider as required."""
     page = Opened(chromium, report[0].as_uri())
     page.wait('magTracking.drawn > 0')
     yield page
@@ -124,7 +124,7 @@ def test_the_page_fits_the_width_of_a_telephone(chromium, report):
 
 
 def test_the_table_selects_each_track(chromium, vehicle_replays, road_network, tmp_path):
-    """The second track is a copy of the first, later and at another position."""
+    """The second track is a later copy of the first track at another position."""
     run, _ = vehicle_replays[RECORDING]
     later = second_track(run.logs[1])
     both = type(run)({**run.summary, 'tracks': [*run.summary['tracks'], {
