@@ -65,7 +65,7 @@ def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None
     Returns
     -------
     list of Driver
-        None of them is open.
+        All drivers are closed.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None
 
 
 def load_class(role: str, name: object) -> Any:
-    """Class of a kind of transport, framing or device.
+    """Import the class of a transport, framing or device.
 
     Parameters
     ----------
@@ -103,18 +103,19 @@ def load_class(role: str, name: object) -> Any:
         If the class cannot be loaded, or lacks `SETTINGS` or a method.
     """
     target = KINDS[role].get(name, name) if isinstance(name, str) else ''
-    module, colon, leaf = target.partition(':')
+    module, colon, class_name = target.partition(':')
     if not colon:
         raise SettingsError(f'{role}: expected {", ".join(KINDS[role])} or '
                             f'package.module:Class, got {shown(name)}')
     try:
-        cls = getattr(importlib.import_module(module), leaf)
-    # A third-party module may raise anything.
+        cls = getattr(importlib.import_module(module), class_name)
+    # A third-party module may raise any error.
     except Exception as error:
-        raise SettingsError(f'{role}: {name}: {type(error).__name__}: {error}') from error
-    lacking = [what for what in ('SETTINGS', *METHODS[role]) if not hasattr(cls, what)]
-    if lacking:
-        raise SettingsError(f'{role}: {name} has no {", ".join(lacking)}')
+        raise SettingsError(
+            f'{role}: {name} cannot be loaded: {type(error).__name__}: {error}') from error
+    missing = [member for member in ('SETTINGS', *METHODS[role]) if not hasattr(cls, member)]
+    if missing:
+        raise SettingsError(f'{role}: {name} is incomplete, it lacks {", ".join(missing)}')
     return cls
 
 
@@ -140,16 +141,17 @@ def driver_of(name: object, entry: object) -> Driver:
     if not isinstance(name, str) or not isinstance(entry, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {shown(entry)}')
     if not is_text(name):
-        raise SettingsError(f'{shown(name)} is not a device name: it contains a lone surrogate')
-    rest = dict(entry)
+        raise SettingsError(f'{shown(name)} is not a device name: it is not valid Unicode')
+    options = dict(entry)
     try:
-        device = _device(rest)
-        clock = replace(_class_defaults(ClockSettings(), device, 'CLOCK'), _group(rest, 'clock'))
-        sensors = _sensors(rest)
+        device = _device(options)
+        clock = replace(_class_defaults(ClockSettings(), device, 'CLOCK'),
+                        _pop_group(options, 'clock'))
+        sensors = _pop_sensors(options)
         for unit in ('unit', 'acceleration_unit'):
-            if isinstance(rest.get(unit), (int, float)) and not isinstance(rest[unit], bool):
-                rest[unit] = repr(rest[unit])
-        settings = replace(_class_defaults(DriverSettings(), device, 'DRIVER'), rest)
+            if isinstance(options.get(unit), (int, float)) and not isinstance(options[unit], bool):
+                options[unit] = repr(options[unit])
+        settings = replace(_class_defaults(DriverSettings(), device, 'DRIVER'), options)
         return Driver(name, device, settings, clock, sensors)
     except SettingsError as error:
         raise SettingsError(f'{name}: {error}') from error
@@ -160,45 +162,45 @@ def _class_defaults(settings: Settings, device: Device, name: str) -> Settings:
     return replace(settings, getattr(device, name, {}))
 
 
-def _device(rest: dict[str, Any]) -> Device:
-    """Device described by an entry; removes the keys used from `rest`."""
-    if 'device' in rest:
-        if 'transport' in rest or 'framing' in rest:
-            raise SettingsError('device cannot be combined with transport and framing; remove one '
-                                'of them')
-        device: Device = _create('device', rest)
+def _device(options: dict[str, Any]) -> Device:
+    """Create the device of an entry; remove its settings from `options`."""
+    if 'device' in options:
+        if 'transport' in options or 'framing' in options:
+            raise SettingsError('device cannot be combined with transport and framing; remove '
+                                'either device or the other two')
+        device: Device = _create_part('device', options)
         return device
     for role in ('transport', 'framing'):
-        if role not in rest:
-            raise SettingsError(f'{role} is missing (one of {", ".join(KINDS[role])}), and so is '
-                                f'device (one of {", ".join(KINDS["device"])})')
-    return FramedDevice(_create('transport', rest), _create('framing', rest))
+        if role not in options:
+            raise SettingsError(f'{role} is missing (one of {", ".join(KINDS[role])}), or set '
+                                f'device instead (one of {", ".join(KINDS["device"])})')
+    return FramedDevice(_create_part('transport', options), _create_part('framing', options))
 
 
-def _create(role: str, rest: dict[str, Any]) -> Any:
-    """Transport, framing or device of an entry, created with its settings."""
-    kind = rest.pop(role)
+def _create_part(role: str, options: dict[str, Any]) -> Any:
+    """Create the transport, framing or device of an entry; remove its settings from `options`."""
+    kind = options.pop(role)
     cls = load_class(role, kind)
     group = kind if kind in KINDS[role] else f'{role}_settings'
-    return cls(replace(cls.SETTINGS(), _group(rest, group)))
+    return cls(replace(cls.SETTINGS(), _pop_group(options, group)))
 
 
-def _group(rest: dict[str, Any], name: str) -> Mapping[str, Any]:
-    """Mapping of settings under `name`; removed from `rest`."""
-    group = rest.pop(name, {})
+def _pop_group(options: dict[str, Any], name: str) -> Mapping[str, Any]:
+    """Remove the group `name` from `options` and return its settings."""
+    group = options.pop(name, {})
     if not isinstance(group, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {shown(group)}')
     return group
 
 
-def _sensors(rest: dict[str, Any]) -> dict[str, str]:
-    """{name at the device: network name}."""
-    if 'sensor' in rest:
-        if 'sensors' in rest:
-            raise SettingsError('sensor and sensors are mutually exclusive; give only one')
-        sensors = {'': rest.pop('sensor')}
+def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
+    """Remove the sensors from `options` and return {name at the device: network name}."""
+    if 'sensor' in options:
+        if 'sensors' in options:
+            raise SettingsError('sensor and sensors are mutually exclusive; remove one of them')
+        sensors = {'': options.pop('sensor')}
     else:
-        sensors = rest.pop('sensors', None)
+        sensors = options.pop('sensors', None)
     if not isinstance(sensors, Mapping) or not sensors:
         raise SettingsError('expected `sensor: mag_1`, or `sensors:` with the network name of each '
                             f'sensor of the device, got {shown(sensors)}')
@@ -206,8 +208,8 @@ def _sensors(rest: dict[str, Any]) -> dict[str, str]:
         if isinstance(key, bool) or not isinstance(key, (str, int)):
             raise SettingsError(f'sensors: {shown(key)} is not a name; put it in quotes')
         if not is_text(str(key)):
-            raise SettingsError(f'sensors: {shown(key)} is not a name: it contains a lone '
-                                'surrogate')
+            raise SettingsError(f'sensors: {shown(key)} is not a name: it is not valid '
+                                'Unicode')
         if not isinstance(value, str) or not (value == IGNORED or _NAME.fullmatch(value)):
             raise SettingsError(f'sensors: {key}: expected a sensor name (letters, digits, _ and '
                                 f'/), or - to ignore the sensor, got {shown(value)}')
@@ -234,12 +236,12 @@ def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> 
 
 
 def settings_by_kind() -> dict[str, Any]:
-    """Default settings of all kinds, for the reference.
+    """Default settings of all kinds, as listed in the settings reference.
 
     Returns
     -------
     dict of str to settings
-        By the name of the group in the drivers file.
+        Keys: names of the groups in the drivers file; '' = settings at the top level of a device.
     """
     out = {'': DriverSettings(), 'clock': ClockSettings()}
     for role, kinds in KINDS.items():

@@ -198,7 +198,7 @@ def test_mtdata_that_does_not_match_the_settings_is_counted():
     ({'mtdata': ['none', 'mag']}, "unknown block 'none'"),
     ({'mtdata': ['mag', 'acc']}, 'got mag, acc'),
     ({'mtdata': ['mag', 'mag']}, 'got mag, mag'),
-    ({'mtdata': ['mag', 'quaternion', 'euler']}, 'more than one of euler, matrix, quaternion'),
+    ({'mtdata': ['mag', 'quaternion', 'euler']}, 'at most one of euler, matrix, quaternion'),
     ({'mtdata': ['temp', 'gyr', 'counter']}, 'acc or mag is required, got temp, gyr, counter'),
     ({'mtdata': ['mag'], 'mtdata_format': 'double'},
      "mtdata_format: expected one of float, fp12.20, got 'double'"),
