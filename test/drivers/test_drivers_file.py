@@ -17,14 +17,14 @@ BOARD = {'transport': 'serial', 'serial': {'port': '/dev/ttyUSB0'}, 'framing': '
 
 
 def read(tmp_path, content, network=None):
-    """The drivers of a file with this content."""
+    """Read the drivers of a file with `content`."""
     path = tmp_path / 'drivers.yaml'
     path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
     return read_drivers(path, network)
 
 
 def without(*keys, **more):
-    """The board with some keys removed and others added."""
+    """Entry `BOARD` with some keys removed and others added."""
     return {'board': {**{k: v for k, v in BOARD.items() if k not in keys}, **more}}
 
 
@@ -66,7 +66,8 @@ def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
     (without(device='i2c'), 'device cannot be combined with transport and framing'),
     (without(transport='carrier pigeon'), "transport: expected serial, udp, mqtt or package.mod"),
     (without(framing=['text']), 'framing: expected text'),
-    (without(transport='no_such_module:Port'), "no_such_module:Port: ModuleNotFoundError: No"),
+    (without(transport='no_such_module:Port'),
+     "no_such_module:Port cannot be loaded: ModuleNotFoundError: No"),
     (without(transport='yaml:Port'), "module 'yaml' has no attribute 'Port'"),
     (without(serial={'prot': 'x'}), 'unknown setting prot; did you mean port?'),
     (without(serial={'port': 'x', 'baud': 'fast'}), "baud: expected int, got 'fast'"),
@@ -77,7 +78,7 @@ def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
     (without(binary={'sync': 'A5'}), 'unknown setting binary'),
     (without('sensor'), 'expected `sensor: mag_1`, or `sensors:`'),
     (without(sensors={'A': 'mag_2'}), 'sensor and sensors are mutually exclusive'),
-    ('{"\\ud800": {}}', "'\\ud800' is not a device name: it contains a lone surrogate"),
+    ('{"\\ud800": {}}', "'\\ud800' is not a device name: it is not valid Unicode"),
     (without('sensor', sensors={'\ud800': 'a'}), "sensors: '\\ud800' is not a name"),
     (without(text={'fields': ['\udcff']}), "fields: '\\udcff' is not text"),
     (without('sensor', sensors={'A': 3}), 'sensors: A: expected a sensor name (letters'),
@@ -85,8 +86,9 @@ def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
     (without('sensor', sensors={1.1: 'a'}), 'sensors: 1.1 is not a name; put it in quotes'),
     (without('sensor', sensors={None: 'a'}), 'sensors: None is not a name; put it in quotes'),
     (without(sensor='mag 1'), 'expected a sensor name (letters, digits'),
-    (without(framing='collections:OrderedDict'), 'OrderedDict has no SETTINGS, parse'),
-    (without(framing='.x:Y'), 'framing: .x:Y: TypeError'),
+    (without(framing='collections:OrderedDict'),
+     'OrderedDict is incomplete, it lacks SETTINGS, parse'),
+    (without(framing='.x:Y'), 'framing: .x:Y cannot be loaded: TypeError'),
     (without('sensor', sensors={'A': 'a', 'B': 'a'}), 'sensor a is already assigned to board (A)'),
     ({**without(), 'other': BOARD}, 'other: sensor mag_1 is already assigned to board'),
     ({'board': 7}, 'board: expected a mapping of settings, got 7'),

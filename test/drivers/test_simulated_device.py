@@ -33,13 +33,13 @@ class Clock:
 
 
 def device_of(settings=QUIET):
-    """(the device, its clock)."""
+    """(simulated device, its clock)."""
     clock = Clock()
     return SimulatedDevice(settings, lambda: clock.ns, clock.sleep), clock
 
 
 def first_arrivals(device, n, timeout_s=1.0):
-    """The first `n` arrivals."""
+    """Read the first `n` arrivals."""
     out = []
     while len(out) < n:
         out += device.read(timeout_s)
@@ -145,7 +145,7 @@ def test_unsuitable_settings_and_networks_are_refused(tmp_path):
 
 
 def drivers_file(tmp_path, sensors):
-    """Drivers file of the simulator."""
+    """Write a drivers file for the simulator; return its path."""
     path = tmp_path / 'drivers.yaml'
     path.write_text(f'road:\n  device: simulator\n  simulator: {{network: {NETWORK_FILE}, '
                     f'moment: 0.0}}\n  sensors: {sensors}\n')

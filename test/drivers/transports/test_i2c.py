@@ -79,7 +79,7 @@ def test_the_arrival_time_is_that_of_the_conversion(chip):
 
 
 def read_for(device, clock, seconds):
-    """All arrivals within `seconds`."""
+    """Read all arrivals within `seconds`."""
     end_ns, out = clock.ns + round(seconds * 1e9), []
     while clock.ns < end_ns:
         out += device.read((end_ns - clock.ns) * 1e-9)
@@ -103,7 +103,7 @@ def test_missed_polling_cycles_are_counted_and_the_grid_is_kept():
     clock.sleep(0.110)
     after = device.read(1.0)[0].arrival_ns
     again = device.read(1.0)[0].arrival_ns
-    # The cycles at 20, 40, 60 and 80 ms are missed. That at 100 ms is late, the next is not.
+    # The cycles at 20, 40, 60 and 80 ms are missed. The cycle at 100 ms is late, the next is not.
     assert device.counts == {'polling cycles missed': 4}
     assert (again - before) * 1e-9 == pytest.approx(0.120, abs=5e-3)
     assert (after - before) * 1e-9 == pytest.approx(0.110, abs=1e-2)

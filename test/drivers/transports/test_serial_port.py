@@ -64,23 +64,23 @@ class Device:
 
 @pytest.fixture
 def device(tmp_path):
-    made = Device(tmp_path)
-    yield made
-    made.unplug()
+    created = Device(tmp_path)
+    yield created
+    created.unplug()
 
 
 @pytest.fixture
 def handles(monkeypatch):
-    """Ports opened by pyserial, in order."""
-    made = []
+    """Ports opened by pyserial, in the order of opening."""
+    created = []
 
     class Recorded(serial.Serial):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
-            made.append(self)
+            created.append(self)
 
     monkeypatch.setattr(serial, 'Serial', Recorded)
-    return made
+    return created
 
 
 @pytest.fixture
@@ -298,7 +298,7 @@ def test_an_unsupported_baud_rate_is_reported(device, monkeypatch):
 
 
 def test_line_errors_are_counted_from_opening_on(device, monkeypatch):
-    """The kernel's counters run since boot, and overflow."""
+    """The kernel counts from the boot of the machine, and its counters overflow."""
     real, counters = serial_port.fcntl.ioctl, [7] * 20
 
     def ioctl(fd, request, *args):

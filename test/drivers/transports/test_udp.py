@@ -21,31 +21,31 @@ SETTINGS = UdpSettings(address='127.0.0.1')
 @pytest.fixture
 def listen():
     """Factory of open sockets, which are closed at the end."""
-    made = []
+    created = []
 
     def make(report=print, **changes):
         port = free_port(socket.SOCK_DGRAM)
-        made.append(UdpSocket(replace(SETTINGS, **{'port': port} | changes), report))
-        made[-1].open()
-        return made[-1]
+        created.append(UdpSocket(replace(SETTINGS, **{'port': port} | changes), report))
+        created[-1].open()
+        return created[-1]
 
     yield make
-    for udp in made:
+    for udp in created:
         udp.close()
 
 
 @pytest.fixture
 def sockets(monkeypatch):
-    """Sockets created from here on, in order."""
-    made = []
+    """Sockets created during the test, in the order of creation."""
+    created = []
 
     class Recorded(socket.socket):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
-            made.append(self)
+            created.append(self)
 
     monkeypatch.setattr(socket, 'socket', Recorded)
-    return made
+    return created
 
 
 @pytest.fixture
