@@ -118,7 +118,7 @@ def most_in_a_period(m, cpa, sensors=ONE, scale=AS_PUBLISHED):
 
 
 def cpa_where(probability, target):
-    """CPA [m] at which a decreasing function `probability(cpa)` equals `wanted`."""
+    """CPA [m] at which a decreasing function `probability(cpa)` equals `target`."""
     return brentq(lambda cpa: probability(cpa) - target, 2.0, 90.0, xtol=1e-6)
 
 
@@ -130,7 +130,7 @@ def noise_std():
 
 
 def jacobian(z):
-    """Jacobian (11, 2, 6) of both axes by z = (x0, y0, v, theta, M1, M2); chain rule on (7), (8).
+    """Jacobian (11, 2, 6) of the field with respect to z = (x0, y0, v, theta, M1, M2), by (7), (8).
     """
     x0, y0, v, theta, m1, m2 = z
     dB_dr, dB_dm = dipole_jacobians(-places(x0, y0, v, theta), np.array([m1, m2, 0.0]))
@@ -172,12 +172,12 @@ def pass_figure(sensors, title):
 
 
 def figure_2():
-    """Figure 2: one sensor."""
+    """Figure 2: detection probability of one sensor."""
     return pass_figure(ONE, 'MITRE12 Figure 2: one sensor, 25 mph, periods of 0.5 s')
 
 
 def figure_3():
-    """Figure 3: five sensors."""
+    """Figure 3: probability that at least one of five sensors detects the vehicle."""
     return pass_figure(FIVE, 'MITRE12 Figure 3: at least one of five sensors, 20 m apart, 25 mph')
 
 
@@ -201,7 +201,7 @@ def figure_4():
 
 
 def phi_std_bound(C, x0, sign):
-    """Bound on phi [deg] by (19) from the bound `C` on z; x/r^2 in (20) has the `sign` -1."""
+    """Bound on phi [deg] by (19) from the bound `C` on z; `sign` of x/r^2, which is -1 in (20)."""
     row = np.array([-BOUND_CPA, sign * x0]) / (x0**2 + BOUND_CPA**2)
     return np.degrees(np.sqrt(row @ C[:2, :2] @ row))
 
@@ -321,7 +321,8 @@ Figure 5, bounds along the road
            is not observable with one sensor (T10 (5.5)). At -20 m the unobservable direction is
            ({kernel}) = (x0, y0, v, 0, 3 M1, 3 M2)/y0.
            The published curves are finite, which a singular matrix does not allow.
-  agrees   With the prior, no bound exceeds the prior. The bound on theta approaches 15 deg far away.
+  agrees   With the prior, no bound exceeds the prior, and the bound on theta approaches 15 deg
+           far away.
   differs  The bounds on the left and on the right are similar: 20 m before the sensor
            x0 {before[0]:.1f} m and theta {before[3]:.1f} deg, 20 m after it {after[0]:.1f} m and \
 {after[3]:.1f} deg.

@@ -58,7 +58,7 @@ class SlipFraming:
         return Parsed(tuple(readings), len(data) - len(rest), rejected)
 
     def _read(self, packet, readings, rejected):
-        """Add the reading of one packet, or count the reason of its rejection."""
+        """Add the reading of a packet, or count the rejected packet by cause."""
         payload = packet.replace(ESCAPE + b'\xdc', END).replace(ESCAPE + b'\xdd', ESCAPE)
         if not payload:
             return

@@ -76,8 +76,8 @@ def about_cpa(J):
 
 
 def condition_maps():
-    """Condition numbers for three sets of states: eq. (5.1), position at the CPA, scaled by eq.
-    (5.11).
+    """Condition numbers for three state vectors: of eq. (5.1), with the position at the CPA, and
+    scaled by eq. (5.11).
     """
     J = information_map()
     return {'plain': condition_map(J), 'cpa': condition_map(about_cpa(J)),

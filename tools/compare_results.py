@@ -34,7 +34,7 @@ def mag_tracking(tree, *arguments):
 
 
 def recordings(tree, out):
-    """Bundled recordings: [(name, recording, network, target)]; imports the magnet tables."""
+    """Import the magnet tables; return all recordings as [(name, recording, network, target)]."""
     road = ROOT / 'config' / 'network.yaml'
     found = [(p.stem, p, road, 'vehicle') for p in sorted((DATA / 'vehicles').glob('*.mcap'))]
     for folder in ('two_way_road', 'corridor'):

@@ -57,7 +57,7 @@ def add_rules(profile, kind, access, names):
 
 
 def policies(namespace='/'):
-    """Content of the policy file for nodes in a namespace."""
+    """Create the nodes in a namespace; return the content of the policy file."""
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
     from mag_tracking.nodes.middleware import begin
     begin()

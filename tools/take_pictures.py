@@ -1,4 +1,4 @@
-"""Draw the pictures of README and documentation from the bundled recordings, in docs/images.
+"""Draw the pictures in docs/images from the bundled recordings.
 
     PYTHONPATH=test .venv/bin/python tools/take_pictures.py
 """

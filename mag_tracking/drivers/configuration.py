@@ -12,8 +12,8 @@
 A kind is a name in `KINDS`, or `package.module:Class` for a custom class. Such a class has an
 attribute `SETTINGS` and the methods of `reading.Transport`, `Framing` or `Device`. Its attributes
 `CLOCK` and `DRIVER`, mappings of settings, replace the defaults for every device of that kind. The
-settings of a kind are under its own name; those of a custom class under `transport_settings`,
-`framing_settings` or `device_settings`.
+settings of a kind are listed under its own name, and the settings of a custom class under
+`transport_settings`, `framing_settings` or `device_settings`.
 """
 
 import importlib

@@ -108,11 +108,11 @@ class ArrivalClock:
 
 
 class _ClockCandidate:
-    """Readings that may be the beginning of a new clock."""
+    """Readings that may belong to a new clock."""
 
     def __init__(self, ticks: float, arrival_ns: int, last_fit_ns: int, is_near: bool) -> None:
         self.since_ns, self.last_fit_ns, self._is_near = arrival_ns, last_fit_ns, is_near
-        self.first, self.agreeing, self.total, self._fitted = (ticks, arrival_ns), 1, 0, 0
+        self.first, self.agreeing, self.total, self._n_fitted = (ticks, arrival_ns), 1, 0, 0
         self._last = ticks
 
     def add(self, ticks: float, arrival_ns: int, tick_ns: float, wrap: int,
@@ -132,8 +132,8 @@ class _ClockCandidate:
     def is_refuted(self) -> bool:
         """Count a reading that fits the old clock; return whether to discard the candidate."""
         # Slightly faster messages may alternate with messages of unchanged delay.
-        self._fitted += 1
-        return not self._is_near or self._fitted > 4 * self.total
+        self._n_fitted += 1
+        return not self._is_near or self._n_fitted > 4 * self.total
 
 
 class DeviceClock:
@@ -193,7 +193,7 @@ class DeviceClock:
         self._slope, self._has_begun = 0.0, False
 
     def _begin(self, ticks: float, arrival_ns: int) -> None:
-        """Start a new clock at its first point; the drift estimate is kept."""
+        """Start a new clock at its first point, with the previous drift estimate."""
         self._ticks, self._arrival_ns, self._last_ns = ticks, arrival_ns, arrival_ns
         self._height = self._middle = self._newest = self._lowest = 0.0
         self._points: list[Point] = []
@@ -255,7 +255,7 @@ class DeviceClock:
         return count * self._tick_ns
 
     def _add_point(self, t: float, offset: float, low: float, arrival_ns: int) -> int:
-        """Add a point that fits; return its delay [ns]."""
+        """Add a point that fits the clock; return its delay [ns]."""
         if t >= self._block_end:
             self._close_block(t)
             low = offset - self._slope * (t - self._middle)

@@ -100,17 +100,17 @@ class Driver:
         self._sequences = {s: SequenceCheck(settings.sequence_wrap) for s in sensors.values()
                            if s != IGNORED}
         self._clocks: dict[str, ArrivalClock | DeviceClock] = {}
-        self._open, self.fault = False, ''
+        self._is_open, self.fault = False, ''
         self._retry_s, self._last_receipt_ns = settings.retry_s, 0
         self._retry_ns: int | None = None
         self._offset_ns: int | None = None
         self._sole_source = SingleSource()
-        self._unknown: set[str] = set()
+        self._unknown_names: set[str] = set()
         # (clock, ticks, arrival) of the previous reading. Readings with the same ticks and arrival
         # were measured together and have the same timestamp.
         self._measurement: tuple[ArrivalClock | DeviceClock, float | None, int] | None = None
         self._measured_ns: int | None = None
-        self._resolved: dict[tuple[str, str], str] = {}
+        self._known_sensors: dict[tuple[str, str], str] = {}
         self._sample_counts = {s: f'samples: {s}' for s in sensors.values()}
 
     @property
@@ -131,7 +131,7 @@ class Driver:
     @property
     def is_open(self) -> bool:
         """Whether the device is open."""
-        return self._open
+        return self._is_open
 
     def clocks(self) -> dict[str, ArrivalClock | DeviceClock]:
         """Clocks of all sources received so far.
@@ -179,7 +179,7 @@ class Driver:
             Empty if nothing arrived in time.
         accelerations : sequence of AccelerationSample
         """
-        if not self._open and not self._try_to_open(timeout_s):
+        if not self._is_open and not self._try_to_open(timeout_s):
             return NOTHING
         try:
             arrivals = self._read(timeout_s)
@@ -198,7 +198,7 @@ class Driver:
         return self._samples(arrivals, self._wall_offset(now))
 
     def _read(self, timeout_s: float) -> list[Arrival]:
-        """Return the available readings and those that arrive within `batch_s` after the first."""
+        """Read the available readings, then all further readings within `batch_s`."""
         arrivals = self._device.read(timeout_s)
         if not arrivals or not self._settings.batch_s:
             return arrivals
@@ -219,7 +219,7 @@ class Driver:
         for check in self._sequences.values():
             check.pause()
         self._device.close()
-        self._open, self._retry_ns = False, None
+        self._is_open, self._retry_ns = False, None
 
     def fail(self, error: Exception) -> None:
         """Close the device after an unexpected error and schedule its reopening.
@@ -245,12 +245,12 @@ class Driver:
             self._schedule_retry(error)
             return False
         # The previous fault remains until data arrive.
-        self._open, self._last_receipt_ns = True, self._monotonic_ns()
+        self._is_open, self._last_receipt_ns = True, self._monotonic_ns()
         return True
 
     def _schedule_retry(self, why: object) -> None:
         """Close the device and double the delay before it is reopened."""
-        self._open, self.fault = False, str(why)
+        self._is_open, self.fault = False, str(why)
         try:
             self._device.close()
         # A third-party device or a removed port may raise any error; the device is reopened anyway.
@@ -304,7 +304,7 @@ class Driver:
 
         Returns (network name, monotonic time [ns]); None = unknown, or a duplicate.
         """
-        sensor = self._resolved.get((reading.sensor, arrival.source)) \
+        sensor = self._known_sensors.get((reading.sensor, arrival.source)) \
             or self._sensor_of(reading.sensor, arrival.source)
         if sensor is None or reading.sequence is not None and not self._sequences[sensor].is_new(
                 reading.sequence, _bytes_of(reading.field) + _bytes_of(reading.acceleration)):
@@ -320,14 +320,14 @@ class Driver:
             return self.sensors['']
         if sensor is None:
             name = (at_device or source)[:80]
-            if len(self._unknown) < MAX_NAMES:
-                self._unknown.add(name)
+            if len(self._unknown_names) < MAX_NAMES:
+                self._unknown_names.add(name)
             self.own_counts['readings of unknown sensors' + (
-                f': {name}' if name in self._unknown else ' (and others)')] += 1
+                f': {name}' if name in self._unknown_names else ' (and others)')] += 1
         if sensor is None or sensor == IGNORED:
             return None
-        if len(self._resolved) < MAX_SOURCES:
-            self._resolved[at_device, source] = sensor
+        if len(self._known_sensors) < MAX_SOURCES:
+            self._known_sensors[at_device, source] = sensor
         return sensor
 
     def _stamp(self, reading: Reading, arrival: Arrival) -> int | None:

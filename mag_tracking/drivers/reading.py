@@ -129,7 +129,7 @@ class Arrival(NamedTuple):
 
 
 class Device(Protocol):
-    """Receives readings. The rules for calling the methods of a `Transport` apply."""
+    """Receives readings. The calling rules of `Transport` apply."""
 
     @property
     def counts(self) -> Counter[str]:

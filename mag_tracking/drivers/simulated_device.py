@@ -97,7 +97,7 @@ class SimulatedDevice:
         self._path, self._passing_s = _path_along(self._network, settings)
         self._rng = np.random.default_rng(settings.seed)
         self._table: FloatArray | None = None
-        self._start_ns = self._next = 0
+        self._start_ns = self._next_index = 0
         self._shift_s: list[float] = (np.arange(len(self._network)) * settings.sequential
                          / (len(self._network) * settings.rate_hz)).tolist()
 
@@ -106,7 +106,7 @@ class SimulatedDevice:
         if self._table is None:
             self._table = self._field_of_pass()
             self._start_ns = self._monotonic_ns()
-        self._next = math.ceil(self._elapsed() * self._settings.rate_hz) * len(self._network)
+        self._next_index = math.ceil(self._elapsed() * self._settings.rate_hz) * len(self._network)
 
     def read(self, timeout_s: float) -> list[Arrival]:
         """Return the readings that are due; wait for the next reading if no reading is due.
@@ -127,19 +127,19 @@ class SimulatedDevice:
         """
         if self._table is None:
             raise DeviceError('the simulator is not open; call open() first')
-        wait = self._due(self._next) - self._elapsed()
+        wait = self._due(self._next_index) - self._elapsed()
         if wait > 0.0:
             # Waiting for each of a thousand readings separately would be too slow.
             self._sleep(min(max(wait, MIN_WAIT_S), timeout_s))
         elapsed, n = self._elapsed(), len(self._network)
         oldest = math.ceil((elapsed - MAX_BACKLOG_S) * self._settings.rate_hz) * n
-        if oldest > self._next:
-            self.counts['readings dropped, not read in time'] += oldest - self._next
-            self._next = oldest
-        first, self._next = self._next, max(self._next, self._n_due(elapsed))
-        while self._due(self._next) <= elapsed:
-            self._next += 1
-        return self._readings(self._table, first, self._next)
+        if oldest > self._next_index:
+            self.counts['readings dropped, not read in time'] += oldest - self._next_index
+            self._next_index = oldest
+        first, self._next_index = self._next_index, max(self._next_index, self._n_due(elapsed))
+        while self._due(self._next_index) <= elapsed:
+            self._next_index += 1
+        return self._readings(self._table, first, self._next_index)
 
     def close(self) -> None:
         """Do nothing; the simulated time continues."""
@@ -154,7 +154,7 @@ class SimulatedDevice:
         return (self._monotonic_ns() - self._start_ns) / 1e9
 
     def _due(self, i: int) -> float:
-        """Time at which reading `i` is measured [s]; the sensors alternate."""
+        """Measurement time of reading `i` [s]; each cycle has one reading of each sensor."""
         index, j = divmod(i, len(self._network))
         return index / self._settings.rate_hz + self._shift_s[j]
 

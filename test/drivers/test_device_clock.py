@@ -536,7 +536,7 @@ def test_delays_of_seconds_are_not_treated_as_steps():
 
 @pytest.mark.parametrize('fraction', [1.0, 0.3])
 def test_a_link_that_becomes_faster_restarts_the_clock(fraction):
-    """The delay drops from 52 ms to 2 ms, for all messages or for some of them."""
+    """The delay decreases from 52 ms to 2 ms, for all messages or for some of them."""
     rng = np.random.default_rng(6)
     count, t = device_ticks(rng, 100.0, irregular=0.0)
     slow = (t < 50.0) | (rng.random(len(t)) > fraction)

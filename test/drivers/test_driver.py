@@ -21,7 +21,7 @@ CLOCK = ClockSettings(tick_s=1e-6, min_delay_s=0.0)
 
 
 class SimulatedHost:
-    """Host clocks whose time the test sets."""
+    """Simulated clocks of a host."""
 
     def __init__(self):
         self.now_ns, self.step_ns = 5_000_000_000, 0
@@ -281,7 +281,7 @@ def test_the_memory_of_a_sequence_check_is_bounded():
 
 
 def test_duplicate_readings_are_dropped():
-    """Also with a missing axis. A known number with different values is a new reading."""
+    """A known number with different values is a new reading, not a duplicate."""
     def reading(x, sequence, acceleration=None):
         return Reading('', (x, float('nan'), 3.0), acceleration, sequence=sequence)
     driver, *_ = driver_of([

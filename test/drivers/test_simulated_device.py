@@ -95,7 +95,7 @@ def test_readings_arrive_in_time_with_the_specified_noise():
 
 
 def test_sequential_sensors_measure_at_their_own_times():
-    """Each sensor measures a fraction of the interval after the previous one."""
+    """Each sensor measures a fraction of the sampling interval after the previous sensor."""
     device, _ = device_of(dataclasses.replace(QUIET, sequential=True))
     device.open()
     network = read_network(NETWORK_FILE)

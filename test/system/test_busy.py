@@ -50,7 +50,7 @@ def test_every_vehicle_of_a_recording_is_counted(name):
 
 
 def test_smoothed_poses_of_new_targets_are_near_the_published_ones():
-    """Smoothing is linearised at the first filtered poses; otherwise errors reach 50 m."""
+    """Smoothing is linearised at the position of track initiation; otherwise errors reach 50 m."""
     n = 0
     for name in IN_EVERY_TEST:
         got = tracked_recording(name)

@@ -18,7 +18,10 @@ WRONG = chi2.ppf(1.0 - 1e-4, 2)
 
 @functools.cache
 def track_pass(n_sensors, seed, fault=None):
-    """Track a pass; rows of the result are (t, error [m], normalised squared error, flagged)."""
+    """Track a pass; return (pipeline, rows, (begin, end)).
+
+    A row is (t, error [m], normalised squared error, flagged).
+    """
     network, samples, truth, times = stream(n_sensors, seed, fault)
     pipeline = Pipeline(network, settings_for('vehicle', POINT))
     records = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()

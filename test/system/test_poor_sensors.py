@@ -71,7 +71,7 @@ def test_the_doctor_reports_infinite_covariances():
 def test_coarse_steps_hide_no_vehicle_and_are_not_a_fault(name, step, request):
     if (name, step) == ('junction_left_to_right', 1e-6):
         request.applymarker(pytest.mark.xfail(strict=True, reason='the readings of one sensor '
-                            'do not change, and those of the other change by a step of noise'))
+                            'do not change, and the other sensor changes by a step of noise'))
     assert outcome(name, spoiler.steps(step)).detected >= 1
     found = findings(name, spoiler.steps(step))
     assert not any(word in f for f in found for word in (

@@ -167,7 +167,7 @@ def test_bounds_of_one_sensor_without_a_prior_are_infinite(mitre12, bounded):
 
 
 def test_printed_jacobian_and_prior_do_not_explain_the_published_bounds(mitre12, bounded):
-    """(20) affects only phi. With four priors of (26), all bounds are finite at zero speed."""
+    """(20) affects only phi. With four priors of (26), the bounds are finite at zero speed."""
     x, y, h = -20.0, 25.0, 1e-5
     phi = np.array([np.arctan2(y, x + h) - np.arctan2(y, x - h),
                     np.arctan2(y + h, x) - np.arctan2(y - h, x)]) / (2.0 * h)
@@ -205,7 +205,7 @@ def test_the_best_place_of_the_second_sensor_depends_on_the_state(t10, observed)
     assert n['scaled best'][1] == pytest.approx(405, abs=1)
     for name in ('plain', 'cpa', 'scaled'):
         assert n[f'{name} best'][1] <= n[f'{name} best same side'][1]
-    # The state at the CPA is that of a start moved there.
+    # Moving the start to the CPA gives the state at the CPA.
     t = 0.1 * np.arange(60)[:, None] - 3.0
     moved = t10.sensor_information(np.array([0.5, -1.0, 0.0]))
 
@@ -219,7 +219,7 @@ def test_the_best_place_of_the_second_sensor_depends_on_the_state(t10, observed)
 
 
 def test_the_threshold_and_the_ranges_match_t10(observed):
-    """T10 states a threshold of 11.2 and an SNR of 9.2."""
+    """T10 gives a threshold of 11.2 and an SNR of 9.2."""
     n = observed
     assert n['threshold'] == pytest.approx(chi2.isf(0.01, 3), rel=1e-9)
     assert ncx2.sf(n['threshold'], 3, n['snr']) == pytest.approx(0.5, rel=1e-6)

@@ -1,4 +1,4 @@
-"""Configuration for robot_localization: an EKF that fuses published poses is no less accurate.
+"""Configuration for robot_localization: an EKF is as accurate as the published poses it fuses.
 
 `robot_localization` is not available from PyPI. A filter of filterpy replaces it, with the motion
 model and the noise of `config/robot_localization.yaml`.
@@ -57,7 +57,7 @@ def fuse(poses, noise):
 
 
 def errors(names, road_network):
-    """{recording: (errors of the EKF (n,), of the published poses (n,))} [m]."""
+    """{recording: (errors of the EKF (n,), errors of the published poses (n,))} [m]."""
     noise = np.diagonal(np.reshape(settings()['process_noise_covariance'], (15, 15)))[[0, 1, 6, 7]]
     found = {}
     for name in names:

@@ -87,7 +87,7 @@ def test_examples_in_the_text_print_the_documented_output(site, tmp_path):
 
 
 def test_every_figure_in_the_text_is_one_of_the_benchmarks():
-    """Percentages are generated from the benchmarks, because typed numbers become outdated."""
+    """The text contains no percentages of its own, which would become outdated."""
     typed = []
     for path in [ROOT / 'README.md', *(ROOT / 'docs').glob('*.md'),
                  *(ROOT / 'docs' / 'concepts').glob('*.md')]:

@@ -27,7 +27,7 @@ RUNS = 3
 MISSED_AIMS = {
     'clocks 200 ms apart': 'clock offset: the four wrong poses are within 0.5 s of the closest '
                            'point, before the whole pass reveals the offset',
-    'a car with a trailer': 'some poses are those of the car alone, 2 to 3 m ahead of the middle '
+    'a car with a trailer': 'some poses belong to the car alone, 2 to 3 m ahead of the middle '
                             'of both, until the trailer has passed; for others it is unknown',
     'one follows, four sensors': 'in one of six runs two cars 9 m apart are tracked as a truck '
                                  'between them for 0.8 s, until the second one is found',

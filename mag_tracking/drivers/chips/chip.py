@@ -64,7 +64,9 @@ class SmBus(Protocol):
         ----------
         i2c_addr : int
         register : int
+            First register.
         length : int
+            Number of registers.
 
         Returns
         -------
@@ -248,7 +250,7 @@ class Registers:
 
 
 class Conversion(NamedTuple):
-    """Result of a conversion."""
+    """Field and time of a conversion."""
 
     middle_ns: int
     """Estimated `time.monotonic_ns()` at the middle of the conversion."""
@@ -262,7 +264,7 @@ Measurement: TypeAlias = Generator[float, None, Conversion | None]
 
 
 class Identified(Protocol):
-    """Chip, or class of a chip, with an identity."""
+    """Chip, or class of a chip, with registers that identify it."""
 
     @property
     def IDENTITY(self) -> Identity:

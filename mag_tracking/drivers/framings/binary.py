@@ -70,9 +70,9 @@ class BinaryFraming:
     size : int
         Length of a frame in bytes.
     CLOCK : dict of str to float
-        Clock settings that follow from the types: a counter wraps at the limit of its type.
+        Clock settings derived from the field types: a counter wraps at the limit of its type.
     DRIVER : dict of str to int
-        Driver settings that follow from the types.
+        Driver settings derived from the field types.
 
     Raises
     ------
@@ -211,7 +211,7 @@ def _wrap(kind: str) -> int:
 
 
 def _converter(quantity: str, kind: str, order: _ByteOrder) -> _Converter:
-    """Function that converts a value of `struct` for `FieldLayout`."""
+    """Function that converts an unpacked value of a field for `FieldLayout`."""
     if quantity == SKIP:
         return skipped
     convert: _Converter

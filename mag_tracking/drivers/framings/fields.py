@@ -29,7 +29,7 @@ _Choice = TypeVar('_Choice', bound=str)
 
 
 class Rejected(ValueError):
-    """Rejection of a line or frame. The message is the cause, to follow 'lines' or 'frames'."""
+    """Rejection of a line or frame. The message is the cause, without 'lines' or 'frames'."""
 
 
 class FieldLayout:

@@ -103,7 +103,7 @@ class Lines:
 
     def read(self, lines: Iterable[bytes], consumed: int,
              read: Callable[[bytes], list[Reading]]) -> Parsed:
-        """Parse separate lines.
+        """Parse lines that are already separated.
 
         Parameters
         ----------
@@ -228,7 +228,7 @@ def _strip_checksum(line: bytes) -> bytes:
 
 
 def _converter(quantity: str) -> Callable[[bytes], object]:
-    """Function that converts the bytes of a value for `FieldLayout`."""
+    """Function that parses the bytes of a field for `FieldLayout`."""
     if quantity in AXES:
         return _axis
     converters: dict[str, Callable[[bytes], object]] = {

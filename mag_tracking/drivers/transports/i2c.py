@@ -82,7 +82,7 @@ class I2cSettings:
 
 
 class I2cDevice(Closable):
-    """Chips on one bus, with the field in tesla. Implements `reading.Device`.
+    """Chips on one I2C bus; readings are in tesla. Implements `reading.Device`.
 
     Parameters
     ----------
@@ -120,9 +120,9 @@ class I2cDevice(Closable):
         self._period_ns = round(1e9 / settings.rate_hz)
         super().__init__()
         self._bus: Bus | None = None
-        self._lost, self._due_ns = '', 0
-        self._failed: Counter[str] = Counter()
-        self._silent: Counter[str] = Counter()
+        self._loss, self._due_ns = '', 0
+        self._n_failed: Counter[str] = Counter()
+        self._n_silent: Counter[str] = Counter()
         self._max_silent = max(3, math.ceil(settings.silence_timeout_s * settings.rate_hz))
         # Creating the chips checks their settings.
         self._chips = self._create_chips(Bus(None, monotonic_ns, sleep))
@@ -152,8 +152,8 @@ class I2cDevice(Closable):
                 self._release()
                 raise
             self._due_ns = self._monotonic_ns()
-            self._failed.clear()
-            self._silent.clear()
+            self._n_failed.clear()
+            self._n_silent.clear()
 
     @property
     def _name(self) -> str:
@@ -214,7 +214,7 @@ class I2cDevice(Closable):
         return f'cannot be read: {error.strerror or error}'
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """Return the readings of the next polling cycle that has any.
+        """Return the readings of the next polling cycle with at least one reading.
 
         Parameters
         ----------
@@ -236,8 +236,8 @@ class I2cDevice(Closable):
             while True:
                 if self._bus is None:
                     raise DeviceError(f'{self._name}: not open')
-                if self._lost:
-                    raise DeviceError(self._lost)
+                if self._loss:
+                    raise DeviceError(self._loss)
                 if not self._wait(end_ns):
                     return []
                 arrivals = self._run_cycle(self._bus)
@@ -290,29 +290,29 @@ class I2cDevice(Closable):
 
     def _arrivals(self, name: str, conversion: Conversion | None) -> list[Arrival]:
         """Convert a conversion to an arrival; count a missing conversion."""
-        self._failed[name] = 0
+        self._n_failed[name] = 0
         if conversion is None:
             self._count('polling cycles without a new conversion', name)
-            self._silent[name] += 1
-            if self._silent[name] >= self._max_silent:
-                self._lost = (f'{self._name}: {name}: no new conversion in {self._silent[name]} '
+            self._n_silent[name] += 1
+            if self._n_silent[name] >= self._max_silent:
+                self._loss = (f'{self._name}: {name}: no new conversion in {self._n_silent[name]} '
                               'polling cycles; check its power supply')
             return []
-        self._silent[name] = 0
+        self._n_silent[name] = 0
         return [Arrival(conversion.middle_ns, Reading(name, conversion.field))]
 
     def _fail(self, bus: Bus, name: str, error: OSError) -> None:
         """Count a failure; mark the device as lost after too many consecutive failures."""
         bus.forget()
         self._count('failed readings', name)
-        self._failed[name] += 1
-        if self._failed[name] >= self._settings.max_failures:
-            self._lost = (f'{self._name}: {name} failed {self._failed[name]} times in a row: '
+        self._n_failed[name] += 1
+        if self._n_failed[name] >= self._settings.max_failures:
+            self._loss = (f'{self._name}: {name} failed {self._n_failed[name]} times in a row: '
                           f'{self._fault(error)}')
 
     def _release(self) -> None:
         """Close the bus if it is open."""
-        self._lost = ''
+        self._loss = ''
         if self._bus is not None:
             self._bus.smbus.close()
             self._bus = None

@@ -36,7 +36,7 @@ CLOSE_WAIT_S = 0.1
 
 @dataclass(frozen=True)
 class MqttSettings:
-    """Settings of the subscriptions at an MQTT broker."""
+    """Settings of the subscriptions to topics of an MQTT broker."""
 
     host: str = param('localhost', 'Host name or address of the broker.')
     port: int = param(1883, 'Port of the broker, usually 8883 with TLS.', '', (1, 65535))
@@ -113,8 +113,8 @@ class MqttTopics:
         self._queue: deque[Chunk] = deque()
         self._pending_counts: Counter[str] = Counter()
         self._thread: threading.Thread | None = None
-        self._ready = self._closing = False
-        self._lost = f'{self._name}: not open'
+        self._is_ready = self._closing = False
+        self._loss = f'{self._name}: not open'
 
     @property
     def settings(self) -> MqttSettings:
@@ -133,18 +133,18 @@ class MqttTopics:
         client = self._client()
         with self._changed:
             self._count()
-            self._ready = self._closing = False
+            self._is_ready = self._closing = False
         self._connect(client)
         with self._changed:
             # A `close` during the connection has priority.
-            self._lost = self._lost if self._closing else ''
+            self._loss = self._loss if self._closing else ''
         self._thread = threading.Thread(target=self._run, args=(client,), daemon=True,
                                         name=f'mqtt {self._settings.host}')
         self._thread.start()
         with self._changed:
-            answered = self._changed.wait_for(lambda: self._ready or self._lost,
+            answered = self._changed.wait_for(lambda: self._is_ready or self._loss,
                                            self._settings.connect_timeout_s)
-            lost = self._lost
+            lost = self._loss
         if not answered or lost:
             self.close()
             raise DeviceError(lost or f'{self._name}: no answer within '
@@ -196,7 +196,7 @@ class MqttTopics:
         return password
 
     def _connect(self, client: paho.Client) -> None:
-        """Connect, with a TLS handshake if configured; raises DeviceError."""
+        """Connect the client, with a TLS handshake if configured; raises DeviceError."""
         s = self._settings
         try:
             client.connect(s.host, s.port, s.keepalive_s)
@@ -219,13 +219,14 @@ class MqttTopics:
         # Any error ends the thread and the connection, and must be reported to the reader.
         except Exception as error:
             reason = f'{type(error).__name__}: {error}'
-        self._set_lost(reason if self._ready else f'{reason} Check that it is an MQTT broker and '
-                       f'that it expects tls: {str(self._settings.tls).lower()}')
+        self._set_lost(reason if self._is_ready else
+                       f'{reason} Check that it is an MQTT broker and that it expects tls: '
+                       f'{str(self._settings.tls).lower()}')
 
     def _set_lost(self, reason: str) -> None:
         """Mark the connection as lost and store the first reason."""
         with self._changed:
-            self._lost = self._lost or f'{self._name}: {reason}'
+            self._loss = self._loss or f'{self._name}: {reason}'
             self._changed.notify_all()
 
     def _on_connect(self, client: paho.Client, _: Any, flags: paho.ConnectFlags,
@@ -248,7 +249,7 @@ class MqttTopics:
             self._set_lost(f'subscription refused: {", ".join(refused)}')
             return
         with self._changed:
-            self._ready = True
+            self._is_ready = True
             self._changed.notify_all()
 
     def _on_message(self, client: paho.Client, _: Any, message: paho.MQTTMessage) -> None:
@@ -286,7 +287,7 @@ class MqttTopics:
             self._set_lost(f'no answer for {2 * self._settings.keepalive_s} s')
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """Return the queued messages, or wait for the first one.
+        """Return the queued messages; wait only if the queue is empty.
 
         Parameters
         ----------
@@ -304,15 +305,15 @@ class MqttTopics:
             If the connection is lost and all messages have been returned.
         """
         with self._changed:
-            if self._lost and not self._queue:
-                raise DeviceError(self._lost)
-            self._changed.wait_for(lambda: self._queue or self._lost, timeout_s)
+            if self._loss and not self._queue:
+                raise DeviceError(self._loss)
+            self._changed.wait_for(lambda: self._queue or self._loss, timeout_s)
             chunks = list(self._queue)
             self._queue.clear()
             # Only the reader's thread changes `counts`, which it may be iterating over.
             self._count()
-            if not chunks and self._lost and not self._closing:
-                raise DeviceError(self._lost)
+            if not chunks and self._loss and not self._closing:
+                raise DeviceError(self._loss)
             return chunks
 
     def _count(self) -> None:
@@ -324,7 +325,7 @@ class MqttTopics:
         """Disconnect and end the thread; a `read` in another thread returns."""
         with self._changed:
             self._closing = True
-            self._lost = f'{self._name}: not open'
+            self._loss = f'{self._name}: not open'
         # The end of the thread wakes a waiting reader.
         if self._thread is not None:
             self._thread.join()

@@ -121,7 +121,7 @@ class SerialPort(Polled[serial.Serial]):
         return f'cannot be opened at {self._settings.baud} bit/s: {error}'
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """Return the available bytes, or wait for the first ones.
+        """Return the available bytes; wait only if no byte is available.
 
         Parameters
         ----------

@@ -188,7 +188,7 @@ class UdpSocket(Polled[socket.socket]):
         return f'cannot be opened: {error.strerror}'
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """Return the available datagrams, or wait for the first one.
+        """Return the available datagrams; wait only if no datagram is available.
 
         Parameters
         ----------

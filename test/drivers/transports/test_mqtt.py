@@ -130,7 +130,7 @@ def test_read_returns_at_a_message_or_at_its_timeout(broker, topics):
     chunk, = mqtt.read(5.0)
     assert 0.15 < time.monotonic() - start < 2.0
     timer.join()
-    # The arrival time is that of reception, not of reading.
+    # The chunk contains the time of reception, not the time of the read.
     send(broker.port, [('mag/a', b'y')])
     time.sleep(0.2)
     chunk, = mqtt.read(0.0)

@@ -49,7 +49,7 @@ class Device:
                 os.close(end)
 
     def wait_for(self, n):
-        """Wait until the port holds `n` bytes."""
+        """Wait until `n` bytes are available at the port."""
         end = time.monotonic() + 5.0
         while time.monotonic() < end:
             if struct.unpack('i', fcntl.ioctl(self.slave, termios.FIONREAD, bytes(4)))[0] == n:
@@ -298,7 +298,7 @@ def test_an_unsupported_baud_rate_is_reported(device, monkeypatch):
 
 
 def test_line_errors_are_counted_from_opening_on(device, monkeypatch):
-    """The kernel counts from the boot of the machine, and its counters overflow."""
+    """The counters of the kernel start at boot, and overflow."""
     real, counters = serial_port.fcntl.ioctl, [7] * 20
 
     def ioctl(fd, request, *args):

@@ -114,7 +114,7 @@ def test_one_read_returns_a_limited_number_of_datagrams(listen, sender, monkeypa
 
 
 def wait_for_kernel_timestamps(udp, sender):
-    """Wait until the kernel timestamps datagrams at reception instead of at reading."""
+    """Wait until the kernel timestamps datagrams at their arrival."""
     end = time.monotonic() + 5.0
     while time.monotonic() < end:
         sender(udp, b'x')
