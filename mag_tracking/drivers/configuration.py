@@ -16,9 +16,10 @@ settings of a kind are listed under its own name, and the settings of a custom c
 `transport_settings`, `framing_settings` or `device_settings`.
 """
 
+import dataclasses
 import importlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from os import PathLike
 from typing import Any, TypeVar
 
@@ -49,6 +50,8 @@ KINDS = {
 METHODS = {'transport': ('open', 'read', 'close'), 'framing': ('parse',),
            'device': ('open', 'read', 'close')}
 """Methods required of a transport, framing and device."""
+_ENTRY_KEYS = frozenset(('clock', 'sensor', 'sensors', *KINDS))
+"""Keys of a device besides the driver settings and the groups of its kinds."""
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')
 Settings = TypeVar('Settings', ClockSettings, DriverSettings)
 
@@ -76,6 +79,7 @@ def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None
     if not isinstance(content, Mapping) or not content:
         raise SettingsError(f'{path}: expected a mapping of devices, got {shown(content)}')
     try:
+        _check_devices(content)
         drivers = [driver_of(name, entry) for name, entry in content.items()]
         _check_sensors(drivers, network)
     except SettingsError as error:
@@ -144,7 +148,9 @@ def driver_of(name: object, entry: object) -> Driver:
         raise SettingsError(f'{shown(name)} is not a device name: it is not valid Unicode')
     options = dict(entry)
     try:
-        device = _device(options)
+        kinds = [kind for role in KINDS if isinstance(kind := options.get(role), str)]
+        _check_places(options, {*_ENTRY_KEYS, *_names(DriverSettings())}, kinds)
+        device = _device(options, kinds)
         clock = replace(_class_defaults(ClockSettings(), device, 'CLOCK'),
                         _pop_group(options, 'clock'))
         sensors = _pop_sensors(options)
@@ -162,27 +168,33 @@ def _class_defaults(settings: Settings, device: Device, name: str) -> Settings:
     return replace(settings, getattr(device, name, {}))
 
 
-def _device(options: dict[str, Any]) -> Device:
+def _device(options: dict[str, Any], kinds: Collection[str]) -> Device:
     """Create the device of an entry; remove its settings from `options`."""
     if 'device' in options:
         if 'transport' in options or 'framing' in options:
             raise SettingsError('device cannot be combined with transport and framing; remove '
                                 'either device or the other two')
-        device: Device = _create_part('device', options)
+        device: Device = _create_part('device', options, kinds)
         return device
     for role in ('transport', 'framing'):
         if role not in options:
             raise SettingsError(f'{role} is missing (one of {", ".join(KINDS[role])}), or set '
                                 f'device instead (one of {", ".join(KINDS["device"])})')
-    return FramedDevice(_create_part('transport', options), _create_part('framing', options))
+    return FramedDevice(_create_part('transport', options, kinds),
+                        _create_part('framing', options, kinds))
 
 
-def _create_part(role: str, options: dict[str, Any]) -> Any:
+def _create_part(role: str, options: dict[str, Any], kinds: Collection[str]) -> Any:
     """Create the transport, framing or device of an entry; remove its settings from `options`."""
     kind = options.pop(role)
     cls = load_class(role, kind)
     group = kind if kind in KINDS[role] else f'{role}_settings'
-    return cls(replace(cls.SETTINGS(), _pop_group(options, group)))
+    defaults, changes = cls.SETTINGS(), _pop_group(options, group)
+    try:
+        _check_places(changes, _names(defaults), kinds)
+    except SettingsError as error:
+        raise SettingsError(f'{group}: {error}') from error
+    return cls(replace(defaults, changes))
 
 
 def _pop_group(options: dict[str, Any], name: str) -> Mapping[str, Any]:
@@ -233,6 +245,55 @@ def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> 
             if network is not None and sensor not in network.names:
                 raise SettingsError(f'{driver.name}: sensor {sensor} is not in the network, whose '
                                     f'sensors are {", ".join(network.names)}')
+
+
+def _names(settings: Any) -> set[str]:
+    """Names of the settings and groups of a settings dataclass."""
+    return {field.name for field in dataclasses.fields(settings)}
+
+
+def _groups_of(name: object) -> list[str]:
+    """Groups of a device that have the setting `name`; '' = the top level of the device."""
+    if name in _ENTRY_KEYS:
+        return ['']
+    return [group for group, settings in settings_by_kind().items() if name in _names(settings)]
+
+
+def _any_of(groups: Collection[str]) -> str:
+    """List of groups for a message: 'serial, udp or mqtt'."""
+    *others, last = groups
+    return f'{", ".join(others)} or {last}' if others else last
+
+
+def _check_places(names: Iterable[object], permitted: Collection[str],
+                  kinds: Collection[str]) -> None:
+    """Raise SettingsError if a name that is not permitted belongs to another group of a device."""
+    for name in names:
+        groups = [] if name in permitted else _groups_of(name)
+        if '' in groups:
+            raise SettingsError(f'{name} is misplaced; move it to the top level of the device')
+        used = [group for group in groups if group in (*kinds, 'clock')]
+        if used:
+            raise SettingsError(f'{name} is misplaced; move it to {_any_of(used)}, as in '
+                                f'{used[0]}: {{{name}: ...}}')
+        if groups:
+            raise SettingsError(f'{name} is misplaced; it is a setting of {_any_of(groups)}, but '
+                                f'the device uses {" and ".join(kinds) or "no transport"}')
+
+
+def _check_devices(content: Mapping[object, object]) -> None:
+    """Raise SettingsError if the top level of a file contains settings of a device."""
+    for name, entry in content.items():
+        if isinstance(entry, Mapping):
+            # A device may have the name of a group.
+            is_setting = not any(role in entry for role in KINDS) and name in settings_by_kind()
+            groups = [''] if is_setting else []
+        else:
+            groups = _groups_of(name)
+        if groups:
+            place = '' if '' in groups else f', under {_any_of(groups)}'
+            raise SettingsError(f'{name} is misplaced; the top level of the file contains devices. '
+                                f'Move {name} into a device{place}')
 
 
 def settings_by_kind() -> dict[str, Any]:

@@ -100,6 +100,37 @@ def test_invalid_files_are_refused(tmp_path, content, message):
     assert message in str(error.value) and 'drivers.yaml' in str(error.value)
 
 
+SERIAL = {'port': '/dev/ttyUSB0'}
+
+
+@pytest.mark.parametrize('content, message', [
+    ({'port': '/dev/ttyUSB0', 'board': without(serial={})}, ': port is misplaced; the top level of '
+     'the file contains devices. Move port into a device, under serial, udp or mqtt'),
+    ({'board': without('serial'), 'serial': SERIAL}, ': serial is misplaced; the top level of the '
+     'file contains devices. Move serial into a device'),
+    ({'transport': 'serial'}, ': transport is misplaced; the top level of the file contains '
+     'devices. Move transport into a device'),
+    (without('serial', port='/dev/ttyUSB0'),
+     'board: port is misplaced; move it to serial, as in serial: {port: ...}'),
+    (without(text={**BOARD['text'], **SERIAL}),
+     'board: text: port is misplaced; move it to serial, as in serial: {port: ...}'),
+    (without(serial={**SERIAL, 'unit': 'nT'}),
+     'board: serial: unit is misplaced; move it to the top level of the device'),
+    (without(tick_s=1e-3), 'board: tick_s is misplaced; move it to clock, as in clock: {tick_s: '),
+    ({'pi': {'device': 'i2c', 'i2c': {'sensors': ['A:lis3mdl:0x1c'], 'port': 1}, 'sensor': 'a'}},
+     'pi: i2c: port is misplaced; it is a setting of serial, udp or mqtt, but the device uses i2c'),
+    (without('transport', 'serial', 'framing', 'text', **SERIAL), 'board: port is misplaced; it is '
+     'a setting of serial, udp or mqtt, but the device uses no transport')])
+def test_a_misplaced_setting_is_refused_with_its_place(tmp_path, content, message):
+    with pytest.raises(SettingsError) as error:
+        read(tmp_path, content)
+    assert message in str(error.value)
+
+
+def test_a_device_may_have_the_name_of_a_group(tmp_path):
+    assert [d.name for d in read(tmp_path, {'serial': BOARD})] == ['serial']
+
+
 def test_a_sensor_that_is_not_in_the_network_is_refused(tmp_path):
     network = read_network(NETWORK_FILE)
     assert read(tmp_path, BOARD and {'board': BOARD}, network)
