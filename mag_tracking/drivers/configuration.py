@@ -227,7 +227,9 @@ def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
                                 f'/), or - to ignore the sensor, got {shown(value)}')
     out = {str(key): value for key, value in sensors.items()}
     if len(out) < len(sensors):
-        raise SettingsError('sensors: the same name at the device appears twice')
+        names = [str(key) for key in sensors]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise SettingsError(f'sensors: the name {twice} at the device appears twice; remove one')
     return out
 
 

@@ -306,9 +306,10 @@ class I2cDevice(Closable):
         bus.forget()
         self._count('failed readings', name)
         self._n_failed[name] += 1
-        if self._n_failed[name] >= self._settings.max_failures:
-            self._loss = (f'{self._name}: {name} failed {self._n_failed[name]} times in a row: '
-                          f'{self._fault(error)}')
+        n = self._n_failed[name]
+        if n >= self._settings.max_failures:
+            cycles = '1 polling cycle' if n == 1 else f'{n} consecutive polling cycles'
+            self._loss = f'{self._name}: {name} failed in {cycles}: {self._fault(error)}'
 
     def _release(self) -> None:
         """Close the bus if it is open."""

@@ -80,7 +80,7 @@ def test_failed_readings_are_counted_and_finally_raise(clock):
     fake.answers = True
     assert device.read(1.0)
     fake.answers = False
-    with pytest.raises(DeviceError, match='A failed 3 times in a row: no answer'):
+    with pytest.raises(DeviceError, match='A failed in 3 consecutive polling cycles: no answer'):
         device.read(1.0)
 
 
@@ -131,7 +131,7 @@ def test_an_exception_in_a_driver_is_a_failure_and_releases_the_lock(module, err
     module.Sensor = type('Sensor', (FailingDriver,), {'error': error})
     _, _, device = custom_device('our_driver', FailingDriver, max_failures=2)
     device.open()
-    with pytest.raises(DeviceError, match='failed 2 times in a row: .*overflow'):
+    with pytest.raises(DeviceError, match='failed in 2 consecutive polling cycles: .*overflow'):
         device.read(1.0)
 
 
