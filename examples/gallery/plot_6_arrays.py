@@ -2,7 +2,7 @@
 Arrays instead of a recording
 =============================
 
-How to work in a notebook: read a recording as arrays, track your own arrays without a bag, and get
+A workflow for notebooks: read a recording as arrays, track your own arrays without a bag, and get
 the results as DataFrames and figures.
 """
 

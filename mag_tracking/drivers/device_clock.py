@@ -216,7 +216,8 @@ class DeviceClock:
         Returns
         -------
         int or None, ns
-            Not later than `arrival_ns` minus the minimum delay. None = unknown, and counted.
+            Not later than `arrival_ns` minus the minimum delay. None if the time is unknown, the
+            cause of which is counted.
         """
         if ticks is None:
             self.counts[NO_TICKS] += 1

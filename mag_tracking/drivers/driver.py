@@ -214,7 +214,7 @@ class Driver:
     def close(self) -> None:
         """Close the device; the next `poll` opens it again.
 
-        Readings that the device measures until then are not counted as lost.
+        Readings that the device measures while it is closed are not counted as lost.
         """
         for check in self._sequences.values():
             check.pause()

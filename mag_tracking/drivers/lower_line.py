@@ -24,7 +24,7 @@ def lower_hull(points: Sequence[Point]) -> list[Point]:
     Returns
     -------
     list of Point
-        From left to right.
+        Vertices in ascending order of x.
     """
     hull: list[Point] = []
     for x, y in points:

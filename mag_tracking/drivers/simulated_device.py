@@ -55,7 +55,7 @@ class SimulatorSettings:
 
 
 class SimulatedDevice:
-    """All sensors of a network as one device, with the field in tesla. Implements `reading.Device`.
+    """Simulates all sensors of a network; readings are in tesla. Implements `reading.Device`.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class SimulatedDevice:
     Attributes
     ----------
     counts : Counter
-        Number of lost readings.
+        Number of readings that were dropped because they were not read in time.
 
     Raises
     ------

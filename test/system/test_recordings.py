@@ -164,7 +164,7 @@ def test_the_kind_of_vehicle_is_right(vehicle_replays, name):
 
 @pytest.mark.study
 def test_a_car_is_tracked_along_a_corridor(tmp_path):
-    """An accelerating car at eight sensors along 42 m has a single track."""
+    """A car that accelerates past eight sensors along 42 m has a single track."""
     folder = DATA / 'corridor'
     network = read_network(folder / 'network.yaml')
     run = replay(Recording(folder / 'corridor_8_sensors.mcap'), network, settings_for('vehicle'),

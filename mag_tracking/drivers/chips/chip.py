@@ -177,11 +177,14 @@ class Registers:
     ----------
     bus : Bus
     place : Place
+        Location of the chip.
 
     Attributes
     ----------
     monotonic_ns : callable
+        Monotonic clock of the bus.
     sleep : callable
+        Function that waits for a time in seconds.
     """
 
     def __init__(self, bus: Bus, place: Place) -> None:

@@ -83,7 +83,7 @@ class JsonFraming:
         self._layout = FieldLayout(names)
 
     def _axis_paths(self, name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
-        """Paths of the three axes of a quantity; the path of a list is expanded and stored."""
+        """Return the paths of three axes; the path of a list is stored and expanded."""
         if len(paths) == 1 and paths[0]:
             self._lists.append((paths[0], _split_path(name, paths[0])))
             return tuple(f'{paths[0]}.{i}' for i in range(3))

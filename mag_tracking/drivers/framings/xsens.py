@@ -12,11 +12,14 @@ therefore applied:
 - A message that contains the start of a valid data message is rejected: it is garbage, or it has
   lost bytes and includes bytes of the next message.
 
-A false message that begins before a true data message does not hide it, with two exceptions. The
-first is a false data message if both messages together are longer than the longest frame. The
-second is a data message that has lost a single byte and becomes valid with the preamble of the next
-message. A false message that overlaps no true message may be accepted. After a
-rejected message, the search continues at the byte after its preamble.
+A false message that begins before a true data message hides it only in two cases:
+
+- The false message is a data message, and both messages together are longer than the longest frame.
+- The false message is a data message that has lost one byte, and the preamble of the next message
+  completes it to a valid message.
+
+A false message that overlaps no true message may be accepted. After a rejected message, the search
+continues at the byte after its preamble.
 
 Sources: Xsens, "MT Low Level Communication Protocol Documentation", MT0101P, revision 2019.A:
 message structure and message listing; Xsens, "MTi User Manual", MT0605P, section 5.3.2:

@@ -88,7 +88,7 @@ class I2cDevice(Closable):
     ----------
     settings : I2cSettings
     open_bus : callable, optional
-        Function from the number of a bus to an `smbus2.SMBus` or equivalent.
+        Function that opens the bus with a given number as an `smbus2.SMBus` or equivalent.
     monotonic_ns : callable, optional
         Monotonic clock; tests replace it.
     sleep : callable, optional

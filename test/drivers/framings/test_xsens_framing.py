@@ -1,4 +1,4 @@
-"""Framing of the Xsens protocol: properties of every framing, and false messages."""
+"""Framing of the Xsens protocol: general properties of framings, and false messages."""
 
 import random
 import time
