@@ -18,7 +18,7 @@ COMMENT = ' Written by tools/generate_policies.py; do not edit. How to use it: d
 RECORDING = ROOT / 'test' / 'data' / 'vehicles' / 'straight_car_right.mcap'
 
 
-def create_nodes(folder, namespace):
+def nodes(folder, namespace):
     """Create the nodes, one after the other, in this process."""
     from rclpy.parameter import Parameter
 
@@ -66,7 +66,7 @@ def policies(namespace='/'):
     enclaves = ElementTree.SubElement(root, 'enclaves')
     with tempfile.TemporaryDirectory() as folder:
         os.environ['ROS_HOME'] = folder
-        for node in create_nodes(Path(folder), namespace):
+        for node in nodes(Path(folder), namespace):
             name = node.get_name()
             enclave = ElementTree.SubElement(enclaves, 'enclave', {'path': f'/mag_tracking/{name}'})
             profile = ElementTree.SubElement(
