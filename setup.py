@@ -12,14 +12,14 @@ NODES = ('driver_node', 'replay_node', 'calibration_node', 'detection_node', 'tr
 
 class DataFilesDistribution(Distribution):
     """Workaround: `pip install -e` omits data_files, because setuptools queries the undefined
-    `has_data`. Remove it once an editable install contains share/mag_tracking/package.xml without.
+    `has_data`. Remove it when editable installs contain share/mag_tracking/package.xml without it.
     """
 
     def has_data(self):
         return self.has_data_files()
 
-# Code that runs for every reading and every frame. A wheel may run on other machines, so it is not
-# compiled for this processor; modules select faster versions at run time where that matters.
+# Compiled code runs for every reading and every frame. Wheels may run on other machines, so the
+# code is not optimised for this processor; some modules select faster versions at run time.
 CORES = [
     Pybind11Extension(
         source.removesuffix('.cpp').replace('/', '.'), [source], cxx_std=17,
@@ -48,8 +48,8 @@ setup(
         (f'share/{NAME}/config/security', sorted(glob('config/security/*.xml'))),
         (f'share/{NAME}/config/viewers', sorted(glob('config/viewers/*'))),
     ],
-    # ROS and mag_tracking_msgs are not listed: users of ROS from apt have them already, and pip
-    # would search mag-tracking-msgs on PyPI, where it does not exist.
+    # ROS and mag_tracking_msgs are not listed: they may be installed from apt, and pip would look
+    # for mag-tracking-msgs on PyPI, where it does not exist.
     install_requires=[
         'matplotlib',
         'mcap',

@@ -2,7 +2,7 @@
 
 A car turns at a junction between two magnetometers. The replay node publishes the recording;
 calibration, detection and tracker nodes process it. This program subscribes to their topics, prints
-the track while it grows, and draws it.
+the poses as they arrive, and draws the track.
 """
 
 import argparse
@@ -41,32 +41,35 @@ RECORDING = ROOT / 'test' / 'data' / 'vehicles' / 'junction_left_turns_to_rear.m
 
 
 class Spectator(Node):
-    """Subscribes to the published topics, like any other ROS program."""
+    """Node that records the published topics, as any other ROS program could."""
 
     def __init__(self, network):
         super().__init__('spectator')
         self.network = network
         self.logs, self.truth, self.smoothed = {}, [], {}
         self._frames, self._hypotheses = {}, {}
-        self.create_subscription(NetworkFrame, '/network_frame', self._frame, STREAM)
-        self.create_subscription(HypothesisArray, '/tracker_node/hypotheses', self._bank, STREAM)
-        self.create_subscription(TrackArray, '/tracker_node/tracks', self._track, STREAM)
-        self.create_subscription(SmoothedTrack, '/tracker_node/smoothed', self._whole, RESULTS)
-        self.create_subscription(PoseStamped, '/ground_truth/vehicle_00/pose', self._true, STREAM)
+        self.create_subscription(NetworkFrame, '/network_frame', self._on_frame, STREAM)
+        self.create_subscription(HypothesisArray, '/tracker_node/hypotheses', self._on_hypotheses,
+                                 STREAM)
+        self.create_subscription(TrackArray, '/tracker_node/tracks', self._on_tracks, STREAM)
+        self.create_subscription(SmoothedTrack, '/tracker_node/smoothed', self._on_smoothed,
+                                 RESULTS)
+        self.create_subscription(PoseStamped, '/ground_truth/vehicle_00/pose', self._on_truth,
+                                 STREAM)
 
-    def _frame(self, message):
+    def _on_frame(self, message):
         frame = frame_of(message, self.network)
         self._frames[frame.stamp_ns] = frame
 
-    def _bank(self, message):
+    def _on_hypotheses(self, message):
         self._hypotheses[stamp_ns(message.header.stamp)] = message
 
-    def _whole(self, message):
+    def _on_smoothed(self, message):
         """Store the smoothed path of a track that has ended."""
         positions = [p.pose.pose.position for p in message.poses]
         self.smoothed[message.track_id] = np.array([[p.x, p.y, p.z] for p in positions])
 
-    def _true(self, message):
+    def _on_truth(self, message):
         p, q = message.pose.position, message.pose.orientation
         self.truth.append((stamp_ns(message.header.stamp), p.x, p.y, p.z, q.x, q.y, q.z, q.w))
 
@@ -76,7 +79,7 @@ class Spectator(Node):
         return (np.array([r[0] for r in rows], dtype=np.int64), np.array([r[1:4] for r in rows]),
                 np.array([r[4:] for r in rows]))
 
-    def _track(self, message):
+    def _on_tracks(self, message):
         for m in message.tracks:
             track = track_of(m)
             if track.ended:
@@ -157,7 +160,7 @@ def main(argv=None):
                  observers=[spectator])
     paths = draw(spectators[0], args.out)
     if not paths:
-        print('no track was received', file=sys.stderr)
+        print('no track was received; see the output of the nodes above', file=sys.stderr)
         return 1
     print('pictures:', *paths, sep='\n  ')
     print(f'report for the browser: {write_page(spectators[0], args.out)}')

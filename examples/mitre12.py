@@ -3,8 +3,8 @@
 MITRE12 is Slater & Jacyna, Evaluating Detection and Estimation Capabilities of Magnetometer-Based
 Vehicle Sensors, 2012. The figures use the parameters of its tables and its equations, corrected as
 described in `physics.ellipsoid` and `inference.matched_filter`. The paper leaves the following
-points open. The first two are chosen because they reproduce the numbers of Figures 2 to 4, which
-the alternatives printed by this program do not:
+points open. The first two choices reproduce the numbers of Figures 2 to 4, unlike the alternatives
+printed by this program:
 
 - The road leads north. x is along the road and y across it, to the left, as (0, 25) is the closest
 point of approach (CPA) in Figure 6; M1 is the moment along the road.
@@ -66,7 +66,7 @@ PRIOR_STD = np.array([30.0, 5.0, 10.0 * MPH, np.radians(15.0), 100.0, 100.0])
 PRIOR = np.diag(PRIOR_STD**-2)
 Y0_KNOWN = np.diag([0.0, np.inf, 0.0, 0.0, 0.0, 0.0])
 FIRST_FOUR = np.diag(np.where(np.arange(6) < 4, PRIOR_STD**-2, 0.0))
-"""Prior for the product in (26) up to four, as printed: without M1 and M2."""
+"""Prior if the product in (26) ends at four, as printed: without M1 and M2."""
 BOUND_CPA = 25.0
 ALONG = -np.pi / 2
 AS_PUBLISHED = SAMPLING_RATE / N_SAMPLES
@@ -76,7 +76,7 @@ CHOSEN = 'road to the north, DFT divided by N'
 
 
 def moment(vehicle, azimuth=0.0):
-    """Induced moment (3,) [A m²] along the road, to its left, up; `azimuth` [rad] from north."""
+    """Induced moment (3,) [A m²]: along the road, left, up; `azimuth` of the road [rad]."""
     dip, declination = np.radians(59.0), np.radians(-11.0)
     field = 57e-6 * np.array([np.cos(declination - azimuth) * np.cos(dip),
                               -np.sin(declination - azimuth) * np.cos(dip), -np.sin(dip)])
@@ -84,11 +84,10 @@ def moment(vehicle, azimuth=0.0):
 
 
 def places(x0, y0, v, theta):
-    """Position of the source relative to the sensor at the samples of a period, (..., 11, 3) m;
-    (7), (8).
+    """Positions of the source relative to the sensor during a period, (..., 11, 3) m; (7), (8).
     """
     t = np.arange(N_SAMPLES) / SAMPLING_RATE
-    x, y = (np.asarray(start)[..., None] + v * t * way for start, way in
+    x, y = (np.asarray(start)[..., None] + v * t * direction for start, direction in
             ((x0, -np.sin(theta)), (y0, np.cos(theta))))
     x, y = np.broadcast_arrays(x, y)
     return np.stack([x, y, np.zeros_like(x)], axis=-1)
@@ -107,31 +106,31 @@ def detection(m, cpa, starts, sensors, scale=AS_PUBLISHED):
 
 
 def at_least_once(m, cpa, sensors=ONE, phase=0.0, scale=AS_PUBLISHED):
-    """Probability (6) of a detection in a whole drive; `phase` shifts the periods, in periods."""
+    """Probability (6) of a detection in a whole drive; `phase` shifts the start, in periods."""
     starts = SPEED * PERIOD * (np.arange(-20, 20) + phase)
     return any_detection_probability(detection(m, cpa, starts, sensors, scale))
 
 
 def most_in_a_period(m, cpa, sensors=ONE, scale=AS_PUBLISHED):
-    """Maximum detection probability (5) of one period over its start position."""
+    """Maximum detection probability (5) of one period over all start positions."""
     starts = np.linspace(-60.0, 60.0, 961)
     return any_detection_probability(detection(m, cpa, starts, sensors, scale), axis=-1).max()
 
 
-def cpa_where(probability, wanted):
-    """CPA [m] at which a decreasing function `probability(cpa)` equals `wanted`."""
-    return brentq(lambda cpa: probability(cpa) - wanted, 2.0, 90.0, xtol=1e-6)
+def cpa_where(probability, target):
+    """CPA [m] at which a decreasing function `probability(cpa)` equals `target`."""
+    return brentq(lambda cpa: probability(cpa) - target, 2.0, 90.0, xtol=1e-6)
 
 
 def noise_std():
-    """Noise standard deviation of a sample [T]: S_n + S_s over the band, both signs of frequency.
+    """Noise standard deviation of a sample [T]: S_n + S_s over the two-sided band.
     """
     return np.sqrt(2.0 * quad(lambda f: noise_spectrum(f, BACKGROUND, RESOLUTION, BAND[1]),
                               *BAND, epsabs=0.0)[0])
 
 
 def jacobian(z):
-    """Jacobian (11, 2, 6) of both axes by z = (x0, y0, v, theta, M1, M2); chain rule on (7), (8).
+    """Jacobian (11, 2, 6) of the field with respect to z = (x0, y0, v, theta, M1, M2), by (7), (8).
     """
     x0, y0, v, theta, m1, m2 = z
     dB_dr, dB_dm = dipole_jacobians(-places(x0, y0, v, theta), np.array([m1, m2, 0.0]))
@@ -144,12 +143,12 @@ def jacobian(z):
 
 
 def measured(x0, v=SPEED, vehicle='car'):
-    """Information (6, 6) of one period about z; (18)."""
+    """Information matrix (6, 6) of one period about z; (18)."""
     z = [x0, BOUND_CPA, v, ALONG, *moment(vehicle)[:2]]
     return information(jacobian(z), noise_std()**2 * np.eye(2))
 
 
-def deviations(information_matrix, prior=None):
+def std_bounds(information_matrix, prior=None):
     """Bounds on the standard deviations (6,) in the units of `STATES`; (18), (28)."""
     return np.sqrt(np.diag(bound(information_matrix, prior))) * [scale for *_, scale in STATES]
 
@@ -173,12 +172,12 @@ def pass_figure(sensors, title):
 
 
 def figure_2():
-    """Figure 2: one sensor."""
+    """Figure 2: detection probability of one sensor."""
     return pass_figure(ONE, 'MITRE12 Figure 2: one sensor, 25 mph, periods of 0.5 s')
 
 
 def figure_3():
-    """Figure 3: five sensors."""
+    """Figure 3: probability that at least one of five sensors detects the vehicle."""
     return pass_figure(FIVE, 'MITRE12 Figure 3: at least one of five sensors, 20 m apart, 25 mph')
 
 
@@ -201,21 +200,21 @@ def figure_4():
     return figure
 
 
-def phi_deviation(C, x0, sign):
-    """Bound on phi [deg] by (19) from that on z; (20) prints x/r^2 with `sign` -1."""
+def phi_std_bound(C, x0, sign):
+    """Bound on phi [deg] by (19) from the bound `C` on z; `sign` of x/r^2, which is -1 in (20)."""
     row = np.array([-BOUND_CPA, sign * x0]) / (x0**2 + BOUND_CPA**2)
     return np.degrees(np.sqrt(row @ C[:2, :2] @ row))
 
 
 def draw_bounds(axes, at, matrices, prior):
-    """Draw the six bounds against `at`; those infinite without a prior are dashed, for known y0."""
-    given = np.array([deviations(J, prior) for J in matrices])
-    helped = np.array([deviations(J, Y0_KNOWN) for J in matrices])
+    """Draw the six bounds against `at`; infinite bounds are drawn dashed, for known y0."""
+    bounds = np.array([std_bounds(J, prior) for J in matrices])
+    bounds_known_y0 = np.array([std_bounds(J, Y0_KNOWN) for J in matrices])
     for i, (name, unit, scale) in enumerate(STATES):
-        lost = np.isinf(given[:, i]).mean() > 0.5
-        values = (helped if lost else given)[:, i]
-        axes.semilogy(at, np.where(values > 0.0, values, np.nan), f'C{i}--' if lost else f'C{i}-',
-                      label=f'{name} [{unit}]')
+        infinite = np.isinf(bounds[:, i]).mean() > 0.5
+        values = (bounds_known_y0 if infinite else bounds)[:, i]
+        axes.semilogy(at, np.where(values > 0.0, values, np.nan),
+                      f'C{i}--' if infinite else f'C{i}-', label=f'{name} [{unit}]')
         if prior is not None:
             axes.axhline(PRIOR_STD[i] * scale, color=f'C{i}', lw=0.8, ls=':')
     axes.grid(alpha=0.3)
@@ -225,7 +224,7 @@ def draw_bounds(axes, at, matrices, prior):
 
 
 def bounds_figure(rows, xlabel, title):
-    """Panels without and with prior, one row for each (name, at, matrices)."""
+    """Panels without and with prior, one row of panels for each (name, at, matrices)."""
     figure = Figure(figsize=(10.5, 0.8 + 4.2 * len(rows)), layout='constrained')
     grid = figure.subplots(len(rows), 2, squeeze=False)
     for (left, right), (name, at, matrices) in zip(grid, rows, strict=True):
@@ -254,7 +253,7 @@ def figure_6():
 
 
 def compare_detection():
-    """Numbers of Figures 2 to 4, by name."""
+    """Compute the numbers of Figures 2 to 4, by name."""
     n = {}
     car, east = moment('car'), moment('car', np.pi / 2)
     for name, m, scale in (('', car, AS_PUBLISHED), (' physical', car, 1.0),
@@ -270,22 +269,22 @@ def compare_detection():
 
 
 def compare_bounds():
-    """Numbers of Figures 5 and 6, by name."""
+    """Compute the numbers of Figures 5 and 6, by name."""
     starts = np.linspace(-80.0, 80.0, 161)
-    alone, prior, four = (np.array([deviations(measured(x), p) for x in starts])
+    alone, prior, four = (np.array([std_bounds(measured(x), p) for x in starts])
                           for p in (None, PRIOR, FIRST_FOUR))
     seen = observability(measured(-20.0), [name for name, *_ in STATES], PRIOR_STD)
     n = {'lost': seen.unobservable, 'kernel': seen.kernel[:, 0] / seen.kernel[1, 0],
          'theta alone': alone[:, 3], 'with prior': prior, 'prior on four': four, 'starts': starts}
     for v in (0.0, 10.0, 25.0, 80.0):
         J = measured(0.0, v * MPH)
-        n[f'at {v:.0f} mph'] = tuple(deviations(J, p) for p in (None, PRIOR, FIRST_FOUR))
+        n[f'at {v:.0f} mph'] = tuple(std_bounds(J, p) for p in (None, PRIOR, FIRST_FOUR))
     C = bound(measured(-20.0), PRIOR)
-    return {**n, 'phi at -20 m': [phi_deviation(C, -20.0, sign) for sign in (-1.0, 1.0)]}
+    return {**n, 'phi at -20 m': [phi_std_bound(C, -20.0, sign) for sign in (-1.0, 1.0)]}
 
 
 def detection_report(n):
-    """Comparison of Figures 2 to 4 with the published ones, as text."""
+    """Report that compares Figures 2 to 4 with the published figures."""
     return f"""\
 Figures 2 and 4, one sensor; road to the north, DFT divided by N
   agrees   Car at CPA 30 m: maximum of one period {n['most']:.1%}, published 59.3 %; at least
@@ -307,7 +306,7 @@ Figures 3 and 4, five sensors
 
 
 def bounds_report(n):
-    """Comparison of Figures 5 and 6 with the published ones, as text."""
+    """Report that compares Figures 5 and 6 with the published figures."""
     starts, alone = n['starts'], n['theta alone']
     best = alone.argmin()
     before, after = n['with prior'][starts == -20.0][0], n['with prior'][starts == 20.0][0]
@@ -322,7 +321,8 @@ Figure 5, bounds along the road
            is not observable with one sensor (T10 (5.5)). At -20 m the unobservable direction is
            ({kernel}) = (x0, y0, v, 0, 3 M1, 3 M2)/y0.
            The published curves are finite, which a singular matrix does not allow.
-  agrees   With the prior, no bound exceeds it, and that of theta approaches 15 deg far away.
+  agrees   With the prior, no bound exceeds the prior, and the bound on theta approaches 15 deg
+           far away.
   differs  The bounds on the left and on the right are similar: 20 m before the sensor
            x0 {before[0]:.1f} m and theta {before[3]:.1f} deg, 20 m after it {after[0]:.1f} m and \
 {after[3]:.1f} deg.
@@ -330,12 +330,12 @@ Figure 5, bounds along the road
 Figure 6, bounds against speed
   agrees   Without a prior, theta has no bound at speed zero. With the prior, the bound on v grows
            with speed, from {still[1][2]:.1f} to {n['at 80 mph'][1][2]:.1f} mph at 80 mph.
-  differs  With the prior, the bound on theta at speed zero is that of the prior, \
+  differs  With the prior, the bound on theta at speed zero is the prior itself, \
 {still[1][3]:.0f} deg;
            published is a singularity. Without a prior, the bound on theta decreases with speed,
            because the sensor measures more of the signature:
            {thetas}. Published: it grows.
-Errors in print that were tested as the cause of these differences and excluded
+Misprints that were tested, and excluded, as the cause of these differences
   (20)     The sign of x/r^2 only changes the bound on phi: {phi:.1f} instead of {right:.1f} deg at
            -20 m, with the prior. The six parameters in the figures do not depend on (20).
   (26)     A product up to four leaves M1 and M2 without a prior: bounds up to {most[0]:.0f} and

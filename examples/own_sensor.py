@@ -1,4 +1,4 @@
-"""A driver for a sensor with its own protocol: the complete code of a custom framing.
+"""Driver for a sensor with its own protocol: complete code of a custom framing.
 
 The sensor sends packets delimited by bytes C0 (SLIP, RFC 1055): a counter, a time in microseconds,
 three 24-bit values in units of 10 nT, and the sum of all bytes as checksum. In a drivers file:
@@ -34,7 +34,7 @@ class SlipSettings:
 
 
 class SlipFraming:
-    """Finds packets in a byte stream. It holds settings but no state: see `Framing`."""
+    """Extracts readings from a byte stream. It has settings but no state; see `Framing`."""
 
     SETTINGS = SlipSettings
     # Defaults for every device of this kind; a drivers file may override them.
@@ -45,40 +45,40 @@ class SlipFraming:
         self._sensor = settings.sensor
 
     def parse(self, data, final=False):
-        """Parse all readings in `data`; an incomplete packet at the end is kept for the next call.
+        """Parse all readings in `data`; an incomplete packet at the end remains unconsumed.
         """
         *packets, rest = data.split(END)
         rejected, readings = Counter(), []
         for packet in packets:
             self._read(packet, readings, rejected)
-        # Longer than any packet, or nothing follows: it cannot become a packet.
+        # The remaining bytes cannot become a packet if they are too long, or if no bytes follow.
         if rest and (final or len(rest) > LONGEST):
             rejected['bytes between frames'] += len(rest)
             rest = b''
         return Parsed(tuple(readings), len(data) - len(rest), rejected)
 
     def _read(self, packet, readings, rejected):
-        """Add the reading of one packet, or count the reason of its rejection."""
-        plain = packet.replace(ESCAPE + b'\xdc', END).replace(ESCAPE + b'\xdd', ESCAPE)
-        if not plain:
+        """Add the reading of a packet, or count the rejected packet by cause."""
+        payload = packet.replace(ESCAPE + b'\xdc', END).replace(ESCAPE + b'\xdd', ESCAPE)
+        if not payload:
             return
-        if len(plain) != 16:
+        if len(payload) != 16:
             rejected['bytes between frames'] += len(packet)
-        elif sum(plain[:-1]) % 256 != plain[-1]:
+        elif sum(payload[:-1]) % 256 != payload[-1]:
             rejected['frames with a wrong checksum'] += 1
         else:
-            count, microseconds = struct.unpack_from('<HI', plain)
-            field = tuple(float(int.from_bytes(plain[k:k + 3], 'little', signed=True))
+            count, microseconds = struct.unpack_from('<HI', payload)
+            field = tuple(float(int.from_bytes(payload[k:k + 3], 'little', signed=True))
                           for k in (6, 9, 12))
             readings.append(Reading(self._sensor, field, None, microseconds, count))
 
 
 def packet_of(count, microseconds, field):
-    """Packet as sent by the sensor, for the demonstration."""
-    plain = struct.pack('<HI', count, microseconds) + b''.join(
+    """Encode a packet in the format of the sensor."""
+    payload = struct.pack('<HI', count, microseconds) + b''.join(
         v.to_bytes(3, 'little', signed=True) for v in field)
-    plain += bytes([sum(plain) % 256])
-    return plain.replace(ESCAPE, ESCAPE + b'\xdd').replace(END, ESCAPE + b'\xdc') + END
+    payload += bytes([sum(payload) % 256])
+    return payload.replace(ESCAPE, ESCAPE + b'\xdd').replace(END, ESCAPE + b'\xdc') + END
 
 
 def main():

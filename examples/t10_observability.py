@@ -55,7 +55,7 @@ def seen_by(sensors, m=M):
 
 
 def information_map():
-    """Information (n_y, n_x, 9, 9) of the first sensor and a second one at each grid point."""
+    """Information (n_y, n_x, 9, 9) of the first sensor and a second sensor at each grid point."""
     places = np.stack(np.broadcast_arrays(GRID, GRID[:, None], 0.0), axis=-1)
     return sensor_information(ONE[0]) + np.apply_along_axis(sensor_information, -1, places)
 
@@ -76,8 +76,8 @@ def about_cpa(J):
 
 
 def condition_maps():
-    """Condition numbers for three sets of states: eq. (5.1), position at the CPA, scaled by eq.
-    (5.11).
+    """Condition numbers for three state vectors: of eq. (5.1), with the position at the CPA, and
+    scaled by eq. (5.11).
     """
     J = information_map()
     return {'plain': condition_map(J), 'cpa': condition_map(about_cpa(J)),
@@ -114,7 +114,7 @@ def figure_5_2():
 
 
 def figure_5_3(numbers):
-    """Condition number (n_y, n_x) against the position of the second sensor, logarithmic colours.
+    """Map of the condition number (n_y, n_x) against the position of the second sensor.
     """
     figure = Figure(figsize=(7.5, 6.0), layout='constrained')
     axes = figure.add_subplot()
@@ -156,7 +156,7 @@ def figure_5_4():
 
 
 def comparison(maps):
-    """Numbers of the comparison, by name; `maps` are those of `condition_maps`."""
+    """Compute the numbers compared with T10, by name; `maps` from `condition_maps`."""
     up, h = np.array([0.0, 0.0, 1.0]), energy_threshold(P_FA, 3)
     one, two = seen_by(ONE), seen_by(TWO)
     d = -(R0 + SAMPLE_TIME * np.arange(N_SAMPLES)[:, None] * V0)
@@ -178,7 +178,7 @@ def comparison(maps):
 
 
 def report(n):
-    """Agreements with and differences from T10, as text."""
+    """Report of the agreements with T10 and the differences from T10."""
     def place(name):
         (x, y), number = n[name]
         return f'{number:.0f} at [{x:.1f}, {y:.1f}]'

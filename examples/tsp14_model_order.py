@@ -42,20 +42,20 @@ def passes(rate, orders=(1, 2, 3, 4, 5)):
 
 
 def costs_of(found, n_dipoles):
-    """Normalised costs with a given number of dipoles: list of the cars, and the truck."""
+    """(costs of the cars, cost of the truck), normalised, with `n_dipoles` dipoles."""
     costs = [f.normalised_cost for one in found for f in one.fits if f.n_dipoles == n_dipoles]
     return costs[:-1], costs[-1]
 
 
 def report(found):
-    """Costs next to the published ones, as text; `found` holds the passes of each rate."""
+    """Report that compares the costs with the published costs; `found`: {rate: passes}."""
     lines = []
     for n_dipoles, (cars, large) in zip((1, 3), zip(*PUBLISHED.values(), strict=True),
                                         strict=True):
         lines.append(f'{n_dipoles} dipole{"s" if n_dipoles > 1 else ""}; TSP14: cars {cars[0]:g} '
                      f'to {cars[1]:g}, large vehicles {large[0]:g} to {large[1]:g}')
-        for rate, those in found.items():
-            ours, truck = costs_of(those, n_dipoles)
+        for rate, fitted in found.items():
+            ours, truck = costs_of(fitted, n_dipoles)
             lines.append(f'  {rate:8} cars {min(ours):.2f} to {max(ours):.2f}, truck {truck:.1f}')
     return '\n'.join([*lines, """\
 agrees   Every dipole lowers the cost. With three dipoles, the cars come close to one; the truck
@@ -63,7 +63,7 @@ agrees   Every dipole lowers the cost. With three dipoles, the cars come close t
 differs  With one dipole at 12.5 Hz, the cars are below the published range and the truck is above
          it: these are other vehicles, simulated, with other noise. The published fits use data at
          12.5 Hz (T10 section 6.3). At 100 Hz each sample has more noise relative to the model
-         error, so that the costs are lower."""])
+         error, so the costs are lower."""])
 
 
 def main(argv=None):
@@ -73,8 +73,8 @@ def main(argv=None):
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     found = {rate: passes(rate) for rate in RATES}
-    for rate, those in found.items():
-        figure, path = order_figure(those), args.out / f'figure_7_{rate.replace(" ", "_")}.png'
+    for rate, fitted in found.items():
+        figure, path = order_figure(fitted), args.out / f'figure_7_{rate.replace(" ", "_")}.png'
         figure.axes[0].set_title(f'TSP14 Figure 7 with simulated passes at {rate} '
                                  '(filled: selected order)')
         figure.savefig(path, dpi=110)

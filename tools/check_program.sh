@@ -1,17 +1,17 @@
 #!/bin/sh
 # check_program.sh PROGRAM PACKAGE TESTS: check for a program that some tests use.
-# If it is missing, root installs it from apt; other users get a message, and the tests are skipped.
+# If it is missing, it is installed from apt as root. Other users are told how to install it.
 set -u
 
 program=$1
 package=$2
 tests=$3
 
-there() {
+is_installed() {
     command -v "$program" >/dev/null || [ -x "/usr/sbin/$program" ]
 }
 
-there && exit 0
+is_installed && exit 0
 
 if [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then
     echo "Setting up: installing $package from apt, for $tests"
@@ -19,7 +19,7 @@ if [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then
     { apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install -y "$package"; } \
         >"$log" 2>&1 || tail -n 5 "$log" >&2
     rm -f "$log"
-    there && exit 0
+    is_installed && exit 0
 fi
 
 echo "$program is not installed: $tests are skipped. To run them:"

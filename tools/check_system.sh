@@ -1,6 +1,6 @@
 #!/bin/sh
 # check_system.sh PYTHON: check for the system packages that pip cannot install.
-# Missing packages are installed if this runs as root, and listed otherwise.
+# As root, the missing packages are installed; otherwise they are listed.
 set -u
 
 python=$1
@@ -40,15 +40,15 @@ elif [ "$python" != python3 ]; then
     fail "$python is not installed."
 fi
 
-lacking=$(echo $(missing))
-[ -n "$lacking" ] || exit 0
+missing_packages=$(echo $(missing))
+[ -n "$missing_packages" ] || exit 0
 
 if [ "$(id -u)" -ne 0 ] || ! command -v apt-get >/dev/null; then
-    fail "Missing packages: $lacking" 'On Debian or Ubuntu, install them and try again:' \
+    fail "Missing packages: $missing_packages" 'On Debian or Ubuntu, install them and try again:' \
          "$(apt_line)"
 fi
 
-echo "Setting up: installing missing packages from apt: $lacking"
+echo "Setting up: installing missing packages from apt: $missing_packages"
 log=$(mktemp)
 # shellcheck disable=SC2086 # a list of words
 if ! { apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install -y $apt_packages; } \
@@ -59,7 +59,7 @@ if ! { apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install -y $apt_
 fi
 rm -f "$log"
 
-lacking=$(echo $(missing))
-[ -z "$lacking" ] ||
-    fail "Still missing for $python: $lacking" \
+missing_packages=$(echo $(missing))
+[ -z "$missing_packages" ] ||
+    fail "Still missing for $python: $missing_packages" \
          'This may not be the Python from apt. Try: make setup PYTHON=/usr/bin/python3'

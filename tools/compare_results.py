@@ -4,7 +4,7 @@
 
 Every bundled recording is replayed with both versions from the command line. Every number in
 poses.csv, poses_smoothed.csv, detections.csv and hypotheses.csv must agree within the tolerance;
-every text and the number of rows must be identical. The exit status is 1 if any value differs.
+every string and the number of rows must be identical. The exit status is 1 if any value differs.
 """
 
 import argparse
@@ -34,7 +34,7 @@ def mag_tracking(tree, *arguments):
 
 
 def recordings(tree, out):
-    """Bundled recordings: [(name, recording, network, target)]; imports the magnet tables."""
+    """Import the magnet tables; return all recordings as [(name, recording, network, target)]."""
     road = ROOT / 'config' / 'network.yaml'
     found = [(p.stem, p, road, 'vehicle') for p in sorted((DATA / 'vehicles').glob('*.mcap'))]
     for folder in ('two_way_road', 'corridor'):
@@ -53,19 +53,19 @@ def recordings(tree, out):
 
 
 def replay_all(tree, out, workers):
-    """Replay every bundled recording with the source tree `tree` into `out`; return their names."""
+    """Replay every bundled recording with the source tree `tree` into `out`; return the names."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    todo = recordings(tree, out / 'imported')
+    jobs = recordings(tree, out / 'imported')
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(lambda r: mag_tracking(
             tree, 'replay', r[1], '--network', r[2], '--target', r[3], '--out', out / r[0],
-            '--no-figures'), todo))
-    return [name for name, *_ in todo]
+            '--no-figures'), jobs))
+    return [name for name, *_ in jobs]
 
 
 def difference(one, other):
-    """Relative difference of two numbers; infinite for texts that differ."""
+    """Relative difference of two numbers; infinite for different strings."""
     if one == other:
         return 0.0
     try:
@@ -78,13 +78,13 @@ def difference(one, other):
 
 
 def compare(one, other, renamed):
-    """Compare two CSV files: (rows, values, largest difference, its location)."""
+    """Compare two CSV files; return (n_rows, n_values, largest difference, its location)."""
     with open(one, newline='') as a, open(other, newline='') as b:
-        rows, others = list(csv.reader(a)), list(csv.reader(b))
-    if len(rows) != len(others) or rows[0] != others[0]:
-        return len(rows), 0, math.inf, f'{len(rows)} against {len(others)} rows'
+        rows, other_rows = list(csv.reader(a)), list(csv.reader(b))
+    if len(rows) != len(other_rows) or rows[0] != other_rows[0]:
+        return len(rows), 0, math.inf, f'{len(rows)} against {len(other_rows)} rows'
     worst, where, n = 0.0, '', 0
-    for i, (row, other_row) in enumerate(zip(rows, others, strict=True)):
+    for i, (row, other_row) in enumerate(zip(rows, other_rows, strict=True)):
         for column, x, y in zip(rows[0], row, other_row, strict=True):
             n += 1
             for old, new in renamed:
@@ -104,30 +104,30 @@ def main():
     parser.add_argument('--workers', type=int, default=2,
                         help='number of concurrent replays (default: 2)')
     parser.add_argument('--renamed', nargs=2, action='append', default=[], metavar=('OLD', 'NEW'),
-                        help='text of the base that has been renamed since')
+                        help='string of the base and its new name')
     args = parser.parse_args()
     build = ROOT / 'build' / 'compare'
     commit = subprocess.run(['git', 'rev-parse', '--short', args.base], cwd=ROOT, check=True,
                             capture_output=True, text=True).stdout.strip()
-    tree, kept = build / f'tree_{commit}', build / f'results_{commit}'
+    tree, base_results = build / f'tree_{commit}', build / f'results_{commit}'
     if not tree.exists():
         subprocess.run(['git', 'worktree', 'add', '--detach', tree, commit], cwd=ROOT, check=True,
                        capture_output=True)
         subprocess.run([sys.executable, 'setup.py', '-q', 'build_ext', '--inplace'], cwd=tree,
                        check=True, capture_output=True)
-    if not (kept / 'complete').exists():
-        replay_all(tree, kept, args.workers)
-        (kept / 'complete').touch()
+    if not (base_results / 'complete').exists():
+        replay_all(tree, base_results, args.workers)
+        (base_results / 'complete').touch()
     names = replay_all(ROOT, build / 'results', args.workers)
     failed = False
     for name in names:
         for table in TABLES:
-            n_rows, n, worst, where = compare(kept / name / table, build / 'results' / name / table,
-                                             args.renamed)
-            bad = worst > args.tolerance
-            failed |= bad
+            n_rows, n, worst, where = compare(
+                base_results / name / table, build / 'results' / name / table, args.renamed)
+            is_different = worst > args.tolerance
+            failed |= is_different
             print(f'{name} {table}: {n_rows} rows, {n} values, largest difference {worst:.2g}'
-                  + (f'  DIFFERS: {where}' if bad else ''))
+                  + (f'  DIFFERS: {where}' if is_different else ''))
     print('different' if failed else f'all values agree within {args.tolerance:g} (relative)')
     return int(failed)
 

@@ -1,4 +1,4 @@
-"""Generate the files of config/ that contain every setting with its default.
+"""Generate the files in config/ that contain every setting with its default.
 
 `make config` runs it; a test compares the files with its output.
 """
@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def generated():
-    """{path: content} of every generated file."""
+    """{path: content} of all generated files."""
     assert set(TARGET_DEFAULTS) == {'vehicle', 'magnet'}
     return {ROOT / 'config' / 'default.yaml': to_yaml(Settings()),
             ROOT / 'config' / 'magnet.yaml': to_yaml(settings_for('magnet'))}

@@ -1,7 +1,7 @@
 """Generate config/security/policies.xml: the SROS 2 access policies of the nodes.
 
-The nodes are created and their topics and services are listed. `--check` compares the file with the
-result; `--namespace /robot1` prints the policies of nodes in a namespace.
+The program creates the nodes and lists their topics and services. `--check` compares the file with
+the result; `--namespace /robot1` prints the policies of nodes in a namespace.
 """
 
 import os
@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 ROOT = Path(__file__).resolve().parents[1]
 POLICIES = ROOT / 'config' / 'security' / 'policies.xml'
 SENSORS = ('mag_1', 'mag_2')
-"""Sensors of the bundled network file; the policies have a wildcard in their place."""
+"""Sensors of the bundled network file, which a wildcard replaces in the policies."""
 COMMENT = ' Written by tools/generate_policies.py; do not edit. How to use it: docs/guides/ros.md. '
 RECORDING = ROOT / 'test' / 'data' / 'vehicles' / 'straight_car_right.mcap'
 
@@ -41,23 +41,23 @@ def nodes(folder, namespace):
 
 
 def expression(name):
-    """Name in a policy: absolute, with a wildcard for the sensor."""
+    """Absolute name in a policy, with a wildcard instead of the sensor."""
     for sensor in SENSORS:
         name = name.replace(f'/{sensor}/', '/*/')
     return name
 
 
-def add(profile, kind, what, names):
+def add_rules(profile, kind, access, names):
     """Add the rules of one kind to a profile."""
     if not names:
         return
-    group = ElementTree.SubElement(profile, kind, {what: 'ALLOW'})
+    group = ElementTree.SubElement(profile, kind, {access: 'ALLOW'})
     for name in sorted(set(map(expression, names))):
         ElementTree.SubElement(group, kind.removesuffix('s')).text = name
 
 
 def policies(namespace='/'):
-    """Text of the policy file for nodes in a namespace."""
+    """Create the nodes in a namespace; return the content of the policy file."""
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
     from mag_tracking.nodes.middleware import begin
     begin()
@@ -72,18 +72,18 @@ def policies(namespace='/'):
             profile = ElementTree.SubElement(
                 ElementTree.SubElement(enclave, 'profiles'), 'profile', {
                     'ns': namespace, 'node': name})
-            add(profile, 'topics', 'publish', [p.topic_name for p in node.publishers]
+            add_rules(profile, 'topics', 'publish', [p.topic_name for p in node.publishers]
                 + ['/rosout', '/parameter_events'])
-            add(profile, 'topics', 'subscribe', [s.topic_name for s in node.subscriptions]
+            add_rules(profile, 'topics', 'subscribe', [s.topic_name for s in node.subscriptions]
                 + ['/clock'])
-            add(profile, 'services', 'reply', [s.service_name for s in node.services])
+            add_rules(profile, 'services', 'reply', [s.service_name for s in node.services])
             node.destroy_node()
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding='unicode') + '\n'
 
 
 def main():
-    """Write the file, or compare it; return the exit status."""
+    """Write the file, or compare or print its content; return the exit status."""
     if '--namespace' in sys.argv:
         print(policies(sys.argv[sys.argv.index('--namespace') + 1]), end='')
         return 0

@@ -20,7 +20,7 @@ TRACKER = '/tracker_node'
 
 
 def rviz(network):
-    """Text of an RViz configuration."""
+    """Content of an RViz configuration."""
     def topic(name, durability='Volatile'):
         return {'Value': f'{TRACKER}/{name}', 'Depth': 10, 'History Policy': 'Keep Last',
                 'Reliability Policy': 'Reliable', 'Durability Policy': durability}
@@ -52,7 +52,7 @@ def rviz(network):
 
 
 def foxglove(network, fields):
-    """Text of a layout for Foxglove and Lichtblick."""
+    """Content of a layout for Foxglove and Lichtblick."""
     def plot(title, *paths):
         return {'paths': [{'value': value, 'enabled': True, 'timestampMethod': 'headerStamp',
                            'color': colour} for value, colour in paths],
@@ -85,7 +85,7 @@ def foxglove(network, fields):
 
 
 def plotjuggler(fields):
-    """Text of a layout for PlotJuggler."""
+    """Content of a layout for PlotJuggler."""
     plots = [[(f'{topic}/magnetic_field/{axis}', colour)
               for axis, colour in zip('xyz', AXIS_COLOURS, strict=True)] for topic in fields]
     pose = f'{TRACKER}/odometry/pose/pose/position'
@@ -109,7 +109,7 @@ def plotjuggler(fields):
 
 
 def layouts(network):
-    """Text of each layout: {file name: text}."""
+    """{file name: content} of all layouts."""
     fields = [f'{absolute(topic)}_calibrated' for topic in network.topics]
     return {'mag_tracking.rviz': rviz(network), 'foxglove.json': foxglove(network, fields),
             'plotjuggler.xml': plotjuggler(fields)}

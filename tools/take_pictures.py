@@ -1,4 +1,4 @@
-"""Draw the pictures of README and documentation in docs/images, from the bundled recordings.
+"""Draw the pictures in docs/images from the bundled recordings.
 
     PYTHONPATH=test .venv/bin/python tools/take_pictures.py
 """
@@ -22,11 +22,11 @@ IMAGES = Path(__file__).resolve().parents[1] / 'docs' / 'images'
 RECORDING = vehicle_path('junction_left_turns_to_rear')
 SIZE = {'width': 1280, 'height': 1130}
 SHOWN_S = 2.4
-"""Time of the slider [s]: the car begins to turn."""
+"""Time of the slider [s], when the car begins to turn."""
 
 
 def figures():
-    """{name: matplotlib Figure}."""
+    """Draw all figures from the recordings: {name: matplotlib Figure}."""
     track = mt.track(RECORDING, NETWORK_FILE)
     truck = mt.fit(vehicle_path('straight_truck_right'), NETWORK_FILE).passes[0].chosen
     plan = mt.plan(NETWORK_FILE, 'car', heading=[0.0, 180.0], offset=[-2.0, -2.0])

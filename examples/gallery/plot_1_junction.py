@@ -2,8 +2,8 @@
 A car turns at a junction
 =========================
 
-Two magnetometers stand on both sides of a road. A car arrives from the left and turns into the
-side street between them. This is the recording that ``make demo`` plays over ROS topics.
+Two magnetometers stand on either side of a road. A car arrives from the left and turns into the
+side street between them. ``make demo`` replays this recording over ROS topics.
 """
 
 # %%
@@ -24,8 +24,8 @@ print(result)
 figure = result.map_figure()
 
 # %%
-# At first, several arrival directions explain the field. The weight of each one shows when the
-# evidence decides between them.
+# At first, several arrival directions explain the field. Their weights show how the evidence
+# accumulates until only one direction remains.
 figure = result.weights_figure()
 
 # %%
@@ -34,7 +34,7 @@ figure = result.field_figure()
 
 # %%
 # The recording contains the true poses. ``closest`` is the error at the closest point of approach,
-# ``anees`` the normalised squared error: values near one mean that the covariance is honest.
+# ``anees`` the average normalised squared error, which is near one if the covariance is consistent.
 result.errors()
 
 # %%

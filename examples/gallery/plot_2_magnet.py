@@ -3,11 +3,11 @@ A magnet moves past sixteen sensors
 ===================================
 
 A cylinder magnet of 10 mm is moved past sixteen real three-axis sensors. An optical system
-measured the true poses. The measurements come as a table, not as a recording.
+measures the true poses. The measurements are stored in tables, not in a recording.
 """
 
 # %%
-# Import the table. This writes a recording and a network file.
+# Import the tables, and write a recording and a network file.
 import tempfile
 from pathlib import Path
 
@@ -35,7 +35,7 @@ print(f'axis:     {errors["axis_median_deg"]:.2f} degrees (median)')
 figure = result.map_figure()
 
 # %%
-# The stated standard deviations, in millimetres.
+# Standard deviations of the estimated position, in millimetres.
 std = np.sqrt(np.diagonal(result.poses['covariance'], axis1=1, axis2=2)[:, :3])
-print('stated standard deviation, median of x, y, z [mm]:', np.median(1e3 * std, axis=0).round(2))
+print('standard deviation, median of x, y, z [mm]:', np.median(1e3 * std, axis=0).round(2))
 folder.cleanup()

@@ -2,9 +2,9 @@
 Fit of a truck
 ==============
 
-On a straight road, a batch fit of the whole pass is the most accurate estimate. A vehicle is a row
-of one to four dipoles at constant velocity; the number of dipoles is selected by an information
-criterion.
+On a straight road, a batch fit of the whole pass is the most accurate estimate. A vehicle is
+modelled as a line of one to four dipoles at constant velocity. An information criterion selects the
+number of dipoles.
 """
 
 # %%
@@ -25,11 +25,11 @@ print(f'speed {chosen.speed[0]:.2f} ± {chosen.speed[1]:.2f} m/s, '
 
 # %%
 # Measured (dots) and fitted field (lines). 90 % of the measurements should lie within the bands,
-# which include what the model does not describe.
+# which include the model error.
 figure = pass_figure(chosen, 'truck')
 
 # %%
-# The cost decreases with each dipole. A point dipole describes no truck.
+# The cost decreases with each dipole. A single dipole does not describe a truck.
 figure = order_figure(found.passes)
 
 # %%

@@ -3,7 +3,7 @@ Plan a network
 ==============
 
 How accurately can a network locate a vehicle, where does it detect one, and where would one more
-sensor help most? Cramér-Rao bounds answer this before the first hole is drilled.
+sensor help most? Cramér-Rao bounds answer these questions before any sensor is installed.
 """
 
 # %%
@@ -20,14 +20,14 @@ for lane in plan.lanes:
           f'{lane.pass_std[:, 0].min():.3f} m')
 
 # %%
-# Position bound of a car that passes, by the whole pass. No unbiased estimator is more accurate;
-# real vehicles are not point dipoles and are tracked several times less accurately.
+# Position bound of a passing car, given the measurements of the whole pass. No unbiased estimator
+# is more accurate. Real vehicles are not point dipoles; their errors are several times larger.
 figure = position_figure(plan)
 
 # %%
-# Probability that a car at a place is detected.
+# Probability of detecting a car, as a function of its position.
 figure = detection_figure(plan)
 
 # %%
-# Improvement by one more sensor, for each place of that sensor.
+# Improvement by one more sensor, as a function of the position of this sensor.
 figure = sensor_figure(plan)

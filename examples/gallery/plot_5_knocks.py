@@ -3,8 +3,8 @@ Calibrate a network by knocks
 =============================
 
 Eight sensors stand along a road. Their installer knocked twice on the ground: the accelerometers
-of all sensors record the same shock, which shows by how much their clocks differ. Gravity gives
-the tilt, the Earth's field the heading.
+of all sensors record the same shock, which reveals the offsets of their clocks. Gravity gives the
+tilt of each sensor, the Earth's field its heading.
 """
 
 # %%
@@ -28,6 +28,6 @@ for name, offset, std in zip(found.network.names, found.network.clock_offset,
     print(f'{name}: clock {1e3 * offset:+6.2f} ms, heading ± {np.rad2deg(std[2]):.1f}°')
 
 # %%
-# Left: one knock by the clocks of the sensors, before and after. Right: the rotation of each
-# sensor about the vertical, with its stated uncertainty.
+# Left: one knock, timestamped by the clocks of the sensors, before and after calibration. Right:
+# rotation of each sensor about the vertical, with its estimated uncertainty.
 figure = calibration_figure(found, network)

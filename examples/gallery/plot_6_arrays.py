@@ -2,8 +2,8 @@
 Arrays instead of a recording
 =============================
 
-A notebook path: a recording becomes arrays, arrays of your own run through the pipeline without
-any bag, and results come back as DataFrames and figures.
+A workflow for notebooks: read a recording as arrays, track your own arrays without a bag, and get
+the results as DataFrames and figures.
 """
 
 # %%
@@ -33,8 +33,8 @@ legend = axes.legend(loc='upper left')
 
 # %%
 # Arrays of your own: the name of the sensor, the time in nanoseconds and the field of each
-# reading, sorted by time. A covariance is optional; without one the noise is estimated. Here a
-# second of one sensor is missing, as after a radio dropout.
+# reading, in chronological order. Covariances are optional; if they are missing, the noise is
+# estimated. Here, the data of one sensor are missing for a second, as in a radio dropout.
 lost = (readings.sensor == 1) & (readings.stamp_ns - readings.stamp_ns[0] > 4_000_000_000) \
     & (readings.stamp_ns - readings.stamp_ns[0] < 5_000_000_000)
 own = mt.readings_from_arrays([readings.names[s] for s in readings.sensor[~lost]],
@@ -48,7 +48,7 @@ smoothed = result.smoothed_dataframe()
 smoothed[['stamp_ns', 'x', 'y', 'sd_x', 'sd_y', 'vx']].iloc[::8]
 
 # %%
-# And a figure of your own.
+# Draw a figure of your own.
 figure = Figure(figsize=(8.0, 3.0), layout='constrained')
 axes = figure.add_subplot(xlabel='x [m]', ylabel='y [m]',
                           title='smoothed track, ± 2 standard deviations')

@@ -2,8 +2,8 @@
 Published figures: observability (T10)
 ======================================
 
-What one and two magnetometers can observe of a target that passes at constant velocity, after
-Wahlström (2010), chapter 5. ``examples/t10_observability.py`` prints the comparison with the
+Observability of a target that passes one or two magnetometers at constant velocity, after Wahlström
+(2010), chapter 5. The script ``examples/t10_observability.py`` prints the comparison with the
 published numbers.
 """
 

@@ -2,7 +2,7 @@
 Published figures: number of dipoles (TSP14)
 ============================================
 
-Normalised cost of the fit over the number of dipoles for the bundled passes, as in Figure 7 of
+Normalised cost of the fit against the number of dipoles for the bundled passes, as in Figure 7 of
 Wahlström and Gustafsson (2014).
 """
 

@@ -12,13 +12,14 @@
 A kind is a name in `KINDS`, or `package.module:Class` for a custom class. Such a class has an
 attribute `SETTINGS` and the methods of `reading.Transport`, `Framing` or `Device`. Its attributes
 `CLOCK` and `DRIVER`, mappings of settings, replace the defaults for every device of that kind. The
-settings of a kind are under its own name; those of a custom class under `transport_settings`,
-`framing_settings` or `device_settings`.
+settings of a kind are listed under its own name, and the settings of a custom class under
+`transport_settings`, `framing_settings` or `device_settings`.
 """
 
+import dataclasses
 import importlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from os import PathLike
 from typing import Any, TypeVar
 
@@ -49,6 +50,8 @@ KINDS = {
 METHODS = {'transport': ('open', 'read', 'close'), 'framing': ('parse',),
            'device': ('open', 'read', 'close')}
 """Methods required of a transport, framing and device."""
+_ENTRY_KEYS = frozenset(('clock', 'sensor', 'sensors', *KINDS))
+"""Keys of a device besides the driver settings and the groups of its kinds."""
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')
 Settings = TypeVar('Settings', ClockSettings, DriverSettings)
 
@@ -65,7 +68,7 @@ def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None
     Returns
     -------
     list of Driver
-        None of them is open.
+        All drivers are closed.
 
     Raises
     ------
@@ -76,6 +79,7 @@ def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None
     if not isinstance(content, Mapping) or not content:
         raise SettingsError(f'{path}: expected a mapping of devices, got {shown(content)}')
     try:
+        _check_devices(content)
         drivers = [driver_of(name, entry) for name, entry in content.items()]
         _check_sensors(drivers, network)
     except SettingsError as error:
@@ -84,7 +88,7 @@ def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None
 
 
 def load_class(role: str, name: object) -> Any:
-    """Class of a kind of transport, framing or device.
+    """Import the class of a transport, framing or device.
 
     Parameters
     ----------
@@ -103,18 +107,19 @@ def load_class(role: str, name: object) -> Any:
         If the class cannot be loaded, or lacks `SETTINGS` or a method.
     """
     target = KINDS[role].get(name, name) if isinstance(name, str) else ''
-    module, colon, leaf = target.partition(':')
+    module, colon, class_name = target.partition(':')
     if not colon:
         raise SettingsError(f'{role}: expected {", ".join(KINDS[role])} or '
                             f'package.module:Class, got {shown(name)}')
     try:
-        cls = getattr(importlib.import_module(module), leaf)
-    # A third-party module may raise anything.
+        cls = getattr(importlib.import_module(module), class_name)
+    # A third-party module may raise any error.
     except Exception as error:
-        raise SettingsError(f'{role}: {name}: {type(error).__name__}: {error}') from error
-    lacking = [what for what in ('SETTINGS', *METHODS[role]) if not hasattr(cls, what)]
-    if lacking:
-        raise SettingsError(f'{role}: {name} has no {", ".join(lacking)}')
+        raise SettingsError(
+            f'{role}: {name} cannot be loaded: {type(error).__name__}: {error}') from error
+    missing = [member for member in ('SETTINGS', *METHODS[role]) if not hasattr(cls, member)]
+    if missing:
+        raise SettingsError(f'{role}: {name} is incomplete, it lacks {", ".join(missing)}')
     return cls
 
 
@@ -140,16 +145,19 @@ def driver_of(name: object, entry: object) -> Driver:
     if not isinstance(name, str) or not isinstance(entry, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {shown(entry)}')
     if not is_text(name):
-        raise SettingsError(f'{shown(name)} is not a device name: it contains a lone surrogate')
-    rest = dict(entry)
+        raise SettingsError(f'{shown(name)} is not a device name: it is not valid Unicode')
+    options = dict(entry)
     try:
-        device = _device(rest)
-        clock = replace(_class_defaults(ClockSettings(), device, 'CLOCK'), _group(rest, 'clock'))
-        sensors = _sensors(rest)
+        kinds = [kind for role in KINDS if isinstance(kind := options.get(role), str)]
+        _check_places(options, {*_ENTRY_KEYS, *_names(DriverSettings())}, kinds)
+        device = _device(options, kinds)
+        clock = replace(_class_defaults(ClockSettings(), device, 'CLOCK'),
+                        _pop_group(options, 'clock'))
+        sensors = _pop_sensors(options)
         for unit in ('unit', 'acceleration_unit'):
-            if isinstance(rest.get(unit), (int, float)) and not isinstance(rest[unit], bool):
-                rest[unit] = repr(rest[unit])
-        settings = replace(_class_defaults(DriverSettings(), device, 'DRIVER'), rest)
+            if isinstance(options.get(unit), (int, float)) and not isinstance(options[unit], bool):
+                options[unit] = repr(options[unit])
+        settings = replace(_class_defaults(DriverSettings(), device, 'DRIVER'), options)
         return Driver(name, device, settings, clock, sensors)
     except SettingsError as error:
         raise SettingsError(f'{name}: {error}') from error
@@ -160,45 +168,51 @@ def _class_defaults(settings: Settings, device: Device, name: str) -> Settings:
     return replace(settings, getattr(device, name, {}))
 
 
-def _device(rest: dict[str, Any]) -> Device:
-    """Device described by an entry; removes the keys used from `rest`."""
-    if 'device' in rest:
-        if 'transport' in rest or 'framing' in rest:
-            raise SettingsError('device cannot be combined with transport and framing; remove one '
-                                'of them')
-        device: Device = _create('device', rest)
+def _device(options: dict[str, Any], kinds: Collection[str]) -> Device:
+    """Create the device of an entry; remove its settings from `options`."""
+    if 'device' in options:
+        if 'transport' in options or 'framing' in options:
+            raise SettingsError('device cannot be combined with transport and framing; remove '
+                                'either device or the other two')
+        device: Device = _create_part('device', options, kinds)
         return device
     for role in ('transport', 'framing'):
-        if role not in rest:
-            raise SettingsError(f'{role} is missing (one of {", ".join(KINDS[role])}), and so is '
-                                f'device (one of {", ".join(KINDS["device"])})')
-    return FramedDevice(_create('transport', rest), _create('framing', rest))
+        if role not in options:
+            raise SettingsError(f'{role} is missing (one of {", ".join(KINDS[role])}), or set '
+                                f'device instead (one of {", ".join(KINDS["device"])})')
+    return FramedDevice(_create_part('transport', options, kinds),
+                        _create_part('framing', options, kinds))
 
 
-def _create(role: str, rest: dict[str, Any]) -> Any:
-    """Transport, framing or device of an entry, created with its settings."""
-    kind = rest.pop(role)
+def _create_part(role: str, options: dict[str, Any], kinds: Collection[str]) -> Any:
+    """Create the transport, framing or device of an entry; remove its settings from `options`."""
+    kind = options.pop(role)
     cls = load_class(role, kind)
     group = kind if kind in KINDS[role] else f'{role}_settings'
-    return cls(replace(cls.SETTINGS(), _group(rest, group)))
+    defaults, changes = cls.SETTINGS(), _pop_group(options, group)
+    try:
+        _check_places(changes, _names(defaults), kinds)
+    except SettingsError as error:
+        raise SettingsError(f'{group}: {error}') from error
+    return cls(replace(defaults, changes))
 
 
-def _group(rest: dict[str, Any], name: str) -> Mapping[str, Any]:
-    """Mapping of settings under `name`; removed from `rest`."""
-    group = rest.pop(name, {})
+def _pop_group(options: dict[str, Any], name: str) -> Mapping[str, Any]:
+    """Remove the group `name` from `options` and return its settings."""
+    group = options.pop(name, {})
     if not isinstance(group, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {shown(group)}')
     return group
 
 
-def _sensors(rest: dict[str, Any]) -> dict[str, str]:
-    """{name at the device: network name}."""
-    if 'sensor' in rest:
-        if 'sensors' in rest:
-            raise SettingsError('sensor and sensors are mutually exclusive; give only one')
-        sensors = {'': rest.pop('sensor')}
+def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
+    """Remove the sensors from `options` and return {name at the device: network name}."""
+    if 'sensor' in options:
+        if 'sensors' in options:
+            raise SettingsError('sensor and sensors are mutually exclusive; remove one of them')
+        sensors = {'': options.pop('sensor')}
     else:
-        sensors = rest.pop('sensors', None)
+        sensors = options.pop('sensors', None)
     if not isinstance(sensors, Mapping) or not sensors:
         raise SettingsError('expected `sensor: mag_1`, or `sensors:` with the network name of each '
                             f'sensor of the device, got {shown(sensors)}')
@@ -206,14 +220,16 @@ def _sensors(rest: dict[str, Any]) -> dict[str, str]:
         if isinstance(key, bool) or not isinstance(key, (str, int)):
             raise SettingsError(f'sensors: {shown(key)} is not a name; put it in quotes')
         if not is_text(str(key)):
-            raise SettingsError(f'sensors: {shown(key)} is not a name: it contains a lone '
-                                'surrogate')
+            raise SettingsError(f'sensors: {shown(key)} is not a name: it is not valid '
+                                'Unicode')
         if not isinstance(value, str) or not (value == IGNORED or _NAME.fullmatch(value)):
             raise SettingsError(f'sensors: {key}: expected a sensor name (letters, digits, _ and '
                                 f'/), or - to ignore the sensor, got {shown(value)}')
     out = {str(key): value for key, value in sensors.items()}
     if len(out) < len(sensors):
-        raise SettingsError('sensors: the same name at the device appears twice')
+        names = [str(key) for key in sensors]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise SettingsError(f'sensors: the name {twice} at the device appears twice; remove one')
     return out
 
 
@@ -233,13 +249,62 @@ def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> 
                                     f'sensors are {", ".join(network.names)}')
 
 
+def _names(settings: Any) -> set[str]:
+    """Names of the settings and groups of a settings dataclass."""
+    return {field.name for field in dataclasses.fields(settings)}
+
+
+def _groups_of(name: object) -> list[str]:
+    """Groups of a device that have the setting `name`; '' = the top level of the device."""
+    if name in _ENTRY_KEYS:
+        return ['']
+    return [group for group, settings in settings_by_kind().items() if name in _names(settings)]
+
+
+def _any_of(groups: Collection[str]) -> str:
+    """List of groups for a message: 'serial, udp or mqtt'."""
+    *others, last = groups
+    return f'{", ".join(others)} or {last}' if others else last
+
+
+def _check_places(names: Iterable[object], permitted: Collection[str],
+                  kinds: Collection[str]) -> None:
+    """Raise SettingsError if a name that is not permitted belongs to another group of a device."""
+    for name in names:
+        groups = [] if name in permitted else _groups_of(name)
+        if '' in groups:
+            raise SettingsError(f'{name} is misplaced; move it to the top level of the device')
+        used = [group for group in groups if group in (*kinds, 'clock')]
+        if used:
+            raise SettingsError(f'{name} is misplaced; move it to {_any_of(used)}, as in '
+                                f'{used[0]}: {{{name}: ...}}')
+        if groups:
+            raise SettingsError(f'{name} is misplaced; it is a setting of {_any_of(groups)}, but '
+                                f'the device uses {" and ".join(kinds) or "no transport"}')
+
+
+def _check_devices(content: Mapping[object, object]) -> None:
+    """Raise SettingsError if the top level of a file contains settings of a device."""
+    for name, entry in content.items():
+        if isinstance(entry, Mapping):
+            # A device may have the name of a group.
+            is_setting = not any(role in entry for role in KINDS) and name in settings_by_kind()
+            groups = [''] if is_setting else []
+        else:
+            groups = _groups_of(name)
+        if groups:
+            place = '' if '' in groups else f', under {_any_of(groups)}'
+            raise SettingsError(f'{name} is misplaced; the top level of the file contains devices. '
+                                f'Move {name} into a device{place}')
+
+
 def settings_by_kind() -> dict[str, Any]:
-    """Default settings of all kinds, for the reference.
+    """Default settings of all kinds, as listed in the settings reference.
 
     Returns
     -------
     dict of str to settings
-        By the name of the group in the drivers file.
+        Keys: names of the groups in the drivers file; '' = settings at the top level of a device.
     """
     out = {'': DriverSettings(), 'clock': ClockSettings()}
     for role, kinds in KINDS.items():

@@ -1,16 +1,16 @@
 """Times of measurement from a device's counter and the arrival times of its messages.
 
-A message arrives after a fixed minimum delay plus a random, non-negative one. All points
+A message arrives after a fixed minimum delay plus a random, non-negative delay. All points
 (device time, arrival - device time) therefore lie above a line whose slope is the drift of the
 device's oscillator. The estimate is the line under all points of the last minutes that is closest
 to them on average: the edge of their lower convex hull over their mean abscissa.
 
 Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network delay
 measurements', IEEE INFOCOM 1999. Departures: only the lowest point of each short block of device
-time is kept; the window slides; and of all slopes about as likely as the best one, the slope
-nearest to the previous estimate is used. For exponential delays, Moon's line is the most likely
-one. A line that is lower by 1/K of the mean height of the K points above it is less likely by a
-factor of e; slopes within that range count as about as likely.
+time is kept; the window slides; and of all slopes about as likely as the best slope, the slope
+nearest to the previous estimate is used. For exponential delays, Moon's line is the
+maximum-likelihood line. Lowering a line by 1/K of the mean height of the K points above it reduces
+its likelihood by a factor of e. Slopes within that range are considered about as likely.
 """
 
 import math
@@ -61,11 +61,11 @@ class ClockSettings:
         'more, or is late by more for max_delay_s, indicates a step of the device clock.', 's',
         (1e-3, 60.0))
     window_s: float = param(
-        120.0, 'Memory of the estimate. It must hold at least five readings for the drift to be '
-        'estimated.', 's', (1.0, 86400.0))
+        120.0, 'Length of the estimation window. The drift is estimated only if at least five '
+        'readings are in the window.', 's', (1.0, 86400.0))
     max_drift_ppm: float = param(
-        500.0, 'Maximum deviation of the true tick from tick_s. Crystals stay within 100 ppm, the '
-        'RC oscillators of low-cost boards do not.', 'ppm', (1.0, 50_000.0))
+        500.0, 'Maximum relative error of tick_s. Crystals stay within 100 ppm, unlike the RC '
+        'oscillators of low-cost boards.', 'ppm', (1.0, 50_000.0))
 
 
 class ArrivalClock:
@@ -108,20 +108,20 @@ class ArrivalClock:
 
 
 class _ClockCandidate:
-    """Readings that may be the beginning of a new clock."""
+    """Readings that may belong to a new clock."""
 
-    def __init__(self, ticks: float, arrival_ns: int, last_fit_ns: int, near: bool) -> None:
-        self.since_ns, self.last_fit_ns, self._near = arrival_ns, last_fit_ns, near
-        self.first, self.agreeing, self.total, self._fitted = (ticks, arrival_ns), 1, 0, 0
+    def __init__(self, ticks: float, arrival_ns: int, last_fit_ns: int, is_near: bool) -> None:
+        self.since_ns, self.last_fit_ns, self._is_near = arrival_ns, last_fit_ns, is_near
+        self.first, self.agreeing, self.total, self._n_fitted = (ticks, arrival_ns), 1, 0, 0
         self._last = ticks
 
     def add(self, ticks: float, arrival_ns: int, tick_ns: float, wrap: int,
             tolerance_ns: float) -> int:
-        """Add a reading; return for how long the agreeing readings have lasted [ns]."""
+        """Add a reading; return the time since the first agreeing reading [ns]."""
         first, first_ns = self.first
         span = arrival_ns - first_ns
-        turns = round((span / tick_ns - (ticks - first)) / wrap) if wrap else 0
-        if abs((ticks - first + turns * wrap) * tick_ns - span) > tolerance_ns:
+        n_wraps = round((span / tick_ns - (ticks - first)) / wrap) if wrap else 0
+        if abs((ticks - first + n_wraps * wrap) * tick_ns - span) > tolerance_ns:
             self.first, self.agreeing, span = (ticks, arrival_ns), 1, 0
         elif ticks != self._last:
             self.agreeing += 1
@@ -130,22 +130,22 @@ class _ClockCandidate:
         return span
 
     def is_refuted(self) -> bool:
-        """Whether a reading that fits the old clock discards the candidate."""
-        # Messages that have become slightly faster may alternate with others that have not.
-        self._fitted += 1
-        return not self._near or self._fitted > 4 * self.total
+        """Count a reading that fits the old clock; return whether to discard the candidate."""
+        # Slightly faster messages may alternate with messages of unchanged delay.
+        self._n_fitted += 1
+        return not self._is_near or self._n_fitted > 4 * self.total
 
 
 class DeviceClock:
-    """Times of measurement on the host's monotonic clock; one for all sensors of a device.
+    """Estimates times of measurement on the host's monotonic clock, for all sensors of a device.
 
-    Until there are a few points, the line passes under the lowest one with the nominal tick, or
-    with the drift known from before a restart. A reading that does not fit the clock gets no time.
-    A new clock starts when three different device times in a row agree on it for longer than an
-    emptying queue could explain, or when no reading has fitted for `window_s`. If readings of two
-    clocks alternate, the older clock is kept.
+    Until a few points are available, the line passes through the lowest point, with the nominal
+    tick or with the drift estimated before a restart. A reading that does not fit the clock gets no
+    time. A new clock starts when three consecutive different device times agree on it for longer
+    than an emptying queue could explain, or when no reading has fitted for `window_s`. If readings
+    of two clocks alternate, the older clock is kept.
 
-    float64 keeps the times within 1 ns for 30 days, and within 0.1 µs for ten years.
+    The rounding error of float64 is below 1 ns for 30 days, and below 0.1 µs for ten years.
 
     Parameters
     ----------
@@ -158,12 +158,12 @@ class DeviceClock:
     restarts : Counter
         Number of clocks started after the first, by cause.
     drift_ppm : float, ppm
-        True over nominal tick, minus 1; positive for a slow device. NaN until known.
+        Ratio of the true to the nominal tick, minus 1; positive for a slow device. NaN until known.
     spread_s : float, s
         95th percentile of the delays of recent messages, relative to the fastest. NaN until known.
     stamp_std : float, s
         Error of a timestamp due to the delays and to changes of the drift: the 90th percentile of
-        the distance from the line of the lowest point of each block. An error of `min_delay_s` is
+        the heights above the line of the lowest points of the blocks. An error of `min_delay_s` is
         not included. NaN until known, also after a restart.
 
     Raises
@@ -190,10 +190,10 @@ class DeviceClock:
         self.restarts: Counter[str] = Counter()
         self.drift_ppm = self.spread_s = self.stamp_std = math.nan
         self._delays: deque[float] = deque(maxlen=256)
-        self._slope, self._begun = 0.0, False
+        self._slope, self._has_begun = 0.0, False
 
     def _begin(self, ticks: float, arrival_ns: int) -> None:
-        """Start a new clock at its first point; the drift estimate is kept."""
+        """Start a new clock at its first point, with the previous drift estimate."""
         self._ticks, self._arrival_ns, self._last_ns = ticks, arrival_ns, arrival_ns
         self._height = self._middle = self._newest = self._lowest = 0.0
         self._points: list[Point] = []
@@ -201,10 +201,10 @@ class DeviceClock:
         self._block = self._block_end = self._window_ns / _MAX_BLOCKS * _MIN_BLOCK
         self._early_tolerance_ns, self.stamp_std = self._max_delay_ns, math.nan
         self._candidate: _ClockCandidate | None = None
-        self._begun, self._drift_bound = True, self._max_drift
+        self._has_begun, self._drift_bound = True, self._max_drift
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int | None:
-        """Time at which a reading was measured.
+        """Update the clock with a reading; return the time at which it was measured.
 
         Parameters
         ----------
@@ -216,7 +216,8 @@ class DeviceClock:
         Returns
         -------
         int or None, ns
-            Not later than `arrival_ns` minus the minimum delay. None = unknown, and counted.
+            Not later than `arrival_ns` minus the minimum delay. None if the time is unknown, the
+            cause of which is counted.
         """
         if ticks is None:
             self.counts[NO_TICKS] += 1
@@ -224,7 +225,7 @@ class DeviceClock:
         if not 0 <= ticks < self._top:
             self.counts[OUT_OF_RANGE] += 1
             return None
-        if not self._begun:
+        if not self._has_begun:
             self._begin(ticks, arrival_ns)
         elapsed = arrival_ns - self._arrival_ns
         t = self._device_time(ticks, elapsed)
@@ -247,7 +248,7 @@ class DeviceClock:
         return arrival_ns - self._min_delay_ns - self._add_point(t, elapsed - t, low, arrival_ns)
 
     def _device_time(self, ticks: float, elapsed: int) -> float:
-        """Nominal time since the first reading [ns]; the arrival resolves the counter's wraps."""
+        """Nominal time since the first reading [ns]; the arrival time resolves counter wraps."""
         count = ticks - self._ticks
         if self._wrap:
             t = (elapsed - self._height + self._slope * self._middle) / (1.0 + self._slope)
@@ -255,7 +256,7 @@ class DeviceClock:
         return count * self._tick_ns
 
     def _add_point(self, t: float, offset: float, low: float, arrival_ns: int) -> int:
-        """Add a point that fits; return its delay [ns]."""
+        """Add a point that fits the clock; return its delay [ns]."""
         if t >= self._block_end:
             self._close_block(t)
             low = offset - self._slope * (t - self._middle)
@@ -268,17 +269,17 @@ class DeviceClock:
 
     def _early_limit(self, t: float, arrival_ns: int) -> float:
         """Maximum distance below the line at which a message is accepted [ns]."""
-        # All of the first messages may have been delayed in the buffer of a port opened late.
+        # All first messages may have been delayed in the buffer of a port that was opened late.
         if arrival_ns - self._arrival_ns < self._max_delay_ns:
             return self._max_delay_ns
-        since = t - (self._points[-1][0] if self._points else 0.0)
-        return self._early_tolerance_ns + self._max_drift * since
+        elapsed = t - (self._points[-1][0] if self._points else 0.0)
+        return self._early_tolerance_ns + self._max_drift * elapsed
 
     def _restart(self, ticks: float, arrival_ns: int, delay: float,
-                 suspect: _ClockCandidate) -> None:
+                 candidate: _ClockCandidate) -> None:
         """Start a new clock and count its cause; `delay` is relative to the old line [ns]."""
-        first, first_ns = suspect.first
-        silence = first_ns - suspect.last_fit_ns
+        first, first_ns = candidate.first
+        silence = first_ns - candidate.last_fit_ns
         if silence > self._window_ns:
             cause = LOST
         # The counter started at 0 after the last fitting reading.
@@ -290,18 +291,18 @@ class DeviceClock:
         self._begin(ticks, arrival_ns)
 
     def _has_stepped(self, ticks: float, arrival_ns: int, fits: bool,
-                     suspect: _ClockCandidate) -> bool:
+                     candidate: _ClockCandidate) -> bool:
         """Add a reading to the candidate; return whether the device clock has stepped."""
-        wait = arrival_ns - suspect.since_ns
-        lasted = suspect.add(ticks, arrival_ns, self._tick_ns, self._wrap,
+        wait = arrival_ns - candidate.since_ns
+        duration = candidate.add(ticks, arrival_ns, self._tick_ns, self._wrap,
                              self._tolerance_ns + self._max_drift * wait)
-        # An emptying queue arrives all at once, or at intervals other than those of measurement.
-        needed = self._max_delay_ns if fits else 2.0 * self._tolerance_ns
-        return (suspect.agreeing >= _MIN_AGREEING and lasted >= needed
-                or suspect.total >= _MIN_AGREEING and wait > self._window_ns)
+        # Queued messages arrive all at once, or at intervals unlike the measurement intervals.
+        min_duration = self._max_delay_ns if fits else 2.0 * self._tolerance_ns
+        return (candidate.agreeing >= _MIN_AGREEING and duration >= min_duration
+                or candidate.total >= _MIN_AGREEING and wait > self._window_ns)
 
     def _close_block(self, t: float) -> None:
-        """Keep the lowest point of the block that ends, and update the estimate."""
+        """Store the lowest point of the completed block, and update the estimate."""
         points, longest = self._points, self._window_ns / _MAX_BLOCKS
         points.append(self._point)
         if t - self._newest > self._window_ns:
@@ -310,11 +311,11 @@ class DeviceClock:
             del points[0]
         if len(points) >= _MAX_BLOCKS and self._block < longest:
             self._block *= 2.0
-            self._points = points = [min(points[i:i + 2], key=self._above)
+            self._points = points = [min(points[i:i + 2], key=self._height_above)
                                      for i in range(0, len(points), 2)]
         # A message that overtook another may be the lowest point of a later block.
         points.sort()
-        self._estimate(points)
+        self._update_line(points)
         self._block_end, self._lowest = t + self._block, math.inf
         delays = sorted(self._delays)
         self.spread_s = delays[int(0.95 * (len(delays) - 1))] * 1e-9
@@ -322,11 +323,11 @@ class DeviceClock:
         if self._candidate is None:
             self._tolerance_ns = self._step_ns + 2e9 * self.spread_s
 
-    def _above(self, point: Point) -> float:
+    def _height_above(self, point: Point) -> float:
         """Height of a point above the line [ns]."""
         return point[1] - self._height - self._slope * (point[0] - self._middle)
 
-    def _estimate(self, points: list[Point]) -> None:
+    def _update_line(self, points: list[Point]) -> None:
         """Update height and slope of the line under the points."""
         self._middle = sum(t for t, _ in points) / len(points)
         if len(points) >= _MIN_POINTS and points[0][0] < points[-1][0]:
@@ -335,9 +336,9 @@ class DeviceClock:
             self._slope = min(max(slope, -self._max_drift), self._max_drift)
             self.drift_ppm = self._slope * 1e6
         self._height = 0.0
-        above = sorted(map(self._above, points))
-        self._height = above[0]
+        heights = sorted(map(self._height_above, points))
+        self._height = heights[0]
         if len(points) >= _MIN_POINTS:
-            error = above[int(0.9 * (len(above) - 1))] - above[0]
+            error = heights[int(0.9 * (len(heights) - 1))] - heights[0]
             self.stamp_std = error * 1e-9
             self._early_tolerance_ns, self._drift_bound = _EARLY_NS + 8.0 * error, 0.0

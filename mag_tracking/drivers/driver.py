@@ -1,8 +1,8 @@
 """Driver: keeps one device open and converts its readings to samples.
 
-A driver opens its device and, with back-off, reopens it when the connection is lost. It names the
-sensors, converts units to SI, timestamps every reading with its time of measurement on the host
-clock, and counts losses.
+A driver opens its device and reopens it, with back-off, when the connection is lost. It assigns
+network names to the sensors, converts units to SI, timestamps every reading with its time of
+measurement on the host clock, and counts losses.
 """
 
 import struct
@@ -38,7 +38,7 @@ MAX_SOURCES = 4096
 """Maximum number of sources, each with its own clock."""
 _AXES = struct.Struct('3d')
 PollResult: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
-"""Fields and accelerations."""
+"""Fields and accelerations received by one poll."""
 NOTHING: PollResult = Readings.joined([]), ()
 """Result of a poll without data."""
 MIN_CLOCK_STEP_NS = 10_000_000
@@ -46,7 +46,7 @@ MIN_CLOCK_STEP_NS = 10_000_000
 
 
 class Driver:
-    """Samples of one device.
+    """Opens one device and converts its readings to samples.
 
     Parameters
     ----------
@@ -56,13 +56,14 @@ class Driver:
     settings : DriverSettings
     clock_settings : ClockSettings
     sensors : dict of str to str
-        Network name of each sensor, by its name at the device or by its source. The key '' stands
-        for the only sensor of the device.
+        Network name of each sensor. The key is the name of the sensor at the device, the source of
+        its readings, or '' for the only sensor of the device.
     monotonic_ns : callable, optional
         Monotonic clock of the host; tests replace it.
     wall_ns : callable, optional
         Wall clock of the host.
     sleep : callable, optional
+        Function that waits for a time in seconds.
 
     Attributes
     ----------
@@ -71,7 +72,7 @@ class Driver:
     own_counts : Counter
         Number of losses and faults detected by the driver itself, by cause.
     fault : str
-        Why the device is closed or silent; empty if there is no fault.
+        Reason why the device is closed or silent; empty if neither is the case.
 
     Raises
     ------
@@ -93,23 +94,23 @@ class Driver:
         self._acceleration_scale = scale_of(
             settings.acceleration_unit, ACCELERATION_UNITS, f'{name}: acceleration_unit')
         if settings.stamp_by not in STAMPED_BY:
-            raise SettingsError(f'{name}: stamp_by: expected {", ".join(STAMPED_BY)}, got '
-                                f'{settings.stamp_by!r}')
+            raise SettingsError(f'{name}: stamp_by: expected one of '
+                                f'{", ".join(STAMPED_BY)}, got {settings.stamp_by!r}')
         self._monotonic_ns, self._wall_ns, self._sleep = monotonic_ns, wall_ns, sleep
         self._sequences = {s: SequenceCheck(settings.sequence_wrap) for s in sensors.values()
                            if s != IGNORED}
         self._clocks: dict[str, ArrivalClock | DeviceClock] = {}
-        self._open, self.fault = False, ''
+        self._is_open, self.fault = False, ''
         self._retry_s, self._last_receipt_ns = settings.retry_s, 0
         self._retry_ns: int | None = None
         self._offset_ns: int | None = None
         self._sole_source = SingleSource()
-        self._unknown: set[str] = set()
-        # (clock, ticks, arrival) of the previous reading: readings with the same ticks and
-        # arrival were measured together and share a timestamp.
+        self._unknown_names: set[str] = set()
+        # (clock, ticks, arrival) of the previous reading. Readings with the same ticks and arrival
+        # were measured together and have the same timestamp.
         self._measurement: tuple[ArrivalClock | DeviceClock, float | None, int] | None = None
         self._measured_ns: int | None = None
-        self._resolved: dict[tuple[str, str], str] = {}
+        self._known_sensors: dict[tuple[str, str], str] = {}
         self._sample_counts = {s: f'samples: {s}' for s in sensors.values()}
 
     @property
@@ -130,7 +131,7 @@ class Driver:
     @property
     def is_open(self) -> bool:
         """Whether the device is open."""
-        return self._open
+        return self._is_open
 
     def clocks(self) -> dict[str, ArrivalClock | DeviceClock]:
         """Clocks of all sources received so far.
@@ -143,7 +144,7 @@ class Driver:
         return dict(self._clocks)
 
     def counts(self) -> Counter[str]:
-        """Number of samples, losses and suspect readings.
+        """Numbers of samples, losses and suspect readings.
 
         Returns
         -------
@@ -178,7 +179,7 @@ class Driver:
             Empty if nothing arrived in time.
         accelerations : sequence of AccelerationSample
         """
-        if not self._open and not self._try_to_open(timeout_s):
+        if not self._is_open and not self._try_to_open(timeout_s):
             return NOTHING
         try:
             arrivals = self._read(timeout_s)
@@ -197,7 +198,7 @@ class Driver:
         return self._samples(arrivals, self._wall_offset(now))
 
     def _read(self, timeout_s: float) -> list[Arrival]:
-        """Return the available readings and those that arrive within `batch_s` after the first."""
+        """Read the available readings, then all further readings within `batch_s`."""
         arrivals = self._device.read(timeout_s)
         if not arrivals or not self._settings.batch_s:
             return arrivals
@@ -213,15 +214,15 @@ class Driver:
     def close(self) -> None:
         """Close the device; the next `poll` opens it again.
 
-        Readings that the device measures until then are not counted as lost.
+        Readings that the device measures while it is closed are not counted as lost.
         """
         for check in self._sequences.values():
             check.pause()
         self._device.close()
-        self._open, self._retry_ns = False, None
+        self._is_open, self._retry_ns = False, None
 
     def fail(self, error: Exception) -> None:
-        """Close the device after an unexpected error; it is reopened after the retry interval.
+        """Close the device after an unexpected error and schedule its reopening.
 
         Parameters
         ----------
@@ -244,15 +245,15 @@ class Driver:
             self._schedule_retry(error)
             return False
         # The previous fault remains until data arrive.
-        self._open, self._last_receipt_ns = True, self._monotonic_ns()
+        self._is_open, self._last_receipt_ns = True, self._monotonic_ns()
         return True
 
     def _schedule_retry(self, why: object) -> None:
         """Close the device and double the delay before it is reopened."""
-        self._open, self.fault = False, str(why)
+        self._is_open, self.fault = False, str(why)
         try:
             self._device.close()
-        # A third-party device or a vanished port may raise anything; the device is reopened anyway.
+        # A third-party device or a removed port may raise any error; the device is reopened anyway.
         except Exception as error:
             self.own_counts['failed attempts to close'] += 1
             self.fault += f'; closing failed as well: {type(error).__name__}: {error}'
@@ -260,7 +261,7 @@ class Driver:
         self._retry_s = min(2.0 * self._retry_s, self._settings.max_retry_s)
 
     def _wall_offset(self, monotonic_ns: int) -> int:
-        """Wall clock minus monotonic clock [ns]; timestamps follow steps of the wall clock."""
+        """Return wall clock minus monotonic clock [ns]; count steps of the wall clock."""
         offset = self._wall_ns() - monotonic_ns
         if self._offset_ns is not None and abs(offset - self._offset_ns) > MIN_CLOCK_STEP_NS:
             self.own_counts['steps of the host clock'] += 1
@@ -268,7 +269,7 @@ class Driver:
         return offset
 
     def _samples(self, arrivals: Sequence[Arrival], offset_ns: int) -> PollResult:
-        """Convert arrivals to samples; raises ValueError for other than three axes."""
+        """Convert arrivals to samples; raises ValueError if a field does not have three axes."""
         sensors: list[str] = []
         stamps: list[int] = []
         fields: list[Axes] = []
@@ -299,8 +300,11 @@ class Driver:
         return readings, accelerations
 
     def _resolve(self, reading: Reading, arrival: Arrival) -> tuple[str | None, int | None]:
-        """(network name of the sensor, monotonic ns) of a reading; None if unknown or not new."""
-        sensor = self._resolved.get((reading.sensor, arrival.source)) \
+        """Identify the sensor of a reading, and timestamp the reading unless it is a duplicate.
+
+        Returns (network name, monotonic time [ns]); None = unknown, or a duplicate.
+        """
+        sensor = self._known_sensors.get((reading.sensor, arrival.source)) \
             or self._sensor_of(reading.sensor, arrival.source)
         if sensor is None or reading.sequence is not None and not self._sequences[sensor].is_new(
                 reading.sequence, _bytes_of(reading.field) + _bytes_of(reading.acceleration)):
@@ -308,7 +312,7 @@ class Driver:
         return sensor, self._stamp(reading, arrival)
 
     def _sensor_of(self, at_device: str, source: str) -> str | None:
-        """Network name of a sensor; None if it is unknown or ignored."""
+        """Return the network name of a sensor, or None if ignored; count unknown sensors."""
         sensor = next((self.sensors[name] for name in (at_device, source)
                        if name and name in self.sensors), None)
         if sensor is None and '' in self.sensors and self._sole_source.accepts(
@@ -316,18 +320,18 @@ class Driver:
             return self.sensors['']
         if sensor is None:
             name = (at_device or source)[:80]
-            if len(self._unknown) < MAX_NAMES:
-                self._unknown.add(name)
+            if len(self._unknown_names) < MAX_NAMES:
+                self._unknown_names.add(name)
             self.own_counts['readings of unknown sensors' + (
-                f': {name}' if name in self._unknown else ' (and others)')] += 1
+                f': {name}' if name in self._unknown_names else ' (and others)')] += 1
         if sensor is None or sensor == IGNORED:
             return None
-        if len(self._resolved) < MAX_SOURCES:
-            self._resolved[at_device, source] = sensor
+        if len(self._known_sensors) < MAX_SOURCES:
+            self._known_sensors[at_device, source] = sensor
         return sensor
 
     def _stamp(self, reading: Reading, arrival: Arrival) -> int | None:
-        """Monotonic time of the measurement [ns]; None if no clock provides it."""
+        """Return the monotonic time of the measurement [ns], or None if no clock provides it."""
         by = self._settings.stamp_by
         ticks = reading.sequence if by == 'sequence' else reading.ticks
         clock = self._clocks.get(arrival.source)
@@ -335,24 +339,24 @@ class Driver:
             if len(self._clocks) >= MAX_SOURCES:
                 self.own_counts['readings beyond the maximum number of sources'] += 1
                 return None
-            without = by == 'arrival' or by == 'auto' and ticks is None
-            clock = (ArrivalClock if without else DeviceClock)(self._clock_settings)
+            uses_arrivals = by == 'arrival' or by == 'auto' and ticks is None
+            clock = (ArrivalClock if uses_arrivals else DeviceClock)(self._clock_settings)
             self._clocks[arrival.source] = clock
         if ticks is None and isinstance(clock, DeviceClock):
             self.own_counts['readings without a device time'] += 1
             return None
         measurement = clock, ticks, arrival.arrival_ns
         if self._measurement != measurement or self._measured_ns is None:
-            # Repeated for a reading without a time, so that each one is counted.
+            # The clock counts every reading without a time, so it is called for each of them.
             self._measured_ns = clock.stamp(ticks, arrival.arrival_ns)
             self._measurement = measurement
         return self._measured_ns
 
 
 def _bytes_of(axes: Axes | None) -> bytes:
-    """Three numbers, or None, as bytes; raises ValueError for anything else."""
-    # Thousands of them are kept. Tuples would be tracked by the garbage collector, whose full
-    # collections would then scan all of them.
+    """Pack three numbers, or None, into bytes; raises ValueError for any other value."""
+    # Thousands of readings are stored as bytes. Tuples would be tracked by the garbage collector,
+    # whose full collections would scan all of them.
     try:
         return b'-' if axes is None else _AXES.pack(*axes)
     except struct.error as error:
@@ -363,14 +367,14 @@ def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]
           stopping: Callable[[], bool]) -> None:
     """Poll a driver and pass its samples to a function until `stopping()` is true.
 
-    Intended for a thread of its own, so it does not raise: errors of the device are stored in
-    `driver.fault`, errors of `take` are counted in `driver.own_counts`.
+    No error is raised, because the function may run in its own thread. Errors of the device are
+    stored in `driver.fault`; errors of `take` are counted in `driver.own_counts`.
 
     Parameters
     ----------
     driver : Driver
     take : callable
-        Receives `Readings` and a sequence of `AccelerationSample`.
+        Called with `Readings` and a sequence of `AccelerationSample`.
     stopping : callable
         Returns whether to stop.
     """
@@ -384,7 +388,7 @@ def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]
             if len(readings) or len(accelerations):
                 take(readings, accelerations)
         except Exception as error:
-            # The device is not affected and keeps running.
+            # The device is not affected and stays open.
             what = f'errors while processing readings: {type(error).__name__}'
             text = f'{what}: {error}'[:100]
             known = sum(key.startswith(what) for key in driver.own_counts)

@@ -6,7 +6,7 @@ from mag_tracking.drivers.reading import Arrival, Framing, Transport
 
 
 class FramedDevice:
-    """Readings that a framing finds in the data of a transport. Implements `reading.Device`.
+    """Extracts readings from the data of a transport with a framing. Implements `reading.Device`.
 
     Parameters
     ----------
@@ -23,27 +23,27 @@ class FramedDevice:
 
     def __init__(self, transport: Transport, framing: Framing) -> None:
         self._transport, self._framing = transport, framing
-        self._rest = b''
-        self._found: Counter[str] = Counter()
+        self._unconsumed = b''
+        self._rejected: Counter[str] = Counter()
         self.CLOCK, self.DRIVER = (getattr(framing, name, {}) for name in ('CLOCK', 'DRIVER'))
 
     @property
     def counts(self) -> Counter[str]:
-        """Number of losses and of bytes outside frames, by cause."""
+        """Number of losses and rejections by cause."""
         # Each counter is copied at once, because the polling thread may add a cause meanwhile.
-        total = self._found.copy()
+        total = self._rejected.copy()
         total.update(self._transport.counts.copy())
         return total
 
     def open(self) -> None:
-        """Open the transport. Bytes left from the previous connection are discarded and counted."""
-        if self._rest:
-            self._found['bytes of truncated frames'] += len(self._rest)
-            self._rest = b''
+        """Open the transport; discard and count unconsumed bytes of the previous connection."""
+        if self._unconsumed:
+            self._rejected['bytes of truncated frames'] += len(self._unconsumed)
+            self._unconsumed = b''
         self._transport.open()
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """Return the readings received.
+        """Return the readings received; wait only if no data is available.
 
         Parameters
         ----------
@@ -57,11 +57,11 @@ class FramedDevice:
         """
         out: list[Arrival] = []
         for chunk in self._transport.read(timeout_s):
-            data = chunk.data if self._transport.whole else self._rest + chunk.data
+            data = chunk.data if self._transport.whole else self._unconsumed + chunk.data
             parsed = self._framing.parse(data, final=self._transport.whole)
             if not self._transport.whole:
-                self._rest = data[parsed.consumed:]
-            self._found.update(parsed.rejected)
+                self._unconsumed = data[parsed.consumed:]
+            self._rejected.update(parsed.rejected)
             out += [Arrival(chunk.arrival_ns, reading, chunk.source)
                     for reading in parsed.readings]
         return out

@@ -10,21 +10,21 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 Point: TypeAlias = tuple[float, float]
-"""(x, y)."""
+"""Coordinates (x, y) of a point."""
 
 
 def lower_hull(points: Sequence[Point]) -> list[Point]:
-    """Corners of the lower convex hull.
+    """Vertices of the lower convex hull.
 
     Parameters
     ----------
     points : sequence of Point
-        Sorted.
+        Points in ascending order.
 
     Returns
     -------
     list of Point
-        From left to right.
+        Vertices in ascending order of x.
     """
     hull: list[Point] = []
     for x, y in points:
@@ -38,20 +38,21 @@ def lower_hull(points: Sequence[Point]) -> list[Point]:
 
 
 def likely_slopes(points: Sequence[Point]) -> tuple[float, float]:
-    """Slopes of lines under the points that are about as likely as the best one.
+    """Range of the slopes of lines under the points that are about as likely as the best line.
 
-    The best line is that of Moon et al.: the edge of the hull over the mean of x.
+    The best line, according to Moon et al., is the edge of the lower hull over the mean of x.
 
     Parameters
     ----------
     points : sequence of Point
-        Sorted, three or more, with at least two different x.
+        At least three points in ascending order, with at least two different x.
 
     Returns
     -------
     low : float
+        Minimum slope.
     high : float
-        Equal to `low` if all points are on the best line.
+        Maximum slope; equal to `low` if all points are on the best line.
     """
     hull = lower_hull(points)
     middle = sum(x for x, _ in points) / len(points)
@@ -60,9 +61,9 @@ def likely_slopes(points: Sequence[Point]) -> tuple[float, float]:
             slope = (y - v) / (x - u)
             height = v + slope * (middle - u)
             break
-    # Two points are always on the line. The median is insensitive to stalls, which are not delays.
-    above = sorted(y - height - slope * (x - middle) for x, y in points)[2:]
-    floor = height - above[len(above) // 2] / math.log(2.0) / len(points)
+    # Two points are always on the line. The median is insensitive to stalls of the link.
+    heights = sorted(y - height - slope * (x - middle) for x, y in points)[2:]
+    floor = height - heights[len(heights) // 2] / math.log(2.0) / len(points)
     low = max((y - floor) / (x - middle) for x, y in hull if x < middle)
     high = min((y - floor) / (x - middle) for x, y in hull if x > middle)
     return min(low, slope), max(high, slope)

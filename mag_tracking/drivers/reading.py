@@ -1,8 +1,8 @@
 """Reading of a device, and the protocols `Transport`, `Framing` and `Device`.
 
-A *transport* moves bytes (serial line, UDP, MQTT). A *framing* finds readings in bytes and is a
-pure function. A *device* returns readings with their time of arrival: a transport with a framing,
-a chip on a bus, or the simulator.
+A *transport* receives bytes (serial line, UDP, MQTT). A *framing* extracts readings from bytes and
+is a pure function. A *device* returns readings with their times of arrival: a transport with a
+framing, the chips on a bus, or the simulator.
 """
 
 from collections import Counter
@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, TypeAlias
 
 Axes: TypeAlias = tuple[float, float, float]
-"""x, y and z."""
+"""Components x, y and z of a vector."""
 
 
 class Reading(NamedTuple):
     """One measurement of one sensor, in the device's own units."""
 
     sensor: str = ''
-    """Name of the sensor at the device; empty if the device names none."""
+    """Name of the sensor at the device; empty if the device does not send it."""
     field: Axes | None = None
     """Field in the device's unit, sensor frame. NaN = the axis is not reported or over its range;
     None = no field."""
@@ -27,31 +27,31 @@ class Reading(NamedTuple):
     ticks: float | None = None
     """Device clock at the time of measurement; None = the device has no clock."""
     sequence: int | None = None
-    """Sequence number; None = the device sends none."""
+    """Sequence number; None = the device does not number its readings."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parsed:
-    """Result of a framing."""
+    """Readings and rejections that a framing has extracted from bytes."""
 
     readings: tuple[Reading, ...] = ()
     consumed: int = 0
-    """Number of bytes from the beginning that are not needed again."""
+    """Number of bytes at the beginning that are completely parsed."""
     rejected: Mapping[str, int] = field(default_factory=dict)
-    """Number of rejections by cause. The cause is a plural: 'frames with a wrong checksum',
-    'bytes between frames'."""
+    """Number of rejections by cause. A cause is a plural noun phrase, such as 'frames with a wrong
+    checksum' or 'bytes between frames'."""
 
 
 class Framing(Protocol):
-    """Finds readings in bytes. It holds settings, but no state."""
+    """Extracts readings from bytes. A framing has settings but no state."""
 
     def parse(self, data: bytes, final: bool = False) -> Parsed:
         """Find all readings in `data`.
 
-        A possible beginning of a frame remains unconsumed; it is never longer than the longest
-        frame. With `final`, nothing follows (a datagram): all bytes are consumed, and those outside
-        frames are counted. Splitting the same bytes differently, each piece preceded by the
-        unconsumed rest of the previous one, gives the same readings and counts.
+        A possible incomplete frame at the end remains unconsumed; it is never longer than the
+        longest frame. With `final`, as for a datagram, all bytes are consumed, and bytes outside
+        frames are counted. The readings and counts of a stream do not depend on its division into
+        chunks if each chunk is preceded by the unconsumed bytes of the previous call.
 
         Parameters
         ----------
@@ -72,13 +72,13 @@ class Chunk(NamedTuple):
     """`time.monotonic_ns()` at arrival."""
     data: bytes
     source: str = ''
-    """Origin of the bytes, if the transport knows it: an MQTT topic, a UDP address."""
+    """Origin of the bytes, such as an MQTT topic or a UDP address; empty if unknown."""
 
 
 class Transport(Protocol):
-    """Moves bytes.
+    """Receives bytes over a connection.
 
-    No method except `close` is called before `open`, or from two threads at the same time.
+    No method except `close` is called before `open`, or by two threads at the same time.
     """
 
     whole: bool
@@ -92,11 +92,11 @@ class Transport(Protocol):
         Raises
         ------
         DeviceError
-            If it cannot be opened. The message states the remedy, and nothing remains open.
+            If opening fails. The message includes the remedy, and nothing remains open.
         """
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """Return received data, without waiting if there is any.
+        """Return the data received; wait only if no data is available.
 
         Parameters
         ----------
@@ -125,11 +125,11 @@ class Arrival(NamedTuple):
     """`time.monotonic_ns()` at arrival."""
     reading: Reading
     source: str = ''
-    """Source of its `Chunk`. All readings of one source share one clock."""
+    """Source of the chunk that contains the reading. All readings of one source share a clock."""
 
 
 class Device(Protocol):
-    """Returns readings; otherwise like `Transport`."""
+    """Receives readings. The calling rules of `Transport` apply."""
 
     @property
     def counts(self) -> Counter[str]:
@@ -141,11 +141,11 @@ class Device(Protocol):
         Raises
         ------
         DeviceError
-            If it cannot be opened. The message states the remedy, and nothing remains open.
+            If opening fails. The message includes the remedy, and nothing remains open.
         """
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """Return received readings, without waiting if there are any.
+        """Return the readings received; wait only if no reading is available.
 
         Parameters
         ----------

@@ -3,9 +3,9 @@
 from collections import Counter
 
 MAX_REMEMBERED = 1000
-"""Number of readings remembered. An older number is not a late reading but a restarted count."""
+"""Number of stored sequence numbers. An older number indicates a restarted count."""
 MAX_GAP = 1_000_000
-"""Largest gap counted as loss. A larger one is a jump of the sequence, even after hours of loss."""
+"""Largest gap counted as loss. A larger gap is counted as a jump of the sequence."""
 
 
 class SequenceCheck:
@@ -29,19 +29,19 @@ class SequenceCheck:
 
     def _begin(self) -> None:
         """Start a new count."""
-        self._last: int | None = None
-        self._seen: dict[int, bytes] = {}
-        self._missing: dict[int, bool] = {}
+        self._newest_number: int | None = None
+        self._values: dict[int, bytes] = {}
+        self._lost_numbers: dict[int, bool] = {}
 
     def pause(self) -> None:
         """Start a new count, so that readings during a deliberate pause are not counted as lost."""
         self._begin()
 
     def is_new(self, sequence: int, values: bytes) -> bool:
-        """Whether a reading has not been received before.
+        """Record a reading; return whether it is new.
 
-        Missing numbers are counted as lost, and subtracted again when they arrive late. A known
-        number with other values is not a duplicate: it restarts the count.
+        Skipped numbers are counted as lost; the count is corrected if they arrive late. A known
+        number with different values is not a duplicate: it restarts the count.
 
         Parameters
         ----------
@@ -53,39 +53,41 @@ class SequenceCheck:
         Returns
         -------
         bool
+            False for a duplicate.
         """
         if sequence < 0 or self._wrap and sequence >= self._wrap:
             self.counts['sequence numbers out of range'] += 1
             return True
-        ahead = 1 if self._last is None else self._distance(sequence, self._last)
-        if ahead > MAX_GAP:
+        distance = (1 if self._newest_number is None
+                    else self._distance(sequence, self._newest_number))
+        if distance > MAX_GAP:
             self.counts['sequence jumps'] += 1
             self._begin()
-        elif ahead > 0:
-            self._record_gap(sequence, ahead - 1)
-        elif sequence in self._missing:
-            del self._missing[sequence]
+        elif distance > 0:
+            self._record_gap(sequence, distance - 1)
+        elif sequence in self._lost_numbers:
+            del self._lost_numbers[sequence]
             self.counts['lost'] -= 1
             self.counts['late arrivals'] += 1
-        elif self._seen.get(sequence) == values:
+        elif self._values.get(sequence) == values:
             self.counts['duplicates'] += 1
             return False
         else:
             self.counts['sequence restarts'] += 1
             self._begin()
-            ahead = 1
-        if ahead > 0:
-            self._last = sequence
-        self._seen[sequence] = values
-        _trim(self._seen)
+            distance = 1
+        if distance > 0:
+            self._newest_number = sequence
+        self._values[sequence] = values
+        _trim(self._values)
         return True
 
     def _distance(self, sequence: int, last: int) -> int:
         """Signed distance from `last` to `sequence`; negative if `sequence` is older."""
-        ahead = sequence - last
+        distance = sequence - last
         if self._wrap:
-            ahead = (ahead + self._wrap // 2) % self._wrap - self._wrap // 2
-        return ahead
+            distance = (distance + self._wrap // 2) % self._wrap - self._wrap // 2
+        return distance
 
     def _record_gap(self, sequence: int, n: int) -> None:
         """Count the `n` numbers before `sequence` as lost."""
@@ -93,8 +95,8 @@ class SequenceCheck:
             return
         self.counts['lost'] += n
         for number in range(sequence - min(n, MAX_REMEMBERED), sequence):
-            self._missing[number % self._wrap if self._wrap else number] = True
-        _trim(self._missing)
+            self._lost_numbers[number % self._wrap if self._wrap else number] = True
+        _trim(self._lost_numbers)
 
 
 def _trim(memory: dict[int, bytes] | dict[int, bool]) -> None:

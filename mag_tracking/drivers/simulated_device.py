@@ -1,6 +1,6 @@
 """Simulated roadside: vehicles pass the sensors of a network in real time.
 
-For trying the complete system without hardware, and for measuring its computational cost.
+It serves to try the complete system without hardware, and to measure its computational cost.
 """
 
 import bisect
@@ -21,11 +21,11 @@ from mag_tracking.settings import param
 from mag_tracking.simulation.scenario import Path, random_vehicle
 
 TICK_S = 1e-6
-"""Resolution of the simulated device clock."""
+"""[s] Resolution of the simulated device clock."""
 MIN_WAIT_S = 1e-3
-"""Minimum waiting time, so that several readings arrive together, as from a polled port."""
+"""[s] Minimum waiting time. Several readings arrive together, as from a polled port."""
 MAX_BACKLOG_S = 5.0
-"""Readings older than this are lost when they are read, as in the buffer of a real device."""
+"""[s] Maximum age of a reading. Older readings are dropped, as in the buffer of a real device."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class SimulatorSettings:
     speed: float = param(10.0, 'Speed of the vehicles.', 'm/s', (0.01, 100.0))
     heading_deg: float = param(0.0, 'Heading of the vehicles; 0 = along x.', 'deg', (-360.0, 360.0))
     offset: float = param(
-        0.0, 'Distance from the centre of the network at which the vehicles pass, positive to the '
+        0.0, 'Lateral offset of the vehicles from the centre of the network, positive to the '
         'left.', 'm', (-1e4, 1e4))
     lead: float = param(
         60.0, 'Distance before the first and after the last sensor at which a pass begins and '
@@ -55,7 +55,7 @@ class SimulatorSettings:
 
 
 class SimulatedDevice:
-    """All sensors of a network as one device, with the field in tesla. Implements `reading.Device`.
+    """Simulates all sensors of a network; readings are in tesla. Implements `reading.Device`.
 
     Parameters
     ----------
@@ -63,16 +63,17 @@ class SimulatedDevice:
     monotonic_ns : callable, optional
         Monotonic clock; tests replace it.
     sleep : callable, optional
+        Function that waits for a time in seconds.
 
     Attributes
     ----------
     counts : Counter
-        Number of lost readings.
+        Number of readings that were dropped because they were not read in time.
 
     Raises
     ------
     SettingsError
-        If no network is given, or if it has no Earth field.
+        If no network is configured, or if the network has no Earth field.
     NetworkError
         If the network file is not valid.
     """
@@ -96,19 +97,19 @@ class SimulatedDevice:
         self._path, self._passing_s = _path_along(self._network, settings)
         self._rng = np.random.default_rng(settings.seed)
         self._table: FloatArray | None = None
-        self._start_ns = self._next = 0
+        self._start_ns = self._next_index = 0
         self._shift_s: list[float] = (np.arange(len(self._network)) * settings.sequential
                          / (len(self._network) * settings.rate_hz)).tolist()
 
     def open(self) -> None:
-        """Compute one pass, and start."""
+        """Compute the pass at the first call; skip readings that were due before this call."""
         if self._table is None:
-            self._table = self._one_pass()
+            self._table = self._field_of_pass()
             self._start_ns = self._monotonic_ns()
-        self._next = math.ceil(self._elapsed() * self._settings.rate_hz) * len(self._network)
+        self._next_index = math.ceil(self._elapsed() * self._settings.rate_hz) * len(self._network)
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """Return the readings that are due; wait for the next one if none is.
+        """Return the readings that are due; wait for the next reading if no reading is due.
 
         Parameters
         ----------
@@ -126,19 +127,19 @@ class SimulatedDevice:
         """
         if self._table is None:
             raise DeviceError('the simulator is not open; call open() first')
-        wait = self._due(self._next) - self._elapsed()
+        wait = self._due(self._next_index) - self._elapsed()
         if wait > 0.0:
             # Waiting for each of a thousand readings separately would be too slow.
             self._sleep(min(max(wait, MIN_WAIT_S), timeout_s))
         elapsed, n = self._elapsed(), len(self._network)
         oldest = math.ceil((elapsed - MAX_BACKLOG_S) * self._settings.rate_hz) * n
-        if oldest > self._next:
-            self.counts['readings dropped, not read in time'] += oldest - self._next
-            self._next = oldest
-        first, self._next = self._next, max(self._next, self._n_due(elapsed))
-        while self._due(self._next) <= elapsed:
-            self._next += 1
-        return self._readings(self._table, first, self._next)
+        if oldest > self._next_index:
+            self.counts['readings dropped, not read in time'] += oldest - self._next_index
+            self._next_index = oldest
+        first, self._next_index = self._next_index, max(self._next_index, self._n_due(elapsed))
+        while self._due(self._next_index) <= elapsed:
+            self._next_index += 1
+        return self._readings(self._table, first, self._next_index)
 
     def close(self) -> None:
         """Do nothing; the simulated time continues."""
@@ -153,12 +154,12 @@ class SimulatedDevice:
         return (self._monotonic_ns() - self._start_ns) / 1e9
 
     def _due(self, i: int) -> float:
-        """Time at which reading `i` is measured [s]; the sensors take turns."""
+        """Measurement time of reading `i` [s]; each cycle has one reading of each sensor."""
         index, j = divmod(i, len(self._network))
         return index / self._settings.rate_hz + self._shift_s[j]
 
     def _n_due(self, elapsed: float) -> int:
-        """Number of readings measured so far; rounding may omit some of one interval."""
+        """Number of readings due so far; rounding may omit some readings of the last interval."""
         whole = math.floor(elapsed * self._settings.rate_hz)
         return whole * len(self._network) + bisect.bisect_right(
             self._shift_s, elapsed - whole / self._settings.rate_hz)
@@ -167,7 +168,7 @@ class SimulatedDevice:
         """Readings from `first` up to, but not including, `end`."""
         index, j = np.divmod(np.arange(first, end), len(self._network))
         due_s = index / self._settings.rate_hz + np.array(self._shift_s)[j]
-        # The table covers the pass only; its last row, without a vehicle, serves until the next.
+        # The table covers one pass; its last row, without a vehicle, is used until the next pass.
         row = index % round(self._period_s * self._settings.rate_hz)
         B = table[np.minimum(row, len(table) - 1), j]
         B = B + self._settings.noise * self._rng.standard_normal(B.shape)
@@ -176,8 +177,8 @@ class SimulatedDevice:
                 for t, k, j, b in zip(np.round(due_s / TICK_S).astype(int).tolist(),
                                       index.tolist(), j.tolist(), B.tolist(), strict=True)]
 
-    def _one_pass(self) -> FloatArray:
-        """Field during a pass, (n, n_sensors, 3) T, sensor frames; no vehicle in the last row."""
+    def _field_of_pass(self) -> FloatArray:
+        """Field during a pass, (n, n_sensors, 3) T, sensor frames; last row without a vehicle."""
         s, network = self._settings, self._network
         t = np.arange(0.0, self._passing_s, 1.0 / s.rate_hz)
         body = random_vehicle(np.random.default_rng(s.seed), length=s.length, moment=s.moment)
@@ -191,15 +192,15 @@ class SimulatedDevice:
 
 
 def _path_along(network: SensorNetwork, settings: SimulatorSettings) -> tuple[Path, float]:
-    """Straight path past all sensors, and its duration [s]."""
+    """(straight path past all sensors, duration of a pass [s])."""
     heading = math.radians(settings.heading_deg)
     forward = np.array([math.cos(heading), math.sin(heading)])
     left = np.array([-forward[1], forward[0]])
     along, across = network.positions[:, :2] @ forward, network.positions[:, :2] @ left
     middle = (across.min() + across.max()) / 2.0 + settings.offset
     start = (along.min() - settings.lead) * forward + middle * left
-    way = along.max() - along.min() + 2.0 * settings.lead
-    if way <= 0.0:
+    length = along.max() - along.min() + 2.0 * settings.lead
+    if length <= 0.0:
         raise SettingsError('simulator: lead: the path past the sensors has length 0; increase '
                             'lead')
-    return Path(start, heading, settings.speed), way / settings.speed
+    return Path(start, heading, settings.speed), length / settings.speed

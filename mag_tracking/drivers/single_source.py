@@ -1,21 +1,21 @@
-"""Selection of the source of a device's only sensor, if the drivers file does not name it."""
+"""Selection of the source of a device's only sensor, if the drivers file names no source."""
 
 from typing import TypeAlias
 
 from mag_tracking.units import NS
 
 RELEASE_TIMEOUT_S = 5.0
-"""[s] Silence after which another source may be selected."""
+"""[s] Silence of the selected source after which another source may be selected."""
 
 Source: TypeAlias = tuple[str, str]
 """(device's name of the sensor, address)."""
 
 
 class SingleSource:
-    """Selects one of several sources as that of the only sensor.
+    """Selects the source of a device's only sensor.
 
-    The first source is selected until it falls silent. A stray message received before the device
-    started therefore does not block the device.
+    A source remains selected until it has been silent for `RELEASE_TIMEOUT_S`. A stray message
+    before the start of the device therefore does not block the device permanently.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class SingleSource:
         self._last_receipt_ns = 0
 
     def accepts(self, source: Source, now_ns: int) -> bool:
-        """Whether `source` is the selected source.
+        """Update the selection; return whether `source` is selected.
 
         Parameters
         ----------

@@ -36,7 +36,7 @@ def clock_of(**changes):
 
 
 def timestamps_of(clock, ticks, arrival):
-    """Timestamps as float; NaN for readings without one."""
+    """Timestamps of readings [ns] as float; NaN for readings without a timestamp."""
     out = [clock.stamp(*p) for p in zip(ticks.tolist(), arrival.tolist(), strict=True)]
     return np.array([math.nan if s is None else s for s in out])
 
@@ -59,7 +59,7 @@ def constant(rng, t):
 
 def device_ticks(rng, seconds, rate=100.0, ppm=0.0, wander_ppm=0.0, counter=MHZ,
                  first=4_294_000_000, irregular=1.0):
-    """(ticks of a counter without wraps, time of each [s]), with a random phase."""
+    """(ticks of a counter without wraps, their times [s]), with a random phase."""
     n = int(seconds * rate)
     d = (np.arange(n) + irregular * rng.random(n)) / rate
     count = np.floor(d / counter['tick_s']).astype(np.int64)
@@ -102,15 +102,17 @@ LINKS = {
 def error_limit(mean, rate, wander_ppm, begin, end, z):
     """Limit [s] of the error at the newest end of a fitted line after `begin` .. `end` s.
 
-    No point lies between the fitted and the true line. A line with the error x at its end that is
-    not too low in the middle leaves an empty triangle of area x T / 4, in which z = rate / mean
-    x T / 4 points are expected: P = exp(-z), times 1 + z + z^2 / 2 for the two-dimensional family
-    of lines. Choosing an almost equally likely slope lowers the line by another mean / (rate T),
-    and by twice that at the end. A drift rate f' bends the line away from its chord or tangent by
-    b = f' T^2 / 8, and by (17/16)^2 of that at the end of a block of T / 32. The median height
-    above the tangent is b / 4: slopes that are lower by b / 4 / log(2) / 32 in the middle, and
-    differ by as much as a bend permits, have the error
-    T / 2 sqrt(2 f' b / (128 log(2))) = 0.21 b.
+    No point lies between the fitted and the true line. If the fitted line has the error x at its
+    end and is not too low in the middle, the triangle between the lines has the area x T / 4 and
+    contains no point, although z = rate / mean x T / 4 points are expected. The probability is
+    P = exp(-z), times 1 + z + z^2 / 2 for the two-dimensional family of lines. Choosing an almost
+    equally likely slope lowers the line by another mean / (rate T) in the middle, and by
+    2 mean / (rate T) at the end.
+
+    A drift rate f' bends the line away from its chord or tangent by b = f' T^2 / 8, and by
+    (17/16)^2 b at the end of a block of T / 32. The median height above the tangent is b / 4. A
+    line of almost equally likely slope may be lower by b / 4 / log(2) / 32 in the middle. Together
+    with the bend, its error is T / 2 sqrt(2 f' b / (128 log(2))) = 0.21 b.
     """
     bend = 2e-6 * math.pi / 600.0 * wander_ppm * min(end, 120.0)**2 / 8.0
     return (4.0 * z + 2.0) * mean / (rate * begin) + (1.13 + 0.21) * bend + 4e-9
@@ -212,7 +214,7 @@ def test_timestamps_go_back_by_no_more_than_the_line_moves(delays, period_ms):
     clock = clock_of(window_s=2.0, max_drift_ppm=20.0)
     stamps = [clock.stamp(*p) for p in zip(ticks, arrival, strict=True)]
     steps = np.diff(stamps) - np.diff(time)
-    # Remembered are the window, a block at each end of it, and two periods.
+    # The clock remembers the window, a block at each end of the window, and two periods.
     remembered = 2.0 * (1.0 + 2.0 / 64.0) * 1e9 + 2e6 * period_ms
     assert (steps >= min(delays) - max(delays) - 2.0 * 30e-6 * remembered - 2.0).all()
 
@@ -266,7 +268,7 @@ def test_stamp_std_holds_if_the_drift_wanders():
 
 
 def test_a_counter_of_1_mhz_is_tracked_for_thirty_days():
-    """Messages come for 17 min a day; the counter wraps 20 times in each silence."""
+    """Messages arrive for 17 min a day; the counter wraps 20 times during each pause."""
     clock = clock_of(min_delay_s=2e-3)
     day = 86_400_000_000
     for i in range(31):
@@ -291,7 +293,7 @@ def test_losses_over_several_counter_wraps_are_bridged():
 
 
 def max_rejected(rate):
-    """Maximum readings lost in a restart: two tolerances (0.1 s and twice the spread) and 3."""
+    """Maximum number of readings lost in a restart: two tolerances (0.1 s + 2 spreads), and 3."""
     return 2.0 * (0.1 + 2.0 * 4.0 * 2e-3) * rate + 3
 
 
@@ -340,7 +342,7 @@ def test_a_step_back_during_silence_is_first_treated_as_a_queue(reset, cause):
 
 @pytest.mark.parametrize('sensors', [1, 3])
 def test_occasional_wrong_device_times_affect_no_other_timestamp(sensors):
-    """Times that are wrong by 30 ms or arbitrary are rejected; other timestamps are unchanged."""
+    """Random device times and errors of 30 ms are rejected; other timestamps are unchanged."""
     ticks, arrival, t = (np.repeat(a, sensors) for a in simulate(seconds=60.0))
     rng = np.random.default_rng(2)
     wrong = np.repeat(rng.random(len(t) // sensors) < 0.02, sensors) & (t > 6.0)
@@ -377,7 +379,7 @@ def test_clocks_that_alternate_every_second_only_cause_restarts():
 
 
 def test_an_emptying_queue_does_not_restart_the_clock():
-    """The host stops for 12 s and then reads everything at once."""
+    """The host stops for 12 s and then reads all messages at once."""
     ticks, arrival, t = simulate()
     stalled = (t > 40.0) & (t < 52.0)
     arrival[stalled] = START + 52 * 10**9
@@ -393,7 +395,7 @@ def test_messages_queued_before_opening_are_timestamped():
     clock = clock_of()
     e = errors_of(timestamps_of(clock, ticks, arrival), t)
     assert not clock.counts and not clock.restarts
-    # Bound: the fastest message since then, and the maximum drift.
+    # Bound: delay of the fastest message since the opening, and the maximum drift.
     assert np.abs(e[400:]).max() < 2e6 + 500e-6 * 10e9
     assert np.abs(e[2000:]).max() * 1e-9 < error_limit(2e-3, 100.0, 0.0, 15.0, 15.0, 12.0)
 
@@ -401,7 +403,7 @@ def test_messages_queued_before_opening_are_timestamped():
 @pytest.mark.parametrize('change_ms', [10.8, -10.8])
 @pytest.mark.parametrize('back, restarts', [(0.0, {}), (30.0, {LOST: 1})])
 def test_the_clock_continues_after_an_hour_of_disconnection(change_ms, back, restarts):
-    """Meanwhile, the drift changes by 3 ppm; in some cases, the clock steps by 30 s."""
+    """In this hour, the drift changes by 3 ppm; in some cases, the clock steps by 30 s."""
     ticks, arrival, t = simulate(seed=3, seconds=200.0, ppm=40.0)
     hour = 3600 * 10**9 + round(change_ms * 1e6)
     out = t > 100.0
@@ -462,7 +464,7 @@ def test_a_counter_running_backwards_is_accepted_up_to_min_step_s():
 
 
 def test_a_queue_at_the_start_does_not_bias_the_clock():
-    """Messages of the first 3 s are 2 s late; those of the next 2 s are lost."""
+    """Messages of the first 3 s are 2 s late; messages of the next 2 s are lost."""
     ticks, arrival, t = simulate()
     late = t < 3.0
     arrival[late] += 2 * 10**9
@@ -490,7 +492,7 @@ def test_overtaken_messages_in_blocks_of_one_do_not_bias_the_clock():
 
 
 def test_points_with_one_device_time_have_no_slope():
-    """This occurs only if arrivals are out of order."""
+    """A set of such points occurs only if arrivals are out of order."""
     clock = clock_of(window_s=1.0)
     for i in range(1, 20):
         clock.stamp(2000 * i, START + 60_000_000 + 2_000_000 * i)
@@ -534,7 +536,7 @@ def test_delays_of_seconds_are_not_treated_as_steps():
 
 @pytest.mark.parametrize('fraction', [1.0, 0.3])
 def test_a_link_that_becomes_faster_restarts_the_clock(fraction):
-    """The delay drops from 52 ms to 2 ms, for all messages or for some of them."""
+    """The delay decreases from 52 ms to 2 ms, for all messages or for some of them."""
     rng = np.random.default_rng(6)
     count, t = device_ticks(rng, 100.0, irregular=0.0)
     slow = (t < 50.0) | (rng.random(len(t)) > fraction)

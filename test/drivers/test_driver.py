@@ -21,7 +21,7 @@ CLOCK = ClockSettings(tick_s=1e-6, min_delay_s=0.0)
 
 
 class SimulatedHost:
-    """Clocks of a host whose time the test sets."""
+    """Simulated clocks of a host."""
 
     def __init__(self):
         self.now_ns, self.step_ns = 5_000_000_000, 0
@@ -65,7 +65,7 @@ class ScriptedDevice:
 
 
 def poll_samples(driver, timeout_s):
-    """Samples from one poll of `driver`."""
+    """Fields and accelerations from one poll, in one list."""
     readings, accelerations = driver.poll(timeout_s)
     return [*samples_of(readings), *accelerations]
 
@@ -102,7 +102,7 @@ def test_units_are_converted_to_tesla(unit, tesla):
 @pytest.mark.parametrize('settings, message', [
     ({'unit': 'gauss'}, "board: unit: 'gauss' is neither"), ({'unit': '0'}, 'unit'),
     ({'unit': 'nan'}, 'unit'), ({'acceleration_unit': 'G'}, 'board: acceleration_unit'),
-    ({'stamp_by': 'sundial'}, 'board: stamp_by: expected auto, ticks')])
+    ({'stamp_by': 'sundial'}, 'board: stamp_by: expected one of auto, ticks')])
 def test_invalid_settings_are_refused(settings, message):
     with pytest.raises(SettingsError, match=message):
         driver_of([], settings)
@@ -128,7 +128,7 @@ def test_a_lost_device_is_reopened_with_back_off():
     assert driver.fault == ''
     assert driver.counts()['failed attempts to open'] == 7
     assert driver.counts()['connections lost'] == 1
-    # A device that failed to open is closed, too, because it may hold resources.
+    # A device that failed to open is also closed, because it may hold resources.
     assert device.calls.count('close') == 8
     assert max(machine.slept) <= 0.01 + 1e-9
 
@@ -260,7 +260,7 @@ def test_duplicates_are_distinguished_from_restarts():
     # The same number with the same values is the same reading, NaN or not.
     assert check_sequence([0, 1, 1, 2, 0], values=[5, 6, 6, 7, 5]) == (
         [True, True, False, True, False], {'duplicates': 2})
-    # With other values, the device has restarted, near its first number or far from it.
+    # With different values, the device has restarted, near its first number or far from it.
     for begin in (3, 500, 100_000):
         assert check_sequence([begin, begin + 1, 0, 1, 2]) == (
             [True] * 5, {'sequence restarts': 1})
@@ -281,7 +281,7 @@ def test_the_memory_of_a_sequence_check_is_bounded():
 
 
 def test_duplicate_readings_are_dropped():
-    """A missing axis makes no difference. The same number with other values is a new reading."""
+    """A known number with different values is a new reading, not a duplicate."""
     def reading(x, sequence, acceleration=None):
         return Reading('', (x, float('nan'), 3.0), acceleration, sequence=sequence)
     driver, *_ = driver_of([
@@ -307,7 +307,7 @@ def test_remembered_readings_do_not_burden_the_garbage_collector():
 @pytest.mark.parametrize('sequence', [None, 1])
 @pytest.mark.parametrize('field', [(1.0, 2.0), (1.0, 2.0, 3.0) * 2, (10**400, 0.0, 0.0)])
 def test_a_field_that_is_not_three_floats_is_an_error_of_the_device(field, sequence):
-    """Three such readings are not combined either."""
+    """Three invalid readings are not combined into valid fields."""
     driver, *_ = driver_of([[Reading('', field, sequence=sequence)] * 3])
     with pytest.raises((ValueError, OverflowError)):
         driver.poll(0.1)
@@ -395,7 +395,7 @@ class DigitFraming:
 
 
 class ScriptedTransport:
-    """Transport that returns given chunks."""
+    """Transport that returns predefined chunks."""
 
     def __init__(self, chunks, whole=False):
         self.whole, self.counts, self._chunks = whole, Counter(dropped=2), list(chunks)
@@ -431,7 +431,7 @@ def test_messages_are_not_joined():
 
 
 def test_numbers_skipped_while_closed_are_not_lost():
-    """A gap while the driver is closed is not counted; a gap while it is open is."""
+    """A gap is counted only while the driver is open."""
     def at(*numbers):
         return [Reading('', (float(n), 0.0, 0.0), sequence=n) for n in numbers]
     driver, *_ = driver_of([at(1, 2), at(50, 51, 53)])

@@ -17,14 +17,14 @@ BOARD = {'transport': 'serial', 'serial': {'port': '/dev/ttyUSB0'}, 'framing': '
 
 
 def read(tmp_path, content, network=None):
-    """The drivers of a file with this content."""
+    """Read the drivers of a file with `content`."""
     path = tmp_path / 'drivers.yaml'
     path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
     return read_drivers(path, network)
 
 
 def without(*keys, **more):
-    """The board with some keys removed and others added."""
+    """Entry `BOARD` with some keys removed and others added."""
     return {'board': {**{k: v for k, v in BOARD.items() if k not in keys}, **more}}
 
 
@@ -66,7 +66,8 @@ def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
     (without(device='i2c'), 'device cannot be combined with transport and framing'),
     (without(transport='carrier pigeon'), "transport: expected serial, udp, mqtt or package.mod"),
     (without(framing=['text']), 'framing: expected text'),
-    (without(transport='no_such_module:Port'), "no_such_module:Port: ModuleNotFoundError: No"),
+    (without(transport='no_such_module:Port'),
+     "no_such_module:Port cannot be loaded: ModuleNotFoundError: No"),
     (without(transport='yaml:Port'), "module 'yaml' has no attribute 'Port'"),
     (without(serial={'prot': 'x'}), 'unknown setting prot; did you mean port?'),
     (without(serial={'port': 'x', 'baud': 'fast'}), "baud: expected int, got 'fast'"),
@@ -77,16 +78,18 @@ def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
     (without(binary={'sync': 'A5'}), 'unknown setting binary'),
     (without('sensor'), 'expected `sensor: mag_1`, or `sensors:`'),
     (without(sensors={'A': 'mag_2'}), 'sensor and sensors are mutually exclusive'),
-    ('{"\\ud800": {}}', "'\\ud800' is not a device name: it contains a lone surrogate"),
+    ('{"\\ud800": {}}', "'\\ud800' is not a device name: it is not valid Unicode"),
     (without('sensor', sensors={'\ud800': 'a'}), "sensors: '\\ud800' is not a name"),
     (without(text={'fields': ['\udcff']}), "fields: '\\udcff' is not text"),
     (without('sensor', sensors={'A': 3}), 'sensors: A: expected a sensor name (letters'),
-    (without('sensor', sensors={'1': 'a', 1: 'b'}), 'the same name at the device appears twice'),
+    (without('sensor', sensors={'1': 'a', 1: 'b'}),
+     'the name 1 at the device appears twice; remove one'),
     (without('sensor', sensors={1.1: 'a'}), 'sensors: 1.1 is not a name; put it in quotes'),
     (without('sensor', sensors={None: 'a'}), 'sensors: None is not a name; put it in quotes'),
     (without(sensor='mag 1'), 'expected a sensor name (letters, digits'),
-    (without(framing='collections:OrderedDict'), 'OrderedDict has no SETTINGS, parse'),
-    (without(framing='.x:Y'), 'framing: .x:Y: TypeError'),
+    (without(framing='collections:OrderedDict'),
+     'OrderedDict is incomplete, it lacks SETTINGS, parse'),
+    (without(framing='.x:Y'), 'framing: .x:Y cannot be loaded: TypeError'),
     (without('sensor', sensors={'A': 'a', 'B': 'a'}), 'sensor a is already assigned to board (A)'),
     ({**without(), 'other': BOARD}, 'other: sensor mag_1 is already assigned to board'),
     ({'board': 7}, 'board: expected a mapping of settings, got 7'),
@@ -96,6 +99,37 @@ def test_invalid_files_are_refused(tmp_path, content, message):
     with pytest.raises(SettingsError) as error:
         read(tmp_path, content)
     assert message in str(error.value) and 'drivers.yaml' in str(error.value)
+
+
+SERIAL = {'port': '/dev/ttyUSB0'}
+
+
+@pytest.mark.parametrize('content, message', [
+    ({'port': '/dev/ttyUSB0', 'board': without(serial={})}, ': port is misplaced; the top level of '
+     'the file contains devices. Move port into a device, under serial, udp or mqtt'),
+    ({'board': without('serial'), 'serial': SERIAL}, ': serial is misplaced; the top level of the '
+     'file contains devices. Move serial into a device'),
+    ({'transport': 'serial'}, ': transport is misplaced; the top level of the file contains '
+     'devices. Move transport into a device'),
+    (without('serial', port='/dev/ttyUSB0'),
+     'board: port is misplaced; move it to serial, as in serial: {port: ...}'),
+    (without(text={**BOARD['text'], **SERIAL}),
+     'board: text: port is misplaced; move it to serial, as in serial: {port: ...}'),
+    (without(serial={**SERIAL, 'unit': 'nT'}),
+     'board: serial: unit is misplaced; move it to the top level of the device'),
+    (without(tick_s=1e-3), 'board: tick_s is misplaced; move it to clock, as in clock: {tick_s: '),
+    ({'pi': {'device': 'i2c', 'i2c': {'sensors': ['A:lis3mdl:0x1c'], 'port': 1}, 'sensor': 'a'}},
+     'pi: i2c: port is misplaced; it is a setting of serial, udp or mqtt, but the device uses i2c'),
+    (without('transport', 'serial', 'framing', 'text', **SERIAL), 'board: port is misplaced; it is '
+     'a setting of serial, udp or mqtt, but the device uses no transport')])
+def test_a_misplaced_setting_is_refused_with_its_place(tmp_path, content, message):
+    with pytest.raises(SettingsError) as error:
+        read(tmp_path, content)
+    assert message in str(error.value)
+
+
+def test_a_device_may_have_the_name_of_a_group(tmp_path):
+    assert [d.name for d in read(tmp_path, {'serial': BOARD})] == ['serial']
 
 
 def test_a_sensor_that_is_not_in_the_network_is_refused(tmp_path):

@@ -33,13 +33,13 @@ class Clock:
 
 
 def device_of(settings=QUIET):
-    """(the device, its clock)."""
+    """(simulated device, its clock)."""
     clock = Clock()
     return SimulatedDevice(settings, lambda: clock.ns, clock.sleep), clock
 
 
 def first_arrivals(device, n, timeout_s=1.0):
-    """The first `n` arrivals."""
+    """Read the first `n` arrivals."""
     out = []
     while len(out) < n:
         out += device.read(timeout_s)
@@ -95,7 +95,7 @@ def test_readings_arrive_in_time_with_the_specified_noise():
 
 
 def test_sequential_sensors_measure_at_their_own_times():
-    """Each sensor measures a fraction of the interval after the previous one."""
+    """Each sensor measures a fraction of the sampling interval after the previous sensor."""
     device, _ = device_of(dataclasses.replace(QUIET, sequential=True))
     device.open()
     network = read_network(NETWORK_FILE)
@@ -145,7 +145,7 @@ def test_unsuitable_settings_and_networks_are_refused(tmp_path):
 
 
 def drivers_file(tmp_path, sensors):
-    """Drivers file of the simulator."""
+    """Write a drivers file for the simulator; return its path."""
     path = tmp_path / 'drivers.yaml'
     path.write_text(f'road:\n  device: simulator\n  simulator: {{network: {NETWORK_FILE}, '
                     f'moment: 0.0}}\n  sensors: {sensors}\n')

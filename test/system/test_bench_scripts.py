@@ -1,4 +1,4 @@
-"""The scripts of `make bench` can be imported; they run too rarely to reveal renamed imports."""
+"""The scripts of `make bench` can be imported; they rarely run, so imports are tested here."""
 
 import importlib.util
 import runpy
@@ -15,8 +15,8 @@ def test_a_bench_script_can_be_imported(path):
     assert runpy.run_path(str(path), run_name='imported')['__doc__']
 
 
-def test_the_share_of_the_disturbance_model_is_measured():
-    """Names of timed methods are texts there, which a rename does not find."""
+def test_the_cost_fraction_of_the_disturbance_model_is_measured():
+    """The script names the timed methods in strings, which a rename may miss."""
     assert 0.0 < situations.cost() < 1.0
 
 

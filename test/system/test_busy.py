@@ -15,7 +15,7 @@ from support.random_passes import SIMULATORS, one_random_pass, random_pass
 from support.samples import scenario
 
 MAX_WRONG = 0.01
-"""Aim: maximum share of wrong poses among those without a flag."""
+"""Aim: maximum fraction of wrong poses among unflagged poses."""
 AIMS = {'meeting_2_sensors': (15, 1.0, 4.0), 'following_2_sensors': (16, 0.9, 4.0),
         'traffic_2_sensors': (11, np.inf, np.inf), 'traffic_4_sensors': (11, np.inf, np.inf)}
 """{recording: (minimum number of vehicles, maximum median RMS error [m], maximum median NEES)}."""
@@ -39,7 +39,7 @@ def test_every_vehicle_of_a_recording_is_tracked(name):
 
 @pytest.mark.parametrize('name', studied(AIMS, kept=IN_EVERY_TEST))
 def test_every_vehicle_of_a_recording_is_counted(name):
-    """It is counted in its direction, and there are no other passages."""
+    """Each vehicle is counted in its direction, and no other passage is counted."""
     passages = tracked_recording(name).passages
     right = busy_recordings.rightly_counted(name, passages)
     assert len(right) >= AIMS[name][0] and len(right) == len(passages)
@@ -50,7 +50,7 @@ def test_every_vehicle_of_a_recording_is_counted(name):
 
 
 def test_smoothed_poses_of_new_targets_are_near_the_published_ones():
-    """Smoothing is linearised where the vehicle was found; otherwise it was 50 m off."""
+    """Smoothing is linearised at the position of track initiation; otherwise errors reach 50 m."""
     n = 0
     for name in IN_EVERY_TEST:
         got = tracked_recording(name)
@@ -72,7 +72,7 @@ def test_poses_without_a_flag_are_rarely_wrong():
 
 @pytest.mark.study
 def test_a_tracker_of_one_vehicle_at_a_time_misses_vehicles():
-    """Joint tracks are necessary, and the setting disables them."""
+    """Without joint tracks, which a setting disables, vehicles are missed."""
     score, poses, pipeline, *_ = busy_recordings.tracked_recording(
         'meeting_2_sensors', changes={'track.max_joint_targets': 1})
     assert score.is_found.sum() <= 10
@@ -83,7 +83,7 @@ def test_a_tracker_of_one_vehicle_at_a_time_misses_vehicles():
 @pytest.mark.parametrize('simulator', SIMULATORS)
 @pytest.mark.parametrize('pattern', ['meeting', 'following', 'traffic'])
 def test_vehicles_of_both_simulators_are_tracked(pattern, simulator):
-    """The aim is nine in ten vehicles with two sensors."""
+    """The aim for two sensors is to track nine of ten vehicles."""
     scores = [busy_worlds.tracked(busy_worlds.busy(pattern, 2, simulator, seed))[0]
               for seed in range(3)]
     found = np.concatenate([s.is_found for s in scores])
@@ -96,7 +96,7 @@ def test_vehicles_of_both_simulators_are_tracked(pattern, simulator):
 @pytest.mark.parametrize('simulator', SIMULATORS)
 @pytest.mark.parametrize('kind', ['car', 'truck'])
 def test_one_vehicle_is_rarely_tracked_as_two(kind, simulator):
-    """It happens more often with trucks, whose model is less complete."""
+    """Duplicate tracks are more frequent for trucks, whose model is less complete."""
     network, n = read_network(NETWORK_FILE), 25
     new = []
     for seed in range(n):
@@ -110,7 +110,7 @@ def test_one_vehicle_is_rarely_tracked_as_two(kind, simulator):
 
 
 def test_more_vehicles_than_are_tracked_together_are_counted():
-    """Ten vehicles in seven seconds: the work is bounded, and omitted targets are counted."""
+    """Ten vehicles pass in seven seconds; the joint targets are limited to two."""
     rng = np.random.default_rng(4)
     plan = [(12.0 + 0.7 * k, 1 - 2 * (k % 2), rng.uniform(8.0, 12.0)) for k in range(10)]
     world = busy_worlds.world(
@@ -129,6 +129,6 @@ def test_more_vehicles_than_are_tracked_together_are_counted():
 @pytest.mark.study
 @pytest.mark.parametrize('seed', [1, 14])
 def test_wrong_smoothed_poses_of_a_truck_tracked_as_two_are_flagged(seed):
-    """Previously, 46 of 76 poses without a flag were wrong."""
+    """No unflagged smoothed pose is wrong, and some filtered poses have no flag."""
     got = one_random_pass('clouds', 'truck', seed)
     assert got.smoothed_wrong == 0 and not got.ambiguous.all()

@@ -1,4 +1,4 @@
-"""Two coarse sensors half a metre apart: speed and direction by fit, delay and track.
+"""Two coarse sensors half a metre apart: speed and direction from fit, delay and track.
 
 The series of 40 passes is a study; `make test` runs a few of them.
 """
@@ -15,7 +15,7 @@ SEEDS = range(40)
 
 
 def counts(found):
-    """(n, right direction, speed within 10 %, error within 3 std) of [(truth, (answer, std))]."""
+    """Count [(truth, (answer, std))]: (all, right direction, speed within 10 %, error < 3 std)."""
     v = np.array([truth for truth, _ in found])
     answer, std = np.array([a for _, a in found]).T
     return (len(v), int((answer * v > 0).sum()), int((np.abs(answer / v - 1.0) < 0.1).sum()),
@@ -23,7 +23,7 @@ def counts(found):
 
 
 def delay_of(a):
-    """(answer, std) of the delay."""
+    """(velocity along x, its std) from the delay between the sensors [m/s]."""
     along = np.cos(a.delay.heading)
     return a.delay.speed * along, a.delay.speed_std
 
@@ -43,7 +43,7 @@ def test_speed_and_direction_of_forty_passes_reach_the_aims():
     for name in ('fit', 'delay'):
         n, right, _, consistent = found[name]
         assert n >= 36 and right == n and consistent >= 0.95 * n
-    # Range and size are hardly observable with two sensors at one place.
+    # Range and moment are hardly observable with two sensors so close to each other.
     assert all(a.ambiguous for a in passes if a.track is not None)
 
 
@@ -51,7 +51,7 @@ def test_speed_and_direction_of_forty_passes_reach_the_aims():
 @pytest.mark.xfail(strict=True, reason='unknown; perhaps because the filter assumes independent '
                    'model errors at the two sensors')
 def test_the_speed_of_a_track_at_a_close_pair_reaches_the_aims():
-    """Aims as above, for the filtered and the smoothed track."""
+    """Aims for the filtered and the smoothed track: speed within 10 %, error within 3 std."""
     found = [answers(seed) for seed in SEEDS]
     for name in ('track', 'smoothed'):
         n, _, near, consistent = counts([(a.truth, getattr(a, name)) for a in found])
@@ -71,7 +71,7 @@ def test_frames_of_a_close_pair_are_shorter_than_its_delay():
 
 
 def test_a_glitch_on_a_constant_axis_is_not_its_resolution():
-    """A glitch of 98 uT was treated as the resolution of an axis that had not changed yet."""
+    """The first change of the axis is a glitch of 98 uT, which must not become its resolution."""
     readings, *_ = readings_of(10)
     pipeline = Pipeline(PAIR, settings_for('vehicle'))
     frames = [r for r in pipeline.feed(readings) + pipeline.flush() if hasattr(r, 'n_samples')]

@@ -19,7 +19,7 @@ FLAGS = ('-O1', '-g', '-std=c++17', '-shared', '-fPIC', '-fvisibility=hidden', '
 
 
 def build(source):
-    """Compile a module beside its source, with sanitizers."""
+    """Compile a module with sanitizers, in the folder of its source."""
     module = source.with_name('core' + sysconfig.get_config_var('EXT_SUFFIX'))
     includes = (pybind11.get_include(), sysconfig.get_path('include'))
     subprocess.run(['g++', *FLAGS, *(f'-I{folder}' for folder in includes), str(source), '-o',

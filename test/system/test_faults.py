@@ -13,12 +13,15 @@ from support.faulty_streams import FAULTS, NS, stream
 from support.samples import one
 
 WRONG = chi2.ppf(1.0 - 1e-4, 2)
-"""A pose is wrong if its error squared, normalised with its covariance, exceeds this."""
+"""Normalised squared error above which a pose is wrong."""
 
 
 @functools.cache
-def passed(n_sensors, seed, fault=None):
-    """(pipeline, [(t, error [m], normalised error squared, flagged)], (begin, end)) of a pass."""
+def track_pass(n_sensors, seed, fault=None):
+    """Track a pass; return (pipeline, rows, (begin, end)).
+
+    A row is (t, error [m], normalised squared error, flagged).
+    """
     network, samples, truth, times = stream(n_sensors, seed, fault)
     pipeline = Pipeline(network, settings_for('vehicle', POINT))
     records = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
@@ -52,8 +55,8 @@ COUNTED_AS = {
     (2, 0), pytest.param(2, 1, marks=pytest.mark.study),
     pytest.param(6, 0, marks=pytest.mark.study)])
 def test_a_fault_during_a_pass_is_named_and_gives_no_unflagged_errors(n_sensors, seed, fault):
-    _, whole, _ = passed(n_sensors, seed)
-    pipeline, rows, (begin, end) = passed(n_sensors, seed, fault)
+    _, reference, _ = track_pass(n_sensors, seed)
+    pipeline, rows, (begin, end) = track_pass(n_sensors, seed, fault)
     where, what = COUNTED_AS[fault]
     counts = pipeline.calibrate.counts_of(where) if where == 'mag_2' else \
         pipeline.counts()[where]
@@ -62,14 +65,14 @@ def test_a_fault_during_a_pass_is_named_and_gives_no_unflagged_errors(n_sensors,
     assert not any(n for s in pipeline.network.names if s != 'mag_2'
                    for key, n in pipeline.calibrate.counts_of(s).items()
                    if key.startswith('rejected'))
-    unflagged = sum(z > WRONG and not flagged for _, _, z, flagged in whole)
+    unflagged = sum(z > WRONG and not flagged for _, _, z, flagged in reference)
     wrong = [r for r in rows if r[2] > WRONG and not r[3]]
     assert len(wrong) <= unflagged, wrong[:3]
     if n_sensors > 2:
-        # The others support the track, which after two seconds is as accurate as without the fault.
+        # The other sensors support the track, whose accuracy recovers within two seconds.
         during = [r for r in rows if begin < r[0] < end]
         assert len(during) >= 0.9 * (end - begin) / 0.08 - 1
         late = [(r[1], w[1]) for r, w in zip(
             [r for r in rows if end + 2.0 < r[0]],
-            [w for w in whole if end + 2.0 < w[0]], strict=False)]
+            [w for w in reference if end + 2.0 < w[0]], strict=False)]
         assert all(with_fault < without_fault + 1.0 for with_fault, without_fault in late)

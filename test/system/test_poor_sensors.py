@@ -1,4 +1,4 @@
-"""Bundled recordings, degraded as by poor sensors: tracks, flags and findings.
+"""Bundled recordings, degraded as if by poor sensors: tracks, flags and findings.
 
 All recordings are a study; `make test` runs one or two of each kind. Limits are aims.
 """
@@ -25,10 +25,10 @@ SECOND_CAR = spoiler.vehicle_at_start(recorded(CAR).readings, 6.0, 4.0)
 
 @pytest.mark.parametrize('name', studied(VEHICLES, kept=(CAR,)))
 def test_placeholder_covariances_change_nothing(name):
-    plain = outcome(name, settings=QUICK).result
+    original = outcome(name, settings=QUICK).result
     for variance in PLACEHOLDERS:
         result = outcome(name, spoiler.covariance(variance), settings=QUICK).result
-        np.testing.assert_array_equal(result.poses['position'], plain.poses['position'])
+        np.testing.assert_array_equal(result.poses['position'], original.poses['position'])
         found = [f for f in findings(name, spoiler.covariance(variance)) if 'state a noise' in f]
         assert len(found) == 2, found
         overruled = result.counts['calibrate'].get(
@@ -36,22 +36,22 @@ def test_placeholder_covariances_change_nothing(name):
         assert overruled > 0
 
 
-@pytest.mark.parametrize('stated', studied(
+@pytest.mark.parametrize('covariance', studied(
     [[0.0] * 9, [-1.0] + [0.0] * 8, [1e-2, 0, 0, 0, 1e-2, 0, 0, 0, 1e-2], [-1e-2] * 9,
      [float('inf'), 0, 0, 0, float('inf'), 0, 0, 0, float('inf')]],
     kept=([0.0] * 9, [-1e-2] * 9)))
-def test_invalid_covariances_in_a_recording_change_nothing(stated, tmp_path):
+def test_invalid_covariances_in_a_recording_change_nothing(covariance, tmp_path):
     readings = recorded(CAR).readings
     with RecordingWriter(tmp_path / 'a.mcap') as writer:
         for k, (name, content) in enumerate(magnetic_field_dicts(readings)):
-            content['magnetic_field_covariance'] = [float(v) for v in stated]
+            content['magnetic_field_covariance'] = [float(v) for v in covariance]
             writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD, content, int(readings.stamp_ns[k]))
     result = mt.track(tmp_path / 'a.mcap', NETWORK_FILE, settings=QUICK)
     np.testing.assert_array_equal(result.poses['position'], outcome(
         CAR, settings=QUICK).result.poses['position'])
 
 
-def test_the_doctor_names_topic_size_and_cause_of_a_covariance():
+def test_the_doctor_reports_topic_magnitude_and_cause_of_a_covariance():
     found = [f for f in findings(CAR, spoiler.covariance(1e-2)) if 'state a noise' in f]
     assert '/mag_1/imu/mag state a noise of 1e+08 nT' in found[0] and 'a placeholder' in found[0]
     quiet = recorded(CAR).readings.field[:300:2]
@@ -71,7 +71,7 @@ def test_the_doctor_reports_infinite_covariances():
 def test_coarse_steps_hide_no_vehicle_and_are_not_a_fault(name, step, request):
     if (name, step) == ('junction_left_to_right', 1e-6):
         request.applymarker(pytest.mark.xfail(strict=True, reason='the readings of one sensor '
-                            'do not change, and those of the other change by a step of noise'))
+                            'do not change, and the other sensor changes by a step of noise'))
     assert outcome(name, spoiler.steps(step)).detected >= 1
     found = findings(name, spoiler.steps(step))
     assert not any(word in f for f in found for word in (
@@ -127,12 +127,12 @@ def test_directions_after_another_vehicle_at_the_start_are_right_or_flagged():
 @pytest.mark.parametrize('name', studied([*VEHICLES, *ROADS], kept=(CAR, *ROADS)))
 def test_glitches_and_saturation_are_distinguished(name):
     glitches, clipped = spoiler.glitches(0.003, 2e-5), spoiler.clipped(0.5)
-    plain, found = findings(name), findings(name, glitches)
+    original, found = findings(name), findings(name, glitches)
     # A sensor is reported if more than one of its readings in a thousand is a glitch.
     assert sum('are spikes' in f for f in found) >= (1 if name in ROADS else 2)
     # The truck saturates a sensor in the original recording.
     assert sum('end of the range' in f for f in found) == sum(
-        'end of the range' in f for f in plain)
+        'end of the range' in f for f in original)
     found = findings(name, clipped)
     assert sum('end of the range' in f for f in found) == len(recorded(name).readings.names)
     assert not any('are spikes' in f for f in found), found

@@ -1,4 +1,4 @@
-"""Examples that reproduce published figures: they run, and their numbers are right."""
+"""Examples that reproduce published figures: they run, and their numbers are verified."""
 
 import importlib.util
 from pathlib import Path
@@ -14,7 +14,7 @@ PNG = b'\x89PNG\r\n\x1a\n'
 
 
 def example(name):
-    """The script as a module; examples/ is not a package."""
+    """Import a script as a module; examples/ is not a package."""
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f'{name}.py')
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -66,7 +66,7 @@ def test_an_example_draws_figures_and_prints_differences(name, figures, expected
 
 
 def test_the_moment_and_field_of_the_car_match_the_equations(mitre12):
-    """MITRE12 (A.1)-(A.6), written out for a car that drives north or east, and (1), (2)."""
+    """MITRE12 (A.1)-(A.6), (1) and (2), written out for a car that drives north or east."""
     L1, dip, declination = 0.17356, np.radians(59.0), np.radians(-11.0)
     H = 57e-6 / (4e-7 * np.pi) * np.cos(dip)
     volume = 4.0 / 3.0 * np.pi * 2.0
@@ -78,7 +78,7 @@ def test_the_moment_and_field_of_the_car_match_the_equations(mitre12):
     m = mitre12.moment('car')
     m1, m2 = along * cos, -across * sin
     np.testing.assert_allclose(m[:2], [m1, m2], rtol=1e-4)
-    assert m[2] < 0.0  # the earth's field points down in the north
+    assert m[2] < 0.0  # the Earth's field points down in the north
     x, y = -7.0, 25.0
     R = np.hypot(x, y)
     B = 1e-7 / R**5 * np.array([m1 * (3 * x**2 - R**2) + 3 * m2 * x * y,
@@ -106,13 +106,13 @@ def test_the_jacobian_matches_finite_differences_of_the_field(mitre12, z):
     numeric = np.stack([(field(z + e) - field(z - e)) / (2.0 * e.max()) for e in np.diag(step)],
                        axis=-1)
     analytic = mitre12.jacobian(z)
-    size = np.abs(numeric).max(axis=(0, 1))
-    np.testing.assert_allclose(analytic / size, numeric / size, atol=1e-6)
+    magnitude = np.abs(numeric).max(axis=(0, 1))
+    np.testing.assert_allclose(analytic / magnitude, numeric / magnitude, atol=1e-6)
 
 
 @pytest.mark.parametrize('divisor, scale, cpa', [(11.0, {}, 29.0), (22.0, {'scale': 1.0}, 25.0)])
 def test_the_detection_probability_matches_explicit_sums(mitre12, divisor, scale, cpa):
-    """MITRE12 (B.8)-(B.13), summed over four frequencies: DFT divided by N, or by F_s."""
+    """MITRE12 (B.8)-(B.13), summed over four frequencies, with the DFT divided by N or by F_s."""
     k, t = np.arange(11), np.arange(11) / 22.0
     r = np.stack([-3.0 + 25.0 * 0.44704 * t, np.full(11, cpa), np.zeros(11)], axis=-1)
     B = dipole_field(-r, mitre12.moment('car'))[:, :2]
@@ -137,7 +137,7 @@ def test_detection_probabilities_are_near_the_published_ones(mitre12, detected):
     # "nontrivial".
     assert n['five'] > 0.999 and n['at 25'] > 0.999 and n['at 35'] < 0.1
     assert n['ATV at 10'] > 0.999 and n['ATV five most'] > 0.2
-    # Neither the physical transform nor a road to the east reaches the published numbers.
+    # Neither the physical transform nor a road to the east reproduces the published numbers.
     assert n['once physical'] < n['once east'] < 0.2
     assert n['range physical'] < n['range east'] < n['range']
     # The probability falls with the CPA distance and grows with the number of sensors.
@@ -149,7 +149,7 @@ def test_detection_probabilities_are_near_the_published_ones(mitre12, detected):
 
 
 def test_bounds_of_one_sensor_without_a_prior_are_infinite(mitre12, bounded):
-    """One sensor cannot observe the scale, so MITRE12's bounds without a prior do not exist."""
+    """The scale is unobservable with one sensor, so there are no bounds without a prior."""
     n = bounded
     assert n['lost'] == ('x0', 'y0', 'v', 'M1', 'M2')
     m = mitre12.moment('car')
@@ -161,13 +161,13 @@ def test_bounds_of_one_sensor_without_a_prior_are_infinite(mitre12, bounded):
     assert np.isinf(n['at 0 mph'][0][3])
     assert n['at 0 mph'][1][3] == pytest.approx(15.0, rel=1e-9)
     assert n['at 10 mph'][0][3] > n['at 25 mph'][0][3] > n['at 80 mph'][0][3]
-    # Two sensors can observe it.
+    # With two sensors, the scale is observable.
     J = mitre12.measured(-20.0) + mitre12.measured(0.0)
-    assert np.all(np.isfinite(mitre12.deviations(J)))
+    assert np.all(np.isfinite(mitre12.std_bounds(J)))
 
 
 def test_printed_jacobian_and_prior_do_not_explain_the_published_bounds(mitre12, bounded):
-    """(20) affects phi only; with the first four of (26), all bounds are finite at zero speed."""
+    """(20) affects only phi. With four priors of (26), the bounds are finite at zero speed."""
     x, y, h = -20.0, 25.0, 1e-5
     phi = np.array([np.arctan2(y, x + h) - np.arctan2(y, x - h),
                     np.arctan2(y + h, x) - np.arctan2(y - h, x)]) / (2.0 * h)
@@ -194,7 +194,7 @@ def test_observability_values_match_the_published_ones(observed):
 
 
 def test_the_best_place_of_the_second_sensor_depends_on_the_state(t10, observed):
-    """T10's conclusion holds for the state at the CPA, but not for the state at the start."""
+    """The conclusion of T10 holds for the state at the CPA, but not for the state at the start."""
     n = observed
     assert n['plain best'][0] == (-2.0, 2.0) and n['plain best'][1] == pytest.approx(1110, abs=1)
     assert n['plain best same side'][0] == (-2.2, 0.0)
@@ -205,7 +205,7 @@ def test_the_best_place_of_the_second_sensor_depends_on_the_state(t10, observed)
     assert n['scaled best'][1] == pytest.approx(405, abs=1)
     for name in ('plain', 'cpa', 'scaled'):
         assert n[f'{name} best'][1] <= n[f'{name} best same side'][1]
-    # The state at the CPA is that of a start moved there.
+    # Moving the start to the CPA gives the state at the CPA.
     t = 0.1 * np.arange(60)[:, None] - 3.0
     moved = t10.sensor_information(np.array([0.5, -1.0, 0.0]))
 
@@ -219,7 +219,7 @@ def test_the_best_place_of_the_second_sensor_depends_on_the_state(t10, observed)
 
 
 def test_the_threshold_and_the_ranges_match_t10(observed):
-    """T10 states a threshold of 11.2 and an SNR of 9.2."""
+    """T10 gives a threshold of 11.2 and an SNR of 9.2."""
     n = observed
     assert n['threshold'] == pytest.approx(chi2.isf(0.01, 3), rel=1e-9)
     assert ncx2.sf(n['threshold'], 3, n['snr']) == pytest.approx(0.5, rel=1e-6)
@@ -231,7 +231,7 @@ def test_the_threshold_and_the_ranges_match_t10(observed):
 
 
 def test_the_cost_of_simulated_passes_falls_with_the_model_order(tmp_path, capsys):
-    """TSP14 Figure 7: the cost falls with the number of dipoles, for cars to nearly one."""
+    """TSP14 Figure 7: the cost falls with the number of dipoles; for cars, nearly to one."""
     script = example('tsp14_model_order')
     found = {rate: script.passes(rate, (1, 3)) for rate in script.RATES}
     (cars, truck), (cars_3, truck_3) = (script.costs_of(found['12.5 Hz'], d) for d in (1, 3))

@@ -1,7 +1,7 @@
 """Replays of the bundled recordings: errors against ground truth, covariances, repeatability.
 
-The limits are the targets of the project. A target that is not reached is a strict expected
-failure, so that reaching it is noticed.
+The limits are the aims of the project. A test whose aim is not reached is a strict expected
+failure, so it reports when the aim is reached.
 """
 
 import csv
@@ -31,12 +31,12 @@ def all_vehicles(replays):
 
 
 MAX_STEP = 1.5
-"""Maximum growth of a standard deviation from one pose to the next: in 0.08 s a vehicle moves by a
-fraction of its distance. New evidence may reduce it by any factor."""
+"""Maximum ratio of successive standard deviations of the position. In 0.08 s, a vehicle moves by a
+fraction of its distance. New evidence may reduce the standard deviation by any factor."""
 
 
 def step_of(covariances):
-    """Largest ratio of the standard deviation of a position to that of the previous pose."""
+    """Largest ratio of the standard deviations of two successive positions."""
     std = np.sqrt(np.trace(np.array(covariances)[:, :2, :2], axis1=1, axis2=2))
     return (std[1:] / std[:-1]).max()
 
@@ -56,7 +56,7 @@ def test_the_arrival_direction_is_right(vehicle_replays, name):
     log = run.logs[track['id']]
     best = [max(row, key=lambda a: row[a][0]) for row in log.arrivals]
     assert track['arrival'] == best[-1] == ARRIVAL[name]
-    # It is already right when the position is most certain.
+    # The direction is already right when the position is most certain.
     sd = [np.trace(C[:2, :2]) for C in log.covariance]
     assert best[int(np.argmin(sd))] == ARRIVAL[name]
 
@@ -66,13 +66,13 @@ def test_a_replay_with_truth_reports_its_error_over_the_bound(vehicle_replays, n
     run, _ = vehicle_replays[name]
     found = run.summary['tracks'][0]['truth']['error_over_bound']
     print(f'{name}: error over path bound {found:.1f}')
-    # The aim is 1, the bound itself. These limits are not aims, but the values reached (0.9 to 5.2,
-    # the truck 12.9) with a margin, so that a change for the worse is noticed.
+    # The aim is 1, the bound itself. The limits detect regressions: they are the present values
+    # (0.9 to 5.2, truck 12.9) with a margin.
     assert 0.1 < found < (20.0 if 'truck' in name else 6.0)
 
 
 def expected_to_fail(names, reasons):
-    """Parameters `names`; those with a reason are expected to fail."""
+    """Parameters `names`, of which the names in `reasons` are expected to fail."""
     return [pytest.param(n, marks=pytest.mark.xfail(strict=True, reason=reasons[n]))
             if n in reasons else n for n in names]
 
@@ -89,7 +89,7 @@ def test_the_error_near_the_sensors_is_within_its_limit(vehicle_replays, name):
     print(f'{name}: a {track["kind"]}, rms {errors["rms"]}, closest {errors["closest"]:.2f} '
           f'at {errors["closest_distance"]:.1f} m, ANEES {errors["anees"]:.1f}')
     if name == 'junction_rear_turns_right':
-        assert errors['rms'] is None  # it never comes within 5 m
+        assert errors['rms'] is None  # the vehicle never comes within 5 m
     else:
         assert errors['rms'] <= (1.2 if 'fast' in name or 'truck' in name else 0.6)
 
@@ -105,7 +105,7 @@ def test_the_error_at_the_cpa_is_within_its_limit(vehicle_replays, name):
 
 
 def speed_error(vehicle_replays, name):
-    """Relative error of the speed at the pose that is most certain."""
+    """Relative error of the speed at the most certain pose."""
     run, _ = vehicle_replays[name]
     log = run.logs[pass_of(vehicle_replays, name)['id']]
     stamps, positions, _ = next(iter(run.truth.values()))
@@ -137,7 +137,7 @@ SMOOTHED_NOT_REACHED = {
 
 @pytest.mark.parametrize('name', expected_to_fail(VEHICLES, SMOOTHED_NOT_REACHED))
 def test_errors_of_smoothed_poses_are_within_their_limits(vehicle_replays, name):
-    """The limits of position errors are those of the filtered poses."""
+    """The limits of position errors are the same as for filtered poses."""
     run, folder = vehicle_replays[name]
     track = pass_of(vehicle_replays, name)
     smoothed = track['smoothed']
@@ -164,7 +164,7 @@ def test_the_kind_of_vehicle_is_right(vehicle_replays, name):
 
 @pytest.mark.study
 def test_a_car_is_tracked_along_a_corridor(tmp_path):
-    """An accelerating car at eight sensors along 42 m has a single track."""
+    """A car that accelerates past eight sensors along 42 m has a single track."""
     folder = DATA / 'corridor'
     network = read_network(folder / 'network.yaml')
     run = replay(Recording(folder / 'corridor_8_sensors.mcap'), network, settings_for('vehicle'),

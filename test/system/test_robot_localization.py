@@ -1,4 +1,4 @@
-"""Configuration for robot_localization: an EKF that fuses the published pose is not less accurate.
+"""Configuration for robot_localization: an EKF is as accurate as the published poses it fuses.
 
 `robot_localization` is not available from PyPI. A filter of filterpy replaces it, with the motion
 model and the noise of `config/robot_localization.yaml`.
@@ -18,7 +18,7 @@ from support.bundled import ROOT, VEHICLES, vehicle_path
 
 CONFIGURATION = ROOT / 'config' / 'robot_localization.yaml'
 FIRST_SPEED_STD = 30.0
-"""[m/s] The velocity is unknown at the first pose."""
+"""[m/s] Initial standard deviation of the velocity, which is unknown at the first pose."""
 
 
 def settings():
@@ -37,8 +37,8 @@ def poses_of(name, network):
              for t in tracks], interpolate_truth(truth, [t.stamp_ns for t in tracks])[:, :2])
 
 
-def filtered(poses, noise):
-    """Positions (n, 2) of an EKF of x, y, vx, vy that fuses poses; `noise` (4,) per second."""
+def fuse(poses, noise):
+    """Fuse poses with an EKF of x, y, vx, vy; positions (n, 2). `noise` (4,) is per second."""
     ekf, out, last_ns = KalmanFilter(dim_x=4, dim_z=2), [], None
     ekf.H = np.eye(2, 4)
     for stamp_ns, position, R in poses:
@@ -57,13 +57,13 @@ def filtered(poses, noise):
 
 
 def errors(names, road_network):
-    """{recording: (errors of the EKF (n,), of the published poses (n,))} [m]."""
+    """{recording: (errors of the EKF (n,), errors of the published poses (n,))} [m]."""
     noise = np.diagonal(np.reshape(settings()['process_noise_covariance'], (15, 15)))[[0, 1, 6, 7]]
     found = {}
     for name in names:
         poses, true = poses_of(name, road_network)
         published = np.array([position for _, position, _ in poses])
-        found[name] = [np.hypot(*(p - true).T) for p in (filtered(poses, noise), published)]
+        found[name] = [np.hypot(*(p - true).T) for p in (fuse(poses, noise), published)]
     return found
 
 

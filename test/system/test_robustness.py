@@ -1,4 +1,4 @@
-"""Regression tests of faults that reviews have found."""
+"""Regression tests for faults found in reviews."""
 
 import dataclasses
 import json
@@ -130,7 +130,7 @@ def test_an_axis_with_occasional_dropouts_is_learnt():
 
 
 def test_a_present_axis_never_has_an_unknown_covariance():
-    """Two axes are learnt, then a third begins to report: it is held back and counted."""
+    """Two axes are learnt, then a third axis begins to report and is held back and counted."""
     network = dataclasses.replace(line_network(2), noise_std=(None, None))
     s = Calibrate(network, CalibrateSettings())
     rng = np.random.default_rng(0)
@@ -164,7 +164,7 @@ def test_the_background_of_a_slow_sensor_is_learnt():
 
 @pytest.mark.parametrize('seed', studied(range(3), kept=(0,)))
 def test_a_pass_causes_no_second_detection(seed):
-    """A background that was learnt in three seconds stays valid for a whole pass."""
+    """A background learnt in three seconds remains valid during a whole pass."""
     network = dataclasses.replace(line_network(2), noise_std=(None, None))
     tracks, pipeline, _ = drive(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5),
                                 Path(np.array([-80.0, -1.2]), 0.0, 10.0), duration=30.0, seed=seed)
@@ -216,7 +216,7 @@ def test_the_existence_of_a_target_falls_on_noise():
 
 
 def test_the_pose_covariance_matches_sampled_states():
-    """Position, rotation and their cross terms against states drawn from the filter's Gaussian."""
+    """Position, rotation and cross terms are compared with states sampled from the Gaussian."""
     network, frames, _ = magnet_frames(4)
     stage_ = TrackManager(network, settings_for('magnet').track)
     track = [t for f in frames for t in stage_.feed(f)][-1]
@@ -224,13 +224,13 @@ def test_the_pose_covariance_matches_sampled_states():
     rng = np.random.default_rng(1)
     x = rng.multivariate_normal(bank.x[0, :12], bank.P[0, :12, :12], 200_000)
     m = track.moment
-    # The rotation that takes m to the drawn moment, to first order.
+    # Rotation of m to the sampled moment, to first order.
     w = np.cross(m, x[:, 6:9]) / (m @ m)
-    drawn = np.cov(np.hstack([x[:, :3], w]).T)
+    sampled = np.cov(np.hstack([x[:, :3], w]).T)
     published = pose_covariance(track).copy()
     published[3:, 3:] -= np.pi**2 * np.outer(m, m) / (m @ m)
-    sd = np.sqrt(np.diagonal(drawn))
-    assert np.abs((drawn - published) / np.outer(sd, sd)).max() < 0.03
+    sd = np.sqrt(np.diagonal(sampled))
+    assert np.abs((sampled - published) / np.outer(sd, sd)).max() < 0.03
     # The cross terms are large enough to reveal a wrong sign.
     assert np.abs(published[:3, 3:] / np.outer(sd[:3], sd[3:])).max() > 0.1
 

@@ -1,4 +1,4 @@
-"""The documentation site: builds without warnings, runs its examples, has no broken link."""
+"""The documentation site builds without warnings, runs its examples, and has no broken link."""
 
 import os
 import re
@@ -78,8 +78,8 @@ def test_every_internal_link_leads_to_a_page_and_an_anchor(site):
 
 
 @pytest.mark.timeout(BUILD_S)
-def test_examples_in_the_text_print_what_they_say(site, tmp_path):
-    """After the build of the site, whose generated pages and doctrees are not made again."""
+def test_examples_in_the_text_print_the_documented_output(site, tmp_path):
+    """The generated pages and doctrees of the built site are reused."""
     sphinx('doctest', ROOT / 'docs', tmp_path, '-d', str(site / '.doctrees'))
     text = (tmp_path / 'output.txt').read_text(encoding='utf-8')
     n, = re.findall(r'(\d+) tests?\n', text)[:1]
@@ -87,7 +87,7 @@ def test_examples_in_the_text_print_what_they_say(site, tmp_path):
 
 
 def test_every_figure_in_the_text_is_one_of_the_benchmarks():
-    """A number that is not generated would grow old: text has no percentages of its own."""
+    """The text contains no percentages of its own, which would become outdated."""
     typed = []
     for path in [ROOT / 'README.md', *(ROOT / 'docs').glob('*.md'),
                  *(ROOT / 'docs' / 'concepts').glob('*.md')]:
@@ -95,5 +95,5 @@ def test_every_figure_in_the_text_is_one_of_the_benchmarks():
             continue
         text = re.sub(r'\{\{.*?\}\}|`[^`]*`', '', path.read_text(encoding='utf-8'), flags=re.S)
         typed += [(path.name, found) for found in re.findall(r'\d[\d.,]* %', text)
-                  if found != '90 %']  # The ellipses of the maps.
+                  if found != '90 %']  # Probability of the ellipses in maps.
     assert typed == []

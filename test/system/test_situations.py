@@ -21,13 +21,13 @@ EXPECTED_DOUBTS = {
     'a sensor knocked': doubts.INNOVATIONS,
     'stops for 5 s': doubts.HEIGHT,
 }
-"""{situation: one of the doubts about its poses}."""
+"""{situation: doubt expected at some of its poses}."""
 RUNS = 3
 
 MISSED_AIMS = {
     'clocks 200 ms apart': 'clock offset: the four wrong poses are within 0.5 s of the closest '
                            'point, before the whole pass reveals the offset',
-    'a car with a trailer': 'some poses are those of the car alone, 2 to 3 m ahead of the middle '
+    'a car with a trailer': 'some poses belong to the car alone, 2 to 3 m ahead of the middle '
                             'of both, until the trailer has passed; for others it is unknown',
     'one follows, four sensors': 'in one of six runs two cars 9 m apart are tracked as a truck '
                                  'between them for 0.8 s, until the second one is found',
@@ -45,8 +45,8 @@ MISSED_EVENT_AIMS = {
 
 RIGHT_WITHOUT_DOUBTS = {'a car': 199, 'a truck': 249, 'a car that turns': 241,
                         'a car of 25 to 40 m/s': 128, 'a U-turn': 125, 'a car, four sensors': 67}
-"""{situation: number of right poses without a flag in these runs, before tracks were compared with
-other explanations}. At least 95 % of them must remain."""
+"""{situation: number of right unflagged poses in these runs, without the comparison of tracks with
+other explanations}. With the comparison, at least 95 % of this number must remain."""
 
 
 @functools.cache
@@ -77,7 +77,7 @@ def test_poses_have_the_expected_doubt(name):
 def test_disturbances_are_events_and_cars_are_not(name):
     found = verdicts(name, 1 if name in IN_EVERY_TEST else RUNS)
     if SITUATIONS[name].group == 'control':
-        # A background that is learnt wrongly after a release counts as a disturbance.
+        # A wrongly learnt background after a release counts as a disturbance.
         assert sum(v.n_mistaken for v in found) == 0
         right = sum(v.n_sure - v.n_wrong for v in found)
         assert right >= 0.95 * RIGHT_WITHOUT_DOUBTS[name]

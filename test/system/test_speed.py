@@ -1,4 +1,4 @@
-"""Quick part of the benchmarks: imports, ratios and counts; `make bench` measures the rest."""
+"""Quick benchmarks: imports, speed ratios and comparison of figures. `make bench` runs all."""
 
 import json
 import subprocess
@@ -45,7 +45,7 @@ def test_the_tracker_imports_no_rarely_needed_modules():
 
 @pytest.mark.parametrize('n_sensors, min_ratio', [(2, 80.0), (8, 40.0)])
 def test_the_bank_is_many_times_faster_than_a_loop_over_filterpy(n_sensors, min_ratio):
-    """The aims are 350 and 120 (`bench.bench`); limits are half the ratios beside other tests."""
+    """The aims are 350 and 120 (`bench.bench`); the limits are lower, as other tests may run."""
     _, _, ratio, *_ = bank_ratio(Peer, n_sensors, False, rounds=4, repeats=20)
     assert ratio >= min_ratio
 

@@ -13,23 +13,23 @@ FAULT_NAMES = [name for name, fault in FAULTS.items() if fault]
 def test_every_fault_changes_the_readings(name):
     readings = recorded('straight_car_right').readings
     for fault in spoil_with(name):
-        spoilt = fault(readings)
-        if len(spoilt) == len(readings):
-            # The recording states no covariance.
+        degraded = fault(readings)
+        if len(degraded) == len(readings):
+            # The recording contains no covariance.
             assert readings.covariance is None
-            assert spoilt.covariance is not None \
-                or (spoilt.stamp_ns != readings.stamp_ns).any() \
-                or not np.allclose(spoilt.field, readings.field, rtol=0.0, atol=1e-12)
+            assert degraded.covariance is not None \
+                or (degraded.stamp_ns != readings.stamp_ns).any() \
+                or not np.allclose(degraded.field, readings.field, rtol=0.0, atol=1e-12)
         else:
-            assert 0 < len(spoilt) < len(readings)
+            assert 0 < len(degraded) < len(readings)
 
 
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
 def test_a_placeholder_covariance_does_not_change_a_random_pass(simulator):
-    plain, spoilt = (spoilt_pass(name, simulator, 'car', 3)
+    original, degraded = (spoilt_pass(name, simulator, 'car', 3)
                      for name in ('none', 'stated noise of 0.1 T'))
-    assert plain.detected and len(plain.error) > 10
-    np.testing.assert_array_equal(plain.error, spoilt.error)
+    assert original.detected and len(original.error) > 10
+    np.testing.assert_array_equal(original.error, degraded.error)
 
 
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])

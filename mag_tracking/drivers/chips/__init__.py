@@ -1,1 +1,1 @@
-"""Magnetometers on I2C, one file for each manufacturer or chip."""
+"""Magnetometer chips on I2C, one file for each manufacturer or chip."""

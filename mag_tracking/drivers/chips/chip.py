@@ -15,7 +15,7 @@ from mag_tracking.drivers.reading import Axes
 from mag_tracking.errors import DeviceError, SettingsError
 
 CONVERSION_MARGIN = 1.1
-"""Ratio of the waiting time to the data sheet's typical conversion time."""
+"""Ratio of the waiting time to the typical conversion time of the data sheet."""
 Identity: TypeAlias = tuple[tuple[int, int], ...]
 """((register, value), ...) that identify a chip."""
 Value = TypeVar('Value', int, float)
@@ -23,7 +23,7 @@ Choice = TypeVar('Choice')
 
 
 class SmBus(Protocol):
-    """Part of the interface of `smbus2.SMBus` that is used. All methods raise OSError."""
+    """Subset of the interface of `smbus2.SMBus`. All methods raise OSError if they fail."""
 
     def write_byte(self, i2c_addr: int, value: int, /) -> object:
         """Write one byte without a register number.
@@ -64,7 +64,9 @@ class SmBus(Protocol):
         ----------
         i2c_addr : int
         register : int
+            First register.
         length : int
+            Number of registers.
 
         Returns
         -------
@@ -94,13 +96,13 @@ class Place(NamedTuple):
     """Channel of the multiplexer."""
 
     def __str__(self) -> str:
-        behind = ('' if self.multiplexer is None else
+        channel = ('' if self.multiplexer is None else
                   f', on channel {self.channel} of the multiplexer at {self.multiplexer:#04x}')
-        return f'address {self.address:#04x}{behind}'
+        return f'address {self.address:#04x}{channel}'
 
 
 class Bus:
-    """Open bus with its multiplexers.
+    """I2C bus with its multiplexers.
 
     Source: TCA9548A data sheet (SCPS207), section 8.5. The only register of a multiplexer has one
     bit for each channel and is written without a register number.
@@ -110,10 +112,12 @@ class Bus:
     smbus : smbus2.SMBus or None
         None if no transfers are made.
     monotonic_ns : callable
+        Monotonic clock, such as `time.monotonic_ns`.
     sleep : callable
+        Function that waits for a time in seconds, such as `time.sleep`.
     multiplexers : collection of int, optional
-        Addresses of all TCA9548A. One channel of one of them is open at a time, and none during
-        transfers to a chip directly on the bus.
+        Addresses of all TCA9548A multiplexers. At most one channel of all multiplexers is open, and
+        no channel during transfers to a chip directly on the bus.
 
     Attributes
     ----------
@@ -130,7 +134,7 @@ class Bus:
 
     @property
     def smbus(self) -> SmBus:
-        """Open bus.
+        """Interface to the open bus.
 
         Raises
         ------
@@ -142,42 +146,45 @@ class Bus:
         return self._smbus
 
     def select(self, place: Place) -> None:
-        """Open the path to a chip and close all others.
+        """Open the multiplexer channel of a chip and close all other channels.
 
         Parameters
         ----------
         place : Place
         """
-        wanted = (place.multiplexer, place.channel)
-        if not self._multiplexers or wanted == self._selected:
+        selection = (place.multiplexer, place.channel)
+        if not self._multiplexers or selection == self._selected:
             return
-        open_now = None if self._selected is None else self._selected[0]
+        open_multiplexer = None if self._selected is None else self._selected[0]
         # Multiplexers in an unknown state may have an open channel.
-        others = self._multiplexers if self._selected is None else [open_now]
-        for address in others:
+        to_close = self._multiplexers if self._selected is None else [open_multiplexer]
+        for address in to_close:
             if address is not None and address != place.multiplexer:
                 self.smbus.write_byte(address, 0)
         if place.multiplexer is not None and place.channel is not None:
             self.smbus.write_byte(place.multiplexer, 1 << place.channel)
-        self._selected = wanted
+        self._selected = selection
 
     def forget(self) -> None:
-        """Discard the known state of the multiplexers, after a failure."""
+        """Discard the stored state of the multiplexers, which a failure may have changed."""
         self._selected = None
 
 
 class Registers:
-    """Registers of one chip. All methods raise OSError if the chip does not answer.
+    """Access to the registers of one chip. All methods raise OSError if the chip does not answer.
 
     Parameters
     ----------
     bus : Bus
     place : Place
+        Location of the chip.
 
     Attributes
     ----------
     monotonic_ns : callable
+        Monotonic clock of the bus.
     sleep : callable
+        Function that waits for a time in seconds.
     """
 
     def __init__(self, bus: Bus, place: Place) -> None:
@@ -246,10 +253,10 @@ class Registers:
 
 
 class Conversion(NamedTuple):
-    """Measured value."""
+    """Field and time of a conversion."""
 
     middle_ns: int
-    """`time.monotonic_ns()` at the middle of the conversion, as accurately as it is known."""
+    """Estimated `time.monotonic_ns()` at the middle of the conversion."""
     field: Axes
     """[T] Field in the right-handed axes described by the chip's module; NaN for an axis over
     its range."""
@@ -260,7 +267,7 @@ Measurement: TypeAlias = Generator[float, None, Conversion | None]
 
 
 class Identified(Protocol):
-    """Chip, or class of a chip, with an identity."""
+    """Chip, or class of a chip, with registers that identify it."""
 
     @property
     def IDENTITY(self) -> Identity:
@@ -278,19 +285,19 @@ class Chip(Identified, Protocol):
         OSError
             If the chip does not answer.
         DeviceError
-            If it cannot be configured, with the reason.
+            If the chip cannot be configured. The message gives the reason.
         """
 
     def measure(self) -> Measurement:
-        """Make one measurement.
+        """Measure the field once.
 
-        The chips of a bus measure concurrently, so the generator may be resumed later than it
-        requested while another chip uses the bus.
+        The chips of a bus measure concurrently. While another chip uses the bus, the generator may
+        be resumed later than requested.
 
         Returns
         -------
         Conversion or None
-            None if there is no conversion that has not been returned before.
+            None if no new conversion is available.
 
         Yields
         ------
@@ -307,15 +314,15 @@ class Chip(Identified, Protocol):
 class ChipClass(Identified, Protocol):
     """Class of a `Chip`. Creating an instance must not access the bus.
 
-    `count` is called with the cause of a loss, a plural.
+    `count` is called with the cause of each loss, as a plural noun phrase.
     """
 
     NAME: str
-    """Name of the chip in the settings, and of the group of its own settings."""
+    """Name of the chip in the settings, and name of its settings group."""
 
     def __call__(self, registers: Registers, settings: Any,
                  count: Callable[[str], None]) -> Chip:
-        """Create a chip with these registers."""
+        """Create a chip that is accessed through `registers`."""
 
 
 def check_identity(chip: Identified, registers: Registers) -> None:
@@ -334,14 +341,14 @@ def check_identity(chip: Identified, registers: Registers) -> None:
         If no chip answers.
     """
     for register, expected in chip.IDENTITY:
-        found = registers.read(register)
-        if found != expected:
-            raise DeviceError(f'identity register {register:#04x} reads {found:#04x} instead of '
+        value = registers.read(register)
+        if value != expected:
+            raise DeviceError(f'identity register {register:#04x} reads {value:#04x} instead of '
                               f'{expected:#04x}')
 
 
 def one_of(name: str, value: Value, choices: Mapping[Value, Choice]) -> Choice:
-    """Value that belongs to one of a few permitted settings.
+    """Look up the value of a setting in the table of its permitted values.
 
     Parameters
     ----------
@@ -350,7 +357,7 @@ def one_of(name: str, value: Value, choices: Mapping[Value, Choice]) -> Choice:
     value : int or float
         Value of the setting.
     choices : dict
-        By permitted value.
+        Result for each permitted value.
 
     Returns
     -------

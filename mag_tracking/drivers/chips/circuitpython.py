@@ -1,14 +1,16 @@
 """Adapter for drivers written for CircuitPython, which exist for nearly every magnetometer.
 
-A chip named `adafruit_lis3mdl.LIS3MDL` is that class of that module, which must be installed (`pip
-install adafruit-circuitpython-lis3mdl`). It is created with a bus, an address and its own defaults,
-and its property `magnetic` is read.
+The chip name `adafruit_lis3mdl.LIS3MDL` selects the class `LIS3MDL` of the module
+`adafruit_lis3mdl`, which must be installed (`pip install adafruit-circuitpython-lis3mdl`). The
+adapter creates an instance with a bus, an address and the default arguments of the class, and reads
+its property `magnetic`.
 
-This is inferior to a chip of `chips/`: the property does not distinguish an old conversion from a
-new one, some drivers wait inside it, an axis over its range is not detected, and axes and scale are
-those of the driver (the scale of the MMC5603 driver 1.0.16 is 2.4 % above the data sheet's 16384
-counts per gauss). The time of a reading is the middle of the call, so a chip that measures
-continuously is late by 0.5 to 1.5 of its periods.
+If `chips/` has a module for the chip, that module is preferable, because the adapter has several
+limitations. It does not distinguish an old conversion from a new one. Some drivers block while they
+wait for a conversion. An axis over its range is not detected. The driver defines axes and scale
+(the scale of the MMC5603 driver 1.0.16 is 2.4 % above the data sheet's 16384 counts per gauss). The
+timestamp of a reading is the middle of the call, which is 0.5 to 1.5 periods late for a chip that
+measures continuously.
 
 Source: the CircuitPython API reference, `busio.I2C`, and "CircuitPython design guide, sensor
 properties and units": `magnetic` is in microtesla.
@@ -24,11 +26,11 @@ from mag_tracking.drivers.chips.chip import Conversion, Measurement, Registers
 from mag_tracking.errors import DeviceError
 
 TIMEOUT_NS = 250_000_000
-"""[ns] Time after which a driver that waits for its chip is stopped."""
+"""[ns] Timeout of a driver that waits for its chip."""
 
 
 class BusioI2c:
-    """Part of the interface of `busio.I2C` that CircuitPython drivers use.
+    """Subset of the interface of `busio.I2C` that CircuitPython drivers use.
 
     After the deadline every transaction raises OSError, because drivers wait for their chip in
     unbounded loops.
@@ -60,7 +62,7 @@ class BusioI2c:
         Returns
         -------
         bool
-            Whether it was free.
+            Whether the bus was free.
         """
         self._check_time()
         free, self._locked = not self._locked, True
@@ -121,7 +123,7 @@ class BusioI2c:
         in_buffer[in_start:in_end] = bytes(message)
 
     def _transfer(self, *messages: i2c_msg) -> None:
-        """Make one transaction, if the deadline has not passed."""
+        """Make one transaction; raise OSError if the deadline has passed."""
         self._check_time()
         self._registers.transfer(*messages)
 
@@ -175,7 +177,7 @@ class CircuitpythonChip:
         Yields
         ------
         float, s
-            Never: the driver itself waits for the chip.
+            Nothing is yielded: the driver itself waits for the chip.
 
         Raises
         ------
@@ -208,15 +210,15 @@ def load(name: str) -> Any:
     Raises
     ------
     DeviceError
-        If it cannot be imported. The message names the package to install.
+        If the class cannot be imported. The message names the package to install.
     """
     module_name, _, class_name = name.rpartition('.')
     try:
         module = importlib.import_module(module_name)
-    # Blinka, which such drivers import, raises various errors on boards that it does not support.
+    # Blinka, which CircuitPython drivers import, raises various errors on unsupported boards.
     except (ImportError, NotImplementedError, RuntimeError, OSError) as error:
         package = module_name.partition('.')[0].replace('adafruit_', 'adafruit-circuitpython-')
         raise DeviceError(f'{name}: cannot be loaded ({error}); is {package} installed?') from error
     if not hasattr(module, class_name):
-        raise DeviceError(f'{name}: the module {module_name} has no {class_name}')
+        raise DeviceError(f'{name}: the module {module_name} has no class {class_name}')
     return getattr(module, class_name)

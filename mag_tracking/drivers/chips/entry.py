@@ -12,7 +12,7 @@ ENTRY = re.compile(r'(?P<name>[^:]+):(?P<chip>[^:]+):0x(?P<address>[0-9a-fA-F]{2
 
 
 class Sensor(NamedTuple):
-    """Sensor on a bus."""
+    """Name, chip and location of a sensor on a bus."""
 
     name: str
     chip: str
@@ -53,7 +53,7 @@ def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor
 
 
 def _conflict(one: Place, other: Place) -> bool:
-    """Whether two chips would answer together; one directly on the bus answers on any channel."""
+    """Whether two chips would answer at once; a chip directly on the bus answers on any channel."""
     return one.address == other.address and (
         one == other or None in (one.multiplexer, other.multiplexer))
 
@@ -91,10 +91,10 @@ def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
     return Sensor(name, chip, Place(address, multiplexer, int(match['channel'])))
 
 
-def _address(name: str, what: str, digits: str, lowest: int) -> int:
+def _address(name: str, role: str, digits: str, lowest: int) -> int:
     """Parse an address and check its range."""
     address = int(digits, 16)
     if not lowest <= address <= 0x77:
-        raise SettingsError(f'sensors: {name}: {what} {address:#04x} is outside '
+        raise SettingsError(f'sensors: {name}: {role} {address:#04x} is outside '
                             f'{lowest:#04x} .. 0x77')
     return address

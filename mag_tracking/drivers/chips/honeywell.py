@@ -1,14 +1,14 @@
 """Honeywell HMC5883L and HMC5983: anisotropic magnetoresistive bridges, 12 bits.
 
-Each reading starts a conversion. Its time is the middle of the conversion, 3 ms after the start,
-with an uncertainty of about 1 ms.
+Each reading starts a conversion. The timestamp is the middle of the conversion, 3 ms after the
+start, with an uncertainty of about 1 ms.
 
 Axes: as drawn in the data sheets, right-handed. The order of the registers is X, Z, Y. An axis over
 its range is NaN.
 
 Scale: 73, 92, 122, 152, 227, 256, 303, 435 nT per count for ranges of ±88, 130, 190, 250, 400, 470,
 560, 810 µT. The noise is about 200 nT. The offset may be tens of microtesla and drifts with
-temperature. The HMC5983, as configured here, corrects its scale for temperature.
+temperature. The HMC5983 is configured to correct its scale for temperature.
 
 Chips sold as HMC5883L are often QMC5883L, which answer at 0x0d and are not supported.
 
@@ -50,7 +50,7 @@ class Hmc5883lSettings:
 
 
 class Hmc5883l:
-    """HMC5883L; see the module.
+    """HMC5883L magnetometer; the module describes its timing, axes and scale.
 
     Parameters
     ----------
@@ -80,12 +80,12 @@ class Hmc5883l:
         self._registers.sleep(CONVERSION_S * CONVERSION_MARGIN)
 
     def measure(self) -> Measurement:
-        """Make one single measurement.
+        """Make a single measurement.
 
         Returns
         -------
         Conversion or None
-            None if the conversion is not done in time.
+            None if the conversion is not finished in time.
 
         Yields
         ------
@@ -103,9 +103,9 @@ class Hmc5883l:
         configuration, gain_bits, mode, x, z, y = struct.unpack(
             '>BBBhhh', self._registers.read_block(CONFIGURATION_A, 9))
         if configuration != self.CONFIGURATION or gain_bits != self._gain_bits:
-            raise OSError(errno.EIO, 'the chip lost its settings; check its supply')
-        # The chip becomes idle when the conversion is done. Its RDY bit remains set from one
-        # conversion to the next, and does not indicate a new one.
+            raise OSError(errno.EIO, 'the chip lost its settings; check its power supply')
+        # The chip becomes idle when the conversion is finished. Its RDY bit does not indicate a
+        # new conversion, because it remains set from one conversion to the next.
         if mode & 0x03 == SINGLE_MEASUREMENT:
             return None
         x, y, z = (math.nan if c == OVERFLOW else c / self._gain * 1e-4 for c in (x, y, z))
@@ -113,7 +113,7 @@ class Hmc5883l:
 
 
 class Hmc5983(Hmc5883l):
-    """HMC5983, with temperature compensation; see the module."""
+    """HMC5983 magnetometer: an HMC5883L with temperature compensation."""
 
     NAME = 'hmc5983'
     CONFIGURATION = 0x90

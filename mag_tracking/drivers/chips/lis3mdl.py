@@ -1,8 +1,8 @@
 """ST LIS3MDL: magnetoresistive sensor, 16 bits.
 
-It measures continuously at 155 Hz in ultra-high-performance mode. The time of a reading is the time
-at which it is read minus one period of 6.5 ms: half a period for the conversion and half for its
-mean age, with an uncertainty of half a period.
+It measures continuously at 155 Hz in ultra-high-performance mode. The timestamp of a reading is the
+time of the read access minus one period of 6.5 ms: half a period for the conversion and half a
+period for its mean age. The uncertainty is half a period.
 
 Axes: as drawn in the data sheet, right-handed.
 
@@ -48,7 +48,7 @@ class Lis3mdlSettings:
 
 
 class Lis3mdl:
-    """LIS3MDL; see the module.
+    """LIS3MDL magnetometer; the module describes its timing, axes and scale.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class Lis3mdl:
                  count: Callable[[str], None]) -> None:
         self._registers, self._count = registers, count
         self._scale_bits, self._gain = one_of('lis3mdl.range_ut', settings.range_ut, FULL_SCALES)
-        self._largest = settings.range_ut * 1e-6
+        self._max_field = settings.range_ut * 1e-6
 
     def set_up(self) -> None:
         """Configure the chip for continuous measurement."""
@@ -84,12 +84,12 @@ class Lis3mdl:
         Returns
         -------
         Conversion or None
-            None if there is no new conversion.
+            None if no new conversion is available.
 
         Yields
         ------
         float, s
-            Never: the chip measures continuously.
+            Nothing is yielded: the chip measures continuously.
         """
         yield from ()
         now_ns = self._registers.monotonic_ns()
@@ -100,4 +100,4 @@ class Lis3mdl:
             self._count('conversions overwritten before they were read')
         counts = struct.unpack('<hhh', self._registers.read_block(OUT | AUTO_INCREMENT, 6))
         return Conversion(now_ns - PERIOD_NS,
-                          mask_overrange([c / self._gain * 1e-4 for c in counts], self._largest))
+                          mask_overrange([c / self._gain * 1e-4 for c in counts], self._max_field))

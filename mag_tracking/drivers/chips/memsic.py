@@ -3,23 +3,23 @@
 The offset of a bridge drifts with temperature by much more than the noise. A current pulse (SET, or
 RESET with the opposite sign) reverses the sensing direction of all three axes, but not the offset.
 Half the difference of the measurements after a SET and a RESET therefore has no offset, and half
-their sum is the offset. The pulses also remove the effect of a strong magnet on the chip. A
-reading is such a pair, whose halves are `1 ms + 1.1 conversion` apart. With `set_reset_s` above 0,
-pairs are made only at that interval, and their offset is subtracted from the single measurements in
-between. This is faster, but has 1.4 times the noise, and half the change of the field within a pair
-remains in the offset until the next pair.
+their sum is the offset. The pulses also remove the effect of a strong magnet on the chip. By
+default, a reading is a pair of such measurements, `1 ms + 1.1 conversion` apart. If `set_reset_s`
+is above 0, a pair is measured only at that interval, and its offset is subtracted from the single
+measurements until the next pair. Single measurements are faster but have 1.4 times the noise. If
+the field changes during a pair, half the change remains in the offset until the next pair.
 
-The time of a reading is the middle of its conversions, which the reading itself starts; the
-uncertainty due to the chip's oscillator is below 0.5 ms. A pair takes twice
-`1 ms + 1.1 conversion`, plus about 1 ms on a bus of 400 kHz.
+A reading starts its conversions, and its timestamp is the middle of them. The uncertainty due to
+the chip's oscillator is below 0.5 ms. A pair lasts twice `1 ms + 1.1 conversion`, plus about 1 ms
+on a bus of 400 kHz.
 
-Axes: the direction after RESET is positive, because the axes are right-handed in it. The axes after
-SET are opposite, although the data sheet of the MMC5983MA calls the value after SET positive. Linux
-describes the MMC5603 and its relatives as "naturally aligned after RESET" (mmc5633.c). Rotate the
-board once in the Earth's field to verify the signs.
+Axes: the sensing directions after RESET are positive, because they form a right-handed frame. After
+SET they are reversed, although the data sheet of the MMC5983MA calls the value after SET positive.
+Linux describes the MMC5603 and its relatives as "naturally aligned after RESET" (mmc5633.c). Rotate
+the board once in the Earth's field to verify the signs.
 
 MMC5983MA: ±800 µT, 6.10 nT per count. Noise of 40, 60, 80, 120 nT rms for conversions of 8, 4, 2,
-0.5 ms; 0.7 of it for a pair.
+0.5 ms; a pair has 0.7 times the noise.
 MMC5603NJ: ±3 mT, 6.10 nT per count. Noise of 200 nT rms for the conversion of 6.6 ms.
 
 Sources: MMC5983MA data sheet Rev A (2019), "Register Map" and "Using SET and RESET to remove bridge
@@ -69,7 +69,7 @@ class Mmc5603Settings(Mmc5983maSettings):
 
 
 class Mmc5983ma:
-    """MMC5983MA; see the module.
+    """MMC5983MA magnetometer; the module describes its timing, axes and scale.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class Mmc5983ma:
     BANDWIDTHS = {8.0: 0, 4.0: 1, 2.0: 2, 0.5: 3}
     SOFT_RESET_S = 0.015
     FULL_SCALE = 131070
-    """Largest valid number of counts; larger numbers are at the end of the converter's range."""
+    """Maximum valid count; higher counts are at the limit of the converter's range."""
     N_BYTES = 7
 
     def __init__(self, registers: Registers, settings: Mmc5983maSettings,
@@ -105,12 +105,12 @@ class Mmc5983ma:
         self._registers.write(self.CONTROL_1, self._bandwidth)
 
     def measure(self) -> Measurement:
-        """Make a pair of measurements, or a single one with the stored offset.
+        """Measure a pair, or once with the stored offset.
 
         Returns
         -------
         Conversion or None
-            None if a conversion is not done in time.
+            None if a conversion is not finished in time.
 
         Yields
         ------
@@ -119,7 +119,7 @@ class Mmc5983ma:
         """
         if self._offset is None or (
                 self._registers.monotonic_ns() - self._offset_ns >= self._set_reset_ns):
-            return (yield from self._pair())
+            return (yield from self._measure_pair())
         conversion = yield from self._convert()
         if conversion is None:
             return None
@@ -127,7 +127,7 @@ class Mmc5983ma:
         x, y, z = (c - o for c, o in zip(counts, self._offset, strict=True))
         return _conversion(middle_ns, (x, y, z))
 
-    def _pair(self) -> Measurement:
+    def _measure_pair(self) -> Measurement:
         """Measure after SET and after RESET; store the offset."""
         halves = []
         for pulse in (SET, RESET):
@@ -146,7 +146,7 @@ class Mmc5983ma:
         return _conversion((set_ns + reset_ns) // 2, (x, y, z))
 
     def _convert(self) -> Generator[float, None, tuple[int, Axes] | None]:
-        """(middle [ns], counts of the three axes) of one conversion; None if it is late."""
+        """Make one conversion; return (middle [ns], counts of the axes), or None if it is late."""
         self._registers.write(self.CONTROL_0, TAKE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()
         yield self._conversion_ns * 1e-9 * CONVERSION_MARGIN
@@ -157,13 +157,13 @@ class Mmc5983ma:
 
     @staticmethod
     def _counts(block: bytes) -> list[int]:
-        """Signed counts: 16 bits of each axis, then the last two of all axes in one byte."""
+        """Signed counts: 16 bits of each axis, then the last two bits of all axes in one byte."""
         return [(block[2 * i] << 10 | block[2 * i + 1] << 2 | block[6] >> (6 - 2 * i) & 3)
                 - (1 << 17) for i in range(3)]
 
 
 class Mmc5603(Mmc5983ma):
-    """MMC5603NJ; see the module."""
+    """MMC5603NJ magnetometer; the module describes its timing, axes and scale."""
 
     IDENTITY = ((0x39, 0x10),)
     NAME = 'mmc5603'
@@ -175,12 +175,12 @@ class Mmc5603(Mmc5983ma):
 
     @staticmethod
     def _counts(block: bytes) -> list[int]:
-        """Signed counts: 16 bits of each axis, then the last four of each in a byte."""
+        """Signed counts: 16 bits of each axis, then a byte with the last four bits of each axis."""
         return [(block[2 * i] << 12 | block[2 * i + 1] << 4 | block[6 + i] >> 4) - (1 << 19)
                 for i in range(3)]
 
 
 def _conversion(middle_ns: int, counts: Axes) -> Conversion:
-    """Conversion of counts to tesla."""
+    """Conversion with `counts` scaled to tesla."""
     x, y, z = (c / COUNTS_PER_TESLA for c in counts)
     return Conversion(middle_ns, (x, y, z))

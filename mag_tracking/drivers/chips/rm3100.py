@@ -1,12 +1,12 @@
 """PNI RM3100: three magneto-inductive coils and a counter, 24 bits.
 
-It measures continuously, X, Y and Z in sequence, as fast as its cycle count permits. The time of a
-reading is the time at which it is read minus one period: half a period for the conversion and half
-for its mean age, with an uncertainty of half a period. The period is 1.9, 3.5, 6.8 ms for 50, 100,
-200 cycles.
+It measures continuously, X, Y and Z in sequence, as fast as its cycle count permits. The timestamp
+of a reading is the time of the read access minus one period: half a period for the conversion and
+half a period for its mean age. The uncertainty is half a period. The period is 1.9, 3.5, 6.8 ms for
+50, 100, 200 cycles.
 
-Axes: those of the board on which the coils are mounted; with coils placed and connected as in the
-manual, right-handed (north, east, down).
+Axes: determined by the board on which the coils are mounted. If the coils are placed and connected
+as in the manual, the axes are right-handed (north, east, down).
 
 Scale: 50, 26, 13 nT per count; range ±800 µT, beyond which an axis is NaN; noise of 30, 20, 15 nT
 rms.
@@ -30,7 +30,7 @@ from mag_tracking.settings import param
 
 CONTINUOUS, CYCLE_COUNTS, RATE, RESULTS, STATUS = 0x01, 0x04, 0x0B, 0x24, 0x34
 ALL_AXES_READY = 0x79
-"""START, all three axes, and data ready when all three are measured."""
+"""Register value: measure all three axes continuously, and report them when all are ready."""
 FASTEST = 0x92
 READY = 0x80
 FULL_SCALE = 800e-6
@@ -49,7 +49,7 @@ class Rm3100Settings:
 
 
 class Rm3100:
-    """RM3100; see the module.
+    """RM3100 magnetometer; the module describes its timing, axes and scale.
 
     Parameters
     ----------
@@ -85,12 +85,12 @@ class Rm3100:
         Returns
         -------
         Conversion or None
-            None if there is no new conversion.
+            None if no new conversion is available.
 
         Yields
         ------
         float, s
-            Never: the chip measures continuously.
+            Nothing is yielded: the chip measures continuously.
         """
         yield from ()
         now_ns = self._registers.monotonic_ns()

@@ -1,1 +1,1 @@
-"""Framings: readings from bytes, one file per format. All are pure functions."""
+"""Framings: extraction of readings from bytes, one file per format. All are pure functions."""

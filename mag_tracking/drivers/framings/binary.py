@@ -49,16 +49,17 @@ class BinarySettings:
 
 
 class BinaryFraming:
-    """Readings from binary frames.
+    """Extracts readings from binary frames. Implements `Framing`.
 
     If a frame is not valid, the search continues one byte after the beginning of its sync. With an
-    n-bit checksum, every true frame is found at any position, except that a sync in garbage or in a
-    payload passes for a frame with probability 2^-n and then hides the true frames that begin
-    within its length. Without a checksum (a tail is a weak one) every sync passes: true frames are
-    found as long as they follow each other without a gap, or with a gap that contains no sync.
-    After any other gap, readings may be false or lost until a frame happens to be aligned again.
+    n-bit checksum, every true frame is found at any position, with one exception: a sync in garbage
+    or in a payload is accepted as a frame with probability 2^-n, and then hides the true frames
+    that begin within its length. Without a checksum, every sync is accepted; a tail is a weak
+    checksum. True frames are then found if they follow each other without a gap, or if the gap
+    contains no sync. After any other gap, readings may be false or lost until the search is aligned
+    with the frames again.
 
-    No standard defines this format; it is the frame commonly chosen by makers of sensor boards.
+    No standard defines this format, but many sensor boards use it.
 
     Parameters
     ----------
@@ -69,9 +70,9 @@ class BinaryFraming:
     size : int
         Length of a frame in bytes.
     CLOCK : dict of str to float
-        Clock settings that follow from the types: a counter wraps at the end of its type.
+        Clock settings derived from the field types: a counter wraps at the limit of its type.
     DRIVER : dict of str to int
-        Driver settings that follow from the types.
+        Driver settings derived from the field types.
 
     Raises
     ------
@@ -82,15 +83,16 @@ class BinaryFraming:
     SETTINGS = BinarySettings
 
     def __init__(self, settings: BinarySettings) -> None:
-        self._sync = _hexadecimal('sync', settings.sync)
+        self._sync = _parse_bytes('sync', settings.sync)
         if not self._sync:
             raise SettingsError('sync: at least one byte is required, such as A5')
-        self._tail = _hexadecimal('tail', settings.tail)
+        self._tail = _parse_bytes('tail', settings.tail)
         self._order: _ByteOrder = chosen('byte_order', settings.byte_order, ('little', 'big'))
         name = chosen('checksum', settings.checksum, ('none', *CHECKSUMS))
-        self._checksum = CHECKSUMS.get(name, Checksum(0, _zero))
-        since = chosen('checksum_from', settings.checksum_from, ('sync', 'payload'))
-        fields, each = _typed('fields', settings.fields), _typed('each', settings.each)
+        self._checksum = CHECKSUMS.get(name, Checksum(0, _empty_checksum))
+        first_part = chosen('checksum_from', settings.checksum_from, ('sync', 'payload'))
+        fields, each = (_parse_fields('fields', settings.fields),
+                        _parse_fields('each', settings.each))
         self._layout = FieldLayout([name for name, _ in fields], [name for name, _ in each],
                                    settings.count)
         types = [kind for _, kind in fields + each * settings.count]
@@ -99,7 +101,7 @@ class BinaryFraming:
         self._converters = [_converter(quantity, kind, self._order) for quantity, kind
                             in zip(self._layout.quantities, types, strict=True)]
         self._payload = len(self._sync)
-        self._covered = 0 if since == 'sync' else self._payload
+        self._covered = 0 if first_part == 'sync' else self._payload
         self._payload_end = self._payload + self._struct.size
         self._checksum_end = self._payload_end + self._checksum.size
         self.size = self._checksum_end + len(self._tail)
@@ -127,12 +129,12 @@ class BinaryFraming:
         while True:
             start = data.find(self._sync, at)
             if start < 0:
-                at = len(data) - self._begun(data, at)
+                at = len(data) - self._partial_sync(data, at)
                 break
             if start + self.size > len(data):
                 at = start
                 break
-            cause = self._fault(data, start)
+            cause = self._rejection_cause(data, start)
             if not cause:
                 try:
                     readings += self._read(data, start)
@@ -145,19 +147,19 @@ class BinaryFraming:
                 frames += 1
                 at = start + self.size
         consumed = len(data) if final else at
-        if between := consumed - frames * self.size:
-            rejected['bytes between frames'] = between
+        if n_outside := consumed - frames * self.size:
+            rejected['bytes between frames'] = n_outside
         return Parsed(tuple(readings), consumed, rejected)
 
-    def _begun(self, data: bytes, at: int) -> int:
-        """Length of a possible beginning of a sync at the end of `data`, after position `at`."""
+    def _partial_sync(self, data: bytes, at: int) -> int:
+        """Length of a partial sync at the end of `data`, after the index `at`."""
         for n in range(min(len(self._sync) - 1, len(data) - at), 0, -1):
             if data.endswith(self._sync[:n]):
                 return n
         return 0
 
-    def _fault(self, data: bytes, start: int) -> str:
-        """Why there is no frame at `start`; empty if there is one."""
+    def _rejection_cause(self, data: bytes, start: int) -> str:
+        """Cause by which the frame at `start` is rejected; empty for a valid frame."""
         # An exception would be too slow, as this is called for every byte that looks like a sync.
         if not data.startswith(self._tail, start + self._checksum_end):
             return 'with a wrong tail'
@@ -174,21 +176,22 @@ class BinaryFraming:
             [convert(value) for convert, value in zip(self._converters, values, strict=True)])
 
 
-def _zero(data: bytes) -> int:
-    """Checksum without any bytes."""
+def _empty_checksum(data: bytes) -> int:
+    """Value of the checksum `none`, which has no bytes."""
     return 0
 
 
-def _hexadecimal(setting: str, text: str) -> bytes:
-    """Bytes of a hexadecimal text."""
+def _parse_bytes(setting: str, text: str) -> bytes:
+    """Parse a setting of hexadecimal bytes."""
     try:
         return bytes.fromhex(text)
     except ValueError:
-        raise SettingsError(f'{setting}: {text!r} is not hexadecimal, as in A5 5A') from None
+        raise SettingsError(
+            f'{setting}: {text!r} is not hexadecimal; expected bytes such as A5 5A') from None
 
 
-def _typed(setting: str, fields: Sequence[str]) -> list[tuple[str, str]]:
-    """[(name, type)] of fields such as x:i16."""
+def _parse_fields(setting: str, fields: Sequence[str]) -> list[tuple[str, str]]:
+    """Parse fields such as x:i16 into [(name, type)]."""
     out = []
     for text in fields:
         name, _, kind = text.rpartition(':')
@@ -208,7 +211,7 @@ def _wrap(kind: str) -> int:
 
 
 def _converter(quantity: str, kind: str, order: _ByteOrder) -> _Converter:
-    """Function from a value of `struct` to that expected by `FieldLayout`."""
+    """Function that converts an unpacked value of a field for `FieldLayout`."""
     if quantity == SKIP:
         return skipped
     convert: _Converter

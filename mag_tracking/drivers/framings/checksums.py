@@ -1,7 +1,7 @@
 """Checksums of the frames sent by devices.
 
 Source: names, polynomials and check values of the "Catalogue of parametrised CRC algorithms" (G.
-Cook). The check value is that of the ASCII text '123456789'.
+Cook). The check value is the checksum of the ASCII string '123456789'.
 """
 
 import binascii
@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 
 class Checksum(NamedTuple):
-    """Size and function of a checksum."""
+    """Length and function of a checksum."""
 
     size: int
-    """Size in bytes."""
+    """Length in bytes."""
     value: Callable[[bytes], int]
-    """Function from the bytes covered to the checksum."""
+    """Function that computes the checksum of the covered bytes."""
 
 
 def sum8(data: bytes) -> int:
@@ -50,7 +50,7 @@ def xor8(data: bytes) -> int:
 
 
 def _forward_table(polynomial: int) -> tuple[int, ...]:
-    """The 256 remainders of an 8-bit CRC, most significant bit first."""
+    """Table of the 256 remainders of an 8-bit CRC, most significant bit first."""
     table = []
     for byte in range(256):
         for _ in range(8):
@@ -60,7 +60,7 @@ def _forward_table(polynomial: int) -> tuple[int, ...]:
 
 
 def _reflected_table(polynomial: int) -> tuple[int, ...]:
-    """The 256 remainders of a CRC, least significant bit first; `polynomial` is reflected too."""
+    """Table of the 256 remainders of a CRC with a reflected polynomial, low-order bit first."""
     table = []
     for byte in range(256):
         for _ in range(8):

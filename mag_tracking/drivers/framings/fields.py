@@ -1,4 +1,4 @@
-"""Meaning of the values of a frame, as named in the settings.
+"""Fields of a frame as named in the settings, and conversion of their values to readings.
 
 A field is one of `sensor`, `ticks`, `sequence`, the axes `x y z` of the magnetic field, the axes
 `ax ay az` of the acceleration, or `-` for a value to be skipped. If a frame contains several
@@ -29,7 +29,7 @@ _Choice = TypeVar('_Choice', bound=str)
 
 
 class Rejected(ValueError):
-    """A line or frame has no reading. The text is the cause, to follow 'lines' or 'frames'."""
+    """Rejection of a line or frame. The message is the cause, without 'lines' or 'frames'."""
 
 
 class FieldLayout:
@@ -40,23 +40,25 @@ class FieldLayout:
     fields : sequence of str
         Fields in the order in which they are sent.
     each : sequence of str, optional
-        Axes and skipped values of one of several identical sensors, without a sensor's name. They
-        are repeated `count` times after `fields`, for the sensors '0', '1', ...
+        Axes and skipped values of one sensor, without its name, if a frame contains several
+        identical sensors. They are repeated `count` times after `fields`, for the sensors '0', '1',
+        ...
     count : int, optional
+        Number of identical sensors.
 
     Attributes
     ----------
     quantities : tuple of str
-        Field of each value of a frame, without the sensor.
+        Field of each value of a frame, without the name of the sensor.
 
     Raises
     ------
     SettingsError
-        If a field is unknown or appears twice, or there is no axis.
+        If a field is unknown or appears twice, or if no field is an axis.
     """
 
     def __init__(self, fields: Sequence[str], each: Sequence[str] = (), count: int = 0) -> None:
-        names = _expanded(tuple(fields), tuple(each), count)
+        names = _expand(tuple(fields), tuple(each), count)
         index: dict[str, int] = {}
         sensors: dict[str, dict[str, int]] = {}
         for i, name in enumerate(names):
@@ -65,7 +67,7 @@ class FieldLayout:
             if name in index:
                 raise SettingsError(f'fields: {name} appears twice')
             index[name] = i
-            quantity, sensor = _parts(name)
+            quantity, sensor = _split(name)
             if quantity in AXES:
                 sensors.setdefault(sensor, {})[quantity] = i
         if not sensors:
@@ -74,11 +76,11 @@ class FieldLayout:
         if '' in sensors and len(sensors) > 1:
             raise SettingsError('fields: either all axes or none must name a sensor (x.A), got '
                                 f'{list(names)}')
-        self.quantities = tuple(_parts(name)[0] for name in names)
+        self.quantities = tuple(_split(name)[0] for name in names)
         # `readings` appends a NaN and a None to the values, for fields that the frame lacks.
         self._device = index.get('sensor')
         self._ticks, self._sequence = index.get('ticks', -1), index.get('sequence', -1)
-        self._sensors = [(sensor, _triple(axes, FIELD), _triple(axes, ACCELERATION))
+        self._sensors = [(sensor, _axes_getter(axes, FIELD), _axes_getter(axes, ACCELERATION))
                          for sensor, axes in sensors.items()]
 
     def readings(self, values: Values) -> list[Reading]:
@@ -107,23 +109,23 @@ class FieldLayout:
                 for name, field, acceleration in self._sensors]
 
 
-def _parts(name: str) -> tuple[str, str]:
-    """(quantity, sensor) of a field."""
+def _split(name: str) -> tuple[str, str]:
+    """Split a field into (quantity, sensor)."""
     quantity, _, sensor = name.partition('.')
     return quantity, sensor
 
 
-def _triple(axes: Mapping[str, int], names: Sequence[str]) -> Callable[[Values], Any]:
-    """Function from the values of a frame to three axes, or to None if it has none of them."""
+def _axes_getter(axes: Mapping[str, int], names: Sequence[str]) -> Callable[[Values], Any]:
+    """Function that selects three axes of a frame's values; it returns None if all are missing."""
     if not any(name in axes for name in names):
         return itemgetter(-1)
     return itemgetter(*(axes.get(name, -2) for name in names))
 
 
-def _expanded(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """All fields of a frame, each of them checked."""
+def _expand(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tuple[str, ...]:
+    """Check all fields of a frame and repeat the fields of identical sensors."""
     for name in fields:
-        quantity, sensor = _parts(name)
+        quantity, sensor = _split(name)
         if quantity not in (AXES if '.' in name else (*FRAME_QUANTITIES, *AXES, SKIP)):
             raise SettingsError(f'fields: {name!r}: expected one of '
                                 f'{" ".join((*FRAME_QUANTITIES, *AXES))} or - (only an axis may '
@@ -246,7 +248,7 @@ def skipped(value: object) -> None:
 
 
 def unescaped(setting: str, text: str) -> bytes:
-    r"""Bytes (UTF-8) of a text with escape sequences.
+    r"""Bytes (UTF-8) of a string with escape sequences.
 
     The sequences \n, \r, \t, \0, \\ and \xhh are recognised, so that both kinds of YAML quotes
     have the same effect.
@@ -264,7 +266,7 @@ def unescaped(setting: str, text: str) -> bytes:
     Raises
     ------
     SettingsError
-        If an escape sequence is unknown, or the text cannot be encoded.
+        If an escape sequence is unknown, or the string is not valid Unicode.
     """
     def character(match: re.Match[str]) -> str:
         code = match[1]
@@ -299,7 +301,7 @@ def chosen(setting: str, value: str, choices: Sequence[_Choice]) -> _Choice:
     Raises
     ------
     SettingsError
-        If it is not permitted.
+        If `value` is not permitted.
     """
     if value not in choices:
         raise SettingsError(f'{setting}: expected one of {", ".join(choices)}, got {value!r}')

@@ -26,29 +26,29 @@ _Converter: TypeAlias = Callable[[object, str], object]
 
 @dataclass(frozen=True)
 class JsonSettings:
-    """Settings of the framing of JSON objects. A path is keys separated by dots, as in `a.b.0`."""
+    """Settings of the framing of JSON objects. A path is a series of keys, such as `a.b.0`."""
 
     sensor: str = param('', "Path of the sensor's name (a string or an integer); empty = none.")
     ticks: str = param('', 'Path of the device clock; empty = none.')
     sequence: str = param('', 'Path of the sequence number; empty = none.')
     field: tuple[str, ...] = param(
         (), 'Paths of the three axes of the field (empty = the axis is missing), or the path of a '
-        'list of three.')
-    acceleration: tuple[str, ...] = param((), 'Paths of the acceleration, like those of the field.')
-    end: str = param('\\n', 'End of a line. A carriage return before it is removed.')
+        'list of the three values.')
+    acceleration: tuple[str, ...] = param((), 'Paths of the acceleration, in the form of `field`.')
+    end: str = param('\\n', 'Line terminator. A carriage return before it is removed.')
     max_length: int = param(
-        4096, 'Maximum length of a line or message without its end.', 'bytes', (2, 1 << 20))
+        4096, 'Maximum length of a line or message without its terminator.', 'bytes', (2, 1 << 20))
 
 
 class JsonFraming:
-    """Readings from JSON objects, one reading per object.
+    """Extracts readings from JSON objects, one reading per object. Implements `Framing`.
 
     An axis is missing if it is null or NaN; an object that lacks a configured path is rejected. An
-    object that spans several lines is read only if the data are `final` and contain nothing
-    else; otherwise its lines are read one by one.
+    object that spans several lines is parsed only if the data are `final` and contain only this
+    object; otherwise each line is parsed separately.
 
-    Source: RFC 8259. NaN and Infinity, which it does not define, are accepted, because Python,
-    JavaScript libraries and many devices write them.
+    Source: RFC 8259. NaN and Infinity are not defined there, but accepted, because many libraries
+    and devices write them.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class JsonFraming:
     Raises
     ------
     SettingsError
-        If a path is not valid, or neither the field nor the acceleration has one.
+        If a path is not valid, or neither the field nor the acceleration has a path.
     """
 
     SETTINGS = JsonSettings
@@ -71,20 +71,21 @@ class JsonFraming:
         for name in FRAME_QUANTITIES:
             if path := getattr(settings, name):
                 names.append(name)
-                self._values.append((path, _keys(name, path), _CONVERTERS[name]))
+                self._values.append((path, _split_path(name, path), _CONVERTERS[name]))
         for name, axes in (('field', FIELD), ('acceleration', ACCELERATION)):
-            for axis, path in zip(axes, self._axes(name, getattr(settings, name)), strict=True):
+            for axis, path in zip(axes, self._axis_paths(name, getattr(settings, name)),
+                                  strict=True):
                 if path:
                     names.append(axis)
-                    self._values.append((path, _keys(name, path), _axis))
+                    self._values.append((path, _split_path(name, path), _axis))
         if not self._values or names[-1] in FRAME_QUANTITIES:
             raise SettingsError('field: a path of the field or of the acceleration is required')
         self._layout = FieldLayout(names)
 
-    def _axes(self, name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
-        """Paths of three axes."""
+    def _axis_paths(self, name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the paths of three axes; the path of a list is stored and expanded."""
         if len(paths) == 1 and paths[0]:
-            self._lists.append((paths[0], _keys(name, paths[0])))
+            self._lists.append((paths[0], _split_path(name, paths[0])))
             return tuple(f'{paths[0]}.{i}' for i in range(3))
         if any(paths) and len(paths) != 3:
             raise SettingsError(f'{name}: expected the paths of three axes, or the path of a list, '
@@ -113,13 +114,13 @@ class JsonFraming:
         if self._lines.end not in data.strip() or len(data) > self._lines.max_length:
             return False
         try:
-            self._json(data)
+            self._decode_document(data)
         except Rejected:
             return False
         return True
 
-    def _json(self, line: bytes) -> Any:
-        """Content of a line; raises Rejected."""
+    def _decode_document(self, line: bytes) -> Any:
+        """Decode a JSON document; raises Rejected."""
         try:
             return self._decode(line.decode())
         except RecursionError:
@@ -127,18 +128,18 @@ class JsonFraming:
         except Rejected:
             raise
         except ValueError:
-            # Also an integer with more digits than Python converts.
+            # This includes integers with more digits than Python converts.
             raise Rejected('that are not JSON') from None
 
     def _read(self, line: bytes) -> list[Reading]:
         """Readings of one object; raises Rejected."""
-        content = self._json(line)
+        content = self._decode_document(line)
         if not isinstance(content, dict):
             raise Rejected('that are not a JSON object')
         for path, keys in self._lists:
             value = _lookup(content, path, keys)
             if not isinstance(value, list) or len(value) != 3:
-                raise Rejected(f'whose {path} is not a list of three')
+                raise Rejected(f'whose {path} is not a list of three values')
         return self._layout.readings([convert(_lookup(content, path, keys), path)
                                       for path, keys, convert in self._values])
 
@@ -151,8 +152,8 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
-def _keys(name: str, path: str) -> _Keys:
-    """Steps of a path: (key, index or None)."""
+def _split_path(name: str, path: str) -> _Keys:
+    """Split a path into its keys: ((key, list index or None), ...)."""
     keys = path.split('.')
     if not all(keys):
         raise SettingsError(f'{name}: {path!r} has an empty key')
@@ -160,7 +161,7 @@ def _keys(name: str, path: str) -> _Keys:
 
 
 def _lookup(value: Any, path: str, keys: _Keys) -> Any:
-    """Value at a path; raises Rejected."""
+    """Value at a path; raises Rejected if the path is missing."""
     for key, index in keys:
         if isinstance(value, dict) and key in value:
             value = value[key]
@@ -179,17 +180,17 @@ def _number(value: object, path: str) -> int | float:
 
 
 def _axis(value: object, path: str) -> float:
-    """Value of an axis; NaN for null."""
+    """Convert an axis; NaN for null. Raises Rejected."""
     return float('nan') if value is None else axis_value(_number(value, path))
 
 
 def _ticks(value: object, path: str) -> float:
-    """Device time, which is required."""
+    """Convert a device time; raises Rejected if it is missing."""
     return ticks_value(_number(value, path))
 
 
 def _sequence(value: object, path: str) -> int:
-    """Sequence number; JSON does not distinguish 12 from 12.0."""
+    """Convert a sequence number; JSON does not distinguish 12 from 12.0."""
     value = _number(value, path)
     if isinstance(value, float):
         if not value.is_integer():
@@ -199,7 +200,7 @@ def _sequence(value: object, path: str) -> int:
 
 
 def _sensor(value: object, path: str) -> str:
-    """Name of the sensor, which may be a number."""
+    """Convert the name of a sensor, which may be an integer."""
     if isinstance(value, int) and not isinstance(value, bool):
         value = str(value)
     if not isinstance(value, str):

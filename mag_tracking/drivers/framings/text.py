@@ -23,7 +23,7 @@ from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
-# Each character can match in one way only; otherwise a long line would take quadratic time.
+# Each character matches in only one way; otherwise a long line would take quadratic time.
 _NUMBER = re.compile(rb'[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?').fullmatch
 _MISSING = re.compile(rb'(?:[+-]?nan)?', re.IGNORECASE).fullmatch
 _INFINITE = re.compile(rb'[+-]?inf(?:inity)?', re.IGNORECASE).fullmatch
@@ -39,23 +39,24 @@ class TextSettings:
         'one. x.A is an axis of sensor A, for lines with several sensors.')
     each: tuple[str, ...] = param((), 'Axes of one sensor, repeated count times after the fields.')
     count: int = param(0, 'Number of sensors described by each.', '', (0, 4096))
-    separator: str = param(',', 'Separator of two values; a blank stands for any white space.')
-    end: str = param('\\n', 'End of a line. A carriage return before it is removed.')
-    prefix: str = param('', 'Beginning of the lines with readings; other lines are rejected.')
-    comment: str = param('', 'Beginning of the lines to ignore; empty = none.')
+    separator: str = param(',', 'Separator between values; a blank stands for any white space.')
+    end: str = param('\\n', 'Line terminator. A carriage return before it is removed.')
+    prefix: str = param('', 'Prefix of every line with readings; lines without it are rejected.')
+    comment: str = param('', 'Prefix of comment lines, which are ignored; empty = no comments.')
     checksum: str = param(
         'none', 'Checksum: none, or nmea (a line ends in * and two hexadecimal digits, the '
         'exclusive or of the preceding characters without a leading $).')
-    max_length: int = param(512, 'Maximum length of a line without its end.', 'bytes', (1, 65536))
+    max_length: int = param(
+        512, 'Maximum length of a line without its terminator.', 'bytes', (1, 65536))
 
 
 class Lines:
-    """Splits bytes into lines and counts those that cannot be read. It holds no state.
+    """Splits bytes into lines and counts invalid lines. It has no state.
 
     Parameters
     ----------
     end : str
-        End of a line, as in `TextSettings`.
+        Line terminator, as in `TextSettings`.
     max_length : int, bytes
         Maximum length of a line.
 
@@ -83,10 +84,10 @@ class Lines:
         ----------
         data : bytes
         final : bool
-            Whether the bytes after the last end are a line too.
+            Whether the bytes after the last terminator are a complete line.
         read : callable
-            Function from a line of valid UTF-8 (bytes, neither empty nor too long) to readings; may
-            raise Rejected.
+            Function that returns the readings of a line or raises Rejected. The line is valid UTF-8
+            (bytes), not empty and not too long.
 
         Returns
         -------
@@ -96,13 +97,13 @@ class Lines:
         if final:
             lines += [rest] if rest else []
             return self.read(lines, len(data), read)
-        # Of a line that is too long, enough is kept for it to be too long in the next call too.
-        kept = min(len(rest), self.max_length + len(self.end))
-        return self.read(lines, len(data) - kept, read)
+        # An overlong line remains unconsumed up to a length that the next call rejects again.
+        n_unconsumed = min(len(rest), self.max_length + len(self.end))
+        return self.read(lines, len(data) - n_unconsumed, read)
 
     def read(self, lines: Iterable[bytes], consumed: int,
              read: Callable[[bytes], list[Reading]]) -> Parsed:
-        """Parse lines that have been split already.
+        """Parse lines that are already separated.
 
         Parameters
         ----------
@@ -120,13 +121,13 @@ class Lines:
         rejected: Counter[str] = Counter()
         for line in lines:
             try:
-                readings += read(self._checked(line))
+                readings += read(self._clean(line))
             except Rejected as cause:
                 rejected[f'lines {cause}'] += 1
         return Parsed(tuple(readings), consumed, rejected)
 
-    def _checked(self, line: bytes) -> bytes:
-        """Line without its carriage return; raises Rejected."""
+    def _clean(self, line: bytes) -> bytes:
+        """Check a line and remove its carriage return; raises Rejected."""
         if len(line) > self.max_length:
             raise Rejected('longer than max_length')
         if not line.isascii():
@@ -141,12 +142,12 @@ class Lines:
 
 
 class TextFraming:
-    """Readings from lines of text, one frame per line.
+    """Extracts readings from lines of text, one frame per line. Implements `Framing`.
 
     An axis is missing if it is `nan` or empty; all other numbers are decimal. A line that does not
-    match the settings is rejected as a whole. Without a prefix or a checksum, part of a line may
-    look like a complete line: '12.5,3,4' is also the end of '-12.5,3,4', and '1,2,3', if `final`
-    is set for a truncated line, is also the beginning of '1,2,34'.
+    match the settings is rejected as a whole. Without a prefix or a checksum, part of a line may be
+    mistaken for a complete line: '12.5,3,4' is also the end of '-12.5,3,4'. If `final` is set for
+    a truncated line, '1,2,3' is also the beginning of '1,2,34'.
 
     Source: NMEA 0183, section "Checksum field".
 
@@ -171,9 +172,9 @@ class TextFraming:
         separator = unescaped('separator', settings.separator)
         self._separator = None if separator == b' ' else separator
         self._converters = [_converter(q) for q in self._layout.quantities]
-        self._check(separator)
+        self._check_settings(separator)
 
-    def _check(self, separator: bytes) -> None:
+    def _check_settings(self, separator: bytes) -> None:
         """Raise SettingsError if no line can be read with these settings."""
         if not separator or re.search(rb'[0-9A-Za-z+.-]', separator):
             raise SettingsError(f'separator: {separator!r} is empty or can be part of a number')
@@ -208,7 +209,7 @@ class TextFraming:
         if not line.startswith(self._prefix):
             raise Rejected('without the prefix')
         if self._nmea:
-            line = _without_checksum(line)
+            line = _strip_checksum(line)
         values = line[len(self._prefix):].split(self._separator)
         if len(values) != len(self._converters):
             raise Rejected('with an unexpected number of fields')
@@ -216,8 +217,8 @@ class TextFraming:
             [convert(text) for convert, text in zip(self._converters, values, strict=True)])
 
 
-def _without_checksum(line: bytes) -> bytes:
-    """Line without `*hh`; raises Rejected."""
+def _strip_checksum(line: bytes) -> bytes:
+    """Verify the checksum and remove `*hh`; raises Rejected."""
     if line[-3:-2] != b'*':
         raise Rejected('without a checksum')
     line, digits = line[:-3], line[-2:]
@@ -227,16 +228,16 @@ def _without_checksum(line: bytes) -> bytes:
 
 
 def _converter(quantity: str) -> Callable[[bytes], object]:
-    """Function from the bytes between two separators to the value expected by `FieldLayout`."""
+    """Function that parses the bytes of a field for `FieldLayout`."""
     if quantity in AXES:
         return _axis
-    others: dict[str, Callable[[bytes], object]] = {
+    converters: dict[str, Callable[[bytes], object]] = {
         'ticks': _ticks, 'sequence': _sequence, 'sensor': _sensor, SKIP: skipped}
-    return others[quantity]
+    return converters[quantity]
 
 
 def _axis(text: bytes) -> float:
-    """Value of an axis; NaN if empty."""
+    """Parse an axis; NaN if missing. Raises Rejected."""
     text = text.strip(b' \t')
     if _NUMBER(text):
         return axis_value(text)
@@ -247,12 +248,12 @@ def _axis(text: bytes) -> float:
 
 
 def _ticks(text: bytes) -> float:
-    """Device time, which is required."""
+    """Parse a device time; raises Rejected if it is missing."""
     return ticks_value(_axis(text))
 
 
 def _sequence(text: bytes) -> int:
-    """Sequence number, which is required."""
+    """Parse a sequence number; raises Rejected if it is missing."""
     text = text.strip(b' \t')
     if not _INTEGER(text):
         raise Rejected('with a sequence that is not an integer')
@@ -260,5 +261,5 @@ def _sequence(text: bytes) -> int:
 
 
 def _sensor(text: bytes) -> str:
-    """Name of the sensor."""
+    """Parse the name of a sensor; raises Rejected if it is not valid."""
     return sensor_name(text.strip(b' \t').decode())

@@ -1,20 +1,25 @@
 """Framing of the binary protocol of the Xsens MTi and MTx.
 
 A message consists of the preamble 0xFA, the address 0xFF, its type (MID), the length of DATA (one
-byte, or 0xFF and two bytes), DATA, and a byte that makes the sum of all bytes but the preamble a
-multiple of 256. One of 256 false messages has a valid checksum. Therefore:
+byte, or 0xFF and two bytes), DATA, and a checksum byte, which makes the sum of all bytes but the
+preamble a multiple of 256. One in 256 false messages has a valid checksum. Further checks are
+therefore applied:
 
-- A message must be one that a device sends: MTData2, MTData, WakeUp, Error, or a reply, whose MID
-  is that of the request plus one and therefore odd. It must not be longer than the settings permit.
-- The packets of MTData2 must fill it, and MTData must have the configured length.
-- A message that contains the start of a valid data message is rejected: it was garbage, or it lost
-  some of its bytes and includes those of its successor.
+- The message type must be one that devices send: MTData2, MTData, WakeUp, Error, or a reply. The
+  MID of a reply is the MID of the request plus one, and therefore odd.
+- The message must not be longer than the settings permit.
+- The packets of MTData2 must fill the message, and MTData must have the configured length.
+- A message that contains the start of a valid data message is rejected: it is garbage, or it has
+  lost bytes and includes bytes of the next message.
 
-No true data message is lost to a false one that begins before it, with two exceptions: the two
-together are longer than the longest frame and the false one is a data message too; or a data
-message that lost a single byte is completed, and becomes valid, with the preamble of the next one.
-A false message that overlaps no true one can still pass. The search continues at the byte after the
-preamble of a rejected message.
+A false message that begins before a true data message hides it only in two cases:
+
+- The false message is a data message, and both messages together are longer than the longest frame.
+- The false message is a data message that has lost one byte, and the preamble of the next message
+  completes it to a valid message.
+
+A false message that overlaps no true message may be accepted. After a rejected message, the search
+continues at the byte after its preamble.
 
 Sources: Xsens, "MT Low Level Communication Protocol Documentation", MT0101P, revision 2019.A:
 message structure and message listing; Xsens, "MTi User Manual", MT0605P, section 5.3.2:
@@ -27,7 +32,7 @@ from typing import NamedTuple
 
 from mag_tracking.drivers.framings.xsens_data import (
     TICK_S,
-    Content,
+    DecodedMessage,
     MTDataLayout,
     read_mtdata2,
 )
@@ -41,7 +46,7 @@ _MTDATA, _MTDATA2, _WAKE_UP, _ERROR = 0x32, 0x36, 0x3E, 0x42
 _DATA_MESSAGES = (_MTDATA, _MTDATA2)
 _EXTENDED = 0xFF
 _MAX_OVERHEAD = 7
-"""Number of bytes of a message with extended length besides DATA."""
+"""Number of bytes outside DATA in a message with extended length."""
 
 
 @dataclass(frozen=True)
@@ -59,28 +64,28 @@ class XsensSettings:
 
 
 class _Message(NamedTuple):
-    """Message in a window of bytes; it may end after the last byte received."""
+    """Type and position of a message in a window; it may end after the last byte received."""
 
     mid: int
     begin: int
-    """Beginning of DATA."""
+    """Index of the first byte of DATA."""
     end: int
-    """End of the checksum."""
+    """Index of the byte after the checksum."""
 
 
-class _Step(NamedTuple):
-    """Result for the message that may begin at a position."""
+class _ParseStep(NamedTuple):
+    """Result of parsing the message that may begin at a position."""
 
     length: int
     """Number of bytes consumed; 0 = more bytes are needed."""
-    taken: bool
+    is_accepted: bool
     """Whether the message is accepted."""
     causes: tuple[str, ...] = ()
     reading: Reading | None = None
 
 
-_WAIT = _Step(0, False)
-_REFUSE = _Step(1, False)
+_WAIT = _ParseStep(0, False)
+_REFUSE = _ParseStep(1, False)
 
 
 def _is_from_device(mid: int) -> bool:
@@ -89,21 +94,21 @@ def _is_from_device(mid: int) -> bool:
 
 
 def _message_at(window: bytes, place: int, longest: int) -> _Message | None:
-    """Message that may begin at `place`; None if none can."""
-    # While the head is incomplete, MID is -1 and the end is one byte after the window.
-    head = window[place:place + 6]
-    if not head.startswith(_START[:len(head)]):
+    """Message that may begin at the index `place`; None if no message can begin there."""
+    # While the header is incomplete, MID is -1 and the end is one byte after the window.
+    header = window[place:place + 6]
+    if not header.startswith(_START[:len(header)]):
         return None
-    if len(head) > 2 and not _is_from_device(head[2]):
+    if len(header) > 2 and not _is_from_device(header[2]):
         return None
-    if len(head) < 4 or head[3] == _EXTENDED and len(head) < 6:
+    if len(header) < 4 or header[3] == _EXTENDED and len(header) < 6:
         return _Message(-1, len(window), len(window) + 1)
-    size, begin = head[3], place + 4
-    if size == _EXTENDED:
-        size, begin = head[4] << 8 | head[5], place + 6
-    if size > longest:
+    length, begin = header[3], place + 4
+    if length == _EXTENDED:
+        length, begin = header[4] << 8 | header[5], place + 6
+    if length > longest:
         return None
-    return _Message(head[2], begin, begin + size + 1)
+    return _Message(header[2], begin, begin + length + 1)
 
 
 def _is_checksum_valid(window: bytes, place: int, message: _Message) -> bool:
@@ -112,12 +117,13 @@ def _is_checksum_valid(window: bytes, place: int, message: _Message) -> bool:
 
 
 class XsensFraming:
-    """Readings from the messages of an MTi or MTx. Implements `Framing`.
+    """Extracts readings from the messages of an MTi or MTx. Implements `Framing`.
 
     A reading has the field in arbitrary units (1 = the magnitude of the field where Xsens
     calibrated the sensor), the acceleration in m/s², the packet counter as sequence (modulo 2^16),
-    and SampleTimeFine as ticks (10 kHz), each if the device sends it. A message with neither field
-    nor acceleration has no reading; it is counted, and its sequence number appears to be lost.
+    and SampleTimeFine as ticks (10 kHz). Quantities that the device does not send are None. A
+    message with neither field nor acceleration gives no reading. Such a message is counted, and its
+    sequence number is counted as lost.
 
     Parameters
     ----------
@@ -126,7 +132,7 @@ class XsensFraming:
     Raises
     ------
     SettingsError
-        If `mtdata` or `mtdata_format` do not describe a message.
+        If `mtdata` or `mtdata_format` does not describe a message.
     """
 
     SETTINGS = XsensSettings
@@ -168,19 +174,19 @@ class XsensFraming:
             if start == len(data):
                 break
             window = data[start:start + longest]
-            step = self._step(window, not final and len(window) < longest)
+            step = self._parse_step(window, not final and len(window) < longest)
             if step.length == 0:
                 break
             position += step.length
-            if not step.taken:
+            if not step.is_accepted:
                 rejected['bytes between frames'] += step.length
             rejected.update(step.causes)
             if step.reading is not None:
                 readings.append(step.reading)
         return Parsed(tuple(readings), position, {c: n for c, n in rejected.items() if n})
 
-    def _step(self, window: bytes, more: bool) -> _Step:
-        """Result for the message at the beginning of `window`; `more` = more bytes may follow."""
+    def _parse_step(self, window: bytes, more: bool) -> _ParseStep:
+        """Parse the message at the beginning of `window`; `more` = more bytes may follow."""
         message = _message_at(window, 0, self._longest)
         if message is None:
             return _REFUSE
@@ -188,25 +194,25 @@ class XsensFraming:
             return _WAIT if more else _REFUSE
         if not _is_checksum_valid(window, 0, message):
             return _REFUSE._replace(causes=('frames with a wrong checksum',))
-        content = self._data_content(window, message)
-        if content is None and message.mid == _MTDATA2:
+        decoded = self._decode(window, message)
+        if decoded is None and message.mid == _MTDATA2:
             return _REFUSE._replace(causes=('MTData2 messages with invalid packet lengths',))
-        inside = self._step_inside(window, message, content is not None, more)
-        if inside is not None:
-            return inside
-        if content is None:
-            return _Step(message.end, True, (self._cause(window, message),))
-        return _Step(message.end, True, content.causes, content.reading)
+        step = self._search_inside(window, message, decoded is not None, more)
+        if step is not None:
+            return step
+        if decoded is None:
+            return _ParseStep(message.end, True, (self._cause(window, message),))
+        return _ParseStep(message.end, True, decoded.causes, decoded.reading)
 
-    def _step_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
-                     more: bool) -> _Step | None:
-        """Result if another message that begins inside rejects or delays `outer`; else None."""
-        refused = _REFUSE._replace(causes=('messages that contain the start of another',))
+    def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
+                       more: bool) -> _ParseStep | None:
+        """Search `outer` for another message; return a step that rejects or delays it, or None."""
+        rejection = _REFUSE._replace(causes=('messages that contain the start of another',))
         place = 0
         while True:
-            # A data message does not wait for the byte after it, although its checksum may be a
-            # preamble; otherwise one in 256 messages would be late.
-            place = self._next_inside(window, place + 1, outer.end, outer_is_data)
+            # The checksum of a message may be the preamble of the next. A data message does not
+            # wait for the byte after it; otherwise one in 256 data messages would be delayed.
+            place = self._next_start(window, place + 1, outer.end, outer_is_data)
             if place < 0:
                 return None
             inner = _message_at(window, place, self._longest)
@@ -216,21 +222,21 @@ class XsensFraming:
                 if more:
                     return _WAIT
                 if len(window) == self._longest + _MAX_OVERHEAD and not outer_is_data:
-                    return refused
+                    return rejection
             elif (_is_checksum_valid(window, place, inner)
-                  and self._data_content(window, inner) is not None):
-                return refused
+                  and self._decode(window, inner) is not None):
+                return rejection
 
     @staticmethod
-    def _next_inside(window: bytes, place: int, end: int, whole: bool) -> int:
-        """Position of the next start before `end`, -1 if none; `whole` = both of its bytes."""
+    def _next_start(window: bytes, place: int, end: int, whole: bool) -> int:
+        """Index of the next start before `end`, or -1; `whole` = with both start bytes."""
         found = window.find(_START, place, end if whole else end + 1)
         if found < 0 and not whole and end == len(window) and window.endswith(_PREAMBLE, place):
             return end - 1
         return found
 
-    def _data_content(self, window: bytes, message: _Message) -> Content | None:
-        """Content of a well-formed data message, else None."""
+    def _decode(self, window: bytes, message: _Message) -> DecodedMessage | None:
+        """Decode a data message; None if the message is malformed or of another type."""
         data = window[message.begin:message.end - 1]
         if message.mid == _MTDATA2:
             return read_mtdata2(data)
@@ -239,7 +245,7 @@ class XsensFraming:
         return None
 
     def _cause(self, window: bytes, message: _Message) -> str:
-        """Cause by which a message without a reading is counted."""
+        """Cause by which a message that cannot be decoded is counted."""
         if message.mid == _MTDATA:
             if self._layout is None:
                 return 'MTData messages, although mtdata is none'

@@ -1,4 +1,4 @@
-"""Content of DATA of the Xsens data messages MTData2 and MTData.
+"""Decoding of the Xsens data messages MTData2 and MTData.
 
 The magnetic field is in arbitrary units (1 = the magnitude of the field where Xsens calibrated the
 sensor), the acceleration in m/s². Both are in the sensor frame: the coordinate bits of a data
@@ -26,20 +26,20 @@ _SAMPLE_TIME_FINE = 0x1060
 _ACCELERATION = 0x4020
 _MAGNETIC_FIELD = 0xC020
 _COMPONENT_READOUT = 0xA000
-"""Group of the raw values."""
+"""Identifier group of the raw sensor values."""
 _MAGNETIC = 0xC000
 _KIND = 0xFFF0
 _GROUP = 0xFE00
 
 _FLOAT, _FIXED_12_20, _FIXED_16_32 = 0, 1, 2
-_THREE = (struct.Struct('>3f'), struct.Struct('>3i'), struct.Struct('>IhIhIh'),
+_TRIPLE_FORMATS = (struct.Struct('>3f'), struct.Struct('>3i'), struct.Struct('>IhIhIh'),
           struct.Struct('>3d'))
-"""Three real numbers, by the two precision bits of the identifier."""
+"""Formats of three real numbers, indexed by the two precision bits of the identifier."""
 
 _BLOCKS = {
     'temp': 4, 'acc': 12, 'gyr': 12, 'mag': 12, 'quaternion': 16, 'euler': 12, 'matrix': 36,
     'analog_1': 2, 'analog_2': 2, 'status': 1, 'counter': 2}
-"""Size in bytes of the blocks of MTData, in the order of the protocol."""
+"""Length in bytes of the blocks of MTData, in the order of the protocol."""
 _ORIENTATIONS = {'quaternion', 'euler', 'matrix'}
 _FORMATS = {'float': _FLOAT, 'fp12.20': _FIXED_12_20}
 
@@ -47,18 +47,18 @@ _FORMATS = {'float': _FLOAT, 'fp12.20': _FIXED_12_20}
 _Triple: TypeAlias = tuple[float, float, float]
 
 
-class Content(NamedTuple):
-    """Content of a data message."""
+class DecodedMessage(NamedTuple):
+    """Reading and counted causes of a data message."""
 
     reading: Reading | None
-    """None = neither field nor acceleration."""
+    """None = the message has neither field nor acceleration."""
     causes: tuple[str, ...]
-    """Causes by which ignored content is counted, one for each occurrence."""
+    """Causes by which ignored data are counted, one for each occurrence."""
 
 
 def _three_reals(data: bytes, precision: int) -> _Triple | None:
-    """Three real numbers; None if `data` has another length."""
-    layout = _THREE[precision]
+    """Decode three real numbers; None if the length of `data` is wrong."""
+    layout = _TRIPLE_FORMATS[precision]
     if len(data) != layout.size:
         return None
     values = layout.unpack(data)
@@ -71,8 +71,8 @@ def _three_reals(data: bytes, precision: int) -> _Triple | None:
     return values
 
 
-def _value(identifier: int, data: bytes) -> tuple[str, float | _Triple | None] | None:
-    """(field of a reading, value) of a packet; None for any other packet."""
+def _decode_packet(identifier: int, data: bytes) -> tuple[str, float | _Triple | None] | None:
+    """Decode a packet into (attribute of `Reading`, value); None if the packet is not used."""
     # The value is None if the length of the packet is wrong.
     if identifier == _PACKET_COUNTER:
         return 'sequence', int.from_bytes(data, 'big') if len(data) == 2 else None
@@ -86,12 +86,12 @@ def _value(identifier: int, data: bytes) -> tuple[str, float | _Triple | None] |
     return None
 
 
-def read_mtdata2(data: bytes) -> Content | None:
-    """Read DATA of an MTData2 message.
+def read_mtdata2(data: bytes) -> DecodedMessage | None:
+    """Decode DATA of an MTData2 message.
 
-    A packet is an identifier (u16), the size of its data (u8), and the data. Of the packets that
-    are not used, only raw values (0xA0..) and other magnetic packets (0xC0..) are counted.
-    SampleTimeCoarse (0x1070) is too coarse for a clock.
+    A packet is an identifier (u16), the length of its data (u8), and the data. Unused packets are
+    counted only if they contain raw values (0xA0..) or other magnetic data (0xC0..).
+    SampleTimeCoarse (0x1070) is not used, because it is too coarse for a clock.
 
     Parameters
     ----------
@@ -99,10 +99,10 @@ def read_mtdata2(data: bytes) -> Content | None:
 
     Returns
     -------
-    Content or None
-        None if the packets do not fill `data`, or if a packet that is used has an invalid size.
+    DecodedMessage or None
+        None if the packets do not fill `data`, or if a used packet has an invalid length.
     """
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     causes: list[str] = []
     position, end = 0, len(data)
     while position < end:
@@ -113,36 +113,36 @@ def read_mtdata2(data: bytes) -> Content | None:
         position = begin + data[begin - 1]
         if position > end:
             return None
-        named = _value(identifier, data[begin:position])
-        if named is None:
+        decoded = _decode_packet(identifier, data[begin:position])
+        if decoded is None:
             if identifier & _GROUP in (_COMPONENT_READOUT, _MAGNETIC):
                 causes.append(f'packets not used: 0x{identifier:04X}')
             continue
-        name, value = named
+        name, value = decoded
         if value is None:
             return None
-        if name in found:
+        if name in values:
             causes.append(f'duplicate packets in a message: 0x{identifier:04X}')
             continue
-        found[name] = value
-    return _content(found, causes)
+        values[name] = value
+    return _message_of(values, causes)
 
 
-def _content(found: Mapping[str, Any], causes: Sequence[str]) -> Content:
-    """Content with a reading, if there is a field or an acceleration."""
-    if 'field' in found or 'acceleration' in found:
-        return Content(Reading(**found), tuple(causes))
-    return Content(None, (*causes, 'messages without field or acceleration'))
+def _message_of(values: Mapping[str, Any], causes: Sequence[str]) -> DecodedMessage:
+    """Message with a reading if it has a field or an acceleration."""
+    if 'field' in values or 'acceleration' in values:
+        return DecodedMessage(Reading(**values), tuple(causes))
+    return DecodedMessage(None, (*causes, 'messages without field or acceleration'))
 
 
 class MTDataLayout:
-    """Layout of an MTData message, which the message itself does not describe.
+    """Layout of MTData messages, which the messages themselves do not describe.
 
     Parameters
     ----------
     blocks : sequence of str
-        'temp', 'acc', 'gyr', 'mag', then one of 'quaternion', 'euler' and 'matrix', 'analog_1',
-        'analog_2', 'status', 'counter'; only those that are enabled.
+        Enabled blocks in this order: 'temp', 'acc', 'gyr', 'mag', one of 'quaternion', 'euler' and
+        'matrix', 'analog_1', 'analog_2', 'status', 'counter'.
     number_format : str
         Format of all real numbers: 'float' or 'fp12.20'.
 
@@ -166,7 +166,8 @@ class MTDataLayout:
             raise SettingsError(f'mtdata: expected blocks in protocol order, each at most once '
                                 f'({", ".join(_BLOCKS)}), got {", ".join(blocks)}')
         if len(_ORIENTATIONS.intersection(blocks)) > 1:
-            raise SettingsError('mtdata: more than one of ' + ', '.join(sorted(_ORIENTATIONS)))
+            raise SettingsError(
+                'mtdata: expected at most one of ' + ', '.join(sorted(_ORIENTATIONS)))
         if not {'acc', 'mag'}.intersection(blocks):
             raise SettingsError(f'mtdata: acc or mag is required, got {", ".join(blocks)}')
         if number_format not in _FORMATS:
@@ -179,22 +180,22 @@ class MTDataLayout:
             self._begin[name] = self.size
             self.size += _BLOCKS[name]
 
-    def read(self, data: bytes) -> Content:
-        """Read DATA of length `size`.
+    def read(self, data: bytes) -> DecodedMessage:
+        """Decode DATA of an MTData message.
 
         Parameters
         ----------
-        data : bytes
+        data : (size,) bytes
 
         Returns
         -------
-        Content
+        DecodedMessage
         """
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         for block, name in (('mag', 'field'), ('acc', 'acceleration')):
             if block in self._begin:
                 begin = self._begin[block]
-                found[name] = _three_reals(data[begin:begin + 12], self._precision)
+                values[name] = _three_reals(data[begin:begin + 12], self._precision)
         if 'counter' in self._begin:
-            found['sequence'] = int.from_bytes(data[self._begin['counter']:], 'big')
-        return _content(found, ())
+            values['sequence'] = int.from_bytes(data[self._begin['counter']:], 'big')
+        return _message_of(values, ())

@@ -1,1 +1,1 @@
-"""Transports: moving bytes to this machine, one file each."""
+"""Transports: reception of bytes, and polled chips, one file per protocol."""

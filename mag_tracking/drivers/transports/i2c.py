@@ -1,9 +1,9 @@
 """Magnetometer chips on an I2C bus of this machine, polled cyclically.
 
 A polling cycle begins every 1 / rate_hz at absolute deadlines, so timing errors do not accumulate.
-Every chip is read once per cycle, and chips that measure on request do so at the same time. The
-arrival time of a reading is the middle of the chip's conversion, as accurately as it is known; the
-modules of `chips/` give the accuracy. The field is in tesla.
+Every chip is read once per cycle, and chips that measure on request measure at the same time. The
+arrival time of a reading is the estimated middle of the chip's conversion; the modules of `chips/`
+give the accuracy. The field is in tesla.
 
 If the bus hangs, `read` blocks for the timeout of the bus adapter's driver, usually one second. A
 cycle ends at the first such failure.
@@ -82,27 +82,28 @@ class I2cSettings:
 
 
 class I2cDevice(Closable):
-    """Chips of one bus, with the field in tesla. Implements `reading.Device`.
+    """Chips on one I2C bus; readings are in tesla. Implements `reading.Device`.
 
     Parameters
     ----------
     settings : I2cSettings
     open_bus : callable, optional
-        Function from the number of a bus to an `smbus2.SMBus` or equivalent.
+        Function that opens the bus with a given number as an `smbus2.SMBus` or equivalent.
     monotonic_ns : callable, optional
         Monotonic clock; tests replace it.
     sleep : callable, optional
+        Function that waits for a time in seconds.
 
     Attributes
     ----------
     counts : Counter
-        Number of missed polling cycles, and for each sensor of failed readings, of cycles without
-        a new conversion and of overwritten conversions.
+        Number of missed polling cycles. For each sensor, number of failed readings, of cycles
+        without a new conversion, and of overwritten conversions.
 
     Raises
     ------
     SettingsError
-        If no sensor is given, or a sensor or a chip setting is not valid.
+        If no sensor is configured, or if a sensor or a chip setting is not valid.
     """
 
     SETTINGS = I2cSettings
@@ -119,9 +120,9 @@ class I2cDevice(Closable):
         self._period_ns = round(1e9 / settings.rate_hz)
         super().__init__()
         self._bus: Bus | None = None
-        self._lost, self._due_ns = '', 0
-        self._failed: Counter[str] = Counter()
-        self._silent: Counter[str] = Counter()
+        self._loss, self._due_ns = '', 0
+        self._n_failed: Counter[str] = Counter()
+        self._n_silent: Counter[str] = Counter()
         self._max_silent = max(3, math.ceil(settings.silence_timeout_s * settings.rate_hz))
         # Creating the chips checks their settings.
         self._chips = self._create_chips(Bus(None, monotonic_ns, sleep))
@@ -151,8 +152,8 @@ class I2cDevice(Closable):
                 self._release()
                 raise
             self._due_ns = self._monotonic_ns()
-            self._failed.clear()
-            self._silent.clear()
+            self._n_failed.clear()
+            self._n_silent.clear()
 
     @property
     def _name(self) -> str:
@@ -160,7 +161,7 @@ class I2cDevice(Closable):
         return f'/dev/i2c-{self._settings.bus}'
 
     def _create_chips(self, bus: Bus) -> dict[str, Chip]:
-        """{name of the sensor: chip}, without access to the bus."""
+        """Create {name of the sensor: chip}, without access to the bus."""
         chips: dict[str, Chip] = {}
         for name, sensor in self._sensors.items():
             registers = Registers(bus, sensor.place)
@@ -191,20 +192,20 @@ class I2cDevice(Closable):
             raise DeviceError(f'{where}: {self._fault(error)}') from error
 
     def _matching_chips(self, registers: Registers) -> list[str]:
-        """Names of the supported chips with the identity found at a place."""
-        found = []
+        """Names of the supported chips whose identity matches the registers."""
+        names = []
         for name, cls in CHIPS.items():
             try:
                 check_identity(cls, registers)
             except (DeviceError, OSError):
                 continue
-            found.append(name)
-        return found
+            names.append(name)
+        return names
 
     def _fault(self, error: OSError) -> str:
-        """Meaning of a bus error, and the remedy."""
+        """Explanation of a bus error, with the remedy."""
         if error.errno in NO_ANSWER:
-            return ('no answer; check wiring and supply, and the address with i2cdetect -y '
+            return ('no answer; check wiring, power supply, and the address with i2cdetect -y '
                     f'{self._settings.bus}')
         if isinstance(error, TimeoutError):
             return 'the bus hangs; check for a chip or wire that holds a line low'
@@ -213,7 +214,7 @@ class I2cDevice(Closable):
         return f'cannot be read: {error.strerror or error}'
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """Return the readings of the next polling cycle that has any.
+        """Return the readings of the next polling cycle with at least one reading.
 
         Parameters
         ----------
@@ -223,7 +224,7 @@ class I2cDevice(Closable):
         Returns
         -------
         list of Arrival
-            Empty if there is no reading in time, or if `close` was called.
+            Empty if no reading is available in time, or if `close` was called.
 
         Raises
         ------
@@ -235,8 +236,8 @@ class I2cDevice(Closable):
             while True:
                 if self._bus is None:
                     raise DeviceError(f'{self._name}: not open')
-                if self._lost:
-                    raise DeviceError(self._lost)
+                if self._loss:
+                    raise DeviceError(self._loss)
                 if not self._wait(end_ns):
                     return []
                 arrivals = self._run_cycle(self._bus)
@@ -262,7 +263,7 @@ class I2cDevice(Closable):
         return False
 
     def _run_cycle(self, bus: Bus) -> list[Arrival]:
-        """Let every chip measure once, all at the same time."""
+        """Measure once with all chips at the same time."""
         arrivals: list[Arrival] = []
         running = {name: chip.measure() for name, chip in self._chips.items()}
         wake_ns = dict.fromkeys(running, self._monotonic_ns())
@@ -275,10 +276,10 @@ class I2cDevice(Closable):
                 wait_s = next(running[name])
                 wake_ns[name] = self._monotonic_ns() + math.ceil(wait_s * 1e9)
                 continue
-            except StopIteration as done:
-                arrivals += self._arrivals(name, done.value)
+            except StopIteration as stop:
+                arrivals += self._arrivals(name, stop.value)
             except TimeoutError as error:
-                # Every further attempt would block for as long.
+                # Every further attempt would block for the same time.
                 for other in wake_ns:
                     self._fail(bus, other, error)
                 return arrivals
@@ -288,37 +289,38 @@ class I2cDevice(Closable):
         return arrivals
 
     def _arrivals(self, name: str, conversion: Conversion | None) -> list[Arrival]:
-        """List with the reading of a conversion, or an empty one."""
-        self._failed[name] = 0
+        """Convert a conversion to an arrival; count a missing conversion."""
+        self._n_failed[name] = 0
         if conversion is None:
             self._count('polling cycles without a new conversion', name)
-            self._silent[name] += 1
-            if self._silent[name] >= self._max_silent:
-                self._lost = (f'{self._name}: {name}: no new conversion in {self._silent[name]} '
-                              'polling cycles; check its supply')
+            self._n_silent[name] += 1
+            if self._n_silent[name] >= self._max_silent:
+                self._loss = (f'{self._name}: {name}: no new conversion in {self._n_silent[name]} '
+                              'polling cycles; check its power supply')
             return []
-        self._silent[name] = 0
+        self._n_silent[name] = 0
         return [Arrival(conversion.middle_ns, Reading(name, conversion.field))]
 
     def _fail(self, bus: Bus, name: str, error: OSError) -> None:
-        """Count a failure; too many consecutive ones mark the device as lost."""
+        """Count a failure; mark the device as lost after too many consecutive failures."""
         bus.forget()
         self._count('failed readings', name)
-        self._failed[name] += 1
-        if self._failed[name] >= self._settings.max_failures:
-            self._lost = (f'{self._name}: {name} failed {self._failed[name]} times in a row: '
-                          f'{self._fault(error)}')
+        self._n_failed[name] += 1
+        n = self._n_failed[name]
+        if n >= self._settings.max_failures:
+            cycles = '1 polling cycle' if n == 1 else f'{n} consecutive polling cycles'
+            self._loss = f'{self._name}: {name} failed in {cycles}: {self._fault(error)}'
 
     def _release(self) -> None:
         """Close the bus if it is open."""
-        self._lost = ''
+        self._loss = ''
         if self._bus is not None:
             self._bus.smbus.close()
             self._bus = None
 
 
 def _open_error(error: OSError) -> str:
-    """Why a bus cannot be opened, and the remedy."""
+    """Reason why a bus cannot be opened, with the remedy."""
     if error.errno == errno.ENOENT:
         return ('not found; enable I2C (on a Raspberry Pi: raspi-config), load the module with '
                 'sudo modprobe i2c-dev, and list the buses with i2cdetect -l')

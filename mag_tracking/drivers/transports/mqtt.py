@@ -5,8 +5,8 @@ because their arrival would not indicate when they were measured. For the same r
 messages are skipped by default, and if the reader is too slow, the oldest messages of the queue are
 dropped first.
 
-A lost connection is an error until `open` is called again. The network loop runs in its own thread,
-which records the arrival times.
+After the connection is lost, `read` raises an error until `open` is called again. The network loop
+runs in its own thread, which records the arrival times.
 
 Sources: MQTT 3.1.1, OASIS Standard (connect return codes 3.2.2.3, failure in SUBACK 3.9.3, flags
 DUP and RETAIN 3.3.1, client identifiers 3.1.3.1); paho-mqtt 2 with CallbackAPIVersion.VERSION2.
@@ -31,12 +31,12 @@ from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
 
 CLOSE_WAIT_S = 0.1
-"""[s] Maximum time until the thread notices that it is to end."""
+"""[s] Maximum delay between a call of `close` and the end of the network thread."""
 
 
 @dataclass(frozen=True)
 class MqttSettings:
-    """Settings of the subscriptions at an MQTT broker."""
+    """Settings of the subscriptions to topics of an MQTT broker."""
 
     host: str = param('localhost', 'Host name or address of the broker.')
     port: int = param(1883, 'Port of the broker, usually 8883 with TLS.', '', (1, 65535))
@@ -48,18 +48,18 @@ class MqttSettings:
     tls: bool = param(
         False, "Whether to encrypt the connection and verify the broker's certificate.")
     ca_file: str = param(
-        '', 'Certificates (PEM) of the authorities trusted to certify the broker; empty = those of '
-        'the system.')
+        '', 'File with the certificates (PEM) of trusted authorities; empty = certificates of the '
+        'system.')
     client_id: str = param(
         '', 'Client identifier, unique for each connection to the broker; empty = a random one.')
     keepalive_s: int = param(
         10, 'Keep-alive interval. The connection is closed if the broker does not answer for twice '
         'this interval.', 's', (1, 65535))
     connect_timeout_s: float = param(
-        5.0, "Maximum time to connect, and again to receive the broker's answers.", 's',
+        5.0, "Timeout for connecting, and again for the broker's acknowledgements.", 's',
         (0.1, 600.0))
     queue: int = param(
-        10000, 'Maximum number of messages in the queue. If it is full, the oldest are dropped.',
+        10000, 'Maximum number of messages in the queue. If full, the oldest message is dropped.',
         '', (1, 10_000_000))
     max_length: int = param(
         65536, 'Maximum length of a message; longer ones are dropped.', 'bytes', (1, 1 << 28))
@@ -68,7 +68,7 @@ class MqttSettings:
 
 
 class _Certificates(ssl.SSLContext):
-    """TLS context that handshakes at once: its failure closes the socket, which paho does not."""
+    """TLS context with an immediate handshake, whose failure closes the socket, unlike in paho."""
 
     def wrap_socket(self, sock: socket.socket, *args: Any, **kwargs: Any) -> ssl.SSLSocket:
         """Wrap a socket with an immediate handshake."""
@@ -85,13 +85,13 @@ class MqttTopics:
     Attributes
     ----------
     counts : Counter
-        Number of dropped messages by cause, and of messages that the broker delivered again
-        ('messages with the dup flag'), which are accepted.
+        Number of dropped messages by cause. It includes 'messages with the dup flag', which the
+        broker has delivered again and which are accepted.
 
     Raises
     ------
     SettingsError
-        If no topic is given, a password has no user name, or there are certificates without TLS.
+        If no topic is configured, a password has no user name, or `ca_file` is set without TLS.
     """
 
     SETTINGS = MqttSettings
@@ -113,8 +113,8 @@ class MqttTopics:
         self._queue: deque[Chunk] = deque()
         self._pending_counts: Counter[str] = Counter()
         self._thread: threading.Thread | None = None
-        self._ready = self._closing = False
-        self._lost = f'{self._name}: not open'
+        self._is_ready = self._closing = False
+        self._loss = f'{self._name}: not open'
 
     @property
     def settings(self) -> MqttSettings:
@@ -133,25 +133,25 @@ class MqttTopics:
         client = self._client()
         with self._changed:
             self._count()
-            self._ready = self._closing = False
+            self._is_ready = self._closing = False
         self._connect(client)
         with self._changed:
             # A `close` during the connection has priority.
-            self._lost = self._lost if self._closing else ''
+            self._loss = self._loss if self._closing else ''
         self._thread = threading.Thread(target=self._run, args=(client,), daemon=True,
                                         name=f'mqtt {self._settings.host}')
         self._thread.start()
         with self._changed:
-            answered = self._changed.wait_for(lambda: self._ready or self._lost,
+            answered = self._changed.wait_for(lambda: self._is_ready or self._loss,
                                            self._settings.connect_timeout_s)
-            lost = self._lost
+            lost = self._loss
         if not answered or lost:
             self.close()
             raise DeviceError(lost or f'{self._name}: no answer within '
                               f'{self._settings.connect_timeout_s:g} s; is it an MQTT broker?')
 
     def _client(self) -> paho.Client:
-        """A client that is ready to connect; raises DeviceError if a file cannot be read."""
+        """Create a client; raises DeviceError if a file cannot be read."""
         s = self._settings
         client = paho.Client(
             CallbackAPIVersion.VERSION2, s.client_id or f'mag_tracking_{secrets.token_hex(4)}',
@@ -166,7 +166,7 @@ class MqttTopics:
         return client
 
     def _certificates(self) -> ssl.SSLContext:
-        """TLS context with the trusted authorities."""
+        """Create a TLS context with the trusted authorities."""
         path = self._settings.ca_file
         # This kind of context requires a certificate that matches the host name.
         certificates = _Certificates(ssl.PROTOCOL_TLS_CLIENT)
@@ -181,7 +181,7 @@ class MqttTopics:
         return certificates
 
     def _password(self) -> str | None:
-        """First line of the password file; None without a file."""
+        """First line of the password file; None if no file is configured."""
         path = self._settings.password_file
         if not path:
             return None
@@ -196,7 +196,7 @@ class MqttTopics:
         return password
 
     def _connect(self, client: paho.Client) -> None:
-        """Connect, with a handshake for TLS."""
+        """Connect the client, with a TLS handshake if configured; raises DeviceError."""
         s = self._settings
         try:
             client.connect(s.host, s.port, s.keepalive_s)
@@ -209,23 +209,24 @@ class MqttTopics:
             raise DeviceError(f'{self._name}: cannot connect: {error}') from error
 
     def _run(self, client: paho.Client) -> None:
-        """Run the network loop; only this thread uses the client after `open`."""
+        """Run the network loop. After `open`, only this thread uses the client."""
         try:
-            said = MQTTErrorCode.MQTT_ERR_SUCCESS
-            while said == MQTTErrorCode.MQTT_ERR_SUCCESS and not self._closing:
-                said = client.loop(CLOSE_WAIT_S)
-            reason = paho.error_string(said)
+            status = MQTTErrorCode.MQTT_ERR_SUCCESS
+            while status == MQTTErrorCode.MQTT_ERR_SUCCESS and not self._closing:
+                status = client.loop(CLOSE_WAIT_S)
+            reason = paho.error_string(status)
             client.disconnect()
         # Any error ends the thread and the connection, and must be reported to the reader.
         except Exception as error:
             reason = f'{type(error).__name__}: {error}'
-        self._set_lost(reason if self._ready else f'{reason} Check that it is an MQTT broker and '
-                       f'that it expects tls: {str(self._settings.tls).lower()}')
+        self._set_lost(reason if self._is_ready else
+                       f'{reason} Check that it is an MQTT broker and that it expects tls: '
+                       f'{str(self._settings.tls).lower()}')
 
     def _set_lost(self, reason: str) -> None:
-        """Mark the connection as lost; the first reason is kept."""
+        """Mark the connection as lost and store the first reason."""
         with self._changed:
-            self._lost = self._lost or f'{self._name}: {reason}'
+            self._loss = self._loss or f'{self._name}: {reason}'
             self._changed.notify_all()
 
     def _on_connect(self, client: paho.Client, _: Any, flags: paho.ConnectFlags,
@@ -248,7 +249,7 @@ class MqttTopics:
             self._set_lost(f'subscription refused: {", ".join(refused)}')
             return
         with self._changed:
-            self._ready = True
+            self._is_ready = True
             self._changed.notify_all()
 
     def _on_message(self, client: paho.Client, _: Any, message: paho.MQTTMessage) -> None:
@@ -268,7 +269,7 @@ class MqttTopics:
             self._changed.notify_all()
 
     def _rejection_cause(self, message: paho.MQTTMessage) -> tuple[str, str]:
-        """(cause of the rejection of a message, or '', and its topic)."""
+        """(cause of the rejection of a message, topic); the cause is empty for a valid message."""
         try:
             topic = message.topic
         except UnicodeDecodeError:
@@ -286,7 +287,7 @@ class MqttTopics:
             self._set_lost(f'no answer for {2 * self._settings.keepalive_s} s')
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """Return the queued messages, or wait for the first one.
+        """Return the queued messages; wait only if the queue is empty.
 
         Parameters
         ----------
@@ -304,19 +305,19 @@ class MqttTopics:
             If the connection is lost and all messages have been returned.
         """
         with self._changed:
-            if self._lost and not self._queue:
-                raise DeviceError(self._lost)
-            self._changed.wait_for(lambda: self._queue or self._lost, timeout_s)
+            if self._loss and not self._queue:
+                raise DeviceError(self._loss)
+            self._changed.wait_for(lambda: self._queue or self._loss, timeout_s)
             chunks = list(self._queue)
             self._queue.clear()
             # Only the reader's thread changes `counts`, which it may be iterating over.
             self._count()
-            if not chunks and self._lost and not self._closing:
-                raise DeviceError(self._lost)
+            if not chunks and self._loss and not self._closing:
+                raise DeviceError(self._loss)
             return chunks
 
     def _count(self) -> None:
-        """Add the counts since the last call."""
+        """Add the pending counts to `counts`."""
         self.counts += self._pending_counts
         self._pending_counts.clear()
 
@@ -324,7 +325,7 @@ class MqttTopics:
         """Disconnect and end the thread; a `read` in another thread returns."""
         with self._changed:
             self._closing = True
-            self._lost = f'{self._name}: not open'
+            self._loss = f'{self._name}: not open'
         # The end of the thread wakes a waiting reader.
         if self._thread is not None:
             self._thread.join()

@@ -1,4 +1,4 @@
-"""Common parts of transports over a file descriptor: waiting, and closing during a wait."""
+"""Common parts of transports with a file descriptor: waiting for data, and closing."""
 
 import select
 import threading
@@ -58,23 +58,23 @@ class Polled(Closable, Generic[H]):
         self._poll = select.poll()
 
     def _attach(self, handle: H) -> None:
-        """Use `handle` from now on."""
+        """Store an open handle, and register it for polling."""
         self._handle, self._poll = handle, select.poll()
         self._poll.register(handle.fileno(), select.POLLIN)
 
     def _wait(self, timeout_s: float) -> int | None:
-        """Time at which data became available [ns]; None if none did."""
+        """Wait for data; return the time of its arrival [ns], or None after the timeout."""
         end = time.monotonic() + timeout_s
         while not self._closing:
-            left = end - time.monotonic()
-            if self._poll.poll(1e3 * max(0.0, min(left, CLOSE_WAIT_S))):
+            remaining = end - time.monotonic()
+            if self._poll.poll(1e3 * max(0.0, min(remaining, CLOSE_WAIT_S))):
                 return time.monotonic_ns()
-            if left <= 0.0:
+            if remaining <= 0.0:
                 break
         return None
 
     def _release(self) -> None:
-        """Close the handle, if there is one."""
+        """Close the handle if it is open."""
         if self._handle is not None:
             self._handle.close()
             self._handle = None

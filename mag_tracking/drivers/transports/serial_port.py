@@ -1,8 +1,7 @@
 """Serial line: USB adapters, USB boards, RS-232 and RS-485 ports.
 
-The stream of bytes has no boundaries; finding readings is the task of the framing. Data received
-before `open` are discarded, so the first bytes may be the rest of a frame, and all bytes are
-received after `open`.
+The transport returns a stream of bytes, in which the framing finds the readings. Data received
+before `open` are discarded, so the first bytes may belong to an incomplete frame.
 
 Sources: the termios of pyserial 3.5; TIOCGICOUNT of Linux (ioctl_tty(2), and `struct
 serial_icounter_struct` in linux/serial.h) for losses on the line and in the driver. A
@@ -42,7 +41,7 @@ class SerialSettings:
 
     port: str = param(
         '', 'Path of the port, such as /dev/ttyUSB0. The links in /dev/serial/by-id keep their '
-        'names when adapters are plugged in elsewhere.')
+        'names when an adapter is plugged into another USB port.')
     baud: int = param(115200, 'Baud rate.', 'bit/s', (50, 20_000_000))
     parity: str = param('N', 'Parity: N = none, E = even, O = odd.')
     stop_bits: int = param(1, 'Number of stop bits.', '', (1, 2))
@@ -59,12 +58,12 @@ class SerialPort(Polled[serial.Serial]):
     Attributes
     ----------
     counts : Counter
-        Number of errors on the line, if the driver of the port counts them.
+        Number of line errors by cause, if the driver of the port counts them.
 
     Raises
     ------
     SettingsError
-        If no port is given, or the parity is not valid.
+        If no port is configured, or the parity is not valid.
     """
 
     SETTINGS = SerialSettings
@@ -106,11 +105,12 @@ class SerialPort(Polled[serial.Serial]):
                 self._line_errors = None
 
     def _open_error(self, error: Exception) -> str:
-        """Why the port cannot be opened, and the remedy."""
+        """Reason why the port cannot be opened, with the remedy."""
         code = getattr(error, 'errno', None)
         if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-            there = ', '.join(f'{p.device} ({p.description})' for p in list_ports.comports())
-            return f'not found; {f"available ports: {there}" if there else "no ports available"}'
+            available = ', '.join(f'{p.device} ({p.description})' for p in list_ports.comports())
+            return ('not found; '
+                    f'{f"available ports: {available}" if available else "no ports available"}')
         if code in (errno.EACCES, errno.EPERM):
             return ('no permission; add your user to the group dialout (sudo usermod -aG dialout '
                     '$USER) and log in again')
@@ -121,7 +121,7 @@ class SerialPort(Polled[serial.Serial]):
         return f'cannot be opened at {self._settings.baud} bit/s: {error}'
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """Return the available bytes, or wait for the first ones.
+        """Return the available bytes; wait only if no byte is available.
 
         Parameters
         ----------
@@ -131,8 +131,8 @@ class SerialPort(Polled[serial.Serial]):
         Returns
         -------
         list of Chunk
-            One chunk, whose arrival is the time of the wake-up. Empty if nothing arrived in time,
-            or if `close` was called.
+            One chunk; its arrival is the time at which the thread woke up. Empty if nothing arrived
+            in time, or if `close` was called.
 
         Raises
         ------
@@ -151,17 +151,17 @@ class SerialPort(Polled[serial.Serial]):
                     return []
                 data = self._handle.read(max(1, self._handle.in_waiting))
             except OSError as error:
-                raise DeviceError(f'serial port {self._settings.port}: connection lost, check '
-                                  f'whether it is plugged in ({error})') from error
+                raise DeviceError(f'serial port {self._settings.port}: connection lost; check '
+                                  f'that the device is plugged in ({error})') from error
         return [Chunk(arrival_ns, data)] if data else []
 
     def _count_line_errors(self, before: tuple[int, ...], now: tuple[int, ...]) -> None:
-        """Add the losses between two readings of the kernel's counters."""
+        """Add the errors between two readings of the kernel's counters."""
         for i, cause in LINE_ERRORS.items():
             if now[i] != before[i]:
                 self.counts[cause] += (now[i] - before[i]) % 2**32
 
 
 def _line_errors_of(port: serial.Serial) -> tuple[int, ...]:
-    """The kernel's counters; raises OSError if the driver of the port has none."""
+    """Read the kernel's error counters; raises OSError if the port's driver does not count."""
     return ICOUNTER.unpack(fcntl.ioctl(port.fileno(), TIOCGICOUNT, bytes(ICOUNTER.size)))

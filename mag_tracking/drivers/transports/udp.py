@@ -1,15 +1,16 @@
 """UDP over IPv4; each datagram is a message.
 
-The arrival time of a datagram is that of the kernel (SO_TIMESTAMPNS), which does not depend on when
-this process runs. It is taken from the wall clock and converted to the monotonic clock by their
-difference, which is constant unless the wall clock is set: fine adjustments by the system change
-the rate of both. If the difference has changed since the queue was last empty, the time of the
-wake-up is used instead, and counted. In the first milliseconds after the first socket of the
-machine requests timestamps, the kernel returns the time of the reading instead.
+The kernel measures the arrival time of a datagram (SO_TIMESTAMPNS), so the arrival time does not
+depend on when this process runs. The wall-clock time of the kernel is converted to the monotonic
+clock by the difference of the clocks. The difference is constant unless the wall clock is set,
+because fine adjustments by the system change the rate of both clocks. If the difference has changed
+since the queue was last empty, the wake-up time of the thread is used instead, and counted. When
+the first socket of the machine has requested timestamps, the kernel returns the time of the read
+access instead of the arrival time for a few milliseconds.
 
-Datagrams that the kernel dropped because the buffer was full are read from the socket's own counter
-(SO_MEMINFO). Unlike SO_RXQ_OVFL, which is delivered with the next datagram, it is also correct if
-no further datagram arrives.
+The number of datagrams dropped by the kernel because of a full buffer is read from the counter of
+the socket (SO_MEMINFO). SO_RXQ_OVFL is not used, because it is delivered with the next datagram and
+therefore misses losses after which no datagram arrives.
 
 Sources: socket(7), ip(7) and udp(7) of Linux; order of the counters: SK_MEMINFO_* of
 linux/sock_diag.h, described in sock_diag(7).
@@ -33,7 +34,7 @@ from mag_tracking.settings import param
 AT_ONCE = 1000
 """Maximum number of datagrams per `read`."""
 CLOCK_SET_NS = 1_000_000
-"""[ns] Larger changes of the difference between the clocks are not measurement errors."""
+"""[ns] A larger change of the clock difference indicates that the wall clock was set."""
 SO_TIMESTAMPNS = getattr(socket, 'SO_TIMESTAMPNS', 35)
 SO_MEMINFO = 55
 MEMINFO = struct.Struct('9I')
@@ -52,8 +53,8 @@ class UdpSettings:
         'interface on which to join it; 0.0.0.0 = according to the routing table.')
     port: int = param(0, 'Local port to listen on; required.', '', (1, 65535))
     group: str = param(
-        '', 'Multicast group to join, such as 239.1.2.3. Only datagrams sent to it are then '
-        'received.')
+        '', 'Multicast group to join, such as 239.1.2.3. If set, only datagrams sent to the group '
+        'are received.')
     sources: tuple[str, ...] = param(
         ('',), 'Addresses from which datagrams are accepted; an empty address stands for all.')
     source_port: bool = param(
@@ -71,14 +72,14 @@ def clock_difference() -> int | None:
     Returns
     -------
     int or None, ns
-        None if even the fastest measurement took too long to be accurate.
+        None if even the fastest measurement was too slow to be accurate.
     """
-    tries = []
+    measurements = []
     for _ in range(3):
         before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        tries.append((after - before, wall - (before + after) // 2))
-    took, difference = min(tries)
-    return difference if took < CLOCK_SET_NS else None
+        measurements.append((after - before, wall - (before + after) // 2))
+    duration, difference = min(measurements)
+    return difference if duration < CLOCK_SET_NS else None
 
 
 class UdpSocket(Polled[socket.socket]):
@@ -90,12 +91,12 @@ class UdpSocket(Polled[socket.socket]):
     ----------
     settings : UdpSettings
     report : callable, optional
-        Receives a line of text for the user if the kernel reduced the receive buffer.
+        Called with a message for the user if the kernel limits the receive buffer.
 
     Attributes
     ----------
     counts : Counter
-        Number of dropped datagrams and of replaced timestamps, by cause.
+        Number of dropped datagrams and of wake-up times used as arrival times, by cause.
 
     Raises
     ------
@@ -135,7 +136,7 @@ class UdpSocket(Polled[socket.socket]):
         Raises
         ------
         DeviceError
-            If the system refuses.
+            If the socket cannot be opened.
         """
         with self._lock:
             self._release()
@@ -149,16 +150,17 @@ class UdpSocket(Polled[socket.socket]):
             self._attach(opened)
 
     def _set_up(self, opened: socket.socket) -> None:
-        """Set the options, then bind: datagrams arrive as soon as the socket is bound."""
+        """Set the options, then bind, because a bound socket receives datagrams at once."""
         s = self._settings
         opened.setblocking(False)
         opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, s.receive_buffer)
         # The kernel doubles the requested size for its overhead, and returns the doubled size.
-        given = opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
-        if given < s.receive_buffer:
-            self._report(f'UDP {self._where()}: the kernel limits the receive buffer to {given} '
-                         f'bytes instead of {s.receive_buffer}; increase net.core.rmem_max')
+        buffer_size = opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+        if buffer_size < s.receive_buffer:
+            self._report(f'UDP {self._where()}: the kernel limits the receive buffer to '
+                         f'{buffer_size} bytes instead of {s.receive_buffer}; increase '
+                         'net.core.rmem_max')
         if s.group:
             # Several programs may listen to a group. Binding to it excludes all other datagrams.
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -167,12 +169,12 @@ class UdpSocket(Polled[socket.socket]):
         opened.bind((s.group or s.address, s.port))
 
     def _where(self) -> str:
-        """Local end of the connection, for messages."""
+        """Local address and group, for messages."""
         s = self._settings
         return f'{s.address}:{s.port}' + (f', group {s.group}' if s.group else '')
 
     def _open_error(self, error: OSError) -> str:
-        """Why the socket cannot be opened, and the remedy."""
+        """Reason why the socket cannot be opened, with the remedy."""
         s = self._settings
         if error.errno == errno.EADDRINUSE:
             return 'the port is in use by another program; choose another port'
@@ -186,7 +188,7 @@ class UdpSocket(Polled[socket.socket]):
         return f'cannot be opened: {error.strerror}'
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """Return the available datagrams, or wait for the first one.
+        """Return the available datagrams; wait only if no datagram is available.
 
         Parameters
         ----------
@@ -215,27 +217,28 @@ class UdpSocket(Polled[socket.socket]):
         return chunks
 
     def _drain(self, opened: socket.socket, woken_ns: int) -> list[Chunk]:
-        """Chunks of the queued datagrams."""
-        came: list[tuple[bytes, list[Ancillary], int, tuple[str, int]]] = []
-        empty = False
-        room = socket.CMSG_SPACE(TIMESPEC.size)
-        while len(came) < AT_ONCE and not empty:
+        """Receive the queued datagrams; return the accepted datagrams as chunks."""
+        datagrams: list[tuple[bytes, list[Ancillary], int, tuple[str, int]]] = []
+        is_empty = False
+        ancillary_size = socket.CMSG_SPACE(TIMESPEC.size)
+        while len(datagrams) < AT_ONCE and not is_empty:
             try:
-                came.append(opened.recvmsg(self._settings.max_length, room))
+                datagrams.append(opened.recvmsg(self._settings.max_length, ancillary_size))
             except BlockingIOError:
-                empty = True
+                is_empty = True
         difference = clock_difference()
-        usable = (difference is not None and self._difference is not None
-                  and abs(difference - self._difference) < CLOCK_SET_NS)
-        if empty:
-            # Only an empty queue updates it: queued datagrams arrived under the old difference.
+        is_usable = (difference is not None and self._difference is not None
+                     and abs(difference - self._difference) < CLOCK_SET_NS)
+        if is_empty:
+            # Queued datagrams have the old difference, which is kept until the queue is empty.
             self._difference = difference
-        return [Chunk(self._arrival(ancillary, difference if usable else None, woken_ns), data,
+        return [Chunk(self._arrival(ancillary, difference if is_usable else None, woken_ns), data,
                       f'{ip}:{port}' if self._settings.source_port else ip)
-                for data, ancillary, flags, (ip, port) in came if self._accept(data, flags, ip)]
+                for data, ancillary, flags, (ip, port) in datagrams
+                if self._accept(data, flags, ip)]
 
     def _accept(self, data: bytes, flags: int, ip: str) -> bool:
-        """Whether a datagram is accepted; a rejected one is counted."""
+        """Return whether a datagram is accepted; count a rejected datagram."""
         if not self._any_source and ip not in self._sources:
             self.counts['datagrams from other sources'] += 1
         elif flags & socket.MSG_TRUNC:
@@ -247,7 +250,7 @@ class UdpSocket(Polled[socket.socket]):
         return False
 
     def _arrival(self, ancillary: list[Ancillary], difference: int | None, woken_ns: int) -> int:
-        """Arrival time of a datagram on the monotonic clock [ns]."""
+        """Return the monotonic arrival time of a datagram [ns]; count wake-up times."""
         if difference is not None:
             for level, kind, data in ancillary:
                 if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):

@@ -1,4 +1,4 @@
-"""Adafruit's own CircuitPython drivers over simulated chips."""
+"""Adafruit's CircuitPython drivers with simulated chips, and custom drivers."""
 
 import sys
 from types import ModuleType, SimpleNamespace
@@ -72,7 +72,7 @@ def test_wrong_and_missing_chips_are_reported(clock):
         open_device(clock, LIS3MDL, silent)
 
 
-def test_failed_readings_are_counted_and_raise_in_the_end(clock):
+def test_failed_readings_are_counted_and_finally_raise(clock):
     fake = FakeMmc5603(clock)
     _, device = open_device(clock, MMC5603, fake, max_failures=3)
     fake.answers = False
@@ -80,7 +80,7 @@ def test_failed_readings_are_counted_and_raise_in_the_end(clock):
     fake.answers = True
     assert device.read(1.0)
     fake.answers = False
-    with pytest.raises(DeviceError, match='A failed 3 times in a row: no answer'):
+    with pytest.raises(DeviceError, match='A failed in 3 consecutive polling cycles: no answer'):
         device.read(1.0)
 
 
@@ -97,7 +97,7 @@ def test_a_driver_that_waits_for_ever_times_out(clock):
 
 
 def custom_device(name, cls, **changes):
-    """(clock, bus, device) of a LIS3MDL with a custom driver from the module `name`."""
+    """Rig (clock, bus, device) of a LIS3MDL with a custom driver from the module `name`."""
     clock = Clock()
     settings = replace(I2cSettings(), {'sensors': [f'A:{name}.Sensor:0x1c'], **changes})
     bus = FakeBus(clock, {0x1C: FakeLis3mdl(clock)})
@@ -131,7 +131,7 @@ def test_an_exception_in_a_driver_is_a_failure_and_releases_the_lock(module, err
     module.Sensor = type('Sensor', (FailingDriver,), {'error': error})
     _, _, device = custom_device('our_driver', FailingDriver, max_failures=2)
     device.open()
-    with pytest.raises(DeviceError, match='failed 2 times in a row: .*overflow'):
+    with pytest.raises(DeviceError, match='failed in 2 consecutive polling cycles: .*overflow'):
         device.read(1.0)
 
 
@@ -220,7 +220,7 @@ def test_the_error_of_a_missing_driver_names_its_package():
 
 def test_a_module_without_the_class_is_refused(module):
     _, _, device = custom_device('our_driver', None)
-    with pytest.raises(DeviceError, match='the module our_driver has no Sensor'):
+    with pytest.raises(DeviceError, match='the module our_driver has no class Sensor'):
         device.open()
 
 

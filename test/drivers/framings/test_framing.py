@@ -225,7 +225,7 @@ MAX_REST = {'text': 121, 'json': 257, 'binary': 24, 'binary of a board': 41, 'sh
 
 
 def random_stream(name, seed):
-    """A random stream of pieces that are difficult for this framing."""
+    """Random stream of pieces that are difficult for the framing `name`."""
     rng, atoms = random.Random(seed), FRAMINGS[name][1]
     if atoms:
         return b''.join(rng.choices(atoms, k=rng.randint(0, 40)))
@@ -237,7 +237,7 @@ def random_stream(name, seed):
 
 
 def parse_pieces(name, pieces, final):
-    """(readings, counts, rest) of a stream parsed in pieces."""
+    """Parse a stream in pieces; return (readings, counts, unconsumed bytes)."""
     framing = FRAMINGS[name][0]
     readings, counts, rest = [], Counter(), b''
     for i, piece in enumerate(pieces):
@@ -321,7 +321,7 @@ def test_a_megabyte_without_frames_takes_linear_time(name, piece, size):
     stream = piece * (size // len(piece))
     start = time.process_time()
     parsed = framing.parse(stream)
-    # It takes about a second; quadratic time would be hours.
+    # Parsing takes about a second; in quadratic time it would take hours.
     assert time.process_time() - start < 20.0
     assert not parsed.readings and len(stream) - parsed.consumed <= MAX_REST[name]
     pieces = [stream[i:i + 1000] for i in range(0, 2**16, 1000)]

@@ -145,10 +145,10 @@ def test_an_object_with_every_quantity_is_parsed():
 
 
 @pytest.mark.parametrize('line, cause', [
-    (b'{"m": [1, 2]}', 'whose m is not a list of three'),
-    (b'{"m": [1, 2, 3, 4]}', 'whose m is not a list of three'),
-    (b'{"m": {"0": 1, "1": 2, "2": 3}}', 'whose m is not a list of three'),
-    (b'{"m": null}', 'whose m is not a list of three'),
+    (b'{"m": [1, 2]}', 'whose m is not a list of three values'),
+    (b'{"m": [1, 2, 3, 4]}', 'whose m is not a list of three values'),
+    (b'{"m": {"0": 1, "1": 2, "2": 3}}', 'whose m is not a list of three values'),
+    (b'{"m": null}', 'whose m is not a list of three values'),
     (b'{"x": [1, 2, 3]}', 'without m'),
     (b'{"m": [1, 2, true]}', 'whose m.2 is not a number'),
     (b'{"m": [1, 2, "3"]}', 'whose m.2 is not a number'),

@@ -1,4 +1,4 @@
-"""Contents of Xsens messages: recorded messages, number formats and layouts of MTData."""
+"""Decoding of Xsens messages: recorded messages, number formats and layouts of MTData."""
 
 import random
 
@@ -48,7 +48,7 @@ CONFIGURATION = bytes.fromhex(
 
 
 def test_a_recorded_message_of_an_mti_g_710_is_decoded():
-    """The reference values are those of another decoder."""
+    """The reference values come from another decoder."""
     parsed = FRAMING.parse(MTI_G_710)
     reading, = parsed.readings
     assert reading.field is None
@@ -58,7 +58,7 @@ def test_a_recorded_message_of_an_mti_g_710_is_decoded():
 
 
 def test_the_clock_and_sequence_defaults_match_the_messages():
-    """The next message of the recording came 10 ms later, with 51703223 ticks."""
+    """The next message of the recording arrived 10 ms later, with 51703223 ticks."""
     reading, = FRAMING.parse(MTI_G_710).readings
     assert (51703223 - reading.ticks) * FRAMING.CLOCK['tick_s'] == pytest.approx(0.01)
     last = READING._replace(ticks=float(0xFFFFFFFF), sequence=0xFFFF)
@@ -68,7 +68,7 @@ def test_the_clock_and_sequence_defaults_match_the_messages():
 
 
 def test_a_recorded_message_of_an_mti_300_is_decoded():
-    """The reference values are those of Xsens' MT Manager."""
+    """The reference values come from Xsens' MT Manager."""
     parsed = FRAMING.parse(message(0x36, MTI_300))
     reading, = parsed.readings
     assert reading.field == pytest.approx((-0.30001938, 1.42270923, 0.58756894), abs=5e-9)
@@ -198,7 +198,7 @@ def test_mtdata_that_does_not_match_the_settings_is_counted():
     ({'mtdata': ['none', 'mag']}, "unknown block 'none'"),
     ({'mtdata': ['mag', 'acc']}, 'got mag, acc'),
     ({'mtdata': ['mag', 'mag']}, 'got mag, mag'),
-    ({'mtdata': ['mag', 'quaternion', 'euler']}, 'more than one of euler, matrix, quaternion'),
+    ({'mtdata': ['mag', 'quaternion', 'euler']}, 'at most one of euler, matrix, quaternion'),
     ({'mtdata': ['temp', 'gyr', 'counter']}, 'acc or mag is required, got temp, gyr, counter'),
     ({'mtdata': ['mag'], 'mtdata_format': 'double'},
      "mtdata_format: expected one of float, fp12.20, got 'double'"),

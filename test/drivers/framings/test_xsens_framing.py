@@ -1,4 +1,4 @@
-"""Framing of the Xsens protocol: properties of every framing, and false messages."""
+"""Framing of the Xsens protocol: general properties of framings, and false messages."""
 
 import random
 import time
@@ -31,7 +31,7 @@ MAX_MESSAGE = 512 + 7
 
 
 def parse_in_pieces(framing, data, sizes):
-    """(readings, counts) of `data` parsed in pieces of these sizes; the last piece is the rest."""
+    """Parse `data` in pieces of `sizes` and a last piece; return (readings, counts)."""
     readings, counts, rest, position = [], {}, b'', 0
     sizes = [*sizes, len(data)]
     while position < len(data):
@@ -69,7 +69,7 @@ def test_messages_with_invalid_identifiers_are_garbage(mid):
 
 
 def padded_message(size):
-    """A message with `READING` and padding packets; its data have `size` bytes."""
+    """Message with `READING` and padding packets; its DATA has `size` bytes."""
     fill = size - (len(FRAME) - 5) - 9
     sent = mtdata2(READING, behind=b''.join(
         packet(0x5010, bytes(n)) for n in (fill // 3, fill // 3, fill - 2 * (fill // 3))))
@@ -178,14 +178,15 @@ def test_message_starts_without_an_end_take_linear_time(unit):
 # False messages.
 
 def forged(mid, size, inside, at, adjust):
-    """A message with `size` bytes of data that contain the start of `inside` at the offset `at`.
+    """False message of type `mid`, whose DATA is `at` zeros and the start of `inside`.
 
-    The byte `adjust` makes the checksum valid.
+    DATA has `size` bytes. The byte at the index `adjust` makes the checksum valid. The message is
+    followed by the remaining bytes of `inside`.
     """
-    head = bytearray(b'\xfa\xff' + bytes([mid, size]) + bytes(at))
-    rest = inside[:size + 5 - len(head)]
-    head[adjust] = -(sum(head[1:]) + sum(rest)) & 0xFF
-    data = bytes(head) + inside
+    header = bytearray(b'\xfa\xff' + bytes([mid, size]) + bytes(at))
+    rest = inside[:size + 5 - len(header)]
+    header[adjust] = -(sum(header[1:]) + sum(rest)) & 0xFF
+    data = bytes(header) + inside
     assert sum(data[1:size + 5]) % 256 == 0
     return data
 
@@ -193,7 +194,7 @@ def forged(mid, size, inside, at, adjust):
 @pytest.mark.parametrize('inside', [FRAME * 6, message(0x32, bytes(42)) + FRAME * 6])
 @pytest.mark.parametrize('size', range(9, 200, 7))
 def test_a_message_that_contains_another_is_rejected(inside, size):
-    """The forged message ends within the contained one, with it, or after it."""
+    """The outer message ends within the inner message, with it, or after it."""
     data = forged(0x0D, size, inside, 6, 5)
     whole = LEGACY.parse(data, final=True)
     assert whole.readings == LEGACY.parse(inside).readings
@@ -204,9 +205,9 @@ def test_a_message_that_contains_another_is_rejected(inside, size):
 
 
 def test_a_message_that_ends_with_the_next_preamble_is_rejected():
-    head = bytearray(b'\xfa\xff\x0d\x04\x00\x00\x00\x00')
-    head[4] = -(sum(head[1:]) + 0xFA) & 0xFF
-    data = bytes(head) + FRAME
+    header = bytearray(b'\xfa\xff\x0d\x04\x00\x00\x00\x00')
+    header[4] = -(sum(header[1:]) + 0xFA) & 0xFF
+    data = bytes(header) + FRAME
     parsed = FRAMING.parse(data)
     assert parsed.readings == (READING,)
     assert parsed.rejected == {SPLICED: 1, BETWEEN: 8}
@@ -230,7 +231,7 @@ def test_an_answer_that_ends_with_a_preamble_waits_but_a_reading_does_not():
 
 
 def test_lost_bytes_cost_no_other_message():
-    """Every other message loses two or more bytes and so runs into its successor."""
+    """Every other message loses two or more bytes, so it extends into the next message."""
     rng = random.Random(3)
     data, sent = [], []
     while len(data) < 8000:
@@ -268,7 +269,7 @@ def test_a_frame_with_a_wrong_checksum_is_counted_and_searched():
 
 
 def test_a_possible_start_in_the_data_delays_the_message():
-    """The data contain a possible start of another message that would end later."""
+    """The data contain a possible start of another message, which would end later."""
     for inside, ends in ((b'\xfa\xff\x36\x20', 0x20 + 5), (b'\xfa\xff\x32\x2a', 0x2A + 5)):
         sent = mtdata2(READING, behind=packet(0x5010, bytes(3) + inside + bytes(5)))
         begins = sent.index(inside)
@@ -287,7 +288,7 @@ def test_a_possible_start_in_the_data_delays_the_message():
 
 
 def test_a_valid_checksum_in_the_data_does_not_reject_the_message():
-    """The contained message has invalid packets, or not the length of MTData."""
+    """The inner message has invalid packets, or a length other than configured for MTData."""
     for inside in (message(0x36, b'\x10\x20\x03\x00\x00'), message(0x32, bytes(41)),
                    message(0x31, b'')):
         sent = mtdata2(READING, behind=packet(0x5010, inside))

@@ -79,7 +79,7 @@ def test_the_arrival_time_is_that_of_the_conversion(chip):
 
 
 def read_for(device, clock, seconds):
-    """All arrivals within `seconds`."""
+    """Read all arrivals within `seconds`."""
     end_ns, out = clock.ns + round(seconds * 1e9), []
     while clock.ns < end_ns:
         out += device.read((end_ns - clock.ns) * 1e-9)
@@ -103,7 +103,7 @@ def test_missed_polling_cycles_are_counted_and_the_grid_is_kept():
     clock.sleep(0.110)
     after = device.read(1.0)[0].arrival_ns
     again = device.read(1.0)[0].arrival_ns
-    # The cycles at 20, 40, 60 and 80 ms are missed. That at 100 ms is late, the next is not.
+    # The cycles at 20, 40, 60 and 80 ms are missed. The cycle at 100 ms is late, the next is not.
     assert device.counts == {'polling cycles missed': 4}
     assert (again - before) * 1e-9 == pytest.approx(0.120, abs=5e-3)
     assert (after - before) * 1e-9 == pytest.approx(0.110, abs=1e-2)
@@ -228,9 +228,9 @@ def test_a_chip_that_keeps_failing_is_lost_and_can_be_reopened(chip):
     clock, bus, device, fake = one(chip, max_failures=5)
     device.read(1.0)
     fake.answers = False
-    with pytest.raises(DeviceError, match=r'A failed 5 times in a row: no answer'):
+    with pytest.raises(DeviceError, match=r'A failed in 5 consecutive polling cycles: no answer'):
         device.read(10.0)
-    with pytest.raises(DeviceError, match='A failed 5 times'):
+    with pytest.raises(DeviceError, match='A failed in 5 consecutive'):
         device.read(10.0)
     assert device.counts['failed readings: A'] == 5
     device.close()
@@ -253,7 +253,7 @@ def test_readings_of_other_chips_are_returned_when_one_is_lost():
     device.open()
     bus.chips[0x1C].answers = False
     assert [a.reading.sensor for a in device.read(1.0)] == ['B']
-    with pytest.raises(DeviceError, match='A failed 1 times'):
+    with pytest.raises(DeviceError, match='A failed in 1 polling cycle: '):
         device.read(1.0)
 
 
@@ -308,5 +308,5 @@ def test_a_hanging_bus_costs_one_timeout_per_polling_cycle():
     assert (clock.ns - start) * 1e-9 < 1.2
     assert {k: n for k, n in device.counts.items() if 'failed' in k} == {
         f'failed readings: {name}': 1 for name in 'ABC'}
-    with pytest.raises(DeviceError, match='in a row: the bus hangs'):
+    with pytest.raises(DeviceError, match='polling cycles: the bus hangs'):
         device.read(5.0)

@@ -109,8 +109,8 @@ def test_a_chip_is_set_up_from_any_state(chip):
 def test_a_missing_chip_is_reported():
     _, bus, device = rig(['A:lis3mdl:0x1e'], {})
     with pytest.raises(DeviceError, match=re.escape(
-            '/dev/i2c-1: A (lis3mdl, address 0x1e): no answer; check wiring and supply, and the '
-            'address with i2cdetect -y 1')):
+            '/dev/i2c-1: A (lis3mdl, address 0x1e): no answer; check wiring, power supply, and '
+            'the address with i2cdetect -y 1')):
         device.open()
     assert bus.opened == 1 and not bus.open
 

@@ -21,31 +21,31 @@ SETTINGS = UdpSettings(address='127.0.0.1')
 @pytest.fixture
 def listen():
     """Factory of open sockets, which are closed at the end."""
-    made = []
+    created = []
 
     def make(report=print, **changes):
         port = free_port(socket.SOCK_DGRAM)
-        made.append(UdpSocket(replace(SETTINGS, **{'port': port} | changes), report))
-        made[-1].open()
-        return made[-1]
+        created.append(UdpSocket(replace(SETTINGS, **{'port': port} | changes), report))
+        created[-1].open()
+        return created[-1]
 
     yield make
-    for udp in made:
+    for udp in created:
         udp.close()
 
 
 @pytest.fixture
 def sockets(monkeypatch):
-    """Sockets created from here on, in order."""
-    made = []
+    """Sockets created during the test, in the order of creation."""
+    created = []
 
     class Recorded(socket.socket):
         def __init__(self, *args, **kwargs):
             super().__init__(*args, **kwargs)
-            made.append(self)
+            created.append(self)
 
     monkeypatch.setattr(socket, 'socket', Recorded)
-    return made
+    return created
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def test_one_read_returns_a_limited_number_of_datagrams(listen, sender, monkeypa
 
 
 def wait_for_kernel_timestamps(udp, sender):
-    """Wait until the kernel timestamps datagrams at reception instead of at reading."""
+    """Wait until the kernel timestamps datagrams at their arrival."""
     end = time.monotonic() + 5.0
     while time.monotonic() < end:
         sender(udp, b'x')
