@@ -12,7 +12,7 @@ from mag_tracking.nodes.status_log import StatusLog
 EXPECTED_COUNTS = ('samples: ', 'late arrivals: ', 'other messages: ', 'lines that are comments',
                    'lines without the prefix', 'lines that are empty', 'retained messages skipped',
                    'conversions overwritten', 'packets not used')
-"""Counts that begin with one of these are reported, but do not cause a warning."""
+"""Prefixes of counts that are reported but do not cause a warning."""
 
 
 class DriverDiagnostics:
@@ -25,7 +25,7 @@ class DriverDiagnostics:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._reported: dict[str, dict[str, int]] = {}
+        self._reported_counts: dict[str, dict[str, int]] = {}
         self._log = StatusLog(node.get_logger())
 
     def statuses(self, drivers: Sequence[Driver], served: Collection[str],
@@ -50,10 +50,11 @@ class DriverDiagnostics:
     def _status(self, driver: Driver, served: bool, active: bool) -> DiagnosticStatus:
         """Diagnostics of one device."""
         counts = driver.counts()
-        before = self._reported.get(driver.name, {})
-        increases = [f'{what}: {n - before.get(what, 0)} more' for what, n in sorted(counts.items())
-                     if n > before.get(what, 0) and not what.startswith(EXPECTED_COUNTS)]
-        self._reported[driver.name] = dict(counts)
+        previous = self._reported_counts.get(driver.name, {})
+        increases = [f'{what}: {n - previous.get(what, 0)} more'
+                     for what, n in sorted(counts.items())
+                     if n > previous.get(what, 0) and not what.startswith(EXPECTED_COUNTS)]
+        self._reported_counts[driver.name] = dict(counts)
         level, message = DiagnosticStatus.OK, 'open'
         if not active:
             message = 'not active'

@@ -208,7 +208,7 @@ def create_node(own, parameter, name):
 def test_a_file_without_backgrounds_is_refused_as_state_file(folders):
     own, _ = folders
     (own / 'notes.txt').write_text('theirs')
-    with pytest.raises(SettingsError, match='exists and is not a file of backgrounds'):
+    with pytest.raises(SettingsError, match='exists and is not a background file'):
         create_node(own, 'state_file', 'notes.txt')
     write_backgrounds(own / 'kept.json', {})
     create_node(own, 'state_file', 'kept.json')

@@ -66,8 +66,8 @@ def test_a_silent_input_is_reported_until_it_returns(clock):
     clock[0] += module.FIRST_MESSAGE_TIMEOUT_S
     late = status_of(flow, sender_exists=False)
     assert late.level == DiagnosticStatus.WARN
-    assert late.message == 'no message received on /a: it has no publisher; start the ' \
-        'node or driver that publishes it'
+    assert late.message == 'no message received on /a: no publisher found; start the ' \
+        'driver or the preceding node'
     assert status_of(flow).message == 'no message received on /a'
     flow.add(0, 0, clock[0])
     clock[0] += module.SILENCE_TIMEOUT_S
