@@ -51,10 +51,10 @@ def add(commands: Commands) -> None:
     add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder of the dataset')
     add_settings(p)
-    where = p.add_mutually_exclusive_group()
-    where.add_argument('--workers', type=int, metavar='N', default=os.cpu_count() or 1,
+    executor = p.add_mutually_exclusive_group()
+    executor.add_argument('--workers', type=int, metavar='N', default=os.cpu_count() or 1,
                        help='number of processes on this machine (default: number of processors)')
-    where.add_argument('--scheduler', metavar='ADDRESS',
+    executor.add_argument('--scheduler', metavar='ADDRESS',
                        help='address of a running Dask scheduler (e.g. tcp://10.0.0.5:8786)')
 
 
@@ -64,19 +64,20 @@ def _archive(args: argparse.Namespace) -> int:
         raise SettingsError(f'--workers: expected 1 or more, got {args.workers}')
     network, settings = recorded_network(args), settings_of(args)
     recordings = recordings_of(args.recordings)
-    with recorded_signals(signal.SIGINT) as seen, \
+    with recorded_signals(signal.SIGINT) as signals, \
             tqdm(total=sum(map(size_of, recordings)), unit='B', unit_scale=True, desc='archive',
                  disable=None) as bar:
-        run = archive(recordings, network, settings, args.out, args.workers, args.scheduler,
-                      bar.update, lambda: bool(seen), tqdm.write)
-    print(f'{len(run.done)} recordings tracked: {run.tracks} tracks, {run.passes} passes'
-          + (f'; {len(run.already_done)} skipped (already tracked)' if run.already_done else ''))
-    if run.lost_workers:
-        print(f'  workers lost: {run.lost_workers}; their tasks were repeated')
-    if run.failed:
-        print(f'  recordings failed: {len(run.failed)}; the reasons are in recordings.parquet')
-    if run.interrupted:
+        result = archive(recordings, network, settings, args.out, args.workers, args.scheduler,
+                         bar.update, lambda: bool(signals), tqdm.write)
+    print(f'{len(result.done)} recordings tracked: {result.tracks} tracks, {result.passes} passes'
+          + (f'; {len(result.already_done)} skipped (already tracked)'
+             if result.already_done else ''))
+    if result.lost_workers:
+        print(f'  workers lost: {result.lost_workers}; their tasks were repeated')
+    if result.failed:
+        print(f'  recordings failed: {len(result.failed)}; the reasons are in recordings.parquet')
+    if result.interrupted:
         print(f'interrupted; partial results in {args.out}; run the same command to continue')
         return 130
     print(f'dataset in {args.out}')
-    return 1 if run.failed else 0
+    return 1 if result.failed else 0

@@ -10,8 +10,8 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 
 _NOTE = '''
-A substitute for the command `ros2`, which is missing in a ROS from PyPI. Names are relative to
-the namespace set with --ros-args -r __ns:=/NAMESPACE.
+A substitute for the command `ros2`, which ROS from PyPI lacks. Names are relative to the
+namespace set with --ros-args -r __ns:=/NAMESPACE.
 '''
 
 
@@ -63,11 +63,11 @@ def _echo(args: argparse.Namespace) -> int:
             # The reader has closed the pipe (`| head`). Python would report it again at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return False
-        return not seen and n != args.count
+        return not signals and n != args.count
 
-    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
         with observer(args.ros_arguments) as graph:
-            receive_messages(graph, args.topic, show, lambda: bool(seen))
+            receive_messages(graph, args.topic, show, lambda: bool(signals))
     return 0
 
 

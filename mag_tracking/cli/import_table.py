@@ -9,7 +9,7 @@ from mag_tracking.errors import SettingsError
 _IMPORT = '''
 Converts a table (CSV with a header) to a recording.
 
-Table of readings: --columns assigns the columns and --unit states the unit of the field. Each row
+Table of readings: --columns assigns the columns and --unit gives the unit of the field. Each row
 contains either one reading, with the sensor in a column (sensor, x, y, z), or one reading of each
 sensor (NAME.x, NAME.y, NAME.z). Omit axes that are not measured. A sensor with the number 3 is
 named mag_3. Write a network file with the positions of the sensors yourself; config/network.yaml

@@ -83,7 +83,7 @@ def test_sensor_positions_alone_are_sufficient(tmp_path, capsys):
     text = capsys.readouterr().out
     assert 'note: noise of 41 sensors assumed to be 1e-07 T' in text
     # With one noise level for two kinds of sensors, the noisier kind is inconsistent.
-    assert 'warning: sensors inconsistent with the others' in text
+    assert 'warning: sensors inconsistent with other sensors' in text
     network = read_network(out)
     assert network.noise_std == (None,) * 41 and network.imu_topics == (None,) * 41
     assert command(few, '--sensors', POSITIONS, '--noise-std', 3e-7, out=out) == 0
