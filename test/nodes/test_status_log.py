@@ -42,7 +42,7 @@ def test_a_fault_is_logged_at_its_beginning_and_end(log):
     assert log(0.0, DiagnosticStatus.OK, 'running') == []
     assert log(1.0, DiagnosticStatus.ERROR, 'silent for 3 s') == [
         ('error', 'mag_1: silent for 3 s')]
-    # Its numbers change every second.
+    # The number in the message changes every second.
     assert log(2.0, DiagnosticStatus.ERROR, 'silent for 4 s') == []
     assert log(3.0, DiagnosticStatus.WARN, 'noisy') == [('warning', 'mag_1: noisy')]
     assert log(4.0, DiagnosticStatus.OK, 'running') == [('info', 'mag_1: running again')]
@@ -72,7 +72,7 @@ def test_a_hundred_sensors_with_one_fault_do_not_fill_the_log(log):
     lines = [line for j in range(100) for line in log(
         1.0, DiagnosticStatus.OK, 'running', f'node: mag_{j}')]
     assert len(lines) == status_log.MAX_SIMILAR_LINES
-    # Another fault is still logged, and this one again in the next minute.
+    # A different fault is still logged; the first fault is logged again in the next minute.
     assert log(2.0, DiagnosticStatus.WARN, 'noisy', 'node: mag_7') == [('warning', 'mag_7: noisy')]
     assert log(2.0 * REPEAT_INTERVAL_S, DiagnosticStatus.ERROR, 'no message on /mag_7/imu/mag',
                'node: mag_7')
