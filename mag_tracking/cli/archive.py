@@ -17,7 +17,7 @@ _ARCHIVE = '''
 Tracks many or long recordings on several processors or machines. The results equal those of
 `mag-tracking replay` for each recording; long recordings are divided during quiet intervals. An
 interrupted run continues when the same command is run again; completed recordings are skipped. A
-recording that fails is listed with the reason and does not stop the others.
+recording that fails is listed with the reason and does not stop the other recordings.
 
 Parquet files written to DIR:
   tracks/             one row per track
@@ -25,7 +25,7 @@ Parquet files written to DIR:
   smoothed/           one row per smoothed pose
   passes/             one row per fitted pass
   health/             one row per sensor every ten minutes
-  recordings.parquet  one row per recording, including those that failed
+  recordings.parquet  one row per recording, including failed recordings
 
 examples:
   mag-tracking archive recordings/ --network site.yaml --out archive

@@ -116,8 +116,8 @@ def _print(result: Calibration, recording: Recording) -> None:
               'target (run mag-tracking doctor for details)')
     if survey.disagreements and result.evidence is None:
         print('  note: passes were not used, because some sensors contradict the Earth\'s field')
-    for what, n in {**result.rejected, **recording.losses}.items():
-        print(f'  warning: {what}: {n}')
+    for cause, n in {**result.rejected, **recording.losses}.items():
+        print(f'  warning: {cause}: {n}')
 
 
 def _row(result: Calibration, j: int) -> str:

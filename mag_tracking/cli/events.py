@@ -58,8 +58,8 @@ def _events(args: argparse.Namespace) -> int:
                  disable=None) as bar:
         result = find_events(recording, network, settings, bar.update, lambda: bool(signals))
     _print(result, network.names)
-    for what, n in {**result.rejections, **recording.losses}.items():
-        print(f'  warning: {what}: {n}')
+    for cause, n in {**result.rejections, **recording.losses}.items():
+        print(f'  warning: {cause}: {n}')
     if args.out is not None:
         write_events(args.out, result.events)
         print(f'tables in {args.out}')

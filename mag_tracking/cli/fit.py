@@ -33,7 +33,7 @@ from mag_tracking.settings import read_parameter_file
 
 _FIT = '''
 Extracts the passes from a recording (from before each detection until its end) and fits each
-pass as a whole: a row of 1, 2, 3, 4 dipoles at constant velocity (TSP14). For a vehicle on a
+pass as a whole: a row of 1, 2, 3 or 4 dipoles at constant velocity (TSP14). For a vehicle on a
 straight road this is the most accurate estimate. The normalised cost is 1 if the model is right
 and larger otherwise.
 
@@ -240,7 +240,7 @@ def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any
     simultaneous = [p for p in passes if p.n_vehicles > 1]
     if simultaneous:
         print(f'--same-vehicle: {len(simultaneous)} vehicles that passed simultaneously with '
-              'others are not used')
+              'other vehicles are not used')
     fits = [p.chosen for p in passes if p.chosen is not None and p.n_vehicles == 1]
     try:
         if not fits:

@@ -36,8 +36,8 @@ def _info(args: argparse.Namespace) -> int:
         print('  warning: the recording contains no messages')
     for topic in sorted(recording.types):
         print(f'  {topic}  {recording.types[topic]}  {recording.message_counts[topic]}')
-    for what, n in recording.losses.items():
-        print(f'  warning: {what}: {n}')
+    for cause, n in recording.losses.items():
+        print(f'  warning: {cause}: {n}')
     if args.network:
         network = read_network(args.network)
         namespaces = namespaces_of(network.topics, recording.types) or ['/']

@@ -82,8 +82,8 @@ class _ReadingPrinter:
     def lines(self, elapsed_s: float) -> list[str]:
         """Describe the state of the device and the samples received since the last call."""
         counts = self.driver.counts()
-        errors = ', '.join(f'{what}: {n}' for what, n in sorted(counts.items())
-                           if not what.startswith('samples: '))
+        errors = ', '.join(f'{count}: {n}' for count, n in sorted(counts.items())
+                           if not count.startswith('samples: '))
         state = self.driver.fault or ('open' if self.driver.is_open else 'opening')
         out = [f'{self.driver.name}: {state}' + (f'  ({errors})' if errors else '')]
         for sensor, queue in self._samples.items():

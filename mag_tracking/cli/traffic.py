@@ -182,10 +182,10 @@ def _print(name: str, result: TrafficResult, recording: Recording,
         print(f'  {line}, {direction}, {vehicle_class}: {n}')
     doubtful = sum(v.passage.ambiguous for v in result.vehicles)
     warnings = {**({'ambiguous passages': doubtful} if doubtful else {}),
-                **{what: n for what, n in result.counts.items() if n and what != 'passages'},
+                **{cause: n for cause, n in result.counts.items() if n and cause != 'passages'},
                 **result.rejections, **recording.losses}
-    for what, n in warnings.items():
-        print(f'  warning: {what}: {n}')
+    for cause, n in warnings.items():
+        print(f'  warning: {cause}: {n}')
     for topic in result.missing_topics:
         print(f'  warning: no messages on {topic}')
     for sensor in result.sensors_without_background:

@@ -68,8 +68,8 @@ def _tumble(args: argparse.Namespace) -> int:
                 lambda: bool(signals))
     for name, fit in fits.items():
         _print_fit(name, fit)
-    for what, n in recording.losses.items():
-        print(f'  warning: {what}: {n}')
+    for cause, n in recording.losses.items():
+        print(f'  warning: {cause}: {n}')
     converged = [name for name, fit in fits.items() if fit.converged]
     if signals or not converged:
         print('interrupted: nothing was written' if signals else 'nothing was written')

@@ -106,6 +106,7 @@ class BackgroundStore:
         Parameters
         ----------
         sensors : iterable of str
+            Names of the sensors.
         is_live : bool
             Whether the readings are live. During a replay, the file is not changed.
         """

@@ -241,7 +241,7 @@ class CalibrationNode(StageNode):
         return calibrated
 
     def _do_deferred_work(self) -> None:
-        """Run the deferred work of the stages, the health checks and a due step of the round."""
+        """Run the deferred work of the stages, the health checks, and the next step if due."""
         self._stage.idle()
         if self._next_steps is not None:
             self._next_steps[1].idle()

@@ -76,7 +76,7 @@ class DetectionNode(StageNode):
         self.report_state()
 
     def _subscribe(self) -> None:
-        """Subscribe to the calibrated fields; for a node in its own process."""
+        """Subscribe to the calibrated fields and monitor the tracker."""
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self.subscription(MagneticField, f'{topic}_calibrated', partial(self._receive, sensor),
                               STREAM, source='calibration')

@@ -51,9 +51,9 @@ class DriverDiagnostics:
         """Diagnostics of one device."""
         counts = driver.counts()
         previous = self._reported_counts.get(driver.name, {})
-        increases = [f'{what}: {n - previous.get(what, 0)} more'
-                     for what, n in sorted(counts.items())
-                     if n > previous.get(what, 0) and not what.startswith(EXPECTED_COUNTS)]
+        increases = [f'{count}: {n - previous.get(count, 0)} more'
+                     for count, n in sorted(counts.items())
+                     if n > previous.get(count, 0) and not count.startswith(EXPECTED_COUNTS)]
         self._reported_counts[driver.name] = dict(counts)
         level, message = DiagnosticStatus.OK, 'open'
         if not active:
@@ -67,7 +67,7 @@ class DriverDiagnostics:
             message = 'opening'
         elif increases:
             level, message = DiagnosticStatus.WARN, '; '.join(increases)
-        values = {what: str(n) for what, n in sorted(counts.items())}
+        values = {count: str(n) for count, n in sorted(counts.items())}
         for source, clock in driver.clocks().items():
             suffix = f' ({source})' if source else ''
             values[f'clock drift [ppm]{suffix}'] = f'{clock.drift_ppm:.2f}'

@@ -87,7 +87,7 @@ class Observer:
         request : object
             Request of type `service_type.Request`.
         once : bool
-            Whether the call changes a state and must not be repeated.
+            Whether the call must not be repeated, because it changes the server.
 
         Returns
         -------

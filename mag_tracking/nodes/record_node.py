@@ -128,13 +128,13 @@ class RecordNode(Node):
 
     @property
     def lost(self) -> 'Counter[str]':
-        """Number of lost messages by topic; topics without losses are omitted."""
+        """Numbers of lost messages by topic; topics without losses are omitted."""
         now = Counter({topic: s.n_lost for topic, s in self._sources.items()})
         return +(now + self._lost_before)
 
     @property
     def refused(self) -> dict[str, str]:
-        """Reason why a topic is not recorded, by topic."""
+        """Topics that are not recorded: {topic: reason}."""
         return self._refused
 
     def topic_counts(self) -> tuple[int, int]:
@@ -236,6 +236,7 @@ def log(text: str) -> None:
     Parameters
     ----------
     text : str
+        Line to print.
     """
     with suppress(OSError):
         tqdm.write(f'record: {text}', file=sys.stderr)

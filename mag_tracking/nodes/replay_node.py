@@ -262,8 +262,8 @@ class ReplayNode(ManagedNode):
     def _end(self) -> None:
         """Handle the end of the recording: restart if `loop` is set, otherwise stop."""
         assert self._recording is not None, 'end without a recording'
-        for what, n in self._recording.losses.items():
-            self.get_logger().warning(f'{what}: {n}')
+        for cause, n in self._recording.losses.items():
+            self.get_logger().warning(f'{cause}: {n}')
         if self._loop:
             self._seek(0.0)
             return

@@ -180,14 +180,15 @@ def test_tumbling_calibrates_a_real_sensor(tmp_path, capsys):
 
 def test_tumbling_removes_background_and_noise_of_raw_readings(tmp_path, capsys):
     network = read_network(NETWORK_FILE)
-    stated = replace(network, background=(np.full(3, 1e-5),) * 2, noise_std=(np.full(3, 1e-8),) * 2)
-    write_network(tmp_path / 'stated.yaml', stated)
+    given_network = replace(network, background=(np.full(3, 1e-5),) * 2,
+                            noise_std=(np.full(3, 1e-8),) * 2)
+    write_network(tmp_path / 'stated.yaml', given_network)
     recording = write_recording(tmp_path / 'hand', tumbled())
     assert main(['tumble', str(recording), '--network', str(tmp_path / 'stated.yaml'), '--sensor',
                  'mag_1', '--out', str(tmp_path / 'out.yaml')]) == 0
     calibrated = read_network(tmp_path / 'out.yaml')
     assert calibrated.background[0] is None and calibrated.noise_std[0] is None
-    np.testing.assert_array_equal(calibrated.background[1], stated.background[1])
+    np.testing.assert_array_equal(calibrated.background[1], given_network.background[1])
 
 
 def test_tumbling_calibrates_raw_counts(tmp_path, capsys):
@@ -197,7 +198,8 @@ def test_tumbling_calibrates_raw_counts(tmp_path, capsys):
     assert main(['tumble', str(write_recording(tmp_path, counts * 1e-9)), '--network',
                  str(NETWORK_FILE), '--sensor', 'mag_1', '--out', str(tmp_path / 'out.yaml')]) == 0
     network = read_network(tmp_path / 'out.yaml')
-    magnitude = np.linalg.norm((counts * 1e-9 - network.offset[0]) @ network.correction[0].T, axis=1)
+    magnitude = np.linalg.norm(
+        (counts * 1e-9 - network.offset[0]) @ network.correction[0].T, axis=1)
     print(capsys.readouterr().out, magnitude.std() / magnitude.mean())
     assert magnitude.std() / magnitude.mean() <= 0.03
 

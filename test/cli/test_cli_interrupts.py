@@ -133,7 +133,7 @@ def test_the_command_works_outside_the_main_thread(tmp_path):
 
 @pytest.mark.parametrize('unbuffered', ['', '1'])
 def test_a_closed_pipe_ends_the_command_silently(unbuffered):
-    """As with `| head`: no error message, and the usual exit status."""
+    """With `| head`, there is no error message, and the exit status is as usual."""
     command = [sys.executable, '-m', 'mag_tracking.cli', 'info', str(vehicle_path(NAME))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                           env={**os.environ, 'PYTHONUNBUFFERED': unbuffered}) as process:

@@ -1,7 +1,7 @@
 """The launch file: executed with a stand-in for `launch_ros`, and run if ROS launch is installed.
 
 PyPI's `launch` is another package. The stand-in records the objects that the file creates. Their
-executables, parameters, arguments and files are compared with those of the package.
+executables, parameters, arguments and files are compared with the package.
 """
 
 import importlib.util

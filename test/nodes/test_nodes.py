@@ -106,7 +106,7 @@ def compare_with_offline(collector, folder):
 
 
 def compare_traffic(collector, offline):
-    """Assert that passages equal the offline passages; the last ones may not be published yet."""
+    """Assert that passages equal the offline passages, except for the last two."""
     n = len(collector.passages)
     assert len(offline.vehicles) - 2 <= n <= len(offline.vehicles) and n > 5
     for online, vehicle in zip(collector.passages, offline.vehicles, strict=False):

@@ -58,7 +58,7 @@ def test_each_begin_and_end_of_a_doubt_is_reported_once_without_delay():
 @pytest.mark.parametrize('steps', [1, 2, 3, 5])
 @pytest.mark.parametrize('phase', [0, 1, 2])
 def test_rounds_of_any_length_agree_with_the_reports(steps, phase):
-    """A round publishes per-sensor states of different age."""
+    """A round updates the published states of the sensors at different times."""
     listener = Listener()
     for k in range(len(READINGS) // BATCH):
         listener.feed(k)

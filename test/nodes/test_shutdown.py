@@ -1,4 +1,4 @@
-"""Shutdown of processes with ROS, also if the middleware hangs."""
+"""Shutdown of processes with ROS, even if the middleware hangs."""
 
 import ast
 import os

@@ -1,4 +1,4 @@
-"""A signal at any moment of the start ends a process silently and with status 0."""
+"""A signal at any time during startup ends a process silently with status 0."""
 
 import ast
 import signal
@@ -162,7 +162,7 @@ def test_a_signal_at_any_moment_of_the_start_ends_the_process(start_s, name, ste
         process = launch_and_wait(COMMANDS[name])
         time.sleep(k * step_s)
         ends[round(k * step_s, 2), signum.name] = end_of(process, signum)
-    print(f'{name}: up after {duration_s:.2f} s; {len(ends)} signals, {step_s:.2f} s apart')
+    print(f'{name}: up after {duration_s:.2f} s; {len(ends)} signals, one every {step_s:.2f} s')
     # A node that is up may have logged a line, for example about a missing device.
     assert {moment: (status, output) for moment, (status, output) in ends.items()
             if status or 'Traceback' in output or output.count('\n') > 1} == {}
