@@ -9,6 +9,7 @@ from tqdm import tqdm
 
 from mag_tracking.apps.archive import archive, recordings_of, size_of
 from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
@@ -69,7 +70,8 @@ def _archive(args: argparse.Namespace) -> int:
                  disable=None) as bar:
         result = archive(recordings, network, settings, args.out, args.workers, args.scheduler,
                          bar.update, lambda: bool(signals), tqdm.write)
-    print(f'{len(result.done)} recordings tracked: {result.tracks} tracks, {result.passes} passes'
+    print(f'{quantity(len(result.done), "recording")} tracked: {quantity(result.tracks, "track")}, '
+          f'{quantity(result.passes, "pass", "passes")}'
           + (f'; {len(result.already_done)} skipped (already tracked)'
              if result.already_done else ''))
     if result.lost_workers:

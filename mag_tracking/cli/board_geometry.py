@@ -21,6 +21,7 @@ from mag_tracking.apps.board_geometry import (
 )
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network, write_network
@@ -91,7 +92,7 @@ def _geometry(args: argparse.Namespace) -> int:
     date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
     unknowns = 'poses and geometry' if box else 'geometry'
     # Ctrl-C ends the estimation immediately: nothing has been written yet.
-    with _elapsed_time(f'estimating the {unknowns} of {len(network)} sensors'):
+    with _elapsed_time(f'estimating the {unknowns} of {quantity(len(network), "sensor")}'):
         survey = survey_geometry(args.table, network, args.moment, settings, date, box,
                                  args.noise_std)
     _print(survey, box is not None)
@@ -179,7 +180,7 @@ def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
               f'(check mounting, axes, unit, noise): {", ".join(g.suspect_sensors)}')
     n_assumed = sum(std is None for std in survey.network.noise_std)
     if n_assumed:
-        print(f'  note: noise of {n_assumed} sensors assumed to be '
+        print(f'  note: noise of {quantity(n_assumed, "sensor")} assumed to be '
               f'{ASSUMED_NOISE:g} T (set --noise-std, or noise_std in a network file)')
     for j, name in enumerate(survey.network.names):
         if np.isnan(g.bias[j]).all():

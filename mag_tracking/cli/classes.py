@@ -19,6 +19,7 @@ from mag_tracking.apps.classes import (
     train_classes,
 )
 from mag_tracking.cli.options import Commands, add_command, check_writable
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.signature_tables import read_model, write_model
@@ -120,8 +121,8 @@ def _evaluate(args: argparse.Namespace) -> int:
     model = None if args.model is None else read_model(args.model)
     evaluation = evaluate_classes(examples, model, args.splits,
                                   partial(tqdm, desc='splits', disable=None, leave=False))
-    test = f'{args.splits} splits of 70/30' if model is None else f'{args.model}'
-    print(f'{len(examples.labels)} signatures, {test}; {evaluation.n} tested')
+    test = f'{quantity(args.splits, "split")} of 70/30' if model is None else f'{args.model}'
+    print(f'{quantity(len(examples.labels), "signature")}, {test}; {evaluation.n} tested')
     _print_evaluation(evaluation)
     return 0
 

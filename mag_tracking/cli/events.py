@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from mag_tracking.apps.events import EventsResult, find_events
 from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import PassEvent
@@ -74,7 +75,7 @@ def _print(result: EventsResult, names: tuple[str, ...]) -> None:
     for event in result.events:
         print(line_of(event))
     counts = result.counts()
-    print(', '.join(f'{name}: {counts.get(name, 0)} events' for name in names))
+    print(', '.join(f'{name}: {quantity(counts.get(name, 0), "event")}' for name in names))
     for topic in result.missing_topics:
         print(f'  warning: no messages on {topic}')
     for name in result.sensors_without_background:

@@ -21,6 +21,7 @@ from mag_tracking.cli.options import (
     distinct_names,
     recorded_network,
 )
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.iron import hard_and_soft_iron
 from mag_tracking.interrupts import recorded_signals
@@ -139,7 +140,8 @@ def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
 def _print_pass(fitted_pass: FittedPass) -> None:
     """Print the fits of one pass as a table, one row per number of dipoles."""
     data = fitted_pass.fits[0].data
-    print(f'{fitted_pass.recording}, {fitted_pass.label}: {data.n_values} measurements, '
+    print(f'{fitted_pass.recording}, {fitted_pass.label}: '
+          f'{quantity(data.n_values, "measurement")}, '
           f'sensors: {", ".join(data.network.names[j] for j in data.sensors)}')
     for note in fitted_pass.notes:
         print(f'  note: {note}')
@@ -239,8 +241,8 @@ def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any
     """Estimate and print hard and soft iron; return the content for JSON, or None on failure."""
     simultaneous = [p for p in passes if p.n_vehicles > 1]
     if simultaneous:
-        print(f'--same-vehicle: {len(simultaneous)} vehicles that passed simultaneously with '
-              'other vehicles are not used')
+        print('--same-vehicle: vehicles not used because they passed simultaneously with others: '
+              f'{len(simultaneous)}')
     fits = [p.chosen for p in passes if p.chosen is not None and p.n_vehicles == 1]
     try:
         if not fits:
@@ -256,7 +258,8 @@ def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any
     std = np.sqrt(np.diagonal(iron.covariance)) * np.sqrt(max(1.0, iron.normalised_cost))
     hard = ', '.join(f'{v:.1f} ({s:.1f})' for v, s in zip(iron.hard, std[:3], strict=True))
     print(f'hard iron m0 = {hard} A m^2 (forward, left, up); soft iron D = {iron.soft:.3f} '
-          f'({std[3]:.3f}) m^3; {len(fits)} passes, normalised cost {iron.normalised_cost:.1f}')
+          f'({std[3]:.3f}) m^3; {quantity(len(fits), "pass", "passes")}, '
+          f'normalised cost {iron.normalised_cost:.1f}')
     return {'hard': iron.hard.tolist(), 'soft': iron.soft, 'std': std.tolist(),
             'normalised_cost': iron.normalised_cost, 'passes': len(fits)}
 
@@ -270,8 +273,7 @@ def _draw(fitted_pass: FittedPass, out: Path) -> None:
     from mag_tracking.report.figure_file import save_figure
     from mag_tracking.report.fit_figures import pass_figure
 
-    title = f'{fitted_pass.recording}, {fitted_pass.label}, {fit.n_dipoles} ' \
-        f'dipole{"s" * (fit.n_dipoles > 1)}'
+    title = f'{fitted_pass.recording}, {fitted_pass.label}, {quantity(fit.n_dipoles, "dipole")}'
     title += ' (without the field of other vehicles)' if fitted_pass.n_vehicles > 1 else ''
     save_figure(pass_figure(fit, title + (' (no estimate)' if fit.reason else '')),
                 out / f'{fitted_pass.recording}_'

@@ -6,6 +6,7 @@ import signal
 import sys
 
 from mag_tracking.cli.options import Commands, add_command
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 
@@ -42,7 +43,8 @@ def _topics(args: argparse.Namespace) -> int:
 
     with observer(args.ros_arguments) as graph:
         for name, kinds, n_publishers, n_subscribers in topics(graph):
-            print(f'{name}  {kinds}  {n_publishers} publishers, {n_subscribers} subscribers')
+            print(f'{name}  {kinds}  {quantity(n_publishers, "publisher")}, '
+                  f'{quantity(n_subscribers, "subscriber")}')
     return 0
 
 

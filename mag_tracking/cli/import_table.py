@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from mag_tracking.cli.options import Commands, add_command
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import SettingsError
 
 _IMPORT = '''
@@ -63,13 +64,13 @@ def _import(args: argparse.Namespace) -> int:
     if args.columns is None:
         recording, network, n = import_pose_table(args.table, args.background, args.out,
                                                   args.noise_std)
-        print(f'{n} readings written to {recording}, network to {network}')
+        print(f'{quantity(n, "reading")} written to {recording}, network to {network}')
         return 0
     if args.unit is None:
         raise SettingsError('import: --unit is missing; give the unit of the field')
     recording, counts = import_field_table(args.table, args.columns, args.unit, args.out,
                                            args.time_unit)
-    print(f'{sum(counts.values())} readings written to {recording}')
+    print(f'{quantity(sum(counts.values()), "reading")} written to {recording}')
     for name, n in counts.items():
         print(f'  /{name}/imu/mag  {n}')
     return 0

@@ -14,6 +14,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.drivers.driver import IGNORED, Driver, serve
 from mag_tracking.errors import SettingsError
@@ -108,9 +109,9 @@ def _sample_line(samples: Sequence[Sample], elapsed_s: float) -> str:
                      for column, known in zip(fields.T, is_valid.T, strict=True)])
     line = (f'{len(fields) / elapsed_s:7.1f} Hz  ' + ' '.join(f'{v:9.3f}' for v in mean)
             + f' uT  |B| {np.sqrt(np.nansum(mean**2)):8.3f}')
-    missing = fields.size - np.count_nonzero(is_valid)
-    if missing and is_valid.any(axis=0).all():
-        line += f'  {missing} values missing'
+    n_missing = fields.size - np.count_nonzero(is_valid)
+    if n_missing and is_valid.any(axis=0).all():
+        line += f'  {quantity(n_missing, "value")} missing'
     if np.nanmax(np.abs(fields), initial=0.0) > MAX_PLAUSIBLE_FIELD:
         line += '  (very large; check `unit`)'
     return line

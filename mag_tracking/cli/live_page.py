@@ -12,6 +12,7 @@ from pathlib import Path
 
 from mag_tracking.apps.view import view
 from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
@@ -87,7 +88,7 @@ def _view(args: argparse.Namespace) -> int:
     network, settings = recorded_network(args), settings_of(args)
     recording = Recording(args.recording)
     scene = LiveScene(args.recording.name, network)
-    scene.subtitle = f'{len(network)} sensors, frame {network.frame}'
+    scene.subtitle = f'{quantity(len(network), "sensor")}, frame {network.frame}'
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, \
             PageServer(scene, args.host, args.port) as server:
         _print_flushed(f'live page: {server.url}')

@@ -19,6 +19,7 @@ from mag_tracking.cli.options import (
     distinct_names,
     recorded_network,
 )
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
@@ -135,9 +136,10 @@ def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Pat
 
 def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None:
     """Print counts, notes and tracks of a run."""
-    print(f'{path.name}: {summary["counts"]["align"].get("frames", 0)} frames, '
-          f'{summary["counts"]["detect"].get("onsets", 0)} detections, '
-          f'{len(summary["tracks"])} tracks')
+    counts = summary['counts']
+    print(f'{path.name}: {quantity(counts["align"].get("frames", 0), "frame")}, '
+          f'{quantity(counts["detect"].get("onsets", 0), "detection")}, '
+          f'{quantity(len(summary["tracks"]), "track")}')
     for note in notes_of(summary):
         print(f'  {"warning: " if note.level == WARNING else ""}{note.text}')
     for t in summary['tracks']:
@@ -150,19 +152,20 @@ def _overview(path: Path, summary: dict[str, Any]) -> str:
     """Format the name of the recording and the number of its tracks by verdict."""
     verdicts = Counter(t['verdict'] for t in summary['tracks'])
     counts = ', '.join(f'{n} {verdict}' for verdict, n in verdicts.most_common())
-    n = len(summary['tracks'])
-    return f'{path.name}: {n} track{"" if n == 1 else "s"}' + (f' ({counts})' if counts else '')
+    return (f'{path.name}: {quantity(len(summary["tracks"]), "track")}'
+            + (f' ({counts})' if counts else ''))
 
 
 def _print_track(t: dict[str, Any]) -> None:
     """Print a track: overview, doubts, velocity from the delay, mounting and errors."""
-    print(f'  track {t["id"]}: {t["poses"]} poses'
+    print(f'  track {t["id"]}: {quantity(t["poses"], "pose")}'
           + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
              if t['arrival'] else '')
           + (f', {t["kind"]} ({t["kind_weight"]:.0%})' if t['kind'] else '')
           + f', {t["speed"]:.2f} m/s, {t["moment_size"]:.3g} A m^2, {t["verdict"]}')
     for doubt, n in t['doubts'].items():
-        print(f'    ambiguous in {n} of {t["poses"]} poses: {MEANINGS[doubt]} ({doubt})')
+        print(f'    ambiguous in {n} of {quantity(t["poses"], "pose")}: {MEANINGS[doubt]} '
+              f'({doubt})')
     delay = t.get('delay', {})
     if 'speed' in delay:
         print(f'    velocity from the delay between sensors: {delay["speed"]:.2f} '

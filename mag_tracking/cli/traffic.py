@@ -21,6 +21,7 @@ from mag_tracking.cli.options import (
     distinct_names,
     recorded_network,
 )
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.files import output_folder
@@ -177,7 +178,7 @@ def _print(name: str, result: TrafficResult, recording: Recording,
         print(f'{line_of(vehicle)}{identity}')
     total = Counter((v.passage.line, DIRECTIONS[v.passage.forward], v.passage.vehicle_class)
                     for v in result.vehicles)
-    print(f'{name}: {len(result.vehicles)} vehicles')
+    print(f'{name}: {quantity(len(result.vehicles), "vehicle")}')
     for (line, direction, vehicle_class), n in sorted(total.items()):
         print(f'  {line}, {direction}, {vehicle_class}: {n}')
     doubtful = sum(v.passage.ambiguous for v in result.vehicles)

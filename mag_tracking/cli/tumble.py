@@ -16,6 +16,7 @@ from mag_tracking.cli.options import (
     now,
     recorded_network,
 )
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import write_network
@@ -94,6 +95,7 @@ def _print_fit(name: str, fit: EllipsoidFit) -> None:
                           zip(fit.offset, fit.offset_std, strict=True))
         print(f'{name}: scatter of the field magnitude {100 * fit.residual:.2f}% (uncorrected '
               f'{100 * fit.residual_before:.1f}%); offset {offset} uT; coverage '
-              f'{fit.coverage:.2f}; {fit.n_readings} readings, {fit.n_outliers} outliers')
+              f'{fit.coverage:.2f}; {quantity(fit.n_readings, "reading")}, '
+              f'{quantity(fit.n_outliers, "outlier")}')
     for warning in fit.warnings:
         print(f'  warning: {name}: {warning}')

@@ -73,8 +73,9 @@ class DoctorNode(Node):
         list of Finding
         """
         topic = self.resolve_topic_name(RAW_READINGS)
-        found = [Finding(True, topic, f'{n} invalid messages: {error}', 'check the driver that '
-                         'publishes this topic') for error, n in self._invalid_messages.items()]
+        found = [Finding(True, topic, f'{n} invalid message{"" if n == 1 else "s"}: {error}',
+                         'check the driver that publishes this topic')
+                 for error, n in self._invalid_messages.items()]
         for sensor, topic in self._topics.items():
             found += topic_findings(self, sensor, topic)
             if sensor not in self._batched_sensors and not self.count_publishers(topic):

@@ -122,8 +122,8 @@ class Flow:
                 message += ', and its publisher is gone: check that it is running'
         elif new_losses:
             level = DiagnosticStatus.WARN
-            message = f'{new_losses} messages from {self.source} were lost: the input queue was ' \
-                'full; reduce the load of this computer'
+            message = f'{new_losses} message{"" if new_losses == 1 else "s"} from {self.source} ' \
+                'lost: the input queue was full; reduce the load of this computer'
         elif busy > MAX_LOAD or median > MAX_LATENCY_S:
             level = DiagnosticStatus.WARN
             message = f'input from {self.source}: load {100.0 * busy:.0f} %' + (

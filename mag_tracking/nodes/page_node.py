@@ -126,7 +126,8 @@ class PageNode(Node):
             self._layout = layout
             self._frames.clear()
             self._tracks.clear()
-            self._scene.subtitle = f'{len(layout)} sensors, frame {layout.frame}'
+            self._scene.subtitle = f'{len(layout)} sensor{"" if len(layout) == 1 else "s"}, ' \
+                f'frame {layout.frame}'
             self._scene.use_network(layout)
 
     def _receive_frame(self, message: bytes) -> None:

@@ -303,7 +303,7 @@ def _record(node: RecordNode, stopped: Callable[[], bool]) -> None:
                 next_discovery = now + DISCOVERY_INTERVAL_S
                 topic_counts, previous_counts = node.topic_counts(), topic_counts
                 if topic_counts != previous_counts:
-                    log(f'{topic_counts[0]} of {topic_counts[1]} topics have a publisher')
+                    log(f'publishers found for {topic_counts[0]} of {topic_counts[1]} topics')
             if bar.disable and now >= next_line:
                 log(progress_line(node.recorder, now - start))
                 next_line += PROGRESS_INTERVAL_S

@@ -268,7 +268,8 @@ class ReplayNode(ManagedNode):
             self._seek(0.0)
             return
         self.finished = True
-        self.get_logger().info(f'end of the recording: {self.counts["messages"]} messages played')
+        n = self.counts['messages']
+        self.get_logger().info(f'end of the recording: {n} message{"" if n == 1 else "s"} played')
 
     def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Handle ~/pause."""

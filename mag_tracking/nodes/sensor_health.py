@@ -219,7 +219,8 @@ class HealthDiagnostics:
         if self._is_replayed or not abs(delay_s) > MAX_LIVE_DELAY_S:
             return []
         days = abs(delay_s) / 86400.0
-        difference = f'{days / 365.25:.0f} years' if days > 730.0 else f'{days:.0f} days'
+        difference = f'{days / 365.25:.0f} years' if days > 730.0 else \
+            'a day' if days < 1.5 else f'{days:.0f} days'
         return [Finding(False, name, f'its timestamps are {difference} '
                         f'{"behind" if delay_s > 0.0 else "ahead of"} the clock of this computer',
                         'for a recording, set use_sim_time (--use-sim-time); otherwise set the '

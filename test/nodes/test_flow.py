@@ -89,11 +89,11 @@ def test_lost_messages_are_reported_once(clock):
     flow.add(0, 0, clock[0])
     flow.n_lost += 7
     status = status_of(flow)
-    assert status.level == DiagnosticStatus.WARN and status.message.startswith('7 messages')
+    assert status.level == DiagnosticStatus.WARN and status.message.startswith('7 messages from')
     assert values(status)['lost in the queue'] == '7'
     assert status_of(flow).level == DiagnosticStatus.OK
     flow.n_lost += 1
-    assert status_of(flow).message.startswith('1 messages')
+    assert status_of(flow).message.startswith('1 message from')
 
 
 def test_an_old_recording_is_neither_late_nor_live(clock):

@@ -55,7 +55,7 @@ def test_commands_show_a_calibration_and_a_driver(command, tmp_path):
     processes = [start('calibration_node', *NAMESPACE[1:], '-p', f'network:={NETWORK_FILE}'),
                  start('driver_node', *NAMESPACE[1:], '-p', f'drivers:={udp}')]
     try:
-        wait_for(lambda: '/lab/mag_1/imu/mag  sensor_msgs/msg/MagneticField  1 publishers, 1 sub'
+        wait_for(lambda: '/lab/mag_1/imu/mag  sensor_msgs/msg/MagneticField  1 publisher, 1 sub'
                  in command('topics')[1])
         status, output = command('echo', CALIBRATION_STATE, '--count', '1', *NAMESPACE)
         assert status == 0 and output.endswith('---\n'), output
