@@ -1,4 +1,4 @@
-"""Log of diagnostics: each fault when it appears, and once a minute while it lasts."""
+"""Log of diagnostics: each fault when it appears; errors also once a minute while they last."""
 
 import re
 import time
@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 REPEAT_INTERVAL_S = 60.0
-"""[s] Interval at which a persistent fault is logged again."""
+"""[s] Interval at which a persistent error is logged again; minimum interval for other faults."""
 MAX_SIMILAR_LINES = 4
 """Maximum number of lines per interval that differ only in numbers, such as sensor numbers."""
 MAX_FAULTS = 1000
@@ -27,6 +27,8 @@ class StatusLog:
     def __init__(self, logger: RcutilsLogger) -> None:
         self._logger = logger
         self._faulty_names: set[str] = set()
+        # Last logged fault of each name whose status has not been OK since.
+        self._current_faults: dict[str, tuple[str, str]] = {}
         self._last_logged: dict[tuple[str, str], float] = {}
         self._similar: Counter[str] = Counter()
         self._interval_start = 0.0
@@ -34,7 +36,7 @@ class StatusLog:
     @property
     def n_remembered(self) -> int:
         """Number of stored faults and kinds of lines."""
-        return len(self._last_logged) + len(self._similar)
+        return len(self._last_logged) + len(self._current_faults) + len(self._similar)
 
     def add(self, status: DiagnosticStatus) -> None:
         """Log a status if its fault is new or has ended.
@@ -45,6 +47,7 @@ class StatusLog:
         """
         subject = str(status.name.rpartition(': ')[2])
         if status.level == DiagnosticStatus.OK:
+            self._current_faults.pop(status.name, None)
             if status.name in self._faulty_names:
                 self._faulty_names.discard(status.name)
                 self._log(DiagnosticStatus.OK, f'{subject}: {status.message} again')
@@ -54,9 +57,14 @@ class StatusLog:
         fault, now = (status.name, _NUMBER.sub('#', status.message)), time.monotonic()
         if now - self._last_logged.get(fault, -REPEAT_INTERVAL_S) < REPEAT_INTERVAL_S:
             return
+        if status.level != DiagnosticStatus.ERROR \
+                and self._current_faults.get(status.name) == fault:
+            return
         if len(self._last_logged) >= MAX_FAULTS:
             self._last_logged.clear()
+            self._current_faults.clear()
         self._last_logged[fault] = now
+        self._current_faults[status.name] = fault
         self._log(status.level, f'{subject}: {status.message}')
 
     def info(self, text: str) -> None:

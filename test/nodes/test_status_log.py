@@ -1,4 +1,4 @@
-"""Faults in the log: at their beginning, at intervals while they last, and at their end."""
+"""Faults in the log: at their beginning and end, and errors at intervals while they last."""
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -57,10 +57,24 @@ def test_a_lasting_or_intermittent_fault_is_logged_once_a_minute(log):
     assert all(b - a >= REPEAT_INTERVAL_S for a, b in zip(times, times[1:], strict=False))
 
 
+def test_a_warning_is_logged_once_per_outage(log):
+    """A node without input warns once, however long the outage lasts."""
+    def warnings(begin, end):
+        return [k for k in range(begin, end) for level, _ in log(
+            float(k), DiagnosticStatus.WARN, f'no message from detection for {k - begin + 3} s')
+            if level == 'warning']
+    assert warnings(3, 600) == [3]
+    assert log(600.0, DiagnosticStatus.OK, 'running') == [('info', 'mag_1: running again')]
+    assert warnings(603, 610) == [603]
+    assert len(log(610.0, DiagnosticStatus.OK, 'running')) == 1
+    # Frequent outages are logged once a minute; an outage that lasts is always logged.
+    assert warnings(620, 900) == [603 + REPEAT_INTERVAL_S]
+
+
 def test_the_number_of_remembered_faults_is_bounded(log):
     for k in range(2 * MAX_FAULTS):
         log(0.0, DiagnosticStatus.WARN, 'bad', f'node: {"x" * (k % 97)}{"y" * (k // 97)}')
-    assert log.statuses.n_remembered <= 2 * MAX_FAULTS
+    assert log.statuses.n_remembered <= 3 * MAX_FAULTS
 
 
 def test_a_hundred_sensors_with_one_fault_do_not_fill_the_log(log):
