@@ -1,4 +1,4 @@
-"""Launch calibration, detection and tracking, and optionally the drivers or a replay as input.
+"""Launch calibration, detection and tracking, optionally with drivers or a replay as input.
 
 ros2 launch mag_tracking tracking.launch.py network:=/path/to/network.yaml [drivers:=FILE]
 """
@@ -28,7 +28,7 @@ def config(name):
 
 
 def launch_arguments():
-    """Arguments of the launch file.
+    """Declare the arguments of the launch file.
 
     Returns
     -------
@@ -38,25 +38,25 @@ def launch_arguments():
         DeclareLaunchArgument('network', description='Path of the network file.'),
         DeclareLaunchArgument('namespace', default_value='', description='Namespace of all nodes.'),
         DeclareLaunchArgument('use_sim_time', default_value='false',
-                              description='Take the time from /clock, for a replay.'),
+                              description='Use the time on /clock, for a replay.'),
         DeclareLaunchArgument('target', default_value='vehicle',
                               description='Kind of target: vehicle or magnet.'),
         DeclareLaunchArgument('params', default_value=config('empty.yaml'),
                               description='Parameter file of the nodes.'),
         DeclareLaunchArgument('drivers', default_value='',
-                              description='Drivers file: start driver_node with it.'),
+                              description='Drivers file; starts driver_node.'),
         DeclareLaunchArgument('batches', default_value='false',
-                              description='Let driver_node publish readings of many sensors in '
-                              'one message.'),
+                              description='Publish the readings of many sensors in one '
+                              'message.'),
         DeclareLaunchArgument('recording', default_value='',
-                              description='Recording: start replay_node with it.'),
+                              description='Recording; starts replay_node.'),
         DeclareLaunchArgument('rate', default_value='1.0',
-                              description='Speed of the replay; 1 = as recorded.'),
+                              description='Playback rate; 1 = as recorded.'),
     ]
 
 
 def generate_launch_description():
-    """Nodes and their launch arguments.
+    """Describe the nodes and their launch arguments.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def generate_launch_description():
         *launch_arguments(),
         *(Node(package='mag_tracking', executable=name, namespace=namespace, parameters=common)
           for name in ('calibration_node', 'detection_node', 'tracker_node')),
-        # Sources come last, so that their first messages find subscribers.
+        # Sources are started last, so that their first messages have subscribers.
         Node(package='mag_tracking', executable='driver_node', namespace=namespace,
              condition=IfCondition(has_drivers),
              parameters=[{'drivers': drivers, 'network': network,

@@ -1,4 +1,4 @@
-"""The command `mag-tracking`; each module registers one command or a few related ones."""
+"""The command `mag-tracking`; each module registers one or several related commands."""
 
 import argparse
 import io
@@ -17,7 +17,7 @@ INTERRUPTED_MESSAGE = 'mag-tracking: interrupted'
 """Message printed after Ctrl-C."""
 
 BROKEN_PIPE_STATUS = 128 + signal.SIGPIPE
-"""Exit status after the reader of stdout has closed the pipe, as in other programs."""
+"""Exit status if the reader of stdout has closed the pipe, as usual for commands."""
 
 
 def command() -> NoReturn:
@@ -41,12 +41,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 for success, 1 for an error that has been printed, 130 after Ctrl-C;
-        others depend on the command.
+        Exit status: 0 for success, 1 for an error that has been printed, 130 after Ctrl-C.
+        Further values depend on the command and are described in its help text.
     """
     words = sys.argv[1:] if argv is None else argv
     for word in words:
-        # Paths cannot contain NUL, and each function with a path would fail in a different way.
+        # Paths cannot contain NUL, but each function with a path reports this differently.
         if '\0' in word:
             print(f'mag-tracking: {word!r} contains a NUL character', file=sys.stderr)
             return 1
@@ -70,7 +70,7 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _is_stdout_closed() -> bool:
-    """Whether the reader of stdout has closed the pipe (`| head`); further output is discarded."""
+    """Return whether the reader of stdout has closed the pipe; if so, discard further output."""
     if sys.stdout is None:
         return False
     poll = select.poll()
@@ -86,14 +86,14 @@ def _run(args: argparse.Namespace) -> int:
     """Run a parsed command and return its exit status."""
     try:
         status: int = args.run_command(args)
-        # A process that was started with a closed stdout has none.
+        # sys.stdout is None if the process was started with a closed stdout.
         if sys.stdout is not None:
             sys.stdout.flush()
         return status
     except (MagTrackingError, OSError) as error:
         if isinstance(error, BrokenPipeError) and _is_stdout_closed():
             return BROKEN_PIPE_STATUS
-        # An OSError here is a full disk or a lost drive; its message names the file.
+        # An OSError here is due to a full disk or a lost drive; its message names the file.
         print(f'mag-tracking: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:

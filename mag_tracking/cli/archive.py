@@ -9,6 +9,7 @@ from tqdm import tqdm
 
 from mag_tracking.apps.archive import archive, recordings_of, size_of
 from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
@@ -17,7 +18,7 @@ _ARCHIVE = '''
 Tracks many or long recordings on several processors or machines. The results equal those of
 `mag-tracking replay` for each recording; long recordings are divided during quiet intervals. An
 interrupted run continues when the same command is run again; completed recordings are skipped. A
-recording that fails is listed with the reason and does not stop the others.
+recording that fails is listed with the reason and does not stop the other recordings.
 
 Parquet files written to DIR:
   tracks/             one row per track
@@ -25,7 +26,7 @@ Parquet files written to DIR:
   smoothed/           one row per smoothed pose
   passes/             one row per fitted pass
   health/             one row per sensor every ten minutes
-  recordings.parquet  one row per recording, including those that failed
+  recordings.parquet  one row per recording, including failed recordings
 
 examples:
   mag-tracking archive recordings/ --network site.yaml --out archive
@@ -51,10 +52,10 @@ def add(commands: Commands) -> None:
     add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder of the dataset')
     add_settings(p)
-    where = p.add_mutually_exclusive_group()
-    where.add_argument('--workers', type=int, metavar='N', default=os.cpu_count() or 1,
+    executor = p.add_mutually_exclusive_group()
+    executor.add_argument('--workers', type=int, metavar='N', default=os.cpu_count() or 1,
                        help='number of processes on this machine (default: number of processors)')
-    where.add_argument('--scheduler', metavar='ADDRESS',
+    executor.add_argument('--scheduler', metavar='ADDRESS',
                        help='address of a running Dask scheduler (e.g. tcp://10.0.0.5:8786)')
 
 
@@ -64,19 +65,21 @@ def _archive(args: argparse.Namespace) -> int:
         raise SettingsError(f'--workers: expected 1 or more, got {args.workers}')
     network, settings = recorded_network(args), settings_of(args)
     recordings = recordings_of(args.recordings)
-    with recorded_signals(signal.SIGINT) as seen, \
+    with recorded_signals(signal.SIGINT) as signals, \
             tqdm(total=sum(map(size_of, recordings)), unit='B', unit_scale=True, desc='archive',
                  disable=None) as bar:
-        run = archive(recordings, network, settings, args.out, args.workers, args.scheduler,
-                      bar.update, lambda: bool(seen), tqdm.write)
-    print(f'{len(run.done)} recordings tracked: {run.tracks} tracks, {run.passes} passes'
-          + (f'; {len(run.already_done)} skipped (already tracked)' if run.already_done else ''))
-    if run.lost_workers:
-        print(f'  workers lost: {run.lost_workers}; their tasks were repeated')
-    if run.failed:
-        print(f'  recordings failed: {len(run.failed)}; the reasons are in recordings.parquet')
-    if run.interrupted:
+        result = archive(recordings, network, settings, args.out, args.workers, args.scheduler,
+                         bar.update, lambda: bool(signals), tqdm.write)
+    print(f'{quantity(len(result.done), "recording")} tracked: {quantity(result.tracks, "track")}, '
+          f'{quantity(result.passes, "pass", "passes")}'
+          + (f'; {len(result.already_done)} skipped (already tracked)'
+             if result.already_done else ''))
+    if result.lost_workers:
+        print(f'  workers lost: {result.lost_workers}; their tasks were repeated')
+    if result.failed:
+        print(f'  recordings failed: {len(result.failed)}; the reasons are in recordings.parquet')
+    if result.interrupted:
         print(f'interrupted; partial results in {args.out}; run the same command to continue')
         return 130
     print(f'dataset in {args.out}')
-    return 1 if run.failed else 0
+    return 1 if result.failed else 0

@@ -21,6 +21,7 @@ from mag_tracking.apps.board_geometry import (
 )
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network, write_network
@@ -30,7 +31,7 @@ _GEOMETRY = '''
 Estimates the position, orientation, gain and bias of each sensor of a board from the readings
 of all sensors while a magnet of known moment is moved over the board. The poses of the magnet
 are measured by a tracker; the offsets between tracker and board, and between tool and magnet,
-are estimated. Without a tracker, --unknown-poses estimates the poses as well, within the box
+are estimated. Without a tracker, --unknown-poses also estimates the poses, within the box
 from --low to --high. The poses should fill the working volume, with the magnet tilted in
 various directions: 162 poses were sufficient for 41 sensors.
 
@@ -59,12 +60,12 @@ def add(commands: Commands) -> None:
     p = add_command(commands, 'board-geometry', _geometry,
                     _GEOMETRY.replace('{settings}', settings))
     p.add_argument('table', type=Path, metavar='TABLE', help='readings and poses (.csv)')
-    stated = p.add_mutually_exclusive_group(required=True)
-    stated.add_argument('--sensors', type=Path, metavar='FILE',
-                        help='nominal positions x,y,z [m] of all sensors (.csv), which are aligned '
-                        'with the axes')
-    add_network(stated, required=False, text='network file with the nominal geometry, sensors in '
-                'the order of the table')
+    geometry = p.add_mutually_exclusive_group(required=True)
+    geometry.add_argument('--sensors', type=Path, metavar='FILE',
+                          help='nominal positions x,y,z [m] of all sensors (.csv); the sensors are '
+                          'aligned with the axes')
+    add_network(geometry, required=False, text='network file with the nominal geometry, sensors '
+                'in the order of the table')
     p.add_argument('--moment', required=True, type=float, metavar='A_M2',
                    help='magnitude of the magnet\'s moment [A m^2]')
     p.add_argument('--out', required=True, type=Path, metavar='FILE',
@@ -85,23 +86,23 @@ def add(commands: Commands) -> None:
 
 def _geometry(args: argparse.Namespace) -> int:
     """Run `mag-tracking board-geometry`."""
-    box = _checked(args)
+    box = _checked_box(args)
     network = read_network(args.network) if args.sensors is None else board_of(args.sensors)
     settings = replace(GeometrySettings(), read_parameter_file(args.params) if args.params else {})
     date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
     unknowns = 'poses and geometry' if box else 'geometry'
     # Ctrl-C ends the estimation immediately: nothing has been written yet.
-    with _elapsed_time(f'estimating the {unknowns} of {len(network)} sensors'):
-        found = survey_geometry(args.table, network, args.moment, settings, date, box,
-                                args.noise_std)
-    _print(found, box is not None)
-    if not found.geometry.converged:
-        print(f'mag-tracking: calibration rejected: {found.geometry.reason}; nothing was written',
+    with _elapsed_time(f'estimating the {unknowns} of {quantity(len(network), "sensor")}'):
+        survey = survey_geometry(args.table, network, args.moment, settings, date, box,
+                                 args.noise_std)
+    _print(survey, box is not None)
+    if not survey.geometry.converged:
+        print(f'mag-tracking: calibration rejected: {survey.geometry.reason}; nothing was written',
               file=sys.stderr)
         return 1
     # Ctrl-C does not interrupt the writing.
     with recorded_signals(signal.SIGINT):
-        write_network(args.out, found.network, 'Geometry from a magnet\'s poses in '
+        write_network(args.out, survey.network, 'Geometry from a magnet\'s poses in '
                       f'{args.table.name}; nominal geometry: '
                       f'{(args.sensors or args.network).name}.')
         if args.figure is not None:
@@ -109,13 +110,13 @@ def _geometry(args: argparse.Namespace) -> int:
             from mag_tracking.report.figure_file import save_figure
             from mag_tracking.report.geometry_figures import geometry_figure
 
-            save_figure(geometry_figure(found), args.figure)
+            save_figure(geometry_figure(survey), args.figure)
     print(f'network written to {args.out}')
     return 0
 
 
-def _checked(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[float]] | None:
-    """Check the options and return the box; raises SettingsError or OutputError."""
+def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[float]] | None:
+    """Check the options and return the box; raise SettingsError or OutputError."""
     corners = args.low, args.high
     if args.unknown_poses and None in corners:
         raise SettingsError('--unknown-poses: give the box that contains the magnet with --low and '
@@ -138,15 +139,15 @@ def _checked(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[float]
 
 
 @contextmanager
-def _elapsed_time(text: str) -> Iterator[None]:
-    """Print the task, and on a terminal the elapsed time; the duration is not predictable."""
-    done = threading.Event()
-    bar = tqdm(desc=text, bar_format='{desc}: {elapsed}', disable=None)
+def _elapsed_time(task: str) -> Iterator[None]:
+    """Print the task and, on a terminal, the elapsed time; the total time is not predictable."""
+    stop = threading.Event()
+    bar = tqdm(desc=task, bar_format='{desc}: {elapsed}', disable=None)
     if bar.disable:
-        print(text, flush=True)
+        print(task, flush=True)
 
     def tick() -> None:
-        while not done.wait(0.5):
+        while not stop.wait(0.5):
             bar.refresh()
 
     ticker = threading.Thread(target=tick, daemon=True)
@@ -154,66 +155,66 @@ def _elapsed_time(text: str) -> Iterator[None]:
     try:
         yield
     finally:
-        done.set()
+        stop.set()
         ticker.join()
         bar.close()
 
 
-def _print(found: GeometrySurvey, blind: bool) -> None:
+def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
     """Print the calibration as a table, followed by its quality and warnings."""
-    g = found.geometry
+    g = survey.geometry
     if g.converged:
         print('sensor      shift [mm]    rotation [deg] gain            '
               'bias [uT]                    residual')
-        for j, name in enumerate(found.network.names):
-            print(f'{name:11s} {_row(found, j)}')
-        _print_magnet(g, blind)
-    n_unused = found.n_poses - len(found.rows)
-    print(f'{len(found.rows)} of {found.n_poses} poses used, normalised cost '
+        for j, name in enumerate(survey.network.names):
+            print(f'{name:11s} {_row(survey, j)}')
+        _print_magnet(g, has_unknown_poses)
+    n_unused = survey.n_poses - len(survey.rows)
+    print(f'{len(survey.rows)} of {survey.n_poses} poses used, normalised cost '
           f'{g.normalised_cost:.2f} (1 = consistent with noise and field error)')
     if n_unused:
-        print(f'  warning: poses not used (without readings{" or outside the box" * blind}): '
-              f'{n_unused}')
+        print('  warning: poses not used (without readings'
+              f'{" or outside the box" * has_unknown_poses}): {n_unused}')
     if g.suspect_sensors:
-        print('  warning: sensors inconsistent with the others or with their nominal geometry '
+        print('  warning: sensors inconsistent with other sensors or their nominal geometry '
               f'(check mounting, axes, unit, noise): {", ".join(g.suspect_sensors)}')
-    n_assumed = sum(std is None for std in found.network.noise_std)
+    n_assumed = sum(std is None for std in survey.network.noise_std)
     if n_assumed:
-        print(f'  note: noise of {n_assumed} sensors assumed to be '
+        print(f'  note: noise of {quantity(n_assumed, "sensor")} assumed to be '
               f'{ASSUMED_NOISE:g} T (set --noise-std, or noise_std in a network file)')
-    for j, name in enumerate(found.network.names):
+    for j, name in enumerate(survey.network.names):
         if np.isnan(g.bias[j]).all():
             print(f'  warning: {name} has no readings; its nominal geometry is kept')
-    for name, axes in found.silent_axes:
+    for name, axes in survey.silent_axes:
         print(f'  warning: {name} never reported {axes}: its background is still unknown')
-    if found.suspect_rows:
+    if survey.suspect_rows:
         print('  warning: rows with inconsistent poses (the header is row 1): '
-              f'{", ".join(map(str, found.suspect_rows))}')
+              f'{", ".join(map(str, survey.suspect_rows))}')
 
 
-def _print_magnet(g: NetworkGeometry, blind: bool) -> None:
+def _print_magnet(g: NetworkGeometry, has_unknown_poses: bool) -> None:
     """Print the moment, and the offset and tilt of the magnet in its tool."""
-    def listed(values: FloatArray, std: FloatArray, scale: float, digits: int) -> str:
+    def formatted(values: FloatArray, std: FloatArray, scale: float, digits: int) -> str:
         return ' '.join(f'{scale * v:.{digits}f} ({scale * s:.{digits}f})'
                         for v, s in zip(values, std, strict=True))
 
     moment, std = g.moment
     print(f'moment {moment:.4f} ({std:.4f}) A m^2' if std else f'moment {moment:g} A m^2 (given)')
-    if not blind:
+    if not has_unknown_poses:
         offset, offset_std = g.tool_offset
         tilt, tilt_std = g.tool_tilt
         print(f'magnet relative to the tracked point, tool frame: '
-              f'{listed(offset, offset_std, 1e3, 2)} mm; tilt '
-              f'{listed(tilt, tilt_std, 180.0 / np.pi, 2)} deg')
+              f'{formatted(offset, offset_std, 1e3, 2)} mm; tilt '
+              f'{formatted(tilt, tilt_std, 180.0 / np.pi, 2)} deg')
 
 
-def _row(found: GeometrySurvey, j: int) -> str:
-    """One row of the table of sensors."""
-    g = found.geometry
-    moved = 1e3 * np.linalg.norm(found.network.positions[j] - found.stated.positions[j])
-    moved_std, rotated_std = (np.sqrt(np.square(v[j]).mean())
+def _row(survey: GeometrySurvey, j: int) -> str:
+    """Format the row of sensor `j` in the table."""
+    g = survey.geometry
+    shift = 1e3 * np.linalg.norm(survey.network.positions[j] - survey.stated.positions[j])
+    shift_std, rotation_std = (np.sqrt(np.square(v[j]).mean())
                              for v in (1e3 * g.position_std, np.rad2deg(g.rotation_std)))
     bias = ' '.join(f'{1e6 * b:+8.2f}' for b in g.bias[j])
-    return (f'{moved:5.2f} ({moved_std:.2f})  {np.rad2deg(found.rotation_angle[j]):6.2f} '
-            f'({rotated_std:.2f})  {g.gain[j]:.4f} ({g.gain_std[j]:.4f}) {bias}  '
+    return (f'{shift:5.2f} ({shift_std:.2f})  {np.rad2deg(survey.rotation_angle[j]):6.2f} '
+            f'({rotation_std:.2f})  {g.gain[j]:.4f} ({g.gain_std[j]:.4f}) {bias}  '
             f'{g.sensor_residual[j]:8.2f}')

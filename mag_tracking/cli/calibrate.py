@@ -29,9 +29,9 @@ twice, at uneven intervals, so that all sensors are shaken) and its noise, from 
 begins without a target. Checks that all sensors measure the same Earth field, and reports flipped
 or swapped axes and wrong units. Passing vehicles improve the headings (disable with --no-passes).
 Headings remain uncertain (a bias of 0.6 uT rotates a compass by two degrees): their standard
-deviations are written to the network file and used by the tracker. Orientations stated by hand are
-kept in the file, and the next calibration starts from them. Exit status 2 if a sensor must be
-wrong.
+deviations are written to the network file and used by the tracker. Nominal orientations are kept
+in the file, and the next calibration starts from them. Exit status 2 if the field of a sensor
+contradicts the Earth's field.
 
 The network file must contain the Earth's field, as earth_field (tesla) or as site:
   site: {latitude: 58.4, longitude: 15.6, height: 60, date: 2026-05-01, x_azimuth_deg: 90}
@@ -69,69 +69,69 @@ def _calibrate(args: argparse.Namespace) -> int:
     recording = Recording(args.recording)
     check_outputs(args)
     check_report(args, args.recording, args.network, args.out, args.figure)
-    times = 1 if args.no_passes else 2
-    with recorded_signals(signal.SIGINT) as seen:
-        with tqdm(total=times * recording.size, unit='B', unit_scale=True,
+    n_reads = 1 if args.no_passes else 2
+    with recorded_signals(signal.SIGINT) as signals:
+        with tqdm(total=n_reads * recording.size, unit='B', unit_scale=True,
                   desc=args.recording.name, disable=None) as bar:
-            found = calibrate(recording, network, settings, now(), not args.no_passes, bar.update,
-                              lambda: bool(seen))
-    _print(found, recording)
-    if seen:
+            result = calibrate(recording, network, settings, now(), not args.no_passes, bar.update,
+                               lambda: bool(signals))
+    _print(result, recording)
+    if signals:
         print('interrupted: nothing was written')
         return 130
-    write_network(args.out, found.network,
+    write_network(args.out, result.network,
                   f'Calibrated from {args.recording.name} and {args.network.name}.')
     if args.report is not None:
         # Imported here because it loads matplotlib.
         from mag_tracking.apps.calibrate_report import write_report
 
-        write_report(found, network, args.recording.name, args.report)
+        write_report(result, network, args.recording.name, args.report)
     if args.figure is not None:
         # Imported here because it loads matplotlib.
         from mag_tracking.report.calibration_figures import calibration_figure
         from mag_tracking.report.figure_file import save_figure
 
-        save_figure(calibration_figure(found, network), args.figure)
+        save_figure(calibration_figure(result, network), args.figure)
     print(f'network written to {args.out}')
-    return 2 if found.survey.disagreements else 0
+    return 2 if result.survey.disagreements else 0
 
 
-def _print(found: Calibration, recording: Recording) -> None:
+def _print(result: Calibration, recording: Recording) -> None:
     """Print the calibration as a table, followed by notes and warnings."""
-    survey = found.survey
+    survey = result.survey
     print('sensor      tilt     heading [deg]    clock [ms]          noise [nT]           source')
     for j, sensor in enumerate(survey.sensors):
-        print(f'{sensor.sensor:11s} {_row(found, j)}')
+        print(f'{sensor.sensor:11s} {_row(result, j)}')
     if survey.reference:
         print(f'clock offsets relative to {survey.reference}')
-    if found.evidence is not None:
-        scatter = found.evidence.scatter[~np.isnan(found.evidence.scatter)]
-        print(f'passes used: {found.evidence.n_tracks}'
+    if result.evidence is not None:
+        scatter = result.evidence.scatter[~np.isnan(result.evidence.scatter)]
+        print(f'passes used: {result.evidence.n_tracks}'
               + (f'; largest scatter: {np.sqrt(scatter.max()):.1f} standard deviations'
                  if len(scatter) else ''))
-    for text in survey.warnings():
-        print(f'  warning: {text}')
-    for name in found.without_background:
+    for warning in survey.warnings():
+        print(f'  warning: {warning}')
+    for name in result.without_background:
         print(f'  warning: {name}: no background was learnt; the recording must begin without a '
               'target (run mag-tracking doctor for details)')
-    if survey.disagreements and found.evidence is None:
-        print('  note: passes were not used because some sensors must be wrong')
-    for what, n in {**found.rejected, **recording.losses}.items():
-        print(f'  warning: {what}: {n}')
+    if survey.disagreements and result.evidence is None:
+        print('  note: passes were not used, because some sensors contradict the Earth\'s field')
+    for cause, n in {**result.rejected, **recording.losses}.items():
+        print(f'  warning: {cause}: {n}')
 
 
-def _row(found: Calibration, j: int) -> str:
-    """One row of the table of sensors."""
-    network = found.network
+def _row(result: Calibration, j: int) -> str:
+    """Format the row of sensor `j` in the table."""
+    network = result.network
     R, std = network.R_ws[j], network.orientation_std[j]
     tilt = np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))
-    # Direction of the sensor's x axis, seen from above.
+    # Direction of the sensor's x axis in the horizontal plane.
     heading = np.degrees(np.arctan2(R[1, 0], R[0, 0]))
     sd = '  (?)' if std is None else f'({np.degrees(std[2]):.1f})'
-    done, noise = network.calibrated[j], network.noise_std[j]
+    calibrated, noise = network.calibrated[j], network.noise_std[j]
     clock = ' ' * 16
-    if done is not None and not np.isnan(done.clock_offset_std):
-        clock = f'{1e3 * network.clock_offset[j]:+8.2f} ({1e3 * done.clock_offset_std:.2f})'
-    quiet = ' '.join(f'{1e9 * v:5.1f}' for v in noise) if noise is not None else ' ' * 17
-    return (f'{tilt:6.1f}  {heading:+8.1f} {sd:>6s}  {clock:16s}  {quiet}  '
-            f'{"as stated" if done is None else done.by}')
+    if calibrated is not None and not np.isnan(calibrated.clock_offset_std):
+        clock = f'{1e3 * network.clock_offset[j]:+8.2f} ({1e3 * calibrated.clock_offset_std:.2f})'
+    noise_column = ' '.join(f'{1e9 * v:5.1f}' for v in noise) if noise is not None else ' ' * 17
+    return (f'{tilt:6.1f}  {heading:+8.1f} {sd:>6s}  {clock:16s}  {noise_column}  '
+            f'{"as stated" if calibrated is None else calibrated.by}')

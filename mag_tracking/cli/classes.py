@@ -19,13 +19,14 @@ from mag_tracking.apps.classes import (
     train_classes,
 )
 from mag_tracking.cli.options import Commands, add_command, check_writable
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.signature_tables import read_model, write_model
 
 _CLASSES = '''
-A single sensor determines neither size nor distance of a target, but the shape of the field
-during a pass identifies its class, after training on labelled passes.
+A single sensor determines neither size nor distance of a target. After training on labelled
+passes, the shape of the field during a pass identifies the class of the target.
 
 LABELLED is one of:
   - a CSV table with one row per sample (label, signature, time_s, x_nt, y_nt, z_nt) or one row per
@@ -54,18 +55,19 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'classes', _no_action, _CLASSES)
+    p = add_command(commands, 'classes', _reject_missing_action, _CLASSES)
     actions = p.add_subparsers(dest='action', metavar='ACTION', required=True)
-    for name, run, text in (('train', _train, 'Train a classifier on labelled passes.'),
-                            ('evaluate', _evaluate, 'Measure accuracy and reliability.'),
-                            ('predict', _predict, 'Classify signatures.')):
-        _add_action(actions, name, run, text)
+    for name, run, description in (
+            ('train', _train, 'Train a classifier on labelled passes.'),
+            ('evaluate', _evaluate, 'Measure accuracy and reliability.'),
+            ('predict', _predict, 'Classify signatures.')):
+        _add_action(actions, name, run, description)
 
 
 def _add_action(actions: Commands, name: str, run: Callable[[argparse.Namespace], int],
-                text: str) -> None:
+                description: str) -> None:
     """Register `train`, `evaluate` or `predict`."""
-    p = actions.add_parser(name, help=text, description=text)
+    p = actions.add_parser(name, help=description, description=description)
     p.set_defaults(run_command=run)
     p.add_argument('labelled', type=Path, metavar='LABELLED',
                    help='table of signatures (.csv) or recording')
@@ -83,13 +85,13 @@ def _add_action(actions: Commands, name: str, run: Callable[[argparse.Namespace]
                        help='number of 70/30 splits without --model (default: 20)')
 
 
-def _no_action(args: argparse.Namespace) -> int:
-    """Never called: argparse requires an action."""
+def _reject_missing_action(args: argparse.Namespace) -> int:
+    """Reject a command without an action; usually argparse does so before."""
     raise SettingsError('classes: expected train, evaluate or predict')
 
 
 def _examples(args: argparse.Namespace) -> Examples:
-    """Read the signatures of the command line and print a warning for each unusable one."""
+    """Read the signatures given by the options; print a warning for each unusable signature."""
     network = None if args.network is None else read_network(args.network)
     examples = examples_of(labelled_signatures(args.labelled, args.labels, network,
                                                args.action != 'predict'))
@@ -117,33 +119,33 @@ def _evaluate(args: argparse.Namespace) -> int:
         raise SettingsError(f'--splits: expected 1 or more, got {args.splits}')
     examples = _examples(args)
     model = None if args.model is None else read_model(args.model)
-    found = evaluate_classes(examples, model, args.splits,
-                             partial(tqdm, desc='splits', disable=None, leave=False))
-    how = f'{args.splits} splits of 70/30' if model is None else f'{args.model}'
-    print(f'{len(examples.labels)} signatures, {how}; {found.n} tested')
-    _print_evaluation(found)
+    evaluation = evaluate_classes(examples, model, args.splits,
+                                  partial(tqdm, desc='splits', disable=None, leave=False))
+    test = f'{quantity(args.splits, "split")} of 70/30' if model is None else f'{args.model}'
+    print(f'{quantity(len(examples.labels), "signature")}, {test}; {evaluation.n} tested')
+    _print_evaluation(evaluation)
     return 0
 
 
-def _print_evaluation(found: Evaluation) -> None:
+def _print_evaluation(evaluation: Evaluation) -> None:
     """Print the scores of an evaluation."""
-    print(f'  largest class: {found.majority:.1%} (accuracy of a constant prediction)')
-    for name, values in (('accuracy', found.accuracy),
-                         ('balanced accuracy', found.balanced_accuracy),
-                         ('classified as unknown', found.unknown)):
-        print(f'  {name}: {_share(values)}')
-    for k, name in enumerate(found.classes):
-        print(f'  recall of {name}: {_share(found.recall[:, k])}')
-    print(f'  expected calibration error of the probabilities: {found.reliability:.3f}')
+    print(f'  largest class: {evaluation.majority:.1%} (accuracy of a constant prediction)')
+    for name, values in (('accuracy', evaluation.accuracy),
+                         ('balanced accuracy', evaluation.balanced_accuracy),
+                         ('classified as unknown', evaluation.unknown)):
+        print(f'  {name}: {_mean_fraction(values)}')
+    for k, name in enumerate(evaluation.classes):
+        print(f'  recall of {name}: {_mean_fraction(evaluation.recall[:, k])}')
+    print(f'  expected calibration error of the probabilities: {evaluation.reliability:.3f}')
 
 
-def _share(values: 'np.ndarray[tuple[int, ...], np.dtype[np.float64]]') -> str:
-    """Mean of a fraction over all test sets, with its standard deviation if there are several."""
-    known = values[np.isfinite(values)]
-    if not len(known):
+def _mean_fraction(values: 'np.ndarray[tuple[int, ...], np.dtype[np.float64]]') -> str:
+    """Format the mean of a fraction over the test sets, ± its standard deviation if several."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
         return 'no examples'
-    spread = f' ± {known.std():.1%}' if len(known) > 1 else ''
-    return f'{known.mean():.1%}{spread}'
+    spread = f' ± {finite.std():.1%}' if len(finite) > 1 else ''
+    return f'{finite.mean():.1%}{spread}'
 
 
 def _predict(args: argparse.Namespace) -> int:

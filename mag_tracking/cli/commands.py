@@ -88,6 +88,6 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _module_of(word: str) -> str | None:
-    """Module of a command given by name or alias; None for any other word."""
+    """Module of the command with a name or alias; None for an unknown word."""
     return next((command.module for name, command in COMMANDS.items()
                  if word in (name, *command.aliases)), None)

@@ -46,7 +46,7 @@ def add(commands: Commands) -> None:
     p.add_argument('recording', nargs='?', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     p.add_argument('--live', type=float, metavar='SECONDS',
-                   help='examine the live topics for this time instead (needs ROS 2)')
+                   help='examine live topics for this time instead of a recording (needs ROS 2)')
     add_recorded_network(p)
     add_settings(p)
     add_report(p)
@@ -58,30 +58,31 @@ def _doctor(args: argparse.Namespace) -> int:
         raise SettingsError('doctor: give either RECORDING or --live SECONDS')
     network, settings = recorded_network(args), settings_of(args)
     check_report(args, args.recording, args.network)
-    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
         if args.live is not None:
             if not 1.0 <= args.live <= 86400.0:
                 raise SettingsError(f'--live: expected 1 to 86400 s, got {args.live:g}')
             # Imported here because it needs ROS.
             from mag_tracking.nodes.doctor_node import listening
 
-            with listening(network, settings, args.live, lambda: bool(seen),
+            with listening(network, settings, args.live, lambda: bool(signals),
                            args.ros_arguments) as live:
-                live.status = _report(args, live.doctor, live.findings, bool(seen))
+                live.status = _report(args, live.doctor, live.findings, bool(signals))
             return live.status
         recording = Recording(args.recording)
         with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
                   disable=None) as bar:
-            doctor, more = examine(recording, network, settings, bar.update, lambda: bool(seen))
-    return _report(args, doctor, more, bool(seen))
+            doctor, further_findings = examine(recording, network, settings, bar.update,
+                                               lambda: bool(signals))
+    return _report(args, doctor, further_findings, bool(signals))
 
 
-def _report(args: argparse.Namespace, doctor: Doctor, more: list[Finding],
+def _report(args: argparse.Namespace, doctor: Doctor, further_findings: list[Finding],
             is_interrupted: bool) -> int:
-    """Print all findings, including `more`, write the report, and return the exit status."""
+    """Print all findings, write the report, and return the exit status."""
     for name, health in doctor.sensors.items():
         print(f'{name:11s} {_row(health)}')
-    findings = sorted(more + doctor.findings(), key=lambda f: not f.serious)
+    findings = sorted(further_findings + doctor.findings(), key=lambda f: not f.serious)
     for finding in findings:
         print(f'{"ERROR" if finding.serious else "note "} {finding.subject}: {finding.what}\n'
               f'      {finding.advice}')
@@ -97,7 +98,7 @@ def _report(args: argparse.Namespace, doctor: Doctor, more: list[Finding],
 
 
 def _row(health: SensorHealth) -> str:
-    """One row of the table of sensors."""
+    """Format the row of a sensor in the table."""
     c = health.counts
     if not c['readings']:
         return 'no readings'

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from mag_tracking.apps.events import EventsResult, find_events
 from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import PassEvent
@@ -22,7 +23,7 @@ _EVENTS = '''
 Detects the passes at each sensor and describes them without tracking: onset and release, peak,
 energy, time of the closest point of approach, direction (needs two horizontal axes), and the
 signature of the field. One sensor with one axis is sufficient. Distance and speed are not
-observable with a single sensor, so that no value is in metres.
+observable with a single sensor, so no value is in metres.
 
 With --out, writes events.csv and signatures.csv to DIR.
 
@@ -53,17 +54,17 @@ def _events(args: argparse.Namespace) -> int:
     recording = Recording(args.recording)
     if args.out is not None and recording.lies_in(args.out):
         raise OutputError(f'--out: {args.out} is the folder of the recording; choose another one')
-    with recorded_signals(signal.SIGINT) as seen, \
+    with recorded_signals(signal.SIGINT) as signals, \
             tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
                  disable=None) as bar:
-        result = find_events(recording, network, settings, bar.update, lambda: bool(seen))
+        result = find_events(recording, network, settings, bar.update, lambda: bool(signals))
     _print(result, network.names)
-    for what, n in {**result.rejections, **recording.losses}.items():
-        print(f'  warning: {what}: {n}')
+    for cause, n in {**result.rejections, **recording.losses}.items():
+        print(f'  warning: {cause}: {n}')
     if args.out is not None:
         write_events(args.out, result.events)
         print(f'tables in {args.out}')
-    if seen:
+    if signals:
         print('interrupted: the results cover only the part read so far')
         return 130
     return 0
@@ -74,7 +75,7 @@ def _print(result: EventsResult, names: tuple[str, ...]) -> None:
     for event in result.events:
         print(line_of(event))
     counts = result.counts()
-    print(', '.join(f'{name}: {counts.get(name, 0)} events' for name in names))
+    print(', '.join(f'{name}: {quantity(counts.get(name, 0), "event")}' for name in names))
     for topic in result.missing_topics:
         print(f'  warning: no messages on {topic}')
     for name in result.sensors_without_background:
@@ -92,14 +93,14 @@ def line_of(event: PassEvent) -> str:
     -------
     str
     """
-    at = datetime.fromtimestamp(event.closest_ns / NS, tz=timezone.utc)
+    closest_time = datetime.fromtimestamp(event.closest_ns / NS, tz=timezone.utc)
     p = event.left_to_right
-    way = f'left to right ({p:.0%})' if p > 0.9 else f'right to left ({1.0 - p:.0%})' \
+    direction = f'left to right ({p:.0%})' if p > 0.9 else f'right to left ({1.0 - p:.0%})' \
         if p < 0.1 else 'direction unknown'
-    time = f'{at:%H:%M:%S}.{at.microsecond // 10000:02d}'
+    time = f'{closest_time:%H:%M:%S}.{closest_time.microsecond // 10000:02d}'
     closest = f'closest {time} ± {event.closest_std:.2f} s' if np.isfinite(event.closest_std) \
         else f'peak at {time}, closest point unknown'
     duration = (event.release_ns - event.onset_ns) / NS
     return (f'{event.sensor} {event.number}: {closest}, duration {duration:.2f} s, peak '
-            f'{1e9 * np.sqrt(np.nansum(event.peak**2)):.0f} nT on {event.axes}, {way}'
+            f'{1e9 * np.sqrt(np.nansum(event.peak**2)):.0f} nT on {event.axes}, {direction}'
             + ('' if event.ended else ', not ended'))

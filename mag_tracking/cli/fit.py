@@ -21,6 +21,7 @@ from mag_tracking.cli.options import (
     distinct_names,
     recorded_network,
 )
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.iron import hard_and_soft_iron
 from mag_tracking.interrupts import recorded_signals
@@ -33,9 +34,9 @@ from mag_tracking.settings import read_parameter_file
 
 _FIT = '''
 Extracts the passes from a recording (from before each detection until its end) and fits each
-pass as a whole: a row of 1, 2, 3, 4 dipoles at constant velocity (TSP14). For a vehicle on a
+pass as a whole: a row of 1, 2, 3 or 4 dipoles at constant velocity (TSP14). For a vehicle on a
 straight road this is the most accurate estimate. The normalised cost is 1 if the model is right
-and larger if it is not.
+and larger otherwise.
 
 The tracker runs in parallel and determines the number of vehicles in a pass. Two or three
 simultaneous vehicles are fitted together, on a road at z = 0, and listed separately.
@@ -49,7 +50,7 @@ files written to DIR:
   fits.csv, fits.json   one row per pass, vehicle and number of dipoles
   report.html           interactive report: map, time slider, fields
   *_pass_N.png          measured and fitted field with 90% bands; for several vehicles
-                        *_pass_N_vehicle_K.png, with the field of the others removed
+                        *_pass_N_vehicle_K.png, without the field of other vehicles
   orders.png            normalised cost over the number of dipoles
 
 examples:
@@ -88,32 +89,32 @@ def _fit(args: argparse.Namespace) -> int:
     network = recorded_network(args)
     settings = settings_for('vehicle', read_parameter_file(args.params) if args.params else {})
     _check(args, network)
-    # All recordings are opened before anything is written.
+    # All recordings are opened before a file is written.
     recordings = [Recording(path) for path in args.recordings]
     if any(recording.lies_in(args.out) for recording in recordings):
         raise OutputError(f'--out: {args.out} is the folder of a recording; choose another one')
     jobs = [RecordingFit(r, network, settings, args.orders, args.cpa_range) for r in recordings]
     passes: list[FittedPass] = []
     warnings: list[str] = []
-    with recorded_signals(signal.SIGINT) as seen, FitFolder(args.out) as folder:
+    with recorded_signals(signal.SIGINT) as signals, FitFolder(args.out) as folder:
         for path, recording, job in zip(args.recordings, recordings, jobs, strict=True):
             with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
                       disable=None) as bar:
-                for one in job.passes(bar.update, lambda: bool(seen)):
-                    folder.add(one)
-                    passes.append(one)
+                for fitted_pass in job.passes(bar.update, lambda: bool(signals)):
+                    folder.add(fitted_pass)
+                    passes.append(fitted_pass)
                     bar.clear()
-                    _print_pass(one)
+                    _print_pass(fitted_pass)
                     if not args.no_figures:
-                        _draw(one, args.out)
+                        _draw(fitted_pass, args.out)
             lines = [f'{path.name}: {line}' for line in job.warnings()]
             warnings += lines
             for line in lines:
                 print(f'  warning: {line}')
-            if seen:
+            if signals:
                 break
         iron = _iron(passes, network) if args.same_vehicle else None
-        folder.summary = {'iron': iron, 'interrupted': bool(seen)}
+        folder.summary = {'iron': iron, 'interrupted': bool(signals)}
     # Imported here because it loads matplotlib.
     from mag_tracking.apps.fit_report import write_report
 
@@ -122,12 +123,12 @@ def _fit(args: argparse.Namespace) -> int:
         print('no passes: nothing was detected')
     elif not args.no_figures:
         _draw_orders(passes, args.out)
-    print(f'{"interrupted; partial results" if seen else "results"} in {args.out}')
-    return 130 if seen else 0
+    print(f'{"interrupted; partial results" if signals else "results"} in {args.out}')
+    return 130 if signals else 0
 
 
 def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
-    """Check the options; raises SettingsError or OutputError."""
+    """Check the options; raise SettingsError or OutputError."""
     distinct_names(args.recordings)
     check_orders('--orders', args.orders)
     check_cpa_range('--cpa-range', args.cpa_range, network)
@@ -136,24 +137,25 @@ def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
                             'iron cannot be separated without it')
 
 
-def _print_pass(one: FittedPass) -> None:
+def _print_pass(fitted_pass: FittedPass) -> None:
     """Print the fits of one pass as a table, one row per number of dipoles."""
-    data = one.fits[0].data
-    print(f'{one.recording}, {one.label}: {data.n_values} measurements, '
+    data = fitted_pass.fits[0].data
+    print(f'{fitted_pass.recording}, {fitted_pass.label}: '
+          f'{quantity(data.n_values, "measurement")}, '
           f'sensors: {", ".join(data.network.names[j] for j in data.sensors)}')
-    for note in one.notes:
+    for note in fitted_pass.notes:
         print(f'  note: {note}')
-    if any(not f.reason for f in one.fits):
+    if any(not f.reason for f in fitted_pass.fits):
         print('  dipoles  cost       x        y       z      speed        heading      length   '
               '   moment   (standard deviation)')
-    for fit in one.fits:
-        mark = '*' if fit is one.chosen else ' '
+    for fit in fitted_pass.fits:
+        mark = '*' if fit is fitted_pass.chosen else ' '
         cost = f'{fit.normalised_cost:8.2f}' if len(fit.x) else ' ' * 8
         print(f' {mark}   {fit.n_dipoles}  {cost}  {fit.reason or _numbers(fit)}')
         if fit.bearing is not None:
             _print_bearing(fit.bearing)
-        if fit.reason and fit is one.known:
-            print(f'        determined: {_known(fit)}')
+        if fit.reason and fit is fitted_pass.known:
+            print(f'        determined: {_trusted_values(fit)}')
         if not fit.reason and fit.is_poor_mixture:
             print('        ambiguous: the joint fit of the vehicles is poor')
         elif not fit.reason and fit.ambiguous:
@@ -161,45 +163,46 @@ def _print_pass(one: FittedPass) -> None:
             print(f'        ambiguous: {np.exp(-0.5 * chi_square):.2f} times as likely at position '
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
                   + (f' and length {abs(path[6]):.1f} m' if len(path) > 6 else ''))
-    _print_delay(one)
-    if one.chosen is not None:
-        chosen_cost = one.chosen.normalised_cost
+    _print_delay(fitted_pass)
+    if fitted_pass.chosen is not None:
+        chosen_cost = fitted_pass.chosen.normalised_cost
         if chosen_cost > MAX_NORMALISED_COST:
             print(f'  poor fit (cost {chosen_cost:.1f}): errors of speed and position may be '
                   'several standard deviations')
-        centre = one.chosen.data.network.positions[one.chosen.data.sensors].mean(axis=0)
-        time, std, distance, distance_std = one.chosen.closest_approach(centre)
+        centre = fitted_pass.chosen.data.network.positions[
+            fitted_pass.chosen.data.sensors].mean(axis=0)
+        time, std, distance, distance_std = fitted_pass.chosen.closest_approach(centre)
         print(f'  closest to the centre of the sensors {time:+.2f} ({std:.2f}) s after the '
               f'strongest field, at {distance:.2f} ({distance_std:.2f}) m')
-        dr, dv = one.disagreement
+        dr, dv = fitted_pass.disagreement
         if np.isfinite(dr):
             print(f'  fits with a similar cost differ by up to {dr:.2f} m and {dv:.2f} m/s, '
                   'which the standard deviations do not include')
 
 
-def _known(fit: PassFit) -> str:
-    """Trusted values among speed, direction and time of a fit without an estimate."""
+def _trusted_values(fit: PassFit) -> str:
+    """Format the trusted values (speed, direction, time) of a fit without an estimate."""
     speed, speed_std = fit.speed
     heading, heading_std = np.degrees(fit.heading)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     time, time_std, _, _ = fit.closest_approach(centre)
-    texts = {'speed': f'{speed:.2f}({speed_std:.2f}) m/s',
+    values = {'speed': f'{speed:.2f}({speed_std:.2f}) m/s',
              'direction': f'{heading:.1f}({heading_std:.1f}) deg',
              'time': f'closest to the centre of the sensors {time:+.2f}({time_std:.2f}) s after '
                      'the strongest field'}
-    return ', '.join(texts[name] for name in fit.trusted)
+    return ', '.join(values[name] for name in fit.trusted)
 
 
-def _print_delay(one: FittedPass) -> None:
-    """Print the velocity from the delays between sensors, and whether it contradicts the fit."""
-    c = one.correlated
+def _print_delay(fitted_pass: FittedPass) -> None:
+    """Print the velocity from the delays between sensors; warn if the fit contradicts it."""
+    c = fitted_pass.correlated
     if c.reason:
         print(f'  no velocity from the delay between sensors: {c.reason}')
         return
     line = ' (assumed along the line of the sensors)' if np.isnan(c.heading_std) else ''
     print(f'  velocity from the delay between sensors: {c.speed:.2f}({c.speed_std:.2f}) m/s, '
           f'heading {np.degrees(c.heading):.0f} deg{line}')
-    best = one.chosen
+    best = fitted_pass.chosen
     if best is not None and contradicts_delays(best.speed, best.heading, c):
         print('  warning: the velocities of the fit and from the delay contradict each other; rely '
               'on neither. Check clock offsets, positions in the network file, and whether the '
@@ -207,39 +210,40 @@ def _print_delay(one: FittedPass) -> None:
 
 
 def _numbers(fit: PassFit) -> str:
-    """Position, speed, heading, length and moment, with standard deviations in parentheses."""
+    """Format the estimates of a fit, with standard deviations in parentheses."""
     sd = np.sqrt(np.diagonal(fit.robust_covariance))[:3]
-    place = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
+    position = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
     moment, P = fit.moment
-    size = np.linalg.norm(moment)
-    size_std = np.sqrt(moment @ P @ moment) / size
+    magnitude = np.linalg.norm(moment)
+    magnitude_std = np.sqrt(moment @ P @ moment) / magnitude
     heading, heading_std = np.degrees(fit.heading)
-    return (f'{place} m  {fit.speed[0]:.2f}({fit.speed[1]:.2f}) m/s  {heading:.1f}'
+    return (f'{position} m  {fit.speed[0]:.2f}({fit.speed[1]:.2f}) m/s  {heading:.1f}'
             f'({heading_std:.1f}) deg  {fit.length[0]:.1f}({fit.length[1]:.1f}) m  '
-            f'{size:.0f}({size_std:.0f}) A m^2')
+            f'{magnitude:.0f}({magnitude_std:.0f}) A m^2')
 
 
 def _print_bearing(b: Bearing) -> None:
-    """Print the directions and times that a single sensor determines."""
-    def text(k: int, direction: FloatArray) -> str:
+    """Print the directions and times that are observable with a single sensor."""
+    def direction_text(k: int, direction: FloatArray) -> str:
         if not np.isfinite(direction).all():
             return 'unknown'
         return (f'({" ".join(f"{v:.2f}" for v in direction)}) ± '
                 f'{np.degrees(b.direction_std[k]):.1f} deg')
 
-    print(f'        directions: closest point {text(0, b.cpa_direction)}, motion '
-          f'{text(1, b.motion_direction)} (or both reversed), moment '
-          f'{text(2, b.moment_direction)}')
+    print(f'        directions: closest point {direction_text(0, b.cpa_direction)}, motion '
+          f'{direction_text(1, b.motion_direction)} (or both reversed), moment '
+          f'{direction_text(2, b.moment_direction)}')
     print(f'        closest {b.cpa_time:+.3f} ({b.cpa_time_std:.3f}) s after the strongest field; '
           f'speed/range {b.rate:.3f} ({b.rate_std:.3f}) 1/s')
 
 
 def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any] | None:
-    """Hard and soft iron from the chosen fits, JSON-ready; None after printing the reason."""
-    together = [one for one in passes if one.n_vehicles > 1]
-    if together:
-        print(f'--same-vehicle: {len(together)} vehicles that passed with others are not used')
-    fits = [one.chosen for one in passes if one.chosen is not None and one.n_vehicles == 1]
+    """Estimate and print hard and soft iron; return the content for JSON, or None on failure."""
+    simultaneous = [p for p in passes if p.n_vehicles > 1]
+    if simultaneous:
+        print('--same-vehicle: vehicles not used because they passed simultaneously with others: '
+              f'{len(simultaneous)}')
+    fits = [p.chosen for p in passes if p.chosen is not None and p.n_vehicles == 1]
     try:
         if not fits:
             raise ValueError('no pass has an estimate')
@@ -254,24 +258,26 @@ def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any
     std = np.sqrt(np.diagonal(iron.covariance)) * np.sqrt(max(1.0, iron.normalised_cost))
     hard = ', '.join(f'{v:.1f} ({s:.1f})' for v, s in zip(iron.hard, std[:3], strict=True))
     print(f'hard iron m0 = {hard} A m^2 (forward, left, up); soft iron D = {iron.soft:.3f} '
-          f'({std[3]:.3f}) m^3; {len(fits)} passes, normalised cost {iron.normalised_cost:.1f}')
+          f'({std[3]:.3f}) m^3; {quantity(len(fits), "pass", "passes")}, '
+          f'normalised cost {iron.normalised_cost:.1f}')
     return {'hard': iron.hard.tolist(), 'soft': iron.soft, 'std': std.tolist(),
             'normalised_cost': iron.normalised_cost, 'passes': len(fits)}
 
 
-def _draw(one: FittedPass, out: Path) -> None:
-    """Draw the chosen fit, or else the fit with the most dipoles."""
-    fit = one.chosen or next((f for f in reversed(one.fits) if len(f.x)), None)
+def _draw(fitted_pass: FittedPass, out: Path) -> None:
+    """Draw the chosen fit; if no fit is chosen, draw the fit with the most dipoles."""
+    fit = fitted_pass.chosen or next((f for f in reversed(fitted_pass.fits) if len(f.x)), None)
     if fit is None:
         return
     # Imported here because it loads matplotlib.
     from mag_tracking.report.figure_file import save_figure
     from mag_tracking.report.fit_figures import pass_figure
 
-    title = f'{one.recording}, {one.label}, {fit.n_dipoles} dipole{"s" * (fit.n_dipoles > 1)}'
-    title += ' (field of the others removed)' if one.n_vehicles > 1 else ''
+    title = f'{fitted_pass.recording}, {fitted_pass.label}, {quantity(fit.n_dipoles, "dipole")}'
+    title += ' (without the field of other vehicles)' if fitted_pass.n_vehicles > 1 else ''
     save_figure(pass_figure(fit, title + (' (no estimate)' if fit.reason else '')),
-                out / f'{one.recording}_{one.label.replace(", ", "_").replace(" ", "_")}.png')
+                out / f'{fitted_pass.recording}_'
+                f'{fitted_pass.label.replace(", ", "_").replace(" ", "_")}.png')
 
 
 def _draw_orders(passes: Sequence[FittedPass], out: Path) -> None:

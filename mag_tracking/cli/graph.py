@@ -6,12 +6,13 @@ import signal
 import sys
 
 from mag_tracking.cli.options import Commands, add_command
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 
 _NOTE = '''
-A substitute for the command `ros2`, which is missing in a ROS from PyPI. Names are relative to
-the namespace set with --ros-args -r __ns:=/NAMESPACE.
+A substitute for the command `ros2`, which ROS from PyPI lacks. Names are relative to the
+namespace set with --ros-args -r __ns:=/NAMESPACE.
 '''
 
 
@@ -42,7 +43,8 @@ def _topics(args: argparse.Namespace) -> int:
 
     with observer(args.ros_arguments) as graph:
         for name, kinds, n_publishers, n_subscribers in topics(graph):
-            print(f'{name}  {kinds}  {n_publishers} publishers, {n_subscribers} subscribers')
+            print(f'{name}  {kinds}  {quantity(n_publishers, "publisher")}, '
+                  f'{quantity(n_subscribers, "subscriber")}')
     return 0
 
 
@@ -63,11 +65,11 @@ def _echo(args: argparse.Namespace) -> int:
             # The reader has closed the pipe (`| head`). Python would report it again at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return False
-        return not seen and n != args.count
+        return not signals and n != args.count
 
-    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
         with observer(args.ros_arguments) as graph:
-            receive_messages(graph, args.topic, show, lambda: bool(seen))
+            receive_messages(graph, args.topic, show, lambda: bool(signals))
     return 0
 
 

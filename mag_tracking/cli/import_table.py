@@ -4,12 +4,13 @@ import argparse
 from pathlib import Path
 
 from mag_tracking.cli.options import Commands, add_command
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import SettingsError
 
 _IMPORT = '''
 Converts a table (CSV with a header) to a recording.
 
-Table of readings: --columns assigns the columns and --unit states the unit of the field. Each row
+Table of readings: --columns assigns the columns and --unit gives the unit of the field. Each row
 contains either one reading, with the sensor in a column (sensor, x, y, z), or one reading of each
 sensor (NAME.x, NAME.y, NAME.z). Omit axes that are not measured. A sensor with the number 3 is
 named mag_3. Write a network file with the positions of the sensors yourself; config/network.yaml
@@ -63,13 +64,13 @@ def _import(args: argparse.Namespace) -> int:
     if args.columns is None:
         recording, network, n = import_pose_table(args.table, args.background, args.out,
                                                   args.noise_std)
-        print(f'{n} readings written to {recording}, network to {network}')
+        print(f'{quantity(n, "reading")} written to {recording}, network to {network}')
         return 0
     if args.unit is None:
         raise SettingsError('import: --unit is missing; give the unit of the field')
     recording, counts = import_field_table(args.table, args.columns, args.unit, args.out,
                                            args.time_unit)
-    print(f'{sum(counts.values())} readings written to {recording}')
+    print(f'{quantity(sum(counts.values()), "reading")} written to {recording}')
     for name, n in counts.items():
         print(f'  /{name}/imu/mag  {n}')
     return 0

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from mag_tracking.cli.options import Commands, add_command, add_network
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.network.file import read_network
 from mag_tracking.network.topics import absolute, namespaces_of
 from mag_tracking.recording.reader import Recording
@@ -29,15 +30,15 @@ def _info(args: argparse.Namespace) -> int:
         for message in recording.messages():
             recording.message_counts[message.topic] += 1
     print(f'{recording.path}: {recording.size / 1e6:.2f} MB, '
-          f'{sum(recording.message_counts.values())} messages')
+          f'{quantity(sum(recording.message_counts.values()), "message")}')
     if recording.start_ns is not None and recording.end_ns is not None:
         print(f'  {(recording.end_ns - recording.start_ns) / 1e9:.2f} s')
     if not recording.message_counts:
         print('  warning: the recording contains no messages')
     for topic in sorted(recording.types):
         print(f'  {topic}  {recording.types[topic]}  {recording.message_counts[topic]}')
-    for what, n in recording.losses.items():
-        print(f'  warning: {what}: {n}')
+    for cause, n in recording.losses.items():
+        print(f'  warning: {cause}: {n}')
     if args.network:
         network = read_network(args.network)
         namespaces = namespaces_of(network.topics, recording.types) or ['/']

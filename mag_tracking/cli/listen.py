@@ -14,6 +14,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.drivers.driver import IGNORED, Driver, serve
 from mag_tracking.errors import SettingsError
@@ -26,8 +27,8 @@ Sample: TypeAlias = tuple[int, FloatArray | None]
 
 _LISTEN = '''
 Opens the devices of a drivers file and prints, once per second, the state and error counts of
-each device and the rate and field of each sensor. It needs no ROS, which makes it the first test
-of a new connection. Ctrl-C ends it. Exit status 1 if a sensor has sent no readings.
+each device and the rate and field of each sensor. The command needs no ROS and is suitable as the
+first test of a new connection. Ctrl-C ends it. Exit status 1 if a sensor has sent no readings.
 
 examples:
   mag-tracking listen config/drivers.yaml
@@ -35,7 +36,7 @@ examples:
 '''
 
 MAX_PLAUSIBLE_FIELD = 1e-3
-"""Larger fields suggest a nearby magnet or a wrong unit [T]."""
+"""[T] A larger field suggests a nearby magnet or a wrong unit."""
 
 
 def add(commands: Commands) -> None:
@@ -47,7 +48,7 @@ def add(commands: Commands) -> None:
     """
     p = add_command(commands, 'listen', _listen, _LISTEN)
     p.add_argument('drivers', type=Path, metavar='DRIVERS', help='drivers file with the devices')
-    add_network(p, False, 'check that its sensors match those of the drivers file')
+    add_network(p, False, 'check that its sensors match the drivers file')
     p.add_argument('--seconds', type=float, default=math.inf, metavar='N',
                    help='exit after N seconds (default: at Ctrl-C)')
 
@@ -57,10 +58,10 @@ class _ReadingPrinter:
 
     def __init__(self, driver: Driver) -> None:
         self.driver = driver
-        self._received: dict[str, deque[Sample]] = {
+        self._samples: dict[str, deque[Sample]] = {
             sensor: deque(maxlen=20_000) for sensor in driver.sensors.values()
             if sensor != IGNORED}
-        self.silent = set(self._received)
+        self.silent_sensors = set(self._samples)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=serve, daemon=True, args=(
             driver, self._add, self._stop.is_set))
@@ -70,9 +71,9 @@ class _ReadingPrinter:
         """Store received samples."""
         for name, stamp, field in zip(readings.sensor_names(), readings.stamp_ns.tolist(),
                                       readings.field, strict=True):
-            self._received[name].append((stamp, field))
+            self._samples[name].append((stamp, field))
         for a in accelerations:
-            self._received[a.sensor].append((a.stamp_ns, None))
+            self._samples[a.sensor].append((a.stamp_ns, None))
 
     def stop(self) -> None:
         """Close the device."""
@@ -82,38 +83,38 @@ class _ReadingPrinter:
     def lines(self, elapsed_s: float) -> list[str]:
         """Describe the state of the device and the samples received since the last call."""
         counts = self.driver.counts()
-        errors = ', '.join(f'{what}: {n}' for what, n in sorted(counts.items())
-                           if not what.startswith('samples: '))
-        state = self.driver.fault or ('open' if self.driver.is_open else 'not open yet')
+        errors = ', '.join(f'{count}: {n}' for count, n in sorted(counts.items())
+                           if not count.startswith('samples: '))
+        state = self.driver.fault or ('open' if self.driver.is_open else 'opening')
         out = [f'{self.driver.name}: {state}' + (f'  ({errors})' if errors else '')]
-        for sensor, queue in self._received.items():
+        for sensor, queue in self._samples.items():
             samples = [queue.popleft() for _ in range(len(queue))]
             if not samples:
                 out.append(f'  {sensor:12s} no readings')
                 continue
-            self.silent.discard(sensor)
+            self.silent_sensors.discard(sensor)
             age_ms = (time.time_ns() - max(stamp for stamp, _ in samples)) / 1e6
-            out.append(f'  {sensor:12s} {_sample_text(samples, elapsed_s)}  latest {age_ms:.0f} ms '
+            out.append(f'  {sensor:12s} {_sample_line(samples, elapsed_s)}  latest {age_ms:.0f} ms '
                        'ago')
         return out
 
 
-def _sample_text(samples: Sequence[Sample], elapsed_s: float) -> str:
-    """Rate, mean field and warnings of the samples of one sensor, in one line."""
+def _sample_line(samples: Sequence[Sample], elapsed_s: float) -> str:
+    """Format rate, mean field and warnings of the samples of one sensor."""
     fields = np.array([field for _, field in samples if field is not None])
     if not len(fields):
         return f'{len(samples) / elapsed_s:7.1f} Hz of accelerations'
     is_valid = ~np.isnan(fields)
     mean = np.array([1e6 * column[known].mean() if known.any() else np.nan
                      for column, known in zip(fields.T, is_valid.T, strict=True)])
-    text = (f'{len(fields) / elapsed_s:7.1f} Hz  ' + ' '.join(f'{v:9.3f}' for v in mean)
+    line = (f'{len(fields) / elapsed_s:7.1f} Hz  ' + ' '.join(f'{v:9.3f}' for v in mean)
             + f' uT  |B| {np.sqrt(np.nansum(mean**2)):8.3f}')
-    missing = fields.size - np.count_nonzero(is_valid)
-    if missing and is_valid.any(axis=0).all():
-        text += f'  {missing} values missing'
+    n_missing = fields.size - np.count_nonzero(is_valid)
+    if n_missing and is_valid.any(axis=0).all():
+        line += f'  {quantity(n_missing, "value")} missing'
     if np.nanmax(np.abs(fields), initial=0.0) > MAX_PLAUSIBLE_FIELD:
-        text += '  (very large; check `unit`)'
-    return text
+        line += '  (very large; check `unit`)'
+    return line
 
 
 def _listen(args: argparse.Namespace) -> int:
@@ -123,15 +124,15 @@ def _listen(args: argparse.Namespace) -> int:
     network = read_network(args.network) if args.network else None
     printers = [_ReadingPrinter(driver) for driver in read_drivers(args.drivers, network)]
     end = time.monotonic() + args.seconds
-    last = time.monotonic()
-    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
-        while not seen and last < end:
-            while not seen and time.monotonic() < min(last + 1.0, end):
+    last_report = time.monotonic()
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
+        while not signals and last_report < end:
+            while not signals and time.monotonic() < min(last_report + 1.0, end):
                 time.sleep(0.02)
             now = time.monotonic()
-            for line in [line for printer in printers for line in printer.lines(now - last)]:
+            for line in [line for printer in printers for line in printer.lines(now - last_report)]:
                 print(line, flush=True)
-            last = now
+            last_report = now
     for printer in printers:
         printer.stop()
-    return int(any(printer.silent for printer in printers))
+    return int(any(printer.silent_sensors for printer in printers))

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from mag_tracking.apps.view import view
 from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
@@ -21,11 +22,11 @@ from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK, PageServer, che
 
 _PAGE = '''
 Open the printed address in a browser. The page shows a map with tracks, 90% regions and
-hypotheses, the fields of the sensors, and the health of the system. It is available on this
+hypotheses, the fields of the sensors, and the health of the system. The page is available on this
 machine only; --host 0.0.0.0 also serves it to other machines, which need the token in the address.
 '''
 _VIEW = f'''
-Tracks a recording in real time and shows it on a live page. Ctrl-C ends it.
+Tracks a recording in real time and shows the result on a live page. Ctrl-C ends the command.
 {_PAGE}
 example:
   mag-tracking view junction.mcap --network config/network.yaml
@@ -76,7 +77,7 @@ def add_page(parser: argparse.ArgumentParser, port: bool = True) -> None:
 
 
 def _print_flushed(line: str) -> None:
-    """Print a line without buffering."""
+    """Print a line and flush stdout."""
     print(line, flush=True)
 
 
@@ -87,15 +88,15 @@ def _view(args: argparse.Namespace) -> int:
     network, settings = recorded_network(args), settings_of(args)
     recording = Recording(args.recording)
     scene = LiveScene(args.recording.name, network)
-    scene.subtitle = f'{len(network)} sensors, frame {network.frame}'
-    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen, \
+    scene.subtitle = f'{quantity(len(network), "sensor")}, frame {network.frame}'
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, \
             PageServer(scene, args.host, args.port) as server:
         _print_flushed(f'live page: {server.url}')
         view(recording, network, settings, scene, args.rate,
-             lambda: bool(seen) or not server.is_serving)
-        if not seen:
+             lambda: bool(signals) or not server.is_serving)
+        if not signals:
             _print_flushed('end of the recording; the page remains available until Ctrl-C')
-        while not seen and server.is_serving:
+        while not signals and server.is_serving:
             time.sleep(0.1)
         return 0 if server.is_serving else 1
 
@@ -105,21 +106,21 @@ def _watch(args: argparse.Namespace) -> int:
     # Imported here because it needs ROS.
     from mag_tracking.nodes.page_node import watch
 
-    ended = _ended_input() if args.until_eof else None
+    end_of_input = _end_of_input_event() if args.until_eof else None
     return watch(args.host, args.port, _print_flushed, args.ros_arguments,
-                 ended.is_set if ended is not None else lambda: False)
+                 end_of_input.is_set if end_of_input is not None else lambda: False)
 
 
-def _ended_input() -> threading.Event:
-    """Event that is set at the end of stdin, which means that the parent process has ended."""
-    ended = threading.Event()
+def _end_of_input_event() -> threading.Event:
+    """Return an event that is set at the end of stdin, when the parent process has ended."""
+    end_of_input = threading.Event()
 
     def read() -> None:
         sys.stdin.read()
-        ended.set()
+        end_of_input.set()
 
     threading.Thread(target=read, daemon=True).start()
-    return ended
+    return end_of_input
 
 
 @contextmanager
@@ -129,10 +130,11 @@ def page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator
     Parameters
     ----------
     host : str
-        Local address.
+        Local address of the page.
     port : int
+        Port of the page.
     ros_arguments : sequence of str
-        Arguments for ROS, beginning with --ros-args.
+        ROS arguments; the first is `--ros-args`.
 
     Yields
     ------

@@ -1,4 +1,4 @@
-"""Options shared by several commands; those of the tracker are in `tracking_options`."""
+"""Options shared by several commands; see `tracking_options` for the options of the tracker."""
 
 import argparse
 import dataclasses
@@ -54,6 +54,7 @@ def add_network(parser: argparse._ActionsContainer, required: bool = True,
     ----------
     parser : argparse container
     required : bool
+        Whether the option is required.
     text : str
         Help text.
     """
@@ -69,7 +70,8 @@ def add_recorded_network(parser: argparse._ActionsContainer) -> None:
     """
     add_network(parser)
     parser.add_argument('--namespace', metavar='NAMESPACE', help='namespace of the relative topics '
-                        'in the network file (e.g. /robot1), if the recording contains several')
+                        'in the network file (e.g. /robot1), if the recording contains several '
+                        'namespaces')
 
 
 def recorded_network(args: argparse.Namespace) -> SensorNetwork:
@@ -78,7 +80,7 @@ def recorded_network(args: argparse.Namespace) -> SensorNetwork:
     Parameters
     ----------
     args : argparse.Namespace
-        With the options of `add_recorded_network`.
+        Parsed arguments with the options of `add_recorded_network`.
 
     Returns
     -------
@@ -116,7 +118,7 @@ def distinct_names(paths: Iterable[Path]) -> list[str]:
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
         raise OutputError(f'several recordings are named {duplicates[0]}: their results would '
-                          'overwrite each other; run the command once for each')
+                          'overwrite each other; run the command once per recording')
     return names
 
 
@@ -126,7 +128,7 @@ def now() -> str:
     Returns
     -------
     str
-        UTC, ISO 8601.
+        Time in UTC, ISO 8601.
     """
     return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
 
@@ -148,7 +150,7 @@ def check_writable(path: Path | None) -> None:
     Parameters
     ----------
     path : Path or None
-        None is accepted.
+        None is not checked.
 
     Raises
     ------
@@ -162,12 +164,12 @@ def check_writable(path: Path | None) -> None:
 
 
 def check_report(args: argparse.Namespace, *others: Path | None) -> None:
-    """Check that the report can be written and does not replace another file.
+    """Check that the report can be written without replacing another file of the command.
 
     Parameters
     ----------
     args : argparse.Namespace
-        With the option of `add_report`.
+        Parsed arguments with the option of `add_report`.
     *others : Path or None
         Other input and output files of the command.
 
@@ -192,6 +194,7 @@ def check_outputs(args: argparse.Namespace) -> None:
     Parameters
     ----------
     args : argparse.Namespace
+        Parsed arguments with --out and --figure.
 
     Raises
     ------

@@ -20,8 +20,9 @@ from mag_tracking.settings import read_parameter_file
 _PLAN = '''
 Predicts, before installation, the position accuracy, the detection probability, and the best place
 for an additional sensor. The accuracies are Cramer-Rao bounds for a point target at constant
-speed: a good estimator approaches them, and none exceeds them. Errors beyond the noise (clocks,
-mountings, extended vehicles) are modelled as a relative error of the field (--field-error).
+speed: a good estimator approaches them, and no unbiased estimator is more accurate. Errors beyond
+the noise (clocks, mountings, extended vehicles) are modelled as a relative error of the field
+(--field-error).
 
 files written to DIR:
   plan_position.png    map: standard deviation of the position from a whole pass
@@ -80,7 +81,7 @@ def add(commands: Commands) -> None:
 
 
 def _inputs(args: argparse.Namespace, network: SensorNetwork, settings: Settings) -> PlanInputs:
-    """Inputs of the plan from the command line; raises SettingsError, naming the option."""
+    """Return the inputs of the plan; raise SettingsError that names the invalid option."""
     try:
         return plan_inputs(
             network, settings, args.target, moment=args.moment, height=args.height,
@@ -88,8 +89,8 @@ def _inputs(args: argparse.Namespace, network: SensorNetwork, settings: Settings
             rate=args.rate, field_error=args.field_error, area=args.area,
             clearance=args.clearance, grid=args.grid)
     except SettingsError as error:
-        name, _, text = str(error).partition(':')
-        raise SettingsError(f'--{name.replace("_", "-")}:{text}') from error
+        name, _, message = str(error).partition(':')
+        raise SettingsError(f'--{name.replace("_", "-")}:{message}') from error
 
 
 def _plan(args: argparse.Namespace) -> int:

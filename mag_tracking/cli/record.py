@@ -13,7 +13,7 @@ from mag_tracking.network.topics import NAME
 _RECORD = '''
 Records the magnetic fields on the topics of the network, unchanged, until Ctrl-C. The
 sensor_msgs/Imu topics of the sensors (/mag_1/imu/data_raw next to /mag_1/imu/mag) are
-recorded when they appear. DIR becomes a rosbag2 recording: MCAP files and a metadata.yaml.
+also recorded. DIR becomes a rosbag2 recording: MCAP files and a metadata.yaml.
 Messages that are lost in transport or dropped on a full disk are counted and reported;
 recording resumes in a new file when the disk has space. After a crash, less than a second
 is missing; `mag-tracking repair DIR` then rebuilds the index.
@@ -38,9 +38,9 @@ def add(commands: Commands) -> None:
     p.add_argument('--out', required=True, type=Path, metavar='DIR',
                    help='output folder')
     p.add_argument('--topics', nargs='+', default=[], metavar='TOPIC',
-                   help='record these topics as well')
+                   help='also record these topics')
     p.add_argument('--results', action='store_true',
-                   help='record the results of the nodes as well (tracks, detections, calibrated '
+                   help='also record the results of the nodes (tracks, detections, calibrated '
                    'fields)')
     p.add_argument('--all', action='store_true', help='record all topics')
     p.add_argument('--split-mb', type=float, default=1000.0, metavar='N',

@@ -19,6 +19,7 @@ from mag_tracking.cli.options import (
     distinct_names,
     recorded_network,
 )
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
@@ -44,8 +45,8 @@ files written to DIR:
   report.html         interactive report: map, time slider, curves, tables
   *_track_N.png       figures: map, weights, measured and predicted field
 
-With several recordings, each has its own folder in DIR. Results of an earlier run are replaced
-and its figures are removed; other files in the folder are kept.
+With several recordings, each has its own folder in DIR. Results of a previous run are replaced and
+its figures are removed; other files in the folder are kept.
 
 examples:
   mag-tracking replay junction.mcap --network config/network.yaml --out out
@@ -103,24 +104,24 @@ def _replay(args: argparse.Namespace) -> int:
     names = distinct_names(args.recordings)
     if args.rerun:
         check_rerun()
-    with recorded_signals(signal.SIGINT) as seen:
+    with recorded_signals(signal.SIGINT) as signals:
         for path, name in zip(args.recordings, names, strict=True):
             out = args.out / name if len(args.recordings) > 1 else args.out
-            _replay_one(path, network, settings, out, seen, args)
-            if seen:
+            _replay_one(path, network, settings, out, signals, args)
+            if signals:
                 print(f'interrupted; partial results in {out}')
                 return 130
     return 0
 
 
 def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Path,
-                seen: Sequence[int], args: argparse.Namespace) -> None:
+                signals: Sequence[int], args: argparse.Namespace) -> None:
     """Replay one recording into one folder; an interrupted run leaves partial results."""
     recording = Recording(path)
     with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
               disable=None) as bar:
-        run = replay(recording, network, settings, out, bar.update, lambda: bool(seen), tqdm.write,
-                     args.truth)
+        run = replay(recording, network, settings, out, bar.update, lambda: bool(signals),
+                     tqdm.write, args.truth)
     _print_summary(path, run.summary, bool(run.truth))
     if args.tum:
         write_trajectories(run, out)
@@ -128,16 +129,17 @@ def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Pat
         write_rerun(out / RERUN_FILE, network, run.logs, run.smoothed)
     write_report(run, network, out)
     if not args.no_figures:
-        write_figures(run, network, out, stopped=lambda: bool(seen))
-    if not seen:
+        write_figures(run, network, out, stopped=lambda: bool(signals))
+    if not signals:
         print(f'{_overview(path, run.summary)}; results in {out}')
 
 
 def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None:
     """Print counts, notes and tracks of a run."""
-    print(f'{path.name}: {summary["counts"]["align"].get("frames", 0)} frames, '
-          f'{summary["counts"]["detect"].get("onsets", 0)} detections, '
-          f'{len(summary["tracks"])} tracks')
+    counts = summary['counts']
+    print(f'{path.name}: {quantity(counts["align"].get("frames", 0), "frame")}, '
+          f'{quantity(counts["detect"].get("onsets", 0), "detection")}, '
+          f'{quantity(len(summary["tracks"]), "track")}')
     for note in notes_of(summary):
         print(f'  {"warning: " if note.level == WARNING else ""}{note.text}')
     for t in summary['tracks']:
@@ -147,22 +149,23 @@ def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None
 
 
 def _overview(path: Path, summary: dict[str, Any]) -> str:
-    """Name of the recording and number of its tracks, by verdict."""
+    """Format the name of the recording and the number of its tracks by verdict."""
     verdicts = Counter(t['verdict'] for t in summary['tracks'])
-    text = ', '.join(f'{n} {verdict}' for verdict, n in verdicts.most_common())
-    n = len(summary['tracks'])
-    return f'{path.name}: {n} track{"" if n == 1 else "s"}' + (f' ({text})' if text else '')
+    counts = ', '.join(f'{n} {verdict}' for verdict, n in verdicts.most_common())
+    return (f'{path.name}: {quantity(len(summary["tracks"]), "track")}'
+            + (f' ({counts})' if counts else ''))
 
 
 def _print_track(t: dict[str, Any]) -> None:
-    """Print a track: overview, doubts, independent speed, mounting and errors."""
-    print(f'  track {t["id"]}: {t["poses"]} poses'
+    """Print a track: overview, doubts, velocity from the delay, mounting and errors."""
+    print(f'  track {t["id"]}: {quantity(t["poses"], "pose")}'
           + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
              if t['arrival'] else '')
           + (f', {t["kind"]} ({t["kind_weight"]:.0%})' if t['kind'] else '')
           + f', {t["speed"]:.2f} m/s, {t["moment_size"]:.3g} A m^2, {t["verdict"]}')
     for doubt, n in t['doubts'].items():
-        print(f'    ambiguous in {n} of {t["poses"]} poses: {MEANINGS[doubt]} ({doubt})')
+        print(f'    ambiguous in {n} of {quantity(t["poses"], "pose")}: {MEANINGS[doubt]} '
+              f'({doubt})')
     delay = t.get('delay', {})
     if 'speed' in delay:
         print(f'    velocity from the delay between sensors: {delay["speed"]:.2f} '
@@ -180,6 +183,6 @@ def _print_track(t: dict[str, Any]) -> None:
                   'orientation in the network file is wrong, or the target differs from the '
                   'model')
     truth = t.get('truth', {})
-    for name, (text, unit) in TRUTH_METRICS.items():
+    for name, (description, unit) in TRUTH_METRICS.items():
         if isinstance(truth.get(name), float):
-            print(f'    against {truth["name"]}: {text}: {truth[name]:.4g}{unit}')
+            print(f'    against {truth["name"]}: {description}: {truth[name]:.4g}{unit}')

@@ -1,4 +1,4 @@
-"""Options of the commands that track, and the settings that they select."""
+"""Options of tracking commands, and the settings that they select."""
 
 import argparse
 from pathlib import Path
@@ -26,7 +26,7 @@ def settings_of(args: argparse.Namespace) -> Settings:
     Parameters
     ----------
     args : argparse.Namespace
-        With the options of `add_settings`.
+        Parsed arguments with the options of `add_settings`.
 
     Returns
     -------

@@ -21,6 +21,7 @@ from mag_tracking.cli.options import (
     distinct_names,
     recorded_network,
 )
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.files import output_folder
@@ -47,7 +48,7 @@ the network; the settings traffic.line_* define other lines. A vehicle is counte
 has ended. Ambiguous passages are counted and marked.
 
 With --out, writes passages.csv (one row per vehicle) and intervals.csv (counts and mean speeds per
-interval, direction and class) to DIR, and the same as Parquet if pyarrow is installed.
+interval, direction and class) to DIR, and the same tables as Parquet if pyarrow is installed.
 
 With --fleet, enrolled vehicles are recognised by the hard and soft iron of their moments.
 --enrol NAME adds the only vehicle of each recording to the fleet file. A vehicle enrolled at
@@ -87,31 +88,32 @@ def _traffic(args: argparse.Namespace) -> int:
     tables: dict[str, list[dict[str, Any]]] = {'passages': [], 'intervals': []}
     fleet = _fleet(args, network)
     enrolled: list[FleetPass] = []
-    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
         for name, recording in zip(names, recordings, strict=True):
-            if seen:
+            if signals:
                 break
             with tqdm(total=recording.size, unit='B', unit_scale=True, desc=recording.path.name,
                       disable=None) as bar:
                 result = count_traffic(recording, network, settings, bar.update,
-                                       lambda: bool(seen))
-            if args.enrol is not None and not seen:
+                                       lambda: bool(signals))
+            if args.enrol is not None and not signals:
                 enrolled.append(pass_of(name, [v.passage for v in result.vehicles]))
-            found = [None if fleet is None else fleet.identify(v.passage)
-                     for v in result.vehicles]
-            _print(name, result, recording, found)
+            identifications = [None if fleet is None else fleet.identify(v.passage)
+                              for v in result.vehicles]
+            _print(name, result, recording, identifications)
             tables['passages'] += [
-                passage_row(name, v.passage, result.class_names, _delay(v), _vehicle(who))
-                for v, who in zip(result.vehicles, found, strict=True)]
+                passage_row(name, v.passage, result.class_names, _delay(v),
+                            _vehicle(identification))
+                for v, identification in zip(result.vehicles, identifications, strict=True)]
             tables['intervals'] += [row for s in result.summaries for row in summary_rows(name, s)]
             if args.out is not None:
                 # Written after each recording, so that an interruption loses nothing.
                 write_traffic(args.out, tables, tables_of(result.class_names, fleet is not None))
-    if args.enrol is not None and not seen:
+    if args.enrol is not None and not signals:
         _enrol(args, network, enrolled)
     if args.out is not None:
         print(f'tables in {args.out}')
-    if seen:
+    if signals:
         print('interrupted: the results cover only the part read so far')
         return 130
     return 0
@@ -131,7 +133,7 @@ def _recordings(args: argparse.Namespace, network: SensorNetwork) -> list[Record
 
 
 def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
-    """Enrolled vehicles to recognise; None without --fleet and while enrolling."""
+    """Read the enrolled vehicles to recognise; None without --fleet or with --enrol."""
     if args.enrol is not None:
         if args.fleet is None:
             raise SettingsError('--enrol: give the fleet file with --fleet')
@@ -155,35 +157,36 @@ def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetP
     print(f'{args.fleet}: {args.enrol} is recognised at {at} (passes: {len(fleet[args.enrol])})')
 
 
-def _vehicle(found: Identification | None) -> dict[str, Any]:
-    """Columns of the enrolled vehicle; empty without a fleet."""
-    return {} if found is None else {
-        'vehicle': found.name, 'p_vehicle': found.probabilities.get(found.name, np.nan)}
+def _vehicle(identification: Identification | None) -> dict[str, Any]:
+    """Table columns of the identified vehicle; empty without a fleet."""
+    return {} if identification is None else {
+        'vehicle': identification.name,
+        'p_vehicle': identification.probabilities.get(identification.name, np.nan)}
 
 
 def _delay(vehicle: CountedVehicle) -> dict[str, Any]:
-    """Columns of the speed from the delay between sensors."""
+    """Table columns of the speed from the delay between sensors."""
     return {'delay_speed': vehicle.delay.speed, 'sd_delay_speed': vehicle.delay.speed_std,
             'speeds_contradict': vehicle.speeds_contradict}
 
 
 def _print(name: str, result: TrafficResult, recording: Recording,
-           found: Sequence[Identification | None]) -> None:
+           identifications: Sequence[Identification | None]) -> None:
     """Print one line per vehicle of a recording, the counts, and warnings."""
-    for vehicle, who in zip(result.vehicles, found, strict=True):
-        known = '' if who is None else f', vehicle {who.name}'
-        print(f'{line_of(vehicle)}{known}')
+    for vehicle, identification in zip(result.vehicles, identifications, strict=True):
+        identity = '' if identification is None else f', vehicle {identification.name}'
+        print(f'{line_of(vehicle)}{identity}')
     total = Counter((v.passage.line, DIRECTIONS[v.passage.forward], v.passage.vehicle_class)
                     for v in result.vehicles)
-    print(f'{name}: {len(result.vehicles)} vehicles')
+    print(f'{name}: {quantity(len(result.vehicles), "vehicle")}')
     for (line, direction, vehicle_class), n in sorted(total.items()):
         print(f'  {line}, {direction}, {vehicle_class}: {n}')
     doubtful = sum(v.passage.ambiguous for v in result.vehicles)
     warnings = {**({'ambiguous passages': doubtful} if doubtful else {}),
-                **{what: n for what, n in result.counts.items() if n and what != 'passages'},
+                **{cause: n for cause, n in result.counts.items() if n and cause != 'passages'},
                 **result.rejections, **recording.losses}
-    for what, n in warnings.items():
-        print(f'  warning: {what}: {n}')
+    for cause, n in warnings.items():
+        print(f'  warning: {cause}: {n}')
     for topic in result.missing_topics:
         print(f'  warning: no messages on {topic}')
     for sensor in result.sensors_without_background:
@@ -207,14 +210,14 @@ def line_of(vehicle: CountedVehicle) -> str:
     str
     """
     p = vehicle.passage
-    at = datetime.fromtimestamp(p.stamp_ns / NS, tz=timezone.utc)
+    time = datetime.fromtimestamp(p.stamp_ns / NS, tz=timezone.utc)
     error = '' if np.isnan(p.direction_error) else f' (error probability {p.direction_error:.3f})'
-    known = f'{p.vehicle_class} ({p.class_probabilities.max():.0%})'
+    vehicle_class = f'{p.vehicle_class} ({p.class_probabilities.max():.0%})'
     length = f', {p.length:.1f} m' if p.length else ''
     headway = '' if np.isnan(p.headway) else f', headway {p.headway:.1f} s'
     delay = '' if vehicle.delay.reason else f', {vehicle.delay.speed:.1f} m/s from the delay'
     contradiction = ', speeds contradict each other' if vehicle.speeds_contradict else ''
     doubts = f', doubts: {", ".join(p.doubts)}' if p.doubts else ''
-    return (f'{p.number} {at:%H:%M:%S}.{at.microsecond // 10000:02d} {p.line}: '
+    return (f'{p.number} {time:%H:%M:%S}.{time.microsecond // 10000:02d} {p.line}: '
             f'{DIRECTIONS[p.forward]}{error}, {p.speed:.1f} ± {p.speed_std:.1f} m/s{delay}, '
-            f'{known}{length}{headway}{contradiction}{doubts}')
+            f'{vehicle_class}{length}{headway}{contradiction}{doubts}')

@@ -16,6 +16,7 @@ from mag_tracking.cli.options import (
     now,
     recorded_network,
 )
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import write_network
@@ -60,26 +61,27 @@ def _tumble(args: argparse.Namespace) -> int:
         raise SettingsError(f'--field-size: expected 1e-6 to 1e-3 T, got {args.field_size:g}')
     network, recording = recorded_network(args), Recording(args.recording)
     check_outputs(args)
-    with recorded_signals(signal.SIGINT) as seen:
+    with recorded_signals(signal.SIGINT) as signals:
         with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
                   disable=None) as bar:
-            found, fits, readings, _ = tumble(recording, network, args.sensor, now(),
-                                              args.field_size, bar.update, lambda: bool(seen))
+            calibrated, fits, readings, _ = tumble(
+                recording, network, args.sensor, now(), args.field_size, bar.update,
+                lambda: bool(signals))
     for name, fit in fits.items():
         _print_fit(name, fit)
-    for what, n in recording.losses.items():
-        print(f'  warning: {what}: {n}')
-    good = [name for name, fit in fits.items() if fit.converged]
-    if seen or not good:
-        print('interrupted: nothing was written' if seen else 'nothing was written')
-        return 130 if seen else 1
-    write_network(args.out, found, f'{", ".join(good)} tumbled in {args.recording.name}; based on '
-                  f'{args.network.name}.')
+    for cause, n in recording.losses.items():
+        print(f'  warning: {cause}: {n}')
+    converged = [name for name, fit in fits.items() if fit.converged]
+    if signals or not converged:
+        print('interrupted: nothing was written' if signals else 'nothing was written')
+        return 130 if signals else 1
+    write_network(args.out, calibrated, f'{", ".join(converged)} tumbled in '
+                  f'{args.recording.name}; based on {args.network.name}.')
     if args.figure is not None:
         from mag_tracking.report.calibration_figures import tumble_figure
         from mag_tracking.report.figure_file import save_figure
 
-        save_figure(tumble_figure({name: fits[name] for name in good}, readings), args.figure)
+        save_figure(tumble_figure({name: fits[name] for name in converged}, readings), args.figure)
     print(f'network written to {args.out}')
     return 0
 
@@ -93,6 +95,7 @@ def _print_fit(name: str, fit: EllipsoidFit) -> None:
                           zip(fit.offset, fit.offset_std, strict=True))
         print(f'{name}: scatter of the field magnitude {100 * fit.residual:.2f}% (uncorrected '
               f'{100 * fit.residual_before:.1f}%); offset {offset} uT; coverage '
-              f'{fit.coverage:.2f}; {fit.n_readings} readings, {fit.n_outliers} outliers')
-    for text in fit.warnings:
-        print(f'  warning: {name}: {text}')
+              f'{fit.coverage:.2f}; {quantity(fit.n_readings, "reading")}, '
+              f'{quantity(fit.n_outliers, "outlier")}')
+    for warning in fit.warnings:
+        print(f'  warning: {name}: {warning}')

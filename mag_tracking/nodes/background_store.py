@@ -17,7 +17,7 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 
 WRITE_EVERY_S = 5.0
-"""[s] Maximum interval between writes; shorter if `calibrate.max_resume_gap_s` is short."""
+"""[s] Maximum interval between writes; less if `calibrate.max_resume_gap_s` is short."""
 
 
 class BackgroundStore:
@@ -37,12 +37,12 @@ class BackgroundStore:
                  logger: RcutilsLogger) -> None:
         self._path, self._stage, self._settings = path, stage, settings
         self._logger = logger
-        self._texts: dict[str, str] = {}
-        self._written: frozenset[str] = frozenset()
+        self._entries: dict[str, str] = {}
+        self._written_sensors: frozenset[str] = frozenset()
         self._next_write = 0.0
 
     def restore(self, network: SensorNetwork) -> None:
-        """Offer the stored backgrounds to the stage; its first readings decide whether to use them.
+        """Pass the stored backgrounds to the stage, which checks them against the first readings.
 
         Parameters
         ----------
@@ -51,21 +51,21 @@ class BackgroundStore:
         if self._path is None:
             return
         try:
-            kept, refused = read_backgrounds(self._path, network, self._settings)
+            restored, rejected = read_backgrounds(self._path, network, self._settings)
         except RecordingError as error:
             self._logger.warning(f'stored backgrounds are not used: {error}')
             return
-        for name, why in refused.items():
+        for name, why in rejected.items():
             self._logger.warning(f'{name}: the stored background is not used: {why}')
-        self._stage.resume(kept)
-        if kept:
+        self._stage.resume(restored)
+        if restored:
             self._logger.info(
-                f'stored backgrounds of {", ".join(kept)} are restored for sensors whose readings '
-                f'resume within {self._settings.max_resume_gap_s:g} s of the stored ones; call '
-                '~/calibrate to learn them again')
+                f'the stored backgrounds of {", ".join(restored)} are used if the readings '
+                f'resume within {self._settings.max_resume_gap_s:g} s; call ~/calibrate to learn '
+                'the backgrounds again')
 
     def update(self, network: SensorNetwork, j: int) -> None:
-        """Add the current background of a sensor; it is dropped from the file if it is unknown.
+        """Update the entry of a sensor; remove the entry if the background is unknown.
 
         Parameters
         ----------
@@ -74,42 +74,43 @@ class BackgroundStore:
             Index of the sensor.
         """
         name = network.names[j]
-        kept = None if self._path is None else self._stage.stored(name)
-        if kept is None:
-            self._texts.pop(name, None)
+        background = None if self._path is None else self._stage.stored(name)
+        if background is None:
+            self._entries.pop(name, None)
         else:
-            self._texts[name] = background_text(kept, network, j, self._settings)
+            self._entries[name] = background_text(background, network, j, self._settings)
 
     def write_if_due(self, is_live: bool) -> None:
-        """Write the file if the interval is over or a background has become known.
+        """Write the file if the interval has elapsed or a background has become known.
 
         Parameters
         ----------
         is_live : bool
-            False for readings of a recording: nothing is written.
+            Whether the readings are live. During a replay, nothing is written.
         """
         now = time.monotonic()
-        is_new = not self._texts.keys() <= self._written
+        is_new = not self._entries.keys() <= self._written_sensors
         if self._path is None or not is_live or now < self._next_write and not is_new:
             return
         self._next_write = now + min(WRITE_EVERY_S, self._settings.max_resume_gap_s / 4.0)
         try:
-            write_backgrounds(self._path, self._texts)
-            self._written = frozenset(self._texts)
+            write_backgrounds(self._path, self._entries)
+            self._written_sensors = frozenset(self._entries)
         except OutputError as error:
             self._logger.warning(f'backgrounds cannot be stored for a restart: {error}',
                                  throttle_duration_sec=60.0)
 
     def drop(self, sensors: Iterable[str], is_live: bool) -> None:
-        """Remove sensors from the file.
+        """Remove the backgrounds of sensors from the file.
 
         Parameters
         ----------
         sensors : iterable of str
+            Names of the sensors.
         is_live : bool
-            False for readings of a recording: the file is left unchanged.
+            Whether the readings are live. During a replay, the file is not changed.
         """
         for name in sensors:
-            self._texts.pop(name, None)
+            self._entries.pop(name, None)
         self._next_write = 0.0
         self.write_if_due(is_live)

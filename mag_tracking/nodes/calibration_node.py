@@ -1,4 +1,4 @@
-"""calibration_node: converts raw magnetic fields to calibrated ones."""
+"""calibration_node: converts raw magnetic fields to calibrated fields."""
 
 if __name__ == '__main__':
     # Does not return. Without this, a signal during the imports below would cause a traceback.
@@ -57,11 +57,11 @@ from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.survey.stage import Survey
 
 MIN_STEP_S = 0.01
-"""[s] Minimum interval between the steps of a round over the sensors. A round takes one second
-unless there are too many sensors for that."""
+"""[s] Minimum interval between the steps of a round over the sensors. A round takes one second, or
+longer if there are many sensors."""
 DEFERRED_S = 0.0055
-"""[s] Delay of deferred work after a batch of readings has been published. A pose of a hundred
-sensors takes about that long to compute, and until then the tracker needs the processor cores."""
+"""[s] Delay of deferred work after a batch of readings has been published. During this time, the
+tracker needs the processor cores: it computes a pose from a hundred sensors."""
 
 
 class CalibrationNode(StageNode):
@@ -97,8 +97,8 @@ class CalibrationNode(StageNode):
             lambda status: self.publish_statuses([status]), self._publish_states)
         steady_timer(self, max(1.0 / (2 * len(self.network) + 3), MIN_STEP_S),
                      self._rounds.tick)
-        paced_service(self, CalibrateService, '~/calibrate', self._calibrate)
-        paced_service(self, SurveyMessage, '~/survey', self._solve)
+        paced_service(self, CalibrateService, '~/calibrate', self._handle_calibrate)
+        paced_service(self, SurveyMessage, '~/survey', self._handle_survey)
         self.report_state()
 
     def _connect(self) -> None:
@@ -141,23 +141,23 @@ class CalibrationNode(StageNode):
         path = self._output_path('state_file', name)
         if path.exists() and not is_background_file(path):
             raise SettingsError(f'calibration_node: parameter state_file: {path} exists and is not '
-                                'a file of backgrounds; choose another name, or delete it')
+                                'a background file; choose another name, or delete it')
         return path
 
     def _output_path(self, parameter: str, name: str) -> Path:
-        """Path of an output file; raise SettingsError unless it is in an allowed folder."""
+        """Return the path of an output file; raise SettingsError if its folder is not allowed."""
         prefix = f'calibration_node: parameter {parameter}: '
-        beside, below = self.network_path.parent, state_folder().resolve()
-        path = checked_path(beside / name, SettingsError)
+        network_folder, state_root = self.network_path.parent, state_folder().resolve()
+        path = checked_path(network_folder / name, SettingsError)
         folder = path.parent.resolve()
         if not path.name or path.name == '..' or path.is_dir():
             raise SettingsError(f'{prefix}{name!r} is not a file name')
         if folder / path.name == self.network_path:
             raise SettingsError(f'{prefix}{path} is the network file, which must not be '
                                 'overwritten')
-        if folder != beside and not folder.is_relative_to(below):
+        if folder != network_folder and not folder.is_relative_to(state_root):
             raise SettingsError(f'{prefix}{path} must be in the folder of the network file, '
-                                f'{beside}, or below {below}')
+                                f'{network_folder}, or below {state_root}')
         return folder / path.name
 
     def _survey_path(self) -> Path:
@@ -177,7 +177,7 @@ class CalibrationNode(StageNode):
         return {'calibrate': self._stage, 'survey': self._survey}
 
     def state(self) -> str:
-        """State of the node: waiting for sensors, learning backgrounds, ready, or several of these.
+        """State of the node: waiting for sensors, learning backgrounds, ready, or a combination.
 
         Returns
         -------
@@ -195,24 +195,24 @@ class CalibrationNode(StageNode):
         return ', '.join(parts)
 
     def queues(self) -> dict[str, int]:
-        """Number of readings that are held back.
+        """Number of queued readings.
 
         Returns
         -------
         dict of str to int
-            By stage name.
+            Number by name of the stage.
         """
         return {'calibrate': self._stage.n_held}
 
     def _is_live(self) -> bool:
-        """Whether the readings are live, not of a recording."""
+        """Whether the readings are live and not replayed from a recording."""
         return self.flows['sensors'].is_live
 
     def _receive(self, sensor: str, message: MagneticField) -> None:
         """Calibrate a raw reading and publish the result."""
         raw = reading_of(message, sensor)
         publisher = self._publishers_by_sensor[sensor]
-        for calibrated in self._calibrated(raw):
+        for calibrated in self._calibrate_readings(raw):
             if self._next_steps is None or has_subscribers(publisher):
                 for _, content in magnetic_field_dicts(calibrated, message.header.frame_id):
                     publisher.publish(to_message(MagneticField, content))
@@ -224,14 +224,14 @@ class CalibrationNode(StageNode):
         raw = self.readings_of(message, self._stage)
         if raw is None:
             return
-        for calibrated in self._calibrated(raw):
+        for calibrated in self._calibrate_readings(raw):
             if self._next_steps is None or has_subscribers(self._readings):
                 self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
         self._health_backlog.append((raw, self.now_ns))
         self._deferred.request()
 
-    def _calibrated(self, raw: Readings) -> list[Readings]:
-        """Calibrate readings and pass them to the next steps in this process."""
+    def _calibrate_readings(self, raw: Readings) -> list[Readings]:
+        """Calibrate readings; if the next steps run in this process, pass the result to them."""
         calibrated = self._stage.feed(raw)
         if self._next_steps is not None:
             detection, tracker = self._next_steps
@@ -241,7 +241,7 @@ class CalibrationNode(StageNode):
         return calibrated
 
     def _do_deferred_work(self) -> None:
-        """Run the deferred work of the stages, the health checks and a due step of the round."""
+        """Run the deferred work of the stages, the health checks, and the next step if due."""
         self._stage.idle()
         if self._next_steps is not None:
             self._next_steps[1].idle()
@@ -262,7 +262,7 @@ class CalibrationNode(StageNode):
         message.header.frame_id = self.network.frame
         self._state.publish(message)
 
-    def _calibrate(self, request: CalibrateService.Request,
+    def _handle_calibrate(self, request: CalibrateService.Request,
                    response: CalibrateService.Response) -> CalibrateService.Response:
         """Handle ~/calibrate: learn backgrounds again."""
         try:
@@ -276,9 +276,9 @@ class CalibrationNode(StageNode):
                             f'{", ".join(request.sensors) or "all sensors"} again')
         return response
 
-    def _solve(self, request: SurveyMessage.Request,
+    def _handle_survey(self, request: SurveyMessage.Request,
                response: SurveyMessage.Response) -> SurveyMessage.Response:
-        """Handle ~/survey: update orientations and clocks; running tracks keep the old ones."""
+        """Handle ~/survey: update orientations and clock offsets, except for running tracks."""
         network = self._survey_service.solve(self.network, request.save, response)
         if network is None:
             return response
@@ -289,8 +289,8 @@ class CalibrationNode(StageNode):
         self._rounds.begin(network)
         self._rounds.publish()
         self._store.drop(network.names, self._is_live())
-        for text in response.warnings:
-            self.get_logger().warning(text)
+        for warning in response.warnings:
+            self.get_logger().warning(warning)
         return response
 
 

@@ -1,8 +1,8 @@
 """Conversion of records to and from ROS messages.
 
-The content of each message is defined once, in `messages.schema`, as nested dicts; here dicts
-become message objects. ROS messages have the same attributes as decoded messages of a recording, so
-the functions that read a recording also read them.
+The content of each message is defined once, in `messages.schema`, as nested dicts. This module
+converts the dicts to message objects. ROS messages have the same attributes as decoded messages of
+a recording, so the functions that read a recording also read ROS messages.
 """
 
 import functools
@@ -45,7 +45,7 @@ def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
     cls : type
         Class of the message.
     content : mapping of str to object
-        Fields; missing ones keep their defaults.
+        Fields; a missing field keeps its default.
 
     Returns
     -------
@@ -70,14 +70,14 @@ def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
 
 @functools.cache
 def _element_class(cls: Any, name: str) -> Any:
-    """Class of the elements of the sequence `name` of a message."""
+    """Message class of the elements of the sequence field `name`."""
     element = cls.get_fields_and_field_types()[name].removeprefix('sequence<').removesuffix('>')
     package, leaf = element.split('/')
     return message_class(f'{package}/msg/{leaf}')
 
 
 def _vector(v: Any) -> FloatArray:
-    """Array (3,) of an object with x, y and z."""
+    """Array (3,) of the fields x, y and z of a message."""
     return np.array([v.x, v.y, v.z])
 
 
@@ -88,7 +88,7 @@ def track_of(message: Any, hypotheses: Any = None) -> Track:
     ----------
     message : Track message
     hypotheses : HypothesisArray message, optional
-        Hypotheses of that track; by default the best ones of each arrival direction, from
+        Hypotheses of the track; by default the best hypothesis of each arrival direction, from
         `message`.
 
     Returns

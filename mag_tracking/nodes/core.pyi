@@ -1,10 +1,10 @@
-"""Timeout for the end of the process that works even while Python is blocked; compiled."""
+"""Deadline that ends the process even while Python is blocked; compiled."""
 
 class Deadline:
     """Ends the process unless it is cancelled in time.
 
-    A native thread waits, so code that holds the interpreter lock does not delay it. When the
-    process is ended, no buffer is flushed and no `finally` runs.
+    The deadline runs in a native thread, so code that holds the interpreter lock does not delay it.
+    When the process is ended, no buffer is flushed and no `finally` block runs.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class Deadline:
         """Cancel the deadline; may be called repeatedly."""
 
 def end_within(seconds: float, status: int, message: bytes) -> None:
-    """Start a `Deadline` that cannot be cancelled; it also covers the end of the interpreter.
+    """Start a `Deadline` that cannot be cancelled; it also covers the shutdown of the interpreter.
 
     Parameters
     ----------

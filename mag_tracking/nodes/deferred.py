@@ -1,4 +1,4 @@
-"""Work that is deferred until the recipients of published results have processed them."""
+"""Work that is deferred until the subscribers have processed the published messages."""
 
 from collections.abc import Callable
 
@@ -8,10 +8,10 @@ from mag_tracking.nodes.steady_timer import steady_timer
 
 
 class Deferred:
-    """Calls a function once, after a delay during which the node is idle.
+    """Calls a function once after a delay.
 
-    On a computer with few cores, work done immediately after publishing would take a core from the
-    processes that the messages have just woken.
+    On a computer with few cores, work immediately after publishing would compete with the processes
+    that receive the messages.
 
     Parameters
     ----------
@@ -23,14 +23,14 @@ class Deferred:
 
     def __init__(self, node: Node, delay_s: float, call: Callable[[], None]) -> None:
         self._call = call
-        self._timer = steady_timer(node, delay_s, self._due, autostart=False)
+        self._timer = steady_timer(node, delay_s, self._run, autostart=False)
 
     def request(self) -> None:
         """Schedule the call, unless it is already scheduled."""
         if self._timer.is_canceled():
             self._timer.reset()
 
-    def _due(self) -> None:
-        """Call the function once."""
+    def _run(self) -> None:
+        """Stop the timer and call the function."""
         self._timer.cancel()
         self._call()

@@ -11,7 +11,7 @@ from mag_tracking.messages.types import definition, referenced_types
 
 @functools.cache
 def definition_of(type_name: str) -> str | None:
-    """Definition of a type with those of all contained types, in the format of a `ros2msg` schema.
+    """Definition of a message type and all nested types, in the format of a `ros2msg` schema.
 
     Parameters
     ----------
@@ -27,22 +27,22 @@ def definition_of(type_name: str) -> str | None:
         return definition(type_name)
     except RecordingError:
         pass
-    seen, queue, text = [type_name], [type_name], ''
+    known, queue, schema = [type_name], [type_name], ''
     while queue:
         name = queue.pop(0)
-        own = _own_text(name)
-        if own is None:
+        content = _file_content(name)
+        if content is None:
             return None
         package, _, leaf = name.split('/')
-        text += own if not text else f'{"=" * 80}\nMSG: {package}/{leaf}\n{own}'
-        new = [t for t in referenced_types(own, package) if t not in seen]
-        seen += new
+        schema += content if not schema else f'{"=" * 80}\nMSG: {package}/{leaf}\n{content}'
+        new = [t for t in referenced_types(content, package) if t not in known]
+        known += new
         queue += new
-    return text
+    return schema
 
 
-def _own_text(type_name: str) -> str | None:
-    """Text of the .msg file of a type, or None."""
+def _file_content(type_name: str) -> str | None:
+    """Content of the .msg file of a type; None if the file is not installed."""
     package, kind, leaf = type_name.split('/')
     # The wheels leave AMENT_PREFIX_PATH unset and install below sys.prefix.
     prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]

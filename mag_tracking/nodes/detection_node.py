@@ -1,4 +1,4 @@
-"""detection_node: combines calibrated fields to network frames and detects targets."""
+"""detection_node: combines calibrated fields into network frames and detects targets."""
 
 if __name__ == '__main__':
     # Does not return. Without this, a signal during the imports below would cause a traceback.
@@ -32,16 +32,16 @@ from mag_tracking.stages.stage import Stage
 
 EVENT_INTERVAL_S = 0.5
 """[s] Interval of the search for pass events while there are no frames. Otherwise the search runs
-once per frame, because it costs as much as many readings."""
+once per frame, because one search takes as long as many readings."""
 
 
 class DetectionNode(StageNode):
-    """Aligns the readings of all sensors to frames and tests each frame for a target.
+    """Aligns the readings of all sensors into frames and tests each frame for a target.
 
     Parameters
     ----------
     tracker : TrackerNode, optional
-        Tracker of the same process, which receives the frames directly. Calibrated readings are
+        Tracker in the same process, which receives the frames directly. Calibrated readings are
         then passed to `receive_readings`.
     **node_arguments
         Arguments of `StageNode`.
@@ -76,7 +76,7 @@ class DetectionNode(StageNode):
         self.report_state()
 
     def _subscribe(self) -> None:
-        """Subscribe to the calibrated fields, if the node is a process of its own."""
+        """Subscribe to the calibrated fields and monitor the tracker."""
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self.subscription(MagneticField, f'{topic}_calibrated', partial(self._receive, sensor),
                               STREAM, source='calibration')
@@ -96,15 +96,15 @@ class DetectionNode(StageNode):
         return {'align': self._align, 'detect': self._detect, **events}
 
     def queues(self) -> dict[str, int]:
-        """Number of readings that are held back.
+        """Number of queued readings.
 
         Returns
         -------
         dict of str to int
-            By stage name.
+            Number by name of the stage.
         """
-        held = {} if self._events is None else {'events': sum(map(len, self._event_backlog))}
-        return {'align': self._align.n_held, **held}
+        events = {} if self._events is None else {'events': sum(map(len, self._event_backlog))}
+        return {'align': self._align.n_held, **events}
 
     def _receive(self, sensor: str, message: MagneticField) -> None:
         """Process a calibrated reading."""
@@ -117,7 +117,7 @@ class DetectionNode(StageNode):
             self._feed(readings)
 
     def _feed(self, readings: Readings) -> None:
-        """Publish the frames and events that calibrated readings complete."""
+        """Add calibrated readings; publish the completed frames and events."""
         frames = self._align.feed(readings)
         self._publish(frames)
         if self._events is not None:
@@ -126,7 +126,7 @@ class DetectionNode(StageNode):
                 self._publish_events()
 
     def _publish_events(self) -> None:
-        """Publish the events that are completed by the readings received since the last call."""
+        """Publish the events completed by the readings received since the last call."""
         assert self._events is not None
         readings, self._event_backlog = Readings.joined(self._event_backlog), []
         for event in self._events.feed(readings):
@@ -147,7 +147,7 @@ class DetectionNode(StageNode):
                     self._publish_pending_frame()
 
     def _publish_pending_frame(self) -> None:
-        """Publish the frame that the tracker has processed, once, if it has subscribers."""
+        """Publish the pending frame once, after its pose, if the topic has subscribers."""
         frame, self._pending_frame = self._pending_frame, None
         if frame is not None and has_subscribers(self._frames):
             self._publish_frame(frame)

@@ -45,8 +45,8 @@ class DoctorNode(Node):
                                 strict=True))
         for sensor, topic in self._topics.items():
             self.create_subscription(MagneticField, topic, partial(self._receive, sensor), SENSORS)
-        self._in_batches: set[str] = set()
-        self._bad: Counter[str] = Counter()
+        self._batched_sensors: set[str] = set()
+        self._invalid_messages: Counter[str] = Counter()
         self.create_subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM)
 
     def _receive(self, sensor: str, message: MagneticField) -> None:
@@ -58,40 +58,41 @@ class DoctorNode(Node):
         try:
             readings = readings_of(message)
         except RecordingError as error:
-            self._bad[str(error)] += 1
+            self._invalid_messages[str(error)] += 1
             return
-        known = [name in self.doctor.network.names for name in readings.names]
-        readings = readings.part(np.array(known, dtype=bool)[readings.sensor])
-        self._in_batches.update(readings.sensor_names())
+        is_known = [name in self.doctor.network.names for name in readings.names]
+        readings = readings.part(np.array(is_known, dtype=bool)[readings.sensor])
+        self._batched_sensors.update(readings.sensor_names())
         self.doctor.feed(readings, time.time_ns())
 
     def findings(self) -> list[Finding]:
-        """Faults that are visible in the ROS graph only.
+        """Faults of publishers in the ROS graph and of message contents.
 
         Returns
         -------
         list of Finding
         """
         topic = self.resolve_topic_name(RAW_READINGS)
-        found = [Finding(True, topic, f'{n} invalid messages: {error}', 'check the driver that '
-                         'publishes this topic') for error, n in self._bad.items()]
+        found = [Finding(True, topic, f'{n} invalid message{"" if n == 1 else "s"}: {error}',
+                         'check the driver that publishes this topic')
+                 for error, n in self._invalid_messages.items()]
         for sensor, topic in self._topics.items():
             found += topic_findings(self, sensor, topic)
-            if sensor not in self._in_batches and not self.count_publishers(topic):
+            if sensor not in self._batched_sensors and not self.count_publishers(topic):
                 found.append(missing_publisher(self, sensor, topic, self._topics))
         return found
 
 
 @dataclass
 class DoctorResult:
-    """Result of `listening`."""
+    """Readings and faults collected by `listening`."""
 
     doctor: Doctor
-    """Has received all readings."""
+    """Doctor that has received all readings."""
     findings: list[Finding]
-    """Faults that are visible in the ROS graph only."""
+    """Result of `DoctorNode.findings`."""
     status: int = 1
-    """Exit status if the middleware does not shut down; set it once the report has been written."""
+    """Exit status if the middleware does not shut down; to be set after the report is written."""
 
 
 @contextmanager
@@ -100,7 +101,7 @@ def listening(network: SensorNetwork, settings: Settings, seconds: float,
               ) -> Iterator[DoctorResult]:
     """Receive readings for a limited time; the node is shut down when the context ends.
 
-    If the middleware hangs, the process ends there: see `shut_down`.
+    If the middleware hangs, `shut_down` ends the process.
 
     Parameters
     ----------
@@ -111,7 +112,7 @@ def listening(network: SensorNetwork, settings: Settings, seconds: float,
     stopped : function
         Returns True to stop earlier.
     ros_arguments : sequence of str, optional
-        Begin with `--ros-args`.
+        ROS arguments; the first is `--ros-args`.
 
     Yields
     ------

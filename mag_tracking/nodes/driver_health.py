@@ -12,7 +12,7 @@ from mag_tracking.nodes.status_log import StatusLog
 EXPECTED_COUNTS = ('samples: ', 'late arrivals: ', 'other messages: ', 'lines that are comments',
                    'lines without the prefix', 'lines that are empty', 'retained messages skipped',
                    'conversions overwritten', 'packets not used')
-"""Counts that begin with one of these are reported, but do not cause a warning."""
+"""Prefixes of counts that are reported but do not cause a warning."""
 
 
 class DriverDiagnostics:
@@ -25,7 +25,7 @@ class DriverDiagnostics:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._reported: dict[str, dict[str, int]] = {}
+        self._reported_counts: dict[str, dict[str, int]] = {}
         self._log = StatusLog(node.get_logger())
 
     def statuses(self, drivers: Sequence[Driver], served: Collection[str],
@@ -50,10 +50,11 @@ class DriverDiagnostics:
     def _status(self, driver: Driver, served: bool, active: bool) -> DiagnosticStatus:
         """Diagnostics of one device."""
         counts = driver.counts()
-        before = self._reported.get(driver.name, {})
-        increases = [f'{what}: {n - before.get(what, 0)} more' for what, n in sorted(counts.items())
-                     if n > before.get(what, 0) and not what.startswith(EXPECTED_COUNTS)]
-        self._reported[driver.name] = dict(counts)
+        previous = self._reported_counts.get(driver.name, {})
+        increases = [f'{count}: {n - previous.get(count, 0)} more'
+                     for count, n in sorted(counts.items())
+                     if n > previous.get(count, 0) and not count.startswith(EXPECTED_COUNTS)]
+        self._reported_counts[driver.name] = dict(counts)
         level, message = DiagnosticStatus.OK, 'open'
         if not active:
             message = 'not active'
@@ -66,7 +67,7 @@ class DriverDiagnostics:
             message = 'opening'
         elif increases:
             level, message = DiagnosticStatus.WARN, '; '.join(increases)
-        values = {what: str(n) for what, n in sorted(counts.items())}
+        values = {count: str(n) for count, n in sorted(counts.items())}
         for source, clock in driver.clocks().items():
             suffix = f' ({source})' if source else ''
             values[f'clock drift [ppm]{suffix}'] = f'{clock.drift_ppm:.2f}'

@@ -1,7 +1,7 @@
 """driver_node: reads devices and publishes magnetic fields and accelerations.
 
 A lifecycle node: configuration reads the drivers file, activation opens the devices. With
-`autostart` (the default) it does both at startup.
+`autostart` (the default), the node configures and activates itself at startup.
 """
 
 if __name__ == '__main__':
@@ -91,7 +91,7 @@ class DriverNode(ManagedNode):
                 self._publishers_by_sensor[sensor] = self._advertise(sensor, network)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
-        """Open the devices, each in a thread of its own.
+        """Open each device in its own thread.
 
         Parameters
         ----------
@@ -101,7 +101,7 @@ class DriverNode(ManagedNode):
         Returns
         -------
         TransitionCallbackReturn
-            FAILURE if a thread of an earlier activation is still running.
+            FAILURE if a thread of a previous activation is still running.
         """
         if self._threads:
             self.get_logger().error(f'driver {self._threads[0].name} is still stopping; activate '
@@ -165,7 +165,7 @@ class DriverNode(ManagedNode):
     def close(self) -> None:
         """Stop the threads; each closes its device."""
         self._stop()
-        # Threads that did not stop in time are not waited for again.
+        # `destroy_node` does not wait again for threads that did not stop in time.
         self._threads = []
 
     def destroy_node(self) -> None:
@@ -175,7 +175,7 @@ class DriverNode(ManagedNode):
 
     def _advertise(self, sensor: str,
                    network: SensorNetwork | None) -> tuple[Publisher, Publisher]:
-        """Publishers of the field and the acceleration of a sensor."""
+        """Create the publishers of the field and the acceleration of a sensor."""
         topic, imu_topic = f'{sensor}/imu/mag', f'{sensor}/imu/data_raw'
         if network is not None:
             j = network.names.index(sensor)
@@ -184,7 +184,7 @@ class DriverNode(ManagedNode):
                 self.create_publisher(Imu, imu_topic, STREAM_OUTPUT))
 
     def _publish(self, readings: Readings, accelerations: list[AccelerationSample]) -> None:
-        """Publish each reading on its sensor topic or, with `batches`, all in one message."""
+        """Publish each reading on its sensor topic, or all in one message if `batches` is set."""
         if self._readings is None:
             for sensor, content in magnetic_field_dicts(readings):
                 self._publishers_by_sensor[sensor][0].publish(to_message(MagneticField, content))

@@ -1,4 +1,4 @@
-"""Monitoring of the inputs and outputs of a node: throughput, latency, missing neighbours."""
+"""Monitoring of the inputs and outputs of a node: throughput, latency, missing peer nodes."""
 
 import time
 from collections.abc import Callable, Collection
@@ -11,16 +11,15 @@ from mag_tracking.stages.health.window import quantiles
 from mag_tracking.units import NS
 
 SILENCE_TIMEOUT_S = 2.0
-"""[s] A sensor or node that has sent nothing for longer is reported as silent."""
+"""[s] A sensor or node that has sent nothing for longer than this is reported as silent."""
 FIRST_MESSAGE_TIMEOUT_S = 8.0
 """[s] Grace period for the first message; longer than learning a background takes."""
 MAX_LOAD = 0.95
-"""Maximum share of time that a node can spend on messages without falling behind."""
+"""Maximum fraction of the time that a node can spend on messages without falling behind."""
 MAX_LATENCY_S = 1.0
-"""[s] A larger median latency is reported as a fault: such poses are too old for control."""
+"""[s] A larger median latency is reported as a fault: the poses are then too old for control."""
 MAX_LATENCIES = 10_000
-"""Maximum number of latencies stored between two reports; a thousand sensors have fewer per
-second."""
+"""Maximum number of latencies stored between two reports; enough for a thousand sensors."""
 
 
 class Flow:
@@ -29,7 +28,7 @@ class Flow:
     Parameters
     ----------
     source : str
-        Name of the source: the sensors, or the preceding node.
+        Name of the source: the sensors or the preceding node.
 
     Attributes
     ----------
@@ -48,13 +47,13 @@ class Flow:
         self.source = source
         self.topics: list[str] = []
         self.batches: list[str] = []
-        self._began = time.monotonic()
+        self._start_time = time.monotonic()
         self.last_received: float | None = None
         self.n_lost = 0
-        self._n, self._n_reported_lost = 0, 0
-        self._ages: list[float] = []
-        self._age_s: float | None = None
-        self._busy_s, self._reported = 0.0, time.monotonic()
+        self._n_messages, self._n_reported_lost = 0, 0
+        self._latencies: list[float] = []
+        self._latest_latency_s: float | None = None
+        self._busy_s, self._report_time = 0.0, time.monotonic()
 
     def add(self, stamp_ns: int, came_ns: int, began: float) -> None:
         """Add a message that has been processed.
@@ -68,23 +67,23 @@ class Flow:
         began : float, s
             Start of processing, by `time.monotonic()`.
         """
-        self._n += 1
+        self._n_messages += 1
         self.last_received = time.monotonic()
-        took_s = self.last_received - began
-        self._busy_s += took_s
-        self._age_s = (came_ns - stamp_ns) / NS + took_s
-        if len(self._ages) < MAX_LATENCIES:
-            self._ages.append(self._age_s)
+        duration_s = self.last_received - began
+        self._busy_s += duration_s
+        self._latest_latency_s = (came_ns - stamp_ns) / NS + duration_s
+        if len(self._latencies) < MAX_LATENCIES:
+            self._latencies.append(self._latest_latency_s)
 
     @property
     def n_ages(self) -> int:
         """Number of latencies in the next report."""
-        return len(self._ages)
+        return len(self._latencies)
 
     @property
     def is_live(self) -> bool:
-        """Whether the latest message was live, not of a recording."""
-        return self._age_s is not None and abs(self._age_s) < MAX_LIVE_DELAY_S
+        """Whether the latest message was live and not replayed from a recording."""
+        return self._latest_latency_s is not None and abs(self._latest_latency_s) < MAX_LIVE_DELAY_S
 
     def status(self, node: str, has_publisher: Callable[[], bool]) -> DiagnosticStatus:
         """Diagnostics of the messages received since the last call.
@@ -101,19 +100,20 @@ class Flow:
         DiagnosticStatus
         """
         now = time.monotonic()
-        elapsed, self._reported = max(now - self._reported, 1e-9), now
-        ages, self._ages = self._ages, []
+        elapsed, self._report_time = max(now - self._report_time, 1e-9), now
+        latencies, self._latencies = self._latencies, []
         new_losses, self._n_reported_lost = self.n_lost - self._n_reported_lost, self.n_lost
         level, message = DiagnosticStatus.OK, 'running'
         busy = self._busy_s / elapsed
-        median, percentile_99 = quantiles([a for a in ages if abs(a) < MAX_LIVE_DELAY_S], 0.5, 0.99)
+        median, percentile_99 = quantiles(
+            [v for v in latencies if abs(v) < MAX_LIVE_DELAY_S], 0.5, 0.99)
         if self.last_received is None:
             message = f'waiting for {shortened(self.topics)}'
-            if now - self._began > FIRST_MESSAGE_TIMEOUT_S:
+            if now - self._start_time > FIRST_MESSAGE_TIMEOUT_S:
                 level = DiagnosticStatus.WARN
                 message = f'no message received on {shortened(self.topics)}' + (
-                    '' if has_publisher() else ': it has no publisher; start the node or driver '
-                    'that publishes it')
+                    '' if has_publisher() else ': no publisher found; start the driver or the '
+                    'preceding node')
         elif now - self.last_received > SILENCE_TIMEOUT_S:
             level = DiagnosticStatus.WARN
             message = f'no message from {self.source} for {now - self.last_received:.0f} s'
@@ -122,15 +122,15 @@ class Flow:
                 message += ', and its publisher is gone: check that it is running'
         elif new_losses:
             level = DiagnosticStatus.WARN
-            message = f'{new_losses} messages from {self.source} were lost: the input queue was ' \
-                'full; reduce the load of this computer'
+            message = f'{new_losses} message{"" if new_losses == 1 else "s"} from {self.source} ' \
+                'lost: the input queue was full; reduce the load of this computer'
         elif busy > MAX_LOAD or median > MAX_LATENCY_S:
             level = DiagnosticStatus.WARN
             message = f'input from {self.source}: load {100.0 * busy:.0f} %' + (
                 f', latency {1e3 * median:.0f} ms: this computer is too slow, or its clock differs '
-                'from that of the sensors' if median > MAX_LATENCY_S else
+                'from the clock of the sensors' if median > MAX_LATENCY_S else
                 ': this computer is too slow')
-        values = {'messages': self._n, 'lost in the queue': self.n_lost,
+        values = {'messages': self._n_messages, 'lost in the queue': self.n_lost,
                   'latency, median [ms]': f'{1e3 * median:.4g}',
                   'latency, 99 % [ms]': f'{1e3 * percentile_99:.4g}',
                   'busy [%]': f'{100.0 * busy:.3g}'}
@@ -143,8 +143,8 @@ class Flow:
 class SubscriberMonitor:
     """Checks that the node of the next step still subscribes to a topic.
 
-    That node may have any name: it is identified by the message type that it publishes. Other
-    subscribers, such as recorders, may come and go.
+    The node may have any name; it is identified by the message type that it publishes. Other
+    subscribers, such as recorders, are ignored.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class SubscriberMonitor:
 
     def __init__(self, role: str, topic: str, publishes: str) -> None:
         self.role, self.topic, self._publishes = role, topic, publishes
-        self._seen: set[str] = set()
+        self._known_nodes: set[str] = set()
 
     def status(self, node: str, names: Collection[str],
                types_of: Callable[[str], Collection[str]]) -> DiagnosticStatus:
@@ -177,13 +177,14 @@ class SubscriberMonitor:
         -------
         DiagnosticStatus
         """
-        self._seen |= {name for name in set(names) - self._seen
+        self._known_nodes |= {name for name in set(names) - self._known_nodes
                        if self._publishes in types_of(name)}
-        gone = sorted(self._seen - set(names))
-        is_gone = bool(gone) and not self._seen.intersection(names)
-        message = 'running' if self._seen else \
+        missing = sorted(self._known_nodes - set(names))
+        is_gone = bool(missing) and not self._known_nodes.intersection(names)
+        message = 'running' if self._known_nodes else \
             f'no {self.role} node has subscribed to {self.topic} yet'
         return DiagnosticStatus(
             level=DiagnosticStatus.ERROR if is_gone else DiagnosticStatus.OK,
             name=f'{node}: to {self.role}', hardware_id='magnetometer network',
-            message=f'{", ".join(gone)} is gone: check that it is running' if is_gone else message)
+            message=f'{", ".join(missing)} is gone: check that it is running'
+            if is_gone else message)

@@ -1,4 +1,4 @@
-"""Tools for a ROS graph; small substitutes for the command `ros2`, which ROS from PyPI lacks."""
+"""Inspection of a ROS graph: substitutes for the command `ros2`, which ROS from PyPI lacks."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -32,9 +32,9 @@ DISCOVERY_S = 1.5
 RESPONSE_TIMEOUT_S = 5.0
 """[s] Maximum time for a response."""
 MAX_ATTEMPTS = 3
-"""Maximum number of attempts at a query."""
+"""Maximum number of attempts per query."""
 CHANGE_TIMEOUT_S = 60.0
-"""[s] Maximum time for a change of state; some devices take long to open."""
+"""[s] Maximum time for a change of state; some devices open slowly."""
 
 
 class Observer:
@@ -55,19 +55,19 @@ class Observer:
         self.node, self._executor = node, executor
 
     def wait(self, condition: Callable[[], bool], seconds: float) -> bool:
-        """Spin until a condition holds or the time is over.
+        """Spin until a condition holds or the timeout expires.
 
         Parameters
         ----------
         condition : function
-            Returns bool.
+            Returns whether the condition holds.
         seconds : float, s
-            Maximum time.
+            Timeout.
 
         Returns
         -------
         bool
-            Whether the condition holds.
+            Whether the condition holds at the end.
         """
         end = time.monotonic() + seconds
         spin(self._executor, lambda: condition() or time.monotonic() > end)
@@ -85,8 +85,9 @@ class Observer:
         name : str
             Name of the service.
         request : object
+            Request of type `service_type.Request`.
         once : bool
-            Whether the call changes something and must not be repeated.
+            Whether the call must not be repeated, because it changes the server.
 
         Returns
         -------
@@ -140,12 +141,12 @@ def valid_names() -> Iterator[None]:
 def observer(ros_arguments: Sequence[str] = ()) -> Iterator[Observer]:
     """Create an `Observer` that is shut down when the context ends.
 
-    If the middleware hangs, the process ends there: see `shut_down`.
+    If the middleware hangs, `shut_down` ends the process.
 
     Parameters
     ----------
     ros_arguments : sequence of str, optional
-        Begin with `--ros-args`.
+        ROS arguments; the first is `--ros-args`.
 
     Yields
     ------
@@ -214,20 +215,20 @@ def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
     if cls is None:
         raise GraphError(f'{name}: message type {infos[0].topic_type} is not installed')
     latched = all(i.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for i in infos)
-    done: list[bool] = []
+    stops: list[bool] = []
 
     def handle_one(message: Any) -> None:
-        # More messages may be queued behind the last one that is wanted.
-        if not done and not handle(message):
-            done.append(True)
+        # More messages may be queued after the last one to handle.
+        if not stops and not handle(message):
+            stops.append(True)
 
     graph.node.create_subscription(
         cls, name, handle_one, QoSProfile(
             depth=100, reliability=ReliabilityPolicy.RELIABLE if latched
             else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
-    while rclpy.ok() and not done and not stopped():
-        graph.wait(lambda: bool(done) or stopped(), 1.0)
+    while rclpy.ok() and not stops and not stopped():
+        graph.wait(lambda: bool(stops) or stopped(), 1.0)
 
 
 def as_dict(message: Any) -> Any:
@@ -248,7 +249,7 @@ def as_dict(message: Any) -> Any:
         return message.tolist()
     if isinstance(message, (list, tuple)):
         return [as_dict(v) for v in message]
-    # Type byte, such as the level of a DiagnosticStatus.
+    # A field of type byte, such as the level of a DiagnosticStatus.
     return int.from_bytes(message, 'big') if isinstance(message, bytes) else message
 
 
@@ -298,7 +299,7 @@ def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list
             + ('  (read-only)' if d.read_only else '')
             + (f'  # {d.description}' if d.description else '')
             for n, v, d in sorted(zip(names, values, descriptors, strict=True),
-                                  key=lambda row: row[0])]
+                                  key=lambda entry: entry[0])]
 
 
 def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
@@ -334,7 +335,7 @@ def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
 
 
 def lifecycle_state(graph: Observer, node: str) -> tuple[str, list[str]]:
-    """State of a lifecycle node.
+    """Request the state of a lifecycle node.
 
     Parameters
     ----------
@@ -369,12 +370,12 @@ def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
     """
     possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
                           GetAvailableTransitions.Request()).available_transitions
-    found = [t.transition for t in possible if t.transition.label == transition]
-    if not found:
+    matches = [t.transition for t in possible if t.transition.label == transition]
+    if not matches:
         names = ', '.join(t.transition.label for t in possible)
         raise GraphError(f'{node}: transition {transition} is not possible in the current state; '
                          f'possible: {names}')
     request = ChangeState.Request()
-    request.transition.id = found[0].id
+    request.transition.id = matches[0].id
     if not graph.call(ChangeState, f'{node}/change_state', request, once=True).success:
         raise GraphError(f'{node}: transition {transition} failed; see the log of the node')

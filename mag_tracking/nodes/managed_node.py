@@ -34,10 +34,10 @@ class ManagedNode(LifecycleNode):
         if not fixed_parameter(self, 'autostart', True,
                                'Configure and activate the node at startup.'):
             return
-        done = self.trigger_configure()
+        result = self.trigger_configure()
         if self._configuration_error is not None:
             raise self._configuration_error
-        if done == TransitionCallbackReturn.SUCCESS:
+        if result == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
 
     def prepare(self) -> None:
@@ -51,10 +51,10 @@ class ManagedNode(LifecycleNode):
         raise NotImplementedError
 
     def close(self) -> None:
-        """Stop the threads of the node; called before it is destroyed."""
+        """Stop the threads of the node; called before the node is destroyed."""
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
-        """Call `prepare`; an error is logged and leaves the node unconfigured.
+        """Call `prepare`; log an error and leave the node unconfigured.
 
         Parameters
         ----------

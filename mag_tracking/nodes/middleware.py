@@ -16,9 +16,9 @@ RCLError, UnknownROSArgsError = (rclpy_implementation.RCLError,
                                  rclpy_implementation.UnknownROSArgsError)
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
-"""Fast DDS profile for fast discovery, also of a node that was killed and restarted."""
+"""Fast DDS profile for fast discovery, also of nodes that were killed and restarted."""
 PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-"""Environment variable that selects a profile in Fast DDS of Jazzy (2.14)."""
+"""Environment variable that selects a profile in Fast DDS 2.14 (Jazzy)."""
 PROFILE_IN_FOLDER = 'DEFAULT_FASTRTPS_PROFILES.xml'
 """Profile that Fast DDS loads from the working folder by default."""
 ROS_ARGUMENTS, PARAMETER_FILE = '--ros-args', '--params-file'
@@ -27,8 +27,8 @@ ROS_ARGUMENTS, PARAMETER_FILE = '--ros-args', '--params-file'
 def begin(arguments: list[str] | None = None) -> None:
     """Call `rclpy.init` with the Fast DDS profile of this package, unless the user selects another.
 
-    Other middlewares ignore the profile. Signals stay with the caller, because rclpy's own handlers
-    raise KeyboardInterrupt wherever Python is, even within C++ code of rclpy. Parameter files
+    Other middlewares ignore the profile. No signal handlers are installed, because the handlers of
+    rclpy raise KeyboardInterrupt at any point, even within C++ code of rclpy. Parameter files
     (`--params-file`) may also have the plain format of `--params`.
 
     Parameters
@@ -41,16 +41,16 @@ def begin(arguments: list[str] | None = None) -> None:
     SettingsError
         If the ROS arguments or a parameter file are invalid.
     """
-    named = os.environ.get(PROFILE_VARIABLE)
-    if named is None and not Path(PROFILE_IN_FOLDER).exists():
+    profile = os.environ.get(PROFILE_VARIABLE)
+    if profile is None and not Path(PROFILE_IN_FOLDER).exists():
         os.environ[PROFILE_VARIABLE] = str(PROFILE)
     with tempfile.TemporaryDirectory(prefix='mag_tracking_') as folder:
         _init(_with_ros_files(arguments, Path(folder)))
-    if named and not Path(named).exists():
+    if profile and not Path(profile).exists():
         rclpy.logging.get_logger('middleware').warning(
-            f'{PROFILE_VARIABLE}: file {named} does not exist: no Fast DDS profile is active, and '
-            'messages of a restarted node may be lost for several seconds; correct or unset the '
-            'variable')
+            f'{PROFILE_VARIABLE}: file {profile} does not exist: no Fast DDS profile is active, '
+            'and messages of a restarted node may be lost for several seconds; correct or unset '
+            'the variable')
 
 
 def _init(arguments: list[str] | None) -> None:
@@ -58,12 +58,12 @@ def _init(arguments: list[str] | None) -> None:
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except (RCLError, UnknownROSArgsError) as error:
-        # The rest of the message consists of source locations in rcl.
+        # The remainder of the message consists of source locations in rcl.
         raise SettingsError(f'ROS arguments: {str(error).partition(", at /")[0]}') from error
 
 
 def _with_ros_files(arguments: list[str] | None, folder: Path) -> list[str] | None:
-    """Arguments with plain parameter files replaced by converted copies; raise SettingsError.
+    """Replace plain parameter files in the arguments by converted copies; raise SettingsError.
 
     None selects `sys.argv`. The copies are only needed until `rclpy.init` has returned.
     """
@@ -73,8 +73,8 @@ def _with_ros_files(arguments: list[str] | None, folder: Path) -> list[str] | No
         if word != PARAMETER_FILE or ROS_ARGUMENTS not in words[:k] \
                 or not Path(words[k + 1]).is_file():
             continue
-        text = as_ros_parameters(words[k + 1])
-        if text is not None:
+        content = as_ros_parameters(words[k + 1])
+        if content is not None:
             words[k + 1] = str(folder / f'{k}.yaml')
-            Path(words[k + 1]).write_text(text, encoding='utf-8')
+            Path(words[k + 1]).write_text(content, encoding='utf-8')
     return words

@@ -11,18 +11,18 @@ from rclpy.service import Service
 from mag_tracking.nodes.steady_timer import steady_timer
 
 PACE_S = 0.002
-"""[s] Interval between two responses."""
+"""[s] Interval between responses."""
 CALLS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of the calls, which may have to be queued."""
+"""QoS of the service; the queue is long enough for many simultaneous calls."""
 
 
 def paced_service(node: Node, service_type: Any, name: str,
                   callback: Callable[[Any, Any], Any]) -> Service:
     """Create a service whose responses do not overflow the queues of its clients.
 
-    Every client of a service receives the responses to all clients, and by default stores the
-    latest ten that it has not yet read. About half of forty simultaneous calls would otherwise get
-    no response.
+    Each client of a service receives the responses to all clients. By default, a client stores the
+    latest ten responses that it has not yet read. Without pacing, about half of forty simultaneous
+    calls would get no response.
 
     Parameters
     ----------
@@ -30,23 +30,23 @@ def paced_service(node: Node, service_type: Any, name: str,
     service_type : type
     name : str
     callback : function
-        As for `Node.create_service`.
+        Service callback, as for `Node.create_service`.
 
     Returns
     -------
     Service
     """
     service = node.create_service(service_type, name, callback, qos_profile=CALLS)
-    send, waiting = service.send_response, deque[tuple[Any, Any]]()
+    send, queue = service.send_response, deque[tuple[Any, Any]]()
 
     def send_next() -> None:
-        if waiting:
-            send(*waiting.popleft())
-        if not waiting:
+        if queue:
+            send(*queue.popleft())
+        if not queue:
             timer.cancel()
 
     def send_later(response: Any, header: Any) -> None:
-        waiting.append((response, header))
+        queue.append((response, header))
         if timer.is_canceled():
             timer.reset()
 

@@ -1,4 +1,4 @@
-"""Node of the live page, which shows running nodes; it needs no network file."""
+"""Node that shows running nodes on the live page; requires no network file."""
 
 import os
 import signal
@@ -34,12 +34,12 @@ from mag_tracking.web.page_server import TICK_S, PageServer
 NICENESS = 10
 """Scheduling niceness of the process, which must not delay the nodes."""
 FRAMES_KEPT = 64
-"""Number of recent serialised frames kept for matching with tracks."""
+"""Number of recent serialised frames that are stored for matching with tracks."""
 TRACKS_KEPT = 1000
-"""Maximum number of track messages kept for the next tick."""
+"""Maximum number of track messages stored for the next tick."""
 TRACKS = 'mag_tracking_msgs/msg/TrackArray'
 STALE_TIMEOUT_S = 5.0
-"""[s] A diagnostic status that was not repeated for longer is stale."""
+"""[s] A diagnostic status that has not been repeated for this time is stale."""
 _LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warning',
            DiagnosticStatus.ERROR: 'error', DiagnosticStatus.STALE: 'stale'}
 
@@ -49,7 +49,7 @@ class SensorLayout:
     """Names and positions of the sensors, as published by the tracker."""
 
     frame: str
-    """World frame."""
+    """Name of the world frame."""
     names: tuple[str, ...]
     positions: FloatArray
     """(n, 3) [m], world frame."""
@@ -67,7 +67,7 @@ class PageNode(Node):
 
     The topics `tracker_node/tracks` and `network_frame` are relative and can be remapped; the other
     topics of the tracker are in the same namespace as its tracks. A tracker with another name is
-    found by the type of its tracks, if it is the only one in the namespace.
+    found by the message type of its tracks, if it is the only tracker in the namespace.
 
     Parameters
     ----------
@@ -81,21 +81,21 @@ class PageNode(Node):
         self._frames: deque[bytes] = deque(maxlen=FRAMES_KEPT)
         self._tracks: deque[Any] = deque(maxlen=TRACKS_KEPT)
         self._statuses: dict[str, tuple[float, DiagnosticStatus]] = {}
-        self._tracker: list[Subscription] = []
-        self._attach(self.resolve_topic_name('tracker_node/tracks'))
-        # Frames are frequent and large, so only those that are shown are deserialised.
+        self._tracker_subscriptions: list[Subscription] = []
+        self._subscribe_to_tracker(self.resolve_topic_name('tracker_node/tracks'))
+        # Frames are frequent and large, so only displayed frames are deserialised.
         self._frames_topic = self.resolve_topic_name(NETWORK_FRAME)
         self.create_subscription(NetworkFrame, NETWORK_FRAME, self._receive_frame, STREAM, raw=True)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._receive_diagnostics, STREAM)
         steady_timer(self, TICK_S, self._tick)
         steady_timer(self, 1.0, self._update_health)
 
-    def _attach(self, tracks: str) -> None:
+    def _subscribe_to_tracker(self, tracks: str) -> None:
         """Subscribe to the topics of the tracker that publishes `tracks`."""
-        for subscription in self._tracker:
+        for subscription in self._tracker_subscriptions:
             self.destroy_subscription(subscription)
         self._tracks_topic, base = tracks, tracks.rpartition('/')[0]
-        self._tracker = [
+        self._tracker_subscriptions = [
             self.create_subscription(MarkerArray, f'{base}/sensor_markers', self._receive_sensors,
                                      LATCHED),
             self.create_subscription(TrackArray, tracks, self._receive_tracks, STREAM),
@@ -103,30 +103,31 @@ class PageNode(Node):
                                      RESULTS)]
 
     def _find_tracker(self) -> list[str]:
-        """Attach to the only tracker in the namespace; return the topics of all trackers."""
+        """Subscribe to the only tracker of the namespace; return the track topics of all."""
         namespace = self.get_namespace().rstrip('/')
-        found = [name for name, kinds in self.get_topic_names_and_types()
-                 if TRACKS in kinds and name.startswith(f'{namespace}/')
-                 and self.count_publishers(name)]
-        if found and self._tracks_topic not in found and len(found) == 1:
-            self._attach(found[0])
-        return found
+        topics = [name for name, kinds in self.get_topic_names_and_types()
+                  if TRACKS in kinds and name.startswith(f'{namespace}/')
+                  and self.count_publishers(name)]
+        if topics and self._tracks_topic not in topics and len(topics) == 1:
+            self._subscribe_to_tracker(topics[0])
+        return topics
 
     def _receive_sensors(self, message: MarkerArray) -> None:
-        """Store the sensor positions; another network starts a new scene."""
+        """Store the sensor positions; a different network starts a new scene."""
         bodies = [m for m in message.markers if m.ns == SENSOR_KINDS[0]]
-        texts = {m.id: m.text for m in message.markers if m.ns == SENSOR_KINDS[1]}
-        if not bodies or {m.id for m in bodies} - texts.keys():
+        labels = {m.id: m.text for m in message.markers if m.ns == SENSOR_KINDS[1]}
+        if not bodies or {m.id for m in bodies} - labels.keys():
             return
         layout = SensorLayout(
-            bodies[0].header.frame_id, tuple(texts[m.id] for m in bodies),
+            bodies[0].header.frame_id, tuple(labels[m.id] for m in bodies),
             np.array([[m.pose.position.x, m.pose.position.y, m.pose.position.z] for m in bodies]))
         if (layout.names, layout.frame) != (self._layout.names, self._layout.frame) \
                 or not np.array_equal(layout.positions, self._layout.positions):
             self._layout = layout
             self._frames.clear()
             self._tracks.clear()
-            self._scene.subtitle = f'{len(layout)} sensors, frame {layout.frame}'
+            self._scene.subtitle = f'{len(layout)} sensor{"" if len(layout) == 1 else "s"}, ' \
+                f'frame {layout.frame}'
             self._scene.use_network(layout)
 
     def _receive_frame(self, message: bytes) -> None:
@@ -144,27 +145,28 @@ class PageNode(Node):
         self._scene.add_smoothed(message.track_id, np.array([[p.x, p.y, p.z] for p in points]))
 
     def _receive_diagnostics(self, message: DiagnosticArray) -> None:
-        """Store the latest message of each status."""
+        """Store the latest diagnostic status of each name."""
         now = time.monotonic()
-        self._statuses.update({s.name: (now, s) for s in message.status if self._is_ours(s.name)})
+        self._statuses.update({s.name: (now, s) for s in message.status
+                               if self._is_in_namespace(s.name)})
 
-    def _is_ours(self, status: str) -> bool:
+    def _is_in_namespace(self, status: str) -> bool:
         """Whether a diagnostic status belongs to a node of this namespace."""
         namespace = status.partition(':')[0].rpartition('/')[0]
         return namespace == self.get_namespace().strip('/')
 
     def _tick(self) -> None:
-        """Add received messages to the scene: all frames during a track, else only the latest."""
+        """Add received messages to the scene: all frames during a track, otherwise the latest."""
         if not len(self._layout):
             return
         raw = list(self._frames)
         self._frames.clear()
         if not self._tracks:
             raw = raw[-1:]
-        for one in raw:
+        for data in raw:
             try:
                 self._scene.add_frame(
-                    frame_of(deserialize_message(one, NetworkFrame), self._layout))
+                    frame_of(deserialize_message(data, NetworkFrame), self._layout))
             except RecordingError as error:
                 self.get_logger().error(str(error), throttle_duration_sec=10.0)
         tracks = list(self._tracks)
@@ -178,8 +180,8 @@ class PageNode(Node):
         now = time.monotonic()
         notes, rows = [], []
         for name, (received, status) in sorted(self._statuses.items()):
-            old = now - received > STALE_TIMEOUT_S
-            level = 'stale' if old else _LEVELS.get(status.level, 'error')
+            is_stale = now - received > STALE_TIMEOUT_S
+            level = 'stale' if is_stale else _LEVELS.get(status.level, 'error')
             rows.append([name, level, status.message])
             if level in ('warning', 'error'):
                 notes.append(Note(ERROR if level == 'error' else WARNING,
@@ -189,11 +191,11 @@ class PageNode(Node):
 
     def _missing_topics(self) -> Iterator[Note]:
         """Notes on topics without a publisher."""
-        found = self._find_tracker()
-        if len(found) > 1 and self._tracks_topic not in found:
-            yield Note(WARNING, f'several trackers: {", ".join(found)}; select one (--ros-args -r '
+        topics = self._find_tracker()
+        if len(topics) > 1 and self._tracks_topic not in topics:
+            yield Note(WARNING, f'several trackers: {", ".join(topics)}; select one (--ros-args -r '
                        'tracker_node/tracks:=...)')
-        elif not found:
+        elif not topics:
             yield Note(WARNING, f'no publisher on {self._tracks_topic}: start the tracker, or '
                        'select its namespace (--ros-args -r __ns:=...)')
         elif not len(self._layout):
@@ -206,7 +208,7 @@ def watch(host: str, port: int, report: Callable[[str], object],
           ros_arguments: Sequence[str] = (), ended: Callable[[], bool] = lambda: False) -> int:
     """Serve the page of running nodes until SIGINT or SIGTERM.
 
-    If the middleware hangs at the end, the process is ended: see `shut_down`.
+    If the middleware hangs at the end, `shut_down` ends the process.
 
     Parameters
     ----------
@@ -217,7 +219,7 @@ def watch(host: str, port: int, report: Callable[[str], object],
     report : function
         Called with a line that contains the address of the page.
     ros_arguments : sequence of str, optional
-        Begin with `--ros-args`.
+        ROS arguments; the first is `--ros-args`.
     ended : function, optional
         Returns True to close the page.
 
@@ -233,14 +235,14 @@ def watch(host: str, port: int, report: Callable[[str], object],
     """
     os.nice(NICENESS)
     scene = LiveScene('mag_tracking', NO_SENSORS)
-    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen, \
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, \
             PageServer(scene, host, port) as server:
         report(f'live page: {server.url}')
         begin(list(ros_arguments))
         executor, node, status = make_executor(), PageNode(scene), 1
         executor.add_node(node)
         try:
-            spin(executor, lambda: bool(seen) or not server.is_serving or ended())
+            spin(executor, lambda: bool(signals) or not server.is_serving or ended())
             status = 0 if server.is_serving else 1
         finally:
             shut_down([node], executor, status)

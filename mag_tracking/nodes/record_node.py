@@ -1,4 +1,4 @@
-"""Recorder node: writes serialised messages without decoding them, and counts lost ones."""
+"""Recorder node: writes serialised messages without decoding them; counts lost messages."""
 
 import signal
 import sys
@@ -35,18 +35,18 @@ DISCOVERY_INTERVAL_S = 0.5
 PROGRESS_INTERVAL_S = 10.0
 """[s] Interval between progress lines if the output is not a terminal."""
 DEPTHS = {MAGNETIC_FIELD: 1000, IMU: 1000, FIELD_READINGS: 1000}
-"""Queue length between two fetches, by type. A disk may stall for a second or more."""
+"""Queue length by message type. A disk may stall for a second or more between two fetches."""
 OTHER_DEPTH = 100
-"""Queue length for other types; images are large."""
+"""Queue length for other types, such as images, which are large."""
 
 
-class _Source:
-    """Subscription that is polled, with the state of its publishers."""
+class _PolledSubscription:
+    """Polled subscription that counts lost messages."""
 
     def __init__(self, node: Node, topic: str, type_name: str, latched: bool) -> None:
         self.node, self.type, self.latched = node, type_name, latched
         self.depth = DEPTHS.get(type_name, OTHER_DEPTH)
-        # A best-effort subscription matches every publisher, but does not get latched messages.
+        # A best-effort subscription matches every publisher but does not receive latched messages.
         self.subscription = node.create_subscription(
             message_class(type_name), topic, lambda _: None, QoSProfile(
                 depth=self.depth, reliability=ReliabilityPolicy.RELIABLE if latched
@@ -54,10 +54,10 @@ class _Source:
                 durability=DurabilityPolicy.TRANSIENT_LOCAL if latched
                 else DurabilityPolicy.VOLATILE), raw=True)
         self.publishers: tuple[tuple[int, ...], ...] = ()
-        self.last: int | None = None
-        self.lost = 0
+        self.last_number: int | None = None
+        self.n_lost = 0
 
-    def take(self) -> list[tuple[int, int, bytes]]:
+    def fetch(self) -> list[tuple[int, int, bytes]]:
         """Fetch the queued messages: [(received_ns, sent_ns, data)]."""
         out: list[tuple[int, int, bytes]] = []
         handle = self.subscription.handle
@@ -73,28 +73,28 @@ class _Source:
         return out
 
     def _count_lost(self, number: int | None) -> None:
-        """Count the messages missing before `number`, if a single publisher numbers them."""
+        """Count the messages missing before sequence number `number`; needs a single publisher."""
         if number is None or len(self.publishers) > 1:
-            self.last = None
+            self.last_number = None
             return
-        if self.last is not None and number > self.last:
-            self.lost += number - self.last - 1
-        self.last = number
+        if self.last_number is not None and number > self.last_number:
+            self.n_lost += number - self.last_number - 1
+        self.last_number = number
 
     def set_publishers(self, infos: list[TopicEndpointInfo]) -> None:
-        """Update the publishers; counting restarts if one has disappeared."""
+        """Update the publishers; if one has disappeared, restart the count at the next message."""
         publishers = tuple(sorted(tuple(i.endpoint_gid) for i in infos))
         if set(self.publishers) - set(publishers):
-            self.last = None
+            self.last_number = None
         self.publishers = publishers
 
 
 class RecordNode(Node):
     """Subscribes to the selected topics and passes their messages to a `Recorder`.
 
-    It is polled instead of being spun by an executor. The events executor of the Jazzy wheels fails
-    in callbacks that request time and sequence number of a message; the other executor takes most
-    of a processor core for twenty sensors.
+    The node is polled instead of being spun by an executor. The events executor of the Jazzy wheels
+    fails in callbacks that request time and sequence number of a message. The single-threaded
+    executor uses most of a processor core for twenty sensors.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class RecordNode(Node):
     ----------
     recorder : Recorder
     selection : Selection
-        With absolute topic names.
+        Topics to record, with absolute names.
     """
 
     def __init__(self, recorder: Recorder, selection: Selection,
@@ -116,11 +116,11 @@ class RecordNode(Node):
         super().__init__('record_node', start_parameter_services=False)
         self.recorder, self._report = recorder, report
         self.selection = selection.resolved(self.resolve_topic_name)
-        self._sources: dict[str, _Source] = {}
+        self._sources: dict[str, _PolledSubscription] = {}
         self._refused: dict[str, str] = {}
-        self._described: set[str] = set()
+        self._described_topics: set[str] = set()
         self._lost_before: Counter[str] = Counter()
-        # Their types are known, so messages of a driver that starts later are not missed.
+        # The types of these topics are known, so the subscriptions need not wait for a driver.
         for topic in self.selection.fields:
             self._subscribe(topic, MAGNETIC_FIELD, [])
         for topic in self.selection.imus:
@@ -128,13 +128,13 @@ class RecordNode(Node):
 
     @property
     def lost(self) -> 'Counter[str]':
-        """Number of lost messages by topic; topics without losses are omitted."""
-        now = Counter({topic: s.lost for topic, s in self._sources.items()})
+        """Numbers of lost messages by topic; topics without losses are omitted."""
+        now = Counter({topic: s.n_lost for topic, s in self._sources.items()})
         return +(now + self._lost_before)
 
     @property
     def refused(self) -> dict[str, str]:
-        """Reason why a topic is not recorded, by topic."""
+        """Topics that are not recorded: {topic: reason}."""
         return self._refused
 
     def topic_counts(self) -> tuple[int, int]:
@@ -151,7 +151,7 @@ class RecordNode(Node):
                 len(self._sources))
 
     def discover(self) -> None:
-        """Subscribe to new topics that are selected, and update the publishers of known ones."""
+        """Subscribe to new selected topics; update the publishers of subscribed topics."""
         for topic, _ in self.get_topic_names_and_types():
             if topic in self._refused or not self.selection.wants(topic):
                 continue
@@ -168,22 +168,22 @@ class RecordNode(Node):
         if message_class(type_name) is None:
             self._refuse(topic, f'message type {type_name} is not installed')
             return
-        latched = bool(infos) and all(map(_latched, infos))
-        self._sources[topic] = _Source(self, topic, type_name, latched)
+        latched = bool(infos) and all(map(_is_latched, infos))
+        self._sources[topic] = _PolledSubscription(self, topic, type_name, latched)
         self._sources[topic].set_publishers(infos)
 
-    def _describe(self, topic: str, source: _Source) -> None:
+    def _describe(self, topic: str, source: _PolledSubscription) -> None:
         """Add a topic to the recorder; its publishers are known once a message has arrived."""
-        text = definition_of(source.type)
-        if text is None:
+        definition = definition_of(source.type)
+        if definition is None:
             self._report(f'{topic}: no definition of {source.type} found: the recording of this '
-                         'topic can be read with ROS only')
+                         'topic can only be read with ROS')
         infos = self.get_publishers_info_by_topic(topic)
         reliable = all(i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos)
-        self.recorder.add_topic(topic, source.type, text or '',
+        self.recorder.add_topic(topic, source.type, definition or '',
                                 offered_qos(reliable, source.latched),
                                 max(1, len(infos)) if source.latched else 0)
-        self._described.add(topic)
+        self._described_topics.add(topic)
 
     def _refuse(self, topic: str, why: str) -> None:
         """Report once that a topic is not recorded."""
@@ -193,17 +193,17 @@ class RecordNode(Node):
     def _update_publishers(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
         """Update the publishers of a topic."""
         source = self._sources[topic]
-        others = sorted({i.topic_type for i in infos} - {source.type})
-        if others and f'{topic} as {others[0]}' not in self._refused:
-            self._refuse(f'{topic} as {others[0]}', f'the topic has type {source.type}')
+        other_types = sorted({i.topic_type for i in infos} - {source.type})
+        if other_types and f'{topic} as {other_types[0]}' not in self._refused:
+            self._refuse(f'{topic} as {other_types[0]}', f'the topic has type {source.type}')
         source.set_publishers(infos)
-        if source.latched and not all(map(_latched, infos)):
-            # The subscription requests more than the new publisher offers and would not match it.
+        if source.latched and not all(map(_is_latched, infos)):
+            # The latched subscription would not match the new publisher, which is not latched.
             self.poll()
-            self._lost_before[topic] += source.lost
+            self._lost_before[topic] += source.n_lost
             self.destroy_subscription(source.subscription)
-            self._sources[topic] = _Source(self, topic, source.type, False)
-        elif source.latched and topic in self._described:
+            self._sources[topic] = _PolledSubscription(self, topic, source.type, False)
+        elif source.latched and topic in self._described_topics:
             self.recorder.add_topic(topic, source.type, latched=len(infos))
 
     def poll(self) -> int:
@@ -214,19 +214,19 @@ class RecordNode(Node):
         int
             Number of messages.
         """
-        found = []
+        records = []
         for topic, source in self._sources.items():
-            messages = source.take()
-            if messages and topic not in self._described:
+            messages = source.fetch()
+            if messages and topic not in self._described_topics:
                 self._describe(topic, source)
-            found += [(received, topic, sent, data) for received, sent, data in messages]
-        for received, topic, sent, data in sorted(found, key=lambda f: f[0]):
+            records += [(received, topic, sent, data) for received, sent, data in messages]
+        for received, topic, sent, data in sorted(records, key=lambda r: r[0]):
             self.recorder.write(topic, data, received, sent)
-        return len(found)
+        return len(records)
 
 
-def _latched(info: TopicEndpointInfo) -> bool:
-    """Whether a publisher sends its latest messages to late subscribers."""
+def _is_latched(info: TopicEndpointInfo) -> bool:
+    """Whether a publisher also sends its latest messages to subscribers that join later."""
     return bool(info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -236,6 +236,7 @@ def log(text: str) -> None:
     Parameters
     ----------
     text : str
+        Line to print.
     """
     with suppress(OSError):
         tqdm.write(f'record: {text}', file=sys.stderr)
@@ -245,8 +246,8 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
         split_ns: int = 3600 * 10**9, ros_arguments: Sequence[str] = ()) -> int:
     """Record until SIGINT, SIGTERM or SIGHUP.
 
-    If the middleware hangs at the end, the process is ended: see `shut_down`. The recording has
-    been closed by then.
+    If the middleware hangs at the end, `shut_down` ends the process, after the recording has been
+    closed.
 
     Parameters
     ----------
@@ -255,11 +256,11 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
     out : Path
         Folder of the recording.
     split_bytes : int
-        Size in bytes at which a new file begins.
+        File size [bytes] at which a new file begins.
     split_ns : int, ns
         Duration after which a new file begins.
     ros_arguments : sequence of str, optional
-        Begin with `--ros-args`.
+        ROS arguments; the first is `--ros-args`.
 
     Returns
     -------
@@ -272,13 +273,13 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
         If the recording cannot be written to `out`.
     """
     node, status = None, 1
-    with recorded_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as seen:
+    with recorded_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as signals:
         try:
             with Recorder(out, split_bytes, split_ns, report=log) as recorder:
                 begin(list(ros_arguments))
                 node = RecordNode(recorder, selection, log)
                 log(f'recording to {out}; press Ctrl-C to stop')
-                _record(node, lambda: bool(seen))
+                _record(node, lambda: bool(signals))
             for line in summary(recorder, node.selection, node.lost, node.refused):
                 print(line)
             status = 1 if recorder.unfinished else 0
@@ -288,23 +289,23 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
 
 
 def _record(node: RecordNode, stopped: Callable[[], bool]) -> None:
-    """Poll, record and show progress until `stopped()`."""
-    begin = time.monotonic()
-    next_look, next_line, topic_counts = begin, begin + PROGRESS_INTERVAL_S, None
+    """Poll the node and show the progress until `stopped()`."""
+    start = time.monotonic()
+    next_discovery, next_line, topic_counts = start, start + PROGRESS_INTERVAL_S, None
     bar = tqdm(unit=' messages', unit_scale=True, disable=None)
     try:
         while rclpy.ok() and not stopped():
             now = time.monotonic()
             n = node.poll()
             node.recorder.tick(time.monotonic_ns())
-            if now >= next_look:
+            if now >= next_discovery:
                 node.discover()
-                next_look = now + DISCOVERY_INTERVAL_S
-                topic_counts, before = node.topic_counts(), topic_counts
-                if topic_counts != before:
-                    log(f'{topic_counts[0]} of {topic_counts[1]} topics have a publisher')
+                next_discovery = now + DISCOVERY_INTERVAL_S
+                topic_counts, previous_counts = node.topic_counts(), topic_counts
+                if topic_counts != previous_counts:
+                    log(f'publishers found for {topic_counts[0]} of {topic_counts[1]} topics')
             if bar.disable and now >= next_line:
-                log(progress_line(node.recorder, now - begin))
+                log(progress_line(node.recorder, now - start))
                 next_line += PROGRESS_INTERVAL_S
             with suppress(OSError):
                 bar.update(n)

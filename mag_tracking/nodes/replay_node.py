@@ -1,7 +1,8 @@
 """replay_node: plays a recording on topics, with /clock, pause, resume and seek.
 
 A lifecycle node: configuration opens the recording and advertises its topics, activation starts
-playback, deactivation stops it. With `autostart` (the default) it does both at startup.
+playback, deactivation stops it. With `autostart` (the default), the node configures and activates
+itself at startup.
 """
 
 if __name__ == '__main__':
@@ -33,15 +34,15 @@ from mag_tracking.nodes.stage_node import STREAM
 from mag_tracking.recording.reader import Recording
 
 TICK_S = 0.005
-"""[s] Interval of the search for messages that are due."""
+"""[s] Interval of the checks for due messages."""
 MAX_STEP_S = 0.02
-"""[s] Maximum elapsed time that a tick makes up for."""
+"""[s] Maximum elapsed time of one tick; playback does not catch up after a longer stall."""
 MAX_MESSAGES_PER_TICK = 200
-"""Maximum number of messages published per tick; subscribers have longer queues."""
+"""Maximum number of messages published per tick; at most the queue length of the nodes."""
 
 
 class ReplayNode(ManagedNode):
-    """Publishes the messages of a recording at the recorded or another rate.
+    """Publishes the messages of a recording at the recorded rate or a multiple of it.
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ class ReplayNode(ManagedNode):
     publishers_by_topic : dict of str to Publisher
         Publisher of each recorded topic.
     finished : bool
-        Whether the end has been reached.
+        Whether playback has reached the end of the recording.
 
     Raises
     ------
@@ -85,8 +86,8 @@ class ReplayNode(ManagedNode):
         self.publishers_by_topic: dict[str, Publisher] = {}
         self._not_installed: set[str] = set()
         self._clock_publisher = self.create_publisher(Clock, '/clock', STREAM)
-        self.finished, self._is_active, self._start = False, False, 0.0
-        self._wall: float | None = None
+        self.finished, self._is_active, self._start_time = False, False, 0.0
+        self._last_tick: float | None = None
         paced_service(self, Trigger, '~/pause', self._pause)
         paced_service(self, Trigger, '~/resume', self._resume)
         paced_service(self, Seek, '~/seek', self._seek_service)
@@ -110,11 +111,11 @@ class ReplayNode(ManagedNode):
             raise SettingsError(f'replay_node: parameter rate: {self._rate} is not a finite '
                                 'number above 0')
         recording = Recording(self._path)
-        self._begin = _first_time_ns(recording)
+        self._begin_ns = _first_time_ns(recording)
         self._selected_topics = _selected_topics(recording, self._topics)
         end = recording.end_ns
         if not self._offset >= 0.0 or (
-                end is not None and self._begin + self._offset * 1e9 > end):
+                end is not None and self._begin_ns + self._offset * 1e9 > end):
             raise SettingsError(f'replay_node: parameter start_offset: {self._offset} s is outside '
                                 'the recording')
         self._recording = recording
@@ -136,8 +137,8 @@ class ReplayNode(ManagedNode):
         TransitionCallbackReturn
         """
         # Messages published before discovery is complete are lost.
-        self._start = time.monotonic() + self._delay
-        self._is_active, self._wall = True, None
+        self._start_time = time.monotonic() + self._delay
+        self._is_active, self._last_tick = True, None
         return super().on_activate(state)
 
     def on_deactivate(self, state: State) -> TransitionCallbackReturn:
@@ -212,65 +213,67 @@ class ReplayNode(ManagedNode):
         return topic if topic.startswith(f'{namespace}/') else f'{namespace}{topic}'
 
     def _seek(self, offset: float) -> None:
-        """Continue at `offset` seconds after the first message."""
+        """Set the position to `offset` seconds after the first message."""
         assert self._recording is not None, 'seek without a recording'
-        self._position = self._begin + int(offset * 1e9)
-        self._messages = self._recording.messages(self._selected_topics, self._position)
-        self._next = next(self._messages, None)
-        self._wall = None
+        self._position_ns = self._begin_ns + int(offset * 1e9)
+        self._messages = self._recording.messages(self._selected_topics, self._position_ns)
+        self._next_message = next(self._messages, None)
+        self._last_tick = None
 
     def _tick(self) -> None:
         """Publish the messages that are due."""
         now = time.monotonic()
-        if not self._is_active or self._paused or self.finished or now < self._start \
+        if not self._is_active or self._paused or self.finished or now < self._start_time \
                 or not self._has_subscribers(now):
             return
         # After a stall, playback continues at its rate: a burst would overflow subscriber queues.
-        elapsed = 0.0 if self._wall is None else min(now - self._wall, MAX_STEP_S)
-        self._wall = now
-        self._position += int(elapsed * self._rate * 1e9)
-        self._clock_publisher.publish(Clock(clock=Time(sec=self._position // 10**9,
-                                             nanosec=self._position % 10**9)))
-        room = MAX_MESSAGES_PER_TICK
-        while self._next is not None and self._next.log_time_ns <= self._position:
-            if room == 0:
+        elapsed = 0.0 if self._last_tick is None else min(now - self._last_tick, MAX_STEP_S)
+        self._last_tick = now
+        self._position_ns += int(elapsed * self._rate * 1e9)
+        self._clock_publisher.publish(Clock(clock=Time(sec=self._position_ns // 10**9,
+                                             nanosec=self._position_ns % 10**9)))
+        n_remaining = MAX_MESSAGES_PER_TICK
+        while self._next_message is not None \
+                and self._next_message.log_time_ns <= self._position_ns:
+            if n_remaining == 0:
                 # Slow down rather than overflow the queues.
-                self._position = self._next.log_time_ns
+                self._position_ns = self._next_message.log_time_ns
                 return
-            room -= 1
-            publisher = self._publisher_for(self._next.topic, self._next.type)
-            if publisher is not None and not self._next.data:
-                # Damaged, or a ROS 1 type that cannot be converted.
+            n_remaining -= 1
+            publisher = self._publisher_for(self._next_message.topic, self._next_message.type)
+            if publisher is not None and not self._next_message.data:
+                # The message is damaged, or its ROS 1 type cannot be converted.
                 self.counts['rejected: undecodable message'] += 1
             elif publisher is not None:
-                publisher.publish(self._next.data)
+                publisher.publish(self._next_message.data)
                 self.counts['messages'] += 1
-            self._next = next(self._messages, None)
-        if self._next is None:
+            self._next_message = next(self._messages, None)
+        if self._next_message is None:
             self._end()
 
     def _has_subscribers(self, now: float) -> bool:
         """Whether every magnetic field has a subscriber, or the wait for them has timed out."""
         recording = self._recording
-        if recording is not None and now < self._start + self._subscriber_timeout_s:
+        if recording is not None and now < self._start_time + self._subscriber_timeout_s:
             return all(p.get_subscription_count() for topic, p in self.publishers_by_topic.items()
                        if recording.types.get(topic) == MAGNETIC_FIELD)
         return True
 
     def _end(self) -> None:
-        """Handle the end of the recording: loop, or stop."""
+        """Handle the end of the recording: restart if `loop` is set, otherwise stop."""
         assert self._recording is not None, 'end without a recording'
-        for what, n in self._recording.losses.items():
-            self.get_logger().warning(f'{what}: {n}')
+        for cause, n in self._recording.losses.items():
+            self.get_logger().warning(f'{cause}: {n}')
         if self._loop:
             self._seek(0.0)
             return
         self.finished = True
-        self.get_logger().info(f'end of the recording: {self.counts["messages"]} messages played')
+        n = self.counts['messages']
+        self.get_logger().info(f'end of the recording: {n} message{"" if n == 1 else "s"} played')
 
     def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Handle ~/pause."""
-        self._paused, self._wall = True, None
+        self._paused, self._last_tick = True, None
         response.success, response.message = True, 'paused'
         return response
 
@@ -281,19 +284,19 @@ class ReplayNode(ManagedNode):
         return response
 
     def resume(self) -> None:
-        """Continue at the position of the pause, without the rest of `start_delay`."""
+        """Continue playback at the current position; the remaining `start_delay` is skipped."""
         self._paused = False
-        self._start = min(self._start, time.monotonic())
+        self._start_time = min(self._start_time, time.monotonic())
 
     def _seek_service(self, request: Seek.Request, response: Seek.Response) -> Seek.Response:
-        """Handle ~/seek; an offset outside the recording is refused."""
+        """Handle ~/seek; reject an offset outside the recording."""
         if self._recording is None:
             response.success, response.message = \
                 False, 'no recording is open: configure the node first'
             return response
         last = self._recording.end_ns
         if not request.offset >= 0.0 or (
-                last is not None and self._begin + request.offset * 1e9 > last):
+                last is not None and self._begin_ns + request.offset * 1e9 > last):
             response.success = False
             response.message = f'offset: {request.offset} s is outside the recording'
             return response
@@ -304,10 +307,10 @@ class ReplayNode(ManagedNode):
 
 
 def _first_time_ns(recording: Recording) -> int:
-    """Time of the first message [ns]; raise RecordingError for an empty recording."""
+    """Return the time of the first message [ns]; raise RecordingError for an empty recording."""
     if recording.start_ns is not None:
         return recording.start_ns
-    # An unfinished file has no index: read the first message.
+    # A file that was not closed has no index: read the first message.
     first = next(recording.messages(), None)
     if first is None:
         raise RecordingError(f'{recording.path} contains no messages')
@@ -315,13 +318,13 @@ def _first_time_ns(recording: Recording) -> int:
 
 
 def _selected_topics(recording: Recording, topics: Sequence[str]) -> set[str] | None:
-    """Topics to play, None for all; raise RecordingError for an unknown topic."""
-    wanted = [t for t in topics if t]
-    unknown = [t for t in wanted if t not in recording.types]
+    """Return the topics to play, None for all; raise RecordingError for an unknown topic."""
+    selected = [t for t in topics if t]
+    unknown = [t for t in selected if t not in recording.types]
     if unknown and recording.message_counts:
         raise RecordingError(f'{recording.path} does not contain topic {unknown[0]}; it contains '
                              f'{", ".join(sorted(recording.types))}')
-    return set(wanted) or None
+    return set(selected) or None
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -21,8 +21,8 @@ NODE_PARAMETERS = frozenset({
     'save_as', 'state_file', 'publish_sensor_tf', 'child_frame', 'publish_tf', 'drivers', 'batches',
     'autostart', 'recording', 'rate', 'loop', 'start_offset', 'topics', 'start_delay', 'paused',
     'wait_for_subscribers'})
-"""Parameters of the nodes that are not settings. Every node accepts those of the others, because a
-parameter file and the arguments of a process may be shared by all nodes."""
+"""Node parameters that are not settings. Each node accepts all of them, because the nodes may share
+a parameter file and the arguments of a process."""
 
 
 def fixed_parameter(node: Node, name: str, default: Any, description: str) -> Any:
@@ -47,7 +47,7 @@ def fixed_parameter(node: Node, name: str, default: Any, description: str) -> An
 
 
 def _descriptor(p: Parameter) -> ParameterDescriptor:
-    """Description, unit and range of a setting."""
+    """Create the descriptor of a setting, with its description, unit and range."""
     d = ParameterDescriptor(description=p.doc, read_only=not p.live,
                             additional_constraints=f'unit: {p.unit}' if p.unit else
                             f'one of {", ".join(p.choices)}' if p.choices else '')
@@ -73,47 +73,48 @@ def declare_settings(node: Node, settings: Settings, group: str) -> Settings:
     Returns
     -------
     Settings
-        Settings in force.
+        Settings including the overrides of the node.
 
     Raises
     ------
     SettingsError
         If an override does not name a setting, or has a wrong type, length or range.
     """
-    known = {p.name: p for p in flatten(settings)}
+    settings_by_name = {p.name: p for p in flatten(settings)}
     overrides = dict(node._parameter_overrides)  # rclpy has no public accessor
     for name in overrides:
-        if name not in known and name not in NODE_PARAMETERS \
+        if name not in settings_by_name and name not in NODE_PARAMETERS \
                 and not name.startswith('qos_overrides.'):
             replace(settings, {name: overrides[name].value})
-    changes = {name: _plain(p.value) for name, p in overrides.items() if name in known}
-    in_force = replace(settings, changes)
-    for p in flatten(in_force):
+    changes = {name: _without_array(p.value) for name, p in overrides.items()
+               if name in settings_by_name}
+    current = replace(settings, changes)
+    for p in flatten(current):
         if p.name.startswith(f'{group}.'):
             value = list(p.value) if isinstance(p.value, tuple) else p.value
             node.declare_parameter(p.name, value, _descriptor(p))
-    return in_force
+    return current
 
 
-def _plain(value: Any) -> Any:
-    """Value of a parameter, with arrays as lists."""
+def _without_array(value: Any) -> Any:
+    """Value of a parameter; an array is converted to a list."""
     return list(value) if hasattr(value, '__iter__') and not isinstance(value, str) else value
 
 
 def follow_changes(node: Node, settings: Settings, apply: Callable[[Settings], None]) -> None:
-    """Check live changes of parameters and apply valid ones.
+    """Check live changes of parameters; apply valid changes.
 
     Parameters
     ----------
     node : Node
     settings : Settings
-        Settings in force.
+        Initial settings.
     apply : function
         Called with the new settings.
     """
     state = {'settings': settings}
 
-    def check(parameters: list[RosParameter]) -> SetParametersResult:
+    def reject_invalid(parameters: list[RosParameter]) -> SetParametersResult:
         try:
             replace(state['settings'], _changes(parameters))
         except SettingsError as error:
@@ -126,10 +127,10 @@ def follow_changes(node: Node, settings: Settings, apply: Callable[[Settings], N
             state['settings'] = replace(state['settings'], changes)
             apply(state['settings'])
 
-    known = {p.name for p in flatten(settings)}
+    names = {p.name for p in flatten(settings)}
 
     def _changes(parameters: Iterable[RosParameter]) -> dict[str, Any]:
-        return {p.name: _plain(p.value) for p in parameters if p.name in known}
+        return {p.name: _without_array(p.value) for p in parameters if p.name in names}
 
-    node.add_on_set_parameters_callback(check)
+    node.add_on_set_parameters_callback(reject_invalid)
     node.add_post_set_parameters_callback(apply_changes)

@@ -1,4 +1,4 @@
-"""All nodes in one process, as a launch file does with several; for use without `ros2 launch`."""
+"""Run all nodes in one process; a replacement for the launch file without `ros2 launch`."""
 
 import signal
 import sys
@@ -34,11 +34,11 @@ PathLike = str | OsPathLike[str]
 
 
 MAX_DISCOVERY_S = 60.0
-"""[s] Maximum time for the nodes to discover each other; several seconds on a busy computer."""
+"""[s] Maximum time for mutual discovery of the nodes; a busy computer needs several seconds."""
 
 
 class TrackPrinter(Node):
-    """Prints the poses of tracks; subscribes like any other program.
+    """Prints the poses of tracks.
 
     Parameters
     ----------
@@ -47,6 +47,7 @@ class TrackPrinter(Node):
     every : int
         Print only every n-th pose.
     out : text stream
+        Output stream.
     """
 
     def __init__(self, topic: str = 'tracker_node/tracks', every: int = 1,
@@ -83,25 +84,25 @@ def pose_line(track: Track) -> str:
     sx, sy, sz = (float(v) ** 0.5 for v in track.covariance.diagonal()[:3])
     unit, f = ('m', 1.0) if max(sx, sy) > 0.02 or max(abs(x), abs(y)) > 2.0 else ('mm', 1e3)
     vx, vy, _ = track.velocity
-    size = float((track.moment @ track.moment) ** 0.5)
+    moment = float((track.moment @ track.moment) ** 0.5)
     return (f'track {track.id}  {track.stamp_ns / 1e9:.2f}  '
             f'x {f * x:8.2f} ± {f * sx:5.2f}  y {f * y:8.2f} ± {f * sy:5.2f}  '
             f'z {f * z:7.2f} ± {f * sz:5.2f} {unit}  {(vx * vx + vy * vy) ** 0.5:5.1f} m/s  '
-            f'{size:7.3g} A m²  {track.arrival:6s} {track.kind}'
+            f'{moment:7.3g} A m²  {track.arrival:6s} {track.kind}'
             f'{"  ambiguous" if track.ambiguous else ""}')
 
 
 def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> list[Parameter]:
-    """ROS parameters that put settings in force in the nodes.
+    """ROS parameters of the nodes for the given settings.
 
-    Default values are omitted, so that ROS arguments can change them.
+    Settings with their default values are omitted, so that ROS arguments can change them.
 
     Parameters
     ----------
     network_path : path
     settings : Settings
     reliable : bool
-        Whether the topics of the sensors are reliable, as those of a replay are.
+        Whether to subscribe to the sensors with reliable QoS, for a replay.
 
     Returns
     -------
@@ -195,7 +196,7 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
         ros_arguments: Sequence[str] = ()) -> int:
     """Run the nodes until Ctrl-C, or until a recording has been played and processed.
 
-    If the middleware hangs at the end, the process is ended: see `shut_down`.
+    If the middleware hangs at the end, `shut_down` ends the process.
 
     Parameters
     ----------
@@ -208,31 +209,33 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
     loop : bool
         Restart the recording at its end.
     observers : sequence of functions, optional
-        Create further nodes, after `rclpy.init`; by default a `TrackPrinter`.
+        Functions that create further nodes; called after `rclpy.init`. By default, one function
+        that creates a `TrackPrinter`.
     drivers : path, optional
-        Drivers file; its devices are run as well.
+        Drivers file; if given, a driver node is also run.
     batches : bool
         Publish the readings of many sensors in one message.
     ros_arguments : sequence of str, optional
-        For all nodes; begin with `--ros-args`.
+        ROS arguments for all nodes; the first is `--ros-args`.
 
     Returns
     -------
     int
         Exit status.
     """
-    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
-        # The driver node comes last, so that its first messages find subscribers.
-        last = [partial(driver_node, drivers, network_path, batches)] if drivers else []
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
+        # The driver node is created last, so that its first messages have subscribers.
+        sources = [partial(driver_node, drivers, network_path, batches)] if drivers else []
         begin(list(ros_arguments))
-        return _run_until(lambda: bool(seen), network_path, settings, recording, rate, loop,
-                          observers, last)
+        return _run_until(lambda: bool(signals), network_path, settings, recording, rate, loop,
+                          observers, sources)
 
 
 def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Settings,
                recording: PathLike | None, rate: float, loop: bool,
-               observers: Sequence[Callable[[], Node]], last: Sequence[Callable[[], Node]]) -> int:
-    """Run as described for `run` until `stopped()`; `last` creates the nodes that come last."""
+               observers: Sequence[Callable[[], Node]],
+               sources: Sequence[Callable[[], Node]]) -> int:
+    """Run the nodes until `stopped()`, see `run`; `sources` create the nodes to start last."""
     executor = make_executor()
     nodes: list[Node] = []
     status = 1
@@ -240,7 +243,7 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
         stages, replay = make_nodes(network_path, settings, recording, rate, loop)
         tracks = stages[-1].resolve_topic_name('~/tracks')
         nodes = [*stages, *(make() for make in observers or [partial(TrackPrinter, tracks)]),
-                 *(make() for make in last)]
+                 *(make() for make in sources)]
         nodes += [replay] if replay else []
         for node in nodes:
             executor.add_node(node)
@@ -272,7 +275,7 @@ def _play(executor: Executor, stages: list[StageNode], replay: ReplayNode,
 
 
 def _check_topics(node: StageNode, replay: ReplayNode) -> None:
-    """Raise MagTrackingError unless a played topic belongs to the network."""
+    """Raise MagTrackingError if no played topic belongs to the network."""
     played = {p.topic_name for p in replay.publishers_by_topic.values()}
     if played & {*node.sensor_topics, node.resolve_topic_name(RAW_READINGS)}:
         return
@@ -285,17 +288,17 @@ def _check_topics(node: StageNode, replay: ReplayNode) -> None:
 
 def _drain(executor: Executor, stages: list[StageNode], stopped: Callable[[], bool],
            quiet_s: float = 1.0) -> None:
-    """Spin until no stage has processed anything for `quiet_s` seconds, or until `stopped()`."""
-    def moved() -> list[int]:
+    """Spin until no stage has processed a record for `quiet_s` seconds, or until `stopped()`."""
+    def totals() -> list[int]:
         return [sum(s.counts.values()) for node in stages for s in node.stages().values()]
 
-    last, since = moved(), time.monotonic()
+    previous, since = totals(), time.monotonic()
 
-    def quiet() -> bool:
-        nonlocal last, since
-        now = moved()
-        if now != last:
-            last, since = now, time.monotonic()
+    def is_quiet() -> bool:
+        nonlocal previous, since
+        current = totals()
+        if current != previous:
+            previous, since = current, time.monotonic()
         return stopped() or time.monotonic() - since > quiet_s
 
-    spin(executor, quiet)
+    spin(executor, is_quiet)

@@ -1,4 +1,4 @@
-"""Faults in how the topics of the sensors are published."""
+"""Faults of the publishers of the sensor topics."""
 
 from collections.abc import Mapping
 
@@ -10,11 +10,11 @@ from mag_tracking.network.topics import absolute
 from mag_tracking.stages.health.sensor_health import Finding
 
 MAX_NAMED = 4
-"""Maximum number of names in a message; the rest are counted."""
+"""Maximum number of names in a message; further names are only counted."""
 
 
 def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
-    """Faults of the publishers of a sensor topic: wrong type, or several of them.
+    """Faults of the publishers of a sensor topic: wrong type, several publishers.
 
     Parameters
     ----------
@@ -42,7 +42,8 @@ def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
 def node_of(endpoint: TopicEndpointInfo) -> str | None:
     """Absolute name of the node of an endpoint.
 
-    The middleware announces endpoints and nodes separately; in between, the name is a placeholder.
+    The middleware announces endpoints and nodes separately. Until the node is announced, its name
+    is a placeholder.
 
     Parameters
     ----------
@@ -51,14 +52,14 @@ def node_of(endpoint: TopicEndpointInfo) -> str | None:
     Returns
     -------
     str or None
-        None if the node is not yet discovered.
+        None if the node has not yet been announced.
     """
     namespace = endpoint.node_namespace
     return absolute(endpoint.node_name, namespace) if namespace.startswith('/') else None
 
 
 def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, str]) -> Finding:
-    """Fault of a sensor from which no message has been received.
+    """Fault of a sensor from which no message has been received; suggests other topics.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, s
     topic : str
         Absolute topic name.
     known : mapping of str to str
-        Topics of all sensors of the network; others that are published are suggested.
+        Topics of all sensors of the network, which are not suggested.
 
     Returns
     -------
@@ -77,11 +78,11 @@ def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, s
     if node.count_publishers(topic):
         return Finding(True, sensor, f'no message received on {topic}, although it has a '
                        'publisher', 'check the sensor and its driver')
-    own = node.get_namespace().rstrip('/')
+    namespace = node.get_namespace().rstrip('/')
     others = sorted((name for name, kinds in node.get_topic_names_and_types()
                      if MAGNETIC_FIELD in kinds and name not in known.values()
                      and not name.endswith('_calibrated') and node.count_publishers(name)),
-                    key=lambda name: (not name.startswith(f'{own}/'), name))
+                    key=lambda name: (not name.startswith(f'{namespace}/'), name))
     advice = 'start its driver, or remap its topic'
     if others:
         advice += f'; magnetic fields are published on {shortened(others)}'
@@ -89,7 +90,7 @@ def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, s
 
 
 def shortened(names: list[str]) -> str:
-    """Join names; of many, only the first ones and the number of the rest.
+    """Join names; a long list is cut after the first names and ends with the number of others.
 
     Parameters
     ----------

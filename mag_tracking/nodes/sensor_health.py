@@ -1,4 +1,4 @@
-"""Health of each sensor as diagnostics, over the latest one to two minutes."""
+"""Diagnostics of the health of each sensor over the last one to two minutes."""
 
 import math
 import time
@@ -26,10 +26,9 @@ from mag_tracking.stages.health.sensor_health import (
 )
 
 WINDOW_S = 60.0
-"""[s] Length of an evaluation window. A fault is reported until one to two windows after it has
-ended."""
+"""[s] Length of an evaluation window. A fault is reported for one to two windows after its end."""
 MIN_READINGS = 64
-"""Minimum number of readings in the current window; with fewer, the previous window is reported."""
+"""Number of readings in the current window below which the previous window is reported."""
 STARTUP_S = 3.0
 """[s] Time after the start during which a silent sensor is not a fault."""
 LEARNING_TIMEOUT_FACTOR = 3.0
@@ -63,23 +62,23 @@ class HealthDiagnostics:
         # Start of learning by the monotonic clock [s].
         self._unready_since: dict[str, float] = {}
         self._network_findings: dict[str, list[Finding]] = {}
-        # Number of relearnt backgrounds at the start of the previous window and of this one.
+        # Number of relearnt backgrounds at the start of the previous and the current window.
         self._relearnt: list[dict[str, int]] = [dict.fromkeys(network.names, 0)] * 2
         self._begin(network)
 
     def _begin(self, network: SensorNetwork) -> None:
-        """Reset everything; `network` replaces the previous one."""
+        """Begin the first window with a network, which replaces the previous network."""
         self._network = network
         self._clock_ns = network.clock_offset_ns
-        # Earlier timestamps were corrected by other clock offsets.
+        # Earlier timestamps were corrected with the clock offsets of the previous network.
         self._buffer = ReadingBuffer(len(network), WINDOW // 2)
-        self._past: dict[str, SensorHealth | None] = dict.fromkeys(network.names)
-        self._present = self._new_window()
-        self._began = time.monotonic()
-        self._window_end = self._began + WINDOW_S
+        self._previous: dict[str, SensorHealth | None] = dict.fromkeys(network.names)
+        self._current = self._new_window()
+        self._start_time = time.monotonic()
+        self._window_end = self._start_time + WINDOW_S
 
     def _new_window(self) -> dict[str, SensorHealth]:
-        """Empty `SensorHealth` of each sensor."""
+        """Create an empty `SensorHealth` for each sensor."""
         return {name: SensorHealth() for name in self._network.names}
 
     def use_network(self, network: SensorNetwork) -> None:
@@ -92,7 +91,7 @@ class HealthDiagnostics:
         self._begin(network)
 
     def add(self, readings: Readings, now_ns: int) -> None:
-        """Add raw readings; those of sensors outside the network are ignored.
+        """Add raw readings; readings of sensors outside the network are ignored.
 
         Parameters
         ----------
@@ -100,12 +99,12 @@ class HealthDiagnostics:
         now_ns : int, ns
             Time of arrival.
         """
-        rows = readings.rows(self._index)
-        self._last_received[rows[rows >= 0]] = time.monotonic()
-        # Rows of unknown sensors (-1) get the wrong offset, but are not used.
-        stamps, field, i = readings.stamp_ns - self._clock_ns[rows], plain(readings.field), 0
-        while (i := self._buffer.add(rows, stamps, field, now_ns, i)) < len(rows):
-            self.update(rows[i])
+        indices = readings.rows(self._index)
+        self._last_received[indices[indices >= 0]] = time.monotonic()
+        # Readings of unknown sensors (index -1) get a wrong offset, but are not used.
+        stamps, field, i = readings.stamp_ns - self._clock_ns[indices], plain(readings.field), 0
+        while (i := self._buffer.add(indices, stamps, field, now_ns, i)) < len(indices):
+            self.update(indices[i])
 
     def update(self, j: int) -> None:
         """Evaluate the buffered readings of a sensor.
@@ -115,7 +114,7 @@ class HealthDiagnostics:
         j : int
             Index of the sensor.
         """
-        self._present[self._network.names[j]].add_batch(*self._buffer.pop(j))
+        self._current[self._network.names[j]].add_batch(*self._buffer.pop(j))
 
     def statuses(self, node: str, calibrate: Calibrate) -> list[DiagnosticStatus]:
         """Diagnostics of all sensors.
@@ -138,7 +137,7 @@ class HealthDiagnostics:
         return [self.status(node, j, calibrate) for j in range(len(self._network))]
 
     def begin_round(self, calibrate: Calibrate) -> None:
-        """Compare the sensors with each other, and begin a new window if the current one is over.
+        """Compare the sensors with each other; begin a new window if the current window is over.
 
         Must be called before `status` is called for each sensor.
 
@@ -150,7 +149,7 @@ class HealthDiagnostics:
         self._compare(calibrate)
         if time.monotonic() > self._window_end:
             self._window_end = time.monotonic() + WINDOW_S
-            self._past, self._present = {**self._present}, self._new_window()
+            self._previous, self._current = {**self._current}, self._new_window()
             self._relearnt = [self._relearnt[1], {
                 name: b.n_relearnt for name, b in calibrate.backgrounds().items()}]
 
@@ -161,67 +160,69 @@ class HealthDiagnostics:
                 self._frozen_ns.pop(name, None)
             elif (last := calibrate.last_stamp_ns(name)) is not None:
                 self._frozen_ns.setdefault(name, last)
-        health = {name: self._latest(name) for name in self._network.names}
+        health = {name: self._reported_window(name) for name in self._network.names}
         self._network_findings = {name: [] for name in self._network.names}
         for finding in network_findings(self._network, self._settings.survey, calibrate, health):
             if finding.subject in self._network_findings:
                 self._network_findings[finding.subject].append(finding)
 
-    def _latest(self, name: str) -> SensorHealth:
-        """`SensorHealth` of the current window; of the previous one until it is long enough."""
-        past, present = self._past[name], self._present[name]
-        return past if past is not None and present.counts['readings'] < MIN_READINGS else present
+    def _reported_window(self, name: str) -> SensorHealth:
+        """Current window of a sensor, or its previous window if the current has few readings."""
+        previous, current = self._previous[name], self._current[name]
+        return previous if previous is not None and current.counts['readings'] < MIN_READINGS \
+            else current
 
     def _findings(self, j: int, name: str, calibrate: Calibrate) -> list[Finding]:
         """Faults of a sensor, most serious first."""
         silent_s = time.monotonic() - self._last_received[j]
-        of_topic = [] if self._node is None else topic_findings(
+        graph_findings = [] if self._node is None else topic_findings(
             self._node, name, self._topics[name])
         if not silent_s <= SILENCE_TIMEOUT_S:
-            return [*of_topic, *self._silence(name, silent_s)]
-        found = {f.what: f for f in (*of_topic, *self._network_findings[name],
-                                     *self._clock_finding(name))}
-        # A background that is being learnt, at the start or again, is not a fault yet.
-        patience = 5.0 + LEARNING_TIMEOUT_FACTOR * self._settings.calibrate.learn_s
+            return [*graph_findings, *self._silence_findings(name, silent_s)]
+        findings = {f.what: f for f in (*graph_findings, *self._network_findings[name],
+                                        *self._clock_findings(name))}
+        # A background that is being learnt is not a fault until the timeout.
+        timeout_s = 5.0 + LEARNING_TIMEOUT_FACTOR * self._settings.calibrate.learn_s
         if calibrate.backgrounds()[name].ready:
             self._unready_since.pop(name, None)
         since = self._unready_since.setdefault(name, time.monotonic())
-        if calibrate.backgrounds()[name].ready or time.monotonic() - since > patience:
-            found.update({f.what: f for f in background_findings(
+        if calibrate.backgrounds()[name].ready or time.monotonic() - since > timeout_s:
+            findings.update({f.what: f for f in background_findings(
                 name, calibrate, self._frozen_ns.get(name), self._relearnt[0][name])})
-        found.update({f.what: f for f in covariance_findings(
+        findings.update({f.what: f for f in covariance_findings(
             name, self._topics[name], calibrate)})
-        for health in (self._past[name], self._present[name]):
+        for health in (self._previous[name], self._current[name]):
             if health is not None and health.counts['readings']:
                 for f in health.findings(name, self._network.noise_std[j],
                                          self._settings.calibrate.max_field,
                                          not self._is_replayed):
-                    found.setdefault(f.what, f)
-        return sorted(found.values(), key=lambda f: not f.serious)
+                    findings.setdefault(f.what, f)
+        return sorted(findings.values(), key=lambda f: not f.serious)
 
-    def _silence(self, name: str, silent_s: float) -> list[Finding]:
-        """Fault of a sensor that has been silent for `silent_s`; NaN = since the start."""
+    def _silence_findings(self, name: str, silent_s: float) -> list[Finding]:
+        """Fault of a sensor that has been silent for `silent_s`; NaN: since the start."""
         topic = self._topics[name]
         if not math.isnan(silent_s):
             return [Finding(True, name, f'silent for {silent_s:.0f} s', 'check its cable, its '
                             f'driver and the topic {topic}')]
         # Nodes that are launched together do not start at the same time.
-        if time.monotonic() - self._began < STARTUP_S:
+        if time.monotonic() - self._start_time < STARTUP_S:
             return []
         if self._node is None:
             return [Finding(True, name, 'no message received', 'check its cable, its driver and '
                             f'the topic {topic}')]
         return [missing_publisher(self._node, name, topic, self._topics)]
 
-    def _clock_finding(self, name: str) -> list[Finding]:
-        """Fault of a sensor whose timestamps are far from the clock of this computer."""
-        behind_s = self._latest(name).delay_s[0]
-        if self._is_replayed or not abs(behind_s) > MAX_LIVE_DELAY_S:
+    def _clock_findings(self, name: str) -> list[Finding]:
+        """Fault of a sensor whose timestamps differ by days from the clock of this computer."""
+        delay_s = self._reported_window(name).delay_s[0]
+        if self._is_replayed or not abs(delay_s) > MAX_LIVE_DELAY_S:
             return []
-        days = abs(behind_s) / 86400.0
-        far = f'{days / 365.25:.0f} years' if days > 730.0 else f'{days:.0f} days'
-        return [Finding(False, name, f'its timestamps are {far} '
-                        f'{"behind" if behind_s > 0.0 else "ahead of"} the clock of this computer',
+        days = abs(delay_s) / 86400.0
+        difference = f'{days / 365.25:.0f} years' if days > 730.0 else \
+            'a day' if days < 1.5 else f'{days:.0f} days'
+        return [Finding(False, name, f'its timestamps are {difference} '
+                        f'{"behind" if delay_s > 0.0 else "ahead of"} the clock of this computer',
                         'for a recording, set use_sim_time (--use-sim-time); otherwise set the '
                         'clock of the device, or let its driver use the time of arrival')]
 
@@ -256,11 +257,11 @@ class HealthDiagnostics:
         DiagnosticStatus
         """
         name = self._network.names[j]
-        found = self._findings(j, name, calibrate)
+        findings = self._findings(j, name, calibrate)
         level = DiagnosticStatus.OK
-        if found:
-            level = DiagnosticStatus.ERROR if found[0].serious else DiagnosticStatus.WARN
-        health = self._latest(name)
+        if findings:
+            level = DiagnosticStatus.ERROR if findings[0].serious else DiagnosticStatus.WARN
+        health = self._reported_window(name)
         background = calibrate.backgrounds()[name]
         c, n = health.counts, max(1, health.counts['readings'])
         values: dict[str, str | float] = {
@@ -269,7 +270,7 @@ class HealthDiagnostics:
             'noise [nT]': _numbers(1e9 * health.noise_std),
             'field [uT]': _numbers(1e6 * health.field),
             'saturated': c['saturated'], 'spikes': c['spikes'],
-            'share of missing axes': (c['x'] + c['y'] + c['z']) / (3 * n),
+            'fraction of missing axes': (c['x'] + c['y'] + c['z']) / (3 * n),
             'background': 'doubtful' if background.doubtful else
                           'frozen' if background.frozen else
                           'ready' if background.ready else 'learning',
@@ -277,11 +278,11 @@ class HealthDiagnostics:
             'backgrounds relearnt': background.n_relearnt}
         return DiagnosticStatus(
             level=level, name=f'{node}: {name}', hardware_id=name,
-            message=f'{found[0].what}; {found[0].advice}' if found else
+            message=f'{findings[0].what}; {findings[0].advice}' if findings else
             f'waiting for {self._topics[name]}' if self.is_awaited(name) else 'running',
             values=[KeyValue(key=k, value=v if isinstance(v, str) else _number(v))
                     for k, v in values.items()]
-            + [KeyValue(key='also', value=f.what) for f in found[1:]])
+            + [KeyValue(key='also', value=f.what) for f in findings[1:]])
 
 
 def _number(value: float) -> str:

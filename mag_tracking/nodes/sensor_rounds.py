@@ -1,6 +1,6 @@
-"""Periodic work on each sensor in turn: health, calibration state, stored background.
+"""Periodic work for each sensor: health, calibration state, stored background.
 
-Done for all sensors at once, it would delay the readings.
+The sensors are processed one after another. Work on all sensors at once would delay the readings.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,7 +17,7 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 
 
 class SensorRounds:
-    """Rounds over the sensors of a network, in steps of about the same duration.
+    """Processes the sensors of a network one after another, in steps of similar duration.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class SensorRounds:
     health : HealthDiagnostics
     store : BackgroundStore
     is_live : function
-        Returns whether the readings are live, not of a recording.
+        Returns whether the readings are live and not replayed from a recording.
     publish_status : function
         Called with the `DiagnosticStatus` of a sensor.
     publish_states : function
@@ -43,7 +43,7 @@ class SensorRounds:
         self._is_live = is_live
         self._publish_status, self._publish_states = publish_status, publish_states
         self._is_due = False
-        self._reported: set[tuple[int, tuple[int, int | None]]] = set()
+        self._reported_doubts: set[tuple[int, tuple[int, int | None]]] = set()
         self.begin(network)
 
     def begin(self, network: SensorNetwork) -> None:
@@ -59,45 +59,45 @@ class SensorRounds:
         self._states = [self._state(j) for j in range(len(network))]
 
     def tick(self) -> None:
-        """Mark a step as due; it is done after the next readings, or at the next tick."""
+        """Mark a step as due; the step follows the next readings, or the next tick."""
         if self._is_due:
             self._step()
         self._is_due = True
 
     def step_if_due(self) -> None:
-        """Do a step if one is due."""
+        """Run the next step of the round if it is due."""
         if self._is_due:
             self._step()
 
     def report_doubts(self) -> None:
-        """Publish immediately if a background has become doubtful or certain.
+        """Publish the calibration immediately if a background has become doubtful or certain.
 
-        The tracker flags tracks only after it has received this.
+        The tracker cannot flag tracks until it receives the message.
         """
         backgrounds = self._stage.backgrounds()
         latest = {(j, times[-1]) for j, name in enumerate(self._network.names)
                   if (times := backgrounds[name].doubtful_times)}
-        if changed := latest - self._reported:
+        if changed := latest - self._reported_doubts:
             for j, _ in changed:
                 self._states[j] = self._state(j)
             self.publish()
-        self._reported = latest
+        self._reported_doubts = latest
 
     def _step(self) -> None:
-        """Do the next step of the round."""
+        """Run the next step of the round."""
         self._is_due = False
         next(self._steps)
 
     def publish(self) -> None:
-        """Publish the latest known calibration of all sensors."""
+        """Publish the latest calibration of all sensors."""
         self._publish_states(self._states)
 
     def _state(self, j: int) -> SensorCalibration:
-        """`SensorCalibration` of sensor `j`."""
+        """Current calibration of sensor `j`, as a message."""
         return to_message(SensorCalibration, sensor_dict(self._stage, self._network, j))
 
     def _rounds(self) -> Iterator[None]:
-        """Endless rounds: compare all sensors, report on each, publish, store."""
+        """Run endless rounds, with one `yield` per step: compare, report, publish, store."""
         while True:
             self._health.begin_round(self._stage)
             yield

@@ -25,7 +25,7 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
 
     Workaround: Fast DDS 2.14 blocks forever, while it holds the interpreter lock, if a participant
     is destroyed while another one leaves (eProsima/Fast-DDS 6513). This happened to 1 of 1165 nodes
-    when five were signalled at once. The deadline can be removed once that is fixed.
+    when five were signalled at once. The deadline can be removed once Fast DDS is fixed.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
     executor : Executor, optional
         Executor of the nodes.
     status : int
-        Exit status of the process if it is ended here.
+        Exit status of the process if it is ended by the deadline.
     """
     try:
         for node in nodes:
@@ -56,8 +56,7 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
 def limit_exit_time(status: int) -> None:
     """Limit the time until the process ends, with the same timeout as `shut_down`.
 
-    A node whose constructor raised is destroyed together with the interpreter, which may hang as
-    well.
+    A node whose constructor raised is destroyed together with the interpreter, which may also hang.
 
     Parameters
     ----------
@@ -77,7 +76,7 @@ def flush() -> None:
 
 
 def _final_message() -> bytes:
-    """Message of the deadline; begins with the pending error, which is not printed otherwise."""
+    """Message of the deadline, after the pending error, which would not be printed otherwise."""
     error = sys.exc_info()[1]
     if error is None or isinstance(error, KeyboardInterrupt):
         pending = ''

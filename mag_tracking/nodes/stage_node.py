@@ -1,4 +1,4 @@
-"""Base class of the nodes with stages: parameters, network, diagnostics and the main loop."""
+"""Base class of nodes that run stages: parameters, network, diagnostics and main loop."""
 
 import gc
 import signal
@@ -41,9 +41,9 @@ STREAM = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of subscriptions between the nodes, and of a replay, which may be fast. The queue is long
 enough for the time that the tracker needs to initiate a track."""
 STREAM_OUTPUT = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of publishers between the nodes. A node that replaces a killed one can skip at most 256 older
-messages with a single request (RTPS 2.3, 8.3.5.5). With a longer history it would request the rest
-seconds later and receive nothing until then."""
+"""QoS of publishers between the nodes. A restarted node can skip at most 256 older messages with a
+single request (RTPS 2.3, 8.3.5.5). With a longer history, a second request would follow seconds
+later, and the node would receive nothing until then."""
 SENSORS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of subscriptions to sensors; best effort matches reliable and best-effort publishers."""
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
@@ -52,7 +52,7 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
 
 
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of /tf, the same as that of tf2."""
+"""QoS of /tf, as in tf2."""
 READY = 'ready'
 """State of a node that receives input and works normally."""
 
@@ -83,7 +83,7 @@ class StageNode(Node):
     input_qos : QoSProfile
         QoS of subscriptions to sensors.
     is_replayed : bool
-        Whether the input is a recording.
+        Whether the input is replayed from a recording.
     flows : dict of str to Flow
         Statistics of the inputs, by source.
     now_ns : int, ns
@@ -116,7 +116,7 @@ class StageNode(Node):
             raise SettingsError(f'{name}: parameter track.target is {self.settings.track.target!r}'
                                 f', but target is {target!r}; set target only')
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
-        self._reported: dict[tuple[str, str], int] = {}
+        self._reported_rejections: dict[tuple[str, str], int] = {}
         self.flows: dict[str, Flow] = {}
         self._subscriber_monitors: list[SubscriberMonitor] = []
         self.now_ns = 0
@@ -124,15 +124,15 @@ class StageNode(Node):
         steady_timer(self, 1.0, self._publish_diagnostics)
 
     def state(self) -> str:
-        """State of the node: waiting for its input, or ready.
+        """State of the node: waiting for input, or ready.
 
         Returns
         -------
         str
         """
-        silent = [topic for flow in self.flows.values() if flow.last_received is None
-                  for topic in flow.topics]
-        return f'waiting for {shortened(silent)}' if silent else READY
+        silent_topics = [topic for flow in self.flows.values() if flow.last_received is None
+                         for topic in flow.topics]
+        return f'waiting for {shortened(silent_topics)}' if silent_topics else READY
 
     def report_state(self) -> None:
         """Log the state if it has changed."""
@@ -156,12 +156,12 @@ class StageNode(Node):
         raise NotImplementedError
 
     def queues(self) -> dict[str, int]:
-        """Number of records that are held back.
+        """Number of queued records.
 
         Returns
         -------
         dict of str to int
-            By stage name.
+            Number by name of the stage.
         """
         return {}
 
@@ -174,7 +174,7 @@ class StageNode(Node):
             Role of the next step, for messages.
         topic : str
         publishes : str
-            Message type that the node of the next step publishes, by which it is identified.
+            Message type that identifies the node of the next step among the subscribers.
         """
         self._subscriber_monitors.append(
             SubscriberMonitor(role, self.resolve_topic_name(topic), publishes))
@@ -214,7 +214,7 @@ class StageNode(Node):
         source : str, optional
             Sender; diagnostics report throughput and latency of its messages.
         batches : bool
-            Whether `topic` is an alternative to the other topics of `source`.
+            Whether `topic` carries batches, as an alternative to the other topics of `source`.
 
         Returns
         -------
@@ -254,7 +254,7 @@ class StageNode(Node):
         source : str
             Preceding step; diagnostics report throughput and latency of its records.
         topics : sequence of str
-            Topics on which it publishes.
+            Topics on which the preceding step publishes.
         callback : function
             Called with each record.
         stamp_of : function
@@ -263,7 +263,7 @@ class StageNode(Node):
         Returns
         -------
         function
-            Takes a record.
+            Processes a record.
         """
         flow = self.flows.setdefault(source, Flow(source))
         flow.topics += map(self.resolve_topic_name, topics)
@@ -277,7 +277,7 @@ class StageNode(Node):
         return receive
 
     def readings_of(self, message: FieldReadings, stage: Stage[Any, Any]) -> Readings | None:
-        """Convert a FieldReadings message; an invalid one is logged and counted as a rejection.
+        """Convert a FieldReadings message; log an invalid message and count it as a rejection.
 
         Parameters
         ----------
@@ -298,12 +298,13 @@ class StageNode(Node):
             return None
 
     def _publish_diagnostics(self) -> None:
-        """Publish the counts of the stages; warn of rejections since the last time."""
+        """Publish the counts of the stages; warn of new rejections."""
         statuses, queues = [], self.queues()
         for name, stage in self.stages().items():
-            bad = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')}
-            increases = {k: n for k, n in bad.items() if n != self._reported.get((name, k), 0)}
-            self._reported |= {(name, cause): n for cause, n in increases.items()}
+            rejections = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')}
+            increases = {k: n for k, n in rejections.items()
+                         if n != self._reported_rejections.get((name, k), 0)}
+            self._reported_rejections |= {(name, cause): n for cause, n in increases.items()}
             statuses.append(DiagnosticStatus(
                 level=DiagnosticStatus.WARN if increases else DiagnosticStatus.OK,
                 name=f'{self.title}: {name}', hardware_id='magnetometer network',
@@ -313,18 +314,18 @@ class StageNode(Node):
                 )]))
         statuses += [flow.status(self.title, partial(self._has_publisher, flow))
                      for flow in self.flows.values()]
-        for listener in self._subscriber_monitors:
-            ends = self.get_subscriptions_info_by_topic(listener.topic)
-            statuses.append(listener.status(self.title, {
-                name for name in map(node_of, ends) if name}, self._published_types))
-        self.publish_statuses([*statuses, *self._own_statuses()])
+        for monitor in self._subscriber_monitors:
+            endpoints = self.get_subscriptions_info_by_topic(monitor.topic)
+            statuses.append(monitor.status(self.title, {
+                name for name in map(node_of, endpoints) if name}, self._published_types))
+        self.publish_statuses([*statuses, *self._start_statuses()])
         self.report_state()
 
-    def _own_statuses(self) -> list[DiagnosticStatus]:
-        """Faults of how the node was started."""
+    def _start_statuses(self) -> list[DiagnosticStatus]:
+        """Status of the start of the node: duplicate name, missing clock."""
         faults = []
-        own = self.get_name(), self.get_namespace()
-        n_same = self.get_node_names_and_namespaces().count(own)
+        full_name = self.get_name(), self.get_namespace()
+        n_same = self.get_node_names_and_namespaces().count(full_name)
         if n_same > 1:
             faults.append(f'{n_same} nodes are named {self.get_fully_qualified_name()}: stop all '
                           'but one, or rename this one (-r __node:=NAME; if several nodes run in '
@@ -338,7 +339,7 @@ class StageNode(Node):
             message='; '.join(faults) or self.state())]
 
     def _published_types(self, name: str) -> set[str]:
-        """Types of the messages that a node publishes, as far as it is discovered."""
+        """Types of the messages that a node publishes; empty if it has not been discovered."""
         namespace, _, leaf = name.rpartition('/')
         try:
             found = self.get_publisher_names_and_types_by_node(leaf, namespace or '/')
@@ -367,7 +368,7 @@ class StageNode(Node):
 
 
 def has_subscribers(publisher: Publisher) -> bool:
-    """Whether a topic has subscribers; large messages are built only in that case.
+    """Whether a publisher has subscribers.
 
     Parameters
     ----------
@@ -395,12 +396,12 @@ def title_of(node: Node) -> str:
 
 
 def make_executor() -> Executor:
-    """Create the events executor, which has a tenth of the overhead of others, if it is available.
+    """Create an executor: the events executor, which has a low overhead, if it is available.
 
     Returns
     -------
     Executor
-        Otherwise a `SingleThreadedExecutor`.
+        `EventsExecutor`, or else `SingleThreadedExecutor`.
     """
     try:
         from rclpy.experimental import EventsExecutor
@@ -412,7 +413,7 @@ def make_executor() -> Executor:
 def freeze() -> None:
     """Exclude all existing objects from garbage collection.
 
-    Scanning them again and again would delay readings by more than is acceptable.
+    Repeated scans of these objects would delay the readings too much.
     """
     gc.collect()
     gc.freeze()
@@ -451,13 +452,13 @@ def main(node_class: Callable[[], Node], arguments: list[str] | None = None) -> 
     int
         Exit status.
     """
-    with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
-        return _run_until(seen, node_class, arguments)
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
+        return _run_until(signals, node_class, arguments)
 
 
-def _run_until(seen: list[int], node_class: Callable[[], Node],
+def _run_until(signals: list[int], node_class: Callable[[], Node],
                arguments: list[str] | None) -> int:
-    """Run a node until `seen` contains a signal."""
+    """Run a node until `signals` contains a received signal."""
     try:
         begin(arguments)
     except SettingsError as error:
@@ -468,11 +469,11 @@ def _run_until(seen: list[int], node_class: Callable[[], Node],
         node = node_class()
         executor.add_node(node)
         freeze()
-        spin(executor, lambda: bool(seen))
+        spin(executor, lambda: bool(signals))
         status = 0
     except (MagTrackingError, ParameterException) as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
-        # A node that is only partly constructed is destroyed when the error is deleted.
+        # A partly constructed node is destroyed when the error is deleted.
         limit_exit_time(status)
     except (KeyboardInterrupt, ExternalShutdownException):
         status = 0

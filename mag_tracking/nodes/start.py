@@ -1,7 +1,7 @@
 """Entry points of the nodes, with signal handling before any slow import.
 
-The imports of a node take a second, several on a small computer. From the first line of this module
-on, SIGINT and SIGTERM end the process with status 0: immediately during imports, later through
+The imports of a node take a second, or several seconds on a small computer. As soon as this module
+runs, SIGINT and SIGTERM end the process with status 0: immediately during imports, later through
 `stage_node.main`, which shuts the node down. Signals during the startup of Python itself cannot be
 handled.
 """
@@ -32,7 +32,7 @@ def run_node(name: str) -> NoReturn:
     except KeyboardInterrupt:
         status = 130
     finally:
-        # Finalisation of Python takes time as well, during which further signals are ignored.
+        # Finalisation of Python also takes time; further signals are ignored.
         for s in ENDING:
             signal.signal(s, signal.SIG_IGN)
         limit_exit_time(status)

@@ -1,4 +1,4 @@
-"""Log of the diagnostics: each fault when it appears, and once a minute while it lasts."""
+"""Log of diagnostics: each fault when it appears; errors also once a minute while they last."""
 
 import re
 import time
@@ -8,16 +8,16 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 REPEAT_INTERVAL_S = 60.0
-"""[s] Interval at which a lasting fault is logged again."""
+"""[s] Interval at which a persistent error is logged again; minimum interval for other faults."""
 MAX_SIMILAR_LINES = 4
-"""Maximum number of lines within that interval that differ in numbers only, as for many sensors."""
+"""Maximum number of lines per interval that differ only in numbers, such as sensor numbers."""
 MAX_FAULTS = 1000
-"""Maximum number of faults remembered; more than that come from names generated without limit."""
+"""Maximum number of stored faults; limits the memory if names are generated without limit."""
 _NUMBER = re.compile(r'[\d.]+')
 
 
 class StatusLog:
-    """Logs faults from `DiagnosticStatus` messages, and their end.
+    """Logs the beginning and the end of faults in `DiagnosticStatus` messages.
 
     Parameters
     ----------
@@ -26,18 +26,20 @@ class StatusLog:
 
     def __init__(self, logger: RcutilsLogger) -> None:
         self._logger = logger
-        self._faulty: set[str] = set()
-        self._logged: dict[tuple[str, str], float] = {}
+        self._faulty_names: set[str] = set()
+        # Last logged fault of each name whose status has not been OK since.
+        self._current_faults: dict[str, tuple[str, str]] = {}
+        self._last_logged: dict[tuple[str, str], float] = {}
         self._similar: Counter[str] = Counter()
-        self._similar_since = 0.0
+        self._interval_start = 0.0
 
     @property
     def n_remembered(self) -> int:
-        """Number of faults and kinds of lines that are remembered."""
-        return len(self._logged) + len(self._similar)
+        """Number of stored faults and kinds of lines."""
+        return len(self._last_logged) + len(self._current_faults) + len(self._similar)
 
     def add(self, status: DiagnosticStatus) -> None:
-        """Log a status if it is new.
+        """Log a status if its fault is new or has ended.
 
         Parameters
         ----------
@@ -45,18 +47,24 @@ class StatusLog:
         """
         subject = str(status.name.rpartition(': ')[2])
         if status.level == DiagnosticStatus.OK:
-            if status.name in self._faulty:
-                self._faulty.discard(status.name)
+            self._current_faults.pop(status.name, None)
+            if status.name in self._faulty_names:
+                self._faulty_names.discard(status.name)
                 self._log(DiagnosticStatus.OK, f'{subject}: {status.message} again')
             return
-        self._faulty.add(status.name)
-        # The numbers in the message of a lasting fault change every second.
+        self._faulty_names.add(status.name)
+        # The numbers in the message of a persistent fault change every second.
         fault, now = (status.name, _NUMBER.sub('#', status.message)), time.monotonic()
-        if now - self._logged.get(fault, -REPEAT_INTERVAL_S) < REPEAT_INTERVAL_S:
+        if now - self._last_logged.get(fault, -REPEAT_INTERVAL_S) < REPEAT_INTERVAL_S:
             return
-        if len(self._logged) >= MAX_FAULTS:
-            self._logged.clear()
-        self._logged[fault] = now
+        if status.level != DiagnosticStatus.ERROR \
+                and self._current_faults.get(status.name) == fault:
+            return
+        if len(self._last_logged) >= MAX_FAULTS:
+            self._last_logged.clear()
+            self._current_faults.clear()
+        self._last_logged[fault] = now
+        self._current_faults[status.name] = fault
         self._log(status.level, f'{subject}: {status.message}')
 
     def info(self, text: str) -> None:
@@ -69,16 +77,16 @@ class StatusLog:
         self._log(DiagnosticStatus.OK, text)
 
     def _log(self, level: bytes, text: str) -> None:
-        """Log a line; of many similar ones, only the first."""
+        """Log a line unless `MAX_SIMILAR_LINES` similar lines have been logged."""
         now, pattern = time.monotonic(), _NUMBER.sub('#', text)
-        if now - self._similar_since > REPEAT_INTERVAL_S or len(self._similar) >= MAX_FAULTS:
+        if now - self._interval_start > REPEAT_INTERVAL_S or len(self._similar) >= MAX_FAULTS:
             self._similar.clear()
-            self._similar_since = now
+            self._interval_start = now
         self._similar[pattern] += 1
         if self._similar[pattern] > MAX_SIMILAR_LINES:
             return
         if self._similar[pattern] == MAX_SIMILAR_LINES:
-            text += ' (further similar messages are in /diagnostics only)'
+            text += ' (further similar messages appear only in /diagnostics)'
         if level == DiagnosticStatus.ERROR:
             self._logger.error(text)
         elif level == DiagnosticStatus.OK:

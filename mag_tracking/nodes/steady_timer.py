@@ -10,7 +10,7 @@ from rclpy.timer import Timer
 
 def steady_timer(node: Node, seconds: float, call: Callable[[], None],
                  autostart: bool = True) -> Timer:
-    """Create a timer that does not follow simulated time, which may stop.
+    """Create a timer that is independent of simulated time.
 
     Parameters
     ----------

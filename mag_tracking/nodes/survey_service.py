@@ -14,7 +14,7 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.survey.stage import Survey, with_measured_noise
 
 MIN_INTERVAL_S = 0.5
-"""[s] Minimum interval between calls; readings have to wait while a survey is solved."""
+"""[s] Minimum interval between calls, because each survey delays the readings."""
 
 
 class SurveyService:
@@ -27,7 +27,7 @@ class SurveyService:
     stage : Calibrate
         Calibration stage.
     save_as : Path
-        File to which the network is saved.
+        File to which the network is saved on request.
     imu_topics : sequence of str
         Absolute topics of the accelerometers, for messages.
     """
@@ -36,38 +36,38 @@ class SurveyService:
                  imu_topics: Sequence[str]) -> None:
         self._survey, self._stage, self._save_as = survey, stage, save_as
         self._imu_topics = imu_topics
-        self._ended = -MIN_INTERVAL_S
+        self._end_time = -MIN_INTERVAL_S
 
     def solve(self, network: SensorNetwork, save: bool,
               response: SurveyMessage.Response) -> SensorNetwork | None:
-        """Solve a survey.
+        """Solve a survey unless the previous survey has just ended.
 
         Parameters
         ----------
         network : SensorNetwork
-            Network in force.
+            Current network.
         save : bool
-            Also write the resulting network file.
+            Whether to write the resulting network file.
         response : Survey.Response
-            Filled with the result.
+            Receives the result.
 
         Returns
         -------
         SensorNetwork or None
             None if the survey failed; `response` contains the reason.
         """
-        if time.monotonic() - self._ended < MIN_INTERVAL_S:
+        if time.monotonic() - self._end_time < MIN_INTERVAL_S:
             response.message = f'a survey has just been run; try again in {MIN_INTERVAL_S:g} s'
             return None
         try:
-            return self._solve(network, save, response)
+            return self._solve_now(network, save, response)
         finally:
-            self._ended = time.monotonic()
+            self._end_time = time.monotonic()
 
-    def _solve(self, network: SensorNetwork, save: bool,
+    def _solve_now(self, network: SensorNetwork, save: bool,
                response: SurveyMessage.Response) -> SensorNetwork | None:
-        """Solve a survey now."""
-        # For a sensor with a target nearby, this is the background from before its arrival.
+        """Solve a survey; the interval is not checked."""
+        # If a target is near a sensor, the background was measured before its arrival.
         fields = {name: self._stage.background(name)
                   for name, background in self._stage.backgrounds().items()
                   if background.certain and self._stage.last_stamp_ns(name) is not None}
@@ -77,8 +77,8 @@ class SurveyService:
                 f'{", ".join(filter(None, self._imu_topics))}'
             return None
         date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
-        found = self._survey.solve(fields, date)
-        surveyed = with_measured_noise(found.network, self._stage)
+        solution = self._survey.solve(fields, date)
+        surveyed = with_measured_noise(solution.network, self._stage)
         if save:
             try:
                 write_network(self._save_as, surveyed, 'Written by calibration_node.')
@@ -87,11 +87,11 @@ class SurveyService:
                 return None
         response.success = True
         response.message = (
-            'result in force'
+            'the result is in force'
             + (f' and saved to {self._save_as}; use that file at the next start' if save else '')
-            + f'; clock reference: {found.reference or "none, no knock was sensed"}')
-        response.warnings = found.warnings()
-        response.warnings += [f'{name}: no background has been learnt; its heading stays as in '
-                              'the network file'
+            + f'; clock reference: {solution.reference or "none, because no knock was detected"}')
+        response.warnings = solution.warnings()
+        response.warnings += [f'{name}: no background has been learnt; its heading remains as '
+                              'in the network file'
                               for name in surveyed.names if name not in fields]
         return surveyed

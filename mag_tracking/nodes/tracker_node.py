@@ -80,15 +80,14 @@ class TrackerNode(StageNode):
     Parameters
     ----------
     has_direct_input : bool
-        Whether frames are passed to `receive_frame` within this process, not subscribed to.
+        Whether frames are passed to `receive_frame` directly and not received on a topic.
     **node_arguments
         Arguments of `StageNode`.
 
     Attributes
     ----------
     after_pose : function or None
-        Called once a pose has been published, before everything else; publishes the frame of the
-        pose ahead of the track.
+        Called between publishing a pose and its track; publishes the frame of the pose.
     """
 
     def __init__(self, has_direct_input: bool = False, **node_arguments: Any) -> None:
@@ -121,7 +120,7 @@ class TrackerNode(StageNode):
         # Poses of each running track.
         self._paths: dict[int, deque[PoseStamped]] = {}
         self._is_silent, self._latest_id = False, -1
-        self._doubtful: dict[str, DoubtfulTimes] = {}
+        self._doubtful_times: dict[str, DoubtfulTimes] = {}
         if has_direct_input:
             self.receive_frame = self.direct_input('detection', [NETWORK_FRAME], self._feed,
                                                    lambda frame: frame.stamp_ns)
@@ -129,7 +128,7 @@ class TrackerNode(StageNode):
             self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, STREAM,
                               source='detection')
         steady_timer(self, 0.25, self.end_without_frames)
-        self.subscription(CalibrationState, CALIBRATION_STATE, self._calibrated, LATCHED)
+        self.subscription(CalibrationState, CALIBRATION_STATE, self._receive_calibration, LATCHED)
         self.report_state()
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
@@ -144,21 +143,21 @@ class TrackerNode(StageNode):
     def end_without_frames(self) -> None:
         """End the tracks if frames no longer arrive.
 
-        The time of arrival counts, because a clock may be wrong. During a replay nothing is ended,
-        because it may be slow or paused.
+        The time of arrival is used, because timestamps may be wrong. Tracks are not ended during a
+        replay, which may be slow or paused.
         """
         if self._stage.bank is None or self.is_replayed:
             return
         last_received = self.flows['detection'].last_received
         assert last_received is not None, 'a track without a frame'
         silent_s = time.monotonic() - last_received
-        # Required twice in a row, because frames may be queued while the node is busy.
+        # Two consecutive checks are required, because frames may be queued while the node is busy.
         was_silent, self._is_silent = self._is_silent, \
             silent_s > self.settings.track.end_gap_s + TRANSPORT_MARGIN_S
         if was_silent and self._is_silent:
             self._publish_all(self._stage.give_up('no frames received'), None)
 
-    def _calibrated(self, message: CalibrationState) -> None:
+    def _receive_calibration(self, message: CalibrationState) -> None:
         """Apply the orientations of a survey and the doubtful intervals of the backgrounds."""
         try:
             network = with_orientations(self.network, message)
@@ -167,10 +166,10 @@ class TrackerNode(StageNode):
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
         if not self._has_direct_input:
-            # The message has only the latest interval of each sensor; frames of earlier ones may
-            # still arrive.
-            self._doubtful = merged(self._doubtful, doubtful_times(message))
-            self._stage.doubt(self._doubtful)
+            # The message has only the latest interval of each sensor; frames of earlier intervals
+            # may still arrive.
+            self._doubtful_times = merged(self._doubtful_times, doubtful_times(message))
+            self._stage.doubt(self._doubtful_times)
         if _same_orientations(network, self.network):
             return
         self.network = network
@@ -190,7 +189,7 @@ class TrackerNode(StageNode):
         self._stage.idle()
 
     def doubt(self, times: Mapping[str, DoubtfulTimes]) -> None:
-        """Set the intervals with doubtful backgrounds; tracks with such frames are ambiguous.
+        """Set the intervals with doubtful backgrounds, in which tracks are ambiguous.
 
         Parameters
         ----------
@@ -200,7 +199,7 @@ class TrackerNode(StageNode):
         self._stage.doubt(times)
 
     def idle(self) -> None:
-        """Do work that can wait until the preceding step has published its results."""
+        """Do work that is deferred until the preceding step has published its results."""
         self._stage.idle()
 
     def _feed(self, frame: FieldFrame) -> None:
@@ -282,7 +281,7 @@ class TrackerNode(StageNode):
         if track.topic_uncertainty is not None:
             path.append(to_message(PoseStamped, pose_dict(
                 track.stamp_ns, frame, track.position, track.orientation)))
-        # The topic carries a single path: that of the oldest running track.
+        # The topic carries the path of the oldest running track only.
         if path and track.id == min(self._paths) and has_subscribers(self._path_publisher):
             self._path_publisher.publish(Path(header=path[-1].header, poses=list(path)))
         if has_subscribers(self._markers):
@@ -290,7 +289,7 @@ class TrackerNode(StageNode):
 
 
 def publish_if_any(publisher: Publisher, cls: Any, content: MessageDict | None) -> None:
-    """Publish a message unless it is withheld.
+    """Publish a message unless its content is None.
 
     Parameters
     ----------
@@ -298,17 +297,17 @@ def publish_if_any(publisher: Publisher, cls: Any, content: MessageDict | None) 
     cls : type
         Class of the message.
     content : dict or None
-        None publishes nothing.
+        Fields of the message.
     """
     if content is not None:
         publisher.publish(to_message(cls, content))
 
 
 def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:
-    """Whether two networks have the same orientations, except for rounding of quaternions."""
-    known = [a is b if a is None or b is None else np.allclose(a, b)
+    """Whether two networks have the same orientations within the rounding of quaternions."""
+    is_same_std = [a is b if a is None or b is None else np.allclose(a, b)
              for a, b in zip(one.orientation_std, other.orientation_std, strict=True)]
-    return all(known) and bool(np.abs(one.R_ws - other.R_ws).max() < 1e-9)
+    return all(is_same_std) and bool(np.abs(one.R_ws - other.R_ws).max() < 1e-9)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -2,12 +2,14 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
 import pytest
 
 from mag_tracking.cli import main
+from mag_tracking.cli.quantities import quantity
 from mag_tracking.recording.fit_folder import FIT_COLUMNS
 from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
 from support.bundled import DATA, NETWORK_FILE, QUICK, parameter_file, vehicle_path
@@ -40,17 +42,17 @@ def test_replay_writes_all_documented_files(tmp_path, capsys):
 
 
 def test_replay_reports_replaced_results_and_follows_no_links(tmp_path, capsys):
-    out, theirs = tmp_path / 'out', tmp_path / 'theirs'
+    out, other_file = tmp_path / 'out', tmp_path / 'theirs'
     out.mkdir()
-    theirs.write_text('- tracks.mcap\n')
+    other_file.write_text('- tracks.mcap\n')
     for name in ('poses.csv', 'summary.json', 'tracks.mcap', 'metadata.yaml', 'map_track_1.png'):
-        (out / name).symlink_to(theirs)
+        (out / name).symlink_to(other_file)
     (out / 'field_track_7.png').write_text('of an earlier run')
     (out / 'notes.txt').write_text('mine')
     assert replay_one(out) == 0
     output = capsys.readouterr().out.splitlines()
     assert output.count(f'replacing the results of an earlier run in {out}') == 1
-    assert theirs.read_text() == '- tracks.mcap\n' and (out / 'notes.txt').exists()
+    assert other_file.read_text() == '- tracks.mcap\n' and (out / 'notes.txt').exists()
     assert not any(path.is_symlink() for path in out.iterdir())
     assert {path.name for path in out.glob('*.png')} == {
         f'{kind}_track_1.png' for kind in ('map', 'weights', 'field')}
@@ -171,6 +173,19 @@ def test_an_upside_down_sensor_is_named(tmp_path, capsys):
     assert 'fits best if rotated' not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize('n, text', [(0, '0 passes'), (1, '1 pass'), (2, '2 passes')])
+def test_quantities_have_the_singular_for_one_only(n, text):
+    assert quantity(n, 'pass', 'passes') == text
+    assert quantity(n, 'track') == f'{n} track' + ('' if n == 1 else 's')
+
+
+def test_replay_prints_counts_in_the_singular(tmp_path, capsys):
+    assert replay_one(tmp_path, '--no-figures') == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(re.fullmatch(r'\S+: \d+ frames, 1 detection, 1 track', x) for x in lines), lines
+    assert any(line.startswith(f'{NAME}.mcap: 1 track (') for line in lines), lines
+
+
 def test_replay_reports_a_recording_without_targets(tmp_path, capsys):
     assert replay_one(tmp_path, '--no-figures', '--target', 'magnet') == 0
     assert 'nothing was detected with the settings for a magnet' in capsys.readouterr().out
@@ -218,17 +233,17 @@ def test_fit_writes_all_documented_files(tmp_path, capsys):
 def test_a_file_name_may_be_invalid_utf8(tmp_path):
     path = tmp_path / os.fsdecode(b'\xff$a$.mcap')
     path.write_bytes(vehicle_path('straight_car_right').read_bytes())
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, '-m', 'mag_tracking.cli', 'fit', path, '--network', NETWORK_FILE,
          '--orders', '1', '--out', tmp_path / 'out'], capture_output=True, text=True, timeout=120,
         env={**os.environ, 'PYTHONIOENCODING': 'utf-8:strict'})
-    assert done.returncode == 0, done.stderr
-    assert '\\udcff$a$, pass 1' in done.stdout
+    assert process.returncode == 0, process.stderr
+    assert '\\udcff$a$, pass 1' in process.stdout
     assert '\n\\udcff$a$,1,1,' in (tmp_path / 'out' / 'fits.csv').read_text()
 
 
 def test_fit_of_a_single_pass_cannot_separate_hard_and_soft_iron(tmp_path, capsys):
-    """`iron` is null then."""
+    """In this case, `iron` is null."""
     name = str(vehicle_path('straight_car_right'))
     assert main(['fit', name, '--network', str(NETWORK_FILE), '--orders', '3', '--same-vehicle',
                  '--no-figures', '--out', str(tmp_path)]) == 0

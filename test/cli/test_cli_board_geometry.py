@@ -20,10 +20,10 @@ POSITIONS = FOLDER / 'sensor_positions_m.csv'
 
 @pytest.fixture(scope='module')
 def calibrated(tmp_path_factory):
-    """(written network, output, folder) of a calibration with every other row."""
+    """(written network, output, folder) of a calibration with every other pose."""
     folder = tmp_path_factory.mktemp('geometry')
-    stated, field, positions, axes = board_of_41()
-    write_network(folder / 'stated.yaml', stated)
+    nominal, field, positions, axes = board_of_41()
+    write_network(folder / 'stated.yaml', nominal)
     table = write_table(folder / 'poses.csv', field[::2], positions[::2], axes[::2])
     run = subprocess.run(
         [sys.executable, '-m', 'mag_tracking.cli', 'board-geometry', table, '--network',
@@ -35,58 +35,58 @@ def calibrated(tmp_path_factory):
 def test_the_written_network_locates_the_magnet(calibrated):
     """Locate the magnet with held-out raw readings after the stage Calibrate."""
     network, *_ = calibrated
-    stated, field, positions, axes = board_of_41()
-    g = calibrate_geometry(stated, field[::2], positions[::2], axes[::2], MOMENT,
+    nominal, field, positions, axes = board_of_41()
+    g = calibrate_geometry(nominal, field[::2], positions[::2], axes[::2], MOMENT,
                            GeometrySettings())
     B = through_calibrate(network, field[1::2])
-    # Equal within the digits of the file; the background has not drifted.
+    # The fields are equal within the digits of the file, because the background does not drift.
     np.testing.assert_allclose(B, g.signal(field[1::2]), rtol=0, atol=1e-12)
-    found = [locate_magnet(network, b, MOMENT, *BOX, PoseSettings()) for b in B]
-    assert all(p.converged for p in found)
+    poses = [locate_magnet(network, b, MOMENT, *BOX, PoseSettings()) for b in B]
+    assert all(p.converged for p in poses)
     r, u = g.magnet_poses(positions[1::2], axes[1::2])
-    place = np.linalg.norm([p.position for p in found] - r, axis=1)
-    turn = np.rad2deg([np.arccos(np.clip(p.axis @ a, -1.0, 1.0))
-                       for p, a in zip(found, u, strict=True)])
-    low = positions[1::2, 2] < 0.1
-    said('by the written file', place, turn, low)
-    within_limits(place, turn, low)
+    position_error = np.linalg.norm([p.position for p in poses] - r, axis=1)
+    angle_error = np.rad2deg([np.arccos(np.clip(p.axis @ a, -1.0, 1.0))
+                              for p, a in zip(poses, u, strict=True)])
+    is_low = positions[1::2, 2] < 0.1
+    said('by the written file', position_error, angle_error, is_low)
+    within_limits(position_error, angle_error, is_low)
 
 
 def test_the_printed_table_and_figure_match_the_network(calibrated):
     network, text, folder = calibrated
     rows = [line.split() for line in text.splitlines() if line.startswith('mag_')]
     assert [r[0] for r in rows] == list(network.names)
-    stated = board_of_41()[0]
-    moved = 1e3 * np.linalg.norm(network.positions - stated.positions, axis=1)
-    np.testing.assert_allclose([float(r[1]) for r in rows], moved, atol=0.006)
-    turned = np.rad2deg([np.arccos(0.5 * (np.trace(R) - 1.0)) for R in network.R_ws])
-    np.testing.assert_allclose([float(r[3]) for r in rows], turned, atol=0.006)
+    nominal = board_of_41()[0]
+    shift = 1e3 * np.linalg.norm(network.positions - nominal.positions, axis=1)
+    np.testing.assert_allclose([float(r[1]) for r in rows], shift, atol=0.006)
+    rotation_deg = np.rad2deg([np.arccos(0.5 * (np.trace(R) - 1.0)) for R in network.R_ws])
+    np.testing.assert_allclose([float(r[3]) for r in rows], rotation_deg, atol=0.006)
     gain = 1.0 / np.array([C[0, 0] for C in network.correction])
     np.testing.assert_allclose([float(r[5]) for r in rows], gain, atol=6e-5)
     bias = gain[:, None] * network.background
     np.testing.assert_allclose([[float(v) for v in r[7:10]] for r in rows], 1e6 * bias, atol=0.006)
-    assert np.ptp(gain) > 0.01 and moved.max() > 0.5 and turned.max() > 1.0
+    assert np.ptp(gain) > 0.01 and shift.max() > 0.5 and rotation_deg.max() > 1.0
     assert 'moment 0.264 A m^2 (given)' in text and ' mm; tilt ' in text
     assert '162 of 162 poses used, normalised cost 0.6' in text
     assert 'warning' not in text and 'note' not in text
     assert all(c.by == 'magnet, 162 tracked poses' and c.date.startswith('20')
                and np.isnan(c.clock_offset_std) for c in network.calibrated)
     assert (folder / 'board.png').stat().st_size > 50_000
-    noise = np.array(stated.noise_std) / gain[:, None]
+    noise = np.array(nominal.noise_std) / gain[:, None]
     np.testing.assert_allclose(np.array(network.noise_std), noise, rtol=1e-9)
 
 
 def test_sensor_positions_alone_are_sufficient(tmp_path, capsys):
     out = tmp_path / 'board.yaml'
-    few = write_table(tmp_path / 'poses.csv', *(v[::6] for v in board_of_41()[1:]))
-    assert command(few, '--sensors', POSITIONS, out=out) == 0
+    short_table = write_table(tmp_path / 'poses.csv', *(v[::6] for v in board_of_41()[1:]))
+    assert command(short_table, '--sensors', POSITIONS, out=out) == 0
     text = capsys.readouterr().out
     assert 'note: noise of 41 sensors assumed to be 1e-07 T' in text
     # With one noise level for two kinds of sensors, the noisier kind is inconsistent.
-    assert 'warning: sensors inconsistent with the others' in text
+    assert 'warning: sensors inconsistent with other sensors' in text
     network = read_network(out)
     assert network.noise_std == (None,) * 41 and network.imu_topics == (None,) * 41
-    assert command(few, '--sensors', POSITIONS, '--noise-std', 3e-7, out=out) == 0
+    assert command(short_table, '--sensors', POSITIONS, '--noise-std', 3e-7, out=out) == 0
     assert 'assumed' not in capsys.readouterr().out
     noise = np.array(read_network(out).noise_std) * [[C[0, 0] ** -1] for C in
                                                      read_network(out).correction]
@@ -94,15 +94,15 @@ def test_sensor_positions_alone_are_sufficient(tmp_path, capsys):
 
 
 def test_inconsistent_sensors_and_poses_are_named(tmp_path, capsys, monkeypatch):
-    """A sensor with swapped axes, and a pose by its row in the file after a skipped row."""
-    stated, field, positions, axes, _ = simulated(5)
+    """Swapped axes are reported by sensor; an inconsistent pose by its row in the file."""
+    nominal, field, positions, axes, _ = simulated(5)
     field[:, 2] = field[:, 2][:, [1, 0, 2]]
     field[3] = np.nan
     positions[7, 0] += 0.02
-    write_network(tmp_path / 'stated.yaml', stated)
+    write_network(tmp_path / 'stated.yaml', nominal)
     table = write_table(tmp_path / 'poses.csv', field, positions, axes)
-    drawn, save = [], Figure.savefig
-    monkeypatch.setattr(Figure, 'savefig', lambda figure, *a, **k: drawn.append(figure)
+    figures, save = [], Figure.savefig
+    monkeypatch.setattr(Figure, 'savefig', lambda figure, *a, **k: figures.append(figure)
                         or save(figure, *a, **k))
     assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
                    tmp_path / 'board.png', out=tmp_path / 'out.yaml') == 0
@@ -111,18 +111,18 @@ def test_inconsistent_sensors_and_poses_are_named(tmp_path, capsys, monkeypatch)
     assert 'rows with inconsistent poses (the header is row 1): 9\n' in text
     lines = table.read_text().splitlines()
     assert lines[8].endswith(','.join(map(str, [*positions[7].tolist(), *axes[7].tolist()])))
-    labels = [t.get_text() for f in drawn[0].subfigs for a in f.axes for t in
+    labels = [t.get_text() for f in figures[0].subfigs for a in f.axes for t in
               (a.get_legend().get_texts() if a.get_legend() else [])]
     assert 'does not fit' in labels
-    titles = [a.get_title(loc='left') for f in drawn[0].subfigs for a in f.axes]
+    titles = [a.get_title(loc='left') for f in figures[0].subfigs for a in f.axes]
     assert any('do not fit: 1' in title for title in titles)
 
 
 # Rejected calibrations, settings and invalid input.
 
 def test_a_reversed_magnet_is_refused(tmp_path, capsys):
-    stated, field, positions, axes, _ = simulated(9)
-    write_network(tmp_path / 'stated.yaml', stated)
+    nominal, field, positions, axes, _ = simulated(9)
+    write_network(tmp_path / 'stated.yaml', nominal)
     table = write_table(tmp_path / 'poses.csv', field, positions, -axes)
     assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
                    tmp_path / 'board.png', out=tmp_path / 'out.yaml') == 1
@@ -133,15 +133,15 @@ def test_a_reversed_magnet_is_refused(tmp_path, capsys):
 
 
 def test_settings_are_read_from_a_file(tmp_path, capsys):
-    stated, field, positions, axes, _ = simulated(9)
-    write_network(tmp_path / 'stated.yaml', stated)
+    nominal, field, positions, axes, _ = simulated(9)
+    write_network(tmp_path / 'stated.yaml', nominal)
     table = write_table(tmp_path / 'poses.csv', field, positions, axes)
     params = tmp_path / 'params.yaml'
     params.write_text('{rotation_std_deg: 0.0, moment_std: 0.02}')
     common = '--network', tmp_path / 'stated.yaml', '--params', params
     assert command(table, *common, out=tmp_path / 'out.yaml') == 0
     network = read_network(tmp_path / 'out.yaml')
-    np.testing.assert_allclose(network.R_ws, stated.R_ws, atol=1e-12)
+    np.testing.assert_allclose(network.R_ws, nominal.R_ws, atol=1e-12)
     # A fixed orientation has no standard deviation in the file.
     assert network.orientation_std == (None,) * 9
     assert 'moment 0.26' in (text := capsys.readouterr().out) and '(given)' not in text
@@ -174,20 +174,20 @@ def test_invalid_options_are_named(tmp_path, capsys, options, message):
 
 
 def test_invalid_files_are_named(tmp_path, capsys):
-    few = tmp_path / 'few.csv'
-    few.write_text('0,0,0\n1,0,0\n')
+    short_table = tmp_path / 'few.csv'
+    short_table.write_text('0,0,0\n1,0,0\n')
     out = tmp_path / 'out.yaml'
-    assert command(FOLDER / 'poses.csv', '--sensors', few, out=out) == 1
+    assert command(FOLDER / 'poses.csv', '--sensors', short_table, out=out) == 1
     assert 'readings of 41 sensors, but the network has 2' in capsys.readouterr().err
-    few.write_text('0,0,0\n0,0,0\n')
-    assert command(FOLDER / 'poses.csv', '--sensors', few, out=out) == 1
+    short_table.write_text('0,0,0\n0,0,0\n')
+    assert command(FOLDER / 'poses.csv', '--sensors', short_table, out=out) == 1
     assert 'few.csv: sensors mag_0 and mag_1 are both at' in capsys.readouterr().err
     assert command(tmp_path / 'none.csv', '--sensors', POSITIONS, out=out) == 1
     assert 'cannot read' in capsys.readouterr().err
-    stated, field, positions, axes, _ = simulated(1, n_poses=5)
-    write_network(tmp_path / 'stated.yaml', stated)
-    write_table(few, field, np.tile(stated.positions[0], (5, 1)), axes)
-    assert command(few, '--network', tmp_path / 'stated.yaml', out=out) == 1
+    nominal, field, positions, axes, _ = simulated(1, n_poses=5)
+    write_network(tmp_path / 'stated.yaml', nominal)
+    write_table(short_table, field, np.tile(nominal.positions[0], (5, 1)), axes)
+    assert command(short_table, '--network', tmp_path / 'stated.yaml', out=out) == 1
     assert 'few.csv: pose 0: [0.0, 0.0, 0.0] m is the position of a sensor' \
         in capsys.readouterr().err
     assert not out.exists()
@@ -200,9 +200,9 @@ BOX_OPTIONS = ('--unknown-poses', '--low', -0.08, -0.08, 0.03, '--high', 0.2, 0.
 
 def test_unknown_poses_are_estimated(tmp_path, capsys):
     """The table has no columns of poses."""
-    stated, field, positions, axes, _ = simulated(21)
+    nominal, field, positions, axes, _ = simulated(21)
     field[4] = np.nan
-    write_network(tmp_path / 'stated.yaml', stated)
+    write_network(tmp_path / 'stated.yaml', nominal)
     table = write_table(tmp_path / 'poses.csv', field, 0.0 * positions, axes)
     table.write_text('\n'.join(','.join(line.split(',')[:-6])
                                for line in table.read_text().splitlines()))
@@ -237,10 +237,10 @@ def test_ctrl_c_ends_the_command_without_files(tmp_path):
 
 
 def test_ctrl_c_while_writing_loses_no_file(tmp_path, monkeypatch):
-    """The Ctrl-C arrives between the network file and the figure."""
+    """The interrupt occurs between writing the network file and the figure."""
     from mag_tracking.cli import board_geometry as geometry
-    stated, field, positions, axes, _ = simulated(9)
-    write_network(tmp_path / 'stated.yaml', stated)
+    nominal, field, positions, axes, _ = simulated(9)
+    write_network(tmp_path / 'stated.yaml', nominal)
     table = write_table(tmp_path / 'poses.csv', field, positions, axes)
 
     def interrupted(*args):

@@ -34,7 +34,7 @@ def recording(tmp_path_factory):
 
 
 def replay(recording, folder, offset, capsys):
-    """(output, summary) of a replay with a `clock_offset` [s] of mag_2 in the network file."""
+    """Replay with a `clock_offset` [s] of mag_2; return (output, summary)."""
     folder.mkdir()
     (folder / 'network.yaml').write_text(NETWORK.format(offset))
     params = parameter_file(folder / 'params.yaml', QUICK)

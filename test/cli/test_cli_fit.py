@@ -17,15 +17,15 @@ def passes(tmp_path_factory):
     """{name: recording} of the vehicle at each heading."""
     rng = np.random.default_rng(5)
     folder = tmp_path_factory.mktemp('iron')
-    found = {}
+    recordings = {}
     for name, heading in HEADINGS.items():
         (folder / name).mkdir()
-        found[name] = recorded(folder / name, heading, rng)
-    return found
+        recordings[name] = recorded(folder / name, heading, rng)
+    return recordings
 
 
 def iron_of(names, passes, out):
-    """`iron` in the results of a fit of some passes."""
+    """Fit the passes `names`; return `iron` of the results."""
     assert main(['fit', *(str(passes[n]) for n in names), '--network', str(NETWORK_FILE),
                  '--orders', '1', '--same-vehicle', '--no-figures', '--out', str(out)]) == 0
     return json.loads((out / 'fits.json').read_text())['iron']
@@ -33,12 +33,12 @@ def iron_of(names, passes, out):
 
 def test_passes_at_several_headings_separate_hard_and_soft_iron(passes, tmp_path, capsys):
     iron = iron_of(HEADINGS, passes, tmp_path)
-    found = np.array([*iron['hard'], iron['soft']])
-    std, true = np.array(iron['std']), np.array([*HARD, SOFT])
+    estimate = np.array([*iron['hard'], iron['soft']])
+    std, simulated = np.array(iron['std']), np.array([*HARD, SOFT])
     output = capsys.readouterr().out
-    print(f'm0, D: {found.round(3)} ({std.round(3)}), simulated {true}')
+    print(f'm0, D: {estimate.round(3)} ({std.round(3)}), simulated {simulated}')
     # Errors are within four standard deviations, which are small compared with the values.
-    assert np.all(np.abs(found - true) < 4.0 * std)
+    assert np.all(np.abs(estimate - simulated) < 4.0 * std)
     assert np.all(std[:3] < 0.05 * np.linalg.norm(HARD)) and std[3] < 0.05 * SOFT
     assert iron['passes'] == len(HEADINGS) and 0.1 < iron['normalised_cost'] < 5.0
     assert 'hard iron m0 =' in output and '4 passes' in output

@@ -1,4 +1,4 @@
-"""Attack on running nodes: no file outside is written, no node dies, all calls are answered."""
+"""Invalid calls to running nodes: no file is overwritten, no node ends, each call is answered."""
 
 import os
 from pathlib import Path
@@ -34,28 +34,28 @@ FIXED = {'calibration_node': ('network', 'save_as', 'state_file', 'target', 'rel
 
 @pytest.fixture
 def folders(tmp_path):
-    """(folder of the network file, protected folder); links in the first lead to the second."""
-    own, protected = tmp_path / 'here', tmp_path / 'outside'
-    own.mkdir()
+    """Folder of the network file, with links to a second, protected folder."""
+    network_folder, protected = tmp_path / 'here', tmp_path / 'outside'
+    network_folder.mkdir()
     protected.mkdir()
-    (own / 'network.yaml').write_text(NETWORK_FILE.read_text())
+    (network_folder / 'network.yaml').write_text(NETWORK_FILE.read_text())
     for name in ('network_calibrated.yaml', 'network_calibrated.yaml.part', 'link.yaml'):
         (protected / name).write_text('theirs')
-        (own / name).symlink_to(protected / name)
-    (own / 'outside').symlink_to(protected)
-    return own, protected
+        (network_folder / name).symlink_to(protected / name)
+    (network_folder / 'outside').symlink_to(protected)
+    return network_folder, protected
 
 
 def contents(*folders):
-    """{path: (bytes, is a link)} of all files in folders."""
+    """Content of all files in folders: {path: (bytes, whether the file is a link)}."""
     return {path: (path.read_bytes() if path.is_file() else b'', path.is_symlink())
             for folder in folders for path in sorted(Path(folder).rglob('*'))}
 
 
-def start_nodes(own, home):
+def start_nodes(network_folder, home):
     """Start the nodes as processes; a recording is played in a loop."""
-    network = ['-p', f'network:={own / "network.yaml"}']
-    drivers = own / 'drivers.yaml'
+    network = ['-p', f'network:={network_folder / "network.yaml"}']
+    drivers = network_folder / 'drivers.yaml'
     drivers.write_text(NO_DEVICES)
     return {name: start(name, *arguments, home=home) for name, arguments in {
         'calibration_node': network, 'detection_node': network, 'tracker_node': network,
@@ -65,7 +65,7 @@ def start_nodes(own, home):
 
 
 NO_DEVICES = """
-nobody:
+unused:
   transport: udp
   udp: {port: 47123, address: 127.0.0.1}
   framing: text
@@ -83,16 +83,16 @@ class Attacker:
         self._clients = {}
 
     def __call__(self, kind, name, request):
-        """Response of a service."""
+        """Call a service and return its response."""
         client = self._clients.get(name) or self.node.create_client(kind, name)
         self._clients[name] = client
-        assert self.spin_until(client.service_is_ready), f'there is no {name}'
+        assert self.spin_until(client.service_is_ready), f'service {name} is missing'
         for _ in range(12):
             future = client.call_async(request)
             self.node.executor.spin_until_future_complete(future, 10.0)
             if future.done():
                 return future.result()
-        raise AssertionError(f'{name} has not answered')
+        raise AssertionError(f'service {name} has not responded')
 
 
 def set_parameters(call, node, pairs, atomically=False):
@@ -100,12 +100,12 @@ def set_parameters(call, node, pairs, atomically=False):
     parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in pairs]
     kind, leaf = (SetParametersAtomically, 'set_parameters_atomically') if atomically else \
         (SetParameters, 'set_parameters')
-    answer = call(kind, f'/{node}/{leaf}', kind.Request(parameters=parameters))
-    return [answer.result] if atomically else answer.results
+    response = call(kind, f'/{node}/{leaf}', kind.Request(parameters=parameters))
+    return [response.result] if atomically else response.results
 
 
 def attack_once(call, rng, k):
-    """Attack number `k`: set a parameter or call a service with invalid values."""
+    """Run attack `k`: set a parameter or call a service with invalid values."""
     node = NODES[k % len(NODES)]
     path = PATHS[int(rng.integers(len(PATHS)))]
     if k % 4 < 2:
@@ -113,23 +113,23 @@ def attack_once(call, rng, k):
         for result in set_parameters(call, node, [(name, path)], atomically=k % 4 == 1):
             assert not result.successful, (node, name, path)
     elif k % 4 == 2:
-        answer = call(Survey, '/calibration_node/survey', Survey.Request(save=True))
-        assert isinstance(answer.success, bool)
-        answer = call(Calibrate, '/calibration_node/calibrate',
+        response = call(Survey, '/calibration_node/survey', Survey.Request(save=True))
+        assert isinstance(response.success, bool)
+        response = call(Calibrate, '/calibration_node/calibrate',
                       Calibrate.Request(sensors=[path]))
-        assert not answer.success
+        assert not response.success
     else:
         offset = float(rng.choice([-1.0, np.nan, np.inf, 1e300, 2.0]))
-        answer = call(Seek, '/replay_node/seek', Seek.Request(offset=offset))
-        assert answer.success == (offset == 2.0)
+        response = call(Seek, '/replay_node/seek', Seek.Request(offset=offset))
+        assert response.success == (offset == 2.0)
 
 
 def send_concurrent_calls(ros):
-    """Send many calls at once and assert that each is answered."""
+    """Send many calls at once and assert that each gets a response."""
     node, spin_until = ros
     clients = [(node.create_client(kind, name), request) for kind, name, request in (
         (Survey, '/calibration_node/survey', Survey.Request(save=True)),
-        (Calibrate, '/calibration_node/calibrate', Calibrate.Request(sensors=['nobody'])),
+        (Calibrate, '/calibration_node/calibrate', Calibrate.Request(sensors=['unknown'])),
         (Trigger, '/replay_node/pause', Trigger.Request()),
         (GetParameters, '/tracker_node/get_parameters', GetParameters.Request(names=['network'])),
         (Trigger, '/replay_node/resume', Trigger.Request()))
@@ -140,8 +140,8 @@ def send_concurrent_calls(ros):
     futures = [client.call_async(request) for client, request in clients]
     assert spin_until(lambda: all(f.done() for f in futures), MAX_S), sum(
         f.done() for f in futures)
-    one, request = clients[0]
-    futures = [one.call_async(request) for _ in range(N_CONCURRENT)]
+    client, request = clients[0]
+    futures = [client.call_async(request) for _ in range(N_CONCURRENT)]
     assert spin_until(lambda: all(f.done() for f in futures), MAX_S), sum(
         f.done() for f in futures)
     for client, _ in clients:
@@ -149,32 +149,32 @@ def send_concurrent_calls(ros):
 
 
 def test_nodes_survive_an_attack(ros, folders, tmp_path):
-    own, protected = folders
+    network_folder, protected = folders
     node, spin_until = ros
     home = tmp_path / 'home'
     home.mkdir()
-    processes = start_nodes(own, home)
+    processes = start_nodes(network_folder, home)
     try:
         assert spin_until(lambda: set(NODES) <= set(node.get_node_names()))
-        before, attack = contents(own, protected), Attacker(ros)
-        # The only file that may be written replaces a planted link.
-        answers = []
-        assert spin_until(lambda: answers.append(attack(
+        before, attack = contents(network_folder, protected), Attacker(ros)
+        # Only one file may be written; it replaces a link.
+        successes = []
+        assert spin_until(lambda: successes.append(attack(
             Survey, '/calibration_node/survey', Survey.Request(save=True)).success)
-            or any(answers))
+            or any(successes))
         rng = np.random.default_rng(0)
         for k in range(N_ATTACKS):
             attack_once(attack, rng, k)
         send_concurrent_calls(ros)
         assert not [name for name, p in processes.items() if p.poll() is not None]
-        after = contents(own, protected)
+        after = contents(network_folder, protected)
     finally:
         codes, outputs = stop(list(processes.values()))
     assert not any(codes), outputs
     assert not any('Traceback' in text for text in outputs), outputs
     changed = {p for p in before.keys() | after.keys() if before.get(p) != after.get(p)}
-    assert changed == {own / 'network_calibrated.yaml'}
-    assert not (own / 'network_calibrated.yaml').is_symlink()
+    assert changed == {network_folder / 'network_calibrated.yaml'}
+    assert not (network_folder / 'network_calibrated.yaml').is_symlink()
     written = [p.relative_to(home) for p in home.rglob('*') if p.is_file()]
     assert all(p.parts[0] in ('mag_tracking', 'log') for p in written), written
 
@@ -186,19 +186,19 @@ def test_nodes_survive_an_attack(ros, folders, tmp_path):
     ('outside/x.yaml', 'must be in the folder of'), ('..', 'is not a file name'),
     ('network.yaml', 'is the network file, which must not be')])
 def test_a_file_outside_the_folder_is_refused_at_start(folders, parameter, name, message):
-    own, protected = folders
+    network_folder, protected = folders
     with pytest.raises(SettingsError, match=message):
-        create_node(own, parameter, name)
+        create_node(network_folder, parameter, name)
     assert set(os.listdir(protected)) == {'network_calibrated.yaml', 'network_calibrated.yaml.part',
                                           'link.yaml'}
 
 
-def create_node(own, parameter, name):
+def create_node(network_folder, parameter, name):
     """Create a calibration node with a file name in a parameter."""
     begin()
     try:
         node = CalibrationNode(parameter_overrides=[
-            Parameter('network', value=str(own / 'network.yaml')),
+            Parameter('network', value=str(network_folder / 'network.yaml')),
             Parameter(parameter, value=name)])
         node.destroy_node()
     finally:
@@ -206,10 +206,10 @@ def create_node(own, parameter, name):
 
 
 def test_a_file_without_backgrounds_is_refused_as_state_file(folders):
-    own, _ = folders
-    (own / 'notes.txt').write_text('theirs')
-    with pytest.raises(SettingsError, match='exists and is not a file of backgrounds'):
-        create_node(own, 'state_file', 'notes.txt')
-    write_backgrounds(own / 'kept.json', {})
-    create_node(own, 'state_file', 'kept.json')
-    create_node(own, 'state_file', 'new.json')
+    network_folder, _ = folders
+    (network_folder / 'notes.txt').write_text('theirs')
+    with pytest.raises(SettingsError, match='exists and is not a background file'):
+        create_node(network_folder, 'state_file', 'notes.txt')
+    write_backgrounds(network_folder / 'kept.json', {})
+    create_node(network_folder, 'state_file', 'kept.json')
+    create_node(network_folder, 'state_file', 'new.json')

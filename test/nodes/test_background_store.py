@@ -1,4 +1,4 @@
-"""The file of backgrounds is written as soon as a background is known, else at intervals."""
+"""The background file is written as soon as a background is known, and then at intervals."""
 
 import json
 from dataclasses import replace
@@ -30,7 +30,7 @@ def test_a_background_is_stored_as_soon_as_it_is_known(tmp_path):
     assert stored() == {}
     stage.feed(one(MagSample(10**18, 'mag_1', np.full(3, 1e-8))))
     assert stored() == {'mag_1': 10**18}
-    # A further reading of a sensor causes no write; the first one of another sensor does.
+    # A further reading of a sensor causes no write; the first reading of another sensor does.
     stage.feed(one(MagSample(10**18 + 10**7, 'mag_1', np.full(3, 2e-8))))
     assert stored() == {'mag_1': 10**18}
     stage.feed(one(MagSample(10**18, 'mag_2', np.full(3, 1e-8))))

@@ -1,4 +1,4 @@
-"""Deferred work: done once, in time, and never lost."""
+"""Deferred work is run once, in time, and is never lost."""
 
 import time
 
@@ -20,31 +20,31 @@ EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 
 def test_repeated_requests_cause_one_call(ros):
     node, spin_until = ros
-    called, requested = [], []
-    deferred = Deferred(node, 0.05, lambda: called.append(time.monotonic()))
+    call_times, request_times = [], []
+    deferred = Deferred(node, 0.05, lambda: call_times.append(time.monotonic()))
 
     def request():
-        requested.append(time.monotonic())
+        request_times.append(time.monotonic())
         deferred.request()
     for n in (1, 2):
         for _ in range(3):
             request()
-        assert spin_until(lambda n=n: len(called) == n)
-        assert called[-1] - requested[-3] > 0.045
+        assert spin_until(lambda n=n: len(call_times) == n)
+        assert call_times[-1] - request_times[-3] > 0.045
         spin_until(lambda: False, 0.2)
-        assert len(called) == n
+        assert len(call_times) == n
 
 
 def test_continuous_requests_do_not_postpone_the_call(ros):
     node, spin_until = ros
-    called = []
-    deferred = Deferred(node, 0.05, lambda: called.append(0))
+    call_times = []
+    deferred = Deferred(node, 0.05, lambda: call_times.append(0))
     node.create_timer(0.01, deferred.request)
-    assert spin_until(lambda: len(called) >= 5)
+    assert spin_until(lambda: len(call_times) >= 5)
 
 
 def test_every_reading_of_a_message_is_evaluated(ros):
-    """The calibration evaluates them after publishing."""
+    """The calibration node evaluates the readings after publishing."""
     node, spin_until = ros
     received, statuses, rng, stamps = [], {}, np.random.default_rng(0), []
     publisher = node.create_publisher(FieldReadings, RAW_READINGS, STREAM)
@@ -67,10 +67,10 @@ def test_every_reading_of_a_message_is_evaluated(ros):
         assert spin_until(lambda: received and all(
             values(name).get('background') == 'ready' for name in ('mag_1', 'mag_2')))
         timer.cancel()
-        # If every other reading were missed, the rate would be half of this.
-        sent = 1e9 / np.median(np.diff(stamps))
+        # If every other reading were missed, the rate would be half this value.
+        rate_hz = 1e9 / np.median(np.diff(stamps))
         for name in ('mag_1', 'mag_2'):
-            assert 0.75 * sent < float(values(name)['rate [Hz]']) < 1.33 * sent
+            assert 0.75 * rate_hz < float(values(name)['rate [Hz]']) < 1.33 * rate_hz
             assert [5.0 < float(v) < 30.0 for v in values(name)['noise [nT]'].split()] == [True] * 3
     finally:
         codes, outputs = stop([process])

@@ -11,19 +11,20 @@ from support.bundled import ROOT
     'sensor_msgs/msg/Imu', 'diagnostic_msgs/msg/DiagnosticArray', 'nav_msgs/msg/Odometry',
     'sensor_msgs/msg/PointCloud2', 'visualization_msgs/msg/MarkerArray',
     'rcl_interfaces/msg/ParameterEvent', 'nav_msgs/msg/Path', 'rosgraph_msgs/msg/Clock'])
-def test_definitions_equal_those_of_ros(type_name):
-    """Every type, field and constant equals that of rosbags."""
+def test_definitions_equal_the_definitions_of_rosbags(type_name):
+    """Each type, field and constant is defined as in rosbags."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    found = get_types_from_msg(definition_of(type_name), type_name)
-    needed = {type_name}
-    while more := {n for t in needed for n in names_in(store.fielddefs[t])} - needed:
-        needed |= more
-    assert set(found) == needed
-    assert found == {name: store.fielddefs[name] for name in needed}
+    types = get_types_from_msg(definition_of(type_name), type_name)
+    expected_names = {type_name}
+    while new_names := {n for t in expected_names
+                        for n in names_in(store.fielddefs[t])} - expected_names:
+        expected_names |= new_names
+    assert set(types) == expected_names
+    assert types == {name: store.fielddefs[name] for name in expected_names}
 
 
 def names_in(definition):
-    """Message types named in a definition of rosbags."""
+    """Message types that a definition of rosbags contains."""
     def walk(node):
         if isinstance(node, str):
             return {node} if '/msg/' in node else set()
@@ -32,18 +33,18 @@ def names_in(definition):
 
 
 def test_own_types_have_a_definition_and_unknown_types_have_none(monkeypatch, tmp_path):
-    own = definition_of('mag_tracking_msgs/msg/HypothesisArray')
-    assert own.count('MSG: mag_tracking_msgs/Hypothesis\n') == 1
-    assert own.startswith((ROOT / 'msg_defs/msg/HypothesisArray.msg').read_text())
+    definition = definition_of('mag_tracking_msgs/msg/HypothesisArray')
+    assert definition.count('MSG: mag_tracking_msgs/Hypothesis\n') == 1
+    assert definition.startswith((ROOT / 'msg_defs/msg/HypothesisArray.msg').read_text())
     assert definition_of('odd_msgs/msg/Odd') is None
     monkeypatch.setenv('AMENT_PREFIX_PATH', f'/nowhere:{tmp_path}')
     folder = tmp_path / 'share' / 'new_msgs' / 'msg'
     folder.mkdir(parents=True)
     (folder / 'Outer.msg').write_text('int8 N=3 # Inner x\nInner[<=3] inner\nstring<=4 s "a/b c"')
     (folder / 'Inner.msg').write_text('float64[2] v\n# Odd odd\n')
-    text = definition_of('new_msgs/msg/Outer')
-    assert text.count('MSG: ') == 1 and text.endswith('MSG: new_msgs/Inner\nfloat64[2] v\n'
-                                                      '# Odd odd\n')
+    definition = definition_of('new_msgs/msg/Outer')
+    assert definition.count('MSG: ') == 1 and definition.endswith(
+        'MSG: new_msgs/Inner\nfloat64[2] v\n# Odd odd\n')
     (folder / 'Inner.msg').unlink()
     definition_of.cache_clear()
     assert definition_of('new_msgs/msg/Outer') is None

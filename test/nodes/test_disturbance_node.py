@@ -1,4 +1,4 @@
-"""Disturbance through the nodes: the tracker publishes the same as a replay."""
+"""Disturbance in the nodes: the tracker publishes the same message as a replay."""
 
 import numpy as np
 import pytest
@@ -28,11 +28,11 @@ def test_the_tracker_publishes_the_disturbance_of_a_replay(ros):
     pipeline = Pipeline(world.network, settings_for('vehicle'))
     expected = [r for r in pipeline.feed(readings) if isinstance(r, Disturbance)]
     assert len(expected) == 1 and not expected[0].ended
-    found, frames, discovered = [], [], set()
+    messages, frames, discovered = [], [], set()
     # A node whose diagnostics arrive has also discovered the subscriptions of this node.
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: discovered.update(
         s.name.split(':')[0].strip('/') for s in m.status), RESULTS)
-    node.create_subscription(DisturbanceMessage, '/tracker_node/disturbances', found.append,
+    node.create_subscription(DisturbanceMessage, '/tracker_node/disturbances', messages.append,
                              STREAM_OUTPUT)
     node.create_subscription(NetworkFrame, '/network_frame', frames.append, STREAM)
     publisher = node.create_publisher(FieldReadings, RAW_READINGS, STREAM_OUTPUT)
@@ -47,16 +47,16 @@ def test_the_tracker_publishes_the_disturbance_of_a_replay(ros):
         for i in range(0, len(readings), 40):
             part = readings.part(slice(i, i + 40))
             publisher.publish(to_message(FieldReadings, readings_dict(part)))
-            # Wait for all frames but the open one, so that no queue overflows.
-            reached = int(part.stamp_ns[0]) - NS // 2
-            assert spin_until(lambda reached=reached: reached < 4 * NS or frames
-                              and stamp_ns(frames[-1].header.stamp) >= reached)
-        assert spin_until(lambda: found)
+            # Wait for all frames except the incomplete one, so that no queue overflows.
+            complete_ns = int(part.stamp_ns[0]) - NS // 2
+            assert spin_until(lambda complete_ns=complete_ns: complete_ns < 4 * NS or frames
+                              and stamp_ns(frames[-1].header.stamp) >= complete_ns)
+        assert spin_until(lambda: messages)
     finally:
         codes, outputs = stop(processes)
     assert codes == [0] * 3, outputs
     offline = to_message(DisturbanceMessage, disturbance_dict(expected[0], 'map'))
-    assert (np.isclose(found[0].largest, offline.largest)
-            and np.isclose(found[0].uniform, offline.uniform))
+    assert (np.isclose(messages[0].largest, offline.largest)
+            and np.isclose(messages[0].uniform, offline.uniform))
     for name in ('header', 'id', 'ended', 'begin', 'sensors', 'track_id'):
-        assert getattr(found[0], name) == getattr(offline, name), name
+        assert getattr(messages[0], name) == getattr(offline, name), name

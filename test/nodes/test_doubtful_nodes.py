@@ -1,4 +1,4 @@
-"""Doubtful background through the nodes: the tracker flags its poses as ambiguous."""
+"""Doubtful background in the nodes: the tracker flags its poses as ambiguous."""
 
 import pytest
 from mag_tracking_msgs.msg import CalibrationState, FieldReadings, TrackArray

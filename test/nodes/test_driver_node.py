@@ -45,7 +45,7 @@ def line_of(sensor, k, tick):
 def board(ros, tmp_path):
     """(node, spin_until, line, drivers file, state) of a board that sends at 100 Hz.
 
-    Its clock continues while the process of the test is delayed.
+    The clock of the board continues while the process of the test is delayed.
     """
     node, spin_until = ros
     line = SerialLine(tmp_path / 'port')
@@ -53,10 +53,10 @@ def board(ros, tmp_path):
     drivers = tmp_path / 'drivers.yaml'
     drivers.write_text(BOARD.replace('PORT', str(line.path)))
     state = {'k': 0, 'tick': 0, 'plugged': True, 'garbage': b'', 'skip': 0}
-    began = time.monotonic()
+    begin = time.monotonic()
 
     def send():
-        tick = int((time.monotonic() - began) / 0.01)
+        tick = int((time.monotonic() - begin) / 0.01)
         if tick == state['tick']:
             return
         state['k'] += 1 + state['skip']
@@ -73,14 +73,14 @@ def board(ros, tmp_path):
 
 
 def listen(node, kind, topic, qos=STREAM):
-    """List of (arrival [ns], message) of a topic, filled while `node` spins."""
+    """Subscribe to a topic; return a list of (arrival [ns], message) that `node` fills."""
     received = []
     node.create_subscription(kind, topic, lambda m: received.append((time.time_ns(), m)), qos)
     return received
 
 
 def status_of(received):
-    """Latest status of the board; None before the first."""
+    """Latest status of the board; None before the first status."""
     for _, array in reversed(received):
         for status in array.status:
             if status.hardware_id == 'board':
@@ -110,25 +110,25 @@ def test_a_serial_board_is_published_and_reconnected(board):
         _, imu = accelerations[-1]
         assert imu.linear_acceleration.z == pytest.approx(9.80665)
         assert imu.orientation_covariance[0] == -1.0
-        # Timestamps follow the board's clock: regular even if readings arrive late, and close to
-        # the arrival. The smallest delay counts: on a busy machine, readings wait for this process.
+        # Timestamps follow the board's clock: they are regular even if readings arrive late, and
+        # close to the arrival. The minimum delay is tested, because this process may be delayed.
         stamps = np.array([stamp_ns(m.header.stamp) for _, m in fields[-80:]])
         steps = np.array([round(1e9 * m.magnetic_field.x) for _, m in fields[-80:]])
-        late = np.array([came for came, _ in fields[-80:]]) - stamps
+        delays_ns = np.array([arrival_ns for arrival_ns, _ in fields[-80:]]) - stamps
         assert np.abs(np.diff(stamps) / np.diff(steps) - 1e7).max() < 1e6
-        assert 0 <= late.min() < 50_000_000
+        assert 0 <= delays_ns.min() < 50_000_000
 
         # Lost and garbled lines are counted and reported.
         state['skip'], state['garbage'] = 7, b'A,1,2,3*00\nA,half a li'
         assert spin_until(lambda: status_of(diagnostics) is not None
                           and 'lost: mag_1' in values_of(status_of(diagnostics)))
         values = values_of(status_of(diagnostics))
-        # Seven were skipped, and the incomplete line corrupted the line after it.
+        # Seven lines were skipped, and the incomplete line corrupted the next line.
         assert (values['lost: mag_1'], values['lost: mag_2']) == ('8', '7')
         assert any('checksum' in key for key in values)
         assert status_of(diagnostics).level == DiagnosticStatus.WARN
 
-        # A missing port is an error that names it. Fields are back within 2 s of its return.
+        # A missing port is reported by name. Fields are received within 2 s of its return.
         line.pull_out()
         state['plugged'] = False
         assert spin_until(lambda: status_of(diagnostics).level == DiagnosticStatus.ERROR)
@@ -138,7 +138,7 @@ def test_a_serial_board_is_published_and_reconnected(board):
         line.plug_in()
         state['plugged'] = True
         assert spin_until(lambda: len(fields) > n, 2.0)
-        # The readings lost meanwhile cause a warning first.
+        # At first, the lost readings cause a warning.
         assert spin_until(lambda: status_of(diagnostics).level == DiagnosticStatus.OK)
     finally:
         codes, outputs = stop([process])
@@ -196,7 +196,7 @@ def test_readings_are_published_in_batches(board):
     samples = [samples_of(readings_of(m)) for _, m in batches[5:15]]
     assert np.mean([len(s) for s in samples]) > 8
     for sensor in ('mag_1', 'mag_2'):
-        stamps = [s.stamp_ns for some in samples for s in some if s.sensor == sensor]
+        stamps = [s.stamp_ns for batch in samples for s in batch if s.sensor == sensor]
         assert (np.diff(stamps) > 5e6).all()
     assert samples[0][0].covariance is None
     np.testing.assert_allclose(samples[0][0].field[1:], [1.55e-5, -4.9e-5])

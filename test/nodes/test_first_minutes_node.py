@@ -33,7 +33,7 @@ class NewUser:
         Topic with {} in place of the sensor's name.
     unit : float
         Value published for one tesla.
-    behind_ns : int
+    delay_ns : int
         Delay of the timestamps.
     sensors : sequence of str
         Sensors that are published.
@@ -41,13 +41,13 @@ class NewUser:
         Parameter of the calibration node.
     """
 
-    def __init__(self, topic='{}/imu/mag', unit=1.0, behind_ns=0, sensors=BOTH,
+    def __init__(self, topic='{}/imu/mag', unit=1.0, delay_ns=0, sensors=BOTH,
                  use_sim_time=False):
-        self.topic, self.unit, self.behind_ns = topic, unit, behind_ns
+        self.topic, self.unit, self.delay_ns = topic, unit, delay_ns
         self.sensors, self.use_sim_time = sensors, use_sim_time
 
     def connect(self, node, namespace):
-        """Advertise its topics in a namespace of its own."""
+        """Advertise the topics in a namespace."""
         self._publishers = [node.create_publisher(
             MagneticField, f'{namespace}/{self.topic.format(s)}', STREAM) for s in self.sensors]
         self._rng = np.random.default_rng(0)
@@ -57,7 +57,7 @@ class NewUser:
         for publisher in self._publishers:
             x, y, z = self.unit * (EARTH + 1.2e-8 * self._rng.standard_normal(3))
             publisher.publish(to_message(MagneticField, {
-                'header': {'stamp': stamp_dict(time.time_ns() - self.behind_ns)},
+                'header': {'stamp': stamp_dict(time.time_ns() - self.delay_ns)},
                 'magnetic_field': {'x': x, 'y': y, 'z': z}}))
 
 
@@ -69,15 +69,15 @@ CASES = {
     'gauss': (NewUser(unit=1e4), 'gauss or microtesla published as tesla'),
     'microtesla': (NewUser(unit=1e6), 'gauss or microtesla published as tesla'),
     'time since the device was switched on': (
-        NewUser(behind_ns=time.time_ns() - 100 * 1_000_000_000), 'years behind the clock'),
-    'a bag without use_sim_time': (NewUser(behind_ns=3 * YEAR_NS), 'use_sim_time'),
+        NewUser(delay_ns=time.time_ns() - 100 * 1_000_000_000), 'years behind the clock'),
+    'a bag without use_sim_time': (NewUser(delay_ns=3 * YEAR_NS), 'use_sim_time'),
     'use_sim_time without a clock': (
         NewUser(use_sim_time=True), 'no message was received on /clock'),
-    'another time zone': (NewUser(behind_ns=7200 * 1_000_000_000),
+    'another time zone': (NewUser(delay_ns=7200 * 1_000_000_000),
                           'delay from timestamp to receipt is 7200.')}
 
 
-OF_ANOTHER_TYPE = """
+OTHER_TYPE_PROGRAM = """
 import time
 import rclpy
 from sensor_msgs.msg import Imu
@@ -86,11 +86,11 @@ node = rclpy.create_node('stranger')
 publisher = node.create_publisher(Imu, '/case_3/mag_1/imu/mag', 10)
 time.sleep(600.0)
 """
-"""A separate process, because within one process a topic has one type."""
+"""Program of a separate process, because a topic has only one type within a process."""
 
 
 def node_in(namespace, user):
-    """Calibration node of one case."""
+    """Create the calibration node of a case."""
     return CalibrationNode(namespace=namespace, parameter_overrides=[
         Parameter('network', value=str(NETWORK_FILE)),
         Parameter('use_sim_time', value=user.use_sim_time)])
@@ -108,22 +108,22 @@ def test_mistakes_of_a_new_user_are_reported_within_seconds(ros, capfd):
                     reported.setdefault(case, time.monotonic())
     node.create_subscription(DiagnosticArray, '/diagnostics', check, RESULTS)
     node.create_timer(0.05, lambda: lags.append(time.monotonic()))
-    began, nodes = {}, []
-    other_process = subprocess.Popen([sys.executable, '-c', OF_ANOTHER_TYPE])
+    start_times, nodes = {}, []
+    other_process = subprocess.Popen([sys.executable, '-c', OTHER_TYPE_PROGRAM])
     try:
         assert spin_until(lambda: node.count_publishers('/case_3/mag_1/imu/mag'))
         for k, (case, (user, _)) in enumerate(CASES.items()):
             user.connect(node, f'/case_{k}')
             nodes.append(node_in(f'/case_{k}', user))
-            began[case] = time.monotonic()
+            start_times[case] = time.monotonic()
             node.executor.add_node(nodes[-1])
         spin_until(lambda: len(reported) == len(CASES), 60.0)
     finally:
         other_process.kill()
         other_process.wait()
-        for one in nodes:
-            node.executor.remove_node(one)
-            one.destroy_node()
+        for calibration_node in nodes:
+            node.executor.remove_node(calibration_node)
+            calibration_node.destroy_node()
     logged = capfd.readouterr().err
     missing = [case for case, (_, text) in CASES.items()
                if case not in reported or text not in logged]
@@ -132,8 +132,8 @@ def test_mistakes_of_a_new_user_are_reported_within_seconds(ros, capfd):
         line = next(line for line in logged.splitlines()
                     if f'case_{k}.' in line and CASES[case][1] in line)
         assert line.startswith(('[WARN]', '[ERROR]'))
-    took = {case: reported[case] - began[case] for case in CASES}
-    print({case: round(seconds, 1) for case, seconds in took.items()})
-    # Delay of the machine itself.
-    late = float(np.diff(lags).max())
-    assert max(took.values()) <= MAX_REPORT_S + 2.0 * late
+    delays_s = {case: reported[case] - start_times[case] for case in CASES}
+    print({case: round(seconds, 1) for case, seconds in delays_s.items()})
+    # Longest stall of this process.
+    stall_s = float(np.diff(lags).max())
+    assert max(delays_s.values()) <= MAX_REPORT_S + 2.0 * stall_s

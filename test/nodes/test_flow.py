@@ -26,12 +26,12 @@ def clock(monkeypatch):
 
 
 def status_of(flow, sender_exists=True):
-    """DiagnosticStatus of a `Flow` whose sender exists or not."""
+    """DiagnosticStatus of a `Flow` with or without a sender."""
     return flow.status('me', lambda: sender_exists)
 
 
 def values(status):
-    """{key: value}."""
+    """{key: value} of a status."""
     return {v.key: v.value for v in status.values}
 
 
@@ -44,16 +44,16 @@ def test_latency_is_measured_from_timestamp_to_end_of_processing(clock):
     clock[0] = begin + 1.01
     status = status_of(flow)
     assert status.name == 'me: from a_node' and status.level == DiagnosticStatus.OK
-    found = values(status)
-    assert found['messages'] == '101'
-    assert float(found['latency, median [ms]']) == pytest.approx(50.0)
-    assert float(found['latency, 99 % [ms]']) == pytest.approx(99.0)
+    reported = values(status)
+    assert reported['messages'] == '101'
+    assert float(reported['latency, median [ms]']) == pytest.approx(50.0)
+    assert float(reported['latency, 99 % [ms]']) == pytest.approx(99.0)
     # 101 times 2 ms in 1.01 s.
-    assert float(found['busy [%]']) == pytest.approx(20.0)
+    assert float(reported['busy [%]']) == pytest.approx(20.0)
     clock[0] += 1.0
-    again = values(status_of(flow))
-    assert again['messages'] == '101' and again['busy [%]'] == '0'
-    assert again['latency, median [ms]'] == 'nan'
+    next_report = values(status_of(flow))
+    assert next_report['messages'] == '101' and next_report['busy [%]'] == '0'
+    assert next_report['latency, median [ms]'] == 'nan'
 
 
 def test_a_silent_input_is_reported_until_it_returns(clock):
@@ -61,20 +61,20 @@ def test_a_silent_input_is_reported_until_it_returns(clock):
     flow.topics.append('/a')
     clock[0] += 5.0
     first = status_of(flow)
-    # At first this is normal: the calibration learns the background.
+    # No message is normal at first: the calibration learns the background.
     assert first.level == DiagnosticStatus.OK and first.message == 'waiting for /a'
     clock[0] += module.FIRST_MESSAGE_TIMEOUT_S
-    late = status_of(flow, sender_exists=False)
-    assert late.level == DiagnosticStatus.WARN
-    assert late.message == 'no message received on /a: it has no publisher; start the ' \
-        'node or driver that publishes it'
+    overdue = status_of(flow, sender_exists=False)
+    assert overdue.level == DiagnosticStatus.WARN
+    assert overdue.message == 'no message received on /a: no publisher found; start the ' \
+        'driver or the preceding node'
     assert status_of(flow).message == 'no message received on /a'
     flow.add(0, 0, clock[0])
     clock[0] += module.SILENCE_TIMEOUT_S
     assert status_of(flow).message == 'running'
     clock[0] += 1.0
     silent = status_of(flow)
-    # The node may have no output.
+    # The sender may have nothing to publish.
     assert silent.level == DiagnosticStatus.WARN
     assert silent.message == 'no message from a_node for 3 s'
     gone = status_of(flow, sender_exists=False)
@@ -89,11 +89,11 @@ def test_lost_messages_are_reported_once(clock):
     flow.add(0, 0, clock[0])
     flow.n_lost += 7
     status = status_of(flow)
-    assert status.level == DiagnosticStatus.WARN and status.message.startswith('7 messages')
+    assert status.level == DiagnosticStatus.WARN and status.message.startswith('7 messages from')
     assert values(status)['lost in the queue'] == '7'
     assert status_of(flow).level == DiagnosticStatus.OK
     flow.n_lost += 1
-    assert status_of(flow).message.startswith('1 messages')
+    assert status_of(flow).message.startswith('1 message from')
 
 
 def test_an_old_recording_is_neither_late_nor_live(clock):
@@ -108,11 +108,11 @@ def test_an_old_recording_is_neither_late_nor_live(clock):
     assert flow.is_live
 
 
-@pytest.mark.parametrize('busy_s, age_s', [(0.99, 0.0), (0.01, 2.0)])
-def test_a_computer_that_is_too_slow_is_reported(clock, busy_s, age_s):
+@pytest.mark.parametrize('busy_s, latency_s', [(0.99, 0.0), (0.01, 2.0)])
+def test_a_computer_that_is_too_slow_is_reported(clock, busy_s, latency_s):
     flow = Flow('a_node')
     clock[0] += 1.0
-    flow.add(10 * NS, round((10 + age_s) * NS), clock[0] - busy_s)
+    flow.add(10 * NS, round((10 + latency_s) * NS), clock[0] - busy_s)
     status = status_of(flow)
     assert status.level == DiagnosticStatus.WARN and 'too slow' in status.message
     clock[0] += 1.0
@@ -146,7 +146,7 @@ def test_a_subscriber_that_disappears_is_reported():
 
 
 class StandIn:
-    """Stand-in for a tracker node: the attributes that end a track without frames."""
+    """Stand-in for a tracker node, with the attributes that `end_without_frames` uses."""
 
     def __init__(self, clock, is_replayed=False):
         self._clock, self.is_replayed, self._is_silent = clock, is_replayed, False
@@ -181,7 +181,7 @@ def test_a_track_ends_when_frames_stop_not_when_they_are_old(clock):
 def test_a_busy_node_does_not_end_its_track(clock):
     node = StandIn(clock)
     node.ticks(1.0, frames=True)
-    # The timer runs before the waiting frames.
+    # The timer runs before the queued frames are processed.
     clock[0] += 100.0
     TrackerNode.end_without_frames(node)
     node.ticks(5.0, frames=True)

@@ -29,13 +29,13 @@ rclpy.spin(Slow('slow'))
 
 @pytest.fixture
 def command(capfd):
-    """f(words): (exit status, output) of `mag-tracking` in this process."""
+    """Function that runs `mag-tracking` in this process; returns (exit status, output)."""
     def run(*words):
         capfd.readouterr()
         try:
             status = main(words)
-        except SystemExit as ended:
-            status = ended.code
+        except SystemExit as error:
+            status = error.code
         out, err = capfd.readouterr()
         return status, out + err
     return run
@@ -55,15 +55,15 @@ def test_commands_show_a_calibration_and_a_driver(command, tmp_path):
     processes = [start('calibration_node', *NAMESPACE[1:], '-p', f'network:={NETWORK_FILE}'),
                  start('driver_node', *NAMESPACE[1:], '-p', f'drivers:={udp}')]
     try:
-        wait_for(lambda: '/lab/mag_1/imu/mag  sensor_msgs/msg/MagneticField  1 publishers, 1 sub'
+        wait_for(lambda: '/lab/mag_1/imu/mag  sensor_msgs/msg/MagneticField  1 publisher, 1 sub'
                  in command('topics')[1])
-        code, text = command('echo', CALIBRATION_STATE, '--count', '1', *NAMESPACE)
-        assert code == 0 and text.endswith('---\n'), text
-        message = yaml.safe_load(text.removesuffix('---\n'))
+        status, output = command('echo', CALIBRATION_STATE, '--count', '1', *NAMESPACE)
+        assert status == 0 and output.endswith('---\n'), output
+        message = yaml.safe_load(output.removesuffix('---\n'))
         assert [s['sensor'] for s in message['sensors']] == ['mag_1', 'mag_2']
-        code, text = command('echo', '/diagnostics', '--count', '1')
-        assert code == 0 and isinstance(
-            yaml.safe_load(text.removesuffix('---\n'))['status'][0]['level'], int)
+        status, output = command('echo', '/diagnostics', '--count', '1')
+        assert status == 0 and isinstance(
+            yaml.safe_load(output.removesuffix('---\n'))['status'][0]['level'], int)
         check_parameters(command)
         check_lifecycle(command)
     finally:
@@ -72,31 +72,33 @@ def test_commands_show_a_calibration_and_a_driver(command, tmp_path):
 
 
 def check_parameters(command):
-    """Parameters of the calibration node are shown; invalid changes are refused."""
-    code, text = command('param', '/lab/calibration_node', 'network')
-    assert code == 0 and text.startswith(f'network: {NETWORK_FILE}  (read-only)  # Path'), text
-    code, text = command('param', '/lab/calibration_node', 'network', 'other.yaml')
-    assert code == 1 and 'rejects parameter network' in text, text
-    code, text = command('param', '/lab/calibration_node', 'nonsense')
-    assert code == 1 and 'has no parameter nonsense' in text, text
+    """Assert that parameters of the calibration node are shown and invalid changes rejected."""
+    status, output = command('param', '/lab/calibration_node', 'network')
+    assert status == 0 and output.startswith(
+        f'network: {NETWORK_FILE}  (read-only)  # Path'), output
+    status, output = command('param', '/lab/calibration_node', 'network', 'other.yaml')
+    assert status == 1 and 'rejects parameter network' in output, output
+    status, output = command('param', '/lab/calibration_node', 'nonsense')
+    assert status == 1 and 'has no parameter nonsense' in output, output
 
 
 def check_lifecycle(command):
-    """The state of the driver node is shown and changed."""
-    code, text = command('lifecycle', 'driver_node', *NAMESPACE)
-    assert code == 0 and text.startswith('active; available transitions: deactivate'), text
-    code, text = command('lifecycle', 'driver_node', 'deactivate', *NAMESPACE)
-    assert code == 0 and text.startswith('inactive; available transitions: '), text
-    code, text = command('lifecycle', 'driver_node', 'deactivate', *NAMESPACE)
-    assert code == 1 and 'deactivate is not possible in the current state; possible: ' in text, text
+    """Assert that the state of the driver node is shown and changed."""
+    status, output = command('lifecycle', 'driver_node', *NAMESPACE)
+    assert status == 0 and output.startswith('active; available transitions: deactivate'), output
+    status, output = command('lifecycle', 'driver_node', 'deactivate', *NAMESPACE)
+    assert status == 0 and output.startswith('inactive; available transitions: '), output
+    status, output = command('lifecycle', 'driver_node', 'deactivate', *NAMESPACE)
+    assert status == 1 and \
+        'deactivate is not possible in the current state; possible: ' in output, output
 
 
 def test_integers_are_accepted_for_floating_point_parameters(command):
     process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
     try:
         wait_for(lambda: '/tracker_node/pose' in command('topics')[1])
-        code, text = command('param', 'tracker_node', 'track.field_error', '1')
-        assert code == 0 and text.startswith('track.field_error: 1.0'), text
+        status, output = command('param', 'tracker_node', 'track.field_error', '1')
+        assert status == 0 and output.startswith('track.field_error: 1.0'), output
     finally:
         codes, outputs = stop([process])
     assert codes == [0], outputs
@@ -107,8 +109,8 @@ def test_a_slow_transition_is_requested_once(command):
                                stderr=subprocess.STDOUT, text=True)
     try:
         wait_for(lambda: '/slow/transition_event' in command('topics')[1])
-        code, text = command('lifecycle', '/slow', 'configure')
-        assert code == 0 and text.startswith('inactive; available transitions: '), text
+        status, output = command('lifecycle', '/slow', 'configure')
+        assert status == 0 and output.startswith('inactive; available transitions: '), output
     finally:
         process.kill()
         output, _ = process.communicate()
@@ -122,12 +124,12 @@ def test_a_slow_transition_is_requested_once(command):
     (('echo', ''), 'topic name'), (('echo', '/nowhere'), '/nowhere has no publisher'),
     (('param', '/nowhere'), 'service /nowhere/list_parameters not found')])
 def test_invalid_or_missing_names_are_reported(command, words, error):
-    code, text = command(*words)
-    assert code == 1 and error in text and 'Traceback' not in text, text
+    status, output = command(*words)
+    assert status == 1 and error in output and 'Traceback' not in output, output
 
 
 def test_ros_arguments_are_refused_by_commands_without_ros(command):
-    code, text = command('info', 'a.mcap', '--ros-args', '-r', '__ns:=/x')
-    assert code == 2 and '--ros-args: info runs without ROS' in text
-    code, text = command('--version')
-    assert code == 0 and text.startswith('mag_tracking ')
+    status, output = command('info', 'a.mcap', '--ros-args', '-r', '__ns:=/x')
+    assert status == 2 and '--ros-args: info runs without ROS' in output
+    status, output = command('--version')
+    assert status == 0 and output.startswith('mag_tracking ')

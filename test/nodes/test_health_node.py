@@ -42,7 +42,7 @@ def publish_until(ros):
     """f(condition, silent, step): publish both sensors at 100 Hz until a condition holds.
 
     Sensors in `silent` are not published. A `step` [T] is added to the field of mag_1. Timestamps
-    are regular: a reading that is late on a busy machine has the time when it was due.
+    are regular: a reading that is delayed by a busy machine keeps its nominal time.
     """
     node, spin_until = ros
     publishers = {}
@@ -89,7 +89,7 @@ def statuses(ros):
 
 
 def test_a_relearnt_background_is_reported(publish_until, statuses):
-    """The background follows a permanent step, for example of a parked car."""
+    """The background follows a permanent step, for example due to a parked car."""
     process = start('calibration_node', '-p', f'network:={NETWORK_FILE}',
                     '-p', 'calibrate.relearn_s:=4.0')
 
@@ -123,11 +123,11 @@ def test_a_flipped_axis_is_an_error(publish_until, statuses):
         return any("differs from the Earth's field" in t for t in texts(name))
     try:
         assert publish_until(lambda: is_flagged('mag_1'), step=np.array([0.0, 0.0, 9.8e-5]))
-        seen = []
+        flags = []
         # The other sensor may be slow or lossy on a busy machine, but is not flagged.
-        publish_until(lambda: seen.append(is_flagged('mag_2')), seconds=3.0,
+        publish_until(lambda: flags.append(is_flagged('mag_2')), seconds=3.0,
                       step=np.array([0.0, 0.0, 9.8e-5]))
-        assert texts('mag_2') and not any(seen)
+        assert texts('mag_2') and not any(flags)
         assert ' uT: z is flipped' in texts('mag_1')[0]
         assert statuses['calibration_node: mag_1'].level == DiagnosticStatus.ERROR
         assert statuses['calibration_node: mag_2'].level != DiagnosticStatus.ERROR
@@ -137,7 +137,7 @@ def test_a_flipped_axis_is_an_error(publish_until, statuses):
 
 
 def test_each_sensor_has_a_status(publish_until, statuses):
-    began = time.monotonic()
+    begin = time.monotonic()
     process = start('calibration_node', '-p', f'network:={NETWORK_FILE}')
 
     def status(name):
@@ -149,25 +149,25 @@ def test_each_sensor_has_a_status(publish_until, statuses):
     try:
         assert publish_until(lambda: status('mag_1') and status('mag_2'), silent=('mag_1', 'mag_2'))
         # Diagnostics are published once a second.
-        up = time.monotonic() - began
+        start_s = time.monotonic() - begin
         assert status('mag_1').level == DiagnosticStatus.OK
         assert status('mag_1').message == 'waiting for /mag_1/imu/mag'
         assert publish_until(lambda: status('mag_1').level == DiagnosticStatus.ERROR,
                              silent=('mag_1', 'mag_2'))
         assert status('mag_1').message.startswith(
             'no message received: /mag_1/imu/mag has no publisher; start its driver')
-        # Long, because losses in a stall of the machine count until enough readings follow.
+        # The timeout is long: readings lost in a stall are reported until enough others follow.
         assert publish_until(
             lambda: all(values(name)['background'] == 'ready' and status(name).level
                         == DiagnosticStatus.OK for name in ('mag_1', 'mag_2')), seconds=240.0)
         assert status('mag_2').message == 'running' and status('mag_2').hardware_id == 'mag_2'
         assert float(values('mag_1')['rate [Hz]']) > 20.0
         assert [5.0 < float(v) < 30.0 for v in values('mag_2')['noise [nT]'].split()] == [True] * 3
-        # The rest is the delay of the middleware and of a busy machine.
+        # The difference is the delay of the middleware and of a busy machine.
         delay = float(values('mag_1')['delay [ms]'])
-        late = np.median(publish_until.late_ms)
-        print(f'delay {delay:.1f} ms, of which {late:.1f} ms before publishing')
-        assert delay > 0.0 and abs(delay - late) < scaled(100.0, up - 1.0)
+        publish_delay = np.median(publish_until.late_ms)
+        print(f'delay {delay:.1f} ms, of which {publish_delay:.1f} ms before publishing')
+        assert delay > 0.0 and abs(delay - publish_delay) < scaled(100.0, start_s - 1.0)
         assert publish_until(lambda: 'silent for' in status('mag_2').message, silent=('mag_2',))
         assert status('mag_2').level == DiagnosticStatus.ERROR
         assert status('mag_1').level != DiagnosticStatus.ERROR
@@ -178,7 +178,7 @@ def test_each_sensor_has_a_status(publish_until, statuses):
 
 
 def test_a_restarted_calibration_restores_its_background(ros, publish_until, tmp_path):
-    """No background is given; a target that arrived meanwhile is measured within two seconds."""
+    """A target that arrived during the restart is measured within two seconds."""
     node, _ = ros
     step, calibrated = 4e-7, []
     node.create_subscription(MagneticField, '/mag_1/imu/mag_calibrated',
@@ -190,25 +190,25 @@ def test_a_restarted_calibration_restores_its_background(ros, publish_until, tmp
     first.communicate(timeout=MAX_S)
     publish_until(lambda: False, silent=('mag_1', 'mag_2'), seconds=0.3)
     n, known = len(calibrated), endpoints(node)
-    began = time.monotonic()
+    begin = time.monotonic()
     second = start('calibration_node', '-p', f'network:={NETWORK_FILE}', home=tmp_path)
     try:
         assert publish_until(lambda: endpoints(node) - known or len(calibrated) > n, step=step)
-        up = time.monotonic()
+        running_time = time.monotonic()
         assert publish_until(lambda: len(calibrated) > n + 100, step=step)
     finally:
         codes, outputs = stop([second])
     assert codes == [0], outputs
-    recovery = max(0.0, calibrated[n][0] - up)
+    recovery = max(0.0, calibrated[n][0] - running_time)
     print(f'recovery of a killed calibration without a given background: {recovery:.2f} s')
-    assert recovery <= scaled(2.0, up - began)
+    assert recovery <= scaled(2.0, running_time - begin)
     f = np.array([[m.magnetic_field.x, m.magnetic_field.y, m.magnetic_field.z]
                   for _, m in calibrated[n:]])
     np.testing.assert_allclose(f.mean(axis=0), step, atol=2e-8)
 
 
 def endpoints(node):
-    """Publishers of /diagnostics."""
+    """Identifiers of the publishers of /diagnostics."""
     return {tuple(p.endpoint_gid) for p in node.get_publishers_info_by_topic('/diagnostics')}
 
 
@@ -221,14 +221,15 @@ def test_the_doctor_finds_faults_of_a_live_system(ros, publish_until):
     try:
         health = doctor.doctor.sensors
         assert publish_until(lambda: health['mag_1'].counts['readings'] > 300, silent=('mag_2',))
-        found = [str(f) for f in doctor.findings() + doctor.doctor.findings()]
-        assert any(t.startswith('mag_2: no reading') for t in found), found
+        findings = [str(f) for f in doctor.findings() + doctor.doctor.findings()]
+        assert any(t.startswith('mag_2: no reading') for t in findings), findings
         second = node.create_publisher(MagneticField, '/mag_1/imu/mag', RESULTS)
         assert spin_until(lambda: len(doctor.get_publishers_info_by_topic('/mag_1/imu/mag')) == 2
                           and len(doctor.get_publishers_info_by_topic('/mag_2/imu/mag')) == 1)
-        found = [str(f) for f in doctor.findings()]
-        assert any('mag_1: 2 publishers of /mag_1/imu/mag' in t for t in found), found
-        assert any('publishes std_msgs/msg/String on /mag_2/imu/mag' in t for t in found), found
+        findings = [str(f) for f in doctor.findings()]
+        assert any('mag_1: 2 publishers of /mag_1/imu/mag' in t for t in findings), findings
+        assert any('publishes std_msgs/msg/String on /mag_2/imu/mag' in t
+                   for t in findings), findings
         assert second
     finally:
         other_process.kill()
@@ -238,7 +239,7 @@ def test_the_doctor_finds_faults_of_a_live_system(ros, publish_until):
 
 
 def test_a_new_clock_offset_is_no_clock_step():
-    """Readings that are pending when a survey sets new offsets have the old ones."""
+    """Readings in the buffer have the old offsets when a survey sets new clock offsets."""
     network, settings = read_network(NETWORK_FILE), settings_for('vehicle')
     stage, rng = Calibrate(network, settings.calibrate), np.random.default_rng(2)
     health = HealthDiagnostics(network, settings)
@@ -257,7 +258,7 @@ def test_a_new_clock_offset_is_no_clock_step():
 
 
 def test_past_faults_expire_after_two_windows(monkeypatch):
-    """The fault is a relearnt background, for example of a parked car."""
+    """The fault is a background that was relearnt, for example due to a parked car."""
     now = [0.0]
     monkeypatch.setattr(sensor_health.time, 'monotonic', lambda: now[0])
     network = read_network(NETWORK_FILE)

@@ -35,7 +35,7 @@ class Consumer(Node):
 
 
 def test_transforms_detections_and_markers_describe_the_track():
-    """In a namespace, with the parameters that `robot_localization` requires."""
+    """The nodes run in a namespace, with the parameters that `robot_localization` requires."""
     holder = []
     run(NETWORK_FILE, settings_for('vehicle', {'align.max_wait_s': 5.0}),
         vehicle_path('straight_car_fast_left'), 3.0,

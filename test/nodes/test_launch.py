@@ -1,7 +1,7 @@
-"""The launch file: executed with a stand-in for `launch_ros`, and run if that is installed.
+"""The launch file: executed with a stand-in for `launch_ros`, and run if ROS launch is installed.
 
 PyPI's `launch` is another package. The stand-in records the objects that the file creates. Their
-executables, parameters, arguments and files are compared with those of the package.
+executables, parameters, arguments and files are compared with the package.
 """
 
 import importlib.util
@@ -32,20 +32,20 @@ CLASSES = {
 
 
 class LaunchObject:
-    """Object of the stand-in: name of its class and arguments."""
+    """Object of the stand-in, with the name of its class and its arguments."""
 
-    def __init__(self, name, arguments, named):
-        self.name, self.arguments, self.named = name, arguments, named
+    def __init__(self, name, arguments, keywords):
+        self.name, self.arguments, self.keywords = name, arguments, keywords
 
     def __iter__(self):
         raise TypeError(f'{self.name} is not iterable')
 
 
 def objects_in(value):
-    """All `LaunchObject` in a value."""
+    """Yield each `LaunchObject` in a value."""
     if isinstance(value, LaunchObject):
         yield value
-        for part in (*value.arguments, *value.named.values()):
+        for part in (*value.arguments, *value.keywords.values()):
             yield from objects_in(part)
     elif isinstance(value, Mapping):
         for part in value.values():
@@ -57,7 +57,7 @@ def objects_in(value):
 
 @pytest.fixture
 def launch_objects(monkeypatch):
-    """All `LaunchObject` of the launch file."""
+    """All `LaunchObject` instances of the launch file."""
     for module in ('launch', 'launch_ros', *CLASSES):
         monkeypatch.setitem(sys.modules, module, types.ModuleType(module))
     for module, names in CLASSES.items():
@@ -73,11 +73,11 @@ def launch_objects(monkeypatch):
 @pytest.fixture
 def executables(monkeypatch):
     """Names of the scripts that setup.py installs."""
-    given = {}
-    monkeypatch.setattr(setuptools, 'setup', lambda **named: given.update(named))
+    settings = {}
+    monkeypatch.setattr(setuptools, 'setup', lambda **keywords: settings.update(keywords))
     monkeypatch.chdir(ROOT)
     exec(compile((ROOT / 'setup.py').read_text(), 'setup.py', 'exec'), {'__name__': 'setup'})
-    return {line.split('=')[0].strip() for line in given['entry_points']['console_scripts']}
+    return {line.split('=')[0].strip() for line in settings['entry_points']['console_scripts']}
 
 
 def of_class(launch_objects, name):
@@ -89,21 +89,21 @@ def test_every_name_in_the_launch_file_exists(launch_objects, executables):
     nodes = of_class(launch_objects, 'Node')
     assert len(nodes) == 5
     for node in nodes:
-        assert node.named['package'] == 'mag_tracking'
-        assert node.named['executable'] in executables
-        assert of_class(objects_in(node.named['namespace']),
+        assert node.keywords['package'] == 'mag_tracking'
+        assert node.keywords['executable'] in executables
+        assert of_class(objects_in(node.keywords['namespace']),
                         'LaunchConfiguration')[0].arguments == ('namespace',)
-        for parameters in node.named['parameters']:
+        for parameters in node.keywords['parameters']:
             if isinstance(parameters, dict):
                 assert parameters.keys() <= NODE_PARAMETERS
     declared = {m.arguments[0] for m in of_class(launch_objects, 'DeclareLaunchArgument')}
     used = {m.arguments[0] for m in of_class(launch_objects, 'LaunchConfiguration')}
     assert declared == used
-    for share in of_class(launch_objects, 'PathJoinSubstitution'):
-        package, *path = share.arguments[0]
+    for join in of_class(launch_objects, 'PathJoinSubstitution'):
+        package, *path = join.arguments[0]
         assert package.arguments == ('mag_tracking',) and ROOT.joinpath(*path).is_file()
     for m in of_class(launch_objects, 'DeclareLaunchArgument'):
-        assert m.named.get('description') or m.arguments[0] == 'network', m.arguments
+        assert m.keywords.get('description') or m.arguments[0] == 'network', m.arguments
 
 
 @pytest.mark.skipif(not HAS_LAUNCH, reason='launch_ros is not on PyPI; ROS from apt has it')
@@ -112,7 +112,7 @@ def test_the_launch_file_runs():
         ['ros2', 'launch', str(LAUNCH_FILE), f'network:={NETWORK_FILE}', 'namespace:=road',
          f'recording:={vehicle_path("straight_car_right")}', 'rate:=3.0'], text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    # Ends the process if the line never arrives.
+    # The timer ends the process if the line never arrives.
     watchdog = threading.Timer(MAX_S, process.kill)
     watchdog.start()
     try:

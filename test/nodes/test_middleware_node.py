@@ -34,7 +34,7 @@ begin()
 node, received = Node('listener'), Future()
 executor = EventsExecutor()
 executor.add_node(node)
-# The time to create a node is not a delay of the middleware.
+# The creation of the node is not a delay of the middleware.
 began = time.monotonic()
 node.create_subscription(MagneticField, '/field', received.set_result, STREAM)
 executor.spin_until_future_complete(received, 60.0)
@@ -86,11 +86,11 @@ def test_a_restarted_node_receives_messages_at_once(ros, tmp_path):
     """Without the profile, the delay is often 1 to 4 s."""
     node, spin_until = ros
     publisher = node.create_publisher(MagneticField, '/field', STREAM_OUTPUT)
-    # Fast enough to fill the history kept for killed nodes before the next one starts.
+    # Fast enough to fill the history for a killed node before the next node starts.
     node.create_timer(0.005, lambda: publisher.publish(MagneticField()))
     waits = []
     for i in range(4):
-        received = tmp_path / f'heard_{i}'
+        received = tmp_path / f'received_{i}'
         with subprocess.Popen([sys.executable, '-c', LISTENER, str(received)],
                               env=environment()) as listener:
             try:

@@ -36,7 +36,7 @@ NETWORKS = {'/north': ('straight_car_right', {}),
 
 def start_network(namespace, remapped):
     """Start the nodes of one network except its replay node."""
-    names = [a for one, other in remapped.items() for a in ('-r', f'{one}:={other}')]
+    names = [a for topic, new_topic in remapped.items() for a in ('-r', f'{topic}:={new_topic}')]
     return [start(node, *names, *name_arguments(namespace, node), '-p', f'network:={NETWORK_FILE}',
                   '-p', 'reliable_input:=true',
                   *(['-p', 'align.max_wait_s:=5.0'] if node == 'detection_node' else []))
@@ -44,13 +44,13 @@ def start_network(namespace, remapped):
 
 
 def name_arguments(namespace, node):
-    """Arguments that give a node its namespace and name."""
+    """Arguments that set the namespace and name of a node."""
     return ['-r', f'__ns:={namespace}', '-r', f'__node:={NODES[node]}']
 
 
 def play(namespace, recording, remapped):
     """Start the replay node of one network."""
-    names = [a for one, other in remapped.items() for a in ('-r', f'{one}:={other}')]
+    names = [a for topic, new_topic in remapped.items() for a in ('-r', f'{topic}:={new_topic}')]
     return start('replay_node', *names, *name_arguments(namespace, 'replay_node'),
                  '-p', f'recording:={vehicle_path(recording)}', '-p', 'rate:=2.5',
                  '-p', 'start_delay:=3.0', '-p', 'wait_for_subscribers:=300.0')
@@ -108,11 +108,11 @@ def test_two_networks_on_one_graph_do_not_interfere(ros, tmp_path, road_network)
 
 
 def run_command(*arguments):
-    """(exit status, output) of the command."""
-    done = subprocess.run([sys.executable, '-m', 'mag_tracking.cli', *arguments], text=True,
-                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=MAX_S * 2,
-                          env=environment(ROS_HOME=os.environ['ROS_HOME']), check=False)
-    return done.returncode, done.stdout
+    """Run the command; return (exit status, output)."""
+    process = subprocess.run([sys.executable, '-m', 'mag_tracking.cli', *arguments], text=True,
+                             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=MAX_S * 2,
+                             env=environment(ROS_HOME=os.environ['ROS_HOME']), check=False)
+    return process.returncode, process.stdout
 
 
 def test_the_runner_accepts_ros_arguments():

@@ -1,4 +1,4 @@
-"""Faults while a vehicle passes, over the real middleware: reported, and recovered from.
+"""Faults while a vehicle passes, over the real middleware: reports and recovery.
 
 The track continues or ends, and wrong poses are flagged as ambiguous.
 """
@@ -33,12 +33,12 @@ MAX_VEHICLES = 5
 
 @pytest.fixture(scope='module')
 def site(tmp_path_factory):
-    """`World` of all tests; each test restores it, except for the link."""
-    with world(tmp_path_factory.mktemp('world')) as it:
-        yield it
+    """`World` of all tests; each test restores its state except for the link."""
+    with world(tmp_path_factory.mktemp('world')) as running_world:
+        yield running_world
 
 
-def ended(world, since_ns):
+def ended_tracks(world, since_ns):
     """Tracks that ended after `since_ns`."""
     return [t for t in world.tracks(since_ns) if t.ended]
 
@@ -48,11 +48,11 @@ def seconds_to_first_reading(world, sensor_back_ns):
     assert world.wait(lambda: any(
         m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns
         for _, m in world.since(sensor_back_ns, 'driver_node')))
-    took = next(came for came, m in world.since(sensor_back_ns, 'driver_node')
+    delay_s = next(arrival_ns for arrival_ns, m in world.since(sensor_back_ns, 'driver_node')
                 if m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns)
-    took = (took - sensor_back_ns) / NS
-    assert took <= MAX_RECOVERY_S
-    return took
+    delay_s = (delay_s - sensor_back_ns) / NS
+    assert delay_s <= MAX_RECOVERY_S
+    return delay_s
 
 
 def check_recovery(world, began, track, lost_ns, where):
@@ -65,7 +65,7 @@ def check_recovery(world, began, track, lost_ns, where):
     assert where in world.told(lost_ns, name)[0][1].message
     assert world.wait(lambda: world.told(lost_ns, name, 'lost: mag_1', 'lost: mag_2'))
     assert world.wait(lambda: world.told(lost_ns, name)[-1][1].message == 'open')
-    assert world.wait(lambda: ended(world, began))
+    assert world.wait(lambda: ended_tracks(world, began))
     assert {t.id for t in world.tracks(began)} == {track}
     assert world.tracks(began)[-1].stamp_ns > lost_ns + NS
     assert world.wrong(began) == []
@@ -74,12 +74,13 @@ def check_recovery(world, began, track, lost_ns, where):
 def track_vehicle(world):
     """Start vehicles until one is tracked; return (its start [ns], track id).
 
-    The driver publishes its status once a second; the next one is due 0.35 s after the return.
+    The driver publishes its status once a second; the next status is due 0.35 s after the return.
     """
     for _ in range(MAX_VEHICLES):
         assert world.wait(world.is_quiet)
-        asked = time.time_ns()
-        assert world.wait(lambda asked=asked: world.told(asked, f'driver_node: {world.link}'))
+        start_ns = time.time_ns()
+        assert world.wait(lambda start_ns=start_ns: world.told(
+            start_ns, f'driver_node: {world.link}'))
         began = world.call()
         world.pause(2.65)
         if world.tracks(began):
@@ -117,9 +118,9 @@ def test_a_killed_node_recovers_after_its_restart(site, name):
     site.use('mqtt')
     began = track_vehicle_to(site, -4.0)
     site.kill(name)
-    up, recovery = site.recovery(name)
-    print(f'{name}: up after {up:.2f} s, first output {recovery:.2f} s later')
-    assert recovery <= scaled(MAX_RECOVERY_S, up)
+    start_s, recovery = site.recovery(name)
+    print(f'{name}: up after {start_s:.2f} s, first output {recovery:.2f} s later')
+    assert recovery <= scaled(MAX_RECOVERY_S, start_s)
     assert site.wait(site.roadside.is_gone)
     assert site.wrong(began) == []
 
@@ -128,23 +129,24 @@ def test_a_killed_node_recovers_after_its_restart(site, name):
     ('calibration_node', 'detection_node: from calibration', 'no message from'),
     ('detection_node', 'tracker_node: from detection', 'no message from'),
     ('tracker_node', 'detection_node: to tracker', 'tracker_node is gone')])
-def test_a_dead_node_is_reported_by_its_neighbour(site, name, reporter, words):
+def test_a_dead_node_is_reported_by_its_peer(site, name, reporter, words):
     """A track without frames ends."""
     site.use('mqtt')
     began = track_vehicle_to(site, -4.0)
     killed = time.time_ns()
     site.kill(name)
     assert site.wait(lambda: site.told(killed, reporter, words, 'check that it is running'))
-    [(came, status), *_] = site.told(killed, reporter, words, 'check that it is running')
+    [(arrival_ns, status), *_] = site.told(killed, reporter, words, 'check that it is running')
     assert status.level == DiagnosticStatus.ERROR
-    reported_s = (came - killed) / NS
+    reported_s = (arrival_ns - killed) / NS
     print(f'a dead {name}: reported after {reported_s:.1f} s')
     if name != 'tracker_node':
-        assert site.wait(lambda: ended(site, began))
-        [last] = ended(site, began)
+        assert site.wait(lambda: ended_tracks(site, began))
+        [last] = ended_tracks(site, began)
         assert last.stamp_ns < killed + NS
-    up, recovery = site.recovery(name)
-    assert recovery <= scaled(MAX_RECOVERY_S, up) and reported_s <= scaled(MAX_REPORT_S, up)
+    start_s, recovery = site.recovery(name)
+    assert recovery <= scaled(MAX_RECOVERY_S, start_s) \
+        and reported_s <= scaled(MAX_REPORT_S, start_s)
     restarted = time.time_ns()
     assert site.wait(lambda: [s for _, s in site.told(restarted, reporter, 'running')])
 
@@ -156,14 +158,14 @@ def test_a_dead_driver_is_reported_by_the_calibration(site):
     for sensor in ('mag_1', 'mag_2'):
         name = f'calibration_node: {sensor}'
         assert site.wait(lambda name=name: site.told(killed, name, 'silent', 'driver'))
-        [*_, (came, status)] = site.told(killed, name, 'silent')
+        [*_, (arrival_ns, status)] = site.told(killed, name, 'silent')
         assert status.level == DiagnosticStatus.ERROR
-    reported_s = (came - killed) / NS
+    reported_s = (arrival_ns - killed) / NS
     print(f'a dead driver: reported after {reported_s:.1f} s')
-    # The other link, so that readings from before the restart do not count.
+    # Use the other link, so that readings from before the restart do not count.
     site.link = 'serial'
-    up, recovery = site.recovery('driver_node')
-    assert recovery <= scaled(MAX_RECOVERY_S, up) and reported_s <= scaled(5.0, up)
+    start_s, recovery = site.recovery('driver_node')
+    assert recovery <= scaled(MAX_RECOVERY_S, start_s) and reported_s <= scaled(5.0, start_s)
     assert site.wait(lambda: 'silent' not in site.told(
         killed, 'calibration_node: mag_1')[-1][1].message)
 
@@ -183,12 +185,12 @@ def test_a_track_survives_a_missing_port(site):
 
 def test_two_boards_of_one_name_are_reported(site):
     site.use('mqtt')
-    asked = time.time_ns()
-    assert site.wait(lambda: site.told(asked, 'driver_node: mqtt'))
+    start_ns = time.time_ns()
+    assert site.wait(lambda: site.told(start_ns, 'driver_node: mqtt'))
     assert not site.told(0, 'driver_node: mqtt', 'sequence restarts')
     began = time.time_ns()
     site.roadside.twin = True
-    # Detected in the sequence numbers and in the clock; readings that do not fit it are rejected.
+    # The sequence numbers and the clock reveal the second board; unfit readings are rejected.
     for words in ('sequence restarts: mag_1', 'do not fit the clock'):
         assert site.wait(lambda words=words: site.told(
             began, 'driver_node: mqtt', words)), words
@@ -199,14 +201,14 @@ def test_two_boards_of_one_name_are_reported(site):
 
 def test_a_broker_that_refuses_the_login_is_reported(site):
     site.use('mqtt')
-    asked = time.time_ns()
-    assert site.wait(lambda: site.told(asked, 'driver_node: guarded', 'refused'))
-    [(_, status)] = site.told(asked, 'driver_node: guarded')
+    start_ns = time.time_ns()
+    assert site.wait(lambda: site.told(start_ns, 'driver_node: guarded', 'refused'))
+    [(_, status)] = site.told(start_ns, 'driver_node: guarded')
     assert status.level == DiagnosticStatus.ERROR
     assert f'127.0.0.1:{site.guarded.port}' in status.message
     assert 'not authori' in status.message.lower()
     # Other devices are not affected.
-    assert site.wait(lambda: site.since(asked, 'driver_node'))
+    assert site.wait(lambda: site.since(start_ns, 'driver_node'))
 
 
 def restart(pipeline, name):
@@ -226,7 +228,7 @@ def restart(pipeline, name):
     # A track that begins close to the sensors may be wrong, but is ambiguous.
     ('detection_node', -8.0, 1.0), ('tracker_node', -4.0, 1.0)])
 def test_no_pose_is_wrong_after_a_gap_during_a_pass(tmp_path, name, x, gap_s):
-    """As above without processes: reproducible times, and the default frame period."""
+    """Same faults without processes, at reproducible times, with the default frame period."""
     network, speed = read_network(network_file(tmp_path)), 10.0
     settings = settings_for('vehicle', {**POINT, **STEADY['calibration_node'],
                                         **STEADY['detection_node']})

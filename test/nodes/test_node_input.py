@@ -33,7 +33,7 @@ def test_invalid_parameters_end_the_node_with_a_clear_error(arguments, message):
 
 
 def publish_readings_and_faults(publish):
-    """Publish readings that establish a background, then one message of each fault."""
+    """Publish readings that establish a background, then one message with each fault."""
     rng = np.random.default_rng(0)
     for k in range(150):
         field = np.array([2e-6, 1.5e-5, -4.9e-5]) + 1e-8 * rng.standard_normal(3)

@@ -62,7 +62,7 @@ class Collector(Node):
     def __init__(self):
         super().__init__('collector')
         self.poses, self.tracks, self.hypotheses, self.paths = [], [], [], []
-        self.late, self.smoothed, self.passages, self.summaries = [], [], [], []
+        self.fixed_lag, self.smoothed, self.passages, self.summaries = [], [], [], []
         self.create_subscription(VehiclePassage, '/tracker_node/passages', self.passages.append,
                                  RESULTS)
         self.create_subscription(TrafficSummary, '/tracker_node/traffic', self.summaries.append,
@@ -71,7 +71,7 @@ class Collector(Node):
                                  RESULTS)
         self.create_subscription(Path, '/tracker_node/path_smoothed', self.paths.append, RESULTS)
         self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose_smoothed',
-                                 self.late.append, STREAM)
+                                 self.fixed_lag.append, STREAM)
         self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose',
                                  self.poses.append, STREAM)
         self.create_subscription(TrackArray, '/tracker_node/tracks', self.tracks.append, STREAM)
@@ -86,34 +86,36 @@ def compare_with_offline(collector, folder):
     tracks = [track_of(t) for m in collector.tracks for t in m.tracks]
     live = [t for t in tracks if not t.ended]
     assert len(live) == len(collector.poses)
-    # At the end of a stream, the nodes may hold back one or two frames until a flush.
+    # At the end of a stream, one or two frames may be queued in the nodes until a flush.
     assert len(offline) - 2 <= len(live) <= len(offline)
-    worst = 0.0
+    max_difference = 0.0
     for t, pose in zip(live, collector.poses, strict=True):
         row = offline[t.stamp_ns, t.id]
-        theirs = np.array([float(row[c]) for c in (
+        expected = np.array([float(row[c]) for c in (
             'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz',
             'mx', 'my', 'mz', 'weight')])
-        ours = np.r_[t.position, t.velocity, np.sqrt(np.diagonal(t.covariance)), t.moment, t.weight]
-        worst = max(worst, np.abs(ours - theirs).max() / np.abs(theirs).max(),
-                    (np.abs(ours - theirs) / np.maximum(np.abs(theirs), 1e-9)).max())
+        online = np.r_[t.position, t.velocity, np.sqrt(np.diagonal(t.covariance)), t.moment,
+                       t.weight]
+        max_difference = max(
+            max_difference, np.abs(online - expected).max() / np.abs(expected).max(),
+            (np.abs(online - expected) / np.maximum(np.abs(expected), 1e-9)).max())
         assert t.ambiguous == bool(int(row['ambiguous']))
         p = pose.pose.pose.position
         assert (p.x, p.y, p.z) == tuple(t.position) and stamp_ns(pose.header.stamp) == t.stamp_ns
-    return worst
+    return max_difference
 
 
 def compare_traffic(collector, offline):
-    """Assert that published passages equal those offline; the last ones may be held back."""
+    """Assert that passages equal the offline passages, except for the last two."""
     n = len(collector.passages)
     assert len(offline.vehicles) - 2 <= n <= len(offline.vehicles) and n > 5
-    for ours, vehicle in zip(collector.passages, offline.vehicles, strict=False):
-        theirs = to_message(VehiclePassage, vehicle_passage_dict(
+    for online, vehicle in zip(collector.passages, offline.vehicles, strict=False):
+        expected = to_message(VehiclePassage, vehicle_passage_dict(
             vehicle.passage, offline.class_names, 'map'))
-        # Compared as text, because NaN is not equal to itself.
-        assert str(ours) == str(theirs)
-    for ours, summary in zip(collector.summaries, offline.summaries, strict=False):
-        assert str(ours) == str(to_message(TrafficSummary, traffic_summary_dict(summary, 'map')))
+        # Compared as strings, because NaN is not equal to itself.
+        assert str(online) == str(expected)
+    for online, summary in zip(collector.summaries, offline.summaries, strict=False):
+        assert str(online) == str(to_message(TrafficSummary, traffic_summary_dict(summary, 'map')))
 
 
 def compare_smoothed(collector, folder):
@@ -123,9 +125,9 @@ def compare_smoothed(collector, folder):
     assert len(collector.paths) == 1
     steps = collector.paths[0].poses
     assert [stamp_ns(s.header.stamp) for s in steps] == [int(r['stamp_ns']) for r in offline]
-    ours = np.array([[getattr(s.pose.position, a) for a in 'xyz'] for s in steps])
-    theirs = np.array([[float(r[a]) for a in 'xyz'] for r in offline])
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
+    online = np.array([[getattr(s.pose.position, a) for a in 'xyz'] for s in steps])
+    expected = np.array([[float(r[a]) for a in 'xyz'] for r in offline])
+    np.testing.assert_allclose(online, expected, rtol=0, atol=1e-9)
     whole = collector.smoothed[0]
     assert len(collector.smoothed) == 1 and whole.track_id == int(offline[0]['track_id'])
     flags = [row['ambiguous'] == '1' for row in offline]
@@ -137,13 +139,13 @@ def compare_smoothed(collector, folder):
         published = [p.pose.pose.position.x, p.pose.pose.position.y, v.x, v.y, C[0, 0]**0.5]
         np.testing.assert_allclose(
             published, [float(row[c]) for c in ('x', 'y', 'vx', 'vy', 'sd_x')], rtol=0, atol=1e-9)
-    late = {stamp_ns(m.header.stamp): m.pose.pose.position for m in collector.late}
+    fixed_lag = {stamp_ns(m.header.stamp): m.pose.pose.position for m in collector.fixed_lag}
     # Ambiguous fixed-lag poses are withheld: they have no flag and no covariance of a mixture.
-    assert late.keys() <= {stamp_ns(s.header.stamp) for s in steps}
-    assert len(late) > 0.4 * len(steps)
-    position = {stamp_ns(s.header.stamp): xyz for s, xyz in zip(steps, theirs, strict=True)}
-    apart = [np.hypot(p.x - position[s][0], p.y - position[s][1]) for s, p in late.items()]
-    assert 0.01 < np.median(apart) < 2.0
+    assert fixed_lag.keys() <= {stamp_ns(s.header.stamp) for s in steps}
+    assert len(fixed_lag) > 0.4 * len(steps)
+    position = {stamp_ns(s.header.stamp): xyz for s, xyz in zip(steps, expected, strict=True)}
+    distances = [np.hypot(p.x - position[s][0], p.y - position[s][1]) for s, p in fixed_lag.items()]
+    assert 0.01 < np.median(distances) < 2.0
 
 
 def collect_from_nodes(network_file, settings, recording, rate):
@@ -159,10 +161,10 @@ def test_nodes_equal_offline_on_vehicles(name, tmp_path, road_network):
     settings = settings_for('vehicle', {**PATIENT, 'track.smoothing_lag_s': 0.3})
     replay(Recording(vehicle_path(name)), road_network, settings, tmp_path)
     collector = collect_from_nodes(NETWORK_FILE, settings, vehicle_path(name), 6.0)
-    worst = compare_with_offline(collector, tmp_path)
+    max_difference = compare_with_offline(collector, tmp_path)
     compare_smoothed(collector, tmp_path)
-    print(f'{name}: nodes against offline, largest relative difference {worst:.1e}')
-    assert worst <= 1e-9
+    print(f'{name}: nodes against offline, largest relative difference {max_difference:.1e}')
+    assert max_difference <= 1e-9
 
 
 def test_nodes_equal_offline_on_several_vehicles(tmp_path):
@@ -173,7 +175,7 @@ def test_nodes_equal_offline_on_several_vehicles(tmp_path):
     settings, recording = settings_for('vehicle', PATIENT), BUSY / f'{name}.mcap'
     replay(Recording(recording), network, settings, tmp_path)
     collector = collect_from_nodes(network_file, settings, recording, 2.0)
-    worst = compare_with_offline(collector, tmp_path)
+    max_difference = compare_with_offline(collector, tmp_path)
     ids = {t.id for m in collector.tracks for t in m.tracks}
     together = [s for s, n in Counter(t.header.stamp.sec for m in collector.tracks
                                       for t in m.tracks).items() if n > 13]
@@ -181,18 +183,19 @@ def test_nodes_equal_offline_on_several_vehicles(tmp_path):
     smoothed = [m.track_id for m in collector.smoothed]
     assert len(smoothed) == len(set(smoothed)) and set(smoothed) <= ids
     compare_traffic(collector, mt.traffic(recording, network, PATIENT))
-    print(f'several vehicles: nodes against offline, largest relative difference {worst:.1e}')
-    assert worst <= 1e-9
+    print('several vehicles: nodes against offline, largest relative difference '
+          f'{max_difference:.1e}')
+    assert max_difference <= 1e-9
 
 
 def test_nodes_equal_offline_at_the_defaults(tmp_path, road_network):
     """At the rate of the recording, no message is late by half a second."""
     settings, recording = settings_for('vehicle'), vehicle_path('straight_car_fast_left')
     replay(Recording(recording), road_network, settings, tmp_path)
-    worst = compare_with_offline(
+    max_difference = compare_with_offline(
         collect_from_nodes(NETWORK_FILE, settings, recording, 1.0), tmp_path)
-    print(f'defaults: nodes against offline, largest relative difference {worst:.1e}')
-    assert worst <= 1e-9
+    print(f'defaults: nodes against offline, largest relative difference {max_difference:.1e}')
+    assert max_difference <= 1e-9
 
 
 @pytest.mark.parametrize('run_number', studied([1, 2], [1]))
@@ -200,14 +203,14 @@ def test_nodes_equal_offline_on_magnets(run_number, magnet_runs, tmp_path):
     recording, network_file = magnet_runs[run_number]
     settings = settings_for('magnet', {'align.max_wait_s': 60.0})
     replay(Recording(recording), read_network(network_file), settings, tmp_path)
-    worst = compare_with_offline(
+    max_difference = compare_with_offline(
         collect_from_nodes(network_file, settings, recording, 80.0), tmp_path)
-    print(f'magnet run {run_number}: nodes against offline {worst:.1e}')
-    assert worst <= 1e-9
+    print(f'magnet run {run_number}: nodes against offline {max_difference:.1e}')
+    assert max_difference <= 1e-9
 
 
 def receive_topics(node):
-    """{message type: [messages]} of the topics of the nodes, filled while `node` spins."""
+    """Subscribe to the topics of the nodes; return {message type: [messages]}."""
     topics = {NetworkFrame: '/network_frame', TrackArray: '/tracker_node/tracks',
               Odometry: '/tracker_node/odometry', MarkerArray: '/tracker_node/markers',
               PassEvent: '/detection_node/events', Clock: '/clock',
@@ -306,12 +309,12 @@ def test_replay_services_pause_seek_and_resume(ros):
 def test_parameters_have_descriptors_and_are_checked(ros):
     process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
     try:
-        described = call(ros, DescribeParameters, '/tracker_node/describe_parameters',
-                         DescribeParameters.Request(names=[
-                             'track.field_error', 'track.vehicle.induced_share'])).descriptors
-        assert all(d.description for d in described)
-        assert described[0].floating_point_range[0].to_value == 10.0
-        assert [d.read_only for d in described] == [False, True]
+        descriptors = call(ros, DescribeParameters, '/tracker_node/describe_parameters',
+                           DescribeParameters.Request(names=[
+                               'track.field_error', 'track.vehicle.induced_share'])).descriptors
+        assert all(d.description for d in descriptors)
+        assert descriptors[0].floating_point_range[0].to_value == 10.0
+        assert [d.read_only for d in descriptors] == [False, True]
 
         def set_parameter(name, value):
             return call(ros, SetParameters, '/tracker_node/set_parameters',
@@ -337,17 +340,17 @@ def test_a_track_is_unchanged_by_conversion_to_messages_and_back():
         mounting=np.arange(27.0).reshape(9, 3),
         mounting_covariance=np.arange(81.0).reshape(9, 3, 3) / 7.0)
     from mag_tracking_msgs.msg import Track as TrackMessage
-    back = track_of(to_message(TrackMessage, track_dict(track, 'map')),
-                    to_message(HypothesisArray, hypotheses_dict(track, 'map')))
+    converted = track_of(to_message(TrackMessage, track_dict(track, 'map')),
+                         to_message(HypothesisArray, hypotheses_dict(track, 'map')))
     for name in ('stamp_ns', 'id', 'ended', 'existence', 'weight', 'nis', 'degrees_of_freedom',
                  'arrival', 'ambiguous', 'unobservable', 'kind', 'kind_weight', 'length',
                  'length_std'):
-        assert getattr(back, name) == getattr(track, name), name
+        assert getattr(converted, name) == getattr(track, name), name
     for name in ('position', 'velocity', 'covariance', 'orientation', 'orientation_covariance',
                  'position_orientation_covariance', 'moment', 'moment_covariance', 'predicted',
                  'mounting', 'mounting_covariance', 'nis_by_sensor'):
-        np.testing.assert_array_equal(getattr(back, name), getattr(track, name))
-    assert len(back.hypotheses) == len(track.hypotheses)
+        np.testing.assert_array_equal(getattr(converted, name), getattr(track, name))
+    assert len(converted.hypotheses) == len(track.hypotheses)
 
 
 @pytest.mark.parametrize('signum', [signal.SIGINT, signal.SIGTERM])

@@ -29,16 +29,17 @@ class Listener(Node):
                                  STREAM)
         self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose',
                                  self.poses.append, STREAM)
-        self.early = 0
-        self.create_subscription(TrackArray, '/tracker_node/tracks', self._track, STREAM)
-        self.create_subscription(DiagnosticArray, '/diagnostics', self._note, RESULTS)
+        self.n_early = 0
+        self.create_subscription(TrackArray, '/tracker_node/tracks', self._receive_tracks, STREAM)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._receive_diagnostics,
+                                 RESULTS)
 
-    def _track(self, message):
+    def _receive_tracks(self, message):
         """Count tracks that arrive before their frame; viewers draw both together."""
         stamps = {stamp_ns(f.header.stamp) for f in self.frames}
-        self.early += any(stamp_ns(t.header.stamp) not in stamps for t in message.tracks)
+        self.n_early += any(stamp_ns(t.header.stamp) not in stamps for t in message.tracks)
 
-    def _note(self, message):
+    def _receive_diagnostics(self, message):
         self.statuses |= {s.name: s for s in message.status}
 
 
@@ -52,11 +53,11 @@ def test_topics_between_the_stages_are_published():
     assert len(stamps) > 100 and (np.diff(stamps) > 0).all()
     assert ({stamp_ns(p.header.stamp) for p in listener.poses} <= {*stamps}
             and len(listener.poses) > 10)
-    assert len(listener.fields) > 900 and listener.early == 0
+    assert len(listener.fields) > 900 and listener.n_early == 0
     # Diagnostics treat calls between stages as messages.
     for name in ('detection_node: from calibration', 'tracker_node: from detection'):
-        found = [s for key, s in listener.statuses.items() if key == name]
-        assert found and all(s.level == b'\x00' for s in found), (name, found)
+        statuses = [s for key, s in listener.statuses.items() if key == name]
+        assert statuses and all(s.level == b'\x00' for s in statuses), (name, statuses)
 
 
 def test_no_stage_subscribes_to_another_one(ros):

@@ -33,11 +33,11 @@ def command(*arguments):
 
 
 def address(process):
-    """Address that the command prints."""
+    """Address of the page, as printed by the command."""
     for line in process.stdout:
-        found = re.search(r'live page: (\S+)', line)
-        if found:
-            return found[1]
+        match = re.search(r'live page: (\S+)', line)
+        if match:
+            return match[1]
     raise AssertionError(f'the command ended with {process.wait()} and printed no address')
 
 
@@ -88,7 +88,7 @@ def test_the_page_of_running_nodes_shows_the_values_of_the_topic(ros):
 
 
 def messages_of(url, until, seconds=MAX_S):
-    """Messages of a viewer until `until(message)`."""
+    """Yield the messages to a viewer, up to the first message for which `until` is true."""
     with connect(url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
         end = time.monotonic() + seconds
         while True:
@@ -99,7 +99,7 @@ def messages_of(url, until, seconds=MAX_S):
 
 
 def test_a_renamed_tracker_is_found_and_may_be_restarted():
-    """Its second run restarts with track 1 and the times of the recording."""
+    """The second run starts again with track 1 and the times of the recording."""
     watch = command('watch', '--port', 0)
     try:
         url = address(watch)
@@ -119,7 +119,7 @@ def test_a_renamed_tracker_is_found_and_may_be_restarted():
 
 
 def test_a_page_ends_with_the_command_that_started_it():
-    """Also if the command is killed."""
+    """The page also ends if the command is killed."""
     run = command('run', '--network', NETWORK_FILE, '--web', 0)
     url = address(run)
     assert urllib.request.urlopen(url, timeout=MAX_S).status == 200
@@ -145,11 +145,11 @@ def test_run_serves_the_page_and_frees_the_port():
     assert terminate(run) == 0
     port = int(url.rstrip('/').rpartition(':')[2])
     end = time.monotonic() + MAX_S
-    again = command('watch', '--port', port)
-    assert address(again) == url and time.monotonic() < end
+    second_watch = command('watch', '--port', port)
+    assert address(second_watch) == url and time.monotonic() < end
     # The port is in use: the command reports it before it starts a node.
-    refused = command('run', '--network', NETWORK_FILE, '--web', port)
-    output = refused.communicate(timeout=MAX_S)[0]
-    assert refused.returncode == 1
+    second_run = command('run', '--network', NETWORK_FILE, '--web', port)
+    output = second_run.communicate(timeout=MAX_S)[0]
+    assert second_run.returncode == 1
     assert f'port {port}: Address already in use' in output
-    assert terminate(again) == 0
+    assert terminate(second_watch) == 0

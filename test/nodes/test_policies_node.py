@@ -11,17 +11,17 @@ POLICIES = ROOT / 'config' / 'security' / 'policies.xml'
 
 
 def test_policies_are_up_to_date():
-    done = subprocess.run([sys.executable, str(ROOT / 'tools' / 'generate_policies.py'), '--check'],
-                          text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                          timeout=MAX_S, check=False)
-    assert done.returncode == 0, done.stdout
+    process = subprocess.run([sys.executable, str(ROOT / 'tools' / 'generate_policies.py'),
+                              '--check'], text=True, stdout=subprocess.PIPE,
+                             stderr=subprocess.STDOUT, timeout=MAX_S, check=False)
+    assert process.returncode == 0, process.stdout
 
 
 def test_policies_of_a_namespace_contain_it_everywhere():
-    done = subprocess.run([sys.executable, str(ROOT / 'tools' / 'generate_policies.py'),
-                           '--namespace', '/robot1'], text=True, stdout=subprocess.PIPE,
-                          stderr=subprocess.DEVNULL, timeout=MAX_S, check=False)
-    profiles = list(ElementTree.fromstring(done.stdout).iter('profile'))
+    process = subprocess.run([sys.executable, str(ROOT / 'tools' / 'generate_policies.py'),
+                              '--namespace', '/robot1'], text=True, stdout=subprocess.PIPE,
+                             stderr=subprocess.DEVNULL, timeout=MAX_S, check=False)
+    profiles = list(ElementTree.fromstring(process.stdout).iter('profile'))
     assert {p.get('ns') for p in profiles} == {'/robot1'}
     names = {e.text for p in profiles for rule in p for e in rule}
     common = {'/clock', '/diagnostics', '/rosout', '/parameter_events', '/tf', '/tf_static'}
@@ -29,7 +29,7 @@ def test_policies_of_a_namespace_contain_it_everywhere():
 
 
 def test_policies_allow_only_the_interfaces_of_each_node():
-    """Rules by profile, as in the schema of sros2."""
+    """The rules are read as in the schema of sros2."""
     profiles = {p.get('node'): p for p in ElementTree.parse(POLICIES).iter('profile')}
     assert set(profiles) == {'calibration_node', 'detection_node', 'tracker_node', 'driver_node',
                              'replay_node'}

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.timeout(600)
 
 
 class Session:
-    """RecordNode in this process, and its reports."""
+    """Recording in this process, with the reports of its `RecordNode`."""
 
     def __init__(self, folder, selection, **arguments):
         self.reports = []
@@ -53,7 +53,7 @@ class Session:
 
 @pytest.fixture
 def record(ros, tmp_path):
-    """f(selection, …): new `Session`, closed after the test."""
+    """Function that opens a `Session`; all sessions are closed after the test."""
     sessions = []
 
     def make(selection, **arguments):
@@ -91,8 +91,8 @@ def test_selected_topics_are_recorded(ros, record):
             session.node.poll()
         time.sleep(0.02)
     for topics, session in sessions.items():
-        found = set(session.recorder.counts) - {'/rosout', '/parameter_events'}
-        assert found == topics, topics ^ found
+        recorded = set(session.recorder.counts) - {'/rosout', '/parameter_events'}
+        assert recorded == topics, topics ^ recorded
         assert session.node.refused == {} == session.node.lost and session.reports == []
 
 
@@ -147,12 +147,12 @@ def test_a_restarted_or_second_publisher_is_no_loss(ros, record):
         total += 20
         assert session.until(lambda: session.recorder.counts[FIELDS[0]] == total)  # noqa: B023
         node.destroy_publisher(publisher)
-    pair = [node.create_publisher(MagneticField, FIELDS[0], STREAM) for _ in range(2)]
-    assert session.until(lambda: all(p.get_subscription_count() for p in pair)
+    publishers = [node.create_publisher(MagneticField, FIELDS[0], STREAM) for _ in range(2)]
+    assert session.until(lambda: all(p.get_subscription_count() for p in publishers)
                          and node.count_publishers(FIELDS[0]) == 2)
     for k in range(40):
         for _ in range(1 + k % 3):
-            pair[k % 2].publish(MagneticField())
+            publishers[k % 2].publish(MagneticField())
         total += 1 + k % 3
         session.until(lambda: True)
     assert session.until(lambda: session.recorder.counts[FIELDS[0]] == total)
@@ -176,11 +176,11 @@ def test_each_file_begins_with_the_last_latched_message(ros, record):
     files = sorted(session.recorder.folder.glob('*.mcap'), key=lambda p: int(p.stem.split('_')[-1]))
     assert len(files) > 1
     for n, file in enumerate(files):
-        found = [decode(m).frame_id for m in Recording(file).messages([topic])]
-        assert (found[0] == 'early') == (n == 0)
+        recorded = [decode(m).frame_id for m in Recording(file).messages([topic])]
+        assert (recorded[0] == 'early') == (n == 0)
         if n:
             previous = [decode(m).frame_id for m in Recording(files[n - 1]).messages([topic])]
-            assert found[0] == previous[-1]
+            assert recorded[0] == previous[-1]
     with Reader(session.recorder.folder) as reader:
         (connection,) = reader.connections
     assert connection.ext.offered_qos_profiles[0].durability.name == 'TRANSIENT_LOCAL'

@@ -49,7 +49,7 @@ def recording_process(out, *options):
 
 
 def await_messages(process, n):
-    """Read the output of a recording process until `n` messages, or none for ten seconds."""
+    """Wait until a recording process reports `n` messages, or no more for ten seconds."""
     before, lines = None, 0
     for line in process.stdout:
         match = re.search(r' s: (\d+) messages', line)
@@ -61,7 +61,7 @@ def await_messages(process, n):
 
 
 def contents(path, topics):
-    """{topic: [message as text]}; as text, because padding bytes are undefined."""
+    """{topic: [message as a string]}; serialised messages have undefined padding bytes."""
     out = {t: [] for t in topics}
     for m in Recording(path).messages(topics):
         out[m.topic].append(repr(decode(m)))
@@ -77,7 +77,7 @@ def poses(folder):
 
 
 def test_a_recorded_replay_equals_the_original(ros, tmp_path, road_network):
-    """Same messages, also in rosbags, and the same track. SIGTERM ends the recorder cleanly."""
+    """Messages and tracks are the same, also for rosbags. SIGTERM ends the recorder cleanly."""
     before = set(os.listdir('/dev/shm'))
     original, out = vehicle_path('straight_car_right'), tmp_path / 'night'
     process = recording_process(out)
@@ -99,15 +99,15 @@ def test_a_recorded_replay_equals_the_original(ros, tmp_path, road_network):
     for topic, n in expected.items():
         assert f'  {topic}  {n}\n' in output, output
     assert f'{out}: {sum(expected.values())} messages' in output
-    theirs, ours = contents(original, expected), contents(out, expected)
-    assert theirs == ours and set(Recording(out).types) == set(expected)
+    expected_contents, recorded_contents = contents(original, expected), contents(out, expected)
+    assert expected_contents == recorded_contents and set(Recording(out).types) == set(expected)
     with AnyReader([out], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         counts = Counter(c.topic for c, _, raw in reader.messages()
                          if reader.deserialize(raw, c.msgtype))
     assert counts == expected
     with open(out / 'night_0.mcap', 'rb') as stream:
         times = [m.log_time for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]
-    # Ordered also across topics, except for messages that arrive between two polls.
+    # Messages are also ordered across topics, except within one poll.
     assert np.mean(np.diff(times) >= 0) > 0.9
     patient = settings_for('vehicle', {'align.max_wait_s': 5.0})
     for path in (original, out):
@@ -120,26 +120,26 @@ def test_a_recorded_replay_equals_the_original(ros, tmp_path, road_network):
 def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):
     node, spin_until = ros
     before = set(os.listdir('/dev/shm'))
-    sent = []
+    send_times = []
     publisher = node.create_publisher(MagneticField, FIELDS[0], STREAM)
 
     def publish():
         message = MagneticField()
-        message.header.stamp.nanosec = len(sent)
-        sent.append(time.time_ns())
+        message.header.stamp.nanosec = len(send_times)
+        send_times.append(time.time_ns())
         publisher.publish(message)
     process = recording_process(tmp_path / 'a')
     try:
         node.create_timer(0.005, publish)
-        # Some chunks are in the file, and the next one is being filled.
+        # Some chunks have been written, and the next chunk is being filled.
         assert spin_until(lambda: sum(
             p.stat().st_size for p in (tmp_path / 'a').glob('*.mcap')) > 6000)
-        n = len(sent)
-        spin_until(lambda: len(sent) > n + 150)
+        n = len(send_times)
+        spin_until(lambda: len(send_times) > n + 150)
     finally:
         used = segments_of(process.pid)
         process.kill()
-        killed = time.time_ns()
+        kill_time = time.time_ns()
         process.communicate()
         # A killed process leaves its segments; earlier segments belong to this process.
         for name in used - before & set(os.listdir('/dev/shm')):
@@ -147,10 +147,10 @@ def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):
     messages = list(Recording(tmp_path / 'a').messages())
     numbers = [decode(m).header.stamp.nanosec for m in messages]
     assert numbers == sorted(set(numbers)) and len(numbers) > 100
-    print(f'lost: {(killed - sent[numbers[-1]]) / NS:.2f} s')
-    assert killed - sent[numbers[-1]] < NS
-    # Log times are those of arrival, not of the poll.
-    delays = [m.log_time_ns - sent[k] for m, k in zip(messages, numbers, strict=True)]
+    print(f'lost: {(kill_time - send_times[numbers[-1]]) / NS:.2f} s')
+    assert kill_time - send_times[numbers[-1]] < NS
+    # Log times are arrival times, not poll times.
+    delays = [m.log_time_ns - send_times[k] for m, k in zip(messages, numbers, strict=True)]
     assert min(delays) > 0 and np.median(delays) < record_node.POLL_INTERVAL_S * NS / 4
     assert repair(tmp_path / 'a', report=lambda _: None) == 1
     with Reader(tmp_path / 'a') as reader:

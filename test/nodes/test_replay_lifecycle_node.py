@@ -30,10 +30,10 @@ def test_lifecycle_transitions_start_and_stop_playback(ros):
                     ChangeState.Request(transition=Transition(id=transition))).success
 
     try:
-        found = call(ros, GetState, '/replay_node/get_state', GetState.Request()).current_state.id
-        assert found == State.PRIMARY_STATE_UNCONFIGURED
-        refused = call(ros, Seek, '/replay_node/seek', Seek.Request(offset=1.0))
-        assert not refused.success and 'configure the node first' in refused.message
+        state = call(ros, GetState, '/replay_node/get_state', GetState.Request()).current_state.id
+        assert state == State.PRIMARY_STATE_UNCONFIGURED
+        response = call(ros, Seek, '/replay_node/seek', Seek.Request(offset=1.0))
+        assert not response.success and 'configure the node first' in response.message
         assert change(Transition.TRANSITION_CONFIGURE)
         assert spin_until(lambda: node.count_publishers('/mag_1/imu/mag') == 1)
         assert not spin_until(lambda: fields, 0.5)
@@ -58,9 +58,9 @@ def test_lifecycle_transitions_start_and_stop_playback(ros):
 def test_an_unreadable_recording_leaves_the_node_unconfigured(ros, tmp_path):
     process = start('replay_node', '-p', 'autostart:=false', '-p', f'recording:={tmp_path}/no.mcap')
     try:
-        done = call(ros, ChangeState, '/replay_node/change_state', ChangeState.Request(
+        response = call(ros, ChangeState, '/replay_node/change_state', ChangeState.Request(
             transition=Transition(id=Transition.TRANSITION_CONFIGURE)))
-        assert not done.success
+        assert not response.success
     finally:
         codes, outputs = stop([process])
     assert codes == [0] and 'no.mcap' in outputs[0]

@@ -1,4 +1,4 @@
-"""Names of nodes and topics in the graph, also during discovery."""
+"""Names of nodes and topics in the graph, including during discovery."""
 
 from types import SimpleNamespace
 

@@ -15,7 +15,7 @@ from support.bundled import NETWORK_FILE
 from support.dense_traffic import after_dense_traffic
 
 READINGS = after_dense_traffic('junction_left_to_right', 7.0)
-"""Both backgrounds become doubtful twice; one of them while the other is doubtful."""
+"""Both backgrounds become doubtful twice, and are both doubtful for a while."""
 BATCH = 40
 
 
@@ -34,13 +34,13 @@ class Listener:
         self.times = merged(self.times, doubtful_times(SimpleNamespace(sensors=states)))
 
     def feed(self, k):
-        """Batch `k` of the readings."""
+        """Feed batch `k` of the readings."""
         self.stage.feed(READINGS.part(slice(k * BATCH, (k + 1) * BATCH)))
         self.rounds.report_doubts()
 
     @property
-    def is_right(self):
-        """Whether the received intervals equal those of the calibration."""
+    def is_consistent(self):
+        """Whether the received intervals equal the intervals of the calibration stage."""
         return {n: t for n, t in self.times.items() if t} == self.stage.doubtful_intervals()
 
 
@@ -51,32 +51,32 @@ def test_each_begin_and_end_of_a_doubt_is_reported_once_without_delay():
         listener.feed(k)
         changes += listener.stage.doubtful_intervals() != before
         listener.rounds.report_doubts()
-        assert listener.is_right and listener.n == changes
+        assert listener.is_consistent and listener.n == changes
     assert [len(t) for t in listener.times.values()] == [2, 2]
 
 
 @pytest.mark.parametrize('steps', [1, 2, 3, 5])
 @pytest.mark.parametrize('phase', [0, 1, 2])
 def test_rounds_of_any_length_agree_with_the_reports(steps, phase):
-    """A round publishes per-sensor states of different age."""
+    """A round updates the published states of the sensors at different times."""
     listener = Listener()
     for k in range(len(READINGS) // BATCH):
         listener.feed(k)
         if (k + phase) % steps == 0:
             listener.rounds.tick()
             listener.rounds.step_if_due()
-        assert listener.is_right
+        assert listener.is_consistent
 
 
 def test_relearning_ends_a_doubt():
-    """Also if the doubt began with the latest reading."""
+    """The doubt also ends if it began with the latest reading."""
     listener, n = Listener(), 0
     while not listener.stage.doubtful_intervals():
         listener.feed(n)
         n += 1
     listener.stage.forget(())
     listener.rounds.report_doubts()
-    assert listener.is_right and listener.times['mag_1'][-1][1] is not None
+    assert listener.is_consistent and listener.times['mag_1'][-1][1] is not None
     for k in range(n, len(READINGS) // BATCH):
         listener.feed(k)
-    assert listener.is_right
+    assert listener.is_consistent

@@ -1,4 +1,4 @@
-"""Shutdown of processes with ROS, also if the middleware hangs."""
+"""Shutdown of processes with ROS, even if the middleware hangs."""
 
 import ast
 import os
@@ -58,12 +58,12 @@ start.run_node('failing_node')
 '''
 
 
-def started(code, *arguments, **how):
-    """Start Python with arguments; its output is buffered until the end."""
+def started(code, *arguments, **options):
+    """Start Python with arguments; its output is buffered until the process ends."""
     buffered = environment(ROS_HOME=os.environ['ROS_HOME'])
     buffered.pop('PYTHONUNBUFFERED', None)
     return subprocess.Popen([sys.executable, *code, *arguments], text=True, **{
-        'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE, 'env': buffered, **how})
+        'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE, 'env': buffered, **options})
 
 
 def test_a_stuck_node_is_ended_with_its_exit_status():
@@ -168,11 +168,11 @@ def test_the_doctor_reports_before_its_shutdown(monkeypatch, capfd):
 
     statuses = []
 
-    def reported(nodes, executor, status):
+    def shut_down_after_report(nodes, executor, status):
         statuses.append((status, 'has no publisher' in capfd.readouterr().out))
         shut_down(nodes, executor, status)
 
-    monkeypatch.setattr(doctor_node, 'shut_down', reported)
+    monkeypatch.setattr(doctor_node, 'shut_down', shut_down_after_report)
     assert main(['doctor', '--live', '1', '--network', str(NETWORK_FILE)]) == 2
     assert statuses == [(2, True)]
 

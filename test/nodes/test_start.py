@@ -1,4 +1,4 @@
-"""A signal at any moment of the start ends a process silently and with status 0."""
+"""A signal at any time during startup ends a process silently with status 0."""
 
 import ast
 import signal
@@ -32,19 +32,19 @@ SCRIPTS = {name: ['-c', f'from mag_tracking.nodes.start import {name}; {name}()'
 SIGNAL_AT_IMPORT = """
 import os, runpy, sys
 signum, module = int(sys.argv.pop(1)), sys.argv.pop(1)
-def strike(event, arguments):
+def send_signal(event, arguments):
     if event == 'import' and arguments[0] == module:
         os.kill(os.getpid(), signum)
-sys.addaudithook(strike)
+sys.addaudithook(send_signal)
 kind, what = sys.argv.pop(1), sys.argv.pop(1)
 if kind == '-m':
     runpy.run_module(what, run_name='__main__', alter_sys=True)
 else:
     exec(what)
 """
-"""Run a command that sends itself a signal at the import of a module."""
+"""Program that runs a command and sends itself a signal at the import of a module."""
 LIBRARIES = ('librcl.so', 'libfastrtps.so')
-"""Libraries loaded during the start of a node, the second when it initialises ROS."""
+"""Libraries loaded during the start of a node; the second is loaded when ROS is initialised."""
 
 
 def launch(arguments):
@@ -153,7 +153,7 @@ def start_s(monkeypatch):
     pytest.param('tracker_node', 0.25), pytest.param('run', 0.25, marks=pytest.mark.study),
     *(pytest.param(name, 0.05, marks=pytest.mark.study) for name in COMMANDS)])
 def test_a_signal_at_any_moment_of_the_start_ends_the_process(start_s, name, step_s):
-    """On a slow machine, the steps are longer, not more."""
+    """On a slow machine, the steps are longer, not more numerous."""
     duration_s = start_s(COMMANDS[name])
     n = round(2.5 / step_s)
     step_s, ends = max(step_s, 1.2 * duration_s / n), {}
@@ -162,7 +162,7 @@ def test_a_signal_at_any_moment_of_the_start_ends_the_process(start_s, name, ste
         process = launch_and_wait(COMMANDS[name])
         time.sleep(k * step_s)
         ends[round(k * step_s, 2), signum.name] = end_of(process, signum)
-    print(f'{name}: up after {duration_s:.2f} s; {len(ends)} signals, {step_s:.2f} s apart')
+    print(f'{name}: up after {duration_s:.2f} s; {len(ends)} signals, one every {step_s:.2f} s')
     # A node that is up may have logged a line, for example about a missing device.
     assert {moment: (status, output) for moment, (status, output) in ends.items()
             if status or 'Traceback' in output or output.count('\n') > 1} == {}

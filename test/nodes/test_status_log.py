@@ -1,4 +1,4 @@
-"""Faults in the log: at their beginning, at intervals while they last, and at their end."""
+"""Faults in the log: at their beginning and end, and errors at intervals while they last."""
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -42,7 +42,7 @@ def test_a_fault_is_logged_at_its_beginning_and_end(log):
     assert log(0.0, DiagnosticStatus.OK, 'running') == []
     assert log(1.0, DiagnosticStatus.ERROR, 'silent for 3 s') == [
         ('error', 'mag_1: silent for 3 s')]
-    # Its numbers change every second.
+    # The number in the message changes every second.
     assert log(2.0, DiagnosticStatus.ERROR, 'silent for 4 s') == []
     assert log(3.0, DiagnosticStatus.WARN, 'noisy') == [('warning', 'mag_1: noisy')]
     assert log(4.0, DiagnosticStatus.OK, 'running') == [('info', 'mag_1: running again')]
@@ -57,10 +57,24 @@ def test_a_lasting_or_intermittent_fault_is_logged_once_a_minute(log):
     assert all(b - a >= REPEAT_INTERVAL_S for a, b in zip(times, times[1:], strict=False))
 
 
+def test_a_warning_is_logged_once_per_outage(log):
+    """A node without input warns once, however long the outage lasts."""
+    def warnings(begin, end):
+        return [k for k in range(begin, end) for level, _ in log(
+            float(k), DiagnosticStatus.WARN, f'no message from detection for {k - begin + 3} s')
+            if level == 'warning']
+    assert warnings(3, 600) == [3]
+    assert log(600.0, DiagnosticStatus.OK, 'running') == [('info', 'mag_1: running again')]
+    assert warnings(603, 610) == [603]
+    assert len(log(610.0, DiagnosticStatus.OK, 'running')) == 1
+    # Frequent outages are logged once a minute; an outage that lasts is always logged.
+    assert warnings(620, 900) == [603 + REPEAT_INTERVAL_S]
+
+
 def test_the_number_of_remembered_faults_is_bounded(log):
     for k in range(2 * MAX_FAULTS):
         log(0.0, DiagnosticStatus.WARN, 'bad', f'node: {"x" * (k % 97)}{"y" * (k // 97)}')
-    assert log.statuses.n_remembered <= 2 * MAX_FAULTS
+    assert log.statuses.n_remembered <= 3 * MAX_FAULTS
 
 
 def test_a_hundred_sensors_with_one_fault_do_not_fill_the_log(log):
@@ -68,11 +82,11 @@ def test_a_hundred_sensors_with_one_fault_do_not_fill_the_log(log):
         0.0, DiagnosticStatus.ERROR, f'no message on /mag_{j}/imu/mag', f'node: mag_{j}')]
     assert len(lines) == status_log.MAX_SIMILAR_LINES
     assert lines[0] == ('error', 'mag_0: no message on /mag_0/imu/mag')
-    assert lines[-1][1].endswith('(further similar messages are in /diagnostics only)')
+    assert lines[-1][1].endswith('(further similar messages appear only in /diagnostics)')
     lines = [line for j in range(100) for line in log(
         1.0, DiagnosticStatus.OK, 'running', f'node: mag_{j}')]
     assert len(lines) == status_log.MAX_SIMILAR_LINES
-    # Another fault is still logged, and this one again in the next minute.
+    # A different fault is still logged; the first fault is logged again in the next minute.
     assert log(2.0, DiagnosticStatus.WARN, 'noisy', 'node: mag_7') == [('warning', 'mag_7: noisy')]
     assert log(2.0 * REPEAT_INTERVAL_S, DiagnosticStatus.ERROR, 'no message on /mag_7/imu/mag',
                'node: mag_7')

@@ -17,7 +17,7 @@ NAME = 'junction_left_turns_to_rear'
 
 
 def offline(road_network):
-    """Network calibrated by the command from the beginning without targets."""
+    """Network calibrated offline, without passes."""
     return calibrate(Recording(vehicle_path(NAME)), road_network, settings_for('vehicle'), 'now',
                      passes=False).network
 
@@ -38,30 +38,31 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
         assert spin_until(lambda: node.count_publishers('/tracker_node/tracks')
                           and node.count_publishers('/mag_1/imu/mag_calibrated')
                           and node.count_subscribers('/network_frame'))
-        refused = call(ros, Survey, '/calibration_node/survey', Survey.Request(save=True))
-        assert not refused.success and 'no background' in refused.message
+        response = call(ros, Survey, '/calibration_node/survey', Survey.Request(save=True))
+        assert not response.success and 'no background' in response.message
         assert not saved.exists()
         processes.append(start('replay_node', '-p', f'recording:={vehicle_path(NAME)}',
                                '-p', 'rate:=1.0', '-p', 'start_delay:=1.0',
                                '-p', 'wait_for_subscribers:=300.0'))
         assert spin_until(lambda: states and all(s.ready for s in states[-1].sensors))
         # The knocks are over, and the car is seconds away.
-        answer = call(ros, Survey, '/calibration_node/survey', Survey.Request(save=True))
-        assert answer.success and not answer.warnings, answer
+        response = call(ros, Survey, '/calibration_node/survey', Survey.Request(save=True))
+        assert response.success and not response.warnings, response
         assert spin_until(lambda: states[-1].sensors[1].clock_offset != 0.0)
         assert spin_until(lambda: any(t.status == t.ENDED for m in tracks for t in m.tracks))
     finally:
         codes, outputs = stop(processes)
     assert codes == [0] * 4, outputs
-    found, expected = read_network(saved), offline(road_network)
+    surveyed, expected = read_network(saved), offline(road_network)
     state = states[-1].sensors
     for j in range(2):
-        np.testing.assert_allclose(found.R_ws[j], expected.R_ws[j], atol=np.deg2rad(0.05))
-        np.testing.assert_allclose(found.orientation_std[j], expected.orientation_std[j], rtol=0.05)
-        assert abs(found.clock_offset[j] - expected.clock_offset[j]) < 1e-6
-        assert state[j].clock_offset == found.clock_offset[j]
-        assert state[j].calibrated_by == found.calibrated[j].by != ''
-    # With the old network, a tracker would begin with five degrees about each axis.
+        np.testing.assert_allclose(surveyed.R_ws[j], expected.R_ws[j], atol=np.deg2rad(0.05))
+        np.testing.assert_allclose(surveyed.orientation_std[j], expected.orientation_std[j],
+                                   rtol=0.05)
+        assert abs(surveyed.clock_offset[j] - expected.clock_offset[j]) < 1e-6
+        assert state[j].clock_offset == surveyed.clock_offset[j]
+        assert state[j].calibrated_by == surveyed.calibrated[j].by != ''
+    # With the old network, a track would begin with an uncertainty of five degrees per axis.
     assert 'surveyed sensor orientations received' in outputs[2]
     first = next(track_of(t) for m in tracks for t in m.tracks if t.status == t.ACTIVE)
     assert (first.mounting_std.min(axis=1) < np.deg2rad(0.4)).all()

@@ -21,20 +21,20 @@ VIEWERS = ROOT / 'config' / 'viewers'
 
 
 def layout_entries():
-    """[(topic, path of fields)] and frames of all layouts."""
+    """Read [(topic, path of fields)] and the frames of all layouts."""
     content = yaml.safe_load((VIEWERS / 'mag_tracking.rviz').read_text())['Visualization Manager']
-    found = [(d['Topic']['Value'], '') for d in content['Displays'] if 'Topic' in d]
+    entries = [(d['Topic']['Value'], '') for d in content['Displays'] if 'Topic' in d]
     frames = {content['Global Options']['Fixed Frame']}
     layout = json.loads((VIEWERS / 'foxglove.json').read_text())
     for panel in layout['configById'].values():
-        found += [(topic, '') for topic in panel.get('topics', ())]
+        entries += [(topic, '') for topic in panel.get('topics', ())]
         frames |= {panel['followTf']} if 'followTf' in panel else set()
         for path in panel.get('paths', ()):
             topic, _, fields = path['value'].partition('.')
-            found.append((topic, fields))
+            entries.append((topic, fields))
     for curve in ElementTree.parse(VIEWERS / 'plotjuggler.xml').iter('curve'):
-        found.append((None, curve.get('name')))
-    return found, frames
+        entries.append((None, curve.get('name')))
+    return entries, frames
 
 
 class GraphObserver(Node):
@@ -82,9 +82,9 @@ def type_of(kind, fields):
 
 
 def test_topics_fields_and_frames_of_the_layouts_exist(demo):
-    found, frames = layout_entries()
-    assert len(found) > 20 and frames <= demo.frames
-    for topic, path in found:
+    entries, frames = layout_entries()
+    assert len(entries) > 20 and frames <= demo.frames
+    for topic, path in entries:
         if topic is None:
             # PlotJuggler separates topic and fields in the same way.
             topic = max((t for t in demo.types if path.startswith(f'{t}/')), key=len, default=path)
