@@ -21,7 +21,7 @@ def write_report(doctor: Doctor, findings: Sequence[Finding], subject: str, path
     doctor : Doctor
     findings : sequence of Finding
     subject : str
-        Name of what was examined.
+        Name of the examined recording or network.
     path : Path
         File to write.
 
@@ -41,7 +41,7 @@ def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Pa
     doctor : Doctor
     findings : sequence of Finding
     subject : str
-        Name of what was examined.
+        Name of the examined recording or network.
 
     Returns
     -------

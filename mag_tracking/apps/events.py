@@ -21,7 +21,7 @@ from mag_tracking.stages.stage import rejected
 
 @dataclass(frozen=True, eq=False)
 class EventsResult:
-    """Events in a recording."""
+    """Pass events in a recording."""
 
     events: tuple[PassEvent, ...]
     """Events in the order in which they ended."""

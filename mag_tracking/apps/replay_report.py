@@ -79,7 +79,7 @@ def replay_page(run: Run, network: SensorNetwork) -> Page:
 
 def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
            notes: list[Note]) -> dict[str, Any]:
-    """Map of the tracks; adds a note for everything that it omits."""
+    """Create the map of the tracks; add a note for each omission."""
     if len(logs) < len(run.logs):
         notes.append(Note(NOTE, f'the page shows the first {len(logs)} of {len(run.logs)} tracks'))
     max_poses = max_poses_of(logs)

@@ -76,8 +76,8 @@ class TrackingResult:
     no_detection_reason: str | None
     """One sentence if nothing was detected; otherwise None."""
     sensors_without_background: tuple[str, ...]
-    """Sensors that were not used because their background was not learnt. Their readings need a
-    quiet interval, or the network file a `background` and a `noise_std`."""
+    """Sensors that were not used because their background was not learnt. To use them, record a
+    quiet interval, or set `background` and `noise_std` in the network file."""
     disturbances: tuple[Disturbance, ...]
     """Fields that a disturbance explains better than a target."""
 
@@ -99,7 +99,7 @@ class TrackingResult:
         Returns
         -------
         pandas.DataFrame
-            With the columns of `poses.csv`.
+            Table with the columns of `poses.csv`.
 
         Raises
         ------
@@ -114,7 +114,7 @@ class TrackingResult:
         Returns
         -------
         pandas.DataFrame
-            With the columns of `poses_smoothed.csv`, and `complete`.
+            Table with the columns of `poses_smoothed.csv`, and `complete`.
 
         Raises
         ------
@@ -129,7 +129,7 @@ class TrackingResult:
         Returns
         -------
         pandas.DataFrame
-            With the columns of `detections.csv`.
+            Table with the columns of `detections.csv`.
 
         Raises
         ------
@@ -149,7 +149,7 @@ class TrackingResult:
         Returns
         -------
         dict or None
-            The entry `truth` of a track in `summary.json`; None without ground truth.
+            Entry `truth` of a track in `summary.json`; None without ground truth.
 
         Raises
         ------
@@ -181,8 +181,8 @@ class TrackingResult:
         log, errors = self._log(track_id), self.errors(track_id)
         truth = None if errors is None else interpolate_truth(self.truth[errors['name']],
                                                               log.stamp_ns)
-        mine = self.smoothed[(self.smoothed['track_id'] == log.id) & self.smoothed['complete']]
-        return map_figure(log, self.network, truth, mine['position'] if len(mine) else None)
+        smoothed = self.smoothed[(self.smoothed['track_id'] == log.id) & self.smoothed['complete']]
+        return map_figure(log, self.network, truth, smoothed['position'] if len(smoothed) else None)
 
     def weights_figure(self, track_id: int | None = None) -> 'Figure':
         """Draw the weight of each arrival direction over time.
@@ -231,8 +231,9 @@ class TrackingResult:
         if track_id is None and self.tracks:
             return next(iter(self.tracks.values()))
         if track_id is None or track_id not in self.tracks:
-            known = ', '.join(map(str, self.tracks)) or 'none'
-            raise UnknownTrackError(f'track {track_id or ""}: not in the result, which has {known}')
+            available = ', '.join(map(str, self.tracks)) or 'none'
+            raise UnknownTrackError(f'track {track_id or ""} is not in the result; tracks in the '
+                                    f'result: {available}')
         return self.tracks[track_id]
 
 
@@ -241,7 +242,7 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
           settings: Mapping[str, Any] | None = None) -> TrackingResult:
     """Track the targets in readings or in a recording.
 
-    The stages are those of `mag-tracking replay` and of the ROS nodes; no files are written.
+    The stages are the same as in `mag-tracking replay` and the ROS nodes. No files are written.
 
     Parameters
     ----------
@@ -290,7 +291,7 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
             collector.add(pipeline.feed(readings))
         info = recorded_readings(recording, reader, Readings.joined([]))
     collector.add(pipeline.flush())
-    return _result(pipeline, results, collector.logs, info)
+    return _tracking_result(pipeline, results, collector.logs, info)
 
 
 def _batches(readings: Readings) -> Iterator[Readings]:
@@ -327,15 +328,15 @@ class _Results:
         self.poses.append(replace(track, hypotheses=()))
 
 
-def _result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
-            recording: RecordedReadings) -> TrackingResult:
+def _tracking_result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
+                     recording: RecordedReadings) -> TrackingResult:
     """Convert the results to arrays; the readings of `recording` are not used."""
     rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
-    why = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
-                              pipeline.detect, recording.missing_topics, rejections)
+    reason = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
+                                 pipeline.detect, recording.missing_topics, rejections)
     return TrackingResult(
         pipeline.network, pipeline.settings, pose_array(results.poses),
         smoothed_array(results.smoothed), detection_array(results.detections), tracks,
         recording.truth, rejections, pipeline.counts(), recording.lost,
-        recording.missing_topics, why, tuple(pipeline.calibrate.unready()),
+        recording.missing_topics, reason, tuple(pipeline.calibrate.unready()),
         tuple(results.disturbances.values()))

@@ -57,7 +57,7 @@ def test_summaries_add_up():
     assert result.no_detection_reason is None and '30 vehicles' in repr(result)
 
 
-def test_speeds_by_track_and_by_delay_agree_along_a_road():
+def test_speeds_of_track_and_delay_agree_along_a_road():
     """The delay estimate requires sensors along the road and a single vehicle."""
     result = mt.traffic(DATA / 'corridor' / 'corridor_8_sensors.mcap',
                         DATA / 'corridor' / 'network.yaml')
@@ -72,7 +72,7 @@ def test_speeds_by_track_and_by_delay_agree_along_a_road():
     assert all(v.delay.reason and not v.speeds_contradict for v in road().vehicles)
 
 
-def test_tables_hold_every_vehicle_and_interval(tmp_path, capsys):
+def test_tables_contain_every_vehicle_and_interval(tmp_path, capsys):
     arguments = ['traffic', str(vehicle_path('straight_car_right')),
                  str(vehicle_path('straight_truck_right')), '--network', str(NETWORK_FILE)]
     assert main([*arguments, '--out', str(tmp_path)]) == 0
@@ -96,7 +96,7 @@ def test_tables_hold_every_vehicle_and_interval(tmp_path, capsys):
     assert float(rows[0]['speed']) == pytest.approx(truth['vehicles'][0]['speed_mps'], rel=0.15)
 
 
-def test_invalid_input_is_named(tmp_path, capsys):
+def test_invalid_input_is_reported(tmp_path, capsys):
     recording = vehicle_path('straight_car_right')
     with pytest.raises(SettingsError, match='track.target'):
         mt.traffic(recording, NETWORK_FILE, {'track.target': 'magnet'})
@@ -109,7 +109,7 @@ def test_invalid_input_is_named(tmp_path, capsys):
 
 
 def test_tables_without_rows_have_their_columns(tmp_path, capsys):
-    """They replace the tables of an earlier run."""
+    """Empty tables replace the tables of an earlier run."""
     recording = str(vehicle_path('straight_car_right'))
     one_sensor = tmp_path / 'one_sensor.yaml'
     one_sensor.write_text('sensors:\n  mag_1: {position: [0, -4.5, 0]}\n')
@@ -130,7 +130,7 @@ def test_every_column_is_described():
         assert [c.name for c in columns if not c.meaning] == []
 
 
-def test_invalid_input_is_found_before_the_run(tmp_path, capsys):
+def test_invalid_input_is_reported_before_the_run(tmp_path, capsys):
     good = str(vehicle_path('straight_car_right'))
     other = tmp_path / 'other.mcap'
     with RecordingWriter(other) as writer:
