@@ -83,7 +83,7 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
 
 
 def _recordings_at(path: Path, visited: set[Path]) -> list[Path]:
-    """Find the recordings at or below a path, skipping and updating the `visited` folders.
+    """Find the recordings at or below a path; skip `visited` folders and add new ones to them.
 
     An unreadable folder is included, so that it is reported as a failed recording.
     """

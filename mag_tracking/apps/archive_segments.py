@@ -146,7 +146,7 @@ class SegmentWriter:
             self._lookback.clear()
             self._unwritten.append((frame, doubts))
         elif last is not None and last.target_present:
-            # The frame that ends the tracks.
+            # This frame ends the tracks.
             self._unwritten.append((frame, doubts))
             self._quiet_since_ns = frame.stamp_ns
         else:

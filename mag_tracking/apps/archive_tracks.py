@@ -81,7 +81,7 @@ class SegmentTables:
             self._add_pass(*numbered_pass)
 
     def finish(self, tracker: TrackManager) -> None:
-        """End the segment.
+        """End the segment and write the remaining tracks.
 
         Parameters
         ----------

@@ -101,7 +101,7 @@ class RecordedEvidence(ClockComparison):
         self.was_apart = False
 
     def add(self, found: RigidPass, rows: IntArray) -> None:
-        """Add a pass.
+        """Add a pass and record it.
 
         Parameters
         ----------
@@ -116,7 +116,7 @@ class RecordedEvidence(ClockComparison):
 
 @dataclass
 class _Tracked:
-    """Result of `track_segment` that its tables do not contain."""
+    """Counts and clock evidence of a segment that was tracked."""
 
     n_tracks: int
     n_passes: int

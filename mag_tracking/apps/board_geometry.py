@@ -162,7 +162,7 @@ def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
     Returns
     -------
     (K, n, 3) array, T, sensor frame
-        The background is not removed.
+        Corrected readings, including the background.
     """
     out = np.array(readings, dtype=float)
     for j, (offset, C) in enumerate(zip(network.offset, network.correction, strict=True)):

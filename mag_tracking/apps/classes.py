@@ -132,7 +132,7 @@ def _interval_signatures(path: Path, labels: str | PathLike[str], network: Senso
 
 def _signatures(path: Path, readings: Readings, names: Any,
                 interval: LabelledInterval) -> Iterator[Signature]:
-    """Extract the signatures of one interval, one per sensor with readings in it."""
+    """Extract the signatures of one interval, one per sensor with readings in the interval."""
     inside = (interval.begin_ns <= readings.stamp_ns) & (readings.stamp_ns <= interval.end_ns)
     for name in readings.names:
         selected = inside & (names == name)

@@ -35,7 +35,7 @@ _TIMEOUT_ERRORS = (TimeoutError, asyncio.TimeoutError)
 
 
 class LostWorkersError(MagTrackingError):
-    """Several workers were lost while running a task."""
+    """A task lost its worker several times."""
 
 
 class _Task(NamedTuple):

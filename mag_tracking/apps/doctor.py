@@ -253,7 +253,7 @@ class Doctor:
                 self._missed.add_target(name, begin_ns, self.sensors)
 
     def findings(self) -> list[Finding]:
-        """Return all findings so far.
+        """Return the findings from all readings so far.
 
         Returns
         -------

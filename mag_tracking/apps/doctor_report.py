@@ -76,7 +76,7 @@ def _rates(doctor: Doctor) -> Chart:
 
 
 def _table(doctor: Doctor) -> Table:
-    """Table of the sensors."""
+    """Table of the readings, faults, field and delay of each sensor."""
     rows: list[list[str | float | None]] = []
     for name, health in doctor.sensors.items():
         c, delay = health.counts, float(health.delay_s[0])

@@ -64,7 +64,7 @@ class RecordingFit:
 
     def passes(self, progress: Callable[[int], object] | None = None,
                stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """Iterate over the fitted passes as they are completed.
+        """Read the recording and yield each pass after its fit.
 
         Parameters
         ----------
@@ -182,7 +182,7 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
 
 
 def check_orders(name: str, orders: Sequence[int]) -> None:
-    """Check that the numbers of dipoles are different and from 1 to 8.
+    """Check that the numbers of dipoles are distinct and from 1 to 8.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def check_orders(name: str, orders: Sequence[int]) -> None:
 
 
 def check_cpa_range(name: str, cpa_range: Sequence[float] | None, network: SensorNetwork) -> None:
-    """Check the range at the closest point of approach.
+    """Check the range at the closest point of approach, which requires a single sensor.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ N_POSES = 120
 
 def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
                  out: Path) -> Path:
-    """Write `report.html`.
+    """Write the report of fitted passes to `report.html`.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings:
     warnings : sequence of str
         Lines of `RecordingFit.warnings` of all recordings.
     out : Path
-        Folder.
+        Output folder.
 
     Returns
     -------

@@ -25,7 +25,7 @@ MAX_PASS_S = 60.0
 
 
 class PassCollector:
-    """Extracts passes from readings: the measurements from `PAD_S` before an onset to its release.
+    """Extracts passes from readings: all measurements from `PAD_S` before an onset to the release.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ class PassCollector:
 
 
 def _common_covariance(covariances: FloatArray) -> FloatArray:
-    """Covariances (n, 3, 3) of readings, replaced by the first if they are similar.
+    """Replace the covariances (n, 3, 3) of readings by the first one if they are similar.
 
     While the noise is being learnt, its estimate varies slightly although the noise is constant. A
     coarse sensor has a much larger covariance in a constant field than in a changing field.

@@ -78,7 +78,7 @@ class PassTracks:
             Position and velocity at the time when `data.t` is zero. Empty for magnets.
         """
         end_ns = data.stamp_ns + int(NS * data.t.max())
-        candidates = sorted((pose for pose in self._most_certain_until(end_ns)
+        candidates = sorted((pose for pose in self._poses_of_smallest_variance(end_ns)
                              if pose.stamp_ns >= data.stamp_ns), key=lambda pose: pose.variance)
         paths: list[FloatArray] = []
         for pose in candidates:
@@ -87,7 +87,7 @@ class PassTracks:
                 paths.append(path)
         return np.array(paths).reshape(-1, 6)
 
-    def _most_certain_until(self, end_ns: int) -> list[_Pose]:
+    def _poses_of_smallest_variance(self, end_ns: int) -> list[_Pose]:
         """Return the pose of smallest variance of each track until a time; drop older poses.
 
         Vehicles that are still approaching are omitted: their latest pose has the smallest

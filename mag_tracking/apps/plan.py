@@ -191,7 +191,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
 
 def _closest_point_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                           lane: Lane, reach: float) -> tuple[Observability, dict[str, FloatArray]]:
-    """Compute `Plan.observability` and `Plan.blocks`; `reach` [m] is a typical distance."""
+    """Compute `Plan.observability` and `Plan.blocks`, scaled with a distance `reach` [m]."""
     closest = lane.points[np.argmin(np.abs(lane.along))][None]
     J = pass_information(network.positions, network.R_sw, target, sampling, closest,
                          lane.heading)[0].sum(axis=1)

@@ -18,7 +18,7 @@ LOW_QUANTILE = 0.02
 
 
 def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
-    """Write `report.html`.
+    """Write the report of a plan to `report.html`.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
     lines : list of str
         Lines of `summary_lines`.
     out : Path
-        Folder.
+        Output folder.
 
     Returns
     -------

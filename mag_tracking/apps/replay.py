@@ -196,7 +196,7 @@ class RunCollector:
 
     def __init__(self, results: Results) -> None:
         self._results = results
-        # Set by the first frame; every track follows a frame.
+        # The first frame, which precedes every track, sets this attribute.
         self._frame: FieldFrame
         self.logs: dict[int, TrackLog] = {}
         self.smoothed: dict[int, SmoothedLog] = {}

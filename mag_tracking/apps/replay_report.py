@@ -27,14 +27,14 @@ from mag_tracking.report.track_log import TrackLog
 
 
 def write_report(run: Run, network: SensorNetwork, out: Path) -> Path:
-    """Write `report.html`.
+    """Write the report of a replay to `report.html`.
 
     Parameters
     ----------
     run : Run
     network : SensorNetwork
     out : Path
-        Folder.
+        Output folder.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
 
 
 def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) -> Table:
-    """Table of the sensors."""
+    """Table of the background, readings, noise and position of each sensor."""
     innovations = [t['nis_by_sensor'] for t in summary['tracks']]
     rows = []
     for j, (name, s) in enumerate(summary['sensors'].items()):

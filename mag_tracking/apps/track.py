@@ -44,7 +44,7 @@ _BATCH = 4096
 
 @dataclass(frozen=True, eq=False)
 class TrackingResult:
-    """Tracks, poses and detections.
+    """Tracks, poses and detections of a recording or of readings.
 
     Arrays are structured, in SI units and in chronological order; they are empty without targets.
     """
@@ -227,7 +227,7 @@ class TrackingResult:
         return field_figure(self._log(track_id), self.network)
 
     def _log(self, track_id: int | None) -> TrackLog:
-        """History of a track; None selects the first one."""
+        """Return the history of a track; None selects the first track."""
         if track_id is None and self.tracks:
             return next(iter(self.tracks.values()))
         if track_id is None or track_id not in self.tracks:
@@ -295,7 +295,7 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
 
 
 def _batches(readings: Readings) -> Iterator[Readings]:
-    """Readings in batches of at most `_BATCH`."""
+    """Split readings into batches of at most `_BATCH` readings."""
     return (readings.part(slice(i, i + _BATCH)) for i in range(0, len(readings), _BATCH))
 
 

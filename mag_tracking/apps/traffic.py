@@ -51,7 +51,7 @@ class CountedVehicle:
 
 @dataclass(frozen=True)
 class TrafficResult:
-    """Traffic in a recording."""
+    """Counted vehicles and traffic summaries of a recording."""
 
     class_names: tuple[str, ...]
     """Classes, in the order of `VehiclePassage.class_probabilities`."""

@@ -1,4 +1,4 @@
-"""A stuck sensor is distinguished from a quiet one by targets that other sensors measure."""
+"""Targets that other sensors detect distinguish stuck sensors from quiet sensors."""
 
 import numpy as np
 import pytest

@@ -70,7 +70,7 @@ def test_an_hour_without_messages_is_skipped(road_network, tmp_path):
 
 
 def rewrite(path, network, log_time_of, stamp_of):
-    """Copy the recording; functions of (index, time [ns]) change its log times and timestamps."""
+    """Copy the recording with other times: functions of (index of a message, time [ns])."""
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
     with RecordingWriter(path) as writer:
         for k, (readings, log_ns) in enumerate(reader.readings_as_received()):
