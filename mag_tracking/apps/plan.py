@@ -183,8 +183,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
         network, target, sampling, x, y,
         np.median(np.concatenate(bounds, axis=1), axis=1).reshape(len(y), len(x)),
         probability.mean(axis=1).reshape(len(y), len(x)), planned, median_bound.reshape(shape),
-        without,
-        (float(coarse_x[best % shape[1]]), float(coarse_y[best // shape[1]])),
+        without, (float(coarse_x[best % shape[1]]), float(coarse_y[best // shape[1]])),
         observable, blocks,
         _miss_probabilities(network, target, sampling, planned[0], area, settings))
 
