@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from mag_tracking.apps.doctor_covariances import covariance_findings
+from mag_tracking.apps.doctor_rejections import rejection_advice
 from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import consensus, disagreements
@@ -26,19 +27,6 @@ MAX_FROZEN_S = 30.0
 
 MAX_CLOCK_DIFFERENCE_S = 60.0
 """Maximum difference between the clocks of sensors [s]."""
-
-_ADVICE = (
-    ('above', 'check for gauss or microtesla published as tesla; near a magnet, raise '
-     'calibrate.max_field'),
-    ('unknown sensor', 'add the sensor to the network file'),
-    ('duplicate', 'the driver publishes readings twice, or its timestamps are too coarse'),
-    ('out of order', 'check for two publishers on one topic, and for a clock that was set'),
-    ('stamp too far ahead', 'check for a clock step or corrupt messages'),
-    ('no axis', 'check the sensor and its driver'),
-    ('infinite', 'check the driver'),
-    ('covariance', 'publish zeros if the noise is unknown'),
-    ('undecodable', 'the recording is damaged, or its message type differs'))
-"""Advice for rejected readings: (part of the cause, advice)."""
 
 MIN_MISSED_TARGETS = 3
 """Number of consecutive missed targets at which a sensor is reported."""
@@ -151,7 +139,7 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       'begin without a target for a few seconds, or set background and noise_std '
                       'in the network file')
     if background.n_relearnt > n_reported:
-        yield Finding(False, name, 'a lasting change of the field was learnt as its background '
+        yield Finding(False, name, 'a lasting change of the field became its background '
                       f'{background.n_relearnt - n_reported} times', 'check for a parked vehicle '
                       'or an object near it; calibrate.relearn_s: 0 disables relearning')
     if last is not None and frozen_since_ns is not None \
@@ -270,8 +258,8 @@ class Doctor:
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)
         for cause, n in rejected(self.calibrate.counts).items():
-            advice = next((a for key, a in _ADVICE if key in cause), 'check the driver')
-            found.append(Finding(n > 100, 'calibrate', f'{n} readings rejected: {cause}', advice))
+            found.append(Finding(n > 100, 'calibrate', f'{n} readings rejected: {cause}',
+                                 rejection_advice(cause)))
         warning = frame_period_warning(self._settings.align, self.network)
         if warning:
             found.append(Finding(True, 'align', warning, 'set align.period_s to 0 (auto)'))
