@@ -13,6 +13,7 @@ from mag_tracking.analysis.network_geometry import (
     NetworkGeometry,
     calibrate_geometry,
 )
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.errors import NetworkError, RecordingError
 from mag_tracking.network import SensorNetwork
@@ -126,8 +127,8 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
     else:
         readings = read_readings(table)
     if readings.shape[1] != len(network):
-        raise RecordingError(f'{table}: readings of {readings.shape[1]} sensors, but the '
-                             f'network has {len(network)}')
+        raise RecordingError(f'{table}: readings of {quantity(readings.shape[1], "sensor")}, but '
+                             f'the network has {len(network)}')
     configured = _with_noise(network, noise_std)
     nominal = _with_noise(configured, ASSUMED_NOISE)
     field = corrected(nominal, readings)

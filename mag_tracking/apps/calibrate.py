@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting, with_evidence
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.network import SensorNetwork
@@ -150,7 +151,7 @@ def _track_passes(recording: Recording, network: SensorNetwork, settings: Settin
 def _with_pass_records(network: SensorNetwork, surveyed: SensorNetwork, date: str,
                        n_tracks: int) -> SensorNetwork:
     """Add the number of passes to the calibration records of `surveyed`; set them in `network`."""
-    passes = f'{n_tracks} pass{"es" if n_tracks > 1 else ""}'
+    passes = quantity(n_tracks, 'pass', 'passes')
     return replace(network, calibrated=tuple(
         surveyed.calibration_record(j, date, f'as stated; {passes}') if record is None
         else replace(record, date=date, by=f'{record.by}; {passes}')

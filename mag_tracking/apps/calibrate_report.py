@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from mag_tracking.apps.calibrate import Calibration
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.files import replace_text
 from mag_tracking.geometry import yaw_between
 from mag_tracking.network import SensorNetwork
@@ -63,9 +64,9 @@ def calibration_page(found: Calibration, stated: SensorNetwork, name: str) -> Pa
               for sensor in found.without_background]
     notes += [Note(WARNING, f'{cause}: {n}') for cause, n in found.rejected.items()]
     if found.evidence is not None:
-        n = found.evidence.n_tracks
-        notes.append(Note(NOTE, f'{n} pass{"es" * (n != 1)} used'))
-    return Page(f'Calibration from {name}', f'{len(stated)} sensors', notes, None,
+        passes = quantity(found.evidence.n_tracks, 'pass', 'passes')
+        notes.append(Note(NOTE, f'{passes} used'))
+    return Page(f'Calibration from {name}', quantity(len(stated), 'sensor'), notes, None,
                 [*_knocks(found), _headings(found, stated)], [_table(found)])
 
 

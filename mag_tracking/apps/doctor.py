@@ -8,6 +8,7 @@ import numpy as np
 from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.apps.doctor_rejections import rejection_advice
 from mag_tracking.apps.prescan import prescan_of
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import consensus, disagreements
 from mag_tracking.network import SensorNetwork
@@ -139,9 +140,10 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       'begin without a target for a few seconds, or set background and noise_std '
                       'in the network file')
     if background.n_relearnt > n_reported:
-        yield Finding(False, name, 'a lasting change of the field became its background '
-                      f'{background.n_relearnt - n_reported} times', 'check for a parked vehicle '
-                      'or an object near it; calibrate.relearn_s: 0 disables relearning')
+        times = quantity(background.n_relearnt - n_reported, 'time')
+        yield Finding(False, name, f'a lasting change of the field became its background {times}',
+                      'check for a parked vehicle or an object near it; calibrate.relearn_s: 0 '
+                      'disables relearning')
     if last is not None and frozen_since_ns is not None \
             and (last - frozen_since_ns) / NS > MAX_FROZEN_S:
         yield Finding(False, name, 'its background has been frozen for '
@@ -258,8 +260,9 @@ class Doctor:
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)
         for cause, n in rejected(self.calibrate.counts).items():
-            found.append(Finding(n > 100, 'calibrate', f'{n} readings rejected: {cause}',
-                                 rejection_advice(cause)))
+            found.append(Finding(
+                n > 100, 'calibrate', f'{quantity(n, "reading")} rejected: {cause}',
+                rejection_advice(cause)))
         warning = frame_period_warning(self._settings.align, self.network)
         if warning:
             found.append(Finding(True, 'align', warning, 'set align.period_s to 0 (auto)'))

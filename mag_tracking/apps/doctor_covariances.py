@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.sensor_health import Finding
 
@@ -56,9 +57,9 @@ def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator
     n, declared, measured = calibrate.overruled(name)
     if not n:
         return
-    advice = (f'the measured noise was used {n} times; configure the driver to publish the '
-              'variance in T^2, or zeros if it is unknown (calibrate.trust_covariances: true uses '
-              'the covariances unchecked)')
+    advice = (f'the measured noise was used {quantity(n, "time")}; configure the driver to publish '
+              'the variance in T^2, or zeros if it is unknown (calibrate.trust_covariances: true '
+              'uses the covariances unchecked)')
     valid = (declared > 0.0) & np.isfinite(declared) & (measured > 0.0)
     if not valid.any() or np.abs(np.log(declared[valid] / measured[valid])).max() < np.log(2.0):
         yield Finding(False, name, f'the covariances on {topic} contradict the quiet readings '

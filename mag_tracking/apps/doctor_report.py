@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mag_tracking.apps.doctor import Doctor
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.files import replace_text
 from mag_tracking.report.page import ERROR, NOTE, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, plain
@@ -50,8 +51,10 @@ def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Pa
     notes = [Note(ERROR if f.serious else NOTE, f'{f.subject}: {f.what}. {f.advice}')
              for f in findings] or [Note(NOTE, 'no faults found')]
     serious = sum(f.serious for f in findings)
-    return Page(f'Health of {subject}', f'{serious} serious findings, {len(findings) - serious} '
-                'notes', notes, None, [_noise(doctor), _rates(doctor)], [_table(doctor)])
+    numbers = (f'{quantity(serious, "serious finding")}, '
+               f'{quantity(len(findings) - serious, "note")}')
+    return Page(f'Health of {subject}', numbers, notes, None, [_noise(doctor), _rates(doctor)],
+                [_table(doctor)])
 
 
 def _noise(doctor: Doctor) -> Chart:

@@ -9,6 +9,7 @@ import numpy as np
 
 from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
 from mag_tracking.apps.prescan import prescan_of
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.readings import network_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
@@ -116,7 +117,7 @@ class FitResult:
     """Warnings about lost or rejected readings and unused sensors."""
 
     def __repr__(self) -> str:
-        return (f'FitResult({len(self.passes)} passes'
+        return (f'FitResult({quantity(len(self.passes), "pass", "passes")}'
                 + (f'; warnings: {"; ".join(self.warnings)}' if self.warnings else '') + ')')
 
     def to_dataframe(self) -> 'pd.DataFrame':

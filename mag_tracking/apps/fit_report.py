@@ -8,6 +8,7 @@ import numpy as np
 
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.apps.pass_fitter import FittedPass
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.report.fit_figures import target_alone
@@ -82,8 +83,8 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
     scene = scene_of(network, 0, int(max(ends) * NS), tracks) if tracks else None
     n_estimates = len(tracks)
     n_passes = len({(fitted.recording, fitted.number) for fitted in passes})
-    several = f', {len(passes)} vehicles' if len(passes) > n_passes else ''
-    return Page(f'{n_passes} pass{"es" * (n_passes != 1)}{several}, {n_estimates} with an estimate',
+    several = f', {quantity(len(passes), "vehicle")}' if len(passes) > n_passes else ''
+    return Page(f'{quantity(n_passes, "pass", "passes")}{several}, {n_estimates} with an estimate',
                 'each fitted as a row of dipoles at constant velocity', notes, scene,
                 [_order_chart(passes)] if passes else [], [_table(passes)])
 
@@ -118,16 +119,11 @@ def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, begin: float) -> 
               for j in data.sensors]
     entry = fitted_entry(number, begin + t, state, C, fit.ambiguous, fields)
     entry['facts'] = {
-        'label': f'{fitted.recording}, {fitted.label}', 'kind': _dipole_label(fit.n_dipoles),
+        'label': f'{fitted.recording}, {fitted.label}', 'kind': quantity(fit.n_dipoles, 'dipole'),
         'speed': float(fit.speed[0]), 'moment': float(np.linalg.norm(fit.moment[0])),
         'verdict': ('ambiguous' if fit.ambiguous else 'unique')
         + f', cost {fit.normalised_cost:.2f}'}
     return entry
-
-
-def _dipole_label(n: int) -> str:
-    """Number of dipoles with its unit, such as '2 dipoles'."""
-    return f'{n} dipole{"s" * (n > 1)}'
 
 
 def _order_chart(passes: Sequence[FittedPass]) -> Chart:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.stages.calibrate.stage import Calibrate
@@ -41,7 +42,7 @@ def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: C
     n_accepted = sum(calibrate.counts_of(name)['accepted'] for name in network.names)
     if not n_accepted and rejected:
         cause, n = max(rejected.items(), key=lambda item: item[1])
-        return f'no reading was usable: {n} were rejected ({cause})'
+        return f'no reading was usable: {quantity(n, "was", "were")} rejected ({cause})'
     if not n_accepted:
         return 'there were no readings on ' + ', '.join(
             missing_topics or network.absolute_topics)
@@ -73,8 +74,9 @@ def _likely_cause(network: SensorNetwork, settings: Settings, calibrate: Calibra
             return (f'noise_std of {name} in the network file is '
                     f'{(noise / scatter)[valid].max():.2g} times the scatter of its readings')
     if detect.largest_excursion > 1.0:
-        return (f'it lasted for {detect.max_consecutive_above} consecutive frames, but '
-                f'detect.onset_frames is {settings.detect.onset_frames}')
+        frames = quantity(detect.max_consecutive_above, 'consecutive frame')
+        return (f'it lasted for {frames}, but detect.onset_frames is '
+                f'{settings.detect.onset_frames}')
     if settings.calibrate.trust_covariances:
         return ('the covariances of the messages are used unchecked '
                 '(calibrate.trust_covariances)')

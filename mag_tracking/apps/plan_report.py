@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from mag_tracking.apps.plan import GOOD_PD, Plan
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import FloatArray
 from mag_tracking.files import replace_text
 from mag_tracking.report.page import NOTE, REPORT, Chart, Note, Page, Table, report_html
@@ -56,7 +57,7 @@ def summary_lines(p: Plan) -> list[str]:
         One line per result.
     """
     noise, lines = float(np.median(p.sampling.noise_std)), list[str]()
-    lines.append(f'{len(p.network)} sensors, {1e9 * noise:.2g} nT noise per frame; '
+    lines.append(f'{quantity(len(p.network), "sensor")}, {1e9 * noise:.2g} nT noise per frame; '
                  f'target with {p.target.moment:g} A m^2 at {p.target.speed:g} m/s')
     observability = p.observability
     observable = (f'not observable: {", ".join(observability.unobservable)}'
@@ -107,7 +108,7 @@ def plan_page(plan: Plan, lines: list[str]) -> Page:
     Page
     """
     network = plan.network
-    return Page(f'Plan for {len(network)} sensors',
+    return Page(f'Plan for {quantity(len(network), "sensor")}',
                 f'target with {plan.target.moment:g} A m^2 at {plan.target.speed:g} m/s',
                 [Note(NOTE, line.strip()) for line in lines], None,
                 [*_maps(plan), *_lanes(plan)],

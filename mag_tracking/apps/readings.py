@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import BoolArray
 from mag_tracking.errors import ReadingsError
 from mag_tracking.network import SensorNetwork
@@ -39,7 +40,7 @@ class RecordedReadings:
     """Topics of the network that are not in the recording."""
 
     def __repr__(self) -> str:
-        return (f'RecordedReadings({len(self.readings)} readings of '
+        return (f'RecordedReadings({quantity(len(self.readings), "reading")} of '
                 f'{", ".join(self.readings.names)}; truth: {", ".join(self.truth) or "none"})')
 
 

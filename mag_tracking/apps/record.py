@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.messages.types import (
     CALIBRATED_READINGS,
     CALIBRATION_STATE,
@@ -109,7 +110,8 @@ def progress_line(recorder: RecorderState, seconds: float) -> str:
     str
     """
     dropped = recorder.dropped.total()
-    return (f'{seconds:.0f} s: {recorder.counts.total()} messages, {recorder.size / 1e6:.1f} MB'
+    messages = quantity(recorder.counts.total(), 'message')
+    return (f'{seconds:.0f} s: {messages}, {recorder.size / 1e6:.1f} MB'
             + (f', dropped: {dropped}' if dropped else ''))
 
 
@@ -131,7 +133,8 @@ def summary(recorder: RecorderState, selection: Selection, lost: Mapping[str, in
     str
         Line of the summary.
     """
-    yield f'{recorder.folder}: {recorder.counts.total()} messages, {recorder.size / 1e6:.2f} MB'
+    messages = quantity(recorder.counts.total(), 'message')
+    yield f'{recorder.folder}: {messages}, {recorder.size / 1e6:.2f} MB'
     for topic, n in sorted((+recorder.counts).items()):
         yield f'  {topic}  {n}'
     for topic in selection.fields + selection.topics:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.report.page import NOTE, WARNING, Note
 from mag_tracking.stages.track.evidence import LOST
 from mag_tracking.stages.track.manager import ALONE, NO_SCALE
@@ -87,17 +88,19 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, summary['clocks_apart'])
     n_lost = counts.get(f'tracks ended: {LOST}', 0)
     if n_lost:
-        yield Note(WARNING, f'{n_lost} tracks lost their target: check the orientations in the '
-                   'network file; other causes are several targets at once, or a kind of target '
-                   'that is not in the settings')
+        yield Note(WARNING, quantity(n_lost, 'track lost its target', 'tracks lost their target')
+                   + ': check the orientations in the network file; other causes are several '
+                   'targets at once, or a kind of target that is not in the settings')
     uncertain = counts.get('sensors whose orientation is hardly known', 0)
     if uncertain:
-        yield Note(WARNING, f'{uncertain} sensors have an orientation uncertainty of more than 15 '
-                   'degrees in the network file: calibrate them')
+        yield Note(WARNING, quantity(uncertain, 'sensor has', 'sensors have')
+                   + ' an orientation uncertainty of more than 15 degrees in the network file: '
+                   'calibrate the network')
     n_too_long = counts.get('tracks too long to smooth', 0)
     if n_too_long:
-        yield Note(WARNING, f'{n_too_long} tracks were too long to smooth (track.max_smoothing_s, '
-                   'or too many frames for the number of sensors)')
+        yield Note(WARNING, quantity(n_too_long, 'track was', 'tracks were')
+                   + ' too long to smooth (track.max_smoothing_s, or too many frames for the '
+                   'number of sensors)')
 
 
 def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:

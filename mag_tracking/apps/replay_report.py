@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.replay import Run
 from mag_tracking.apps.replay_notes import notes_of
 from mag_tracking.files import replace_text
@@ -70,10 +71,11 @@ def replay_page(run: Run, network: SensorNetwork) -> Page:
     if logs:
         scene = _scene(run, network, logs[:MAX_TRACKS], notes)
     counts = summary['counts']
-    return Page(f'{summary["recording"]}: {len(logs)} track{"s" * (len(logs) != 1)}',
-                f'{counts["align"].get("frames", 0)} frames, '
-                f'{counts["detect"].get("onsets", 0)} detections, '
-                f'{len(summary["disturbances"])} disturbances', notes, scene,
+    numbers = (quantity(counts['align'].get('frames', 0), 'frame'),
+               quantity(counts['detect'].get('onsets', 0), 'detection'),
+               quantity(len(summary['disturbances']), 'disturbance'))
+    return Page(f'{summary["recording"]}: {quantity(len(logs), "track")}', ', '.join(numbers),
+                notes, scene,
                 tables=[_sensor_table(summary, run, network)])
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.apps.prescan import prescan, prescan_of
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.readings import (
     RecordedReadings,
     check_order,
@@ -85,12 +86,14 @@ class TrackingResult:
         unused = {**self.rejections, **self.lost}
         notes = [*(f'not used: {n} {cause}' for cause, n in unused.items()),
                  *(f'no messages on {topic}' for topic in self.missing_topics),
-                 *([f'{len(self.disturbances)} disturbances'] if self.disturbances else []),
+                 *([quantity(len(self.disturbances), 'disturbance')] if self.disturbances else []),
                  *(f'no background of {name}' for name in self.sensors_without_background)]
         if self.no_detection_reason:
             notes.append(f'nothing was detected: {self.no_detection_reason}')
-        return (f'TrackingResult({len(self.tracks)} tracks, {len(self.poses)} poses, '
-                f'{len(self.smoothed)} smoothed poses, {len(self.detections)} detections'
+        numbers = (quantity(len(self.tracks), 'track'), quantity(len(self.poses), 'pose'),
+                   quantity(len(self.smoothed), 'smoothed pose'),
+                   quantity(len(self.detections), 'detection'))
+        return (f'TrackingResult({", ".join(numbers)}'
                 + (f'; {"; ".join(notes)}' if notes else '') + ')')
 
     def poses_dataframe(self) -> 'pd.DataFrame':

@@ -16,6 +16,7 @@ from mag_tracking.analysis.correlated_motion import (
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.apps.prescan import prescan_of
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.readings import network_of
 from mag_tracking.apps.replay_notes import no_track_reason
 from mag_tracking.errors import SettingsError
@@ -74,7 +75,8 @@ class TrafficResult:
 
     def __repr__(self) -> str:
         lines = dict(Counter(v.passage.line for v in self.vehicles))
-        return f'TrafficResult({len(self.vehicles)} vehicles, {lines or "no line was crossed"})'
+        return (f'TrafficResult({quantity(len(self.vehicles), "vehicle")}, '
+                f'{lines or "no line was crossed"})')
 
 
 def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],
