@@ -231,12 +231,13 @@ class TrackingResult:
 
     def _log(self, track_id: int | None) -> TrackLog:
         """Return the history of a track; None selects the first track."""
-        if track_id is None and self.tracks:
+        if not self.tracks:
+            raise UnknownTrackError('the result contains no tracks')
+        if track_id is None:
             return next(iter(self.tracks.values()))
-        if track_id is None or track_id not in self.tracks:
-            available = ', '.join(map(str, self.tracks)) or 'none'
-            raise UnknownTrackError(f'track {track_id or ""} is not in the result; tracks in the '
-                                    f'result: {available}')
+        if track_id not in self.tracks:
+            raise UnknownTrackError(f'track {track_id} is not in the result; tracks in the '
+                                    f'result: {", ".join(map(str, self.tracks))}')
         return self.tracks[track_id]
 
 
