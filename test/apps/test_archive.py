@@ -28,8 +28,6 @@ from support.archives import command, rows, same_tables, wait_for
 from support.bundled import DATA, NETWORK_FILE, QUICK
 
 ROAD = DATA / 'two_way_road' / 'two_way_road.mcap'
-NAMES = ('straight_car_right', 'straight_small_left', 'junction_left_to_right')
-TRACKED = ('tracks', 'poses', 'smoothed', 'passes')
 
 
 @pytest.fixture(scope='module')
