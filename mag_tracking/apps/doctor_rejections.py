@@ -72,7 +72,7 @@ def rejection_cause(description: str) -> RejectionCause | None:
 
 
 def rejection_advice(description: str) -> str:
-    """Return the advice for a cause, given by its description.
+    """Return the advice for a cause of rejection, given its description.
 
     Parameters
     ----------

@@ -378,7 +378,7 @@ def write_trajectories(run: Run, out: Path) -> list[Path]:
     ----------
     run : Run
     out : Path
-        Folder.
+        Output folder.
 
     Returns
     -------
@@ -407,7 +407,7 @@ def write_figures(run: Run, network: SensorNetwork, out: Path, max_tracks: int =
     run : Run
     network : SensorNetwork
     out : Path
-        Folder.
+        Output folder.
     max_tracks : int
         Maximum number of tracks.
     stopped : function, optional

@@ -126,7 +126,7 @@ def test_tables_without_rows_have_their_columns(tmp_path, capsys):
 
 
 def test_every_column_is_described():
-    """The reference of the documentation is generated from these descriptions."""
+    """The reference documentation is generated from these descriptions."""
     for columns in tables_of((), True).values():
         assert [c.name for c in columns if not c.meaning] == []
 
