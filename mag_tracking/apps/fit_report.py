@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, PassFit
 from mag_tracking.apps.pass_fitter import FittedPass
 from mag_tracking.apps.quantities import quantity
 from mag_tracking.files import replace_text
@@ -68,7 +68,7 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
     -------
     Page
     """
-    notes = [Note(WARNING, text) for text in warnings]
+    notes = [Note(WARNING, text) for text in (*warnings, *_poor_fits(passes))]
     if not passes:
         notes.append(Note(NOTE, 'no passes: nothing was detected'))
     if any(fitted.n_vehicles > 1 for fitted in passes):
@@ -87,6 +87,16 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
     return Page(f'{quantity(n_passes, "pass", "passes")}{several}, {n_estimates} with an estimate',
                 'each fitted as a row of dipoles at constant velocity', notes, scene,
                 [_order_chart(passes)] if passes else [], [_table(passes)])
+
+
+def _poor_fits(passes: Sequence[FittedPass]) -> list[str]:
+    """Warning about chosen fits with a high cost, in at most one line."""
+    costs = [fitted.chosen.normalised_cost for fitted in passes if fitted.chosen is not None]
+    n_poor = sum(cost > MAX_NORMALISED_COST for cost in costs)
+    if not n_poor:
+        return []
+    return [f'poor fits (normalised cost above {MAX_NORMALISED_COST:g}): {n_poor} of {len(costs)}; '
+            'their errors of speed and position may be several standard deviations']
 
 
 def _begins_ns(passes: Sequence[FittedPass]) -> list[int]:
