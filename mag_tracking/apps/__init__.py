@@ -1,1 +1,1 @@
-"""Applications, callable from Python without ROS; each command has a module of its name."""
+"""Applications, callable from Python without ROS. Each command has a module of the same name."""

@@ -1,4 +1,4 @@
-"""Tracking of many or long recordings on a cluster into one dataset."""
+"""Tracking of many or long recordings on a cluster, with all results in one dataset."""
 
 import dataclasses
 import glob
@@ -30,20 +30,20 @@ METADATA = 'metadata.yaml'
 
 @dataclass
 class ArchiveRun:
-    """Results of a run."""
+    """Results of an archive run."""
 
     done: list[Path] = field(default_factory=list)
     """Recordings tracked in this run."""
     already_done: list[Path] = field(default_factory=list)
     """Recordings tracked by an earlier run."""
     failed: dict[Path, str] = field(default_factory=dict)
-    """{recording: reason} of the recordings that were not tracked."""
+    """Recordings that could not be tracked: {recording: reason}."""
     tracks: int = 0
     """Number of tracks in the recordings tracked in this run."""
     passes: int = 0
     """Number of fitted passes in the recordings tracked in this run."""
     lost_workers: int = 0
-    """Number of workers lost; their tasks were repeated."""
+    """Number of lost workers, whose tasks were repeated."""
     interrupted: bool = False
     """Whether the run was stopped before all recordings were tracked."""
 
@@ -51,7 +51,7 @@ class ArchiveRun:
 def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
     """Find the recordings given by folders, patterns and paths.
 
-    Folders are searched recursively; a folder with a metadata.yaml is a recording.
+    Folders are searched recursively. A folder with a metadata.yaml is itself a recording.
 
     Parameters
     ----------
@@ -61,44 +61,45 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
     Returns
     -------
     list of Path
-        Each recording once, in order.
+        Each recording once, in the order of `names`.
 
     Raises
     ------
     RecordingError
         If a name matches no recording.
     """
-    found: dict[Path, None] = {}
+    selected: dict[Path, None] = {}
     for name in names:
         path = checked_path(name, RecordingError)
-        here = [path] if path.exists() else [Path(p) for p in sorted(
+        matches = [path] if path.exists() else [Path(p) for p in sorted(
             glob.glob(str(path), recursive=True))]
-        recordings = [r for p in here for r in _recordings_at(p, set())]
+        recordings = [r for p in matches for r in _recordings_at(p, set())]
         if not recordings:
-            raise RecordingError(f'{path}: no recording found ({", ".join(SUFFIXES)})')
-        found.update(dict.fromkeys(recordings))
+            raise RecordingError(f'{path}: no recording found; recordings end in '
+                                 f'{", ".join(SUFFIXES)}')
+        selected.update(dict.fromkeys(recordings))
     # A pattern may match a recording and the files in it.
-    return [path for path in found if path.parent not in found]
+    return [path for path in selected if path.parent not in selected]
 
 
-def _recordings_at(path: Path, seen: set[Path]) -> list[Path]:
-    """Recordings at or below a path, without folders already `seen`.
+def _recordings_at(path: Path, visited: set[Path]) -> list[Path]:
+    """Find the recordings at or below a path; skip `visited` folders and add new ones to them.
 
     An unreadable folder is included, so that it is reported as a failed recording.
     """
     path = path.resolve()
     if not path.is_dir():
         return [path] if path.is_file() and path.suffix.lower() in SUFFIXES else []
-    if path in seen:
+    if path in visited:
         return []
-    seen.add(path)
+    visited.add(path)
     try:
         entries = sorted(path.iterdir())
         if (path / METADATA).exists():
             return [path]
     except OSError:
         return [path]
-    return [r for p in entries if not p.name.startswith('.') for r in _recordings_at(p, seen)]
+    return [r for p in entries if not p.name.startswith('.') for r in _recordings_at(p, visited)]
 
 
 def size_of(recording: Path) -> int:
@@ -125,9 +126,10 @@ def archive(recordings: Iterable[str | PathLike[str]],
             progress: Callable[[int], object] | None = None,
             stopped: Callable[[], bool] | None = None,
             report: Callable[[str], object] | None = None) -> ArchiveRun:
-    """Track recordings into a dataset; recordings tracked by an earlier run are skipped.
+    """Track recordings and write the results to a dataset.
 
-    The rows equal those of a separate replay of each recording.
+    Recordings tracked by an earlier run are skipped. The tables contain the same rows as a separate
+    replay of each recording.
 
     Parameters
     ----------
@@ -136,16 +138,17 @@ def archive(recordings: Iterable[str | PathLike[str]],
     network : SensorNetwork or path of a network file
     settings : Settings
     out : path
-        Folder of the dataset; `recording.archive_folder` describes its content.
+        Folder of the dataset, described in `recording.archive_folder`.
     workers : int
         Number of processes on this machine.
     scheduler : str, optional
         Address of a Dask scheduler, such as tcp://10.0.0.5:8786, used instead of `workers`. Its
-        workers need this package, and the recordings and `out` under the same paths.
+        workers need this package and access to the recordings and `out` under the same paths.
     progress : function, optional
         Called with the size of each completed recording in bytes.
     stopped : function, optional
-        Called several times per second; the run ends when it returns true. A later run continues.
+        Called several times per second; the run ends when it returns true. The next run into
+        `out` continues with the remaining recordings.
     report : function, optional
         Called with a line for the user for each recording that fails.
 
@@ -158,7 +161,8 @@ def archive(recordings: Iterable[str | PathLike[str]],
     RecordingError
         If there is no recording.
     OutputError
-        If the dataset cannot be written, or has other settings or another version.
+        If the dataset cannot be written, or was created with other settings or by another
+        version.
     ClusterError
         If the scheduler does not respond or has no workers.
     MissingDependencyError
@@ -169,38 +173,39 @@ def archive(recordings: Iterable[str | PathLike[str]],
     folder = checked_path(out, OutputError).resolve()
     paths = [path for path in paths if folder not in path.parents]
     with ArchiveFolder(folder, _configuration(network, settings)) as dataset:
-        todo: list[Path] = []
+        remaining: list[Path] = []
         for path in paths:
-            known = dataset.done(path)
-            if known is None:
-                todo.append(path)
+            entry = dataset.done(path)
+            if entry is None:
+                remaining.append(path)
             else:
                 run.already_done.append(path)
                 if progress is not None:
-                    progress(known['size'])
+                    progress(entry['size'])
         try:
-            if todo:
+            if remaining:
                 with _Cluster(workers, scheduler) as cluster:
-                    _Scheduler(dataset, cluster, network, settings, run, progress, report).work(
-                        todo, stopped or (lambda: False))
+                    _Scheduler(dataset, cluster, network, settings, run, progress, report).run(
+                        remaining, stopped or (lambda: False))
                     run.lost_workers = cluster.n_lost
         finally:
             dataset.write_recordings([*dataset.known(), *(
-                common_columns(path, None) | {'error': why} for path, why in run.failed.items())])
+                common_columns(path, None) | {'error': reason}
+                for path, reason in run.failed.items())])
     return run
 
 
 def _configuration(network: SensorNetwork, settings: Settings) -> dict[str, Any]:
-    """Settings that all runs into a folder must share, JSON-ready."""
-    def plain(value: Any) -> Any:
+    """Configuration that all runs into a folder must share, as JSON-compatible values."""
+    def json_value(value: Any) -> Any:
         return value.tolist() if hasattr(value, 'tolist') else str(value)
-    text = json.dumps(dataclasses.asdict(network), default=plain, sort_keys=True)
-    return {'network': hashlib.sha256(text.encode()).hexdigest(), 'n_dipoles': N_DIPOLES,
+    network_json = json.dumps(dataclasses.asdict(network), default=json_value, sort_keys=True)
+    return {'network': hashlib.sha256(network_json.encode()).hexdigest(), 'n_dipoles': N_DIPOLES,
             'settings': dataclasses.asdict(settings)}
 
 
 class _Scheduler:
-    """Submits the tasks of all recordings to a cluster, each after those it depends on."""
+    """Submits the tasks of all recordings to a cluster, each task after its dependencies."""
 
     def __init__(self, dataset: ArchiveFolder, cluster: _Cluster, network: SensorNetwork,
                  settings: Settings, run: ArchiveRun, progress: Callable[[int], object] | None,
@@ -211,11 +216,11 @@ class _Scheduler:
         self._segments: Counter[Path] = Counter()
         self._states: dict[Path, list[list[Any]]] = {}
 
-    def work(self, todo: Sequence[Path], stopped: Callable[[], bool]) -> None:
-        """Track the recordings, a few at a time to bound the number of intermediate files."""
-        queued = list(reversed(todo))
+    def run(self, recordings: Sequence[Path], stopped: Callable[[], bool]) -> None:
+        """Track recordings, only a few concurrently to bound the number of intermediate files."""
+        queued = list(reversed(recordings))
         while queued or self._cluster.n_running:
-            while queued and self._n_started() < 2 * self._cluster.n_workers + 1:
+            while queued and self._n_active_recordings() < 2 * self._cluster.n_workers + 1:
                 self._start(queued.pop())
             if stopped():
                 self._run.interrupted = True
@@ -223,8 +228,8 @@ class _Scheduler:
             for (kind, job), result in self._cluster.finished():
                 self._on_finished(kind, job, result)
 
-    def _n_started(self) -> int:
-        """Number of recordings that have tasks."""
+    def _n_active_recordings(self) -> int:
+        """Number of recordings with running tasks."""
         return len({job.recording for _, job in self._cluster.keys()})
 
     def _start(self, path: Path) -> None:
@@ -239,7 +244,7 @@ class _Scheduler:
         self._cluster.submit(('cut', job), 0, cut, job)
 
     def _on_finished(self, kind: str, job: Job, result: Any) -> None:
-        """Process the result of a task and submit the tasks that depend on it."""
+        """Process the result of a task and submit the dependent tasks."""
         path = job.recording
         if isinstance(result, OutputError | ClusterError):
             raise result
@@ -264,7 +269,7 @@ class _Scheduler:
             if not self._segments[path]:
                 self._cluster.submit(('join', job), 2, join, job)
 
-    def _fail(self, path: Path, why: str) -> None:
-        """Record and report a failed recording; the others continue."""
-        self._run.failed[path] = why
-        self._report(f'{path.name}: {why}')
+    def _fail(self, path: Path, reason: str) -> None:
+        """Record and report a failed recording; other recordings continue."""
+        self._run.failed[path] = reason
+        self._report(f'{path.name}: {reason}')

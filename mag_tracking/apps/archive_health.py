@@ -27,7 +27,7 @@ class HealthRows:
 
     def __init__(self, recording: Path, network: SensorNetwork) -> None:
         self._recording, self._network = recording, network
-        self._counted = {name: (0, 0) for name in network.names}
+        self._previous_counts = {name: (0, 0) for name in network.names}
         self._next_ns: int | None = None
 
     def due(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
@@ -36,6 +36,7 @@ class HealthRows:
         Parameters
         ----------
         stamp_ns : int, ns
+            Timestamp of the frame.
         calibrate : Calibrate
 
         Yields
@@ -55,6 +56,7 @@ class HealthRows:
         Parameters
         ----------
         stamp_ns : int, ns
+            Timestamp of the rows.
         calibrate : Calibrate
 
         Yields
@@ -64,22 +66,22 @@ class HealthRows:
         """
         for name, background in calibrate.backgrounds().items():
             counts = calibrate.counts_of(name)
-            before, now = self._counted[name], (counts['accepted'], counts['rejected'])
-            self._counted[name] = now
+            previous, total = self._previous_counts[name], (counts['accepted'], counts['rejected'])
+            self._previous_counts[name] = total
             covariance = background.covariance
             noise = np.full(3, np.nan) if covariance is None \
                 else np.sqrt(np.diagonal(covariance))
-            known = background.ready and counts['accepted'] > 0
-            level = calibrate.background(name) if known else np.full(3, np.nan)
+            has_background = background.ready and counts['accepted'] > 0
+            level = calibrate.background(name) if has_background else np.full(3, np.nan)
             yield {**common_columns(self._recording, stamp_ns), 'sensor': name,
-                   'accepted': now[0] - before[0], 'rejected': now[1] - before[1],
+                   'accepted': total[0] - previous[0], 'rejected': total[1] - previous[1],
                    'times_relearnt': background.n_relearnt, 'ready': background.ready,
                    'stuck': background.stuck, 'doubtful': background.doubtful,
-                   **_axes('background', level), **_axes('drift', background.drift),
-                   **_axes('noise', noise)}
+                   **_axis_columns('background', level), **_axis_columns('drift', background.drift),
+                   **_axis_columns('noise', noise)}
 
 
-def _axes(name: str, values: FloatArray) -> dict[str, float | None]:
+def _axis_columns(name: str, values: FloatArray) -> dict[str, float | None]:
     """Columns of the three axes of a vector; None where the value is unknown."""
     return {f'{name}_{axis}': None if np.isnan(v) else float(v)
             for axis, v in zip('xyz', values, strict=True)}

@@ -1,9 +1,9 @@
 """Segments of a long recording in which a target is near, written to files for the tracker.
 
-All stages before the tracker read the recording once, from beginning to end, and keep their
-backgrounds from segment to segment. The tracker starts each segment without memory and finds the
-same tracks as in the whole recording: a segment begins with the frames that a new track uses
-retrospectively, and ends when a quiet interval exceeds their duration.
+The stages before the tracker process the recording once, from beginning to end, and keep their
+backgrounds across segments. The tracker starts each segment without memory, but finds the same
+tracks as in the whole recording. To this end, a segment begins with all earlier frames that a new
+track may use, and ends only when a quiet interval is longer than their time span.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from mag_tracking.records import FieldFrame
 from mag_tracking.units import NS
 
 MIN_SEGMENT_FRAMES = 300
-"""Minimum number of frames in a segment; the overhead of shorter segments is too large."""
+"""Minimum number of frames in a segment. Shorter segments have too much overhead."""
 CHUNK_FRAMES = 2000
 """Maximum number of frames kept in memory."""
 MIN_QUIET_S = 1.0
@@ -31,12 +31,12 @@ MIN_QUIET_S = 1.0
 Doubts = Mapping[str, DoubtfulTimes]
 """{sensor: times at which its background is doubtful}."""
 NumberedPass = tuple[int, PassData, tuple[str, ...]]
-"""Number of a pass in its recording, its measurements, and notes."""
+"""Index of a pass in its recording from 1, its measurements, and notes for the user."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FrameChunk:
-    """Consecutive frames as arrays, and the passes that ended with them."""
+    """Consecutive frames as arrays, and the passes that ended during these frames."""
 
     stamp_ns: IntArray
     """(n,) ns."""
@@ -49,13 +49,13 @@ class FrameChunk:
     time_offset: FloatArray
     """(n, n_sensors) s, mean time of the samples of a sensor relative to `stamp_ns`."""
     target_present: BoolArray
-    """(n,)."""
+    """(n,) whether a target is present."""
     statistic: FloatArray
     """(n,) detection statistic."""
     degrees_of_freedom: IntArray
     """(n,) degrees of freedom of the detection statistic."""
     doubts: dict[int, Doubts] = dataclasses.field(default_factory=dict)
-    """{index of a frame: doubtful times from this frame on}."""
+    """{index of a frame: doubtful times that apply from this frame on}."""
     passes: tuple[NumberedPass, ...] = ()
     """Passes that ended within the chunk."""
 
@@ -65,9 +65,9 @@ class FrameChunk:
         Yields
         ------
         frame : FieldFrame
-            With its detection result.
+            Frame with its detection result.
         doubts : Doubts or None
-            Doubtful times if they have changed.
+            Doubtful times if they change with this frame, otherwise None.
         """
         for k in range(len(self.stamp_ns)):
             yield FieldFrame(
@@ -93,14 +93,14 @@ def read_segment(path: Path) -> Iterator[FrameChunk]:
 
 
 class SegmentWriter:
-    """Writes each segment of a recording to its own file, with bounded memory.
+    """Writes each segment of a recording to a separate file, using bounded memory.
 
     Parameters
     ----------
     folder : Path
         Folder for the files `segment-0.pickle`, ...
     lookback_s : float, s
-        Duration of the earlier frames that a new track uses.
+        Time span of the earlier frames that a new track uses.
 
     Attributes
     ----------
@@ -114,13 +114,13 @@ class SegmentWriter:
         self._folder = folder
         self._quiet_ns = int(max(lookback_s, MIN_QUIET_S) * NS)
         self.n_segments = self.n_frames = 0
-        # Frames and doubts: quiet ones that a new track may use, and those of the segment.
-        self._recent: deque[tuple[FieldFrame, Doubts]] = deque()
-        self._kept: list[tuple[FieldFrame, Doubts]] = []
+        # (frame, doubts): quiet frames that a new track may use, and frames of the open segment.
+        self._lookback: deque[tuple[FieldFrame, Doubts]] = deque()
+        self._unwritten: list[tuple[FieldFrame, Doubts]] = []
         self._passes: list[NumberedPass] = []
         self._n_written, self._is_open = 0, False
         self._quiet_since_ns = 0
-        self._last: FieldFrame | None = None
+        self._last_frame: FieldFrame | None = None
 
     def add_frame(self, frame: FieldFrame, doubts: Doubts) -> None:
         """Add the next frame.
@@ -128,35 +128,35 @@ class SegmentWriter:
         Parameters
         ----------
         frame : FieldFrame
-            With its detection result.
+            Frame with its detection result.
         doubts : Doubts
             Doubtful times known so far.
         """
-        last, self._last = self._last, frame
+        last, self._last_frame = self._last_frame, frame
         self.n_frames += 1
         if last is not None and frame.stamp_ns <= last.stamp_ns:
             # The time jumped back: a new track does not use earlier frames. If quiet frames were
             # omitted, the tracker of the segment could not detect the jump.
             if not last.target_present:
                 self.close()
-            self._recent.clear()
+            self._lookback.clear()
             self._quiet_since_ns = frame.stamp_ns
         if frame.target_present:
-            self._kept += self._recent
-            self._recent.clear()
-            self._kept.append((frame, doubts))
+            self._unwritten += self._lookback
+            self._lookback.clear()
+            self._unwritten.append((frame, doubts))
         elif last is not None and last.target_present:
-            # The frame that ends the tracks.
-            self._kept.append((frame, doubts))
+            # This frame ends the tracks.
+            self._unwritten.append((frame, doubts))
             self._quiet_since_ns = frame.stamp_ns
         else:
-            if self._n_written + len(self._kept) >= MIN_SEGMENT_FRAMES \
+            if self._n_written + len(self._unwritten) >= MIN_SEGMENT_FRAMES \
                     and frame.stamp_ns - self._quiet_since_ns > self._quiet_ns:
                 self.close()
-            self._recent.append((frame, doubts))
-            while self._recent[0][0].stamp_ns < frame.stamp_ns - self._quiet_ns:
-                self._recent.popleft()
-        if len(self._kept) >= CHUNK_FRAMES:
+            self._lookback.append((frame, doubts))
+            while self._lookback[0][0].stamp_ns < frame.stamp_ns - self._quiet_ns:
+                self._lookback.popleft()
+        if len(self._unwritten) >= CHUNK_FRAMES:
             self._write()
 
     def add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
@@ -165,27 +165,28 @@ class SegmentWriter:
         Parameters
         ----------
         number : int
-            Number of the pass in the recording.
+            Index of the pass in the recording, from 1.
         data : PassData
         notes : tuple of str
+            Notes for the user.
         """
         self._passes.append((number, data, notes))
 
     def close(self) -> None:
         """End the current segment, if there is one."""
-        if self._kept or self._passes:
+        if self._unwritten or self._passes:
             self._write()
         self.n_segments += self._is_open
         self._n_written, self._is_open = 0, False
 
     def _write(self) -> None:
-        """Append the kept frames and passes to the file of the segment; raises OutputError."""
-        frames = [frame for frame, _ in self._kept]
+        """Append the buffered frames and passes to the segment file; raises OutputError."""
+        frames = [frame for frame, _ in self._unwritten]
         doubts: dict[int, Doubts] = {}
-        known: Doubts | None = None
-        for k, (_, now) in enumerate(self._kept):
-            if now != known:
-                doubts[k] = known = now
+        previous: Doubts | None = None
+        for k, (_, current) in enumerate(self._unwritten):
+            if current != previous:
+                doubts[k] = previous = current
 
         arrays = {name: np.array([getattr(frame, name) for frame in frames]) for name in (
             'stamp_ns', 'field', 'covariance', 'n_samples', 'time_offset', 'target_present',
@@ -198,4 +199,4 @@ class SegmentWriter:
         except OSError as error:
             raise OutputError(f'cannot write {path}: {error.strerror}') from error
         self._n_written += len(frames)
-        self._is_open, self._kept, self._passes = True, [], []
+        self._is_open, self._unwritten, self._passes = True, [], []

@@ -24,7 +24,7 @@ from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
 
 TRACKED = ('tracks', 'poses', 'smoothed', 'passes')
-"""Tables with rows from a segment."""
+"""Tables that are filled from the segments."""
 
 
 class SegmentTables:
@@ -34,9 +34,9 @@ class SegmentTables:
     ----------
     recording : Path
     paths : dict of str to Path
-        Files of the tables `TRACKED`.
+        File of each table in `TRACKED`.
     n_dipoles : int
-        Number of dipoles of the row that is fitted to a pass.
+        Number of dipoles in the row that is fitted to a pass.
     settings : TrackSettings
 
     Attributes
@@ -77,11 +77,11 @@ class SegmentTables:
             self._collector.add([frame, *records])
         for log in [log for log in self._collector.logs.values() if log.ended]:
             self._add_track_row(log)
-        for one in chunk.passes:
-            self._add_pass(*one)
+        for numbered_pass in chunk.passes:
+            self._add_pass(*numbered_pass)
 
     def finish(self, tracker: TrackManager) -> None:
-        """End the segment.
+        """End the segment and write the remaining tracks.
 
         Parameters
         ----------
@@ -123,8 +123,8 @@ class SegmentTables:
         track : Track
         """
         if not track.ended:
-            self._tables['poses'].add(self._pose(track) | {
-                'weight': track.weight, 'kind_weight': _number(track.kind_weight),
+            self._tables['poses'].add(self._pose_columns(track) | {
+                'weight': track.weight, 'kind_weight': _nullable(track.kind_weight),
                 'arrival': track.arrival, 'doubts': ' '.join(track.doubts)})
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
@@ -135,16 +135,16 @@ class SegmentTables:
         pose : SmoothedPose
         """
         if pose.complete:
-            self._tables['smoothed'].add(self._pose(pose))
+            self._tables['smoothed'].add(self._pose_columns(pose))
 
-    def _pose(self, pose: Track | SmoothedPose) -> dict[str, Any]:
-        """Columns shared by published and smoothed poses."""
+    def _pose_columns(self, pose: Track | SmoothedPose) -> dict[str, Any]:
+        """Columns common to published and smoothed poses."""
         sd = np.sqrt(np.diagonal(pose.covariance))
         values = np.concatenate([pose.position, pose.velocity, sd, pose.moment]).tolist()
         return {**common_columns(self._recording, pose.stamp_ns), 'track_id': pose.id,
-                **dict(zip(_STATE, map(_number, values), strict=True)),
+                **dict(zip(_STATE_COLUMNS, map(_nullable, values), strict=True)),
                 'covariance': pose.covariance.ravel().tolist(), 'kind': pose.kind,
-                'length': _number(pose.length), 'ambiguous': pose.ambiguous}
+                'length': _nullable(pose.length), 'ambiguous': pose.ambiguous}
 
     def _add_track_row(self, log: TrackLog) -> None:
         """Write the row of a track that has ended and discard its history."""
@@ -158,25 +158,25 @@ class SegmentTables:
     def _add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
         """Fit a pass as a whole and write one row per vehicle."""
         single = (fit_pass(data, self._n_dipoles),)
-        for one in fitted_vehicles(self._recording.stem, number, data, single,
-                                   self._tracks.paths(data), self._ground,
-                                   (self._n_dipoles - 1, self._n_dipoles), notes):
-            rows = pass_rows(one)
+        for vehicle in fitted_vehicles(self._recording.stem, number, data, single,
+                                       self._tracks.paths(data), self._ground,
+                                       (self._n_dipoles - 1, self._n_dipoles), notes):
+            rows = pass_rows(vehicle)
             row = next((row for row in rows if row['chosen']), rows[-1])
             self.n_passes += 1
             self._tables['passes'].add(
-                {name: _number(value) if isinstance(value, float) else value
+                {name: _nullable(value) if isinstance(value, float) else value
                  for name, value in row.items() if name not in ('recording', 'pass')}
                 | common_columns(self._recording, row['stamp_ns'])
-                | {'number': number, 'notes': '; '.join(one.notes)})
+                | {'number': number, 'notes': '; '.join(vehicle.notes)})
 
 
-_STATE = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz', 'mx',
-          'my', 'mz')
+_STATE_COLUMNS = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy',
+                  'sd_vz', 'mx', 'my', 'mz')
 
 
 def _track_columns(log: TrackLog, smoothed: SmoothedLog | None) -> dict[str, Any]:
-    """Columns of a track."""
+    """Columns of a track in the table `tracks`."""
     summary = log.summary()
     out = {name: summary[name] for name in (
         'end_ns', 'poses', 'arrival', 'kind', 'verdict', 'kind_weight', 'ambiguous_share',
@@ -187,9 +187,9 @@ def _track_columns(log: TrackLog, smoothed: SmoothedLog | None) -> dict[str, Any
     if smoothed is not None:
         values = smoothed.summary()
         out |= {'smoothed_speed': values['speed'], 'smoothed_moment_size': values['moment_size']}
-    return {name: _number(v) if isinstance(v, float) else v for name, v in out.items()}
+    return {name: _nullable(v) if isinstance(v, float) else v for name, v in out.items()}
 
 
-def _number(value: float) -> float | None:
-    """Replace NaN by None, the null of a table."""
+def _nullable(value: float) -> float | None:
+    """Replace NaN by None, which is stored as null."""
     return None if math.isnan(value) else value

@@ -1,7 +1,7 @@
 """Tasks of an archive: cut a recording into segments, track each segment, join the tables.
 
-Each task writes one folder below the folder of its recording, and does nothing if its folder
-exists, so that every task can be repeated at any time.
+Each task writes one folder below the folder of its recording. If this folder exists, the task does
+nothing. Every task can therefore be repeated.
 """
 
 import copy
@@ -39,15 +39,15 @@ from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.rigid_pass import RigidPass
 
 N_DIPOLES = 3
-"""Number of dipoles of the row that is fitted to a pass."""
+"""Number of dipoles in the row that is fitted to a pass."""
 
 CUT_FILE, TRACKED_FILE = 'columns.json', 'tracked.pickle'
-"""Files with the result of a task for the next one, stored beside the tables."""
+"""Files that pass the result of a task to the next task, stored in the folder of its tables."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One recording of an archive."""
+    """Parameters of the tasks of one recording."""
 
     recording: Path
     """Path of the recording."""
@@ -56,7 +56,7 @@ class Job:
     folder: Path
     """Folder of the archive."""
     network: SensorNetwork
-    """Network of sensors."""
+    """Sensor network."""
     settings: Settings
     """Settings of all stages."""
 
@@ -90,9 +90,9 @@ class RecordedEvidence(ClockComparison):
     Attributes
     ----------
     passes : list of (RigidPass, (n,) int array)
-        Passes and the rows of their sensors.
+        Passes, each with the indices of its sensors in the network.
     was_apart : bool
-        Whether clocks were ever found apart, so that tracks depend on earlier passes.
+        Whether clocks were ever found to differ. Tracks then depend on earlier passes.
     """
 
     def __init__(self, n_sensors: int) -> None:
@@ -101,13 +101,13 @@ class RecordedEvidence(ClockComparison):
         self.was_apart = False
 
     def add(self, found: RigidPass, rows: IntArray) -> None:
-        """Add a pass.
+        """Add a pass and record it.
 
         Parameters
         ----------
         found : RigidPass
         rows : (n,) int array
-            Rows of its sensors in the network.
+            Indices of its sensors in the network.
         """
         super().add(found, rows)
         self.passes.append((found, rows))
@@ -116,7 +116,7 @@ class RecordedEvidence(ClockComparison):
 
 @dataclass
 class _Tracked:
-    """Result of `track_segment` besides its tables."""
+    """Counts and clock evidence of a segment that was tracked."""
 
     n_tracks: int
     n_passes: int
@@ -124,7 +124,7 @@ class _Tracked:
 
 
 def cut(job: Job) -> dict[str, Any]:
-    """Read a recording, and write its segments and the table of sensor health.
+    """Read a recording and write its segments and its table of sensor health.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def cut(job: Job) -> dict[str, Any]:
     Returns
     -------
     dict
-        Columns of the recording in the table `recordings`, without its tracks.
+        Columns of the recording in the table `recordings`, except tracks, passes and error.
 
     Raises
     ------
@@ -145,16 +145,16 @@ def cut(job: Job) -> dict[str, Any]:
             with TableWriter(folder / 'health.parquet', TABLES['health']) as table:
                 columns = _Segmenter(job, folder, table).read()
             replace_text(folder / CUT_FILE, json.dumps(columns))
-    read: dict[str, Any] = json.loads((job.cut / CUT_FILE).read_text())
-    return read
+    result: dict[str, Any] = json.loads((job.cut / CUT_FILE).read_text())
+    return result
 
 
 @contextmanager
 def _atomic_folder(final: Path) -> Iterator[Path]:
-    """Folder to write to, which is renamed to `final` when it is complete; raises OutputError.
+    """Yield a folder to write to and rename it to `final` at the end; raises OutputError.
 
-    The same task may run elsewhere, on a worker that was considered lost or for a run that was
-    killed. The first one to finish counts; the results are the same.
+    The same task may also run on a worker that was considered lost, or for a run that was killed.
+    The first result is kept; all results are equal.
     """
     draft = final.with_name(f'.{secrets.token_hex(8)}.{final.name}')
     with _output_errors(final):
@@ -170,7 +170,7 @@ def _atomic_folder(final: Path) -> Iterator[Path]:
 
 @contextmanager
 def _output_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError into an OutputError that names `path`, unless `path` exists by now."""
+    """Convert an OSError to an OutputError that names `path`; ignore it if `path` exists."""
     try:
         yield
     except OSError as error:
@@ -179,7 +179,7 @@ def _output_errors(path: Path) -> Iterator[None]:
 
 
 class _Segmenter:
-    """Reads a recording once with the stages before the tracker, and writes its segments."""
+    """Processes a recording with the stages before the tracker and writes its segments."""
 
     def __init__(self, job: Job, folder: Path, health: TableWriter) -> None:
         self._recording, self._path = Recording(job.recording), job.recording
@@ -194,7 +194,7 @@ class _Segmenter:
         self._n_passes = 0
 
     def read(self) -> dict[str, Any]:
-        """Write segments and health; return the columns of the recording."""
+        """Write the segments and the health table; return the columns of the recording."""
         for readings in self._reader.readings():
             self._add_passes(self._passes.feed(readings))
         self._add_passes(self._passes.flush())
@@ -205,8 +205,8 @@ class _Segmenter:
         return {
             **common_columns(self._path, self._first_ns), 'end_ns': self._last_ns,
             'frames': self._writer.n_frames, 'segments': self._writer.n_segments,
-            'size': self._recording.size, 'lost': _text(self._recording.losses),
-            'rejected': _text(self._reader.rejected + Counter(self._passes.rejected)),
+            'size': self._recording.size, 'lost': _format_counts(self._recording.losses),
+            'rejected': _format_counts(self._reader.rejected + Counter(self._passes.rejected)),
             'missing_topics': ' '.join(missing),
             'no_detection_reason': self._passes.no_detection_reason(missing) or ''}
 
@@ -249,7 +249,7 @@ def track_segment(job: Job, k: int) -> None:
 
 
 def _track_into(folder: Path, job: Job, k: int, evidence: RecordedEvidence) -> None:
-    """Track a segment, given the `evidence` on clocks from earlier ones, and write its tables."""
+    """Track a segment with the clock `evidence` of earlier segments, and write its tables."""
     tracker = TrackManager(job.network, job.settings.track, evidence)
     with SegmentTables(job.recording, {name: folder / f'{name}.parquet' for name in TRACKED},
                        N_DIPOLES, job.settings.track) as tables:
@@ -261,10 +261,10 @@ def _track_into(folder: Path, job: Job, k: int, evidence: RecordedEvidence) -> N
 
 
 def join(job: Job) -> dict[str, Any]:
-    """Join the tables of the segments and write them to the archive.
+    """Join the tables of the segments and write the joined tables to the archive.
 
-    If the clocks of sensors are apart, the tracks of a segment depend on the passes of earlier
-    segments, and the segment is tracked again.
+    If the clocks of sensors differ, the tracks of a segment depend on the passes in earlier
+    segments. Such a segment is tracked again.
 
     Parameters
     ----------
@@ -282,40 +282,41 @@ def join(job: Job) -> dict[str, Any]:
     """
     columns = cut(job)
     name, evidence = recording_key(job.recording), RecordedEvidence(len(job.network))
-    folders, shifts, n_tracks, n_passes = [], [], 0, 0
-    with tempfile.TemporaryDirectory(dir=job.work, prefix='.again.') as again:
+    folders, id_offsets, n_tracks, n_passes = [], [], 0, 0
+    with tempfile.TemporaryDirectory(dir=job.work, prefix='.again.') as repeat_folder:
         for k in range(columns['segments']):
             folder = job.segment(k)
-            found = _tracked(folder)
+            result = _read_result(folder)
             evidence.passes = []
-            together = copy.deepcopy(evidence)
-            for one in found.evidence.passes:
-                together.add(*one)
-            if k and (together.was_apart or found.evidence.was_apart):
-                folder = Path(again) / f'segment-{k}'
+            combined = copy.deepcopy(evidence)
+            for rigid_pass in result.evidence.passes:
+                combined.add(*rigid_pass)
+            if k and (combined.was_apart or result.evidence.was_apart):
+                folder = Path(repeat_folder) / f'segment-{k}'
                 folder.mkdir()
                 _track_into(folder, job, k, evidence)
-                found = _tracked(folder)
-                together = found.evidence
-            evidence = together
+                result = _read_result(folder)
+                combined = result.evidence
+            evidence = combined
             folders.append(folder)
-            shifts.append(n_tracks)
-            n_tracks += found.n_tracks
-            n_passes += found.n_passes
+            id_offsets.append(n_tracks)
+            n_tracks += result.n_tracks
+            n_passes += result.n_passes
         for table in TRACKED:
             join_tables([folder / f'{table}.parquet' for folder in folders],
-                        shifts if table != 'passes' else [0] * len(shifts), table, job.folder, name)
+                        id_offsets if table != 'passes' else [0] * len(id_offsets), table,
+                        job.folder, name)
     join_tables([job.cut / 'health.parquet'], [0], 'health', job.folder, name)
     return {**columns, 'tracks': n_tracks, 'passes': n_passes, 'error': ''}
 
 
-def _tracked(folder: Path) -> _Tracked:
+def _read_result(folder: Path) -> _Tracked:
     """Read the result that `track_segment` stored in a folder."""
     with open(folder / TRACKED_FILE, 'rb') as stream:
-        tracked: _Tracked = pickle.load(stream)
-    return tracked
+        result: _Tracked = pickle.load(stream)
+    return result
 
 
-def _text(counts: Mapping[str, int]) -> str:
-    """Format {cause: number} as text."""
+def _format_counts(counts: Mapping[str, int]) -> str:
+    """Format counts {cause: number} as a string."""
     return '; '.join(f'{n} {cause}' for cause, n in counts.items())

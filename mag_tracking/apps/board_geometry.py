@@ -1,4 +1,4 @@
-"""Calibration of the geometry of a sensor board, as by `mag-tracking board-geometry`."""
+"""Geometry calibration of a sensor board, for the command `mag-tracking board-geometry`."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +13,7 @@ from mag_tracking.analysis.network_geometry import (
     NetworkGeometry,
     calibrate_geometry,
 )
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.errors import NetworkError, RecordingError
 from mag_tracking.network import SensorNetwork
@@ -23,37 +24,37 @@ from mag_tracking.recording.pose_table import (
 )
 
 ASSUMED_NOISE = 1e-7
-"""Noise of sensors without a stated noise; near a magnet, the error of the field is larger [T]."""
+"""Noise of sensors without a configured noise [T]. Near a magnet, the field error is larger."""
 
 MIN_ROTATION_STD = 1e-7
-"""Standard deviation below which an orientation was held fixed [rad]."""
+"""Standard deviation below which an orientation counts as fixed in the estimation [rad]."""
 
 FIRST_ROW = 2
-"""Row of the first pose in messages; the header is row 1."""
+"""Row number of the first pose in the table; the header is row 1."""
 
 
 @dataclass(frozen=True)
 class GeometrySurvey:
-    """Calibrated geometry of a board."""
+    """Result of the geometry calibration of a board."""
 
     stated: SensorNetwork
-    """Network before the calibration, with the noise assumed for it."""
+    """Network before the calibration, including the assumed noise."""
     network: SensorNetwork
     """Calibrated network; invalid if the geometry has not converged."""
     geometry: NetworkGeometry
     """Result of the estimation."""
     rows: IntArray
-    """(K,) rows of the table with the poses used."""
+    """(K,) table rows of the poses used."""
     suspect_rows: tuple[int, ...]
-    """Rows of the table with inconsistent poses."""
+    """Table rows of inconsistent poses."""
     n_poses: int
     """Number of poses in the table."""
     silent_axes: tuple[tuple[str, str], ...]
-    """(sensor, axes) that never reported, for sensors with other axes that did."""
+    """(sensor, axes without readings) of each sensor with readings of only some axes."""
 
     @property
     def rotation_angle(self) -> FloatArray:
-        """Angle between stated and estimated orientation of each sensor, (n,) rad."""
+        """Angle between nominal and estimated orientation of each sensor, (n,) rad."""
         trace: FloatArray = np.einsum('nij,nij->n', self.stated.R_ws, self.network.R_ws)
         return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 
@@ -99,8 +100,8 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
     table : path
         CSV file; see `read_pose_table`.
     network : SensorNetwork
-        Nominal geometry, sensors in the order of the table's columns. Its offsets and corrections
-        are applied to the readings.
+        Nominal network, with the sensors in the order of the table columns. Its offsets and
+        corrections are applied to the readings.
     moment : float, A m²
         Magnitude of the magnet's moment.
     settings : GeometrySettings
@@ -109,7 +110,7 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
     box : (low, high), optional
         Corners (3,) [m] of the box that contains the magnet. With a box, the table needs no poses.
     noise_std : float, T, optional
-        Noise of sensors without a stated noise. Without it, `ASSUMED_NOISE` is used but not
+        Noise of sensors without a configured noise. By default, `ASSUMED_NOISE` is used, but not
         stored in the network.
 
     Returns
@@ -126,28 +127,29 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
     else:
         readings = read_readings(table)
     if readings.shape[1] != len(network):
-        raise RecordingError(f'{table}: readings of {readings.shape[1]} sensors, but the '
-                             f'network has {len(network)}')
-    known = _with_noise(network, noise_std)
-    stated = _with_noise(known, ASSUMED_NOISE)
-    field = corrected(stated, readings)
-    # Poses without readings are dropped here with a tracker, and by the estimation without one.
-    given = np.arange(len(field)) if box is not None else np.flatnonzero(
+        raise RecordingError(f'{table}: readings of {quantity(readings.shape[1], "sensor")}, but '
+                             f'the network has {len(network)}')
+    configured = _with_noise(network, noise_std)
+    nominal = _with_noise(configured, ASSUMED_NOISE)
+    field = corrected(nominal, readings)
+    # Poses without readings are removed here or, for unknown poses, by the estimation.
+    pose_indices = np.arange(len(field)) if box is not None else np.flatnonzero(
         ~np.isnan(field).all(axis=(1, 2)))
     try:
         if box is not None:
             low, high = (np.asarray(corner, dtype=float) for corner in box)
-            found = calibrate_geometry_blind(stated, field, moment, low, high, settings)
+            geometry = calibrate_geometry_blind(nominal, field, moment, low, high, settings)
         else:
-            found = calibrate_geometry(stated, field[given], positions[given], axes[given],
-                                       moment, settings)
+            geometry = calibrate_geometry(nominal, field[pose_indices], positions[pose_indices],
+                                          axes[pose_indices], moment, settings)
     except ValueError as error:
         raise RecordingError(f'{table}: {error}') from error
-    by = f'magnet, {len(found.rows)} {"unknown" if box is not None else "tracked"} poses'
-    suspects = tuple(int(given[k]) + FIRST_ROW for k in found.suspect_poses)
+    method = f'magnet, {len(geometry.rows)} {"unknown" if box is not None else "tracked"} poses'
+    suspects = tuple(int(pose_indices[k]) + FIRST_ROW for k in geometry.suspect_poses)
     return GeometrySurvey(
-        stated, calibrated_network(known, found, date, by), found, given[found.rows] + FIRST_ROW,
-        suspects, len(field), tuple(_silent_axes(stated, field)))
+        nominal, calibrated_network(configured, geometry, date, method), geometry,
+        pose_indices[geometry.rows] + FIRST_ROW, suspects, len(field),
+        tuple(_silent_axes(nominal, field)))
 
 
 def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
@@ -161,7 +163,7 @@ def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
     Returns
     -------
     (K, n, 3) array, T, sensor frame
-        The background is not removed.
+        Corrected readings, including the background.
     """
     out = np.array(readings, dtype=float)
     for j, (offset, C) in enumerate(zip(network.offset, network.correction, strict=True)):
@@ -180,8 +182,8 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
     """Apply estimated positions, orientations, gains and biases to a network.
 
     A reading is gain * field + bias. The stage Calibrate applies the correction before it removes
-    the background, so that the background and noise stored here refer to corrected readings. A
-    sensor without readings is not changed.
+    the background. The stored background and noise therefore refer to corrected readings. A sensor
+    without readings is not changed.
 
     Parameters
     ----------
@@ -197,26 +199,26 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
     -------
     SensorNetwork
     """
-    found = geometry.network
+    estimated = geometry.network
     columns = {name: list(getattr(network, name)) for name in (
         'noise_std', 'background', 'correction', 'orientation_std', 'calibrated')}
     for j, gain in enumerate(geometry.gain):
         if np.isnan(geometry.bias[j]).all():
             continue
-        was = network.correction[j]
-        columns['correction'][j] = (np.eye(3) if was is None else was) / gain
-        columns['background'][j] = (None if found.background[j] is None
-                                    else found.background[j] / gain)
+        previous = network.correction[j]
+        columns['correction'][j] = (np.eye(3) if previous is None else previous) / gain
+        columns['background'][j] = (None if estimated.background[j] is None
+                                    else estimated.background[j] / gain)
         if network.noise_std[j] is not None:
             columns['noise_std'][j] = network.noise_std[j] / abs(gain)
         std = _world_std(geometry, j)
         if (std > MIN_ROTATION_STD).all():
             columns['orientation_std'][j] = std
-        before = network.calibrated[j]
+        record = network.calibrated[j]
         columns['calibrated'][j] = network.calibration_record(
-            j, date, by, np.nan if before is None else before.clock_offset_std)
+            j, date, by, np.nan if record is None else record.clock_offset_std)
     changes: dict[str, Any] = {name: tuple(column) for name, column in columns.items()}
-    return replace(network, positions=found.positions, R_ws=found.R_ws, **changes)
+    return replace(network, positions=estimated.positions, R_ws=estimated.R_ws, **changes)
 
 
 def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
@@ -229,7 +231,7 @@ def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
 
 
 def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:
-    """Set the noise [T] of sensors without a stated noise; None leaves the network unchanged."""
+    """Set the noise [T] of sensors without a configured noise; None changes nothing."""
     if noise_std is None:
         return network
     return replace(network, noise_std=tuple(
@@ -237,7 +239,7 @@ def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwor
 
 
 def _silent_axes(network: SensorNetwork, field: FloatArray) -> Iterator[tuple[str, str]]:
-    """(sensor, axes) of sensors with some, but not all, axes that never reported."""
+    """Yield (sensor, axes without readings) of each sensor with readings of only some axes."""
     silent: BoolArray = np.all(np.isnan(field), axis=0)
     for name, axes in zip(network.names, silent, strict=True):
         if axes.any() and not axes.all():

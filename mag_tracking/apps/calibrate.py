@@ -1,4 +1,4 @@
-"""Calibration of a network from a recording, as by `mag-tracking calibrate`."""
+"""Calibration of a network from a recording, for the command `mag-tracking calibrate`."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting, with_evidence
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.network import SensorNetwork
@@ -19,19 +20,19 @@ from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.survey.stage import NetworkSurvey, Survey, with_measured_noise
 
 MIN_POSES = 8
-"""Minimum number of unambiguous poses of a track used for the calibration."""
+"""Minimum number of unambiguous poses of a track that the calibration uses."""
 
 
 @dataclass
 class Calibration:
-    """Calibration of a network."""
+    """Result of the calibration of a network."""
 
     network: SensorNetwork
     """Calibrated network."""
     survey: NetworkSurvey
     """Results from accelerometers, compasses and knocks."""
     evidence: MountingEvidence | None
-    """Results from the passes; None if passes were not used or there were none."""
+    """Results from the passes; None without usable passes."""
     levels: dict[str, FloatArray]
     """{sensor: (3,) field without a target, T, sensor frame}."""
     rejected: dict[str, int]
@@ -58,10 +59,10 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
     date : str
         Date of the calibration, stored in the network.
     passes : bool
-        Whether to estimate orientations from passing targets as well; ignored if
+        Whether to refine the orientations with passing targets; ignored if
         `track.mounting_std_deg` is zero.
     progress : function, optional
-        Called with the number of bytes read since the last call; with `passes`, the recording is
+        Called with the number of bytes read since the last call. With `passes`, the recording is
         read twice.
     stopped : function, optional
         Called after every batch of readings; reading ends when it returns true.
@@ -75,31 +76,33 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
     RecordingError
         If the recording has none of the network's topics, or no samples.
     """
-    levels, survey, calibrated, interrupted = _surveyed(
+    levels, survey, calibrated, interrupted = _survey_recording(
         recording, network, settings, date, progress, stopped)
     if not calibrated.counts.total():
         raise RecordingError(f'{recording.path}: no samples of the sensors of the network')
-    found = with_measured_noise(survey.network, calibrated)
+    estimated = with_measured_noise(survey.network, calibrated)
     evidence = None
-    # A faulty sensor would bias the orientations of the others.
+    # A faulty sensor would bias the orientations of the other sensors.
     if passes and not interrupted and settings.track.mounting_std_deg \
             and not survey.disagreements:
-        tracks, interrupted = _passes(recording, found, settings, progress, stopped)
+        tracks, interrupted = _track_passes(recording, estimated, settings, progress, stopped)
         if tracks:
             prior = np.array([
                 np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
-                for s in found.orientation_std])
-            evidence = fuse_mounting(found, prior, tracks)
-            found = _marked(with_evidence(found, evidence), found, date, evidence.n_tracks)
+                for s in estimated.orientation_std])
+            evidence = fuse_mounting(estimated, prior, tracks)
+            estimated = _with_pass_records(with_evidence(estimated, evidence), estimated, date,
+                                           evidence.n_tracks)
     without_background = tuple(name for name in network.names if name not in levels)
-    return Calibration(found, survey, evidence, levels, rejected(calibrated.counts),
+    return Calibration(estimated, survey, evidence, levels, rejected(calibrated.counts),
                        without_background, interrupted)
 
 
-def _surveyed(recording: Recording, network: SensorNetwork, settings: Settings, date: str,
-              progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
-              ) -> tuple[dict[str, FloatArray], NetworkSurvey, Calibrate, bool]:
-    """First pass over the recording: (levels, NetworkSurvey, Calibrate, interrupted)."""
+def _survey_recording(recording: Recording, network: SensorNetwork, settings: Settings, date: str,
+                      progress: Callable[[int], object] | None,
+                      stopped: Callable[[], bool] | None,
+                      ) -> tuple[dict[str, FloatArray], NetworkSurvey, Calibrate, bool]:
+    """Read the recording for the first time; return (levels, survey, stage, interrupted)."""
     reader = SampleReader(recording, network)
     # Backgrounds and noise in the network file may be outdated; they are learnt again.
     unlearnt = replace(network, background=(), noise_std=())
@@ -122,10 +125,10 @@ def _surveyed(recording: Recording, network: SensorNetwork, settings: Settings, 
     return levels, survey.solve(levels, date), stage, interrupted
 
 
-def _passes(recording: Recording, network: SensorNetwork, settings: Settings,
-            progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
-            ) -> tuple[list[Track], bool]:
-    """Second pass over the recording: (last unambiguous pose of each track, interrupted)."""
+def _track_passes(recording: Recording, network: SensorNetwork, settings: Settings,
+                  progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
+                  ) -> tuple[list[Track], bool]:
+    """Read the recording again; return (last unambiguous pose of each track, interrupted)."""
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
     poses: dict[int, tuple[int, Track]] = {}
     interrupted = False
@@ -145,11 +148,11 @@ def _passes(recording: Recording, network: SensorNetwork, settings: Settings,
     return [track for n, track in poses.values() if n >= MIN_POSES], interrupted
 
 
-def _marked(network: SensorNetwork, surveyed: SensorNetwork, date: str,
-            n_tracks: int) -> SensorNetwork:
-    """Record in the calibration of `network` that it includes passes, based on `surveyed`."""
-    passes = f'{n_tracks} pass{"es" if n_tracks > 1 else ""}'
+def _with_pass_records(network: SensorNetwork, surveyed: SensorNetwork, date: str,
+                       n_tracks: int) -> SensorNetwork:
+    """Add the number of passes to the calibration records of `surveyed`; set them in `network`."""
+    passes = quantity(n_tracks, 'pass', 'passes')
     return replace(network, calibrated=tuple(
-        surveyed.calibration_record(j, date, f'as stated; {passes}') if c is None
-        else replace(c, date=date, by=f'{c.by}; {passes}')
-        for j, c in enumerate(surveyed.calibrated)))
+        surveyed.calibration_record(j, date, f'as stated; {passes}') if record is None
+        else replace(record, date=date, by=f'{record.by}; {passes}')
+        for j, record in enumerate(surveyed.calibrated)))

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from mag_tracking.apps.calibrate import Calibration
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.files import replace_text
 from mag_tracking.geometry import yaw_between
 from mag_tracking.network import SensorNetwork
@@ -63,9 +64,9 @@ def calibration_page(found: Calibration, stated: SensorNetwork, name: str) -> Pa
               for sensor in found.without_background]
     notes += [Note(WARNING, f'{cause}: {n}') for cause, n in found.rejected.items()]
     if found.evidence is not None:
-        n = found.evidence.n_tracks
-        notes.append(Note(NOTE, f'{n} pass{"es" * (n != 1)} used'))
-    return Page(f'Calibration from {name}', f'{len(stated)} sensors', notes, None,
+        passes = quantity(found.evidence.n_tracks, 'pass', 'passes')
+        notes.append(Note(NOTE, f'{passes} used'))
+    return Page(f'Calibration from {name}', quantity(len(stated), 'sensor'), notes, None,
                 [*_knocks(found), _headings(found, stated)], [_table(found)])
 
 
@@ -75,13 +76,14 @@ def _knocks(found: Calibration) -> list[Chart]:
     if not shocks:
         return []
     first, charts = first_knock(shocks), []
-    for title, is_set in (('First knock, uncorrected clocks', False),
+    for title, is_corrected in (('First knock, uncorrected clocks', False),
                           ('First knock, corrected clocks', True)):
         traces = []
-        for k, (name, (t, size)) in enumerate(shocks.items()):
-            offset = found.network.clock_offset[found.network.index(name)] if is_set else 0.0
+        for k, (name, (t, acceleration)) in enumerate(shocks.items()):
+            offset = found.network.clock_offset[found.network.index(name)] if is_corrected else 0.0
             near = np.abs(t - offset - first) < KNOCK_MARGIN_S
-            traces.append(curve(t[near] - offset - first, size[near], name, k, 'lines+markers'))
+            traces.append(curve(t[near] - offset - first, acceleration[near], name, k,
+                                'lines+markers'))
         charts.append(Chart(title, traces, axes('time [s]', 'acceleration from rest [m/s²]')))
     return charts
 
@@ -95,31 +97,31 @@ def _headings(found: Calibration, stated: SensorNetwork) -> Chart:
     for k, (label, network) in enumerate(steps):
         yaw = [float(np.degrees(yaw_between(stated.R_ws[j], network.R_ws[j])))
                for j in range(len(stated))]
-        half = [0.0 if s is None else SCALE_1D * float(np.degrees(s[2]))
-                for s in network.orientation_std]
+        half_width = [0.0 if s is None else SCALE_1D * float(np.degrees(s[2]))
+                      for s in network.orientation_std]
         traces.append({
             'type': 'scatter', 'mode': 'markers', 'x': yaw, 'name': label, 'showlegend': True,
             'y': [plain(name) for name in stated.names],
-            'error_x': {'type': 'data', 'array': half, 'color': SERIES[k]},
+            'error_x': {'type': 'data', 'array': half_width, 'color': SERIES[k]},
             'marker': {'color': SERIES[k], 'size': 8, 'symbol': ('circle', 'square')[k]}})
     return Chart('Rotation about the vertical relative to the network file (90%)', traces,
                  axes('[degrees]', ''))
 
 
 def _table(found: Calibration) -> Table:
-    """Table of the sensors."""
+    """Table of the orientation, clock and noise of each sensor."""
     network, rows = found.network, list[list[str | float | None]]()
     for j, name in enumerate(network.names):
         R, std, noise = network.R_ws[j], network.orientation_std[j], network.noise_std[j]
-        done = network.calibrated[j]
-        known = done is not None and not np.isnan(done.clock_offset_std)
+        record = network.calibrated[j]
+        has_clock = record is not None and not np.isnan(record.clock_offset_std)
         rows.append([
             name, float(np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))),
             float(np.degrees(np.arctan2(R[1, 0], R[0, 0]))),
             None if std is None else float(np.degrees(std[2])),
-            1e3 * float(network.clock_offset[j]) if known else None,
-            1e3 * done.clock_offset_std if done is not None and known else None,
+            1e3 * float(network.clock_offset[j]) if has_clock else None,
+            1e3 * record.clock_offset_std if record is not None and has_clock else None,
             None if noise is None else 1e9 * float(np.nanmean(noise)),
-            'as stated' if done is None else done.by])
+            'as stated' if record is None else record.by])
     return Table('Sensors', ['sensor', 'tilt [deg]', 'heading [deg]', 'std [deg]',
                              'clock [ms]', 'std [ms]', 'noise [nT]', 'source'], rows)

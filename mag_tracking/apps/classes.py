@@ -35,14 +35,14 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 
 @dataclass(frozen=True)
 class Examples:
-    """Features of signatures."""
+    """Feature vectors of signatures, with labels and origins."""
 
     x: FloatArray
     """(n, n_features)."""
     labels: tuple[str, ...]
-    """(n,) classes; empty texts without labels."""
+    """(n,) classes; empty strings if unlabelled."""
     sources: tuple[str, ...]
-    """(n,) descriptions for messages."""
+    """(n,) origins of the signatures, for messages."""
     groups: tuple[str, ...]
     """(n,) identifiers of targets; equal for signatures of the same target."""
     axes: tuple[str, ...]
@@ -50,7 +50,7 @@ class Examples:
     unit: str
     """Unit of all signatures; empty if unknown."""
     left_out: tuple[str, ...]
-    """Reasons, one per signature without features."""
+    """Reason for each signature without features."""
 
 
 def examples_of(signatures: list[Signature]) -> Examples:
@@ -70,13 +70,13 @@ def examples_of(signatures: list[Signature]) -> Examples:
         If there is no usable signature, or axes or units differ.
     """
     if not signatures:
-        raise LabelsError('no signatures were found')
+        raise LabelsError('the input contains no signatures')
     x, rows, reasons = feature_table(signatures)
     if not len(rows):
-        raise LabelsError(f'no signature is usable; {reasons[0]}')
-    kept = [signatures[i] for i in rows.tolist()]
-    return Examples(x, tuple(s.label for s in kept), tuple(s.source for s in kept),
-                    tuple(s.group for s in kept), kept[0].axes, kept[0].unit, tuple(reasons))
+        raise LabelsError(f'no signature is usable; the first reason is: {reasons[0]}')
+    usable = [signatures[i] for i in rows.tolist()]
+    return Examples(x, tuple(s.label for s in usable), tuple(s.source for s in usable),
+                    tuple(s.group for s in usable), usable[0].axes, usable[0].unit, tuple(reasons))
 
 
 def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] | None = None,
@@ -110,13 +110,13 @@ def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] |
         return read_signatures(path, is_labelled)
     if labels is None or network is None:
         raise LabelsError(f'{path}: a recording needs a table of labelled intervals and a network')
-    return list(_extracted(Path(path), labels, network))
+    return list(_interval_signatures(Path(path), labels, network))
 
 
-def _extracted(path: Path, labels: str | PathLike[str], network: SensorNetwork
-               ) -> Iterator[Signature]:
-    """Signatures of the labelled intervals, one per interval and sensor."""
-    readings = _calibrated(path, network)
+def _interval_signatures(path: Path, labels: str | PathLike[str], network: SensorNetwork
+                         ) -> Iterator[Signature]:
+    """Extract one signature per labelled interval and sensor; raises LabelsError."""
+    readings = _calibrated_readings(path, network)
     if not len(readings):
         raise LabelsError(f'{path}: no sensor has calibrated readings')
     names = np.array(readings.names)[readings.sensor]
@@ -132,26 +132,26 @@ def _extracted(path: Path, labels: str | PathLike[str], network: SensorNetwork
 
 def _signatures(path: Path, readings: Readings, names: Any,
                 interval: LabelledInterval) -> Iterator[Signature]:
-    """Signatures of one interval."""
+    """Extract the signatures of one interval, one per sensor with readings in the interval."""
     inside = (interval.begin_ns <= readings.stamp_ns) & (readings.stamp_ns <= interval.end_ns)
     for name in readings.names:
-        mine = inside & (names == name)
-        if interval.sensor not in ('', name) or not mine.any():
+        selected = inside & (names == name)
+        if interval.sensor not in ('', name) or not selected.any():
             continue
-        field = readings.field[mine]
+        field = readings.field[selected]
         has_axis = ~np.isnan(field).all(axis=0)
         field = field[:, has_axis]
         complete = ~np.isnan(field).any(axis=1)
         if has_axis.any() and complete.any():
-            yield Signature((readings.stamp_ns[mine][complete] - interval.begin_ns) / 1e9,
+            yield Signature((readings.stamp_ns[selected][complete] - interval.begin_ns) / 1e9,
                             field[complete], interval.label,
                             f'{path.name}: {name}, row {interval.row}',
                             tuple(np.array(list('xyz'))[has_axis].tolist()), 'T',
                             f'row {interval.row}')
 
 
-def _calibrated(path: Path, network: SensorNetwork) -> Readings:
-    """Calibrated readings of a recording."""
+def _calibrated_readings(path: Path, network: SensorNetwork) -> Readings:
+    """Read a recording and return its calibrated readings."""
     settings = settings_for('vehicle')
     recording = Recording(path)
     calibrate = Calibrate(network, settings.calibrate)
@@ -184,7 +184,7 @@ def train_classes(examples: Examples) -> SignatureModel:
 
 def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_splits: int = 20,
                      progress: Callable[[Iterable[int]], Iterable[int]] = iter) -> Evaluation:
-    """Evaluate a trained model, or the training on stratified splits.
+    """Evaluate a trained model, or models trained on stratified splits.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_
     Raises
     ------
     LabelsError
-        If there are too few examples, or the model has other axes or classes.
+        If there are too few examples, or the model has different axes or classes.
     MissingDependencyError
         If scikit-learn is not installed.
     """
@@ -233,4 +233,4 @@ def check_axes(examples: Examples, model: SignatureModel) -> None:
     if examples.unit != model.unit:
         raise LabelsError(f'the signatures are in {examples.unit or "an unknown unit"}, but the '
                           f'model was trained on {model.unit or "an unknown unit"}; column names '
-                          'such as x_nt, x_ut and x_t state the unit')
+                          'such as x_nt, x_ut and x_t specify the unit')

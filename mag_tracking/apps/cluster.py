@@ -21,25 +21,25 @@ if TYPE_CHECKING:
     from tornado.ioloop import IOLoop
 
 CONNECT_TIMEOUT_S = 15.0
-"""Maximum time for a scheduler to respond and to have a worker [s]."""
+"""Maximum time to wait for a response of a scheduler, and then for its first worker [s]."""
 THREAD_START_TIMEOUT_S = 60.0
 """Maximum time for a thread to start [s]."""
 NO_WORKERS_TIMEOUT_S = 60.0
-"""Maximum time for which a scheduler may have no workers after losing all of them [s]."""
+"""Maximum time without workers after all of them were lost [s]."""
 POLL_S = 0.3
 """Maximum time to wait for a task before returning to the caller [s]."""
 
 _Key = TypeVar('_Key')
-# These are two classes before Python 3.11.
-_TIME_OUT = (TimeoutError, asyncio.TimeoutError)
+# Before Python 3.11, these are different classes.
+_TIMEOUT_ERRORS = (TimeoutError, asyncio.TimeoutError)
 
 
 class LostWorkersError(MagTrackingError):
-    """Several workers were lost while running a task."""
+    """A task lost its worker several times."""
 
 
 class _Task(NamedTuple):
-    """A task, and whether it runs without other tasks."""
+    """Task for a worker. If `runs_alone`, no other task runs at the same time."""
 
     key: Any
     priority: int
@@ -49,7 +49,7 @@ class _Task(NamedTuple):
 
 
 class Cluster(Generic[_Key]):
-    """Runs tasks; a context manager that cancels running tasks at its end.
+    """Runs tasks on workers; a context manager that cancels unfinished tasks on exit.
 
     Parameters
     ----------
@@ -81,8 +81,8 @@ class Cluster(Generic[_Key]):
         logging.getLogger('distributed').setLevel(logging.CRITICAL)
         self._stack = ExitStack()
         self._running: dict[Future[Any], _Task] = {}
-        # Dask reports all tasks of a lost worker as failed, including queued ones. Each of them is
-        # therefore repeated while no other task is running.
+        # Dask reports all tasks of a lost worker as failed, including queued ones. Each such task
+        # is therefore repeated while no other task is running.
         self._suspects: deque[_Task] = deque()
         self._workers: set[str] = set()
         self.n_lost = 0
@@ -110,11 +110,11 @@ class Cluster(Generic[_Key]):
 
     @property
     def n_workers(self) -> int:
-        """Number of workers, at least one."""
+        """Number of workers, or 1 if there are none."""
         return max(1, len(self._workers))
 
     def keys(self) -> list[_Key]:
-        """Keys of the tasks that are running.
+        """Return the keys of the running tasks.
 
         Returns
         -------
@@ -143,13 +143,14 @@ class Cluster(Generic[_Key]):
         self._running[future] = task
 
     def finished(self) -> Iterator[tuple[_Key, Any]]:
-        """Wait up to `POLL_S` for tasks to finish.
+        """Wait up to `POLL_S` for tasks to finish and yield their results.
 
         Yields
         ------
         key : hashable
+            Key of the task.
         result : object
-            Return value of the task, or the exception raised.
+            Return value of the task, or the exception that it raised.
 
         Raises
         ------
@@ -160,7 +161,7 @@ class Cluster(Generic[_Key]):
 
         if not self._running and self._suspects:
             self._run(self._suspects.popleft()._replace(runs_alone=True))
-        with suppress(*_TIME_OUT), self._scheduler_errors():
+        with suppress(*_TIMEOUT_ERRORS), self._scheduler_errors():
             wait(list(self._running), timeout=POLL_S, return_when='FIRST_COMPLETED')
         self._count_lost()
         for future in [f for f in self._running if f.done()]:
@@ -171,7 +172,7 @@ class Cluster(Generic[_Key]):
                 yield task.key, result
 
     def _result_of(self, future: 'Future[Any]') -> Any:
-        """Return value of a task, or its error."""
+        """Return the result of a finished task, or its exception."""
         from distributed import KilledWorker
 
         if future.status == 'finished':
@@ -183,7 +184,7 @@ class Cluster(Generic[_Key]):
                                      'again')
 
     def _count_lost(self) -> None:
-        """Count lost workers; raises ClusterError if all are lost and none has been replaced."""
+        """Count lost workers; raises ClusterError if there have been no workers for too long."""
         with self._scheduler_errors():
             workers = set(self._client.nthreads())
         self.n_lost += len(self._workers - workers)
@@ -196,10 +197,10 @@ class Cluster(Generic[_Key]):
 
     @contextmanager
     def _scheduler_errors(self) -> Iterator[None]:
-        """Turn connection errors into ClusterError."""
+        """Convert connection errors to ClusterError."""
         try:
             yield
-        except _TIME_OUT:
+        except _TIMEOUT_ERRORS:
             raise
         except (OSError, CancelledError, asyncio.CancelledError) as error:
             raise ClusterError(f'lost the connection to the scheduler ({error}); run the command '
@@ -208,42 +209,42 @@ class Cluster(Generic[_Key]):
 
 @cache
 def _event_loop() -> 'IOLoop':
-    """Event loop of all clusters, in a thread that ends with the process; raises ClusterError.
+    """Return the event loop of all clusters, which runs in a daemon thread; raises ClusterError.
 
-    Dask starts its own loop while holding a lock that a failed client also acquires when it is
-    garbage-collected. Collection in the starting thread would block the start for ten seconds.
+    Dask would start its own loop while holding a lock, which a failed client also acquires when it
+    is garbage-collected. A collection in the starting thread would block the start for ten seconds.
     """
     from tornado.ioloop import IOLoop
 
-    started: queue.SimpleQueue[IOLoop] = queue.SimpleQueue()
+    loops: queue.SimpleQueue[IOLoop] = queue.SimpleQueue()
 
-    async def run() -> None:
-        started.put(IOLoop.current())
+    async def serve() -> None:
+        loops.put(IOLoop.current())
         await asyncio.Event().wait()
 
-    def begin() -> None:
-        # A terminal sends Ctrl-C to all processes. Only this process handles it and ends the
-        # others; they inherit the signals blocked here.
+    def run_loop() -> None:
+        # A terminal sends SIGINT to all processes. Only this process handles it and ends the
+        # workers, which inherit the signal mask set here.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        asyncio.run(run())
+        asyncio.run(serve())
 
-    threading.Thread(target=begin, name='cluster', daemon=True).start()
+    threading.Thread(target=run_loop, name='cluster', daemon=True).start()
     try:
-        return started.get(timeout=THREAD_START_TIMEOUT_S)
+        return loops.get(timeout=THREAD_START_TIMEOUT_S)
     except queue.Empty as error:
         raise ClusterError('the thread of the Dask client did not start within '
                            f'{THREAD_START_TIMEOUT_S:.0f} s') from error
 
 
 def _local(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
-    """Client of processes on this machine."""
+    """Start worker processes on this machine and return their client."""
     # Starting Python's resource tracker unblocks SIGINT in the calling thread, which must not be
     # the thread of the event loop.
     resource_tracker.ensure_running()
     cluster = stack.enter_context(distributed.LocalCluster(
         loop=_event_loop(), n_workers=workers, threads_per_worker=1, processes=True,
         dashboard_address=':0',
-        # Exceptions of a task are returned as its result; they need no log.
+        # The exception of a task is returned as its result and need not be logged.
         silence_logs=logging.CRITICAL,
         # Each worker uses one core.
         env={'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}))
@@ -259,17 +260,17 @@ async def _reach(address: str) -> None:
 
 
 def _remote(distributed: Any, address: str) -> 'Client':
-    """Client of a running scheduler; raises ClusterError."""
+    """Connect a client to a running scheduler; raises ClusterError."""
     loop = _event_loop()
     try:
-        # A client that cannot connect remains incomplete and reports errors when it is collected.
+        # A client that cannot connect reports errors when it is garbage-collected.
         distributed.utils.sync(loop, _reach, address)
         client: Client = distributed.Client(address, timeout=CONNECT_TIMEOUT_S, loop=loop)
     except (OSError, ValueError) as error:
         raise ClusterError(f'{address}: no response from a Dask scheduler ({error})') from error
     try:
         client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
-    except _TIME_OUT as error:
+    except _TIMEOUT_ERRORS as error:
         client.close()
         raise ClusterError(f'{address}: the scheduler has no workers') from error
     return client

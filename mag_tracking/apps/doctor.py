@@ -1,4 +1,4 @@
-"""Diagnosis of a sensor network and its readings, as by `mag-tracking doctor`."""
+"""Diagnosis of a sensor network and its readings, for the command `mag-tracking doctor`."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from mag_tracking.apps.doctor_covariances import covariance_findings
+from mag_tracking.apps.doctor_rejections import rejection_advice
 from mag_tracking.apps.prescan import prescan_of
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import consensus, disagreements
 from mag_tracking.network import SensorNetwork
@@ -27,24 +29,11 @@ MAX_FROZEN_S = 30.0
 MAX_CLOCK_DIFFERENCE_S = 60.0
 """Maximum difference between the clocks of sensors [s]."""
 
-_ADVICE = (
-    ('above', 'check for gauss or microtesla published as tesla; near a magnet, raise '
-     'calibrate.max_field'),
-    ('unknown sensor', 'add the sensor to the network file'),
-    ('duplicate', 'the driver publishes readings twice, or its timestamps are too coarse'),
-    ('out of order', 'check for two publishers on one topic, and for a clock that was set'),
-    ('stamp too far ahead', 'check for a clock step or corrupt messages'),
-    ('no axis', 'check the sensor and its driver'),
-    ('infinite', 'check the driver'),
-    ('covariance', 'publish zeros if the noise is unknown'),
-    ('undecodable', 'the recording is damaged, or its message type differs'))
-"""Advice for rejected readings: (part of the cause, advice)."""
-
 MIN_MISSED_TARGETS = 3
-"""Number of missed targets in succession after which a sensor is reported."""
+"""Number of consecutive missed targets at which a sensor is reported."""
 
 LEVEL_STEP = 1e-8
-"""Rounding of levels that are compared; a fiftieth of the field of iron near a sensor [T]."""
+"""Step to which levels are rounded for comparison; a fiftieth of the field of nearby iron [T]."""
 
 
 def level_of(calibrate: Calibrate, name: str, health: SensorHealth) -> FloatArray:
@@ -85,7 +74,7 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
     """
     found = list(_clock_findings(network, sensors))
     levels = np.array([level_of(calibrate, name, sensors[name]) for name in network.names])
-    # Rounded levels are equal after small changes, which need no new comparison.
+    # Rounded levels stay equal during small changes, so that no new comparison is needed.
     levels = LEVEL_STEP * np.round(levels / LEVEL_STEP)
     std = np.array([np.full(3, np.deg2rad(survey.stated_std_deg)) if s is None else s
                     for s in network.orientation_std])
@@ -105,18 +94,19 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
 
 def _clock_findings(network: SensorNetwork,
                     sensors: Mapping[str, SensorHealth]) -> Iterator[Finding]:
-    """Report sensors whose clock differs from those of the others."""
+    """Report sensors whose clock differs from the clocks of other sensors."""
     delays = {name: sensors[name].delay_s[0] for name in network.names}
     delays = {name: d for name, d in delays.items() if not np.isnan(d)}
     if not delays:
         return
-    # The clock nearest to that of the host is the reference; in a replay, all differ equally.
+    # The clock nearest to the host clock is the reference. In a replay, all clocks differ from the
+    # host clock by about the same time.
     reference = min(delays.values(), key=abs)
     for name, delay in delays.items():
         if abs(delay - reference) > MAX_CLOCK_DIFFERENCE_S:
             yield Finding(True, name, f'its timestamps differ by {reference - delay:+.4g} s from '
-                          'those of other sensors', 'set its clock (chrony, PTP); knocks correct '
-                          'only offsets below survey.max_clock_offset_s')
+                          'the timestamps of other sensors', 'set its clock (chrony, PTP); knocks '
+                          'correct only offsets below survey.max_clock_offset_s')
 
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
@@ -139,9 +129,9 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
     """
     background, last = calibrate.backgrounds()[name], calibrate.last_stamp_ns(name)
     if last is not None and not background.ready and background.stuck:
-        yield Finding(True, name, 'its readings do not change, and it is not used', 'the sensor is '
-                      'stuck, or its resolution is too coarse: move iron near it; with background '
-                      'and noise_std in the network file it is used')
+        yield Finding(True, name, 'its readings do not change, and the sensor is not used', 'move '
+                      'iron near it to check whether it is stuck or too coarse; to use it, set '
+                      'background and noise_std in the network file')
     elif last is not None and not background.ready:
         yield Finding(True, name, 'no background was learnt', 'begin without a target for a few '
                       'seconds, or set background and noise_std in the network file')
@@ -150,9 +140,10 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       'begin without a target for a few seconds, or set background and noise_std '
                       'in the network file')
     if background.n_relearnt > n_reported:
-        yield Finding(False, name, 'a lasting change of the field became its background '
-                      f'{background.n_relearnt - n_reported} times', 'check for a parked vehicle '
-                      'or an object near it; calibrate.relearn_s: 0 disables relearning')
+        times = quantity(background.n_relearnt - n_reported, 'time')
+        yield Finding(False, name, f'a lasting change of the field became its background {times}',
+                      'check for a parked vehicle or an object near it; calibrate.relearn_s: 0 '
+                      'disables relearning')
     if last is not None and frozen_since_ns is not None \
             and (last - frozen_since_ns) / NS > MAX_FROZEN_S:
         yield Finding(False, name, 'its background has been frozen for '
@@ -161,27 +152,28 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
 
 
 class MissedTargets:
-    """Counts the targets sensed by other sensors while the reading of a sensor stays constant.
+    """Counts targets that other sensors detect while the readings of a sensor stay constant.
 
     Parameters
     ----------
     names : tuple of str
-        Sensors.
+        Names of the sensors.
     """
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self._missed: dict[str, Counter[str]] = {name: Counter() for name in names}
 
     def add_target(self, name: str, begin_ns: int, sensors: Mapping[str, SensorHealth]) -> None:
-        """Add a target that has ended at one sensor.
+        """Add a target that one sensor detected and that has passed.
 
         Parameters
         ----------
         name : str
             Sensor that detected the target.
         begin_ns : int, ns
-            Beginning of the target.
+            Time at which the detection began.
         sensors : {name: SensorHealth}
+            Health of all sensors.
         """
         for other, health in sensors.items():
             since_ns = health.unchanged_since_ns
@@ -191,7 +183,7 @@ class MissedTargets:
                 self._missed[other].clear()
 
     def findings(self) -> Iterator[Finding]:
-        """Report each sensor that missed several targets in succession.
+        """Report each sensor that missed several consecutive targets.
 
         Yields
         ------
@@ -200,9 +192,9 @@ class MissedTargets:
         for name, missed in self._missed.items():
             for other, n in missed.most_common(1):
                 if n >= MIN_MISSED_TARGETS:
-                    yield Finding(True, name, f'its readings did not change while {other} sensed '
-                                  f'{n} targets', 'the sensor is stuck, too far away, or too '
-                                  'coarse: move iron near it')
+                    yield Finding(True, name, f'its readings did not change while {other} detected '
+                                  f'{n} targets', 'move iron near the sensor to check whether it '
+                                  'is stuck, too far away, or too coarse')
 
 
 class Doctor:
@@ -251,12 +243,12 @@ class Doctor:
                 self._missed.add_target(name, begin_ns, self.sensors)
 
     def findings(self) -> list[Finding]:
-        """Return all findings so far.
+        """Return the findings from all readings so far.
 
         Returns
         -------
         list of Finding
-            Serious ones first.
+            Serious findings first.
         """
         found: list[Finding] = []
         for j, (name, health) in enumerate(self.sensors.items()):
@@ -268,8 +260,9 @@ class Doctor:
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)
         for cause, n in rejected(self.calibrate.counts).items():
-            advice = next((a for key, a in _ADVICE if key in cause), 'check the driver')
-            found.append(Finding(n > 100, 'calibrate', f'{n} readings rejected: {cause}', advice))
+            found.append(Finding(
+                n > 100, 'calibrate', f'{quantity(n, "reading")} rejected: {cause}',
+                rejection_advice(cause)))
         warning = frame_period_warning(self._settings.align, self.network)
         if warning:
             found.append(Finding(True, 'align', warning, 'set align.period_s to 0 (auto)'))
@@ -294,9 +287,9 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
     Returns
     -------
     doctor : Doctor
-        After the recording has been read.
+        Doctor after reading the recording.
     findings : list of Finding
-        Damage of the recording, not included in the findings of the doctor.
+        Damage to the recording, which the findings of `doctor` do not include.
 
     Raises
     ------
@@ -309,8 +302,8 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
         doctor.feed(readings, received_ns)
         if stopped is not None and stopped():
             break
-    lost = [Finding(True, recording.path.name, f'{what}: {n}', 'the recording is damaged: run '
-                    'mag-tracking repair') for what, n in recording.losses.items()]
-    lost += [Finding(False, 'recording', f'{what}: {n}', 'the recording is damaged, or its '
-                     'message type differs') for what, n in reader.rejected.items()]
-    return doctor, lost
+    damage = [Finding(True, recording.path.name, f'{cause}: {n}', 'the recording is damaged: run '
+                      'mag-tracking repair') for cause, n in recording.losses.items()]
+    damage += [Finding(False, 'recording', f'{cause}: {n}', 'the recording is damaged, or its '
+                       'message type differs') for cause, n in reader.rejected.items()]
+    return doctor, damage

@@ -4,17 +4,18 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.sensor_health import Finding
 
 MAX_MISMATCH = 3.0
-"""Factor within which a likely cause must explain the difference of the noise."""
+"""Factor within which a likely cause must explain the ratio of declared to measured noise."""
 
 _UNITS = (('millitesla', 1e3), ('gauss', 1e4), ('microtesla', 1e6), ('nanotesla', 1e9))
 
 
 def likely_cause(stated: float, measured: float) -> str:
-    """Guess why the noise stated in messages differs from that of the readings.
+    """Guess why the noise declared in messages differs from the noise of the readings.
 
     Parameters
     ----------
@@ -26,6 +27,7 @@ def likely_cause(stated: float, measured: float) -> str:
     Returns
     -------
     str
+        Content of the covariance field, such as 'a placeholder'.
     """
     if abs(np.log(stated**2 / measured)) < np.log(MAX_MISMATCH):
         return 'the standard deviation instead of the variance'
@@ -38,7 +40,7 @@ def likely_cause(stated: float, measured: float) -> str:
 
 
 def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator[Finding]:
-    """Report a sensor whose messages state another noise than its readings show.
+    """Report a sensor whose messages declare a different noise than its readings have.
 
     Parameters
     ----------
@@ -52,22 +54,22 @@ def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator
     ------
     Finding
     """
-    n, stated, measured = calibrate.overruled(name)
+    n, declared, measured = calibrate.overruled(name)
     if not n:
         return
-    advice = (f'the measured noise was used {n} times; configure the driver to publish the '
-              'variance in T^2, or zeros if it is unknown (calibrate.trust_covariances: true uses '
-              'the covariances unchecked)')
-    known = (stated > 0.0) & np.isfinite(stated) & (measured > 0.0)
-    if not known.any() or np.abs(np.log(stated[known] / measured[known])).max() < np.log(2.0):
+    advice = (f'the measured noise was used {quantity(n, "time")}; configure the driver to publish '
+              'the variance in T^2, or zeros if it is unknown (calibrate.trust_covariances: true '
+              'uses the covariances unchecked)')
+    valid = (declared > 0.0) & np.isfinite(declared) & (measured > 0.0)
+    if not valid.any() or np.abs(np.log(declared[valid] / measured[valid])).max() < np.log(2.0):
         yield Finding(False, name, f'the covariances on {topic} contradict the quiet readings '
                       '(not positive definite, not finite, or with correlated axes)', advice)
         return
-    ratio = np.full(3, -1.0)
-    ratio[known] = np.abs(np.log(stated[known] / measured[known]))
-    axis = int(np.argmax(ratio))
+    log_ratio = np.full(3, -1.0)
+    log_ratio[valid] = np.abs(np.log(declared[valid] / measured[valid]))
+    axis = int(np.argmax(log_ratio))
     yield Finding(
-        False, name, f'the messages on {topic} state a noise of {1e9 * stated[axis]:.3g} nT, but '
+        False, name, f'the messages on {topic} state a noise of {1e9 * declared[axis]:.3g} nT, but '
         f'quiet readings have {1e9 * measured[axis]:.3g} nT '
-        f'(likely {likely_cause(float(stated[axis]), float(measured[axis]))})',
+        f'(likely cause: {likely_cause(float(declared[axis]), float(measured[axis]))})',
         advice)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mag_tracking.apps.doctor import Doctor
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.files import replace_text
 from mag_tracking.report.page import ERROR, NOTE, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, plain
@@ -21,7 +22,7 @@ def write_report(doctor: Doctor, findings: Sequence[Finding], subject: str, path
     doctor : Doctor
     findings : sequence of Finding
     subject : str
-        Name of what was examined.
+        Name of the examined recording or network.
     path : Path
         File to write.
 
@@ -41,7 +42,7 @@ def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Pa
     doctor : Doctor
     findings : sequence of Finding
     subject : str
-        Name of what was examined.
+        Name of the examined recording or network.
 
     Returns
     -------
@@ -50,8 +51,10 @@ def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Pa
     notes = [Note(ERROR if f.serious else NOTE, f'{f.subject}: {f.what}. {f.advice}')
              for f in findings] or [Note(NOTE, 'no faults found')]
     serious = sum(f.serious for f in findings)
-    return Page(f'Health of {subject}', f'{serious} serious findings, {len(findings) - serious} '
-                'notes', notes, None, [_noise(doctor), _rates(doctor)], [_table(doctor)])
+    numbers = (f'{quantity(serious, "serious finding")}, '
+               f'{quantity(len(findings) - serious, "note")}')
+    return Page(f'Health of {subject}', numbers, notes, None, [_noise(doctor), _rates(doctor)],
+                [_table(doctor)])
 
 
 def _noise(doctor: Doctor) -> Chart:
@@ -76,7 +79,7 @@ def _rates(doctor: Doctor) -> Chart:
 
 
 def _table(doctor: Doctor) -> Table:
-    """Table of the sensors."""
+    """Table of the readings, faults, field and delay of each sensor."""
     rows: list[list[str | float | None]] = []
     for name, health in doctor.sensors.items():
         c, delay = health.counts, float(health.delay_s[0])

@@ -7,6 +7,7 @@ from os import PathLike
 from typing import Any
 
 from mag_tracking.apps.prescan import prescan_of
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.readings import network_of
 from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
@@ -21,7 +22,7 @@ from mag_tracking.stages.stage import rejected
 
 @dataclass(frozen=True, eq=False)
 class EventsResult:
-    """Events in a recording."""
+    """Pass events in a recording."""
 
     events: tuple[PassEvent, ...]
     """Events in the order in which they ended."""
@@ -44,7 +45,7 @@ class EventsResult:
 
     def __repr__(self) -> str:
         counts = ', '.join(f'{n} of {name}' for name, n in self.counts().items())
-        return f'EventsResult({len(self.events)} events: {counts or "none"})'
+        return f'EventsResult({quantity(len(self.events), "event")}: {counts or "none"})'
 
 
 def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],

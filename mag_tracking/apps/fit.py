@@ -1,4 +1,4 @@
-"""Fit the passes of a recording, offline."""
+"""Offline fits of the passes in a recording."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ import numpy as np
 
 from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
 from mag_tracking.apps.prescan import prescan_of
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.readings import network_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
@@ -45,7 +46,8 @@ class RecordingFit:
     orders : sequence of int
         Numbers of dipoles to try.
     cpa_range : (range, std), m, optional
-        Range at the closest point of approach, for a network of one sensor; see `fit_pass`.
+        Range at the closest point of approach, only for a network of one sensor; see
+        `analysis.pass_fit.fit_pass`.
 
     Raises
     ------
@@ -63,7 +65,7 @@ class RecordingFit:
 
     def passes(self, progress: Callable[[int], object] | None = None,
                stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """Iterate over the fitted passes as they are completed.
+        """Read the recording and yield each pass after its fit.
 
         Parameters
         ----------
@@ -112,10 +114,10 @@ class FitResult:
     passes: tuple[FittedPass, ...]
     """One entry per pass and vehicle."""
     warnings: tuple[str, ...]
-    """Lines on lost or rejected readings and on unused sensors."""
+    """Warnings about lost or rejected readings and unused sensors."""
 
     def __repr__(self) -> str:
-        return (f'FitResult({len(self.passes)} passes'
+        return (f'FitResult({quantity(len(self.passes), "pass", "passes")}'
                 + (f'; warnings: {"; ".join(self.warnings)}' if self.warnings else '') + ')')
 
     def to_dataframe(self) -> 'pd.DataFrame':
@@ -131,8 +133,8 @@ class FitResult:
         MissingDependencyError
             If pandas is not installed.
         """
-        rows = [row for one in self.passes for row in pass_rows(one)]
-        # A fit without an estimate has an empty text in this column.
+        rows = [row for fitted in self.passes for row in pass_rows(fitted)]
+        # A fit without an estimate has an empty string in this column.
         columns = {c: [np.nan if c == 'ambiguous' and row[c] == '' else row[c] for row in rows]
                    for c in FIT_COLUMNS}
         return dataframe(columns, FIT_UNITS)
@@ -155,7 +157,7 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
     orders : sequence of int
         Numbers of dipoles to try, 1 to 8.
     cpa_range : (range, std), m, optional
-        Range at the closest point of approach, for a network of one sensor; see
+        Range at the closest point of approach, only for a network of one sensor; see
         `analysis.pass_fit.fit_pass`.
 
     Returns
@@ -181,7 +183,7 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
 
 
 def check_orders(name: str, orders: Sequence[int]) -> None:
-    """Check that the numbers of dipoles are different and from 1 to 8.
+    """Check that the numbers of dipoles are distinct and from 1 to 8.
 
     Parameters
     ----------
@@ -192,14 +194,14 @@ def check_orders(name: str, orders: Sequence[int]) -> None:
     Raises
     ------
     SettingsError
-        If they are not.
+        If a number is repeated or out of range, or there is no number.
     """
     if not len(orders) or min(orders) < 1 or max(orders) > 8 or len(set(orders)) < len(orders):
         raise SettingsError(f'{name}: expected different numbers from 1 to 8, got {list(orders)}')
 
 
 def check_cpa_range(name: str, cpa_range: Sequence[float] | None, network: SensorNetwork) -> None:
-    """Check the range at the closest point of approach.
+    """Check the range at the closest point of approach, which requires a single sensor.
 
     Parameters
     ----------

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, PassFit
 from mag_tracking.apps.pass_fitter import FittedPass
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.report.fit_figures import target_alone
@@ -24,7 +25,7 @@ N_POSES = 120
 
 def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
                  out: Path) -> Path:
-    """Write `report.html`.
+    """Write the report of fitted passes to `report.html`.
 
     Parameters
     ----------
@@ -33,7 +34,7 @@ def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings:
     warnings : sequence of str
         Lines of `RecordingFit.warnings` of all recordings.
     out : Path
-        Folder.
+        Output folder.
 
     Returns
     -------
@@ -67,35 +68,45 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
     -------
     Page
     """
-    notes = [Note(WARNING, text) for text in warnings]
+    notes = [Note(WARNING, text) for text in (*warnings, *_poor_fits(passes))]
     if not passes:
         notes.append(Note(NOTE, 'no passes: nothing was detected'))
-    if any(one.n_vehicles > 1 for one in passes):
+    if any(fitted.n_vehicles > 1 for fitted in passes):
         notes.append(Note(NOTE, 'for vehicles fitted together, the measured field is shown without '
-                          'that of the others'))
+                          'the field of the other vehicles'))
     begins = [ns / NS for ns in _begins_ns(passes)]
-    if len({one.recording for one in passes}) > 1:
-        notes.append(Note(NOTE, 'the recordings follow each other on the time axis'))
-    tracks = [_track(k + 1, one, one.chosen, begins[k])
-              for k, one in enumerate(passes) if one.chosen is not None]
-    ends = [begins[k] + float(one.fits[0].data.t.max()) for k, one in enumerate(passes)]
+    if len({fitted.recording for fitted in passes}) > 1:
+        notes.append(Note(NOTE, 'the time axis shows the recordings one after another'))
+    tracks = [_pass_entry(k + 1, fitted, fitted.chosen, begins[k])
+              for k, fitted in enumerate(passes) if fitted.chosen is not None]
+    ends = [begins[k] + float(fitted.fits[0].data.t.max()) for k, fitted in enumerate(passes)]
     scene = scene_of(network, 0, int(max(ends) * NS), tracks) if tracks else None
     n_estimates = len(tracks)
-    n_passes = len({(one.recording, one.number) for one in passes})
-    several = f', {len(passes)} vehicles' if len(passes) > n_passes else ''
-    return Page(f'{n_passes} pass{"es" * (n_passes != 1)}{several}, {n_estimates} with an estimate',
+    n_passes = len({(fitted.recording, fitted.number) for fitted in passes})
+    several = f', {quantity(len(passes), "vehicle")}' if len(passes) > n_passes else ''
+    return Page(f'{quantity(n_passes, "pass", "passes")}{several}, {n_estimates} with an estimate',
                 'each fitted as a row of dipoles at constant velocity', notes, scene,
                 [_order_chart(passes)] if passes else [], [_table(passes)])
 
 
+def _poor_fits(passes: Sequence[FittedPass]) -> list[str]:
+    """Warning about chosen fits with a high cost, in at most one line."""
+    costs = [fitted.chosen.normalised_cost for fitted in passes if fitted.chosen is not None]
+    n_poor = sum(cost > MAX_NORMALISED_COST for cost in costs)
+    if not n_poor:
+        return []
+    return [f'poor fits (normalised cost above {MAX_NORMALISED_COST:g}): {n_poor} of {len(costs)}; '
+            'their errors of speed and position may be several standard deviations']
+
+
 def _begins_ns(passes: Sequence[FittedPass]) -> list[int]:
-    """Time of the strongest field of each pass on the time axis of the page [ns]."""
+    """Return the time of the strongest field of each pass on the time axis of the page [ns]."""
     out: list[int] = []
     recording, shift, end = '', 0, 0
-    for one in passes:
-        data = one.fits[0].data
-        if one.recording != recording:
-            recording = one.recording
+    for fitted in passes:
+        data = fitted.fits[0].data
+        if fitted.recording != recording:
+            recording = fitted.recording
             first = data.stamp_ns + int(NS * data.t.min())
             shift = end + (int(RECORDING_GAP_S * NS) if out else 0) - first
         out.append(data.stamp_ns + shift)
@@ -103,57 +114,53 @@ def _begins_ns(passes: Sequence[FittedPass]) -> list[int]:
     return out
 
 
-def _track(number: int, one: FittedPass, fit: PassFit, begin: float) -> dict[str, Any]:
-    """Chosen fit of a pass, JSON-ready."""
+def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, begin: float) -> dict[str, Any]:
+    """Create the scene entry of the chosen fit of a pass, as JSON-compatible values."""
     data = fit.data
     t = np.linspace(data.t.min(), data.t.max(), N_POSES)
     F = np.tile(np.eye(6), (N_POSES, 1, 1))
     F[:, :3, 3:] = t[:, None, None] * np.eye(3)
     state = F @ fit.x[:6]
     C = F @ fit.robust_covariance[:6, :6] @ F.transpose(0, 2, 1)
-    alone = target_alone(fit)
-    level = fit.predicted - alone
-    fields = [field_entry(int(j), (data.field - level)[data.sensor == j], alone[data.sensor == j],
-                          begin + data.t[data.sensor == j]) for j in data.sensors]
+    target_field = target_alone(fit)
+    other_field = fit.predicted - target_field
+    fields = [field_entry(int(j), (data.field - other_field)[data.sensor == j],
+                          target_field[data.sensor == j], begin + data.t[data.sensor == j])
+              for j in data.sensors]
     entry = fitted_entry(number, begin + t, state, C, fit.ambiguous, fields)
     entry['facts'] = {
-        'label': f'{one.recording}, {one.label}', 'kind': _dipoles(fit.n_dipoles),
+        'label': f'{fitted.recording}, {fitted.label}', 'kind': quantity(fit.n_dipoles, 'dipole'),
         'speed': float(fit.speed[0]), 'moment': float(np.linalg.norm(fit.moment[0])),
         'verdict': ('ambiguous' if fit.ambiguous else 'unique')
         + f', cost {fit.normalised_cost:.2f}'}
     return entry
 
 
-def _dipoles(n: int) -> str:
-    """Number of dipoles in words."""
-    return f'{n} dipole{"s" * (n > 1)}'
-
-
 def _order_chart(passes: Sequence[FittedPass]) -> Chart:
-    """Normalised cost over the number of dipoles."""
+    """Chart of the normalised cost over the number of dipoles."""
     traces = []
-    for k, one in enumerate(passes):
-        fits = [f for f in one.fits if len(f.x)]
+    for k, fitted in enumerate(passes):
+        fits = [f for f in fitted.fits if len(f.x)]
         traces.append(curve([f.n_dipoles for f in fits], [f.normalised_cost for f in fits],
-                            f'{one.recording}, {one.label}', k, 'lines+markers'))
-    layout = axes('number of dipoles', 'normalised cost (1 = the model is right)', log_y=True)
+                            f'{fitted.recording}, {fitted.label}', k, 'lines+markers'))
+    layout = axes('number of dipoles', 'normalised cost (1 = consistent with noise)', log_y=True)
     layout['xaxis']['dtick'] = 1
     return Chart('Quality of the fits by number of dipoles', traces, layout)
 
 
 def _table(passes: Sequence[FittedPass]) -> Table:
-    """Table of all model orders of all passes."""
+    """Table of the fits of all passes with all numbers of dipoles."""
     rows: list[list[str | float | None]] = []
-    for one in passes:
-        for fit in one.fits:
-            row: list[str | float | None] = [one.recording, one.label.removeprefix('pass '),
+    for fitted in passes:
+        for fit in fitted.fits:
+            row: list[str | float | None] = [fitted.recording, fitted.label.removeprefix('pass '),
                                              fit.n_dipoles]
             known = bool(len(fit.x)) and not fit.reason
             row += [float(fit.normalised_cost) if len(fit.x) else None]
             row += [*map(float, fit.position), float(fit.speed[0]),
                     float(np.degrees(fit.heading[0])), float(fit.length[0]),
                     float(np.linalg.norm(fit.moment[0]))] if known else [None] * 7
-            row += ['chosen' if fit is one.chosen else fit.reason]
+            row += ['chosen' if fit is fitted.chosen else fit.reason]
             rows.append(row)
     return Table('All fits', ['recording', 'pass', 'dipoles', 'cost', 'x [m]', 'y [m]', 'z [m]',
                               'speed [m/s]', 'heading [deg]', 'length [m]', 'moment [A m²]', ''],

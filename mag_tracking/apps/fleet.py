@@ -35,8 +35,8 @@ def induction_of(network: SensorNetwork) -> FloatArray:
         If the Earth's field is unknown.
     """
     if network.earth_field is None or not network.earth_field.any():
-        raise NetworkError('add earth_field to the network file; hard and soft iron cannot be '
-                           'separated without it')
+        raise NetworkError('hard and soft iron cannot be separated without the field of the Earth: '
+                           'add earth_field to the network file')
     return network.earth_field / MU0
 
 
@@ -65,7 +65,7 @@ def pass_of(recording: str, passages: Sequence[VehiclePassage]) -> FleetPass:
     (p,) = passages
     if p.ambiguous:
         raise LabelsError(f'{recording}: the passage is ambiguous ({", ".join(p.doubts)}); record '
-                          'another one')
+                          'another passage')
     return FleetPass(p.moment, p.moment_covariance, _heading(p), f'{recording} {p.number}')
 
 
@@ -94,12 +94,12 @@ class Fleet:
     def __init__(self, passes: dict[str, list[FleetPass]], network: SensorNetwork) -> None:
         self._induction = induction_of(network)
         self.vehicles: list[EnrolledVehicle] = []
-        for name, mine in passes.items():
+        for name, vehicle_passes in passes.items():
             try:
                 self.vehicles.append(enrol(
-                    name, np.array([p.moment for p in mine]).reshape(-1, 3),
-                    np.array([p.covariance for p in mine]).reshape(-1, 3, 3),
-                    np.array([p.heading for p in mine]), self._induction))
+                    name, np.array([p.moment for p in vehicle_passes]).reshape(-1, 3),
+                    np.array([p.covariance for p in vehicle_passes]).reshape(-1, 3, 3),
+                    np.array([p.heading for p in vehicle_passes]), self._induction))
             except ValueError as error:
                 raise LabelsError(str(error)) from error
 
@@ -119,5 +119,5 @@ class Fleet:
 
 
 def _heading(passage: VehiclePassage) -> float:
-    """Heading of the velocity [rad]."""
+    """Heading of a passage [rad]."""
     return float(np.arctan2(passage.velocity[1], passage.velocity[0]))

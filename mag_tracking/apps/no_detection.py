@@ -4,13 +4,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
 
 MAX_NOISE_RATIO = 3.0
-"""Ratio of stated noise to scatter of the readings above which the stated noise is the cause."""
+"""Ratio of configured noise to scatter above which the noise is considered the cause."""
 
 
 def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
@@ -23,9 +24,9 @@ def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: C
     network : SensorNetwork
     settings : Settings
     calibrate : Calibrate
-        Stage after the whole recording.
+        Calibration stage after the whole recording.
     detect : Detect
-        Stage after the whole recording.
+        Detection stage after the whole recording.
     missing_topics : sequence of str
         Topics of the network that were not recorded.
     rejected : {cause: number}
@@ -41,7 +42,7 @@ def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: C
     n_accepted = sum(calibrate.counts_of(name)['accepted'] for name in network.names)
     if not n_accepted and rejected:
         cause, n = max(rejected.items(), key=lambda item: item[1])
-        return f'no reading was usable: {n} were rejected ({cause})'
+        return f'no reading was usable: {quantity(n, "was", "were")} rejected ({cause})'
     if not n_accepted:
         return 'there were no readings on ' + ', '.join(
             missing_topics or network.absolute_topics)
@@ -54,27 +55,28 @@ def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: C
                 f'{settings.calibrate.learn_s:g} s (calibrate.learn_s); set background and '
                 'noise_std in the network file')
     excursions = detect.largest_excursions()
-    sizes = ', '.join(f'{name} {size:.2g}' for name, size in zip(
+    by_sensor = ', '.join(f'{name} {ratio:.2g}' for name, ratio in zip(
         network.names, excursions.tolist(), strict=True))
-    return (f'the largest excursion was {detect.largest_excursion:.2g} of the threshold '
-            f'({sizes}); {_likely_cause(network, settings, calibrate, detect)}')
+    return (f'the largest excursion was {detect.largest_excursion:.2g} times the threshold '
+            f'({by_sensor}); {_likely_cause(network, settings, calibrate, detect)}')
 
 
 def _likely_cause(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
                   detect: Detect) -> str:
-    """Setting or entry of the network file that probably prevented a detection."""
+    """Describe the setting or network-file entry that probably prevented a detection."""
     unready = calibrate.unready()
     if unready:
         return f'{", ".join(unready)} had no background and could not be used'
     for name, noise in zip(network.names, network.noise_std, strict=True):
         scatter = calibrate.backgrounds()[name].scatter_std
-        known = ~np.isnan(scatter)
-        if noise is not None and known.any() and (noise / scatter)[known].max() > MAX_NOISE_RATIO:
+        valid = ~np.isnan(scatter)
+        if noise is not None and valid.any() and (noise / scatter)[valid].max() > MAX_NOISE_RATIO:
             return (f'noise_std of {name} in the network file is '
-                    f'{(noise / scatter)[known].max():.2g} times the scatter of its readings')
+                    f'{(noise / scatter)[valid].max():.2g} times the scatter of its readings')
     if detect.largest_excursion > 1.0:
-        return (f'it lasted for {detect.max_consecutive_above} consecutive frames, but '
-                f'detect.onset_frames is {settings.detect.onset_frames}')
+        frames = quantity(detect.max_consecutive_above, 'consecutive frame')
+        return (f'it lasted for {frames}, but detect.onset_frames is '
+                f'{settings.detect.onset_frames}')
     if settings.calibrate.trust_covariances:
         return ('the covariances of the messages are used unchecked '
                 '(calibrate.trust_covariances)')

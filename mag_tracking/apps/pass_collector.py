@@ -25,14 +25,14 @@ MAX_PASS_S = 60.0
 
 
 class PassCollector:
-    """Extracts passes from readings: all measurements from before a detection until its end.
+    """Extracts passes from readings: all measurements from `PAD_S` before an onset to the release.
 
     Parameters
     ----------
     network : SensorNetwork
     settings : Settings
     on_frame : function, optional
-        Called with every `FieldFrame` after detection.
+        Called with every `FieldFrame` that the detection stage has processed.
     """
 
     def __init__(self, network: SensorNetwork, settings: Settings,
@@ -41,7 +41,7 @@ class PassCollector:
         self._max_field = settings.calibrate.max_field
         self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
                         Detect(network, settings.detect))
-        # Raw and calibrated readings, in network time, from before the latest onset.
+        # Raw and calibrated readings, in network time, from `PAD_S` before the latest onset.
         self._raw: deque[Readings] = deque()
         self._calibrated: deque[Readings] = deque()
         self._onset_ns: int | None = None
@@ -54,7 +54,7 @@ class PassCollector:
 
     @property
     def rejected(self) -> dict[str, int]:
-        """Number of unused samples by cause: {cause: number}."""
+        """Rejected readings: {cause: number}."""
         total: dict[str, int] = {}
         for stage in self._stages[:2]:
             for cause, n in rejected(stage.counts).items():
@@ -76,10 +76,10 @@ class PassCollector:
         """
         calibrate, _, detect = self._stages
         return no_detection_reason(self._network, self._settings, calibrate, detect, missing_topics,
-                                self.rejected)
+                                   self.rejected)
 
     def sensors_without_background(self) -> list[str]:
-        """Names of the sensors whose background was never learnt.
+        """Return the names of the sensors whose background was never learnt.
 
         Returns
         -------
@@ -88,7 +88,7 @@ class PassCollector:
         return self._stages[0].unready()
 
     def feed(self, readings: Readings) -> list[tuple[PassData, tuple[str, ...]]]:
-        """Add raw readings and return the passes completed by them.
+        """Add raw readings and return the passes that they complete.
 
         Parameters
         ----------
@@ -97,7 +97,7 @@ class PassCollector:
         Returns
         -------
         list of (PassData, notes)
-            Notes are texts for the user.
+            Measurements of each pass, and notes for the user.
         """
         calibrate, align, _ = self._stages
         out: list[tuple[PassData, tuple[str, ...]]] = []
@@ -120,6 +120,7 @@ class PassCollector:
         Returns
         -------
         list of (PassData, notes)
+            Measurements of the pass, and notes for the user.
         """
         calibrate, align, _ = self._stages
         out: list[tuple[PassData, tuple[str, ...]]] = []
@@ -133,8 +134,8 @@ class PassCollector:
         return out
 
     def _add_frame(self, frame: FieldFrame) -> list[tuple[PassData, tuple[str, ...]]]:
-        """Detect targets in a frame; return the passes that end with it."""
-        out = []
+        """Detect targets in a frame; return the passes that end with this frame."""
+        passes = []
         for record in self._stages[2].feed(frame):
             if not isinstance(record, Detection):
                 if self._on_frame is not None:
@@ -143,64 +144,65 @@ class PassCollector:
             if record.onset:
                 self._onset_ns = record.stamp_ns
             elif self._onset_ns is not None:
-                out.append(self._cut(self._onset_ns, record.stamp_ns))
+                passes.append(self._cut(self._onset_ns, record.stamp_ns))
         if self._onset_ns is not None and frame.stamp_ns - self._onset_ns > MAX_PASS_S * NS:
-            out.append(self._cut(self._onset_ns, frame.stamp_ns, 'the detection lasts for more '
+            passes.append(self._cut(self._onset_ns, frame.stamp_ns, 'the detection lasts for more '
                                  f'than {MAX_PASS_S:.0f} s; the remainder is not used'))
         self._last_ns = frame.stamp_ns
         begin = (frame.stamp_ns if self._onset_ns is None else self._onset_ns) - PAD_S * NS
-        for kept in (self._raw, self._calibrated):
-            while kept and kept[0].stamp_ns.max() < begin:
-                kept.popleft()
-        return out
+        for buffer in (self._raw, self._calibrated):
+            while buffer and buffer[0].stamp_ns.max() < begin:
+                buffer.popleft()
+        return passes
 
     def _cut(self, onset_ns: int, end_ns: int,
              *remarks: str) -> tuple[PassData, tuple[str, ...]]:
-        """End a pass: (PassData, notes) of the readings from an onset to `end_ns`."""
+        """End the pass that began with an onset; return (PassData, notes) until `end_ns`."""
         begin = onset_ns - int(PAD_S * NS)
-        found = Readings.joined(self._calibrated)
-        found = found.part((begin <= found.stamp_ns) & (found.stamp_ns <= end_ns))
-        found = found.part(np.lexsort((found.stamp_ns, found.sensor)))
-        sensor, field, raw = found.sensor, found.field.copy(), self._raw_fields(found)
+        readings = Readings.joined(self._calibrated)
+        readings = readings.part((begin <= readings.stamp_ns) & (readings.stamp_ns <= end_ns))
+        readings = readings.part(np.lexsort((readings.stamp_ns, readings.sensor)))
+        sensor, field, raw = readings.sensor, readings.field.copy(), self._raw_fields(readings)
         covariance = np.full((len(sensor), 3, 3), np.nan)
         notes = list(remarks)
         for j in np.unique(sensor):
-            mine = np.flatnonzero(sensor == j)
-            if found.covariance is not None:
-                covariance[mine] = _common_covariance(found.covariance[mine])
+            rows = np.flatnonzero(sensor == j)
+            if readings.covariance is not None:
+                covariance[rows] = _common_covariance(readings.covariance[rows])
             for a, axis in enumerate('xyz'):
-                bad = mine[saturated_readings(raw[mine, a])]
-                if len(bad):
-                    field[bad, a] = np.nan
-                    notes.append(f'{self._network.names[j]}: {axis} was saturated in {len(bad)} '
-                                 f'of {len(mine)} samples at {raw[bad[0], a]:.3g} T; not used')
+                saturated = rows[saturated_readings(raw[rows, a])]
+                if len(saturated):
+                    field[saturated, a] = np.nan
+                    notes.append(f'{self._network.names[j]}: {axis} was saturated in '
+                                 f'{len(saturated)} of {len(rows)} samples at '
+                                 f'{raw[saturated[0], a]:.3g} T; these values are not used')
         self._onset_ns = None
-        t = (found.stamp_ns - begin) / NS
+        t = (readings.stamp_ns - begin) / NS
         return PassData(self._network, begin, t, sensor, field, covariance), tuple(notes)
 
     def _raw_fields(self, calibrated: Readings) -> FloatArray:
         """Raw fields (n, 3) [T] of calibrated readings; NaN if the raw reading is unavailable."""
         raw = Readings.joined(self._raw)
-        known: dict[tuple[int, int], int] = {}
+        row_of: dict[tuple[int, int], int] = {}
         for k, key in enumerate(zip(raw.sensor.tolist(), raw.stamp_ns.tolist(), strict=True)):
             # The calibration accepts the first usable reading of a timestamp.
             if np.nanmax(np.abs(raw.field[k]), initial=0.0) <= self._max_field:
-                known.setdefault(key, k)
+                row_of.setdefault(key, k)
         # Row -1 contains NaN.
-        rows = [known.get(key, -1) for key in zip(
+        rows = [row_of.get(key, -1) for key in zip(
             calibrated.sensor.tolist(), calibrated.stamp_ns.tolist(), strict=True)]
         fields: FloatArray = np.concatenate([raw.field, np.full((1, 3), np.nan)])[rows]
         return fields
 
 
 def _common_covariance(covariances: FloatArray) -> FloatArray:
-    """Covariances (n, 3, 3) of readings, replaced by the first if they are similar.
+    """Replace the covariances (n, 3, 3) of readings by the first one if they are similar.
 
-    While the noise is being learnt, its estimate varies slightly although the noise does not. The
-    covariance of a coarse sensor in a constant field is many times that in a changing field.
+    While the noise is being learnt, its estimate varies slightly although the noise is constant. A
+    coarse sensor has a much larger covariance in a constant field than in a changing field.
     """
-    size = np.nansum(np.einsum('kii->ki', covariances), axis=1)
-    if size.max() > 2.0 * size.min():
+    traces = np.nansum(np.einsum('kii->ki', covariances), axis=1)
+    if traces.max() > 2.0 * traces.min():
         return covariances
     common: FloatArray = np.broadcast_to(covariances[0], covariances.shape)
     return common

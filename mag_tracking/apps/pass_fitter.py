@@ -33,22 +33,22 @@ class FittedPass:
     recording: str
     """Name of the recording."""
     number: int
-    """Number of the detection."""
+    """Index of the detection in the recording, from 1."""
     fits: tuple[PassFit, ...]
     """One fit per number of dipoles."""
     notes: tuple[str, ...]
-    """Remarks, such as measurements that were not used and the reason."""
+    """Remarks for the user, such as unused measurements and the reason."""
     correlated: CorrelatedMotion = CorrelatedMotion()
     """Velocity from the delays between the sensors, independent of the model; missing if several
     vehicles were fitted together."""
     vehicle: int = 1
-    """Number among the vehicles that were fitted together, in the order in which they passed."""
+    """Index among the vehicles that were fitted together, from 1, in the order of passing."""
     n_vehicles: int = 1
     """Number of vehicles that were fitted together."""
 
     @property
     def label(self) -> str:
-        """Name in texts and file names."""
+        """Name in messages and file names."""
         return f'pass {self.number}' + (f', vehicle {self.vehicle}' if self.n_vehicles > 1 else '')
 
     @property
@@ -58,7 +58,7 @@ class FittedPass:
 
     @property
     def known(self) -> PassFit | None:
-        """Fit whose trusted values are reported: the chosen one, or else the best one.
+        """Fit whose trusted values are reported: the chosen fit, or else the fit of lowest cost.
 
         None if any fit shows that the target turned or was not a single target.
         """
@@ -73,18 +73,19 @@ class FittedPass:
     def disagreement(self) -> tuple[float, float]:
         """Largest differences [m], [m/s] between the chosen fit and fits with a similar cost.
 
-        They indicate the error of the model. NaN without such a fit, and if the residuals of the
-        chosen fit are consistent with the noise: then fits with more dipoles only fit noise.
+        The differences indicate the error of the model. They are NaN without a fit of similar
+        cost. They are also NaN if the residuals of the chosen fit are consistent with the noise,
+        because additional dipoles then fit only noise.
         """
-        best = self.chosen
-        if best is None or not best.cost > energy_threshold(1e-3, best.degrees_of_freedom):
+        chosen = self.chosen
+        if chosen is None or not chosen.cost > energy_threshold(1e-3, chosen.degrees_of_freedom):
             return np.nan, np.nan
-        others = [f for f in self.fits if f is not best and not f.reason
-                  and f.normalised_cost <= MAX_COST_RATIO * best.normalised_cost]
-        if not others:
+        similar = [f for f in self.fits if f is not chosen and not f.reason
+                   and f.normalised_cost <= MAX_COST_RATIO * chosen.normalised_cost]
+        if not similar:
             return np.nan, np.nan
-        return (max(float(np.linalg.norm(f.position - best.position)) for f in others),
-                max(float(np.linalg.norm(f.velocity - best.velocity)) for f in others))
+        return (max(float(np.linalg.norm(f.position - chosen.position)) for f in similar),
+                max(float(np.linalg.norm(f.velocity - chosen.velocity)) for f in similar))
 
 
 class PassFitter:
@@ -99,9 +100,9 @@ class PassFitter:
     network : SensorNetwork
     settings : Settings
     orders : sequence of int
-        Numbers of dipoles.
+        Numbers of dipoles to try.
     cpa_range : (range, std), m, optional
-        Range at the closest point of approach, for a network of one sensor.
+        Range at the closest point of approach, only for a network of one sensor.
 
     Attributes
     ----------
@@ -115,11 +116,11 @@ class PassFitter:
         self._tracker = TrackManager(network, settings.track)
         self._tracks, self._ground = PassTracks(settings.track), ground_prior(settings.track)
         self._orders, self._cpa_range = tuple(orders), cpa_range
-        self._n = 0
+        self._n_passes = 0
 
     def feed(self, readings: Readings,
              stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """Add raw readings and fit the passes completed by them.
+        """Add raw readings and fit the passes that they complete.
 
         Parameters
         ----------
@@ -131,10 +132,10 @@ class PassFitter:
         -------
         iterator of FittedPass
         """
-        return self._fitted(self.collector.feed(readings), stopped)
+        return self._fit_passes(self.collector.feed(readings), stopped)
 
     def flush(self, stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """End the readings and fit the pass that was still in progress.
+        """End the stream and fit the pass that was still in progress.
 
         Parameters
         ----------
@@ -145,28 +146,29 @@ class PassFitter:
         -------
         iterator of FittedPass
         """
-        return self._fitted(self.collector.flush(), stopped)
+        return self._fit_passes(self.collector.flush(), stopped)
 
     def _track(self, frame: FieldFrame) -> None:
         """Track the targets in a frame."""
         self._tracker.doubt(self.collector.calibrate.doubtful_intervals())
         self._tracks.add(self._tracker.feed(frame))
 
-    def _fitted(self, passes: Iterable[tuple[PassData, tuple[str, ...]]],
-                stopped: Callable[[], bool] | None) -> Iterator[FittedPass]:
-        """Fit passes of the collector; a pass whose fitting is stopped is discarded."""
+    def _fit_passes(self, passes: Iterable[tuple[PassData, tuple[str, ...]]],
+                    stopped: Callable[[], bool] | None) -> Iterator[FittedPass]:
+        """Fit passes; discard a pass whose fitting is stopped."""
         for data, notes in passes:
             fits = []
             for n_dipoles in self._orders:
                 if stopped is not None and stopped():
                     return
                 fits.append(fit_pass(data, n_dipoles, self._cpa_range))
-            self._n += 1
-            found = fitted_vehicles(self._recording, self._n, data, fits, self._tracks.paths(data),
-                                    self._ground, self._orders, notes, stopped)
+            self._n_passes += 1
+            vehicles = fitted_vehicles(
+                self._recording, self._n_passes, data, fits, self._tracks.paths(data),
+                self._ground, self._orders, notes, stopped)
             if stopped is not None and stopped():
                 return
-            yield from found
+            yield from vehicles
 
 
 def fitted_vehicles(recording: str, number: int, data: PassData, single: Sequence[PassFit],
@@ -180,7 +182,7 @@ def fitted_vehicles(recording: str, number: int, data: PassData, single: Sequenc
     recording : str
         Name of the recording.
     number : int
-        Number of the detection.
+        Index of the detection in the recording, from 1.
     data : PassData
     single : sequence of PassFit
         Fits of the pass as a single vehicle.
@@ -190,7 +192,7 @@ def fitted_vehicles(recording: str, number: int, data: PassData, single: Sequenc
     orders : sequence of int
         Numbers of dipoles to try if there are several vehicles.
     notes : tuple of str
-        Remarks on the pass.
+        Remarks on the pass for the user.
     stopped : function, optional
         Fitting ends when it returns true; the result is then invalid.
 
@@ -199,14 +201,15 @@ def fitted_vehicles(recording: str, number: int, data: PassData, single: Sequenc
     list of FittedPass
         One entry per vehicle.
     """
-    found = fit_targets(data, single, paths, ground, orders, stopped)
-    if len(found) == 1:
-        return [FittedPass(recording, number, found[0], notes, correlated_motion(data))]
-    chosen = [fit for fit in map(choose_order, found) if fit is not None]
-    notes = (*notes, f'{len(found)} vehicles were fitted together; the measurements are given '
-                     'without the field of the others')
+    vehicles = fit_targets(data, single, paths, ground, orders, stopped)
+    if len(vehicles) == 1:
+        return [FittedPass(recording, number, vehicles[0], notes, correlated_motion(data))]
+    chosen = [fit for fit in map(choose_order, vehicles) if fit is not None]
+    notes = (*notes, f'{len(vehicles)} vehicles were fitted together; the measurements do not '
+                     'include the field of the other vehicles')
     if not are_separate(data, [path_from(data, fit) for fit in chosen], MAX_TRAILER_DISTANCE):
         notes = (*notes, f'the vehicles are less than {MAX_TRAILER_DISTANCE:.0f} m apart: they may '
                          'be parts of one vehicle')
     return [FittedPass(recording, number, fits, notes, CorrelatedMotion(
-        'several vehicles passed together'), k, len(found)) for k, fits in enumerate(found, 1)]
+        'several vehicles passed together'), k, len(vehicles))
+        for k, fits in enumerate(vehicles, 1)]

@@ -16,11 +16,11 @@ from mag_tracking.units import NS
 
 @dataclass(frozen=True)
 class _Pose:
-    """A pose of a track."""
+    """Position and velocity of a track at one time."""
 
     stamp_ns: int
     path: FloatArray
-    """(6,) position and velocity."""
+    """(6,) position [m] and velocity [m/s], world frame."""
     variance: float
     """Trace of the covariance of the position [m²]."""
 
@@ -34,11 +34,11 @@ class PassTracks:
     """
 
     def __init__(self, settings: TrackSettings) -> None:
-        self._of_vehicles = settings.target == 'vehicle'
-        # The pose of each track with the smallest variance in earlier passes, and all later poses.
+        self._is_for_vehicles = settings.target == 'vehicle'
+        # {track id: pose of smallest variance in earlier passes, followed by all later poses}.
         self._poses: dict[int, list[_Pose]] = {}
         self._ended: set[int] = set()
-        self._latest_ns = 0
+        self._last_stamp_ns = 0
 
     def add(self, records: Iterable[object]) -> None:
         """Store the poses among the records of a tracker.
@@ -48,12 +48,12 @@ class PassTracks:
         records : iterable
         """
         for record in records:
-            if isinstance(record, Track) and record.stamp_ns < self._latest_ns:
+            if isinstance(record, Track) and record.stamp_ns < self._last_stamp_ns:
                 # The time jumped back: earlier poses belong to another pass.
                 self._poses.clear()
                 self._ended.clear()
             if isinstance(record, Track):
-                self._latest_ns = record.stamp_ns
+                self._last_stamp_ns = record.stamp_ns
             if isinstance(record, Track) and record.ended:
                 self._ended.add(record.id)
             elif isinstance(record, Track):
@@ -64,9 +64,9 @@ class PassTracks:
     def paths(self, data: PassData) -> FloatArray:
         """Return the path of each vehicle in a pass.
 
-        A vehicle belongs to the pass if its pose with the smallest variance does. Overlapping
-        tracks are one vehicle that was lost and found again; the most certain one is used. Passes
-        must be given in order.
+        A vehicle belongs to the pass that contains its pose of smallest variance. Overlapping
+        tracks belong to one vehicle that was lost and found again; the track with the smallest
+        variance is used. The method must be called with passes in chronological order.
 
         Parameters
         ----------
@@ -75,39 +75,39 @@ class PassTracks:
         Returns
         -------
         (K, 6) array, m and m/s, world frame
-            Position and velocity when `data.t` is zero. Empty for magnets.
+            Position and velocity at the time when `data.t` is zero. Empty for magnets.
         """
         end_ns = data.stamp_ns + int(NS * data.t.max())
-        mine = sorted((pose for pose in self._most_certain_until(end_ns)
-                       if pose.stamp_ns >= data.stamp_ns), key=lambda pose: pose.variance)
+        candidates = sorted((pose for pose in self._poses_of_smallest_variance(end_ns)
+                             if pose.stamp_ns >= data.stamp_ns), key=lambda pose: pose.variance)
         paths: list[FloatArray] = []
-        for pose in mine:
+        for pose in candidates:
             path = propagated_path(pose.path, (data.stamp_ns - pose.stamp_ns) / NS)
-            if self._of_vehicles and all(are_separate(data, (path, other)) for other in paths):
+            if self._is_for_vehicles and all(are_separate(data, (path, other)) for other in paths):
                 paths.append(path)
         return np.array(paths).reshape(-1, 6)
 
-    def _most_certain_until(self, end_ns: int) -> list[_Pose]:
-        """Pose of each track with the smallest variance until a time; drops older poses.
+    def _poses_of_smallest_variance(self, end_ns: int) -> list[_Pose]:
+        """Return the pose of smallest variance of each track until a time; drop older poses.
 
         Vehicles that are still approaching are omitted: their latest pose has the smallest
         variance.
         """
-        found = []
+        selected = []
         for track, poses in list(self._poses.items()):
-            until = [pose for pose in poses if pose.stamp_ns <= end_ns]
-            later = poses[len(until):]
-            best = min(until, key=lambda pose: pose.variance, default=None)
+            earlier = [pose for pose in poses if pose.stamp_ns <= end_ns]
+            later = poses[len(earlier):]
+            best = min(earlier, key=lambda pose: pose.variance, default=None)
             if best is None:
                 continue
             has_ended = track in self._ended and not later
-            if best is not until[-1] or has_ended:
-                found.append(best)
+            if best is not earlier[-1] or has_ended:
+                selected.append(best)
             self._poses[track] = [best, *later]
             if has_ended:
                 del self._poses[track]
                 self._ended.remove(track)
-        return found
+        return selected
 
 
 def ground_prior(settings: TrackSettings) -> GroundPrior:

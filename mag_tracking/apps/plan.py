@@ -25,11 +25,11 @@ from mag_tracking.pipeline import Settings
 from mag_tracking.stages.track.settings import acceleration_density
 
 MAX_FRAMES = 1000
-"""Maximum number of frames of a pass for the probability of a miss, which no longer depends on
-the number for slower passes."""
+"""Maximum number of frames of a pass in the calculation of the probability of a miss. More frames,
+from slower passes, hardly change the probability."""
 
 Area: TypeAlias = tuple[float, float, float, float]
-"""(x0, y0, x1, y1) [m]."""
+"""Rectangle (x0, y0, x1, y1) [m]."""
 
 GOOD_PD = 0.9
 """Detection probability per frame at which a target counts as detectable."""
@@ -40,13 +40,13 @@ class Lane:
     """Straight lane through the network, with bounds and detection along it."""
 
     name: str
-    """Name in texts."""
+    """Name in messages and figures."""
     heading: float
-    """Anticlockwise from x [rad]."""
+    """Heading, anticlockwise from x [rad]."""
     along: FloatArray
-    """(n,) m, distance from the point nearest to the centre of the sensors."""
+    """(n,) m, signed distance from the point nearest to the centre of the sensors."""
     points: FloatArray
-    """(n, 2) m, world frame."""
+    """(n, 2) m, points of the lane, world frame."""
     pass_std: FloatArray
     """(n, 3) m, m/s, A m²: bounds of position, velocity and moment from the whole pass; median over
     the directions of the moment."""
@@ -78,10 +78,10 @@ class Plan:
     lanes: tuple[Lane, ...]
     """Lanes through the network."""
     with_one_more: FloatArray
-    """Coarser map: median bound [m] over the lanes, near the network, with an additional sensor at
+    """Coarser map: median bound [m] over the lanes near the network, with an additional sensor at
     the point; NaN where no sensor is allowed."""
     without: float
-    """The same bound without the additional sensor [m]."""
+    """Median bound over the lanes near the network, without an additional sensor [m]."""
     best_place: tuple[float, float]
     """Best position of the additional sensor (x, y) [m]."""
     observability: Observability
@@ -92,14 +92,14 @@ class Plan:
     closest point of the first lane."""
     missed: FloatArray
     """(n, 2) lateral distance [m] of a pass with the heading of the first lane, and probability
-    that the pass is not detected at all."""
+    that the pass is missed."""
 
 
 def detection_range(target: PlannedTarget, noise_std: float, n_axes: int,
                     false_alarm: float) -> float:
     """Approximate range at which a frame of one sensor detects half of the targets.
 
-    Averaged over all directions of the moment, the energy is twice that of a dipole abeam.
+    Averaged over all directions of the moment, the energy is twice the energy of a dipole abeam.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
                  lanes: Sequence[tuple[str, float, float]], area: Area, settings: Settings,
                  clearance: float = 0.0, n_grid: int = 41,
                  progress: Callable[[int], object] | None = None) -> Plan:
-    """Compute bounds, detection probabilities and the best place for an additional sensor.
+    """Compute bounds, detection probabilities and the best position of an additional sensor.
 
     Parameters
     ----------
@@ -155,41 +155,42 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     place = network.positions, network.R_sw
     prior = target.prior()
-    std = []
+    bounds = []
     for heading in sorted({heading % np.pi for _, heading, _ in lanes}):
         J = pass_information(*place, target, sampling, points, heading).sum(axis=2)
-        std.append(bounds_of(J, prior)[..., 0])
+        bounds.append(bounds_of(J, prior)[..., 0])
         step(1)
     detect = settings.detect
-    seen = detection_probabilities(*place, target, sampling, points,
-                                   detect.false_alarm_probability, detect.background_std)
+    probability = detection_probabilities(*place, target, sampling, points,
+                                          detect.false_alarm_probability, detect.background_std)
     step(1)
-    done = tuple(_lane(network, target, sampling, *lane, area, settings) for lane in lanes)
+    planned = tuple(_lane(network, target, sampling, *lane, area, settings) for lane in lanes)
     step(1)
-    # The additional sensor is evaluated where the lanes are near the network.
+    # The effect of the additional sensor is evaluated where the lanes are near the network.
     reach = 0.5 * max(np.ptp(network.positions[:, :2], axis=0).max(), 8.0 * target.height)
-    near = [(lane.heading, lane.points[np.abs(lane.along) <= reach][::4]) for lane in done]
+    near = [(lane.heading, lane.points[np.abs(lane.along) <= reach][::4]) for lane in planned]
     coarse_x, coarse_y = _grid(area, max(11, n_grid // 2))
     places = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
-    free = np.all([_distance(lane, places) >= clearance for lane in done], axis=0)
-    more = np.full(len(places), np.nan)
-    without, found = _one_more(network, target, sampling, near, places[free])
-    more[free] = found
+    allowed = np.all([_lane_distances(lane, places) >= clearance for lane in planned], axis=0)
+    median_bound = np.full(len(places), np.nan)
+    without, with_sensor = _added_sensor_bounds(network, target, sampling, near, places[allowed])
+    median_bound[allowed] = with_sensor
     step(1)
-    best = int(np.nanargmin(more)) if free.any() else 0
-    known, blocks = _at_closest(network, target, sampling, done[0], reach)
+    best = int(np.nanargmin(median_bound)) if allowed.any() else 0
+    observable, blocks = _closest_point_bounds(network, target, sampling, planned[0], reach)
     shape = len(coarse_y), len(coarse_x)
     return Plan(
         network, target, sampling, x, y,
-        np.median(np.concatenate(std, axis=1), axis=1).reshape(len(y), len(x)),
-        seen.mean(axis=1).reshape(len(y), len(x)), done, more.reshape(shape), without,
-        (float(coarse_x[best % shape[1]]), float(coarse_y[best // shape[1]])),
-        known, blocks, _missed(network, target, sampling, done[0], area, settings))
+        np.median(np.concatenate(bounds, axis=1), axis=1).reshape(len(y), len(x)),
+        probability.mean(axis=1).reshape(len(y), len(x)), planned, median_bound.reshape(shape),
+        without, (float(coarse_x[best % shape[1]]), float(coarse_y[best // shape[1]])),
+        observable, blocks,
+        _miss_probabilities(network, target, sampling, planned[0], area, settings))
 
 
-def _at_closest(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, lane: Lane,
-                reach: float) -> tuple[Observability, dict[str, FloatArray]]:
-    """Compute `Plan.observability` and `Plan.blocks`; `reach` [m] is a typical distance."""
+def _closest_point_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
+                          lane: Lane, reach: float) -> tuple[Observability, dict[str, FloatArray]]:
+    """Compute `Plan.observability` and `Plan.blocks`, scaled with a distance `reach` [m]."""
     closest = lane.points[np.argmin(np.abs(lane.along))][None]
     J = pass_information(network.positions, network.R_sw, target, sampling, closest,
                          lane.heading)[0].sum(axis=1)
@@ -199,7 +200,7 @@ def _at_closest(network: SensorNetwork, target: PlannedTarget, sampling: Samplin
              'without prior': np.median(bounds_of(J, np.zeros((9, 9))), axis=0)})
 
 
-def _distance(lane: Lane, places: FloatArray) -> FloatArray:
+def _lane_distances(lane: Lane, places: FloatArray) -> FloatArray:
     """Distances (n,) [m] of places (n, 2) from the line of a lane."""
     u = lane.points[-1] - lane.points[0]
     r = places - lane.points[0]
@@ -240,44 +241,45 @@ def _lane(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, nam
     place = network.positions, network.R_sw
     J = pass_information(*place, target, sampling, points, heading).sum(axis=2)
     detect = settings.detect
-    seen = detection_probabilities(*place, target, sampling, points,
-                                   detect.false_alarm_probability, detect.background_std)
+    probability = detection_probabilities(*place, target, sampling, points,
+                                          detect.false_alarm_probability, detect.background_std)
     return Lane(name, heading, along, points,
                 np.median(bounds_of(J, target.prior()), axis=1),
                 _filter_bound(network, target, sampling, points, heading, settings),
-                seen.mean(axis=1))
+                probability.mean(axis=1))
 
 
 def _filter_bound(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                   points: FloatArray, heading: float, settings: Settings) -> FloatArray:
     """Path bound (n,) [m] of a filter that follows a lane from its beginning.
 
-    The motion model is that of the tracker, and the backgrounds are part of the state. Median over
-    the directions of the moment.
+    The filter uses the motion model of the tracker and estimates the backgrounds. The bound is the
+    median over the directions of the moment.
     """
     n_sensors, dt = len(network), np.hypot(*(points[1] - points[0])) / target.speed
-    each = dt / sampling.period
-    still = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
+    n_samples = dt / sampling.period
+    frame_sampling = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
     n_x = 9 + 3 * n_sensors
     F, Q, P0 = np.eye(n_x), np.zeros((n_x, n_x)), np.zeros((n_x, n_x))
     F[:6, :6] = constant_velocity(dt)
     Q[:6, :6] = integrator_noise(dt, acceleration_density(settings.track))
-    known = np.diagonal(target.prior())[[2, 5]]
-    wide = np.array([1.0, 1.0, 1.0, target.speed, target.speed, target.speed])
-    wide[:3] *= np.hypot(*(points[-1] - points[0]))
-    wide[[2, 5]] = np.where(known > 0.0, 1.0 / np.sqrt(np.maximum(known, 1e-30)), wide[[2, 5]])
-    P0[range(6), range(6)] = wide**2
+    information = np.diagonal(target.prior())[[2, 5]]
+    prior_std = np.array([1.0, 1.0, 1.0, target.speed, target.speed, target.speed])
+    prior_std[:3] *= np.hypot(*(points[-1] - points[0]))
+    prior_std[[2, 5]] = np.where(
+        information > 0.0, 1.0 / np.sqrt(np.maximum(information, 1e-30)), prior_std[[2, 5]])
+    P0[range(6), range(6)] = prior_std**2
     P0[range(6, 9), range(6, 9)] = target.moment**2 / 3.0
     P0[range(9, n_x), range(9, n_x)] = min(sampling.background_std, 1e-6)**2
-    _, h, H = zip(*pass_fields(network.positions, network.R_sw, target, still, points, heading),
-                  strict=True)
+    _, h, H = zip(*pass_fields(network.positions, network.R_sw, target, frame_sampling, points,
+                               heading), strict=True)
     h, H = np.concatenate(h), np.concatenate(H)
     std = np.empty((len(points), len(DIRECTIONS)))
     backgrounds = np.broadcast_to(np.eye(3 * n_sensors).reshape(n_sensors, 3, -1),
                                   (len(points), n_sensors, 3, 3 * n_sensors))
     for d in range(len(DIRECTIONS)):
         variance = (np.square(sampling.noise_std) + sampling.field_error**2 * np.square(
-            h[:, d, 0]).sum(axis=-1)) / each
+            h[:, d, 0]).sum(axis=-1)) / n_samples
         P = path_bound(F, Q, np.concatenate([H[:, d, 0], backgrounds], axis=-1),
                        variance[..., None, None] * np.eye(3), P0)
         std[:, d] = np.sqrt(P[:, 0, 0] + P[:, 1, 1])
@@ -285,32 +287,32 @@ def _filter_bound(network: SensorNetwork, target: PlannedTarget, sampling: Sampl
     return bound
 
 
-def _one_more(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
-              near: Sequence[tuple[float, FloatArray]],
-              places: FloatArray) -> tuple[float, FloatArray]:
-    """(median bound, (n_places,) median bounds with an additional sensor at each place) [m]."""
+def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
+                         near: Sequence[tuple[float, FloatArray]],
+                         places: FloatArray) -> tuple[float, FloatArray]:
+    """Compute (median bound, (n_places,) median bounds with a sensor added at each place) [m]."""
     height = network.positions[:, 2].mean()
     candidates = np.column_stack([places, np.full(len(places), height)])
     upright = np.tile(np.eye(3), (len(places), 1, 1))
-    alike = replace(sampling, noise_std=float(np.median(sampling.noise_std)))
+    added_sampling = replace(sampling, noise_std=float(np.median(sampling.noise_std)))
     prior = target.prior()
-    base, more = [], []
+    base, extended = [], []
     for heading, points in near:
         if not len(places):
             continue
         J = pass_information(network.positions, network.R_sw, target, sampling, points,
                              heading).sum(axis=2)
         base.append(bounds_of(J, prior)[..., 0].ravel())
-        extra = pass_information(candidates, upright, target, alike, points, heading)
-        more.append(bounds_of(J[:, :, None] + extra, prior)[..., 0].reshape(-1, len(places)))
+        added = pass_information(candidates, upright, target, added_sampling, points, heading)
+        extended.append(bounds_of(J[:, :, None] + added, prior)[..., 0].reshape(-1, len(places)))
     if not base:
         return float('nan'), np.zeros(0)
-    return float(np.median(np.concatenate(base))), np.median(np.concatenate(more), axis=0)
+    return float(np.median(np.concatenate(base))), np.median(np.concatenate(extended), axis=0)
 
 
-def _missed(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, lane: Lane,
-            area: Area, settings: Settings) -> FloatArray:
-    """Compute `Plan.missed`: fewer consecutive frames than an onset requires detect the target."""
+def _miss_probabilities(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
+                        lane: Lane, area: Area, settings: Settings) -> FloatArray:
+    """Compute `Plan.missed`: a pass is missed if too few consecutive frames detect the target."""
     half = 0.5 * max(area[2] - area[0], area[3] - area[1])
     offsets = np.linspace(0.0, 2.0 * half, 25)
     u = np.array([np.cos(lane.heading), np.sin(lane.heading)])
@@ -319,9 +321,9 @@ def _missed(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, l
     detect, out = settings.detect, []
     for offset in offsets:
         points = network.centre[:2] + offset * np.array([-u[1], u[0]]) + along * u
-        seen = detection_probabilities(
+        probability = detection_probabilities(
             network.positions, network.R_sw, target, sampling, points,
             detect.false_alarm_probability, detect.background_std)
         out.append((offset, float(np.mean(
-            missed_detection_probability(seen, detect.onset_frames)))))
+            missed_detection_probability(probability, detect.onset_frames)))))
     return np.array(out)

@@ -22,7 +22,7 @@ NOISE_STD = 1.2e-8
 """Default noise of one sample [T]."""
 
 CLEARANCE = 2.0
-"""Default distance between a lane for vehicles and an additional sensor [m]."""
+"""Default minimum distance between a lane for vehicles and an additional sensor [m]."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class PlanInputs:
     """Checked arguments of `compute_plan`."""
 
     target: PlannedTarget
-    """Target."""
+    """Assumed target."""
     sampling: Sampling
     """Noise and sampling of the sensors."""
     lanes: tuple[tuple[str, float, float], ...]
@@ -101,16 +101,16 @@ def plan_inputs(network: SensorNetwork, settings: Settings, target: str | None =
         If an input is out of range; the message begins with its name.
     """
     planned = _target(settings.track, target, moment, height, speed)
-    lanes = _lanes(settings.track.vehicle, _floats(heading), _floats(offset))
-    _within('grid', grid, 5, 200)
+    lanes = _lanes(settings.track.vehicle, _to_floats(heading), _to_floats(offset))
+    _in_range('grid', grid, 5, 200)
     sampling = _sampling(network, settings, noise_std, rate, field_error)
     reach = detection_range(planned, float(np.median(sampling.noise_std)), 3,
                             settings.detect.false_alarm_probability)
     sampling = replace(sampling, half_window=1.2 * reach / planned.speed)
     if clearance is None:
         clearance = CLEARANCE if moment is None else 0.0
-    return PlanInputs(planned, sampling, lanes, _area(network, reach, _floats(area)),
-                      _within('clearance', clearance, 0.0, 1e6), grid)
+    return PlanInputs(planned, sampling, lanes, _area(network, reach, _to_floats(area)),
+                      _in_range('clearance', clearance, 0.0, 1e6), grid)
 
 
 def plan(network: SensorNetwork | str | PathLike[str], target: str | None = None, *,
@@ -119,7 +119,7 @@ def plan(network: SensorNetwork | str | PathLike[str], target: str | None = None
          noise_std: float | None = None, rate: float = 100.0, field_error: float | None = None,
          area: Sequence[float] | None = None, clearance: float | None = None, grid: int = 41,
          settings: Mapping[str, Any] | None = None) -> Plan:
-    """Predict accuracy, detection and the best place for an additional sensor.
+    """Predict accuracy, detection and the best position of an additional sensor.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def plan(network: SensorNetwork | str | PathLike[str], target: str | None = None
     offset : sequence of float, m, optional
         Lateral offset of each lane, to the left of the centre of the sensors; default: 0.
     noise_std : float, T, optional
-        Noise of one sample; default: that of the network file, or 12 nT.
+        Noise of one sample; default: the noise in the network file, or 12 nT.
     rate : float, Hz
         Sample rate of each sensor.
     field_error : float, optional
@@ -173,31 +173,31 @@ def plan(network: SensorNetwork | str | PathLike[str], target: str | None = None
     return inputs.run(network, tree)
 
 
-def _within(name: str, value: float, low: float, high: float) -> float:
+def _in_range(name: str, value: float, low: float, high: float) -> float:
     """Return `value`; raises SettingsError if it is out of range."""
     if not low <= value <= high:
         raise SettingsError(f'{name}: expected {low:g} to {high:g}, got {value:g}')
     return value
 
 
-def _floats(values: Sequence[float] | None) -> list[float] | None:
+def _to_floats(values: Sequence[float] | None) -> list[float] | None:
     """Convert the values of a list or array to float."""
     return None if values is None else [float(v) for v in values]
 
 
 def _target(track: TrackSettings, target: str | None, moment: float | None,
             height: float | None, speed: float) -> PlannedTarget:
-    """Target of a kind, or with a moment and a height."""
+    """Create the target from its kind, or from its moment and height."""
     vehicle = track.vehicle
-    _within('speed', speed, 1e-4, 1e3)
+    _in_range('speed', speed, 1e-4, 1e3)
     if height is not None:
-        _within('height', height, -1e3, 1e3)
+        _in_range('height', height, -1e3, 1e3)
     if moment is not None:
         if target not in (None, 'magnet'):
             raise SettingsError('target: give either target or moment')
         if height is None:
             raise SettingsError('height: required together with moment')
-        return PlannedTarget(_within('moment', moment, 1e-6, 1e6), height, speed)
+        return PlannedTarget(_in_range('moment', moment, 1e-6, 1e6), height, speed)
     if target == 'magnet':
         raise SettingsError('moment: required for a magnet, together with height')
     kind = target or 'car'
@@ -211,7 +211,7 @@ def _target(track: TrackSettings, target: str | None, moment: float | None,
 
 def _lanes(vehicle: VehicleSettings, heading: Sequence[float] | None,
            offset: Sequence[float] | None) -> tuple[tuple[str, float, float], ...]:
-    """(name, heading [rad], offset [m]) of each lane."""
+    """Create the lanes (name, heading [rad], offset [m])."""
     names: Sequence[str]
     if heading is None:
         names, heading = vehicle.arrival_names, vehicle.arrival_headings_deg
@@ -222,9 +222,9 @@ def _lanes(vehicle: VehicleSettings, heading: Sequence[float] | None,
         raise SettingsError(f'offset: expected {len(heading)} numbers, one per lane '
                             f'({", ".join(names)}), got {len(offsets)}')
     for value in heading:
-        _within('heading', value, -1e5, 1e5)
+        _in_range('heading', value, -1e5, 1e5)
     for value in offsets:
-        _within('offset', value, -1e5, 1e5)
+        _in_range('offset', value, -1e5, 1e5)
     if offset:
         names = [f'{name}, {value:+g} m' for name, value in zip(names, offset, strict=True)]
     lanes = tuple(zip(names, map(math.radians, heading), offsets, strict=True))
@@ -235,25 +235,25 @@ def _lanes(vehicle: VehicleSettings, heading: Sequence[float] | None,
 
 def _sampling(network: SensorNetwork, settings: Settings, noise_std: float | None, rate: float,
               field_error: float | None) -> Sampling:
-    """Sampling of the sensors, without the duration of a pass.
+    """Create the sampling of the sensors, without the duration of a pass.
 
-    An error of the field that persists over many frames is not averaged out; it is represented by
-    correspondingly more noise in each frame. The tracker models it as a state.
+    A field error that persists over many frames is not averaged out. It is represented here by
+    additional noise in each frame, whereas the tracker estimates it as a state.
     """
     track = settings.track
-    period = max(frame_period(settings.align, network), 1.0 / _within('rate', rate, 1e-2, 1e5))
+    period = max(frame_period(settings.align, network), 1.0 / _in_range('rate', rate, 1e-2, 1e5))
     if noise_std is not None:
-        _within('noise_std', noise_std, 1e-15, 1e-3)
+        _in_range('noise_std', noise_std, 1e-15, 1e-3)
     noise = np.array([noise_std or NOISE_STD if std is None or noise_std
                       else float(np.sqrt(np.mean(np.square(std)))) for std in network.noise_std])
-    error = _within('field_error', track.field_error if field_error is None else field_error,
-                    0.0, 0.9)
-    lasting = max(1.0, 2.0 * track.model_error_time_s / period)
-    return Sampling(period, noise / math.sqrt(max(1.0, rate * period)), error * math.sqrt(lasting))
+    error = _in_range('field_error', track.field_error if field_error is None else field_error,
+                      0.0, 0.9)
+    n_frames = max(1.0, 2.0 * track.model_error_time_s / period)
+    return Sampling(period, noise / math.sqrt(max(1.0, rate * period)), error * math.sqrt(n_frames))
 
 
 def _area(network: SensorNetwork, reach: float, area: Sequence[float] | None) -> Area:
-    """(x0, y0, x1, y1) [m] of the maps."""
+    """Area of the maps (x0, y0, x1, y1) [m]."""
     low, high = network.positions[:, :2].min(axis=0), network.positions[:, :2].max(axis=0)
     if area is not None and len(area) != 4:
         raise SettingsError(f'area: expected X0, Y0, X1, Y1, got {area}')
@@ -261,7 +261,7 @@ def _area(network: SensorNetwork, reach: float, area: Sequence[float] | None) ->
     if not (x1 > x0 and y1 > y0):
         raise SettingsError(f'area: expected X0 < X1 and Y0 < Y1, got {area}')
     for side in (x1 - x0, y1 - y0):
-        _within('area: a side', side, 1e-3, 1e5)
-    _within('area: ratio of its sides', max((x1 - x0) / (y1 - y0),
-                                            (y1 - y0) / (x1 - x0)), 1.0, 50.0)
+        _in_range('area: a side', side, 1e-3, 1e5)
+    _in_range('area: ratio of its sides', max((x1 - x0) / (y1 - y0),
+                                              (y1 - y0) / (x1 - x0)), 1.0, 50.0)
     return x0, y0, x1, y1

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from mag_tracking.apps.plan import GOOD_PD, Plan
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import FloatArray
 from mag_tracking.files import replace_text
 from mag_tracking.report.page import NOTE, REPORT, Chart, Note, Page, Table, report_html
@@ -13,12 +14,12 @@ from mag_tracking.report.page_charts import axes, curve, heat_map, places
 from mag_tracking.report.plan_figures import MIN_MISSED, distinct_lanes, length_text
 from mag_tracking.report.scales import scale_of
 
-LOW_SHARE = 0.02
-"""Quantiles of a bound (this and one minus this) that limit its colour scale."""
+LOW_QUANTILE = 0.02
+"""Quantile of a bound at the lower end of its colour scale; the upper end is symmetric."""
 
 
 def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
-    """Write `report.html`.
+    """Write the report of a plan to `report.html`.
 
     Parameters
     ----------
@@ -26,7 +27,7 @@ def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
     lines : list of str
         Lines of `summary_lines`.
     out : Path
-        Folder.
+        Output folder.
 
     Returns
     -------
@@ -55,39 +56,42 @@ def summary_lines(p: Plan) -> list[str]:
     list of str
         One line per result.
     """
-    noise, out = float(np.median(p.sampling.noise_std)), list[str]()
-    out.append(f'{len(p.network)} sensors, {1e9 * noise:.2g} nT noise per frame; '
-               f'target with {p.target.moment:g} A m^2 at {p.target.speed:g} m/s')
-    o = p.observability
-    seen = (f'not observable: {", ".join(o.unobservable)}' if o.unobservable
-            else f'observable, condition number {o.condition_number:.3g}')
-    out.append(f'single pass on lane {p.lanes[0].name}, without priors: {seen}')
+    noise, lines = float(np.median(p.sampling.noise_std)), list[str]()
+    lines.append(f'{quantity(len(p.network), "sensor")}, {1e9 * noise:.2g} nT noise per frame; '
+                 f'target with {p.target.moment:g} A m^2 at {p.target.speed:g} m/s')
+    observability = p.observability
+    observable = (f'not observable: {", ".join(observability.unobservable)}'
+                  if observability.unobservable
+                  else f'observable, condition number {observability.condition_number:.3g}')
+    lines.append(f'single pass on lane {p.lanes[0].name}, without priors: {observable}')
     for name, (r, v, m) in p.blocks.items():
-        out.append(f'  bounds at the closest point, {name}: position {length_text(r)}, '
-                   f'velocity {v:.3g} m/s, moment {m:.3g} A m^2')
+        lines.append(f'  bounds at the closest point, {name}: position {length_text(r)}, '
+                     f'velocity {v:.3g} m/s, moment {m:.3g} A m^2')
     for lane in p.lanes:
         good = np.flatnonzero(lane.detection >= GOOD_PD)
         first = (f'at {-lane.along[good[0]]:.3g} m before the centre' if len(good)
                  else 'nowhere')
         closest = int(np.argmin(np.abs(lane.along)))
-        out.append(f'lane {lane.name}: the detection probability of a frame reaches {GOOD_PD:.0%} '
-                   f'{first}; position bound at the centre {length_text(lane.filter_std[closest])} '
-                   f'(filter), {length_text(lane.pass_std[closest, 0])} (whole pass)')
-    caught = p.missed[p.missed[:, 1] < 0.01, 0]
-    out.append(f'99% of passes are detected up to {caught.max():.3g} m from the centre'
-               if len(caught) else 'the detection probability of a pass is below 99% everywhere')
-    out.append('(bounds for a point target; errors with real vehicles are several times larger)')
+        lines.append(f'lane {lane.name}: the detection probability of a frame reaches '
+                     f'{GOOD_PD:.0%} {first}; position bound at the centre '
+                     f'{length_text(lane.filter_std[closest])} (filter), '
+                     f'{length_text(lane.pass_std[closest, 0])} (whole pass)')
+    detected = p.missed[p.missed[:, 1] < 0.01, 0]
+    lines.append(
+        f'99% of passes are detected up to {detected.max():.3g} m from the centre'
+        if len(detected) else 'the detection probability of a pass is below 99% everywhere')
+    lines.append('(bounds for a point target; errors with real vehicles are several times larger)')
     if not np.isfinite(p.with_one_more).any():
-        out.append('additional sensor: the area has no place clear of the lanes')
+        lines.append('additional sensor: the area has no place clear of the lanes')
     elif np.nanmin(p.with_one_more) > 0.99 * p.without:
-        out.append('additional sensor: no improvement anywhere in the area')
+        lines.append('additional sensor: no improvement anywhere in the area')
     else:
         x, y = p.best_place
         edge = ' (on the edge of the area)' if x in p.x[[0, -1]] or y in p.y[[0, -1]] else ''
-        out.append(f'additional sensor: best at ({x:.2f}, {y:.2f}) m{edge}, where the median bound '
-                   f'near the sensors is {length_text(np.nanmin(p.with_one_more))} instead of '
-                   f'{length_text(p.without)}')
-    return out
+        lines.append(f'additional sensor: best at ({x:.2f}, {y:.2f}) m{edge}, where the median '
+                     f'bound near the sensors is {length_text(np.nanmin(p.with_one_more))} instead '
+                     f'of {length_text(p.without)}')
+    return lines
 
 
 def plan_page(plan: Plan, lines: list[str]) -> Page:
@@ -104,7 +108,7 @@ def plan_page(plan: Plan, lines: list[str]) -> Page:
     Page
     """
     network = plan.network
-    return Page(f'Plan for {len(network)} sensors',
+    return Page(f'Plan for {quantity(len(network), "sensor")}',
                 f'target with {plan.target.moment:g} A m^2 at {plan.target.speed:g} m/s',
                 [Note(NOTE, line.strip()) for line in lines], None,
                 [*_maps(plan), *_lanes(plan)],
@@ -119,21 +123,21 @@ def _maps(plan: Plan) -> list[Chart]:
     layout = axes(f'x [{unit}]', f'y [{unit}]', is_map=True)
     x, y = f * plan.x, f * plan.y
     bound = np.log10(f * np.clip(plan.position_std, None, np.ptp(plan.x)))
-    low, high = np.nanquantile(bound, [LOW_SHARE, 1.0 - LOW_SHARE])
+    low, high = np.nanquantile(bound, [LOW_QUANTILE, 1.0 - LOW_QUANTILE])
     bar = _log_bar(low, high, f'standard deviation [{unit}]')
     position = heat_map(x, y, bound, 'Viridis', '', float(low), float(high)) | {
         'colorbar': bar, 'text': [[f'{10.0**v:.3g} {unit}' for v in row] for row in bound],
         'hoverinfo': 'x+y+text'}
     gain = 100.0 * (1.0 - plan.with_one_more / plan.without)
     ny, nx = gain.shape
-    charts = [Chart('Position bound of a whole pass', [position, *_marks(plan, f)], layout),
+    charts = [Chart('Position bound of a whole pass', [position, *_site_traces(plan, f)], layout),
               Chart('Probability that one frame detects the target', [
                   heat_map(x, y, plan.detection, 'Cividis', 'probability', 0.0, 1.0),
-                  *_marks(plan, f)], layout)]
+                  *_site_traces(plan, f)], layout)]
     if np.isfinite(gain).any():
         charts.append(Chart('Gain of an additional sensor', [
             heat_map(np.linspace(x[0], x[-1], nx), np.linspace(y[0], y[-1], ny), gain, 'Cividis',
-                     'reduction [%]'), *_marks(plan, f),
+                     'reduction [%]'), *_site_traces(plan, f),
             {'type': 'scatter', 'mode': 'markers', 'x': [f * plan.best_place[0]],
              'y': [f * plan.best_place[1]], 'name': 'best place', 'hoverinfo': 'name+x+y',
              'marker': {'symbol': 'star', 'size': 15, 'color': '#D55E00',
@@ -142,40 +146,40 @@ def _maps(plan: Plan) -> list[Chart]:
 
 
 def _log_bar(low: float, high: float, title: str) -> dict[str, Any]:
-    """Colour bar with plain numbers for logarithmic values."""
+    """Create a colour bar that labels logarithmic values with linear numbers."""
     steps = [10.0**k * m for k in range(-7, 8) for m in (1, 2, 5)]
     inside = [v for v in steps if low <= np.log10(v) <= high] or [10.0 ** (0.5 * (low + high))]
     return {'title': {'text': title, 'side': 'right'}, 'tickvals': np.log10(inside).tolist(),
             'ticktext': [f'{v:.3g}' for v in inside]}
 
 
-def _marks(plan: Plan, f: float) -> list[dict[str, Any]]:
-    """Traces of the lanes and sensors."""
+def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
+    """Traces of the lanes and sensors on a map."""
     low, high = (plan.x[0], plan.y[0]), (plan.x[-1], plan.y[-1])
-    out = []
+    traces = []
     for lane in plan.lanes:
         inside = f * lane.points[((lane.points >= low) & (lane.points <= high)).all(axis=1)]
-        out.append({'type': 'scatter', 'mode': 'lines', 'x': inside[:, 0].tolist(),
-                    'y': inside[:, 1].tolist(), 'hoverinfo': 'skip', 'showlegend': False,
-                    'line': {'color': '#ffffff', 'dash': 'dash', 'width': 1.5}})
-    return [*out, places(f * plan.network.positions, plan.network.names)]
+        traces.append({'type': 'scatter', 'mode': 'lines', 'x': inside[:, 0].tolist(),
+                       'y': inside[:, 1].tolist(), 'hoverinfo': 'skip', 'showlegend': False,
+                       'line': {'color': '#ffffff', 'dash': 'dash', 'width': 1.5}})
+    return [*traces, places(f * plan.network.positions, plan.network.names)]
 
 
 def _lanes(plan: Plan) -> list[Chart]:
     """Charts of bounds and detection along the lanes, and of missed passes."""
     f, unit = scale_of(np.ptp(plan.x))
-    bounds, seen = [], []
+    bounds, detection = [], []
     for k, (name, lane) in enumerate(distinct_lanes(plan.lanes)):
         along: FloatArray = f * lane.along
         bounds += [curve(along, f * lane.filter_std, f'{name}: filter so far', 2 * k),
                    curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]
-        seen.append(curve(along, lane.detection, name, k))
-    known = plan.missed[plan.missed[:, 1] >= MIN_MISSED]
+        detection.append(curve(along, lane.detection, name, k))
+    missed = plan.missed[plan.missed[:, 1] >= MIN_MISSED]
     label = f'distance along the lane, 0 = nearest to the centre [{unit}]'
     return [Chart('Position bound along the lanes', bounds,
                   axes(label, f'standard deviation [{unit}]', log_y=True)),
-            Chart('Detection along the lanes', seen, axes(label, 'probability per frame')),
-            Chart('Missed passes', [curve(f * known[:, 0], known[:, 1], '', 0,
+            Chart('Detection along the lanes', detection, axes(label, 'probability per frame')),
+            Chart('Missed passes', [curve(f * missed[:, 0], missed[:, 1], '', 0,
                                           'lines+markers')],
                   axes(f'lateral distance from the centre of the sensors [{unit}]',
                        'probability of a miss', log_y=True))]

@@ -16,16 +16,16 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.units import NS
 
 LEARNING_TOLERANCE_S = 1.0
-"""Time beyond the minimum within which the background of a quiet beginning is learnt [s]."""
+"""Maximum excess of the learning time of a quiet beginning over the minimum [s]."""
 
 MIN_BLOCKS = 6.0
-"""Minimum learning time in blocks; it matters for slow sensors, whose blocks are longer."""
+"""Minimum learning time in blocks, for slow sensors with long blocks."""
 
-MIN_LEVEL_SHARE = 1.0 / 3.0
-"""Minimum total duration of a background level, as a share of the learning time."""
+MIN_LEVEL_FRACTION = 1.0 / 3.0
+"""Minimum total duration of a background level, as a fraction of the learning time."""
 
 N_READINGS_AT_ONCE = 8
-"""Number of readings fed at once while the beginning is learnt."""
+"""Number of readings per batch while the background at the beginning is learnt."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,9 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
     Prescan
         Empty if the network file contains all backgrounds, or `look_ahead_s` is 0.
     """
-    wanted = [name for name, level in zip(network.names, network.background, strict=True)
-              if level is None]
-    if not wanted or not settings.look_ahead_s:
+    unknown = [name for name, level in zip(network.names, network.background, strict=True)
+               if level is None]
+    if not unknown or not settings.look_ahead_s:
         return Prescan({}, {})
     recorder, learner = Calibrate(network, settings, BlockRecorder), Calibrate(network, settings)
     first_ns: dict[str, int] = {}
@@ -91,26 +91,26 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
         start_ns = min(first_ns.values(), default=0)
         if len(readings) and int(readings.stamp_ns[-1]) - start_ns > settings.look_ahead_s * NS:
             break
-    found, steps, is_quiet = {}, {}, True
+    levels, steps, is_quiet = {}, {}, True
     for name, background in recorder.backgrounds().items():
         assert isinstance(background, BlockRecorder)
         steps[name] = background.steps
-        level, was_freed = _level_of(background, learner.backgrounds()[name].departed_at,
-                                     learnt.get(name)) if name in wanted else (None, False)
+        level, had_target = _level_of(background, learner.backgrounds()[name].departed_at,
+                                      learnt.get(name)) if name in unknown else (None, False)
         if level is not None \
-                and level.n_blocks * level.block_s >= MIN_LEVEL_SHARE * settings.learn_s:
-            found[name] = level
-            is_quiet &= not was_freed \
+                and level.n_blocks * level.block_s >= MIN_LEVEL_FRACTION * settings.learn_s:
+            levels[name] = level
+            is_quiet &= not had_target \
                 and _begins_quietly(learnt.get(name), level, background, settings)
     # A target sensed by one sensor at the beginning may be in the backgrounds of all sensors.
-    return Prescan({} if is_quiet else found, steps)
+    return Prescan({} if is_quiet else levels, steps)
 
 
 def _level_of(recorder: BlockRecorder, departed_at: float | None,
               learnt: tuple[float, FloatArray] | None) -> tuple[QuietLevel | None, bool]:
     """Most frequent level of a sensor, and whether a target stood near it until `departed_at` [s].
 
-    No target stood there if the level `learnt` at the beginning returns.
+    If the level `learnt` at the beginning returns, no target stood there.
     """
     level = recorder.quiet_level()
     if level is None or departed_at is None or learnt is None \
@@ -121,9 +121,10 @@ def _level_of(recorder: BlockRecorder, departed_at: float | None,
 
 def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
            learnt: dict[str, tuple[float, FloatArray]]) -> None:
-    """Update `first_ns` {sensor: first timestamp} and `learnt`.
+    """Feed readings to `learner`; update `first_ns` and `learnt`.
 
-    `learnt` is {sensor: (time of the background after the first reading [s], (3,) background [T])}.
+    `first_ns` is {sensor: first timestamp}. `learnt` is {sensor: (learning time after the first
+    reading [s], (3,) background [T])}.
     """
     for i in range(0, len(readings), N_READINGS_AT_ONCE):
         if len(learnt) == len(learner.backgrounds()):
@@ -139,14 +140,14 @@ def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
                 learnt[name] = since, learner.background(name)
 
 
-def _begins_quietly(learnt: tuple[float, FloatArray] | None, found: QuietLevel,
+def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: QuietLevel,
                     recorder: BlockRecorder, settings: CalibrateSettings) -> bool:
     """Whether the background of a sensor was learnt early and equals the most frequent level."""
-    max_time = LEARNING_TOLERANCE_S + max(settings.learn_s, MIN_BLOCKS * found.block_s)
+    max_time = LEARNING_TOLERANCE_S + max(settings.learn_s, MIN_BLOCKS * level.block_s)
     if learnt is None or learnt[0] > max_time:
         return False
     # Without relearning, a level remains the background even if another level lasts.
-    return not settings.relearn_s or recorder.is_known_level(learnt[1], found)
+    return not settings.relearn_s or recorder.is_known_level(learnt[1], level)
 
 
 def prescan_of(recording: Recording, network: SensorNetwork, settings: CalibrateSettings,
@@ -170,7 +171,7 @@ def prescan_of(recording: Recording, network: SensorNetwork, settings: Calibrate
     RecordingError
         If the recording has none of the network's topics.
     """
-    # A separate Recording, because losses are counted when the recording is read again.
+    # A separate Recording is used, because losses are counted whenever a recording is read.
     reader = SampleReader(Recording(recording.path), network)
 
     def batches() -> Iterator[Readings]:

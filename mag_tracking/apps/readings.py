@@ -1,4 +1,4 @@
-"""Readings as arrays, from a recording or from arrays of the caller."""
+"""Readings as arrays, from a recording or from arrays of the user."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import BoolArray
 from mag_tracking.errors import ReadingsError
 from mag_tracking.network import SensorNetwork
@@ -27,7 +28,7 @@ class RecordedReadings:
     """Content of a recording as arrays."""
 
     readings: Readings
-    """Readings in the order in which they were logged; `names` are those of the network."""
+    """Readings in the order of logging; `names` are the sensors of the network."""
     truth: dict[str, Truth]
     """{target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}; empty without
     ground truth."""
@@ -39,7 +40,7 @@ class RecordedReadings:
     """Topics of the network that are not in the recording."""
 
     def __repr__(self) -> str:
-        return (f'RecordedReadings({len(self.readings)} readings of '
+        return (f'RecordedReadings({quantity(len(self.readings), "reading")} of '
                 f'{", ".join(self.readings.names)}; truth: {", ".join(self.truth) or "none"})')
 
 
@@ -86,10 +87,10 @@ def read_recording(path: str | PathLike[str],
     network = network_of(network)
     recording = Recording(path)
     reader = SampleReader(recording, network)
-    found = Readings.joined(reader.readings())
-    rows = found.rows({name: i for i, name in enumerate(network.names)})
+    recorded = Readings.joined(reader.readings())
+    sensor = recorded.rows({name: i for i, name in enumerate(network.names)})
     return recorded_readings(recording, reader, Readings(
-        network.names, rows, found.stamp_ns, found.field, found.covariance))
+        network.names, sensor, recorded.stamp_ns, recorded.field, recorded.covariance))
 
 
 def recorded_readings(recording: Recording, reader: SampleReader,
@@ -100,7 +101,7 @@ def recorded_readings(recording: Recording, reader: SampleReader,
     ----------
     recording : Recording
     reader : SampleReader
-        After the recording has been read.
+        Reader at the end of the recording.
     readings : Readings
 
     Returns
@@ -138,17 +139,17 @@ def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: Arra
     if isinstance(sensor, str):
         raise ReadingsError(f'sensor: expected one name per reading, got the text {sensor!r}')
     names = tuple(dict.fromkeys(str(name) for name in sensor))
-    rows = {name: i for i, name in enumerate(names)}
-    fields, C = _filled(field), None if covariance is None else _filled(covariance)
-    readings = _checked(Readings(
-        names, np.array([rows[str(name)] for name in sensor], dtype=np.int64),
+    index_of = {name: i for i, name in enumerate(names)}
+    fields, C = _with_nan(field), None if covariance is None else _with_nan(covariance)
+    readings = _to_standard_types(Readings(
+        names, np.array([index_of[str(name)] for name in sensor], dtype=np.int64),
         np.asarray(stamp_ns), fields if fields.size else fields.reshape(0, 3), C))
     check_order(readings, 0.0)
     return readings
 
 
-def _filled(values: ArrayLike) -> NDArray[Any]:
-    """Array with NaN for masked elements."""
+def _with_nan(values: ArrayLike) -> NDArray[Any]:
+    """Convert values to an array with NaN for masked elements."""
     if isinstance(values, np.ma.MaskedArray):
         return np.where(values.mask, np.nan, values.data)
     return np.asarray(values)
@@ -171,7 +172,7 @@ def checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
     ReadingsError
         If shapes or types are wrong, or no reading belongs to a sensor of the network.
     """
-    readings = _checked(readings)
+    readings = _to_standard_types(readings)
     if len(readings) and not set(readings.names) & set(network.names):
         raise ReadingsError(f'no readings of the network: the readings are from '
                             f'{", ".join(readings.names)}, the sensors of the network are '
@@ -179,7 +180,7 @@ def checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
     return readings
 
 
-def _checked(readings: Readings) -> Readings:
+def _to_standard_types(readings: Readings) -> Readings:
     """Convert readings to int64 and float64; raises ReadingsError for a wrong shape or type."""
     n, kinds = len(readings), {'sensor': 'iu', 'stamp_ns': 'iu', 'field': 'iuf',
                                'covariance': 'iuf'}
@@ -191,11 +192,11 @@ def _checked(readings: Readings) -> Readings:
             raise ReadingsError(f'{name}: masked arrays are not supported; use NaN for missing '
                                 'values')
         values = np.asarray(values)
-        # An empty list is converted to float.
+        # NumPy converts an empty list to float.
         if values.dtype.kind not in allowed and values.size:
-            wanted = 'floats' if 'f' in allowed else (
-                'integers, nanoseconds' if name == 'stamp_ns' else 'integers, rows of names')
-            raise ReadingsError(f'{name}: expected {wanted}, got {values.dtype}')
+            expected = 'floats' if 'f' in allowed else (
+                'integers, nanoseconds' if name == 'stamp_ns' else 'integers, indices into names')
+            raise ReadingsError(f'{name}: expected {expected}, got {values.dtype}')
     stamps = np.asarray(readings.stamp_ns)
     if n and not -LATEST_NS <= int(stamps.min()) <= int(stamps.max()) <= LATEST_NS:
         raise ReadingsError(f'stamp_ns: {stamps.min()} .. {stamps.max()} is outside '
@@ -203,7 +204,7 @@ def _checked(readings: Readings) -> Readings:
     sensor = np.asarray(readings.sensor, dtype=np.int64)
     if n and not 0 <= sensor.min() <= sensor.max() < len(readings.names):
         raise ReadingsError(f'sensor: {sensor.min()} .. {sensor.max()} is outside 0 .. '
-                            f'{len(readings.names) - 1}, the rows of names')
+                            f'{len(readings.names) - 1}, the indices of names')
     C = readings.covariance
     return Readings(tuple(readings.names), sensor, np.asarray(readings.stamp_ns, dtype=np.int64),
                     np.asarray(readings.field, dtype=float),
@@ -232,5 +233,5 @@ def check_order(readings: Readings, tolerance: float = MAX_DELAY_S) -> None:
         k = int(np.argmax(late))
         raise ReadingsError(
             f'stamp_ns: reading {k} ({readings.names[readings.sensor[k]]}) is '
-            f'{delay_ns[k] / NS:.3g} s older than an earlier one; sort the readings '
+            f'{delay_ns[k] / NS:.3g} s older than an earlier reading; sort the readings '
             "(np.argsort(stamp_ns, kind='stable')), and track separate recordings separately")

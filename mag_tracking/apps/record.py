@@ -1,10 +1,11 @@
-"""Selection of the topics that `mag-tracking record` records, and its reports."""
+"""Selection of topics and reports for the command `mag-tracking record`."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.messages.types import (
     CALIBRATED_READINGS,
     CALIBRATION_STATE,
@@ -15,11 +16,11 @@ from mag_tracking.messages.types import (
 RESULTS_OF = ('calibration_node/', 'detection_node/', 'tracker_node/')
 """Prefixes of result topics, relative to the namespace of the recorder."""
 RESULTS = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
-"""Other result topics."""
+"""Result topics that do not begin with these prefixes."""
 
 
 class RecorderState(Protocol):
-    """State of a recorder used in reports."""
+    """State of a recorder that the reports describe."""
 
     counts: Counter[str]
     """Number of messages written per topic."""
@@ -36,12 +37,12 @@ class RecorderState(Protocol):
 
 
 class Selection(NamedTuple):
-    """Topics to record, with names as given by the user or, if resolved, absolute names."""
+    """Topics to record, with names as given by the user or, after `resolved`, absolute names."""
 
     fields: tuple[str, ...] = ()
-    """Topics of the magnetic fields of the network."""
+    """Magnetic-field topics of the network."""
     imus: tuple[str, ...] = ()
-    """Topics on which its sensors may publish sensor_msgs/Imu."""
+    """Topics on which the sensors of the network may publish sensor_msgs/Imu."""
     topics: tuple[str, ...] = ()
     """Other topics to record."""
     results: bool = False
@@ -53,7 +54,7 @@ class Selection(NamedTuple):
     results_of: tuple[str, ...] = RESULTS_OF
     """Prefixes of result topics."""
     result_topics: tuple[str, ...] = RESULTS
-    """Other result topics."""
+    """Result topics that do not begin with these prefixes."""
 
     def resolved(self, resolve: Callable[[str], str]) -> 'Selection':
         """Return the selection with absolute names.
@@ -109,7 +110,8 @@ def progress_line(recorder: RecorderState, seconds: float) -> str:
     str
     """
     dropped = recorder.dropped.total()
-    return (f'{seconds:.0f} s: {recorder.counts.total()} messages, {recorder.size / 1e6:.1f} MB'
+    messages = quantity(recorder.counts.total(), 'message')
+    return (f'{seconds:.0f} s: {messages}, {recorder.size / 1e6:.1f} MB'
             + (f', dropped: {dropped}' if dropped else ''))
 
 
@@ -129,9 +131,10 @@ def summary(recorder: RecorderState, selection: Selection, lost: Mapping[str, in
     Yields
     ------
     str
-        One line.
+        Line of the summary.
     """
-    yield f'{recorder.folder}: {recorder.counts.total()} messages, {recorder.size / 1e6:.2f} MB'
+    messages = quantity(recorder.counts.total(), 'message')
+    yield f'{recorder.folder}: {messages}, {recorder.size / 1e6:.2f} MB'
     for topic, n in sorted((+recorder.counts).items()):
         yield f'  {topic}  {n}'
     for topic in selection.fields + selection.topics:
@@ -141,5 +144,5 @@ def summary(recorder: RecorderState, selection: Selection, lost: Mapping[str, in
         yield f'  warning: {topic}: messages dropped while the disk was full: {n}'
     for topic, n in sorted(lost.items()):
         yield f'  warning: {topic}: messages lost before recording: {n}'
-    for topic, why in sorted(refused.items()):
-        yield f'  warning: {topic} was not recorded: {why}'
+    for topic, reason in sorted(refused.items()):
+        yield f'  warning: {topic} was not recorded: {reason}'

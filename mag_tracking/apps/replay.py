@@ -44,11 +44,11 @@ SUSPECT_MOUNTING_RATIO = 2.0
 
 
 class Configured(Protocol):
-    """A network with the settings of its tracking, such as a `Pipeline`."""
+    """Sensor network with its settings, such as a `Pipeline`."""
 
     @property
     def network(self) -> SensorNetwork:
-        """Sensors."""
+        """Sensor network."""
 
     @property
     def settings(self) -> Settings:
@@ -85,13 +85,14 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     progress : function, optional
         Called with the number of bytes read since the last call.
     stopped : function, optional
-        Called after every batch of readings and with every progress. When it returns true,
+        Called after every batch of readings and every progress call. When it returns true,
         reading ends, partial results are written, and the summary is marked as interrupted.
     report : function, optional
         Called with a line for the user if the results of an earlier run are replaced.
     truth : str, optional
-        A CSV file (`recording.truth`), or a topic of the recording with PoseStamped,
-        PoseWithCovarianceStamped or Odometry; default: all topics below /ground_truth.
+        Ground truth: a CSV file (see `recording.truth`), or a topic of the recording with
+        PoseStamped, PoseWithCovarianceStamped or Odometry. Default: all topics below
+        /ground_truth.
 
     Returns
     -------
@@ -144,7 +145,7 @@ class Results(Protocol):
         """
 
     def add_disturbance(self, disturbance: Disturbance, /) -> None:
-        """Add a disturbance, when it is found and again when it has ended.
+        """Add a disturbance; called when it is detected and again when it has ended.
 
         Parameters
         ----------
@@ -177,7 +178,7 @@ class Results(Protocol):
 
 
 class RunCollector:
-    """Forwards the outputs of the pipeline to the results and keeps the history of each track.
+    """Forwards the outputs of the pipeline to the results and stores the history of each track.
 
     Parameters
     ----------
@@ -195,7 +196,7 @@ class RunCollector:
 
     def __init__(self, results: Results) -> None:
         self._results = results
-        # Set by the first frame; every track follows a frame.
+        # The first frame, which precedes every track, sets this attribute.
         self._frame: FieldFrame
         self.logs: dict[int, TrackLog] = {}
         self.smoothed: dict[int, SmoothedLog] = {}
@@ -236,12 +237,13 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
     ----------
     recording : Recording
     reader : SampleReader
-        After the whole recording has been read.
+        Reader at the end of the recording.
     pipeline : Pipeline
-        After the whole recording has been processed.
+        Pipeline after the whole recording has been processed.
     collector : RunCollector
     truth : {target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}
     found : Prescan
+        Result of the first pass over the recording.
 
     Returns
     -------
@@ -266,11 +268,11 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
     tracks = [_track_entry(log, collector.smoothed.get(log.id), pipeline, truth)
               for log in collector.logs.values()]
     disturbances = [asdict(d) for d in collector.disturbances.values()]
-    why = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
-                              pipeline.detect, reader.missing_topics(), rejections)
+    reason = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
+                                 pipeline.detect, reader.missing_topics(), rejections)
     return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
             'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
-            'no_detection_reason': why,
+            'no_detection_reason': reason,
             'close_network': len(pipeline.network) > 1 and pipeline.network.is_compact,
             'frames_too_long': frame_period_warning(pipeline.settings.align, pipeline.network),
             'clocks_apart': pipeline.track.clocks_apart,
@@ -301,24 +303,24 @@ def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline
 
 
 def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
-    """Speed and heading from the delays between the sensors, or the reason for their absence."""
-    found = correlated_motion(PassData.of_frames(network, log.stamp_ns, log.measured, log.noise))
-    if found.reason:
-        return {'reason': found.reason}
+    """Speed and heading from the delays between the sensors, or the reason why they are missing."""
+    motion = correlated_motion(PassData.of_frames(network, log.stamp_ns, log.measured, log.noise))
+    if motion.reason:
+        return {'reason': motion.reason}
     k = log.most_certain()
-    moving = log.velocity[k][:2], log.covariance[k][3:5, 3:5]
-    return {'speed': found.speed, 'speed_sd': found.speed_std,
-            'heading_deg': float(np.degrees(found.heading)),
-            'heading_sd_deg': None if np.isnan(found.heading_std)
-            else float(np.degrees(found.heading_std)),
-            'contradicts': contradicts_delays(speed_of(*moving), heading_of(*moving), found)}
+    velocity = log.velocity[k][:2], log.covariance[k][3:5, 3:5]
+    return {'speed': motion.speed, 'speed_sd': motion.speed_std,
+            'heading_deg': float(np.degrees(motion.heading)),
+            'heading_sd_deg': None if np.isnan(motion.heading_std)
+            else float(np.degrees(motion.heading_std)),
+            'contradicts': contradicts_delays(speed_of(*velocity), heading_of(*velocity), motion)}
 
 
 def _mounting(log: TrackLog, pipeline: Pipeline) -> dict[str, dict[str, Any]]:
     """Estimated mounting error of each sensor; empty if mounting errors are not estimated."""
-    allowed = SUSPECT_MOUNTING_RATIO * pipeline.settings.track.mounting_std_deg
+    max_angle = SUSPECT_MOUNTING_RATIO * pipeline.settings.track.mounting_std_deg
     return {name: {'angles_deg': angles.tolist(), 'std_deg': std.tolist(),
-                   'suspicious': bool(np.abs(angles).max() > allowed)}
+                   'suspicious': bool(np.abs(angles).max() > max_angle)}
             for name, (angles, std) in log.mounting_of(pipeline.network.names).items()}
 
 
@@ -339,15 +341,15 @@ def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
     """
     best: tuple[float, dict[str, Any]] | None = None
     for name, arrays in truth.items():
-        found = _errors_of(log, pipeline, arrays)
-        if found is not None and (best is None or found[0] < best[0]):
-            best = found[0], {'name': name, **found[1]}
+        errors = _errors_of(log, pipeline, arrays)
+        if errors is not None and (best is None or errors[0] < best[0]):
+            best = errors[0], {'name': name, **errors[1]}
     return None if best is None else best[1]
 
 
 def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,
                truth: Truth) -> tuple[float, dict[str, Any]] | None:
-    """(error [m] used to compare ground truths, all errors) against one ground truth, or None."""
+    """Compute (error [m] for the choice of a ground truth, all errors) of a track, or None."""
     if pipeline.settings.track.target == 'magnet':
         magnet = magnet_errors(log, truth, pipeline.settings.track.magnet.axis)
         return (magnet['position_mean'], {**magnet}) if magnet else None
@@ -356,7 +358,7 @@ def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,
 
 
 def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: Truth) -> float | None:
-    """Ratio of the error of a track to its path bound, over the poses of its errors, or None."""
+    """Ratio of the error of a track to its path bound, or None."""
     track = pipeline.settings.track
     if track.target == 'magnet':
         # Between two poses, the magnet may have rotated arbitrarily.
@@ -376,7 +378,7 @@ def write_trajectories(run: Run, out: Path) -> list[Path]:
     ----------
     run : Run
     out : Path
-        Folder.
+        Output folder.
 
     Returns
     -------
@@ -405,7 +407,7 @@ def write_figures(run: Run, network: SensorNetwork, out: Path, max_tracks: int =
     run : Run
     network : SensorNetwork
     out : Path
-        Folder.
+        Output folder.
     max_tracks : int
         Maximum number of tracks.
     stopped : function, optional

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.report.page import NOTE, WARNING, Note
 from mag_tracking.stages.track.evidence import LOST
 from mag_tracking.stages.track.manager import ALONE, NO_SCALE
@@ -22,7 +23,7 @@ def notes_of(summary: Mapping[str, Any]) -> list[Note]:
     list of Note
     """
     return [*_input_notes(summary), *_limit_notes(summary), *_truth_notes(summary),
-            *(Note(NOTE, _disturbance_text(d)) for d in summary['disturbances'])]
+            *(Note(NOTE, _describe_disturbance(d)) for d in summary['disturbances'])]
 
 
 def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
@@ -33,8 +34,8 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     if summary['no_detection_reason']:
         yield Note(NOTE, f'nothing was detected with the settings for a {summary["target"]}: '
                    f'{summary["no_detection_reason"]}')
-    for what, n in {**summary['rejected'], **summary['lost']}.items():
-        yield Note(WARNING, f'{what}: {n}')
+    for cause, n in {**summary['rejected'], **summary['lost']}.items():
+        yield Note(WARNING, f'{cause}: {n}')
     stuck = [name for name, s in sensors.items() if s['stuck']]
     if stuck:
         yield Note(WARNING, f'{", ".join(stuck)}: an axis is constant (run mag-tracking doctor)')
@@ -60,21 +61,21 @@ def no_track_reason(counts: Mapping[str, int]) -> str | None:
     Returns
     -------
     str or None
-        None if this is not the case.
+        One sentence; None if vehicles were tracked, or several sensors measured the target.
     """
     if counts.get(NO_SCALE, 0) or counts.get(ALONE, 0) and not counts.get('tracks', 0):
         return ('no track: the scale is not observable with a single sensor. Use `mag-tracking '
-                'events` to describe the passes without it, or set track.single_sensor_prior: true '
-                'if the vehicles match the settings')
+                'events` to describe the passes without scale, or set track.single_sensor_prior: '
+                'true if the vehicles match the settings')
     return None
 
 
 def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Notes on the limits of the tracks and their causes."""
+    """Notes on limitations of the tracks and their causes."""
     counts = summary['counts']['track']
-    why = no_track_reason(counts)
-    if why:
-        yield Note(NOTE, why)
+    reason = no_track_reason(counts)
+    if reason:
+        yield Note(NOTE, reason)
     elif len(summary['sensors']) == 1 and summary['tracks']:
         yield Note(NOTE, 'range and size are based on the settings (track.single_sensor_prior): '
                    'the scale is not observable with a single sensor')
@@ -85,33 +86,35 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, summary['frames_too_long'])
     if summary['clocks_apart']:
         yield Note(WARNING, summary['clocks_apart'])
-    lost = counts.get(f'tracks ended: {LOST}', 0)
-    if lost:
-        yield Note(WARNING, f'{lost} tracks lost their target: check the orientations in the '
-                   'network file; other causes are several targets at once, or a kind of target '
-                   'that is not in the settings')
-    unknown = counts.get('sensors whose orientation is hardly known', 0)
-    if unknown:
-        yield Note(WARNING, f'{unknown} sensors have an orientation uncertainty of more than 15 '
-                   'degrees in the network file: calibrate them')
-    too_long = counts.get('tracks too long to smooth', 0)
-    if too_long:
-        yield Note(WARNING, f'{too_long} tracks were too long to smooth (track.max_smoothing_s, '
-                   'or too many frames for the number of sensors)')
+    n_lost = counts.get(f'tracks ended: {LOST}', 0)
+    if n_lost:
+        yield Note(WARNING, quantity(n_lost, 'track lost its target', 'tracks lost their target')
+                   + ': check the orientations in the network file; other causes are several '
+                   'targets at once, or a kind of target that is not in the settings')
+    uncertain = counts.get('sensors whose orientation is hardly known', 0)
+    if uncertain:
+        yield Note(WARNING, quantity(uncertain, 'sensor has', 'sensors have')
+                   + ' an orientation uncertainty of more than 15 degrees in the network file: '
+                   'calibrate the network')
+    n_too_long = counts.get('tracks too long to smooth', 0)
+    if n_too_long:
+        yield Note(WARNING, quantity(n_too_long, 'track was', 'tracks were')
+                   + ' too long to smooth (track.max_smoothing_s, or too many frames for the '
+                   'number of sensors)')
 
 
 def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Note on the reliability of the unambiguous poses."""
-    found = summary['unflagged_poses']
-    if found and found['n']:
-        yield Note(NOTE, f'unambiguous poses: {found["n"]}, of which {found["wrong"]} '
-                   f'({found["wrong"] / found["n"]:.1%}) are wrong (error above 2 m and above '
+    """Note on the number of unambiguous poses that are wrong."""
+    poses = summary['unflagged_poses']
+    if poses and poses['n']:
+        yield Note(NOTE, f'unambiguous poses: {poses["n"]}, of which {poses["wrong"]} '
+                   f'({poses["wrong"] / poses["n"]:.1%}) are wrong (error above 2 m and above '
                    'three standard deviations)'
-                   + (f'; {found["without_truth"]} more without ground truth'
-                      if found['without_truth'] else ''))
+                   + (f'; {poses["without_truth"]} more without ground truth'
+                      if poses['without_truth'] else ''))
 
 
-def _disturbance_text(d: Mapping[str, Any]) -> str:
+def _describe_disturbance(d: Mapping[str, Any]) -> str:
     """Describe a disturbance in one sentence."""
     duration = (d['stamp_ns'] - d['begin_ns']) / NS
     extent = 'uniform over the network' if d['uniform'] > 0.5 else 'different at each sensor'

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.replay import Run
 from mag_tracking.apps.replay_notes import notes_of
 from mag_tracking.files import replace_text
@@ -27,14 +28,14 @@ from mag_tracking.report.track_log import TrackLog
 
 
 def write_report(run: Run, network: SensorNetwork, out: Path) -> Path:
-    """Write `report.html`.
+    """Write the report of a replay to `report.html`.
 
     Parameters
     ----------
     run : Run
     network : SensorNetwork
     out : Path
-        Folder.
+        Output folder.
 
     Returns
     -------
@@ -70,16 +71,17 @@ def replay_page(run: Run, network: SensorNetwork) -> Page:
     if logs:
         scene = _scene(run, network, logs[:MAX_TRACKS], notes)
     counts = summary['counts']
-    return Page(f'{summary["recording"]}: {len(logs)} track{"s" * (len(logs) != 1)}',
-                f'{counts["align"].get("frames", 0)} frames, '
-                f'{counts["detect"].get("onsets", 0)} detections, '
-                f'{len(summary["disturbances"])} disturbances', notes, scene,
+    numbers = (quantity(counts['align'].get('frames', 0), 'frame'),
+               quantity(counts['detect'].get('onsets', 0), 'detection'),
+               quantity(len(summary['disturbances']), 'disturbance'))
+    return Page(f'{summary["recording"]}: {quantity(len(logs), "track")}', ', '.join(numbers),
+                notes, scene,
                 tables=[_sensor_table(summary, run, network)])
 
 
 def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
            notes: list[Note]) -> dict[str, Any]:
-    """Map of the tracks; adds a note for everything that it omits."""
+    """Create the map of the tracks; add a note for each omission."""
     if len(logs) < len(run.logs):
         notes.append(Note(NOTE, f'the page shows the first {len(logs)} of {len(run.logs)} tracks'))
     max_poses = max_poses_of(logs)
@@ -107,7 +109,7 @@ def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
 
 
 def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) -> Table:
-    """Table of the sensors."""
+    """Table of the background, readings, noise and position of each sensor."""
     innovations = [t['nis_by_sensor'] for t in summary['tracks']]
     rows = []
     for j, (name, s) in enumerate(summary['sensors'].items()):

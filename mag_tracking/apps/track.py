@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.apps.prescan import prescan, prescan_of
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.readings import (
     RecordedReadings,
     check_order,
@@ -44,7 +45,7 @@ _BATCH = 4096
 
 @dataclass(frozen=True, eq=False)
 class TrackingResult:
-    """Tracks, poses and detections.
+    """Tracks, poses and detections of a recording or of readings.
 
     Arrays are structured, in SI units and in chronological order; they are empty without targets.
     """
@@ -76,8 +77,8 @@ class TrackingResult:
     no_detection_reason: str | None
     """One sentence if nothing was detected; otherwise None."""
     sensors_without_background: tuple[str, ...]
-    """Sensors that were not used because their background was not learnt. Their readings need a
-    quiet interval, or the network file a `background` and a `noise_std`."""
+    """Sensors that were not used because their background was not learnt. To use them, record a
+    quiet interval, or set `background` and `noise_std` in the network file."""
     disturbances: tuple[Disturbance, ...]
     """Fields that a disturbance explains better than a target."""
 
@@ -85,12 +86,14 @@ class TrackingResult:
         unused = {**self.rejections, **self.lost}
         notes = [*(f'not used: {n} {cause}' for cause, n in unused.items()),
                  *(f'no messages on {topic}' for topic in self.missing_topics),
-                 *([f'{len(self.disturbances)} disturbances'] if self.disturbances else []),
+                 *([quantity(len(self.disturbances), 'disturbance')] if self.disturbances else []),
                  *(f'no background of {name}' for name in self.sensors_without_background)]
         if self.no_detection_reason:
             notes.append(f'nothing was detected: {self.no_detection_reason}')
-        return (f'TrackingResult({len(self.tracks)} tracks, {len(self.poses)} poses, '
-                f'{len(self.smoothed)} smoothed poses, {len(self.detections)} detections'
+        numbers = (quantity(len(self.tracks), 'track'), quantity(len(self.poses), 'pose'),
+                   quantity(len(self.smoothed), 'smoothed pose'),
+                   quantity(len(self.detections), 'detection'))
+        return (f'TrackingResult({", ".join(numbers)}'
                 + (f'; {"; ".join(notes)}' if notes else '') + ')')
 
     def poses_dataframe(self) -> 'pd.DataFrame':
@@ -99,7 +102,7 @@ class TrackingResult:
         Returns
         -------
         pandas.DataFrame
-            With the columns of `poses.csv`.
+            Table with the columns of `poses.csv`.
 
         Raises
         ------
@@ -114,7 +117,7 @@ class TrackingResult:
         Returns
         -------
         pandas.DataFrame
-            With the columns of `poses_smoothed.csv`, and `complete`.
+            Table with the columns of `poses_smoothed.csv`, and `complete`.
 
         Raises
         ------
@@ -129,7 +132,7 @@ class TrackingResult:
         Returns
         -------
         pandas.DataFrame
-            With the columns of `detections.csv`.
+            Table with the columns of `detections.csv`.
 
         Raises
         ------
@@ -149,7 +152,7 @@ class TrackingResult:
         Returns
         -------
         dict or None
-            The entry `truth` of a track in `summary.json`; None without ground truth.
+            Entry `truth` of a track in `summary.json`; None without ground truth.
 
         Raises
         ------
@@ -181,8 +184,8 @@ class TrackingResult:
         log, errors = self._log(track_id), self.errors(track_id)
         truth = None if errors is None else interpolate_truth(self.truth[errors['name']],
                                                               log.stamp_ns)
-        mine = self.smoothed[(self.smoothed['track_id'] == log.id) & self.smoothed['complete']]
-        return map_figure(log, self.network, truth, mine['position'] if len(mine) else None)
+        smoothed = self.smoothed[(self.smoothed['track_id'] == log.id) & self.smoothed['complete']]
+        return map_figure(log, self.network, truth, smoothed['position'] if len(smoothed) else None)
 
     def weights_figure(self, track_id: int | None = None) -> 'Figure':
         """Draw the weight of each arrival direction over time.
@@ -227,12 +230,14 @@ class TrackingResult:
         return field_figure(self._log(track_id), self.network)
 
     def _log(self, track_id: int | None) -> TrackLog:
-        """History of a track; None selects the first one."""
-        if track_id is None and self.tracks:
+        """Return the history of a track; None selects the first track."""
+        if not self.tracks:
+            raise UnknownTrackError('the result contains no tracks')
+        if track_id is None:
             return next(iter(self.tracks.values()))
-        if track_id is None or track_id not in self.tracks:
-            known = ', '.join(map(str, self.tracks)) or 'none'
-            raise UnknownTrackError(f'track {track_id or ""}: not in the result, which has {known}')
+        if track_id not in self.tracks:
+            raise UnknownTrackError(f'track {track_id} is not in the result; tracks in the '
+                                    f'result: {", ".join(map(str, self.tracks))}')
         return self.tracks[track_id]
 
 
@@ -241,7 +246,7 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
           settings: Mapping[str, Any] | None = None) -> TrackingResult:
     """Track the targets in readings or in a recording.
 
-    The stages are those of `mag-tracking replay` and of the ROS nodes; no files are written.
+    The stages are the same as in `mag-tracking replay` and the ROS nodes. No files are written.
 
     Parameters
     ----------
@@ -290,11 +295,11 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
             collector.add(pipeline.feed(readings))
         info = recorded_readings(recording, reader, Readings.joined([]))
     collector.add(pipeline.flush())
-    return _result(pipeline, results, collector.logs, info)
+    return _tracking_result(pipeline, results, collector.logs, info)
 
 
 def _batches(readings: Readings) -> Iterator[Readings]:
-    """Readings in batches of at most `_BATCH`."""
+    """Split readings into batches of at most `_BATCH` readings."""
     return (readings.part(slice(i, i + _BATCH)) for i in range(0, len(readings), _BATCH))
 
 
@@ -327,15 +332,15 @@ class _Results:
         self.poses.append(replace(track, hypotheses=()))
 
 
-def _result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
-            recording: RecordedReadings) -> TrackingResult:
+def _tracking_result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
+                     recording: RecordedReadings) -> TrackingResult:
     """Convert the results to arrays; the readings of `recording` are not used."""
     rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
-    why = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
-                              pipeline.detect, recording.missing_topics, rejections)
+    reason = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
+                                 pipeline.detect, recording.missing_topics, rejections)
     return TrackingResult(
         pipeline.network, pipeline.settings, pose_array(results.poses),
         smoothed_array(results.smoothed), detection_array(results.detections), tracks,
         recording.truth, rejections, pipeline.counts(), recording.lost,
-        recording.missing_topics, why, tuple(pipeline.calibrate.unready()),
+        recording.missing_topics, reason, tuple(pipeline.calibrate.unready()),
         tuple(results.disturbances.values()))

@@ -16,6 +16,7 @@ from mag_tracking.analysis.correlated_motion import (
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.apps.prescan import prescan_of
+from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.readings import network_of
 from mag_tracking.apps.replay_notes import no_track_reason
 from mag_tracking.errors import SettingsError
@@ -51,7 +52,7 @@ class CountedVehicle:
 
 @dataclass(frozen=True)
 class TrafficResult:
-    """Traffic in a recording."""
+    """Counted vehicles and traffic summaries of a recording."""
 
     class_names: tuple[str, ...]
     """Classes, in the order of `VehiclePassage.class_probabilities`."""
@@ -74,7 +75,8 @@ class TrafficResult:
 
     def __repr__(self) -> str:
         lines = dict(Counter(v.passage.line for v in self.vehicles))
-        return f'TrafficResult({len(self.vehicles)} vehicles, {lines or "no line was crossed"})'
+        return (f'TrafficResult({quantity(len(self.vehicles), "vehicle")}, '
+                f'{lines or "no line was crossed"})')
 
 
 def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],
@@ -146,12 +148,12 @@ def count_traffic(recording: Recording, network: SensorNetwork, settings: Settin
         pass
     counter.add(pipeline.flush())
     rejections = dict(reader.rejected + Counter(pipeline.rejections()))
-    why = no_detection_reason(network, settings, pipeline.calibrate, pipeline.detect,
-                           reader.missing_topics(), rejections)
+    reason = no_detection_reason(network, settings, pipeline.calibrate, pipeline.detect,
+                                 reader.missing_topics(), rejections)
     return TrafficResult(settings.traffic.class_names, tuple(counter.vehicles),
                          tuple(counter.summaries), dict(pipeline.traffic.counts), rejections,
-                         tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()), why,
-                         no_track_reason(pipeline.counts()['track']))
+                         tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()),
+                         reason, no_track_reason(pipeline.counts()['track']))
 
 
 class _Counter:
@@ -160,7 +162,7 @@ class _Counter:
     def __init__(self, network: SensorNetwork) -> None:
         self._network = network
         self._frame: FieldFrame | None = None
-        self._before_jump: set[int] = set()
+        self._tracks_before_jump: set[int] = set()
         self._frames: dict[int, list[FieldFrame]] = {}
         self.vehicles: list[CountedVehicle] = []
         self.summaries: list[TrafficSummary] = []
@@ -175,28 +177,28 @@ class _Counter:
                 assert self._frame is not None, 'a pose without a frame'
                 self._frames.setdefault(record.id, []).append(self._frame)
             elif isinstance(record, VehiclePassage):
-                self.vehicles.append(CountedVehicle(record, self._delay(record.track_id)))
+                self.vehicles.append(CountedVehicle(record, self._delay_motion(record.track_id)))
             elif isinstance(record, TrafficSummary):
                 self.summaries.append(record)
 
     def _drop_old(self, now_ns: int) -> None:
         """Drop the fields of tracks that ended long ago, or before the time jumped back."""
-        old = self._before_jump or {id for id, frames in self._frames.items()
-                                    if now_ns - frames[-1].stamp_ns > RETENTION_S * NS}
-        for id in old:
-            del self._frames[id]
+        old = self._tracks_before_jump or {track_id for track_id, frames in self._frames.items()
+                                           if now_ns - frames[-1].stamp_ns > RETENTION_S * NS}
+        for track_id in old:
+            del self._frames[track_id]
         # Passages of tracks from before the jump arrive with the frame that jumped back.
         jumped = self._frame is not None and now_ns < self._frame.stamp_ns
-        self._before_jump = set(self._frames) if jumped else set()
+        self._tracks_before_jump = set(self._frames) if jumped else set()
 
-    def _delay(self, id: int) -> CorrelatedMotion:
-        """Velocity of a track from the delays between the sensors."""
-        frames = self._frames.get(id)
+    def _delay_motion(self, track_id: int) -> CorrelatedMotion:
+        """Compute the velocity of a track from the delays between the sensors."""
+        frames = self._frames.get(track_id)
         if not frames:
             return CorrelatedMotion('the fields of the track are no longer stored')
         begin, end = frames[0].stamp_ns, frames[-1].stamp_ns
         if any(other[0].stamp_ns <= end and begin <= other[-1].stamp_ns
-               for name, other in self._frames.items() if name != id):
+               for other_id, other in self._frames.items() if other_id != track_id):
             return CorrelatedMotion('another vehicle was near')
         return correlated_motion(PassData.of_frames(
             self._network, [f.stamp_ns for f in frames], [f.field for f in frames],

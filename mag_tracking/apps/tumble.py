@@ -1,4 +1,4 @@
-"""Calibration of hard and soft iron by tumbling, as by `mag-tracking tumble`."""
+"""Calibration of hard and soft iron by tumbling, for the command `mag-tracking tumble`."""
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -29,7 +29,7 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
     date : str
         Date of the calibration, stored in the network.
     field_size : float, T, optional
-        Magnitude of the ambient field; without it, the gains of the sensors are kept.
+        Magnitude of the ambient field. By default, the gains of the sensors are not changed.
     progress : function, optional
         Called with the number of bytes read since the last call.
     stopped : function, optional
@@ -79,10 +79,10 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
         columns['offset'][j], columns['correction'][j] = fit.offset, fit.correction
         # Background and noise refer to uncorrected readings; both will be learnt again.
         columns['background'][j] = columns['noise_std'][j] = None
-        done = network.calibrated[j]
+        record = network.calibrated[j]
         columns['calibrated'][j] = network.calibration_record(
-            j, date, f'{"as stated" if done is None else done.by}; tumbled to '
-            f'{100 * fit.residual:.1f} % of the field', float('nan') if done is None
-            else done.clock_offset_std)
+            j, date, f'{"as stated" if record is None else record.by}; tumbled to '
+            f'{100 * fit.residual:.1f} % of the field', float('nan') if record is None
+            else record.clock_offset_std)
     changes: dict[str, Any] = {key: tuple(v) for key, v in columns.items()}
     return replace(network, **changes), fits, readings, interrupted

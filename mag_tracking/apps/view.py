@@ -47,13 +47,13 @@ def view(recording: Recording, network: SensorNetwork, settings: Settings, scene
     """
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
     prescan_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
-    due, before_ns, health_due = time.monotonic(), None, 0.0
+    playback_due, last_log_ns, health_due = time.monotonic(), None, 0.0
     for readings, log_ns in _batches(reader.readings_as_received()):
-        # Paced by the time of recording, so that one wrong sensor timestamp cannot stop the page.
-        step_s = 0.0 if before_ns is None else (log_ns - before_ns) / NS
-        due, before_ns = due + min(max(step_s, 0.0), MAX_WAIT_S) / rate, log_ns
-        while time.monotonic() < due and not stopped():
-            time.sleep(min(0.05, max(0.0, due - time.monotonic())))
+        # Log times set the pace, because one wrong sensor timestamp could stop the page.
+        step_s = 0.0 if last_log_ns is None else (log_ns - last_log_ns) / NS
+        playback_due, last_log_ns = playback_due + min(max(step_s, 0.0), MAX_WAIT_S) / rate, log_ns
+        while time.monotonic() < playback_due and not stopped():
+            time.sleep(min(0.05, max(0.0, playback_due - time.monotonic())))
         if stopped():
             return
         _add_records(scene, pipeline.feed(readings))
@@ -65,7 +65,7 @@ def view(recording: Recording, network: SensorNetwork, settings: Settings, scene
 
 
 def _batches(messages: Iterable[tuple[Readings, int]]) -> Iterator[tuple[Readings, int]]:
-    """Readings of about `BATCH_S`, with the time of recording of the last one [ns]."""
+    """Yield batches of about `BATCH_S`, each with the log time of its last message [ns]."""
     batch: list[Readings] = []
     begin_ns = log_ns = 0
     for readings, log_ns in messages:
@@ -95,7 +95,7 @@ def _add_records(scene: LiveScene, records: Iterable[Output]) -> None:
 
 def _update_health(scene: LiveScene, pipeline: Pipeline, reader: SampleReader,
                    notes: list[Note]) -> None:
-    """Update rejections and the table of sensors."""
+    """Update the notes and the table of sensors."""
     rejected = {**reader.rejected, **pipeline.rejections()}
     notes = [*notes,
              *(Note(WARNING, f'no messages on {topic}') for topic in reader.missing_topics()),

@@ -1,4 +1,4 @@
-"""Recordings for archive tests, and an archive of them."""
+"""Recordings for archive tests, and an archive of these recordings."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Archives: rows equal those of a replay, runs continue, invalid recordings are named."""
+"""Archives: rows equal to a replay, continued runs, and invalid recordings."""
 
 import contextlib
 import os
@@ -28,20 +28,18 @@ from support.archives import command, rows, same_tables, wait_for
 from support.bundled import DATA, NETWORK_FILE, QUICK
 
 ROAD = DATA / 'two_way_road' / 'two_way_road.mcap'
-NAMES = ('straight_car_right', 'straight_small_left', 'junction_left_to_right')
-TRACKED = ('tracks', 'poses', 'smoothed', 'passes')
 
 
 @pytest.fixture(scope='module')
 def road_network_file(tmp_path_factory):
-    """Network file of the two-way road, whose sensors are farther apart."""
+    """Network file of the two-way road, with a larger distance between the sensors."""
     path = tmp_path_factory.mktemp('road') / 'network.yaml'
     path.write_text(NETWORK_FILE.read_text().replace('4.5', '5.5'))
     return path
 
 
 def archive_without_cluster(folder, recording, network, settings, in_order=True):
-    """Archive one recording without a cluster; return (its columns, number of segments)."""
+    """Archive a recording without a cluster; return (its columns, number of segments)."""
     work = folder / 'unfinished'
     work.mkdir(parents=True)
     job = Job(recording, work, folder, network, settings)
@@ -52,7 +50,7 @@ def archive_without_cluster(folder, recording, network, settings, in_order=True)
 
 
 def assert_rows_of_replay(folder, result):
-    """Assert that the tables hold the poses and tracks of a result, in order."""
+    """Assert that the tables contain the poses and tracks of a result in the same order."""
     for table, poses in (('poses', result.poses),
                          ('smoothed', result.smoothed[result.smoothed['complete']])):
         files = pq.read_table(folder / table).to_pandas()
@@ -77,10 +75,10 @@ def test_a_recording_in_segments_gives_the_rows_of_a_replay(
     monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 60)
     monkeypatch.setattr(archive_segments, 'CHUNK_FRAMES', 50)
     settings, network = settings_for('vehicle', QUICK), read_network(road_network_file)
-    known, n = archive_without_cluster(tmp_path, ROAD, network, settings, in_order=False)
+    columns, n = archive_without_cluster(tmp_path, ROAD, network, settings, in_order=False)
     result = mt.track(ROAD, network, settings=QUICK)
-    assert n > 8 and known['tracks'] == len(result.tracks) >= 20
-    assert known['passes'] == pq.read_table(tmp_path / 'passes').num_rows >= 20
+    assert n > 8 and columns['tracks'] == len(result.tracks) >= 20
+    assert columns['passes'] == pq.read_table(tmp_path / 'passes').num_rows >= 20
     assert_rows_of_replay(tmp_path, result)
 
 
@@ -88,25 +86,25 @@ def test_a_recording_in_segments_gives_the_rows_of_a_replay(
 @pytest.mark.parametrize('ahead_s', [0.0, 0.2])
 def test_clock_differences_carry_over_between_segments(
         tmp_path, monkeypatch, road_network_file, ahead_s):
-    """With different clocks, tracks are doubted because of passes in earlier segments."""
+    """With clock differences, passes in earlier segments mark later tracks as doubtful."""
     monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 60)
     path = tmp_path / 'network.yaml'
     text = road_network_file.read_text()
     path.write_text(text.replace('mag_2:', f'mag_2:\n    clock_offset: {ahead_s}'))
     network = read_network(path)
     assert network.clock_offset.tolist() == [0.0, ahead_s]
-    tracked, manager = [], archive_work.TrackManager
-    monkeypatch.setattr(archive_work, 'TrackManager', lambda *a: tracked.append(a) or manager(*a))
+    calls, manager = [], archive_work.TrackManager
+    monkeypatch.setattr(archive_work, 'TrackManager', lambda *a: calls.append(a) or manager(*a))
     _, n = archive_without_cluster(tmp_path / 'archive', ROAD, network, settings_for('vehicle'))
     result = mt.track(ROAD, network)
     assert_rows_of_replay(tmp_path / 'archive', result)
     # Segments whose tracks depend on earlier segments were tracked a second time.
-    assert n > 1 and (len(tracked) > n) == bool(ahead_s)
+    assert n > 1 and (len(calls) > n) == bool(ahead_s)
     assert any(CLOCKS_APART in d for d in result.poses['doubts']) == bool(ahead_s)
 
 
 def test_an_archive_contains_all_valid_recordings(tmp_path, recordings, capsys):
-    """Two workers; the invalid recording is named and skipped; a second run changes nothing."""
+    """Two workers skip and report the invalid recording. A second run changes nothing."""
     out, lines = tmp_path / 'out', []
     settings = settings_for('vehicle', QUICK)
     run = archive([recordings], NETWORK_FILE, settings, out, workers=2, report=lines.append)
@@ -116,19 +114,19 @@ def test_an_archive_contains_all_valid_recordings(tmp_path, recordings, capsys):
     assert [p.name[:7] for p in (out / 'unfinished').iterdir()] == ['damaged']
     for path in run.done:
         result = mt.track(path, NETWORK_FILE, settings=QUICK)
-        found = pq.read_table(out / 'poses', filters=[('source', '=', str(path))]).to_pandas()
-        np.testing.assert_array_equal(found.sort_values('stamp_ns')[['x', 'y']].values,
+        poses = pq.read_table(out / 'poses', filters=[('source', '=', str(path))]).to_pandas()
+        np.testing.assert_array_equal(poses.sort_values('stamp_ns')[['x', 'y']].values,
                                       result.poses['position'][:, :2])
-    known = {row[1]: row for row in rows(out, 'recordings')}
-    assert len(known) == 4 and 'not an MCAP file' in known[str(damaged)][3]
+    row_of = {row[1]: row for row in rows(out, 'recordings')}
+    assert len(row_of) == 4 and 'not an MCAP file' in row_of[str(damaged)][3]
     sensors = duckdb.sql(f"SELECT DISTINCT sensor, accepted > 500, noise_x BETWEEN 1e-9 AND 1e-7 "
                          f"FROM read_parquet('{out}/health/**/*.parquet') ORDER BY 1").fetchall()
     assert sensors == [('mag_1', True, True), ('mag_2', True, True)]
 
-    written = {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')}
-    again = archive([recordings / '*.mcap', recordings / 'below'], NETWORK_FILE, settings, out)
-    assert sorted(again.already_done) == sorted(run.done) and not again.done
-    assert {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')} == written
+    mtimes = {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')}
+    second = archive([recordings / '*.mcap', recordings / 'below'], NETWORK_FILE, settings, out)
+    assert sorted(second.already_done) == sorted(run.done) and not second.done
+    assert {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')} == mtimes
     assert len(rows(out, 'recordings')) == 4
 
 
@@ -147,9 +145,9 @@ def test_a_recording_that_changed_is_tracked_again(tmp_path, recordings):
 
 def test_a_stopped_run_continues(tmp_path, recordings, complete_archive):
     out, settings = tmp_path / 'out', settings_for('vehicle', QUICK)
-    seen = []
-    first = archive([recordings], NETWORK_FILE, settings, out, progress=seen.append,
-                    stopped=lambda: bool(seen))
+    sizes = []
+    first = archive([recordings], NETWORK_FILE, settings, out, progress=sizes.append,
+                    stopped=lambda: bool(sizes))
     assert first.interrupted and 1 <= len(first.done) < 3
     second = archive([recordings], NETWORK_FILE, settings, out)
     assert not second.interrupted and len(second.done) + len(first.done) == 3
@@ -167,8 +165,8 @@ def test_a_killed_run_continues(tmp_path, recordings, complete_archive):
             child.kill()
     process.kill()
     process.communicate()
-    done = subprocess.run(arguments, capture_output=True, text=True)
-    assert done.returncode == 1 and 'recordings failed: 1' in done.stdout, done.stderr
+    finished = subprocess.run(arguments, capture_output=True, text=True)
+    assert finished.returncode == 1 and 'recordings failed: 1' in finished.stdout, finished.stderr
     assert same_tables(out, complete_archive)
 
 
@@ -186,7 +184,7 @@ def test_ctrl_c_ends_the_command_with_a_hint_to_continue(tmp_path, recordings):
 
 
 def frames(*segments):
-    """Frames at 10 Hz of consecutive segments (duration [s], target present)."""
+    """Frames at 10 Hz of consecutive segments, each given as (duration [s], target present)."""
     out = []
     for seconds, present in segments:
         for _ in range(round(10 * seconds)):
@@ -199,44 +197,45 @@ def frames(*segments):
 def test_segments_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quiet_s, n):
     monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 10)
     monkeypatch.setattr(archive_segments, 'CHUNK_FRAMES', 7)
-    given = frames((20.0, False), (2.0, True), (quiet_s, False), (2.0, True), (9.0, False))
+    all_frames = frames((20.0, False), (2.0, True), (quiet_s, False), (2.0, True), (9.0, False))
     writer = SegmentWriter(tmp_path, 3.0)
-    for f in given:
-        writer.add_frame(f, {})
+    for frame in all_frames:
+        writer.add_frame(frame, {})
     writer.close()
     assert writer.n_segments == n
     for k in range(n):
-        kept = [f for piece in read_segment(tmp_path / f'segment-{k}.pickle')
-                for f, _ in piece.frames()]
-        first = next(i for i, f in enumerate(kept) if f.target_present)
+        stored = [frame for chunk in read_segment(tmp_path / f'segment-{k}.pickle')
+                  for frame, _ in chunk.frames()]
+        first = next(i for i, frame in enumerate(stored) if frame.target_present)
         # All frames that a track may look back to, and the frame that ends the track.
-        assert kept[first].stamp_ns - kept[0].stamp_ns in (3_000_000_000, 3_100_000_000)
-        assert not kept[-1].target_present
-    assert max(len(p.stamp_ns) for k in range(n) for p in read_segment(
+        assert stored[first].stamp_ns - stored[0].stamp_ns in (3_000_000_000, 3_100_000_000)
+        assert not stored[-1].target_present
+    assert max(len(chunk.stamp_ns) for k in range(n) for chunk in read_segment(
         tmp_path / f'segment-{k}.pickle')) <= 7 + 31
 
 
 def test_a_backward_time_jump_between_segments_loses_no_frames(tmp_path):
     writer = SegmentWriter(tmp_path, 3.0)
-    for f in frames((60.0, False)) + frames((60.0, False), (2.0, True), (9.0, False)):
-        writer.add_frame(f, {})
+    for frame in frames((60.0, False)) + frames((60.0, False), (2.0, True), (9.0, False)):
+        writer.add_frame(frame, {})
     writer.close()
-    kept = [f for p in read_segment(tmp_path / 'segment-0.pickle') for f, _ in p.frames()]
-    assert len(kept) == 31 + 20 + 1
+    stored = [frame for chunk in read_segment(tmp_path / 'segment-0.pickle')
+              for frame, _ in chunk.frames()]
+    assert len(stored) == 31 + 20 + 1
     assert not (tmp_path / 'segment-1.pickle').exists()
 
 
 def test_doubts_are_stored_with_the_frames_of_a_segment(tmp_path):
-    """At the beginning of each segment and whenever they change."""
+    """Doubts are stored at the beginning of each segment and whenever they change."""
     writer = SegmentWriter(tmp_path, 3.0)
     first, second = {'mag_1': ((1, None),)}, {'mag_1': ((1, 5),)}
-    for k, f in enumerate(frames((5.0, False), (2.0, True), (9.0, False))):
-        writer.add_frame(f, first if k < 60 else second)
+    for k, frame in enumerate(frames((5.0, False), (2.0, True), (9.0, False))):
+        writer.add_frame(frame, first if k < 60 else second)
     writer.close()
-    found = [(f.stamp_ns, doubts) for piece in read_segment(tmp_path / 'segment-0.pickle')
-             for f, doubts in piece.frames() if doubts is not None]
-    assert [doubts for _, doubts in found] == [first, second]
-    assert found[0][0] < 5_000_000_000 and found[1][0] == 6_000_000_000
+    stored = [(frame.stamp_ns, doubts) for chunk in read_segment(tmp_path / 'segment-0.pickle')
+              for frame, doubts in chunk.frames() if doubts is not None]
+    assert [doubts for _, doubts in stored] == [first, second]
+    assert stored[0][0] < 5_000_000_000 and stored[1][0] == 6_000_000_000
 
 
 def test_rows_are_partitioned_by_day_and_unknown_values_are_null(complete_archive):

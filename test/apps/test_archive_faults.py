@@ -1,4 +1,4 @@
-"""Archives: faults are reported, and lost work is repeated."""
+"""Archives: faults are reported, and lost tasks are repeated."""
 
 import contextlib
 import gc
@@ -24,7 +24,7 @@ from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 from support.mqtt_broker import free_port
 
 
-def test_the_work_of_a_lost_worker_is_repeated(tmp_path, recordings, complete_archive):
+def test_the_tasks_of_a_lost_worker_are_repeated(tmp_path, recordings, complete_archive):
     out, runs = tmp_path / 'out', []
     before = {*psutil.Process().children(recursive=True)}
     thread = threading.Thread(target=lambda: runs.append(archive(
@@ -71,22 +71,22 @@ def test_a_second_run_into_the_same_folder_is_refused(tmp_path, recordings):
     out, lines = tmp_path / 'out', []
     settings = settings_for('vehicle', QUICK)
 
-    def second():
+    def second_run():
         if not lines:
             with pytest.raises(OutputError, match='another run is writing to'):
                 archive([recordings], NETWORK_FILE, settings, out)
             lines.append('refused')
         return True
-    assert archive([recordings], NETWORK_FILE, settings, out, stopped=second).interrupted
+    assert archive([recordings], NETWORK_FILE, settings, out, stopped=second_run).interrupted
     assert lines == ['refused']
 
 
 def test_a_scheduler_that_does_not_respond_is_an_error(tmp_path, recordings, monkeypatch):
     monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT_S', 1.0)
     settings = settings_for('vehicle', QUICK)
-    for address, why in ((f'tcp://127.0.0.1:{free_port()}', 'no response from a Dask scheduler'),
+    for address, error in ((f'tcp://127.0.0.1:{free_port()}', 'no response from a Dask scheduler'),
                          ('nonsense://x', 'no response from a Dask scheduler')):
-        with pytest.raises(ClusterError, match=why):
+        with pytest.raises(ClusterError, match=error):
             archive([recordings], NETWORK_FILE, settings, tmp_path / 'out', scheduler=address)
 
 
@@ -108,16 +108,16 @@ def test_a_scheduler_requires_workers(tmp_path, recordings, monkeypatch):
 
 
 def test_a_failed_client_does_not_block_the_next_one(tmp_path, recordings, monkeypatch):
-    """Garbage collection of a failed client in Dask's event loop caused a deadlock."""
+    """Garbage collection of a failed client in Dask's event loop must not cause a deadlock."""
     from distributed import LocalCluster
     from tornado.ioloop import IOLoop
 
     settings, current = settings_for('vehicle', QUICK), IOLoop.current
-    seen: set[int] = set()
+    thread_ids: set[int] = set()
 
-    def collecting(*args, **kwargs):
-        if threading.get_ident() not in seen:
-            seen.add(threading.get_ident())
+    def current_after_collection(*args, **kwargs):
+        if threading.get_ident() not in thread_ids:
+            thread_ids.add(threading.get_ident())
             gc.collect()
         return current(*args, **kwargs)
 
@@ -128,7 +128,7 @@ def test_a_failed_client_does_not_block_the_next_one(tmp_path, recordings, monke
             with pytest.raises(ClusterError, match='no response from a Dask scheduler'):
                 archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
                         scheduler='nonsense://x')
-            monkeypatch.setattr(IOLoop, 'current', collecting)
+            monkeypatch.setattr(IOLoop, 'current', current_after_collection)
             run = archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
                           scheduler=local_cluster.scheduler_address)
         finally:
@@ -140,10 +140,10 @@ def test_a_run_continues_after_a_full_disk(tmp_path, recordings, complete_archiv
     """A limit on the file size simulates a full disk."""
     out = tmp_path / 'out'
     arguments = command(recordings, out, tmp_path, '--workers', '1')
-    done = subprocess.run(['bash', '-c', 'ulimit -f 30; exec "$@"', '-', *arguments],
-                          capture_output=True, text=True)
-    assert done.returncode == 1 and 'mag-tracking: cannot write' in done.stderr
-    assert 'Traceback' not in done.stderr and not list(out.glob('done/*.json'))
+    completed = subprocess.run(['bash', '-c', 'ulimit -f 30; exec "$@"', '-', *arguments],
+                               capture_output=True, text=True)
+    assert completed.returncode == 1 and 'mag-tracking: cannot write' in completed.stderr
+    assert 'Traceback' not in completed.stderr and not list(out.glob('done/*.json'))
     assert subprocess.run(arguments, capture_output=True).returncode == 1
     assert same_tables(out, complete_archive)
 
@@ -160,19 +160,19 @@ def test_a_table_is_complete_or_missing(tmp_path):
 
 
 def test_folders_and_patterns_select_recordings(tmp_path, recordings):
-    found = recordings_of([recordings, recordings / 'straight_*.mcap'])
-    assert [p.name for p in found] == ['junction_left_to_right.mcap', 'damaged.mcap',
+    selected = recordings_of([recordings, recordings / 'straight_*.mcap'])
+    assert [p.name for p in selected] == ['junction_left_to_right.mcap', 'damaged.mcap',
                                        'straight_car_right.mcap', 'straight_small_left.mcap']
     (tmp_path / 'bag').mkdir()
     shutil.copy(recordings / 'straight_car_right.mcap', tmp_path / 'bag' / 'a_0.mcap')
     (tmp_path / 'bag' / 'metadata.yaml').write_text('')
     assert recordings_of([tmp_path]) == [(tmp_path / 'bag').resolve()]
-    for nothing in (tmp_path / 'none', tmp_path / '*.bag', recordings / 'notes.txt'):
+    for path in (tmp_path / 'none', tmp_path / '*.bag', recordings / 'notes.txt'):
         with pytest.raises(RecordingError, match='no recording found'):
-            recordings_of([nothing])
+            recordings_of([path])
 
 
-def test_invalid_arguments_are_named(tmp_path, recordings, capsys):
+def test_invalid_arguments_are_reported(tmp_path, recordings, capsys):
     arguments = ['archive', str(recordings), '--network', str(NETWORK_FILE), '--out',
                  str(tmp_path / 'out')]
     assert main([*arguments, '--workers', '0']) == 1
@@ -182,23 +182,23 @@ def test_invalid_arguments_are_named(tmp_path, recordings, capsys):
 
 
 def test_a_recording_that_grows_during_tracking_is_tracked_again(tmp_path):
-    """For example a recording in progress."""
+    """A recording in progress, for example, grows while it is tracked."""
     path, out, settings = tmp_path / 'a.mcap', tmp_path / 'out', settings_for('vehicle', QUICK)
     data = vehicle_path('straight_car_right').read_bytes()
     path.write_bytes(data[:len(data) // 2])
 
-    def grows():
+    def grow():
         if list(out.glob('unfinished/*')):
             path.write_bytes(data)
         return False
-    archive([path], NETWORK_FILE, settings, out, stopped=grows)
+    archive([path], NETWORK_FILE, settings, out, stopped=grow)
     second = archive([path], NETWORK_FILE, settings, out)
     assert len(second.done) == 1 and second.tracks == 1
     assert archive([path], NETWORK_FILE, settings, out).already_done == [path]
 
 
 def test_leftovers_of_an_earlier_state_of_a_recording_are_discarded(tmp_path):
-    """Both tables and intermediate files of a killed run."""
+    """The leftovers are tables and intermediate files of a killed run."""
     path = tmp_path / 'a[1] = ö.mcap'
     shutil.copy(vehicle_path('straight_car_right'), path)
     with ArchiveFolder(tmp_path / 'out', {}) as dataset:
@@ -214,9 +214,9 @@ def test_leftovers_of_an_earlier_state_of_a_recording_are_discarded(tmp_path):
         assert other != work and not work.exists() and not list(other.iterdir())
 
 
-def test_a_recording_that_kills_its_workers_fails_alone(tmp_path, recordings, monkeypatch):
-    """A file name that ends its worker simulates a recording that needs too much memory. Other
-    work that is lost with the worker is repeated."""
+def test_a_recording_that_kills_its_workers_is_the_only_failure(tmp_path, recordings, monkeypatch):
+    """A file that terminates its worker simulates a recording that needs too much memory. Other
+    tasks that are lost with the worker are repeated."""
     folder = tmp_path / 'recordings'
     folder.mkdir()
     shutil.copy(recordings / 'straight_car_right.mcap', folder / 'good.mcap')

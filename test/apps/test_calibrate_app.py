@@ -27,7 +27,7 @@ def truth_of(name):
 
 
 def as_installed(truth):
-    """Network of positions and the Earth's field; all sensors upright, x pointing east."""
+    """Network with true positions and field of the Earth; sensors upright, x to the east."""
     n = len(truth['sensors_m'])
     names = tuple(f'mag_{i + 1}' for i in range(n))
     return SensorNetwork(names, np.array(truth['sensors_m'], dtype=float),
@@ -48,14 +48,14 @@ def calibration_of(name):
 
 def errors(name):
     """Errors of the calibration: tilt (n,) [rad], heading (n,) [rad], clock (n,) [s]."""
-    found, truth = calibration_of(name).network, truth_of(name)['sensor_truth']
+    network, truth = calibration_of(name).network, truth_of(name)['sensor_truth']
     R = np.array(truth['mount_sensor_to_map'])
     # Angle between the vertical axes in the sensor's frame.
-    tilt = np.arccos(np.clip(np.einsum('ji,ji->j', found.R_ws[:, 2], R[:, 2]), -1.0, 1.0))
-    heading = np.array([yaw_between(t, f) for t, f in zip(R, found.R_ws, strict=True)])
-    clock = found.clock_offset - 1e-3 * np.array(truth['clock_offset_ms'])
+    tilt = np.arccos(np.clip(np.einsum('ji,ji->j', network.R_ws[:, 2], R[:, 2]), -1.0, 1.0))
+    heading = np.array([yaw_between(t, f) for t, f in zip(R, network.R_ws, strict=True)])
+    clock = network.clock_offset - 1e-3 * np.array(truth['clock_offset_ms'])
     # Only differences between clocks are observable.
-    return tilt, heading, clock - clock[found.names.index(calibration_of(name).survey.reference)]
+    return tilt, heading, clock - clock[network.names.index(calibration_of(name).survey.reference)]
 
 
 def orientation_stds(name):
@@ -136,8 +136,8 @@ def test_valid_recordings_give_no_warning(name):
 
 
 @pytest.mark.parametrize('name', studied(FILES, QUICK_NAMES, also=lambda name: [
-    pytest.mark.xfail(strict=True, reason='most poses of the truck are flagged as those of another '
-                      'vehicle or as overfitted: one of 89 is usable')]
+    pytest.mark.xfail(strict=True, reason='most poses of the truck are flagged as another '
+                      'vehicle or as overfitted: only one of 89 is usable')]
     if name == 'straight_truck_right' else []))
 def test_a_calibration_records_its_date_and_evidence(name):
     found = calibration_of(name)

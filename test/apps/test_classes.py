@@ -19,7 +19,7 @@ ROAD = DATA / 'two_way_road'
 
 @pytest.fixture(scope='module')
 def tables(tmp_path_factory):
-    """Folder with the same signatures as a table by sample and by row."""
+    """Folder with two tables of the same signatures: one row per sample or per signature."""
     folder, found = tmp_path_factory.mktemp('classes'), signatures(COUNTS, 'boxes')
     write_by_sample(folder / 'by_sample.csv', found)
     write_by_row(folder / 'by_row.csv', found)
@@ -80,7 +80,7 @@ def test_labelled_intervals_give_a_signature_of_each_sensor(tmp_path):
     ([('car', 5, 9), ('truck', 8, 11)], 'rows 2 and 3 overlap'),
     ([('', 5, 9)], 'row 2: the label is empty'), ([('car', 9, 5)], 'ends before it begins'),
     ([('car', 5000, 5009)], 'the interval contains no readings')])
-def test_invalid_intervals_are_named(tmp_path, rows, error):
+def test_invalid_intervals_are_reported(tmp_path, rows, error):
     with pytest.raises(LabelsError, match=error):
         labelled_signatures(vehicle_path('straight_car_right'),
                             write_intervals(tmp_path / 'a.csv', rows),
@@ -136,7 +136,7 @@ def test_a_model_of_other_axes_is_refused(tables, tmp_path, capsys):
 
 
 def test_units_are_converted_or_refused(tables, tmp_path, capsys):
-    """The same signatures in nanotesla, tesla, microtesla and an unknown unit."""
+    """The signatures are given in nanotesla, tesla, microtesla and an unknown unit."""
     found = signatures(COUNTS, 'boxes')
     for name, suffix, unit in (('t', '_t', 1.0), ('ut', '_ut', 1e6), ('none', '', 1e9)):
         write_by_sample(tmp_path / f'{name}.csv', found, unit)
@@ -155,7 +155,7 @@ def test_units_are_converted_or_refused(tables, tmp_path, capsys):
 
 
 def test_signatures_of_events_can_be_classified(tmp_path, capsys):
-    """They have no values before the first reading and after the last one."""
+    """Signatures of events have no values before the first and after the last reading."""
     recording, network = str(ROAD / 'two_way_road.mcap'), str(NETWORK_FILE)
     assert main(['events', recording, '--network', network, '--out', str(tmp_path)]) == 0
     found = labelled_signatures(tmp_path / 'signatures.csv', is_labelled=False)

@@ -12,7 +12,7 @@ from support.bundled import DATA, NETWORK_FILE, vehicle_path
 from support.iron_passes import HARD, recorded
 
 OTHER_HARD = [-x for x in HARD[:2]] + [HARD[2]]
-"""Hard iron of another vehicle, of equal magnitude."""
+"""Hard iron of another vehicle, with equal magnitude."""
 
 
 @pytest.fixture(scope='module')
@@ -54,7 +54,7 @@ def test_enrolled_vehicles_are_recognised(recordings, tmp_path, capsys):
     assert vehicles_of(tmp_path / 'both') == [('other_again', 'other'), ('van_again', 'van')]
 
 
-def test_invalid_enrolments_are_named(recordings, tmp_path, capsys):
+def test_invalid_enrolments_are_reported(recordings, tmp_path, capsys):
     file = tmp_path / 'fleet.json'
     assert command(recordings['van_east'], '--enrol', 'van') == 1
     assert '--enrol: give the fleet file with --fleet' in capsys.readouterr().err

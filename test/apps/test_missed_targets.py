@@ -1,4 +1,4 @@
-"""A stuck sensor is distinguished from a quiet one by targets that other sensors measure."""
+"""Targets that other sensors detect distinguish stuck sensors from quiet sensors."""
 
 import numpy as np
 import pytest
@@ -13,20 +13,20 @@ STEP = 2e-7
 
 
 def findings_of(last_amplitude, stuck_from, n_targets=4):
-    """Findings for three sensors of coarse resolution. The third one measures targets of
+    """Findings for three sensors of coarse resolution. The third sensor measures targets of
     `last_amplitude` [T] and repeats its reading from `stuck_from` [s].
     """
     network, samples = line_network(3), []
     rng = np.random.default_rng(0)
     t = np.arange(0.0, 10.0 * (n_targets + 1), 0.02)
-    held = None
+    stuck_field = None
     for s in t:
         pulse = sum(np.exp(-((s - 10.0 * k - 8.0) / 0.7)**2) for k in range(n_targets))
-        for j, size in enumerate((3e-6, 2e-6, last_amplitude)):
-            field = EARTH + size * pulse + 3e-8 * rng.standard_normal(3)
+        for j, amplitude in enumerate((3e-6, 2e-6, last_amplitude)):
+            field = EARTH + amplitude * pulse + 3e-8 * rng.standard_normal(3)
             field = STEP * np.round(field / STEP)
             if j == 2 and s >= stuck_from:
-                held = field = field if held is None else held
+                stuck_field = field = field if stuck_field is None else stuck_field
             samples.append(MagSample(int(1e9 * s), f'mag_{j + 1}', field))
     doctor = Doctor(network, settings_for('vehicle'))
     for k in range(0, len(samples), 60):
@@ -37,13 +37,13 @@ def findings_of(last_amplitude, stuck_from, n_targets=4):
 @pytest.mark.parametrize('last_amplitude, stuck_from, missed', [
     (2e-6, np.inf, None), (5e-7, np.inf, None), (2e-6, 5.0, 4), (2e-6, 12.0, 3),
     (2e-6, 0.0, 4), (2e-6, 36.0, None)])
-def test_a_stuck_sensor_misses_targets_of_the_others(last_amplitude, stuck_from, missed):
+def test_a_stuck_sensor_misses_targets_of_other_sensors(last_amplitude, stuck_from, missed):
     found = [f for f in findings_of(last_amplitude, stuck_from) if 'did not change while' in f]
     if missed is None:
         assert found == []
     else:
         assert len(found) == 1 and found[0].startswith('mag_3: its readings did not change while')
-        assert f' sensed {missed} targets' in found[0]
+        assert f' detected {missed} targets' in found[0]
 
 
 def test_quiet_sensors_miss_no_targets():

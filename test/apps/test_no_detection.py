@@ -1,4 +1,4 @@
-"""Reason why nothing was detected, in one sentence."""
+"""One-sentence explanation why nothing was detected."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ def test_no_reason_is_given_after_a_detection():
 
 
 @pytest.mark.parametrize('expected, arguments', [
-    (r'excursion was 0\.\d+ of the threshold \(mag_1 0\.\d+, mag_2 0\.\d+\); no target came close',
+    (r'was 0\.\d+ times the threshold \(mag_1 0\.\d+, mag_2 0\.\d+\); no target came close',
      {'readings': QUIET}),
     ('noise_std of mag_1 in the network file is',
      {'network': dataclasses.replace(NETWORK, noise_std=(np.full(3, 3e-6),) * 2)}),
@@ -58,11 +58,11 @@ def test_a_wrong_unit_is_named():
 
 
 def test_given_backgrounds_need_no_comparison_with_readings():
-    """Too few readings to estimate the scatter of a sensor."""
+    """There are too few readings to estimate the scatter of a sensor."""
     given = dataclasses.replace(NETWORK, noise_std=(np.full(3, 1e-8),) * 2, background=tuple(
         np.median(QUIET.field[np.array(QUIET.sensor_names()) == name], axis=0)
         for name in NETWORK.names))
-    assert 'of the threshold' in reason_of(network=given, readings=QUIET.part(slice(0, 40)))
+    assert 'times the threshold' in reason_of(network=given, readings=QUIET.part(slice(0, 40)))
 
 
 def test_a_sensor_without_a_background_is_named():

@@ -8,7 +8,7 @@ from support.passes import EARTH, ROAD
 from support.samples import MagSample, batch
 
 
-def test_an_empty_batch_may_arrive_while_a_reading_is_held():
+def test_an_empty_batch_may_arrive_while_a_reading_is_delayed():
     """A message may contain only readings of sensors outside the network."""
     rng, passes = np.random.default_rng(0), []
     collector = PassCollector(ROAD, settings_for('vehicle'))
@@ -19,7 +19,7 @@ def test_an_empty_batch_may_arrive_while_a_reading_is_held():
             for name in ROAD.names]))
 
     for k in range(1000):
-        # The reading before the empty batch is an outlier: it is held until the next reading.
+        # The reading before the empty batch is an outlier, whose output waits for the next reading.
         passes += feed(k, 5e-6 * (k == 600))
         if k == 600:
             passes += collector.feed(batch([]))

@@ -17,8 +17,8 @@ from support.track_records import NS, track_pose
 
 
 @cache
-def fitted(how, simulator):
-    """(fitted passes, `World`) of a pair of vehicles."""
+def fit_pair(how, simulator):
+    """Fit a pair of vehicles; return (fitted passes, `World`)."""
     a_world = busy(how, 2, simulator, 3, n=1)
     return fits_of_world(a_world, (2, 3)), a_world
 
@@ -26,7 +26,7 @@ def fitted(how, simulator):
 @pytest.mark.parametrize('simulator', SIMULATORS)
 @pytest.mark.parametrize('how', ['meeting', 'following'])
 def test_two_vehicles_are_fitted_together(how, simulator):
-    passes, a_world = fitted(how, simulator)
+    passes, a_world = fit_pair(how, simulator)
     assert [fit.label for fit in passes] == ['pass 1, vehicle 1', 'pass 1, vehicle 2']
     right = with_vehicles(passes, [(a_world.t, position) for position in a_world.positions])
     assert sorted(match.vehicle for match in right) == [0, 1]
@@ -46,7 +46,7 @@ def test_a_stopped_run_returns_no_fits():
 @pytest.mark.study
 @pytest.mark.parametrize('name', ['meeting_2_sensors', 'following_2_sensors'])
 def test_every_vehicle_of_a_recording_is_fitted(name):
-    """All sixteen have the right direction; 90 % of the speeds are within 10 %."""
+    """All sixteen directions are correct; 90 % of the speeds are within 10 %."""
     passes, right = fits_of_recording(name)
     off = np.array([match.one.chosen.speed[0] / match.speed - 1.0 for match in right])
     assert len(right) == len(passes) == 16
@@ -54,7 +54,7 @@ def test_every_vehicle_of_a_recording_is_fitted(name):
 
 
 def pass_of(begin, end):
-    """`PassData` between two times [s]."""
+    """`PassData` of zero fields between two times [s]."""
     t = np.arange(0.0, end - begin, 0.1)
     n = len(t)
     return PassData(ROAD, round(begin * NS), np.tile(t, 2), np.repeat([0, 1], n),
@@ -62,14 +62,14 @@ def pass_of(begin, end):
 
 
 def crossing(number, at, y, v, n=5, std=0.1):
-    """Poses of a track at x = 0 at time `at` [s], when its covariance is smallest."""
+    """Poses of a track that crosses x = 0 at time `at` [s], where its covariance is smallest."""
     return [track_pose(at + 0.2 * k, 0.2 * k * v, y, v, id=number,
                        covariance=(std + 0.1 * abs(k))**2 * np.eye(6))
             for k in range(-n, n + 1)]
 
 
 def in_order(*tracks):
-    """Records of several tracks in the order of their timestamps."""
+    """Records of several tracks in chronological order."""
     return sorted((record for track in tracks for record in track), key=lambda r: r.stamp_ns)
 
 
@@ -81,7 +81,7 @@ def test_vehicles_of_a_pass_have_their_smallest_covariance_in_it():
     paths = tracks.paths(pass_of(0.0, 6.0))
     np.testing.assert_allclose(sorted(paths[:, 3]), [-12.0, 10.0])
     for path in paths:
-        # Its position at the beginning of the pass.
+        # The position refers to the beginning of the pass.
         at = 3.0 if path[3] > 0.0 else 4.0
         np.testing.assert_allclose(path[:2], [-at * path[3], -np.sign(path[3]) * 1.7])
     np.testing.assert_allclose(tracks.paths(pass_of(5.0, 12.0))[:, 3], [14.0])
@@ -102,7 +102,7 @@ def test_a_track_that_ends_at_its_smallest_covariance_is_a_vehicle():
     assert len(tracks.paths(pass_of(0.0, 3.1))) == 0
     tracks.add([track_pose(3.2, 2.0, id=1, ended=True)])
     np.testing.assert_allclose(tracks.paths(pass_of(0.0, 3.5))[:, 3], [10.0])
-    # Tracks that were returned are forgotten.
+    # A returned track is not returned again.
     assert len(tracks.paths(pass_of(0.0, 3.5))) == 0
 
 
@@ -124,6 +124,6 @@ def test_the_ground_prior_follows_the_settings():
         'track.vehicle.heights': [0.4, 0.4, 1.0], 'track.vehicle.height_stds': [0.3, 0.3, 0.3],
         'track.vehicle.climb_std': 0.2})
     ground = ground_prior(settings.track)
-    # Variance of the means plus the variance of each.
+    # Variance of the means plus mean of the variances.
     assert ground.height == pytest.approx((0.6, np.sqrt(0.08 + 0.09)))
     assert ground.climb_std == 0.2

@@ -1,4 +1,4 @@
-"""Recording on a live page: tracks equal those of a replay; wrong timestamps are tolerated."""
+"""Live page of a recording: same tracks as a replay, and tolerance of wrong timestamps."""
 
 import json
 import time
@@ -49,7 +49,7 @@ def view_recording(path, network, rate):
     return scene, time.monotonic() - began
 
 
-def test_tracks_equal_those_of_a_replay(road_network):
+def test_tracks_equal_a_replay(road_network):
     scene, seconds = view_recording(vehicle_path(NAME), road_network, 4.0)
     expected = track(vehicle_path(NAME), NETWORK_FILE, settings=QUICK)
     poses = [t for t in scene.tracks if not t.ended]
@@ -70,7 +70,7 @@ def test_an_hour_without_messages_is_skipped(road_network, tmp_path):
 
 
 def rewrite(path, network, log_time_of, stamp_of):
-    """Copy the recording with log times and timestamps as functions of message `k`."""
+    """Copy the recording with other times: functions of (index of a message, time [ns])."""
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
     with RecordingWriter(path) as writer:
         for k, (readings, log_ns) in enumerate(reader.readings_as_received()):

@@ -1,0 +1,19 @@
+"""Numbers of things in messages."""
+
+
+def quantity(n: int, singular: str, plural: str = '') -> str:
+    """Format a number and its noun, such as '1 track' or '2 tracks'.
+
+    Parameters
+    ----------
+    n : int
+    singular : str
+        Noun for `n` = 1.
+    plural : str
+        Noun for other numbers; default: `singular` with an s.
+
+    Returns
+    -------
+    str
+    """
+    return f'{n} {singular if n == 1 else plural or singular + "s"}'
