@@ -13,10 +13,10 @@ from mag_tracking.analysis.network_geometry import (
     NetworkGeometry,
     calibrate_geometry,
 )
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.errors import NetworkError, RecordingError
 from mag_tracking.network import SensorNetwork
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.pose_table import (
     read_pose_table,
     read_readings,

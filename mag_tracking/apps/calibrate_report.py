@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from mag_tracking.apps.calibrate import Calibration
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.files import replace_text
 from mag_tracking.geometry import yaw_between
 from mag_tracking.network import SensorNetwork
+from mag_tracking.quantities import quantity
 from mag_tracking.report.calibration_figures import first_knock
 from mag_tracking.report.figures import SCALE_1D
 from mag_tracking.report.page import ERROR, NOTE, WARNING, Chart, Note, Page, Table, report_html

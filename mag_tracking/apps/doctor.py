@@ -8,11 +8,11 @@ import numpy as np
 from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.apps.doctor_rejections import rejection_advice
 from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import consensus, disagreements
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings

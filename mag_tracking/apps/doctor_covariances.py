@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mag_tracking.apps.quantities import quantity
+from mag_tracking.quantities import quantity
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.sensor_health import Finding
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from mag_tracking.apps.doctor import Doctor
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.files import replace_text
+from mag_tracking.quantities import quantity
 from mag_tracking.report.page import ERROR, NOTE, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, plain
 from mag_tracking.report.palette import AXIS_COLOURS

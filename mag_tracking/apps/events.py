@@ -7,11 +7,11 @@ from os import PathLike
 from typing import Any
 
 from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.readings import network_of
 from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings, settings_for
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader

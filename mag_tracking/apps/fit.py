@@ -9,11 +9,11 @@ import numpy as np
 
 from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
 from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.readings import network_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings, settings_for
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.fit_folder import FIT_COLUMNS, pass_rows
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader

@@ -8,9 +8,9 @@ import numpy as np
 
 from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, PassFit
 from mag_tracking.apps.pass_fitter import FittedPass
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
+from mag_tracking.quantities import quantity
 from mag_tracking.report.fit_figures import target_alone
 from mag_tracking.report.page import NOTE, REPORT, WARNING, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, curve

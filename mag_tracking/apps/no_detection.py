@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
+from mag_tracking.quantities import quantity
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
 

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from mag_tracking.apps.plan import GOOD_PD, Plan
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import FloatArray
 from mag_tracking.files import replace_text
+from mag_tracking.quantities import quantity
 from mag_tracking.report.page import NOTE, REPORT, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, curve, heat_map, places
 from mag_tracking.report.plan_figures import MIN_MISSED, distinct_lanes, length_text

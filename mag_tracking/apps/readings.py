@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.arrays import BoolArray
 from mag_tracking.errors import ReadingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings

@@ -5,13 +5,13 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.messages.types import (
     CALIBRATED_READINGS,
     CALIBRATION_STATE,
     NETWORK_FRAME,
     RAW_READINGS,
 )
+from mag_tracking.quantities import quantity
 
 RESULTS_OF = ('calibration_node/', 'detection_node/', 'tracker_node/')
 """Prefixes of result topics, relative to the namespace of the recorder."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from mag_tracking.apps.quantities import quantity
+from mag_tracking.quantities import quantity
 from mag_tracking.report.page import NOTE, WARNING, Note
 from mag_tracking.stages.track.evidence import LOST
 from mag_tracking.stages.track.manager import ALONE, NO_SCALE

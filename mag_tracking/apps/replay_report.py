@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.replay import Run
 from mag_tracking.apps.replay_notes import notes_of
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
+from mag_tracking.quantities import quantity
 from mag_tracking.report.metrics import interpolate_truth
 from mag_tracking.report.page import NOTE, REPORT, Note, Page, Table, report_html
 from mag_tracking.report.page_scene import (

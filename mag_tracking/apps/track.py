@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.apps.prescan import prescan, prescan_of
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.readings import (
     RecordedReadings,
     check_order,
@@ -22,6 +21,7 @@ from mag_tracking.errors import UnknownTrackError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Detection, FieldFrame, Readings, SmoothedPose, Track

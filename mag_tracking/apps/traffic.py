@@ -16,13 +16,13 @@ from mag_tracking.analysis.correlated_motion import (
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.readings import network_of
 from mag_tracking.apps.replay_notes import no_track_reason
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Output, Pipeline, Settings, settings_for
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader

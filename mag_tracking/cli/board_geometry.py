@@ -21,10 +21,10 @@ from mag_tracking.apps.board_geometry import (
 )
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network, write_network
+from mag_tracking.quantities import quantity
 from mag_tracking.settings import flatten, read_parameter_file, replace
 
 _GEOMETRY = '''

@@ -19,9 +19,9 @@ from mag_tracking.apps.classes import (
     train_classes,
 )
 from mag_tracking.cli.options import Commands, add_command, check_writable
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.network.file import read_network
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.signature_tables import read_model, write_model
 
 _CLASSES = '''

@@ -10,11 +10,11 @@ from tqdm import tqdm
 
 from mag_tracking.apps.events import EventsResult, find_events
 from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import PassEvent
 from mag_tracking.interrupts import recorded_signals
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.event_tables import write_events
 from mag_tracking.recording.reader import Recording
 from mag_tracking.units import NS

@@ -21,13 +21,13 @@ from mag_tracking.cli.options import (
     distinct_names,
     recorded_network,
 )
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.iron import hard_and_soft_iron
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0
 from mag_tracking.pipeline import settings_for
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.fit_folder import FitFolder
 from mag_tracking.recording.reader import Recording
 from mag_tracking.settings import read_parameter_file

@@ -6,9 +6,9 @@ import signal
 import sys
 
 from mag_tracking.cli.options import Commands, add_command
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
+from mag_tracking.quantities import quantity
 
 _NOTE = '''
 A substitute for the command `ros2`, which ROS from PyPI lacks. Names are relative to the

@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 
 from mag_tracking.cli.options import Commands, add_command
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import SettingsError
+from mag_tracking.quantities import quantity
 
 _IMPORT = '''
 Converts a table (CSV with a header) to a recording.

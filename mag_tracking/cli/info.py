@@ -4,9 +4,9 @@ import argparse
 from pathlib import Path
 
 from mag_tracking.cli.options import Commands, add_command, add_network
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.network.file import read_network
 from mag_tracking.network.topics import absolute, namespaces_of
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 
 

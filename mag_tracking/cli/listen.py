@@ -14,12 +14,12 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.drivers.driver import IGNORED, Driver, serve
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network
+from mag_tracking.quantities import quantity
 from mag_tracking.records import AccelerationSample, Readings
 
 Sample: TypeAlias = tuple[int, FloatArray | None]

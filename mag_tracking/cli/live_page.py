@@ -12,10 +12,10 @@ from pathlib import Path
 
 from mag_tracking.apps.view import view
 from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.web.live_scene import LiveScene
 from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK, PageServer, check_port

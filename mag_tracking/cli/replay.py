@@ -19,11 +19,11 @@ from mag_tracking.cli.options import (
     distinct_names,
     recorded_network,
 )
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import WARNING
 from mag_tracking.report.rerun_file import RERUN_FILE, check_rerun, write_rerun

@@ -21,7 +21,6 @@ from mag_tracking.cli.options import (
     distinct_names,
     recorded_network,
 )
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.files import output_folder
@@ -29,6 +28,7 @@ from mag_tracking.inference.identification import Identification
 from mag_tracking.inference.log_normal_classes import UNKNOWN
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.fleet_file import FleetPass, read_fleet, write_fleet
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader

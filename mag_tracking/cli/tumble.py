@@ -16,10 +16,10 @@ from mag_tracking.cli.options import (
     now,
     recorded_network,
 )
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import write_network
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 
 _TUMBLE = '''

@@ -9,7 +9,6 @@ import sys
 import pytest
 
 from mag_tracking.cli import main
-from mag_tracking.cli.quantities import quantity
 from mag_tracking.recording.fit_folder import FIT_COLUMNS
 from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
 from support.bundled import DATA, NETWORK_FILE, QUICK, parameter_file, vehicle_path
@@ -171,12 +170,6 @@ def test_an_upside_down_sensor_is_named(tmp_path, capsys):
     # A correct network causes no warning.
     assert replay_one(tmp_path / 'right', '--no-figures') == 0
     assert 'fits best if rotated' not in capsys.readouterr().out
-
-
-@pytest.mark.parametrize('n, text', [(0, '0 passes'), (1, '1 pass'), (2, '2 passes')])
-def test_quantities_have_the_singular_for_one_only(n, text):
-    assert quantity(n, 'pass', 'passes') == text
-    assert quantity(n, 'track') == f'{n} track' + ('' if n == 1 else 's')
 
 
 def test_replay_prints_counts_in_the_singular(tmp_path, capsys):

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 
 import mag_tracking as mt
-from mag_tracking.apps.quantities import quantity
 from mag_tracking.apps.replay_notes import notes_of
+from mag_tracking.quantities import quantity
 from mag_tracking.stages.track.evidence import LOST
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 
