@@ -2,7 +2,7 @@
 
 import argparse
 import signal
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,8 @@ from mag_tracking.cli.options import (
     recorded_network,
 )
 from mag_tracking.errors import OutputError, SettingsError
-from mag_tracking.inference.iron import hard_and_soft_iron
+from mag_tracking.inference.detection_theory import energy_threshold
+from mag_tracking.inference.iron import Iron, hard_and_soft_iron
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0
@@ -31,6 +32,9 @@ from mag_tracking.quantities import quantity
 from mag_tracking.recording.fit_folder import FitFolder
 from mag_tracking.recording.reader import Recording
 from mag_tracking.settings import read_parameter_file
+
+P_WARNING = 1e-3
+"""Probability of a warning that correct moments of one vehicle contradict each other."""
 
 _FIT = '''
 Extracts the passes from a recording (from before each detection until its end) and fits each
@@ -260,8 +264,20 @@ def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any
     print(f'hard iron m0 = {hard} A m^2 (forward, left, up); soft iron D = {iron.soft:.3f} '
           f'({std[3]:.3f}) m^3; {quantity(len(fits), "pass", "passes")}, '
           f'normalised cost {iron.normalised_cost:.1f}')
+    for warning in _iron_warnings(iron, len(fits)):
+        print(f'  warning: {warning}')
     return {'hard': iron.hard.tolist(), 'soft': iron.soft, 'std': std.tolist(),
             'normalised_cost': iron.normalised_cost, 'passes': len(fits)}
+
+
+def _iron_warnings(iron: Iron, n_passes: int) -> Iterator[str]:
+    """Reasons not to use hard and soft iron that were estimated from `n_passes` moments."""
+    degrees_of_freedom = 3 * n_passes - 4
+    if iron.normalised_cost * degrees_of_freedom > energy_threshold(P_WARNING, degrees_of_freedom):
+        yield ('the moments contradict each other; the passes may be of different vehicles, or one '
+               'of the fits is wrong')
+    if iron.soft < 0.0:
+        yield 'soft iron is negative, which is impossible; add passes at other headings'
 
 
 def _draw(fitted_pass: FittedPass, out: Path) -> None:

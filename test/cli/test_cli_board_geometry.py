@@ -150,7 +150,8 @@ def test_settings_are_read_from_a_file(tmp_path, capsys):
     assert 'unknown setting gain_sdt; did you mean gain_std?' in capsys.readouterr().err
     params.write_text('iterations: 1')
     assert command(table, *common, out=tmp_path / 'new.yaml') == 1
-    assert 'calibration rejected: no minimum within 1 steps' in capsys.readouterr().err
+    assert ('calibration rejected: no minimum found (maximum number of steps: 1)'
+            in capsys.readouterr().err)
     assert not (tmp_path / 'new.yaml').exists()
 
 

@@ -88,7 +88,7 @@ def test_replay_warns_of_a_large_orientation_uncertainty(tmp_path, capsys, std):
     assert main(['replay', str(ROAD), '--network', str(path), '--out', str(tmp_path / 'run'),
                  '--no-figures']) == 0
     output = capsys.readouterr().out
-    assert ('1 sensors have an orientation uncertainty of more than 15 degrees' in output
+    assert ('1 sensor has an orientation uncertainty of more than 15 degrees' in output
             and ': 1 track (' in output)
     angles = json.loads((tmp_path / 'run' / 'summary.json').read_text())['tracks'][0]['mounting']
     # Tracking limits the uncertainty to 15 degrees.

@@ -41,7 +41,16 @@ def test_passes_at_several_headings_separate_hard_and_soft_iron(passes, tmp_path
     assert np.all(np.abs(estimate - simulated) < 4.0 * std)
     assert np.all(std[:3] < 0.05 * np.linalg.norm(HARD)) and std[3] < 0.05 * SOFT
     assert iron['passes'] == len(HEADINGS) and 0.1 < iron['normalised_cost'] < 5.0
-    assert 'hard iron m0 =' in output and '4 passes' in output
+    assert 'hard iron m0 =' in output and '4 passes' in output and 'warning' not in output
+
+
+def test_passes_of_different_vehicles_cause_a_warning(passes, tmp_path, capsys):
+    (tmp_path / 'other').mkdir()
+    other = recorded(tmp_path / 'other', 50.0, np.random.default_rng(6), hard=[-300.0, 200.0, 90.0])
+    names = ['east', 'west', 'other']
+    iron = iron_of(names, {**passes, 'other': other}, tmp_path / 'out')
+    assert iron['normalised_cost'] > 10.0
+    assert 'warning: the moments contradict each other' in capsys.readouterr().out
 
 
 def test_hard_and_soft_iron_are_not_separated_at_a_single_heading(passes, tmp_path, capsys):

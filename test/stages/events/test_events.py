@@ -268,7 +268,7 @@ def test_the_events_command_prints_counts_and_writes_tables(tmp_path, capsys):
     assert main(['events', str(vehicle_path('straight_car_right')), '--network', str(NETWORK_FILE),
                  '--out', str(tmp_path / 'out')]) == 0
     out = capsys.readouterr().out
-    assert 'mag_1: 1 events, mag_2: 1 events' in out and 'left to right (98%)' in out
+    assert 'mag_1: 1 event, mag_2: 1 event' in out and 'left to right (98%)' in out
     assert ' m/s' not in out and 'unique' not in out
     with open(tmp_path / 'out' / 'events.csv', newline='') as stream:
         rows = list(csv.DictReader(stream))
