@@ -1,4 +1,4 @@
-"""Recordings: readable by other software, and read in spite of damage."""
+"""Recordings are readable by other software, and are read in spite of damage."""
 
 import io
 import tracemalloc
@@ -40,7 +40,7 @@ def write(path, n, topics=2, step_ms=10):
 
 
 def read(path, network=None):
-    """(messages, recording)."""
+    """Read a recording; return its messages and the `Recording`."""
     recording = Recording(path)
     return list(recording.messages()), recording
 
@@ -91,7 +91,7 @@ def test_rosbags_reads_poses_and_tracks(vehicle_replays):
 
 
 def declarations(text):
-    """Declarations of a definition without comments and spacing."""
+    """Declarations of a message definition, without comments and with single spaces."""
     lines = (line.split('#')[0].split() for line in text.splitlines())
     return [' '.join(line) for line in lines if line]
 
@@ -108,7 +108,7 @@ def test_definitions_match_ros_jazzy():
     for name, text in DEFINITIONS.items():
         if not name.startswith('mag_tracking_msgs/'):
             ours = get_types_from_msg(text, name)[name]
-            # The names of the fields and their order are compared.
+            # Only the names and the order of the fields are compared.
             theirs = store.fielddefs[name]
             assert [f[0] for f in ours[1]] == [f[0] for f in theirs[1]], name
 
@@ -185,7 +185,7 @@ def test_reader_memory_does_not_grow_with_the_recording(tmp_path):
 
 
 def test_overlapping_chunks_are_read_in_order(tmp_path):
-    """The file is written topic by topic, so all chunks of the second topic lie in the past."""
+    """The file is written topic by topic, so the second topic begins again at the start time."""
     path = tmp_path / 'a.mcap'
     with RecordingWriter(path) as writer:
         for j in range(2):
@@ -241,7 +241,7 @@ def test_a_topic_of_another_type_is_refused(tmp_path, road_network):
         SampleReader(Recording(path), road_network)
 
 
-def test_a_recording_without_messages_gives_no_samples(tmp_path, road_network):
+def test_a_recording_without_messages_has_no_samples(tmp_path, road_network):
     path = tmp_path / 'a.mcap'
     with RecordingWriter(path):
         pass
@@ -267,7 +267,7 @@ def write_raw(path, log_times, use_chunking=True):
 
 
 @pytest.mark.parametrize('use_chunking', [True, False])
-def test_log_times_beyond_63_bits_are_limited_without_loss(tmp_path, use_chunking):
+def test_log_times_beyond_63_bits_are_clipped_without_loss(tmp_path, use_chunking):
     """MCAP stores log times as unsigned 64-bit integers."""
     write_raw(tmp_path / 'a.mcap', [1, 2, 2**63, 2**64 - 1], use_chunking)
     messages, recording = read(tmp_path / 'a.mcap')
@@ -276,7 +276,7 @@ def test_log_times_beyond_63_bits_are_limited_without_loss(tmp_path, use_chunkin
 
 
 def test_messages_without_chunks_are_read_in_blocks(tmp_path):
-    """The messages before the end of a truncated file are read."""
+    """A truncated file is read up to its last complete message."""
     write_raw(tmp_path / 'a.mcap', range(1000), use_chunking=False)
     blocks = list(Recording(tmp_path / 'a.mcap').blocks())
     assert sum(map(len, blocks)) == 1000 and len(blocks) <= 5
