@@ -1,4 +1,4 @@
-"""Learnt backgrounds of a running calibration, stored so that a restart can restore them.
+"""Storage of the learnt backgrounds of a running calibration, for use after a restart.
 
 A network file contains parameters that stay valid for years. A background file contains the current
 background of each sensor, which is soon outdated.

@@ -1,4 +1,4 @@
-"""One SQLite bag (`.db3`) or ROS 1 bag (`.bag`), read with `rosbags`."""
+"""Reader of one SQLite bag (`.db3`) or ROS 1 bag (`.bag`), with the library `rosbags`."""
 
 import dataclasses
 import functools

@@ -30,9 +30,9 @@ FIT_COLUMNS = (
 point of approach (CPA) refers to the centre of the sensors; its time is in seconds after
 `stamp_ns`. `rate` is the speed divided by the CPA range, which a single sensor can observe; the
 corresponding directions are in `fits.json`. A fit that is not trusted as a whole has only its
-trusted quantities (speed, heading, time of the CPA), and only if it is the fit selected for its
-pass. Jointly fitted vehicles share unknowns and costs. The columns of the delay are model-free and
-the same for all fits of a pass."""
+trusted quantities (speed, heading, time of the CPA), and only if the fit is selected for its pass.
+Jointly fitted vehicles have common unknowns and costs. The columns of the delay are model-free and
+equal for all fits of a pass."""
 
 
 class _FittedPass(Protocol):
@@ -152,7 +152,7 @@ class FitFolder:
     ----------
     folder : Path
     rows : list of dict
-        Rows written so far.
+        Rows that have been written.
     summary : dict
         Further content of `fits.json`, to be filled by the caller.
 

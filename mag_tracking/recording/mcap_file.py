@@ -186,7 +186,7 @@ class _LooseMessages:
         self._messages.append(message)
 
     def flush(self, channels: '_Channels') -> Iterator[MessageBlock]:
-        """Yield the buffered messages as a block, if there are any, and empty the buffer."""
+        """Empty the buffer, and yield a block of its messages unless it was empty."""
         messages, self._messages = self._messages, []
         if not messages:
             return
@@ -222,7 +222,7 @@ class _Channels:
         return self._schema_of[channel] != 0
 
     def block_of(self, chunk: Chunk) -> MessageBlock:
-        """Read the messages of one chunk; raises one of `DECODE_ERRORS` if it is damaged."""
+        """Read the messages of one chunk; raises one of `DECODE_ERRORS` if the chunk is damaged."""
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
         data = stream.read(size)
         rows, definitions = core.records_of(data, LATEST_NS)

@@ -95,7 +95,7 @@ class McapFileWriter:
             name, 'cdr', self._schemas[topic.type], {'offered_qos_profiles': topic.qos})
 
     def flush(self) -> None:
-        """Complete the current chunk, whose messages then survive a crash.
+        """Complete the current chunk, so that a crash cannot lose its messages.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Blocks of messages that are read at once, as arrays of positions in their common bytes."""
+"""Blocks of many messages: their bytes, and arrays with channel, log time and positions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -44,7 +44,7 @@ class Recording:
     Raises
     ------
     RecordingError
-        If there is no readable recording at `path`.
+        If `path` is not a readable recording.
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:

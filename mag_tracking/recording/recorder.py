@@ -44,7 +44,7 @@ _Message: TypeAlias = tuple[int, bytes, int, int]
 class Recorder:
     """Records messages in a rosbag2 folder, in a sequence of files.
 
-    While the disk is full, messages are dropped, counted and reported; as soon as there is space,
+    While the disk is full, messages are dropped, counted and reported. Once space is available,
     recording continues in a new file.
 
     Parameters
@@ -70,7 +70,7 @@ class Recorder:
     dropped : Counter
         Number of messages by topic that were lost because they could not be written.
     repeated : int
-        Number of latched messages that were repeated at the start of a file to make the file
+        Number of latched messages that were repeated at the start of a file, so that the file is
         self-contained.
     unfinished : list of Path
         Files without an index.
@@ -130,7 +130,7 @@ class Recorder:
             Definition of the type as a `ros2msg` schema. Without it, only ROS can read the
             messages.
         qos : str, optional
-            QoS profiles from `offered_qos`. None uses its defaults.
+            QoS profiles from `offered_qos`. None selects its defaults.
         latched : int, optional
             Number of latest messages that are repeated at the start of each later file.
         """

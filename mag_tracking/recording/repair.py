@@ -1,4 +1,4 @@
-"""Repair of recordings that were truncated by a crash or a full disk: adding the missing index."""
+"""Repair of recordings that a crash or a full disk has truncated, by writing the missing index."""
 
 import fcntl
 import io
@@ -89,13 +89,13 @@ class _Scan:
             index.message_index_length += length
 
     def _count(self, channel: int, time_ns: int) -> None:
-        """Count a message."""
+        """Update the message counts and the time range with a message."""
         self.counts[channel] += 1
         low, high = self.times or (time_ns, time_ns)
         self.times = [min(low, time_ns), max(high, time_ns)]
 
     def _add_chunk(self, chunk: Chunk, end: int) -> None:
-        """Add a chunk and its records; raises one of `DECODE_ERRORS` if it is damaged."""
+        """Add a chunk and its records; raises one of `DECODE_ERRORS` if the chunk is damaged."""
         stream, length = get_chunk_data_stream(chunk, validate_crc=True)
         data = stream.read(length)
         self._index, offset = {}, 0
@@ -187,7 +187,7 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
     OutputError
         If the file is still being recorded.
     OSError
-        If the file cannot be written. Its messages are then unchanged.
+        If the file cannot be written. The messages in the file are then unchanged.
     """
     path = Path(path)
     with open(path, 'r+b', buffering=0) as raw, open(path, 'rb') as stream:
@@ -246,7 +246,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     Raises
     ------
     RecordingError
-        If there is no recording.
+        If `path` does not contain a recording.
     OutputError
         If the recording cannot be written or is still being recorded.
     """

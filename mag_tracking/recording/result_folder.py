@@ -63,7 +63,7 @@ def figure_name(kind: str, track_id: int) -> str:
 class ResultFolder:
     """Writes the tables and the recording of one run; a context manager.
 
-    Rows are written immediately, so an interrupted run keeps them.
+    Rows are written immediately, so that an interrupted run does not lose them.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class ResultFolder:
 
     def _remove_earlier_results(self) -> bool:
         """Remove the results of an earlier run; return whether there were any."""
-        # The summary and figures of an earlier run could be mistaken for those of this run.
+        # The summary and figures of an earlier run could be mistaken for results of this run.
         earlier = [path for path in self.folder.iterdir()
                    if (path.name in _RESULTS or _TRACK_FILE.fullmatch(path.name))
                    and (path.is_symlink() or not path.is_dir())]

@@ -53,7 +53,7 @@ class SampleReader:
     Raises
     ------
     RecordingError
-        If the recording has none of the network's topics, its namespace is ambiguous, or `truth`
+        If the recording contains no topic of the network, its namespace is ambiguous, or `truth`
         is not a topic with poses.
     """
 
@@ -182,7 +182,7 @@ class SampleReader:
 
     def _records(self, imus: Mapping[str, Sequence[str]], progress: Progress | None
                  ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """Iterate over (record, log time) of readings, and of accelerations on the topics in
+        """Iterate over (record, log time): readings, and accelerations from the topics in
         `imus`, {topic: sensors}."""
         return self._records_of(self._recording.messages(progress=progress), imus)
 
@@ -236,7 +236,7 @@ class SampleReader:
 
 
 def _namespace(recording: Recording, network: SensorNetwork) -> str:
-    """Namespace of the network's relative topics in a recording, or the root if none is recorded.
+    """Namespace of the network's relative topics in a recording; the root without such topics.
 
     Raises RecordingError if several namespaces are possible.
     """

@@ -1,7 +1,7 @@
 """Labelled signatures in CSV, labelled intervals of a recording, and trained classes in JSON.
 
 A table of signatures has one row per sample (`label`, `signature`, `time_s` and fields) or one row
-per signature (`label`, and its samples in order). A table of intervals has `label`, `begin_s` and
+per signature (`label`, and the samples in order). A table of intervals has `label`, `begin_s` and
 `end_s` (or `begin_ns` and `end_ns`), and optionally `sensor`.
 """
 

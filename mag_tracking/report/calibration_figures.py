@@ -74,7 +74,7 @@ def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> 
     stated : SensorNetwork
         Nominal network, as installed.
     most : int
-        Maximum number of sensors whose knocks are plotted.
+        Maximum number of sensors in the plot of the knocks.
 
     Returns
     -------

@@ -1,6 +1,6 @@
 """Figures of a run; each function returns one figure.
 
-Uncertainty is drawn as 90 % regions throughout.
+All figures show uncertainty as 90 % regions.
 """
 
 from typing import Protocol

@@ -1,4 +1,4 @@
-"""Arrays as base64 in JSON, which is exact and needs a third of the size of decimal numbers."""
+"""Exact arrays as base64 in JSON, about a third as large as decimal numbers."""
 
 import base64
 

@@ -13,7 +13,7 @@ from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
 MAX_SENSORS = 8
-"""Maximum number of sensors per track whose fields are shown. The strongest fields are selected."""
+"""Maximum number of fields per track. The sensors with the strongest fields are selected."""
 MAX_BYTES = 4_000_000
 """Approximate size limit of the track data [bytes]. Larger reports show fewer poses per track."""
 MAX_TRACKS = 1_000
@@ -102,13 +102,13 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
 
 
 def max_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
-    """Return the number of poses per track for which a report meets a size limit approximately.
+    """Return the maximum number of poses per track for a limited size of a report.
 
     Parameters
     ----------
     logs : sequence of TrackLog
     most_bytes : int
-        Size limit of the track data [bytes].
+        Approximate size limit of the track data [bytes].
 
     Returns
     -------

@@ -204,7 +204,7 @@ def length_text(metres: float) -> str:
 
 
 def distinct_lanes(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
-    """Group lanes with identical curves, which would hide each other in a plot.
+    """Group lanes with identical curves, which would overlap in a plot.
 
     Parameters
     ----------

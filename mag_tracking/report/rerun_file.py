@@ -41,7 +41,7 @@ def check_rerun() -> None:
 
 def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, TrackLog],
                 smoothed: Mapping[int, SmoothedLog]) -> None:
-    """Write sensors, poses with 90 % ellipsoids, speeds and fields over time.
+    """Write a recording of the sensors, and of poses, 90 % ellipsoids, speeds and fields over time.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, 
 
 
 def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> None:
-    """Log the poses of a track, and clear them after its end."""
+    """Log the poses of a track, and clear its display after the end of the track."""
     root = f'{network.frame}/track_{log.id}'
     for k, ns in enumerate(log.stamp_ns):
         stream.set_time(TIME, timestamp=np.datetime64(ns, 'ns'))

@@ -13,7 +13,7 @@ MAX_GAP_S = 5.0
 
 
 class TrafficIntervals:
-    """Summaries of passages in equal time intervals, each returned once its interval is complete.
+    """Counter of passages in equal time intervals, which returns a summary of each interval.
 
     Parameters
     ----------

@@ -115,7 +115,7 @@ def commit():
 
 
 def main():
-    """Append the run to the history, and print figures that got worse in red."""
+    """Append the run to the history, and print the figures that got worse, in red."""
     if not LATEST.exists():
         print('no benchmark has been run (benchmarks/latest.json is missing): run make bench')
         return 1

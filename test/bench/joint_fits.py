@@ -77,7 +77,7 @@ def recordings(folder):
 
 
 def worlds(how, simulator, seeds, trucks=TRUCKS):
-    """Fit worlds with pairs of vehicles, of which a fraction `trucks` are trucks; return a `Tally`."""
+    """Fit worlds with pairs of vehicles and a fraction `trucks` of trucks; return their `Tally`."""
     tally = Tally()
     for n_sensors in (2, 4):
         for seed in tqdm(range(seeds), disable=None, leave=False):

@@ -39,7 +39,7 @@ BEGINS_AFTER_S = 0.5
 MANY, GATHER_S = 16, 0.002
 """Maximum number of sensors without batches; [s] duration of a batch in sequential measurement."""
 LEAN = {'arrival_names': "['left']", 'arrival_headings_deg': '[0.0]'}
-"""One kind and one arrival: 3 offsets x 14 moments x 3 speeds = 126 hypotheses, which are all kept."""
+"""One kind, one arrival: all 3 offsets x 14 moments x 3 speeds = 126 hypotheses are kept."""
 
 
 def network_yaml(n):

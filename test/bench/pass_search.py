@@ -29,9 +29,9 @@ def timed(function, *args, **kwargs):
 
 
 def one(seed, n_dipoles, road, compared=True):
-    """Fit one pass; return (optimum found, [s] of the fit, [s] and [s] of scipy from two starts).
+    """Fit one pass; return (is optimal, duration [s] of the fit, durations [s] of scipy).
 
-    The starts are a plausible guess and the best start of the search. The times of scipy are NaN
+    scipy starts from a plausible guess and from the best start of the search. Its durations are NaN
     unless `compared`.
     """
     rng = np.random.default_rng([seed, n_dipoles, road])

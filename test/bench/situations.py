@@ -145,7 +145,7 @@ def summary_of(figures, found):
 
 
 def both_simulators(name, run):
-    """Run a situation, alternating between the simulators; return its `Verdict`."""
+    """Return the `Verdict` of a run; even and odd runs use different simulators."""
     return verdict(name, SIMULATORS[run % 2], run // 2)
 
 

@@ -39,7 +39,7 @@ FAULTS = {
 
 
 def spoil_with(what):
-    """Functions of `Readings` that apply the fault `what` of `FAULTS`; empty for `none`."""
+    """List of functions that apply a fault of `FAULTS` to `Readings`; empty for `none`."""
     if not FAULTS[what]:
         return []
     fault, *arguments = FAULTS[what]
@@ -47,7 +47,7 @@ def spoil_with(what):
 
 
 def spoilt_pass(what, simulator, kind, seed):
-    """Track a random pass with the fault `what` of `FAULTS`; return its `Tracked`."""
+    """Track a random pass with a fault of `FAULTS`; return its `Tracked`."""
     return one_random_pass(simulator, kind, seed, faults=spoil_with(what))
 
 

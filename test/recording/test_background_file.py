@@ -126,7 +126,7 @@ def test_a_changed_calibration_discards_stored_backgrounds(tmp_path, change):
 
 
 def test_a_sensor_moved_before_the_restart_is_relearnt_soon(tmp_path):
-    """This applies even with `relearn_s` = 0, by which steady changes are never relearnt."""
+    """This applies even with `relearn_s` = 0, which disables the relearning of steady changes."""
     network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
     stage.resume(stored)

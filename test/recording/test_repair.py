@@ -65,7 +65,7 @@ def test_repair_recovers_a_file_truncated_at_any_byte(tmp_path):
         start, _, crc = struct.unpack('<QQI', repaired[-28:-8])
         assert crc == zlib.crc32(repaired[start:-12])
         if last_chunk_end <= cut <= len(unfinished):
-            # The rebuilt indexes of the last chunk equal the original ones.
+            # The rebuilt indexes of the last chunk equal the original indexes.
             assert repaired.startswith(unfinished)
         assert repair(file.parent) == 0 and file.read_bytes() == repaired
 
