@@ -198,17 +198,17 @@ class ArchiveFolder:
             If the archive cannot be written.
         """
         name, work = recording_key(recording), self.path / _WORK
-        own = work / f'{name}.{_hash(json.dumps([VERSION, version(_PACKAGE), state]))}'
+        folder = work / f'{name}.{_hash(json.dumps([VERSION, version(_PACKAGE), state]))}'
         try:
             (self.path / _DONE / f'{name}.json').unlink(missing_ok=True)
             for path in self.path.glob(f'*/date=*/{glob.escape(name)}.parquet'):
                 path.unlink()
             for path in work.glob(f'*{glob.escape(name)}.*'):
-                if path != own:
+                if path != folder:
                     _remove(path)
         except OSError as error:
             raise OutputError(f'cannot write to {self.path}: {error.strerror}') from error
-        return output_folder(own)
+        return output_folder(folder)
 
     def complete(self, recording: Path, work: Path, state: list[list[Any]],
                  known: Mapping[str, Any]) -> None:

@@ -153,9 +153,9 @@ class _Fields:
                  ) -> None:
         columns = sorted(columns)
         axes = [axis for axis, _, _ in columns]
-        twice = sorted({axis for axis in axes if axes.count(axis) > 1})
-        if twice:
-            raise LabelsError(f'{path}: several columns contain the axis {twice[0]}')
+        duplicates = sorted({axis for axis in axes if axes.count(axis) > 1})
+        if duplicates:
+            raise LabelsError(f'{path}: several columns contain the axis {duplicates[0]}')
         known = [unit for _, unit, _ in columns if unit]
         if known and len(known) < len(columns):
             raise LabelsError(f'{path}: only some fields have a unit (_t, _ut or _nt)')

@@ -129,12 +129,12 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
     """
     truths, n, n_wrong, n_without = list(truths), 0, 0, 0
     for log in logs:
-        sure = ~np.array(log.ambiguous, dtype=bool)
-        if not sure.any():
+        is_unflagged = ~np.array(log.ambiguous, dtype=bool)
+        if not is_unflagged.any():
             continue
-        stamps = np.array(log.stamp_ns, dtype=np.int64)[sure]
-        position = np.array(log.position)[sure][:, :2]
-        P = np.array(log.covariance)[sure][:, :2, :2]
+        stamps = np.array(log.stamp_ns, dtype=np.int64)[is_unflagged]
+        position = np.array(log.position)[is_unflagged][:, :2]
+        P = np.array(log.covariance)[is_unflagged][:, :2, :2]
         known, wrong = np.zeros(len(stamps), dtype=bool), np.ones(len(stamps), dtype=bool)
         for truth in truths:
             error = position - interpolate_truth(truth, stamps)[:, :2]

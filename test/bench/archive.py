@@ -53,11 +53,11 @@ def write_pass(path, seed):
 def hours_of(recordings, out, workers):
     """Archive the recordings; return (duration [h], result)."""
     with tqdm(total=len(recordings), desc=f'{workers} workers', disable=None) as bar:
-        begun = time.perf_counter()
+        start = time.perf_counter()
         run = archive(recordings, NETWORK_FILE, settings_for('vehicle'), out, workers,
                       progress=lambda _: bar.update())
     assert len(run.done) == len(recordings) and not run.failed, run.failed
-    return (time.perf_counter() - begun) / 3600.0, run
+    return (time.perf_counter() - start) / 3600.0, run
 
 
 def main():

@@ -46,22 +46,22 @@ class Tally:
         self.found += of_vehicles
         self.seconds += seconds
 
-    def figures(self, figures, what, aim=None):
+    def figures(self, figures, label, aim=None):
         """Print the figures; return (number of unflagged fits, number of wrong unflagged fits)."""
         error = np.array([of.one.chosen.speed[0] / of.speed - 1.0 for of in self.found])
         sd = np.array([of.one.chosen.speed[1] / of.speed for of in self.found])
         sure = np.array([not of.one.chosen.ambiguous for of in self.found], dtype=bool)
         wrong = sure & (np.abs(error) > MAX_ERROR) & (np.abs(error) > MAX_ERROR_STD * sd)
         n = max(self.n_vehicles, 1)
-        figures.add(f'{what}: fitted in the right direction', len(error) / n, '', aim, True,
+        figures.add(f'{label}: fitted in the right direction', len(error) / n, '', aim, True,
                     f' (of {self.n_vehicles})')
-        figures.add(f'{what}: speed within 10 %', float((np.abs(error) < MAX_ERROR).mean()), '',
+        figures.add(f'{label}: speed within 10 %', float((np.abs(error) < MAX_ERROR).mean()), '',
                     MIN_CORRECT if aim else None, True)
-        figures.add(f'{what}: median error of the position',
+        figures.add(f'{label}: median error of the position',
                     float(np.median([of.error for of in self.found])), 'm')
-        figures.add(f'{what}: without a flag', float(sure.mean()), '',
+        figures.add(f'{label}: without a flag', float(sure.mean()), '',
                     note=f' ({wrong.sum()} of them wrong)')
-        figures.add(f'{what}: a pass', self.seconds / max(self.n_passes, 1), 's')
+        figures.add(f'{label}: a pass', self.seconds / max(self.n_passes, 1), 's')
         return int(sure.sum()), int(wrong.sum())
 
 

@@ -123,12 +123,12 @@ class PoseMonitor:
                     ('rejected', 'lost', 'readings lost', 'frames with a sensor'))}
 
 
-def start(folder, n, parameters, sequential, batches, together):
+def start(folder, n, parameters, sequential, batches, is_one_process):
     """Start the nodes as processes, the driver last, or all nodes in one process."""
     network, drivers = folder / 'network.yaml', folder / 'drivers.yaml'
     network.write_text(network_yaml(n))
     drivers.write_text(drivers_yaml(n, network, sequential))
-    if together:
+    if is_one_process:
         return {'all_in_one': subprocess.Popen(
             [Path(sys.executable).with_name('mag-tracking'), 'run', '--network', network,
              '--drivers', drivers, '--params', parameters,

@@ -114,10 +114,10 @@ def test_an_empty_file_after_a_crash_costs_no_other_file(tmp_path, name):
 def test_repair_skips_and_reports_a_damaged_chunk(tmp_path):
     unfinished, finished = unfinished_recording(tmp_path)
     file = tmp_path / 'x.mcap'
-    broken = bytearray(unfinished)
+    damaged = bytearray(unfinished)
     middle = make_reader(io.BytesIO(finished)).get_summary().chunk_indexes[2]
-    broken[middle.chunk_start_offset + middle.chunk_length // 2] ^= 0xFF
-    file.write_bytes(broken)
+    damaged[middle.chunk_start_offset + middle.chunk_length // 2] ^= 0xFF
+    file.write_bytes(damaged)
     before, reports = numbers(file)[0], []
     assert 0 < len(before) < 200
     assert repair(file, reports.append) == 1
