@@ -124,9 +124,9 @@ class BagFile:
                 for connection, log_time_ns, data in reader.messages(reader.connections, start_ns):
                     n += 1
                     yield connection.topic, connection.msgtype, log_time_ns, bytes(data)
-            except bag_errors() as error:
-                self._losses[f'{self._path.name}: unreadable after message {n} of '
-                             f'{self.message_counts.total()} ({type(error).__name__})'] += 1
+            except bag_errors():
+                self._losses[f'partially read files ({self._path.name}, up to message {n} of '
+                             f'{self.message_counts.total()})'] = 1
 
 
 @functools.cache

@@ -59,6 +59,7 @@ class McapFile:
         self.start_ns: int | None = None
         self.end_ns: int | None = None
         self._path, self._losses = path, losses
+        self._lost_offsets: set[int] = set()
         self._index = self._inspect(path)
 
     def _inspect(self, file: Path) -> list[ChunkIndex] | None:
@@ -73,7 +74,7 @@ class McapFile:
             except DECODE_ERRORS:
                 summary = None
         if summary is None:
-            self._losses[f'{file.name} has no valid index (truncated?): read up to the damage'] = 1
+            self._losses[f'files without a valid index ({file.name}, possibly truncated)'] = 1
             return None
         for channel in summary.channels.values():
             schema = summary.schemas.get(channel.schema_id)
@@ -123,8 +124,8 @@ class McapFile:
                 if not isinstance(chunk, Chunk):
                     raise ValueError('no chunk at the indexed offset')
                 pending = pending.merged(channels.block_of(chunk))
-            except DECODE_ERRORS as error:
-                self._count_lost_chunk(entry, error)
+            except DECODE_ERRORS:
+                self._count_lost_chunk(entry)
             if progress:
                 progress(entry.chunk_length)
             n = len(pending)
@@ -134,26 +135,33 @@ class McapFile:
             pending = pending.part(slice(n, None))
         yield pending
 
-    def _count_lost_chunk(self, entry: ChunkIndex, error: Exception) -> None:
-        """Count a chunk that cannot be read."""
+    def _count_lost_chunk(self, entry: ChunkIndex) -> None:
+        """Count a chunk of the index that cannot be read."""
         seconds = (entry.message_end_time - entry.message_start_time) / 1e9
         after = (entry.message_start_time - (self.start_ns or entry.message_start_time)) / 1e9
-        self._losses[f'damaged segment of {seconds:.1f} s at {after:.1f} s '
-                    f'({type(error).__name__})'] += 1
+        self._count_loss(entry.chunk_start_offset, f'damaged segments ({self._path.name}, '
+                         f'{seconds:.1f} s long, {after:.1f} s after the start)')
+
+    def _count_loss(self, offset: int, description: str) -> None:
+        """Count an unreadable part at a byte offset, once even if the file is read repeatedly."""
+        if offset not in self._lost_offsets:
+            self._lost_offsets.add(offset)
+            self._losses[description] += 1
 
     def _streamed_blocks(self, stream: BinaryIO, progress: Progress | None
                          ) -> Iterator[MessageBlock]:
         """Iterate over the messages in file order, up to the first damage outside of a chunk."""
         channels, loose = _Channels(), _LooseMessages()
-        reported = 0
+        end = 0
         try:
             for record in StreamReader(stream, emit_chunks=True).records:
+                record_end = stream.tell()
                 if isinstance(record, Chunk):
                     yield from loose.flush(channels)
                     try:
                         yield channels.block_of(record)
-                    except DECODE_ERRORS as error:
-                        self._losses[f'damaged chunk ({type(error).__name__})'] += 1
+                    except DECODE_ERRORS:
+                        self._count_loss(end, f'damaged chunks ({self._path.name})')
                 elif isinstance(record, Schema | Channel):
                     channels.add(record)
                 elif isinstance(record, Message) and channels.has_schema(record.channel_id):
@@ -161,15 +169,16 @@ class McapFile:
                     if len(loose) >= BATCH_SIZE:
                         yield from loose.flush(channels)
                 if progress:
-                    position = stream.tell()
-                    progress(position - reported)
-                    reported = position
+                    progress(record_end - end)
+                end = record_end
             yield from loose.flush(channels)
-        except DECODE_ERRORS as error:
+        except DECODE_ERRORS:
             yield from loose.flush(channels)
-            self._losses[f'{os.path.basename(stream.name)}: unreadable after byte '
-                        f'{stream.tell()} of {os.fstat(stream.fileno()).st_size} '
-                        f'({type(error).__name__})'] += 1
+            size = os.fstat(stream.fileno()).st_size
+            # A file that ends after a complete record only lacks its index.
+            if end < size:
+                self._count_loss(end, f'partially read files ({self._path.name}, up to byte {end} '
+                                      f'of {size})')
 
 
 class _LooseMessages:

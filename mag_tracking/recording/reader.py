@@ -39,7 +39,8 @@ class Recording:
     start_ns, end_ns : int, ns, or None
         Log times of the first and last message. None if unknown.
     losses : Counter
-        Number of unreadable parts by description, updated while messages are read.
+        Number of unreadable parts by description, updated while messages are read. The
+        description begins with the plural of the part, such as 'damaged chunks (a.mcap)'.
 
     Raises
     ------
@@ -57,7 +58,7 @@ class Recording:
         if len(empty) < len(self._files):
             # A crash at a split leaves an empty file. A recording of only empty files is an error.
             self._files = [f for f in self._files if f not in empty]
-            self.losses.update(f'{f.name} is empty (0 bytes)' for f in empty)
+            self.losses.update(f'empty files ({f.name})' for f in empty)
         self._opened = [(BagFile if f.suffix in BAG_SUFFIXES else McapFile)(f, self.losses)
                         for f in self._files]
         for file in self._opened:

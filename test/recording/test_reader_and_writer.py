@@ -1,6 +1,7 @@
 """Recordings are readable by other software, and are read in spite of damage."""
 
 import io
+import re
 import tracemalloc
 
 import numpy as np
@@ -133,8 +134,12 @@ def test_a_truncated_file_is_read_up_to_its_end(tmp_path):
     path.write_bytes(whole[:int(0.6 * len(whole))])
     messages, recording = read(path)
     assert 0.3 * 30_000 < len(messages) < 0.65 * 30_000
-    assert any('has no valid index (truncated?)' in k for k in recording.losses)
-    assert any('unreadable after byte' in k for k in recording.losses)
+    no_index, partially_read = sorted(recording.losses)
+    assert no_index == 'files without a valid index (cut.mcap, possibly truncated)'
+    match = re.fullmatch(r'partially read files \(cut.mcap, up to byte ([0-9]+) of ([0-9]+)\)',
+                         partially_read)
+    end, size = map(int, match.groups())
+    assert 0.5 * size < end < size == path.stat().st_size
     assert [m.log_time_ns for m in messages] == sorted(m.log_time_ns for m in messages)
 
 
@@ -149,7 +154,34 @@ def test_flipped_bytes_cost_only_their_chunk_and_are_reported(tmp_path):
     path.write_bytes(data)
     messages, recording = read(path)
     assert 0.5 * 30_000 < len(messages) < 30_000
-    assert any('damaged segment' in k for k in recording.losses)
+    ((loss, n),) = recording.losses.items()
+    assert n == 1 and re.fullmatch(
+        r'damaged segments \(a.mcap, [0-9.]+ s long, [0-9.]+ s after the start\)', loss)
+
+
+@pytest.mark.parametrize('has_index', [True, False])
+def test_a_loss_is_counted_once_if_a_recording_is_read_repeatedly(tmp_path, has_index):
+    path = tmp_path / 'a.mcap'
+    write(path, 15_000)
+    data = bytearray(path.read_bytes())
+    for chunk in make_reader(io.BytesIO(data)).get_summary().chunk_indexes[1:3]:
+        data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+    path.write_bytes(data if has_index else data[:-100])
+    recording = Recording(path)
+    for _ in range(2):
+        assert sum(1 for _ in recording.messages()) < 30_000
+        n_damaged = {loss.partition(' (')[0]: n for loss, n in recording.losses.items()}
+        assert sum(n for loss, n in recording.losses.items() if loss.startswith('damaged')) == 2
+        assert has_index or n_damaged['damaged chunks'] == 2
+
+
+def test_a_file_that_ends_after_a_complete_record_lacks_only_its_index(tmp_path):
+    write(tmp_path / 'a.mcap', 15_000)
+    data = (tmp_path / 'a.mcap').read_bytes()
+    chunk = make_reader(io.BytesIO(data)).get_summary().chunk_indexes[1]
+    (tmp_path / 'cut.mcap').write_bytes(data[:chunk.chunk_start_offset + chunk.chunk_length])
+    _, recording = read(tmp_path / 'cut.mcap')
+    assert recording.losses == {'files without a valid index (cut.mcap, possibly truncated)': 1}
 
 
 @pytest.mark.parametrize('seed', range(12))
