@@ -161,8 +161,12 @@ def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
                 refused[name] = 'it belongs to another network file or other settings'
             elif name in entries:
                 stored[name] = _background_of(entries[name])
-        except (KeyError, TypeError, ValueError) as error:
-            refused[name] = f'{type(error).__name__}: {error}'
+        except KeyError as error:
+            refused[name] = f'the stored entry has no {error.args[0]}'
+        except TypeError:
+            refused[name] = 'the stored entry is not valid'
+        except ValueError as error:
+            refused[name] = f'the stored entry is not valid: {error}'
     return stored, refused
 
 

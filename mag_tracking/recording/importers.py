@@ -1,6 +1,5 @@
 """Import of third-party tables as recordings and network files."""
 
-import csv
 from os import PathLike
 from pathlib import Path
 from typing import TypeAlias
@@ -14,6 +13,7 @@ from mag_tracking.messages.schema import magnetic_field_dicts, pose_dict
 from mag_tracking.messages.types import MAGNETIC_FIELD, POSE
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
+from mag_tracking.recording.csv_file import number, read_csv
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
 
@@ -93,23 +93,12 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
 
 def _read_table(path: _Path) -> dict[str, FloatArray]:
     """Read the columns of the table as arrays; raises RecordingError."""
-    try:
-        with open(path, newline='', encoding='utf-8') as stream:
-            reader = csv.DictReader(stream)
-            missing = [c for c in _COLUMNS if c not in (reader.fieldnames or ())]
-            if missing:
-                raise RecordingError(f'{path}: column {missing[0]} is missing')
-            values = [[float(row[c]) for c in _COLUMNS] for row in reader]
-    except OSError as error:
-        raise RecordingError(f'cannot read {path}: {error.strerror}') from error
-    except (ValueError, TypeError) as error:
-        raise RecordingError(f'{path}: {error}') from error
-    if not values:
-        raise RecordingError(f'{path} has no rows')
-    a = np.array(values)
-    if not np.isfinite(a).all():
-        row, column = np.argwhere(~np.isfinite(a))[0]
-        raise RecordingError(f'{path}: row {row + 2}: {_COLUMNS[column]} is not a finite number')
+    header, rows = read_csv(path)
+    missing = [c for c in _COLUMNS if c not in header]
+    if missing:
+        raise RecordingError(f'{path}: column {missing[0]} is missing')
+    a = np.array([[number(path, line, c, row[header.index(c)], True) for c in _COLUMNS]
+                  for line, row in rows])
     if (a[:, 0] != a[:, 0].astype(int)).any():
         raise RecordingError(f'{path}: column id contains numbers that are not integers')
     return {'id': a[:, 0], 'timestamp': a[:, 1], 'field': a[:, 2:5], 'sensor': a[:, 5:8],

@@ -150,7 +150,8 @@ def _files(path: Path) -> list[Path]:
             listed = content['rosbag2_bagfile_information']['relative_file_paths']
             files = [path / name for name in listed]
         except (KeyError, TypeError) as error:
-            raise RecordingError(f'{metadata} is not rosbag2 metadata: {error}') from error
+            raise RecordingError(f'{metadata} is not rosbag2 metadata: relative_file_paths is '
+                                 'missing or not a list') from error
     if not files:
         raise RecordingError(f'{path} contains no recording ({", ".join(SUFFIXES)})')
     for file in files:

@@ -183,9 +183,10 @@ def test_an_invalid_file_is_refused(tmp_path, change, message):
 
 
 @pytest.mark.parametrize('key, value, reason', [
-    ('background', [1.0, 2.0], 'ValueError: invalid background'),
+    ('background', [1.0, 2.0], 'not valid: invalid background'),
     ('covariance', [[0.0] * 3] * 3, 'not positive definite'), ('stamp_ns', None, 'at None'),
-    ('made_of', None, 'another network file')])
+    ('made_of', None, 'another network file'), ('covariance', ..., 'entry has no covariance'),
+    ('background', {}, 'the stored entry is not valid')])
 def test_an_invalid_entry_affects_no_other(tmp_path, key, value, reason):
     path = tmp_path / 'kept.json'
     network, stage = learnt_stage()
@@ -195,6 +196,8 @@ def test_an_invalid_entry_affects_no_other(tmp_path, key, value, reason):
                              for j, name in enumerate(network.names)})
     content = json.loads(path.read_text())
     content['sensors']['mag_1'][key] = value
+    if value is ...:
+        del content['sensors']['mag_1'][key]
     path.write_text(json.dumps(content))
     stored, refused = read_backgrounds(path, network, SETTINGS)
     assert list(stored) == ['mag_2'] and list(refused) == ['mag_1'] and reason in refused['mag_1']

@@ -251,9 +251,10 @@ def test_unusable_recordings_are_refused(tmp_path, road_network):
                           (folder, 'contains no recording')):
         with pytest.raises(RecordingError, match=message):
             Recording(path)
-    (folder / 'metadata.yaml').write_text('a: 1')
-    with pytest.raises(RecordingError, match='not rosbag2 metadata'):
-        Recording(folder)
+    for text in ('a: 1', 'rosbag2_bagfile_information: 3'):
+        (folder / 'metadata.yaml').write_text(text)
+        with pytest.raises(RecordingError, match='metadata: relative_file_paths is missing'):
+            Recording(folder)
 
 
 def test_the_error_for_missing_topics_lists_the_recorded_ones(tmp_path, road_network):
