@@ -1,9 +1,9 @@
-"""The dataset of an archive: tables in Parquet files, one per recording and day.
+"""Folder of an archive: tables as Parquet files, with one file per recording and day.
 
     DIR/archive.json                    schema, network and settings
     DIR/TABLE/date=2026-03-01/NAME.parquet
-    DIR/done/NAME.json                  written last: the recording is complete
-    DIR/unfinished/NAME.STATE/          partial results from which the next run continues
+    DIR/done/NAME.json                  written last; marks a complete recording
+    DIR/unfinished/NAME.STATE/          partial results, from which the next run resumes
 
 NAME is the stem of the recording and a hash of its path; STATE is a hash of the names, sizes and
 modification times of its files. pyarrow is imported when a table is written or read.
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     pass
 
 MAX_STEM_BYTES = 100
-"""Maximum length of the recording's stem in file names [bytes]."""
+"""Maximum length of the stem of a recording in `NAME` [bytes]."""
 
 _PACKAGE = 'mag_tracking'
 _HEAD, _DONE, _WORK, _LOCK = 'archive.json', 'done', 'unfinished', '.lock'
 
 
 def recording_key(recording: Path) -> str:
-    """Name of a recording's files, the same in every run.
+    """Name of a recording in the archive, identical in every run.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def recording_key(recording: Path) -> str:
 
 
 def recording_state(recording: Path) -> list[list[Any]]:
-    """State of a recording's files, which changes whenever the recording does.
+    """Names, sizes and modification times of a recording's files, to detect changes.
 
     Parameters
     ----------
@@ -76,19 +76,19 @@ def recording_state(recording: Path) -> list[list[Any]]:
 
 
 def _hash(text: str) -> str:
-    """Eight hexadecimal digits of a hash."""
+    """First eight hexadecimal digits of the SHA-256 hash of a string."""
     return hashlib.sha256(text.encode(errors='backslashreplace')).hexdigest()[:8]
 
 
 class ArchiveFolder:
-    """The folder of an archive, used by the one process that coordinates a run; a context manager.
+    """Folder of an archive, locked by the process that coordinates a run; a context manager.
 
     Parameters
     ----------
     folder : Path
-        Opened, or created if it does not exist.
+        Created if it does not exist.
     head : mapping
-        Data that all runs into this folder must have in common.
+        Metadata that must be identical in all runs that write to this folder.
 
     Attributes
     ----------
@@ -97,8 +97,8 @@ class ArchiveFolder:
     Raises
     ------
     OutputError
-        If the folder was created with other data or another table version, or another run is
-        writing to it.
+        If the folder is not an archive, was created with other metadata or another table version,
+        or is locked by another run.
     """
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
@@ -116,7 +116,7 @@ class ArchiveFolder:
             raise
 
     def _acquire_lock(self) -> int:
-        """Acquire the exclusive lock and return its descriptor; raises OutputError."""
+        """Acquire the exclusive lock and return its file descriptor; raises OutputError."""
         import fcntl
 
         path = self.path / _LOCK
@@ -143,7 +143,7 @@ class ArchiveFolder:
         self.close()
 
     def _check_head(self, head: dict[str, Any]) -> None:
-        """Compare `head` with that of earlier runs, or write it; raises OutputError."""
+        """Check that earlier runs used the same `head`, or write it; raises OutputError."""
         path = self.path / _HEAD
         if not path.exists():
             replace_text(path, json.dumps(head, indent=1, sort_keys=True) + '\n')
@@ -161,7 +161,7 @@ class ArchiveFolder:
                               'Choose another folder')
 
     def done(self, recording: Path) -> dict[str, Any] | None:
-        """Summary of a recording that is complete and has not changed since.
+        """Summary of a recording that is complete in the archive and has not changed since then.
 
         Parameters
         ----------
@@ -170,6 +170,7 @@ class ArchiveFolder:
         Returns
         -------
         dict or None
+            None if the recording must be processed.
         """
         path = self.path / _DONE / f'{recording_key(recording)}.json'
         if not path.exists():
@@ -178,7 +179,7 @@ class ArchiveFolder:
         return known if known.get('state') == recording_state(recording) else None
 
     def begin(self, recording: Path, state: list[list[Any]]) -> Path:
-        """Prepare the folder of partial results, and remove results of other states.
+        """Prepare the folder of a recording's partial results, and remove outdated results.
 
         Parameters
         ----------
@@ -189,6 +190,7 @@ class ArchiveFolder:
         Returns
         -------
         Path
+            Folder of the partial results.
 
         Raises
         ------
@@ -196,17 +198,17 @@ class ArchiveFolder:
             If the archive cannot be written.
         """
         name, work = recording_key(recording), self.path / _WORK
-        own = work / f'{name}.{_hash(json.dumps([VERSION, version(_PACKAGE), state]))}'
+        folder = work / f'{name}.{_hash(json.dumps([VERSION, version(_PACKAGE), state]))}'
         try:
             (self.path / _DONE / f'{name}.json').unlink(missing_ok=True)
             for path in self.path.glob(f'*/date=*/{glob.escape(name)}.parquet'):
                 path.unlink()
             for path in work.glob(f'*{glob.escape(name)}.*'):
-                if path != own:
+                if path != folder:
                     _remove(path)
         except OSError as error:
             raise OutputError(f'cannot write to {self.path}: {error.strerror}') from error
-        return output_folder(own)
+        return output_folder(folder)
 
     def complete(self, recording: Path, work: Path, state: list[list[Any]],
                  known: Mapping[str, Any]) -> None:
@@ -240,7 +242,7 @@ class ArchiveFolder:
                 table.add(row)
 
     def known(self) -> list[dict[str, Any]]:
-        """Summaries of all complete recordings, including those of earlier runs.
+        """Summaries of all complete recordings, from this run and earlier runs.
 
         Returns
         -------
@@ -250,10 +252,10 @@ class ArchiveFolder:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder; a partly removed folder never keeps its name."""
-    away = folder.with_name(f'.{secrets.token_hex(8)}.{folder.name}')
-    folder.rename(away)
-    shutil.rmtree(away, ignore_errors=True)
+    """Remove a folder, renamed first so that an interruption leaves no folder of its name."""
+    renamed = folder.with_name(f'.{secrets.token_hex(8)}.{folder.name}')
+    folder.rename(renamed)
+    shutil.rmtree(renamed, ignore_errors=True)
 
 
 def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder: Path,
@@ -263,15 +265,15 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
     Parameters
     ----------
     parts : iterable of Path
-        Files of the same table, in order of time.
+        Files of the same table, in chronological order.
     shifts : iterable of int
-        Offset to add to the `track_id` of each part.
+        Offset that is added to the `track_id` in each part.
     table : str
         Name of the table.
     folder : Path
         Folder of the archive.
     name : str
-        The files are `folder`/`table`/date=.../`name`.parquet.
+        Stem of the files `folder`/`table`/date=.../`name`.parquet.
 
     Returns
     -------
@@ -284,17 +286,17 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
         If a file cannot be written.
     """
     pa = import_pyarrow()
-    n, a_day = 0, pa.scalar(86_400 * NS)
+    n, day_ns = 0, pa.scalar(86_400 * NS)
     with ExitStack() as files:
         days: dict[int, TableWriter] = {}
         for path, shift in zip(parts, shifts, strict=True):
             rows = pa.parquet.read_table(path)
             n += len(rows)
             if shift:
-                place = rows.schema.get_field_index('track_id')
-                rows = rows.set_column(place, rows.schema.field(place),
+                index = rows.schema.get_field_index('track_id')
+                rows = rows.set_column(index, rows.schema.field(index),
                                        pa.compute.add(rows['track_id'], shift))
-            day_of = pa.compute.divide(rows['stamp_ns'], a_day)
+            day_of = pa.compute.divide(rows['stamp_ns'], day_ns)
             for day in sorted(pa.compute.unique(day_of).to_pylist()):
                 if day not in days:
                     date = datetime.date(1970, 1, 1) + datetime.timedelta(days=day)
@@ -305,12 +307,13 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
 
 
 def common_columns(recording: Path, stamp_ns: int | None) -> dict[str, Any]:
-    """Columns with which every row begins.
+    """Columns common to the rows of all tables.
 
     Parameters
     ----------
     recording : Path
     stamp_ns : int, ns, or None
+        Timestamp of the row.
 
     Returns
     -------
@@ -322,11 +325,11 @@ def common_columns(recording: Path, stamp_ns: int | None) -> dict[str, Any]:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """Content of a JSON file of the archive; raises OutputError."""
+    """Read a JSON file of the archive; raises OutputError."""
     try:
         content = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise OutputError(f'cannot read {path}: {error}') from error
     if not isinstance(content, dict):
-        raise OutputError(f'{path} is not a file of an archive')
+        raise OutputError(f'{path} is not a valid file of an archive')
     return content

@@ -4,11 +4,11 @@ from mag_tracking.recording.parquet_table import Column, columns_of
 
 
 def _axes(prefix: str, unit: str, meaning: str) -> tuple[Column, ...]:
-    """Three columns, for x, y and z."""
+    """Columns for the x, y and z components of a vector."""
     return tuple(Column(f'{prefix}{axis}', 'f', unit, f'{meaning}, {axis}') for axis in 'xyz')
 
 
-_WHERE = (
+_COMMON = (
     Column('recording', 's', '', 'name of the recording: the stem of its file name'),
     Column('source', 's', '', 'path of the recording'),
     Column('stamp_ns', 'i', 'ns', 'timestamp, since 1970'),
@@ -21,17 +21,19 @@ _MOMENT = _axes('m', 'A m^2', 'magnetic moment')
 _KIND = (Column('kind', 's', '', 'kind of vehicle, such as car or truck; empty for magnets'),)
 
 _POSES = (
-    *_WHERE, *_TRACK, *_STATE, *_STATE_SD, *_MOMENT,
+    *_COMMON, *_TRACK, *_STATE, *_STATE_SD, *_MOMENT,
     Column('covariance', 'C', 'm, m/s', 'covariance of position and velocity'),
     *_KIND, Column('length', 'f', 'm', 'length of the row of dipoles'),
     Column('ambiguous', 'b', '', 'whether the pose is ambiguous and must not be relied on'))
 
 TABLES: dict[str, tuple[Column, ...]] = {
     'tracks': (
-        *_WHERE, *_TRACK, Column('end_ns', 'i', 'ns', 'timestamp of the last pose'),
+        *_COMMON, *_TRACK, Column('end_ns', 'i', 'ns', 'timestamp of the last pose'),
         *columns_of('i', '', poses='number of published poses'),
-        *columns_of('s', '', arrival='most probable arrival direction', kind='most probable kind',
-                  verdict='unique or ambiguous', doubts='all doubts of its poses'),
+        *columns_of('s', '', arrival='most probable arrival direction',
+                  kind='most probable kind of vehicle',
+                  verdict='whether the track is unique or ambiguous',
+                  doubts='reasons for doubt about any pose of the track'),
         *columns_of('f', '', arrival_weight='probability of the arrival direction',
                   kind_weight='probability of the kind',
                   ambiguous_share='fraction of poses that are ambiguous',
@@ -48,33 +50,34 @@ TABLES: dict[str, tuple[Column, ...]] = {
         *_POSES, *columns_of('f', '', weight='weight of the hypothesis',
                   kind_weight='probability of the kind'),
         *columns_of('s', '', arrival='arrival direction of the hypothesis',
-                  doubts='names of the doubts')),
+                  doubts='reasons for doubt about the pose')),
     'smoothed': _POSES,
     'passes': (
-        *_WHERE, *columns_of('i', '', number='number of the detection in the recording',
+        *_COMMON, *columns_of('i', '', number='number of the detection in the recording',
                            vehicle='number of the vehicle within the detection',
                            n_vehicles='number of vehicles fitted jointly',
                            n_dipoles='number of dipoles in the fitted row',
                            n_values='number of measurements'),
-        *columns_of('s', '', reason='why the fit is not trusted; empty if it is',
-                  trusted='quantities that are trusted nevertheless',
+        *columns_of('s', '', reason='why the fit is not trusted; empty for a trusted fit',
+                  trusted='quantities that are trusted although the fit is not',
                   notes='measurements that were excluded, and why'),
-        *columns_of('f', '', normalised_cost='near 1 if the model is right',
+        *columns_of('f', '', normalised_cost='cost of the fit; near 1 for a correct model',
                   explained='fraction of the energy that the fit explains'),
         *_STATE, *_STATE_SD,
-        *columns_of('f', 'm/s', speed='speed of the fit', sd_speed='its standard deviation'),
+        *columns_of('f', 'm/s', speed='speed of the fit',
+                  sd_speed='standard deviation of the speed'),
         *columns_of('f', 'deg', heading_deg='heading of the fit',
-                  sd_heading_deg='its standard deviation'),
+                  sd_heading_deg='standard deviation of the heading'),
         *columns_of('f', 'm', length='length of the row of dipoles',
-                  sd_length='its standard deviation'),
+                  sd_length='standard deviation of the length'),
         *_MOMENT, *_axes('sd_m', 'A m^2', 'standard deviation of the moment'),
         *columns_of('f', 'm/s',
                   delay_speed='model-free speed from the delay between sensors',
-                  sd_delay_speed='its standard deviation'),
-        *columns_of('f', 'deg', delay_heading_deg='heading from the delay between sensors',
-                  sd_delay_heading_deg='its standard deviation')),
+                  sd_delay_speed='standard deviation of the model-free speed'),
+        *columns_of('f', 'deg', delay_heading_deg='model-free heading from the delays',
+                  sd_delay_heading_deg='standard deviation of the model-free heading')),
     'health': (
-        *_WHERE, *columns_of('s', '', sensor='name of the sensor'),
+        *_COMMON, *columns_of('s', '', sensor='name of the sensor'),
         *columns_of('i', '', accepted='readings used since the previous row',
                   rejected='readings rejected since the previous row',
                   times_relearnt='number of times the background was relearnt'),
@@ -85,8 +88,9 @@ TABLES: dict[str, tuple[Column, ...]] = {
         *_axes('drift_', 'T/s', 'drift of the background'),
         *_axes('noise_', 'T', 'standard deviation of one reading')),
     'recordings': (
-        *_WHERE, *columns_of('s', '', error='why processing failed; empty if it succeeded',
-                           lost='parts that could not be read', rejected='rejected readings',
+        *_COMMON, *columns_of('s', '', error='why processing failed; empty if it succeeded',
+                           lost='parts of the recording that could not be read',
+                           rejected='rejected readings by cause',
                            missing_topics='topics of the network that were not recorded',
                            no_detection_reason='why nothing was detected; empty otherwise'),
         *columns_of('i', 'ns', end_ns='timestamp of the last frame'),

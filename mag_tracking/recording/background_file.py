@@ -1,7 +1,7 @@
-"""Learnt backgrounds of a running calibration, stored so that a restart can restore them.
+"""Storage of the learnt backgrounds of a running calibration, for use after a restart.
 
-A network file holds what remains valid for years. This file holds the state of the last minute,
-and becomes outdated with the readings.
+A network file contains parameters that stay valid for years. A background file contains the current
+background of each sensor, which is soon outdated.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ _HEAD = '{"version": '
 
 
 def default_path(network_path: str | PathLike[str], node: str) -> Path:
-    """Path of the file in which a node stores the backgrounds of a network, in the state folder.
+    """Default path of the file in which a node stores the backgrounds of a network.
 
     Parameters
     ----------
@@ -37,14 +37,15 @@ def default_path(network_path: str | PathLike[str], node: str) -> Path:
     Returns
     -------
     Path
+        File in the state folder.
     """
     path = Path(network_path).resolve()
-    mark = hashlib.sha256(f'{path} {node}'.encode()).hexdigest()[:8]
-    return state_folder() / f'{path.stem}_{mark}.json'
+    digest = hashlib.sha256(f'{path} {node}'.encode()).hexdigest()[:8]
+    return state_folder() / f'{path.stem}_{digest}.json'
 
 
 def is_background_file(path: Path) -> bool:
-    """Whether a file begins like one with backgrounds.
+    """Whether a file begins with the header of a background file.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def state_folder() -> Path:
 
 
 def _dependencies(network: SensorNetwork, j: int, settings: CalibrateSettings) -> list[Any]:
-    """All parameters that a background of sensor `j` depends on, as lists for a comparison."""
+    """Parameters on which the background of sensor `j` depends, as comparable lists."""
     arrays = (network.offset[j], network.correction[j], network.clock_offset[j],
               network.background[j], network.noise_std[j], network.positions[j], network.R_ws[j])
     return [None if a is None else np.asarray(a).tolist() for a in arrays] \
@@ -78,14 +79,14 @@ def _dependencies(network: SensorNetwork, j: int, settings: CalibrateSettings) -
 
 def background_text(stored: StoredBackground, network: SensorNetwork, j: int,
                     settings: CalibrateSettings) -> str:
-    """JSON text of the background of a sensor.
+    """Serialise the background of a sensor as JSON.
 
     Parameters
     ----------
     stored : StoredBackground
     network : SensorNetwork
     j : int
-        Row of the sensor.
+        Index of the sensor in the network.
     settings : CalibrateSettings
 
     Returns
@@ -116,7 +117,7 @@ def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> No
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f'{path}: {error.strerror}') from error
+        raise OutputError(f'cannot write {path}: {error.strerror}') from error
     replace_text(path, f'{_HEAD}{VERSION}, "sensors": {{\n{rows}\n}}}}\n')
 
 
@@ -134,9 +135,9 @@ def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
     Returns
     -------
     stored : dict of str to StoredBackground
-        By sensor. Empty if the file does not exist.
+        Usable backgrounds by sensor. Empty if the file does not exist.
     refused : dict of str to str
-        Reason by sensor for each background that cannot be used.
+        Reason for each background that cannot be used, by sensor.
 
     Raises
     ------
@@ -148,7 +149,7 @@ def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
     except FileNotFoundError:
         return {}, {}
     except (OSError, ValueError, RecursionError) as error:
-        raise RecordingError(f'{path}: {error}') from error
+        raise RecordingError(f'cannot read {path}: {error}') from error
     entries = content.get('sensors') if isinstance(content, dict) else None
     if not isinstance(entries, dict) or content.get('version') != VERSION:
         raise RecordingError(f'{path} is not a background file of version {VERSION}')
@@ -159,21 +160,25 @@ def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
             if name in entries and entries[name]['made_of'] != _dependencies(network, j, settings):
                 refused[name] = 'it belongs to another network file or other settings'
             elif name in entries:
-                stored[name] = _stored(entries[name])
-        except (KeyError, TypeError, ValueError) as error:
-            refused[name] = f'{type(error).__name__}: {error}'
+                stored[name] = _background_of(entries[name])
+        except KeyError as error:
+            refused[name] = f'the stored entry has no {error.args[0]}'
+        except TypeError:
+            refused[name] = 'the stored entry is not valid'
+        except ValueError as error:
+            refused[name] = f'the stored entry is not valid: {error}'
     return stored, refused
 
 
-def _stored(entry: Any) -> StoredBackground:
-    """Background of an entry; raises ValueError if its numbers are invalid."""
+def _background_of(entry: Any) -> StoredBackground:
+    """Background in an entry of the file; raises ValueError if its numbers are invalid."""
     background = np.array(entry['background'], dtype=float)
     covariance = np.array(entry['covariance'], dtype=float)
     if background.shape != (3,) or covariance.shape != (3, 3) or np.isinf(background).any() \
             or not isinstance(entry['stamp_ns'], int):
         raise ValueError(f'invalid background {background.tolist()} at {entry["stamp_ns"]}')
-    there = ~np.isnan(background)
-    C = covariance[np.ix_(there, there)]
-    if not there.any() or not np.isfinite(C).all() or np.linalg.eigvalsh(C)[0] <= 0.0:
+    is_known = ~np.isnan(background)
+    C = covariance[np.ix_(is_known, is_known)]
+    if not is_known.any() or not np.isfinite(C).all() or np.linalg.eigvalsh(C)[0] <= 0.0:
         raise ValueError('the covariance is not positive definite')
     return StoredBackground(entry['stamp_ns'], background, covariance)

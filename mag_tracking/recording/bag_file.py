@@ -1,4 +1,4 @@
-"""One SQLite bag (`.db3`) or ROS 1 bag (`.bag`), read with `rosbags`."""
+"""Reader of one SQLite bag (`.db3`) or ROS 1 bag (`.bag`), with the library `rosbags`."""
 
 import dataclasses
 import functools
@@ -31,13 +31,13 @@ BLOCK_SIZE = 256
 
 
 class BagFile:
-    """One bag of a recording.
+    """Reader of one bag of a recording.
 
     Parameters
     ----------
     path : Path
     losses : Counter
-        Incremented for everything that cannot be read, by description.
+        Number of unreadable parts by description, updated in place.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class BagFile:
         self.message_counts: Counter[str] = Counter()
         self.start_ns: int | None = None
         self.end_ns: int | None = None
-        with self._reading() as reader:
+        with self._open_reader() as reader:
             for connection in reader.connections:
                 self.types[connection.topic] = connection.msgtype
                 self.message_counts[connection.topic] += connection.msgcount
@@ -69,17 +69,17 @@ class BagFile:
                 # The end time of the library is one nanosecond after the last message.
                 self.start_ns, self.end_ns = times.start_time, times.end_time - 1
 
-    def _reading(self) -> AbstractContextManager[Any]:
-        """Open the reader of the library; raises RecordingError."""
+    def _open_reader(self) -> AbstractContextManager[Any]:
+        """Open the bag with the reader of the library; raises RecordingError."""
         try:
-            reader = self._reader()
+            reader = self._new_reader()
             reader.open()
         except bag_errors() as error:
             raise RecordingError(f'{self._path} cannot be read as a bag: {error}') from error
         return closing(reader)
 
-    def _reader(self) -> 'Ros1Reader | Sqlite3Reader':
-        """Reader of the library for this type of bag."""
+    def _new_reader(self) -> 'Ros1Reader | Sqlite3Reader':
+        """Create the library's reader for this type of bag."""
         # Imported here because most recordings are MCAP and do not need the library.
         if self._is_ros1:
             from rosbags.rosbag1 import Reader
@@ -104,29 +104,29 @@ class BagFile:
         ------
         MessageBlock
         """
-        size, total, done, n = self._path.stat().st_size, self.message_counts.total(), 0, 0
+        size, total, reported, n = self._path.stat().st_size, self.message_counts.total(), 0, 0
         raw = self._raw(start_ns)
-        while found := list(islice(raw, BLOCK_SIZE)):
+        while messages := list(islice(raw, BLOCK_SIZE)):
             yield MessageBlock.of_messages([
                 RawMessage(topic, kind, log_time_ns,
                            cdr_of_ros1(data, kind) if self._is_ros1 else data, schema_of(kind))
-                for topic, kind, log_time_ns, data in found])
-            n += len(found)
-            if progress and (here := size * n // total) > done:
-                progress(here - done)
-                done = here
+                for topic, kind, log_time_ns, data in messages])
+            n += len(messages)
+            if progress and (position := size * n // total) > reported:
+                progress(position - reported)
+                reported = position
 
     def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
         """Iterate over (topic, type, log time, bytes); damage ends the iteration and is counted."""
         n = 0
-        with self._reading() as reader:
+        with self._open_reader() as reader:
             try:
                 for connection, log_time_ns, data in reader.messages(reader.connections, start_ns):
                     n += 1
                     yield connection.topic, connection.msgtype, log_time_ns, bytes(data)
-            except bag_errors() as error:
-                self._losses[f'{self._path.name}: unreadable after message {n} of '
-                             f'{self.message_counts.total()} ({type(error).__name__})'] += 1
+            except bag_errors():
+                self._losses[f'partially read files ({self._path.name}, up to message {n} of '
+                             f'{self.message_counts.total()})'] = 1
 
 
 @functools.cache
@@ -166,20 +166,20 @@ def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
         message = _ros1_types().deserialize_ros1(data, type_name)
     except bag_errors():
         return b''
-    return encoder(type_name)(_plain(message))
+    return encoder(type_name)(_as_dicts(message))
 
 
 @functools.cache
 def _ros1_types() -> 'Typestore':
-    """Message types of ROS 1."""
+    """Type definitions of ROS 1 messages."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC)
 
 
-def _plain(value: Any) -> Any:
-    """Message as nested dicts."""
+def _as_dicts(value: Any) -> Any:
+    """Convert a message to nested dicts."""
     if dataclasses.is_dataclass(value):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)
+        return {f.name: _as_dicts(getattr(value, f.name)) for f in dataclasses.fields(value)
                 if not f.name.startswith('__')}
     return value.tolist() if isinstance(value, np.ndarray) else value

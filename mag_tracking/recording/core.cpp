@@ -1,4 +1,4 @@
-// Python module of compiled functions for work that is repeated many thousand times; core.pyi
+// Python module of compiled functions for work that is repeated many thousands of times; core.pyi
 // documents the arguments.
 
 #include <algorithm>
@@ -59,7 +59,7 @@ py::tuple records_of(const py::bytes& data, std::int64_t latest_ns) {
     return py::make_tuple(out, definitions);
 }
 
-// Append the shortest text that reads back as the same number.
+// Append the shortest decimal representation that is parsed to the same number.
 void append(std::string& text, double value) {
     if (std::isnan(value)) {
         text += "nan";
@@ -90,7 +90,7 @@ py::list number_rows(Array values) {
 
 PYBIND11_MODULE(core, m) {
     using namespace mag_tracking;
-    m.doc() = "Compiled functions for work that is repeated many thousand times.";
+    m.doc() = "Compiled functions for work that is repeated many thousands of times.";
     m.def("number_rows", &number_rows, IN(values));
     m.def("records_of", &records_of, py::arg("data"), py::arg("latest_ns"));
 }

@@ -1,4 +1,4 @@
-"""Compiled functions for work that is repeated many thousand times."""
+"""Compiled functions for work that is repeated many thousands of times."""
 
 from mag_tracking.arrays import FloatArray, IntArray
 
@@ -12,7 +12,7 @@ def number_rows(values: FloatArray) -> list[str]:
     Returns
     -------
     list of str, length n
-        Shortest texts that read back as the same numbers.
+        Shortest decimal representations that are parsed to the same numbers.
     """
 
 def records_of(data: bytes, latest_ns: int) -> tuple[IntArray, list[tuple[int, int, int]]]:
@@ -23,7 +23,7 @@ def records_of(data: bytes, latest_ns: int) -> tuple[IntArray, list[tuple[int, i
     data : bytes
         Uncompressed records of the chunk.
     latest_ns : int, ns
-        Upper limit of the log times; later ones, which MCAP permits, are clipped.
+        Upper limit of the log times. Later times, which MCAP permits, are clipped.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""CSV files: lines, headers and numbers, with errors that name file and row."""
+"""Reading of CSV files, with error messages that name the file and the row."""
 
 import csv
 from os import PathLike
@@ -11,7 +11,7 @@ from mag_tracking.files import checked_path
 
 CsvPath: TypeAlias = str | PathLike[str]
 Lines: TypeAlias = list[tuple[int, list[str]]]
-"""Line number and cells of each line."""
+"""Line number and cells of each line that is not empty."""
 
 
 def read_csv(path: CsvPath) -> tuple[list[str], Lines]:
@@ -44,7 +44,7 @@ def read_csv(path: CsvPath) -> tuple[list[str], Lines]:
 
 
 def csv_lines(path: CsvPath) -> Lines:
-    """Read the lines of a CSV file that are not empty.
+    """Read the non-empty lines of a CSV file.
 
     Parameters
     ----------
@@ -78,7 +78,9 @@ def number(path: CsvPath, line: int, column: str, text: str, finite: bool) -> fl
     ----------
     path : path_like
     line : int
+        Line number, for error messages.
     column : str
+        Name of the column, for error messages.
     text : str
         Content of the cell.
     finite : bool

@@ -35,7 +35,7 @@ def event_row(event: PassEvent) -> list[object]:
 
 
 def _number(value: float) -> str:
-    """Short text of a number; empty if it is unknown."""
+    """Format a number with six significant digits; empty for an unknown number."""
     return f'{value:.6g}' if np.isfinite(value) else ''
 
 

@@ -25,7 +25,7 @@ TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
 _Path: TypeAlias = str | PathLike[str]
 _Axes: TypeAlias = dict[str, dict[str, str]]
-"""{sensor: {axis: column}}; the sensor is '' if a column of the table holds it."""
+"""{sensor: {axis: column}}; the sensor is '' if a column contains the sensor names."""
 
 
 def parse_columns(texts: Sequence[str]) -> tuple[str, str | None, _Axes]:
@@ -35,8 +35,7 @@ def parse_columns(texts: Sequence[str]) -> tuple[str, str | None, _Axes]:
     ----------
     texts : sequence of str
         `time=COLUMN`, and either `sensor=COLUMN` with `x=COLUMN` and so on (one row per reading),
-        or `NAME.x=COLUMN` and so on (one row for all sensors). Axes that were not measured are
-        omitted.
+        or `NAME.x=COLUMN` and so on (one row for all sensors). Omit axes that were not measured.
 
     Returns
     -------
@@ -56,7 +55,7 @@ def parse_columns(texts: Sequence[str]) -> tuple[str, str | None, _Axes]:
     for text in texts:
         key, equals, column = text.partition('=')
         if not (equals and column) or key in found:
-            raise RecordingError(f'columns: {text!r} is given twice' if key in found else
+            raise RecordingError(f'columns: {text!r} repeats a key' if key in found else
                                  f'columns: expected KEY=COLUMN such as time=t, got {text!r}')
         found[key] = column
     time, sensor = found.pop('time', None), found.pop('sensor', None)
@@ -83,7 +82,7 @@ def import_field_table(table: _Path, columns: Sequence[str], unit: str, out: _Pa
     table : path_like
         CSV file with a header.
     columns : sequence of str
-        As for `parse_columns`. An empty field is a missing measurement.
+        Assignments as for `parse_columns`. An empty cell is a missing measurement.
     unit : str
         Unit of the field, a key of `FIELD_UNITS`.
     out : path_like
@@ -96,7 +95,7 @@ def import_field_table(table: _Path, columns: Sequence[str], unit: str, out: _Pa
     recording : Path
         Recording with the readings on `/NAME/imu/mag`.
     counts : dict of str to int
-        Number of readings by sensor. A row in which no axis of a sensor was measured gives none.
+        Number of readings by sensor. A row without a measured axis of the sensor is not counted.
 
     Raises
     ------
@@ -121,17 +120,18 @@ def import_field_table(table: _Path, columns: Sequence[str], unit: str, out: _Pa
 
 def _readings(table: Path, columns: tuple[str, str | None, _Axes], scale: float,
               time_scale: int) -> Readings:
-    """Readings of a table in order of time."""
+    """Read the readings of a table in chronological order; raises RecordingError."""
     time, sensor, axes = columns
     names: list[str] = []
     stamps: list[int] = []
     fields: list[FloatArray] = []
-    wanted = [time, *([sensor] if sensor else []), *(c for a in axes.values() for c in a.values())]
-    for number, row in _rows(table, wanted):
+    column_names = [time, *([sensor] if sensor else []),
+                    *(c for a in axes.values() for c in a.values())]
+    for number, row in _rows(table, column_names):
         stamp = _stamp(row[time], time_scale, f'{table}: row {number}: {time}')
-        for name, columns_of in axes.items():
+        for name, axis_columns in axes.items():
             field = np.full(3, np.nan)
-            for axis, column in columns_of.items():
+            for axis, column in axis_columns.items():
                 field['xyz'.index(axis)] = scale * _number(
                     row[column], f'{table}: row {number}: {column}')
             if not np.isnan(field).all():
@@ -145,13 +145,13 @@ def _readings(table: Path, columns: tuple[str, str | None, _Axes], scale: float,
     return Readings.by_name(names, stamps, np.array(fields)).part(order)
 
 
-def _rows(table: Path, wanted: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
-    """[(row, {column: text})] of a CSV file; raises RecordingError."""
+def _rows(table: Path, column_names: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
+    """Read [(line number, {column: cell})] from a CSV file; raises RecordingError."""
     table = checked_path(table, RecordingError)
     try:
         with open(table, newline='', encoding='utf-8-sig') as stream:
             reader = csv.DictReader(stream, skipinitialspace=True)
-            missing = [c for c in wanted if c not in (reader.fieldnames or ())]
+            missing = [c for c in column_names if c not in (reader.fieldnames or ())]
             if missing:
                 raise RecordingError(f'{table}: column {missing[0]} is missing; the columns are '
                                      f'{", ".join(reader.fieldnames or ["none"])}')
@@ -161,7 +161,7 @@ def _rows(table: Path, wanted: Sequence[str]) -> list[tuple[int, dict[str, str]]
     except (csv.Error, UnicodeDecodeError) as error:
         raise RecordingError(f'{table} is not a CSV file: {error}') from error
     for number, row in rows:
-        if any(row[c] is None for c in wanted):
+        if any(row[c] is None for c in column_names):
             raise RecordingError(f'{table}: row {number} has too few columns')
         if None in row:
             raise RecordingError(f'{table}: row {number} has too many columns (a decimal comma?)')
@@ -169,7 +169,7 @@ def _rows(table: Path, wanted: Sequence[str]) -> list[tuple[int, dict[str, str]]
 
 
 def _number(text: str, where: str) -> float:
-    """Convert a field to a number, NaN if it is empty; raises RecordingError."""
+    """Convert a cell to a number, NaN if it is empty; raises RecordingError."""
     if not text.strip():
         return float('nan')
     try:
@@ -182,19 +182,19 @@ def _number(text: str, where: str) -> float:
 
 
 def _stamp(text: str, scale: int, where: str) -> int:
-    """Convert a time to [ns] without rounding whole numbers; raises RecordingError."""
+    """Convert a cell to a time [ns], whole numbers exactly; raises RecordingError."""
     text = text.strip()
     is_whole = re.fullmatch(r'[+-]?[0-9]{1,20}', text)
     value = int(text) * scale if is_whole else _number(text, where) * scale
     if not 0 <= value <= LATEST_NS:
-        raise RecordingError(f'{where}: {text[:30] or "an empty field"} is not a time after 1970')
+        raise RecordingError(f'{where}: {text[:30] or "an empty cell"} is not a time after 1970')
     return round(value)
 
 
 def _sensor_name(text: str, where: str) -> str:
-    """Valid sensor name for a topic: a number n becomes `mag_n`; raises RecordingError."""
+    """Sensor name that is valid in topics: a number n becomes `mag_n`; raises RecordingError."""
     name = f'mag_{text.strip()}' if re.fullmatch('[0-9]+', text.strip()) else text.strip()
     if not re.fullmatch('[A-Za-z_][A-Za-z0-9_]*', name):
         raise RecordingError(f'{where}: {text!r} is not a valid sensor name: use only letters, '
-                             'digits and _')
+                             'digits and _, and no digit at the beginning')
     return name

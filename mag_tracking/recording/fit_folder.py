@@ -1,4 +1,4 @@
-"""Table of fitted passes: CSV during the run, JSON at its end."""
+"""Table of fitted passes, written as CSV during the run and as JSON at its end."""
 
 import csv
 import json
@@ -30,9 +30,9 @@ FIT_COLUMNS = (
 point of approach (CPA) refers to the centre of the sensors; its time is in seconds after
 `stamp_ns`. `rate` is the speed divided by the CPA range, which a single sensor can observe; the
 corresponding directions are in `fits.json`. A fit that is not trusted as a whole has only its
-trusted quantities (speed, heading, time of the CPA), and only if it is the fit selected for its
-pass. Jointly fitted vehicles share unknowns and costs. The columns of the delay are model-free and
-the same for all fits of a pass."""
+trusted quantities (speed, heading, time of the CPA), and only if the fit is selected for its pass.
+Jointly fitted vehicles have common unknowns and costs. The columns of the delay are model-free and
+equal for all fits of a pass."""
 
 
 class _FittedPass(Protocol):
@@ -65,8 +65,8 @@ def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
     ----------
     fit : PassFit
     is_known : bool, optional
-        Whether it is the fit selected for its pass. Only then does a fit with a reason not to be
-        trusted keep its trusted quantities.
+        Whether the fit is selected for its pass. A fit that is not trusted as a whole keeps its
+        trusted quantities only if it is selected.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
                 'sd_rate': b.rate_std}
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     if fit.reason:
-        return row | (_trusted(fit, centre) if is_known else {})
+        return row | (_trusted_quantities(fit, centre) if is_known else {})
     row['ambiguous'] = int(fit.ambiguous)
     sd = np.sqrt(np.diagonal(fit.robust_covariance))
     moment, P = fit.moment
@@ -104,16 +104,16 @@ def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
     return row
 
 
-def _trusted(fit: PassFit, centre: FloatArray) -> dict[str, float]:
-    """Trusted quantities by column."""
-    found: dict[str, Iterable[float]] = {}
+def _trusted_quantities(fit: PassFit, centre: FloatArray) -> dict[str, float]:
+    """Trusted quantities of a fit by column."""
+    quantities: dict[str, Iterable[float]] = {}
     if 'speed' in fit.trusted:
-        found['speed sd_speed'] = fit.speed
+        quantities['speed sd_speed'] = fit.speed
     if 'direction' in fit.trusted:
-        found['heading_deg sd_heading_deg'] = np.degrees(fit.heading)
+        quantities['heading_deg sd_heading_deg'] = np.degrees(fit.heading)
     if 'time' in fit.trusted:
-        found['cpa_time sd_cpa_time'] = fit.closest_approach(centre)[:2]
-    return {name: float(value) for names, values in found.items()
+        quantities['cpa_time sd_cpa_time'] = fit.closest_approach(centre)[:2]
+    return {name: float(value) for names, values in quantities.items()
             for name, value in zip(names.split(), values, strict=True)}
 
 
@@ -152,7 +152,7 @@ class FitFolder:
     ----------
     folder : Path
     rows : list of dict
-        Rows written so far.
+        Rows that have been written.
     summary : dict
         Further content of `fits.json`, to be filled by the caller.
 
@@ -198,7 +198,7 @@ class FitFolder:
 
 
 def _bearing(bearing: Bearing | None) -> dict[str, Any] | None:
-    """Content of a `Bearing` for JSON."""
+    """Convert a `Bearing` to values for JSON."""
     if bearing is None:
         return None
     return {'to_closest_point': bearing.cpa_direction.tolist(),

@@ -1,4 +1,4 @@
-"""Enrolled vehicles in JSON, stored with the passes of each so that more can be added."""
+"""JSON file of enrolled vehicles, with all passes of each vehicle, so that passes can be added."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -44,7 +44,7 @@ def read_fleet(path: str | PathLike[str]) -> dict[str, list[FleetPass]]:
     Raises
     ------
     RecordingError
-        If the file cannot be read or is not a valid fleet file.
+        If the file cannot be read or is not a valid fleet file of this version.
     """
     path = checked_path(path, RecordingError)
     try:
@@ -60,7 +60,8 @@ def read_fleet(path: str | PathLike[str]) -> dict[str, list[FleetPass]]:
     except OSError as error:
         raise RecordingError(f'cannot read {path}: {error.strerror}') from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RecordingError(f'{path} is not a valid fleet file ({error})') from error
+        raise RecordingError(
+            f'{path} is not a valid fleet file (missing or invalid: {error})') from error
 
 
 def write_fleet(path: Path, fleet: dict[str, list[FleetPass]]) -> None:

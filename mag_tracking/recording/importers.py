@@ -1,6 +1,5 @@
 """Import of third-party tables as recordings and network files."""
 
-import csv
 from os import PathLike
 from pathlib import Path
 from typing import TypeAlias
@@ -14,6 +13,7 @@ from mag_tracking.messages.schema import magnetic_field_dicts, pose_dict
 from mag_tracking.messages.types import MAGNETIC_FIELD, POSE
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
+from mag_tracking.recording.csv_file import number, read_csv
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
 
@@ -24,7 +24,7 @@ _COLUMNS = ('id', 'timestamp', 'Bx', 'By', 'Bz', 'sensor_x', 'sensor_y', 'sensor
 
 def import_pose_table(table: _Path, background: _Path, out: _Path,
                       noise_std: float) -> tuple[Path, Path, int]:
-    """Import a table of magnet poses observed by fixed sensors, as recording and network file.
+    """Import a table of magnet poses and sensor fields as a recording and a network file.
 
     The sensor positions and orientations were measured again for every pose; their medians are
     used.
@@ -37,12 +37,12 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
         sensor to world), and the true pose of the magnet `m_x..z` [mm] and `m_ox..oz` (rotation
         vector; the magnet's axis is the rotated z axis).
     background : path_like
-        CSV file with one row per sensor, in the order of their ids: field without the magnet
+        CSV file with one row per sensor, in the order of the ids: field without the magnet
         [µT, sensor frame].
     out : path_like
         Folder for `<table>.mcap`, `metadata.yaml` and `network.yaml`.
     noise_std : float, T
-        Standard deviation of one reading, which the table does not contain.
+        Noise standard deviation of one reading, which the table does not contain.
 
     Returns
     -------
@@ -59,10 +59,11 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
         If `out` cannot be written.
     """
     rows = _read_table(table)
-    field_free = _read_background(background)
+    backgrounds = _read_background(background)
     ids = np.unique(rows['id']).astype(int)
-    if len(field_free) != len(ids):
-        raise RecordingError(f'{background} has {len(field_free)} sensors, {table} has {len(ids)}')
+    if len(backgrounds) != len(ids):
+        raise RecordingError(f'the tables have different numbers of sensors: {background} '
+                             f'{len(backgrounds)}, {table} {len(ids)}')
     names = tuple(f'mag_{i}' for i in ids)
     position, vectors = (np.array([np.median(rows[kind][rows['id'] == i], axis=0) for i in ids])
                          for kind in ('sensor', 'sensor_rotation'))
@@ -70,7 +71,7 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
     network = SensorNetwork(
         names, position * 1e-3, rotation_from_quaternion(quaternions),
         tuple(f'/{name}/imu/mag' for name in names),
-        noise_std=(np.full(3, noise_std),) * len(ids), background=tuple(field_free * 1e-6))
+        noise_std=(np.full(3, noise_std),) * len(ids), background=tuple(backgrounds * 1e-6))
     out = Path(out)
     recording = out / f'{Path(table).stem}.mcap'
     order = np.argsort(rows['timestamp'], kind='stable')
@@ -91,24 +92,13 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
 
 
 def _read_table(path: _Path) -> dict[str, FloatArray]:
-    """Columns of the table as arrays."""
-    try:
-        with open(path, newline='', encoding='utf-8') as stream:
-            reader = csv.DictReader(stream)
-            missing = [c for c in _COLUMNS if c not in (reader.fieldnames or ())]
-            if missing:
-                raise RecordingError(f'{path}: column {missing[0]} is missing')
-            values = [[float(row[c]) for c in _COLUMNS] for row in reader]
-    except OSError as error:
-        raise RecordingError(f'cannot read {path}: {error.strerror}') from error
-    except (ValueError, TypeError) as error:
-        raise RecordingError(f'{path}: {error}') from error
-    if not values:
-        raise RecordingError(f'{path} has no rows')
-    a = np.array(values)
-    if not np.isfinite(a).all():
-        row, column = np.argwhere(~np.isfinite(a))[0]
-        raise RecordingError(f'{path}: row {row + 2}: {_COLUMNS[column]} is not a finite number')
+    """Read the columns of the table as arrays; raises RecordingError."""
+    header, rows = read_csv(path)
+    missing = [c for c in _COLUMNS if c not in header]
+    if missing:
+        raise RecordingError(f'{path}: column {missing[0]} is missing')
+    a = np.array([[number(path, line, c, row[header.index(c)], True) for c in _COLUMNS]
+                  for line, row in rows])
     if (a[:, 0] != a[:, 0].astype(int)).any():
         raise RecordingError(f'{path}: column id contains numbers that are not integers')
     return {'id': a[:, 0], 'timestamp': a[:, 1], 'field': a[:, 2:5], 'sensor': a[:, 5:8],
@@ -116,7 +106,7 @@ def _read_table(path: _Path) -> dict[str, FloatArray]:
 
 
 def _read_background(path: _Path) -> FloatArray:
-    """Background of each sensor, (n_sensors, 3) [µT]."""
+    """Read the background of each sensor, (n_sensors, 3) [µT]; raises RecordingError."""
     try:
         values = np.loadtxt(path, delimiter=',', ndmin=2)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Reading that reports its progress and can be stopped."""
+"""Reading that reports its progress and can be stopped by the caller."""
 
 from collections.abc import Callable, Iterator
 from typing import TypeAlias, TypeVar
@@ -8,7 +8,7 @@ Progress: TypeAlias = Callable[[int], object]
 _Item = TypeVar('_Item')
 
 class ReadingStopped(Exception):
-    """The caller stopped the reading."""
+    """Raised when the caller stops the reading."""
 
 
 def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progress | None = None,

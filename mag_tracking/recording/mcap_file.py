@@ -1,4 +1,4 @@
-"""One MCAP file, read chunk by chunk with checksums, as far as it is intact."""
+"""Reader of one MCAP file, which checks each chunk and skips damaged chunks."""
 
 import os
 from collections import Counter
@@ -30,13 +30,13 @@ _DEFINITIONS: dict[int, type[Schema] | type[Channel]] = {
 
 
 class McapFile:
-    """One MCAP file of a recording.
+    """Reader of one MCAP file of a recording.
 
     Parameters
     ----------
     path : Path
     losses : Counter
-        Incremented for everything that cannot be read, by description.
+        Number of unreadable parts by description, updated in place.
 
     Attributes
     ----------
@@ -59,11 +59,12 @@ class McapFile:
         self.start_ns: int | None = None
         self.end_ns: int | None = None
         self._path, self._losses = path, losses
+        self._lost_offsets: set[int] = set()
         self._index = self._inspect(path)
 
     def _inspect(self, file: Path) -> list[ChunkIndex] | None:
-        """Read topics, counts and times of the file; returns its chunk index, or None without
-        one."""
+        """Read topics, message counts and times; return the chunk index, or None if there is no
+        index."""
         with open(file, 'rb') as stream:
             if stream.read(5) != b'\x89MCAP':
                 raise RecordingError(f'{file} is not an MCAP file')
@@ -73,7 +74,7 @@ class McapFile:
             except DECODE_ERRORS:
                 summary = None
         if summary is None:
-            self._losses[f'{file.name} has no valid index (truncated?): read up to the damage'] = 1
+            self._losses[f'files without a valid index ({file.name}, possibly truncated)'] = 1
             return None
         for channel in summary.channels.values():
             schema = summary.schemas.get(channel.schema_id)
@@ -104,12 +105,12 @@ class McapFile:
         """
         with open(self._path, 'rb') as stream:
             if self._index:
-                yield from self._from_index(stream, self._index, start_ns, progress)
+                yield from self._indexed_blocks(stream, self._index, start_ns, progress)
             else:
-                yield from self._from_stream(stream, progress)
+                yield from self._streamed_blocks(stream, progress)
 
-    def _from_index(self, stream: BinaryIO, index: list[ChunkIndex], start_ns: int | None,
-                    progress: Progress | None) -> Iterator[MessageBlock]:
+    def _indexed_blocks(self, stream: BinaryIO, index: list[ChunkIndex], start_ns: int | None,
+                        progress: Progress | None) -> Iterator[MessageBlock]:
         """Iterate over the messages of an intact file, in order of log time across chunks."""
         channels = _Channels()
         pending = MessageBlock.of_messages([])
@@ -123,8 +124,8 @@ class McapFile:
                 if not isinstance(chunk, Chunk):
                     raise ValueError('no chunk at the indexed offset')
                 pending = pending.merged(channels.block_of(chunk))
-            except DECODE_ERRORS as error:
-                self._count_lost_chunk(entry, error)
+            except DECODE_ERRORS:
+                self._count_lost_chunk(entry)
             if progress:
                 progress(entry.chunk_length)
             n = len(pending)
@@ -134,46 +135,54 @@ class McapFile:
             pending = pending.part(slice(n, None))
         yield pending
 
-    def _count_lost_chunk(self, entry: ChunkIndex, error: Exception) -> None:
-        """Count a chunk that cannot be read."""
+    def _count_lost_chunk(self, entry: ChunkIndex) -> None:
+        """Count a chunk of the index that cannot be read."""
         seconds = (entry.message_end_time - entry.message_start_time) / 1e9
         after = (entry.message_start_time - (self.start_ns or entry.message_start_time)) / 1e9
-        self._losses[f'damaged segment of {seconds:.1f} s at {after:.1f} s '
-                    f'({type(error).__name__})'] += 1
+        self._count_loss(entry.chunk_start_offset, f'damaged segments ({self._path.name}, '
+                         f'{seconds:.1f} s long, {after:.1f} s after the start)')
 
-    def _from_stream(self, stream: BinaryIO, progress: Progress | None
-                     ) -> Iterator[MessageBlock]:
+    def _count_loss(self, offset: int, description: str) -> None:
+        """Count an unreadable part at a byte offset, once even if the file is read repeatedly."""
+        if offset not in self._lost_offsets:
+            self._lost_offsets.add(offset)
+            self._losses[description] += 1
+
+    def _streamed_blocks(self, stream: BinaryIO, progress: Progress | None
+                         ) -> Iterator[MessageBlock]:
         """Iterate over the messages in file order, up to the first damage outside of a chunk."""
         channels, loose = _Channels(), _LooseMessages()
-        done = 0
+        end = 0
         try:
             for record in StreamReader(stream, emit_chunks=True).records:
+                record_end = stream.tell()
                 if isinstance(record, Chunk):
-                    yield from loose.collected(channels)
+                    yield from loose.flush(channels)
                     try:
                         yield channels.block_of(record)
-                    except DECODE_ERRORS as error:
-                        self._losses[f'damaged chunk ({type(error).__name__})'] += 1
+                    except DECODE_ERRORS:
+                        self._count_loss(end, f'damaged chunks ({self._path.name})')
                 elif isinstance(record, Schema | Channel):
                     channels.add(record)
                 elif isinstance(record, Message) and channels.has_schema(record.channel_id):
                     loose.add(record)
                     if len(loose) >= BATCH_SIZE:
-                        yield from loose.collected(channels)
+                        yield from loose.flush(channels)
                 if progress:
-                    here = stream.tell()
-                    progress(here - done)
-                    done = here
-            yield from loose.collected(channels)
-        except DECODE_ERRORS as error:
-            yield from loose.collected(channels)
-            self._losses[f'{os.path.basename(stream.name)}: unreadable after byte '
-                        f'{stream.tell()} of {os.fstat(stream.fileno()).st_size} '
-                        f'({type(error).__name__})'] += 1
+                    progress(record_end - end)
+                end = record_end
+            yield from loose.flush(channels)
+        except DECODE_ERRORS:
+            yield from loose.flush(channels)
+            size = os.fstat(stream.fileno()).st_size
+            # A file that ends after a complete record only lacks its index.
+            if end < size:
+                self._count_loss(end, f'partially read files ({self._path.name}, up to byte {end} '
+                                      f'of {size})')
 
 
 class _LooseMessages:
-    """Buffer of messages outside of chunks: reading many at once costs as much as reading one."""
+    """Buffer of messages outside of chunks, which are read faster in blocks."""
 
     def __init__(self) -> None:
         self._messages: list[Message] = []
@@ -185,8 +194,8 @@ class _LooseMessages:
         """Add a message."""
         self._messages.append(message)
 
-    def collected(self, channels: '_Channels') -> Iterator[MessageBlock]:
-        """Empty the buffer and iterate over its block, if there is one."""
+    def flush(self, channels: '_Channels') -> Iterator[MessageBlock]:
+        """Empty the buffer, and yield a block of its messages unless it was empty."""
         messages, self._messages = self._messages, []
         if not messages:
             return
@@ -197,7 +206,7 @@ class _LooseMessages:
 
 
 class _Channels:
-    """Channels of a file that have been read so far."""
+    """Schemas and channels that have been read from a file."""
 
     def __init__(self) -> None:
         self._schemas: dict[int, Schema] = {}
@@ -205,7 +214,7 @@ class _Channels:
         self.kinds: dict[int, ChannelKind] = {}
 
     def add(self, record: Schema | Channel) -> None:
-        """Add a record of the file; raises KeyError if the schema of a channel is unknown."""
+        """Add a schema or a channel; raises KeyError if the schema of a channel is unknown."""
         if isinstance(record, Schema):
             self._schemas[record.id] = record
         else:
@@ -215,14 +224,14 @@ class _Channels:
                                                        self._schemas[record.schema_id])
 
     def has_schema(self, channel: int) -> bool:
-        """Whether the messages of a channel have a type; raises KeyError for an unknown channel.
+        """Whether a channel has a schema; raises KeyError for an unknown channel.
 
-        MCAP permits channels without a schema (id 0), ROS does not.
+        MCAP permits channels without a schema (id 0); ROS does not.
         """
         return self._schema_of[channel] != 0
 
     def block_of(self, chunk: Chunk) -> MessageBlock:
-        """Messages of one chunk; raises one of `DECODE_ERRORS` if it is damaged."""
+        """Read the messages of one chunk; raises one of `DECODE_ERRORS` if the chunk is damaged."""
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
         data = stream.read(size)
         rows, definitions = core.records_of(data, LATEST_NS)

@@ -1,4 +1,4 @@
-"""Writer of one MCAP file that tracks how much of the file is intact on disk."""
+"""Writer of one MCAP file, which can be truncated to its complete chunks after a failure."""
 
 import errno
 import os
@@ -15,7 +15,7 @@ from mag_tracking.recording.rosbag2_folder import FileSummary, Opener, Topic, Un
 class McapFileWriter:
     """Writer of one MCAP file of a recording.
 
-    If the disk rejects a write, the methods raise OSError.
+    The methods raise OSError if a write fails.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class McapFileWriter:
     counts : Counter
         Number of messages by topic.
     pending : Counter
-        Number of messages by topic that are not in a complete chunk yet.
+        Number of messages by topic that are not yet in a complete chunk.
     """
 
     def __init__(self, path: Path, opener: Opener) -> None:
@@ -41,20 +41,20 @@ class McapFileWriter:
         self._span: tuple[int | None, int | None] = (None, None)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._intact_size = self._waiting = 0
-        # The writer uses only those methods of a stream that `UnbufferedWriter` has.
+        self._intact_size = self._buffered_size = 0
+        # The writer calls only stream methods that `UnbufferedWriter` has.
         self._writer = Writer(cast(IO[bytes], self._stream), chunk_size=1 << 20,
                               compression=CompressionType.ZSTD)
 
     def start(self) -> None:
-        """Write the header."""
+        """Write the header of the file."""
         self._writer.start(profile='ros2', library='mag_tracking')
         self._mark_intact()
 
     @property
     def size(self) -> int:
-        """Upper limit of the size after a flush, bytes."""
-        return self._stream.offset + self._waiting
+        """Upper bound of the file size after a flush, bytes."""
+        return self._stream.offset + self._buffered_size
 
     def add(self, name: str, topic: Topic, sequence: int, data: bytes, log_ns: int,
             publish_ns: int) -> None:
@@ -76,16 +76,17 @@ class McapFileWriter:
         self.pending[name] += 1
         if name not in self._channels:
             self._open_channel(name, topic)
-        self._waiting += len(data) + 31
-        before = self._stream.offset
+        # A message record has 31 bytes besides its data.
+        self._buffered_size += len(data) + 31
+        previous_offset = self._stream.offset
         self._writer.add_message(self._channels[name], log_ns, data, publish_ns,
                                  sequence & 0xFFFFFFFF)
         self._times.append(log_ns)
-        if self._stream.offset != before:
+        if self._stream.offset != previous_offset:
             self._mark_intact()
 
     def _open_channel(self, name: str, topic: Topic) -> None:
-        """Register schema and channel."""
+        """Register the schema and the channel of a topic."""
         if topic.type not in self._schemas:
             encoding = 'ros2msg' if topic.definition else ''
             self._schemas[topic.type] = self._writer.register_schema(
@@ -94,7 +95,7 @@ class McapFileWriter:
             name, 'cdr', self._schemas[topic.type], {'offered_qos_profiles': topic.qos})
 
     def flush(self) -> None:
-        """Complete the current chunk. A later crash cannot lose its messages.
+        """Complete the current chunk, so that a crash cannot lose its messages.
 
         Raises
         ------
@@ -108,8 +109,8 @@ class McapFileWriter:
             raise OSError(errno.ENOENT, 'the file was removed')
 
     def _mark_intact(self) -> None:
-        """Mark everything that is in the file so far as intact."""
-        self._intact_size, self._waiting = self._stream.offset, 0
+        """Record that the bytes in the file form complete chunks."""
+        self._intact_size, self._buffered_size = self._stream.offset, 0
         self.pending.clear()
         if self._times:
             self._span = min(self._times), max(self._times)
@@ -123,7 +124,7 @@ class McapFileWriter:
         self._stream.raw.close()
 
     def abandon(self) -> None:
-        """Close the file after a failure. Complete chunks remain, without an index."""
+        """Close the file after a failure; complete chunks remain, but no index is written."""
         self.counts -= self.pending
         with suppress(OSError):
             self._stream.raw.truncate(self._intact_size)

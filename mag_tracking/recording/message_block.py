@@ -1,4 +1,4 @@
-"""Blocks of messages that are read at once: arrays that index their common bytes."""
+"""Blocks of many messages: their bytes, and arrays with channel, log time and positions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class ChannelKind(NamedTuple):
     schema: Schema
     """Schema in the file."""
     is_cdr: bool
-    """Whether the messages are CDR. Otherwise they must be converted."""
+    """Whether the messages are encoded as CDR. Other encodings must be converted."""
 
     @classmethod
     def of(cls, topic: str, schema: Schema) -> 'ChannelKind':
@@ -44,7 +44,7 @@ class ChannelKind(NamedTuple):
 
 @dataclass(frozen=True)
 class MessageBlock:
-    """Messages in order of log time."""
+    """Block of messages in order of log time."""
 
     data: bytes
     """Bytes of all messages."""
@@ -62,14 +62,14 @@ class MessageBlock:
     @classmethod
     def of_rows(cls, data: bytes, kinds: Mapping[int, ChannelKind],
                 rows: IntArray) -> 'MessageBlock':
-        """Create a block from the rows of a chunk.
+        """Create a block from the positions of messages.
 
         Parameters
         ----------
         data : bytes
         kinds : mapping of int to ChannelKind
         rows : (n, 4) int array
-            Channel, log time [ns], begin and end, in any order.
+            Channel, log time [ns], and begin and end in `data`; one row per message, in any order.
 
         Returns
         -------
@@ -112,11 +112,12 @@ class MessageBlock:
         return (self.message(k) for k in range(len(self)))
 
     def message(self, k: int) -> RawMessage:
-        """Message of a row, converted to CDR.
+        """Return one message, converted to CDR.
 
         Parameters
         ----------
         k : int
+            Index in the block.
 
         Returns
         -------
@@ -134,7 +135,7 @@ class MessageBlock:
         Parameters
         ----------
         which : int array or slice
-            Rows in any order.
+            Indices of the messages, in any order.
 
         Returns
         -------
@@ -156,13 +157,13 @@ class MessageBlock:
         """
         if not len(self):
             return other
-        # Few messages remain from the previous chunk, so only their bytes are copied.
-        kept = [self.data[b:e] for b, e in zip(self.begin, self.end, strict=True)]
-        size = np.array([len(m) for m in kept], dtype=np.int64)
-        end = len(other.data) + np.cumsum(size)
-        both = MessageBlock(
-            other.data + b''.join(kept), other.kinds, *(
+        # Few messages remain from the previous chunk, so the rest of its bytes is dropped.
+        remaining = [self.data[b:e] for b, e in zip(self.begin, self.end, strict=True)]
+        length = np.array([len(m) for m in remaining], dtype=np.int64)
+        end = len(other.data) + np.cumsum(length)
+        block = MessageBlock(
+            other.data + b''.join(remaining), other.kinds, *(
                 np.concatenate(pair) for pair in (
                     (self.channel, other.channel), (self.log_time_ns, other.log_time_ns),
-                    (end - size, other.begin), (end, other.end))))
-        return both.part(np.argsort(both.log_time_ns, kind='stable'))
+                    (end - length, other.begin), (end, other.end))))
+        return block.part(np.argsort(block.log_time_ns, kind='stable'))

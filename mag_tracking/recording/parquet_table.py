@@ -22,12 +22,12 @@ MAX_BUFFERED_ROWS = 5000
 
 
 class Column(NamedTuple):
-    """A column of a table."""
+    """Description of a column of a table."""
 
     name: str
     """Name of the column."""
     kind: str
-    """Type: t = UTC time, i = integer, f = float, s = text, b = boolean, C = (6, 6) matrix,
+    """Type: t = UTC time, i = integer, f = float, s = string, b = boolean, C = (6, 6) matrix,
     row-major."""
     unit: str
     """Unit; empty for a dimensionless column."""
@@ -41,10 +41,11 @@ def columns_of(kind: str, unit: str, /, **meanings: str) -> tuple[Column, ...]:
     Parameters
     ----------
     kind : str
-        As `Column.kind`.
+        Type, as in `Column.kind`.
     unit : str
+        Unit, as in `Column.unit`.
     **meanings : str
-        Description by name.
+        Description of each column, by name.
 
     Returns
     -------
@@ -98,9 +99,9 @@ def schema_of(columns: Iterable[Column]) -> 'pa.Schema':
 
 
 class TableWriter:
-    """Writes a table piece by piece, and replaces an existing file only on success.
+    """Writer of a Parquet file in parts, which replaces an existing file only on success.
 
-    A context manager; on an error it leaves no file.
+    It is a context manager. An error leaves no new file.
 
     Parameters
     ----------
@@ -119,14 +120,14 @@ class TableWriter:
         # A worker that was assumed to be lost may still be writing the same table.
         self._draft = path.with_name(f'.{secrets.token_hex(8)}.part')
         self._rows: list[Mapping[str, Any]] = []
-        with self._errors_named():
+        with self._convert_errors():
             path.parent.mkdir(parents=True, exist_ok=True)
             self._writer = import_pyarrow().parquet.ParquetWriter(
                 self._draft, self._schema, compression='zstd')
 
     @contextmanager
-    def _errors_named(self) -> Iterator[None]:
-        """Convert OSError to OutputError that names the file."""
+    def _convert_errors(self) -> Iterator[None]:
+        """Convert an OSError to an OutputError that names the file."""
         try:
             yield
         except OSError as error:
@@ -152,7 +153,7 @@ class TableWriter:
         table : pyarrow.Table
         """
         self._flush()
-        with self._errors_named():
+        with self._convert_errors():
             self._writer.write_table(table)
 
     def _flush(self) -> None:
@@ -163,7 +164,7 @@ class TableWriter:
             rows = [{name: value.encode(errors='backslashreplace').decode()
                      if isinstance(value, str) else value for name, value in row.items()}
                     for row in rows]
-            with self._errors_named():
+            with self._convert_errors():
                 self._writer.write_table(
                     import_pyarrow().Table.from_pylist(rows, self._schema))
 
@@ -174,7 +175,7 @@ class TableWriter:
         try:
             if kind is None:
                 self._flush()
-            with self._errors_named():
+            with self._convert_errors():
                 self._writer.close()
                 if kind is None:
                     self._draft.replace(self._path)

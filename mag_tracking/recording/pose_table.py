@@ -10,7 +10,7 @@ _POSE = ('mag_x0', 'mag_y0', 'mag_z0', 'mag_mx0', 'mag_my0', 'mag_mz0')
 
 
 def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Read the field at fixed sensors and the tracked poses of a magnet.
+    """Read the fields at fixed sensors and the poses of a magnet from an external tracker.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
     field : (K, n, 3) array, T, sensor frames
     positions : (K, 3) array, m, tracker frame
     axes : (K, 3) array, tracker frame
-        Normalised unit vectors of the magnet's axis.
+        Unit vectors of the magnet's axis, normalised.
 
     Raises
     ------
@@ -33,16 +33,16 @@ def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     rows, values = _values(path, _POSE)
     axes = values[:, -3:]
-    length = np.linalg.norm(axes, axis=1)
-    for (line, _), size in zip(rows, length, strict=True):
-        if abs(size - 1.0) > 1e-3:
-            raise RecordingError(f'{path}: row {line}: mag_mx0..mag_mz0 has length {size:.6g}, '
-                                 'expected 1')
-    return (values[:, :-6].reshape(len(rows), -1, 3), values[:, -6:-3], axes / length[:, None])
+    lengths = np.linalg.norm(axes, axis=1)
+    for (line, _), vector_length in zip(rows, lengths, strict=True):
+        if abs(vector_length - 1.0) > 1e-3:
+            raise RecordingError(f'{path}: row {line}: mag_mx0..mag_mz0 has length '
+                                 f'{vector_length:.6g}, expected 1')
+    return (values[:, :-6].reshape(len(rows), -1, 3), values[:, -6:-3], axes / lengths[:, None])
 
 
 def read_readings(path: CsvPath) -> FloatArray:
-    """Read only the field from a pose table, which need not contain poses.
+    """Read only the fields from a pose table, which need not contain poses.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def read_sensor_positions(path: CsvPath) -> FloatArray:
 
 
 def _values(path: CsvPath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
-    """[(line, row)], and the numbers of all readings followed by those of the columns `pose`."""
+    """Read [(line, row)] and, for each row, all readings followed by the columns `pose`."""
     header, rows = read_csv(path)
     n = sum(name[:1] == 'x' and name[1:].isdigit() for name in header)
     fields = [f'{a}{j}' for j in range(n) for a in 'xyz']
@@ -96,10 +96,10 @@ def _values(path: CsvPath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
         raise RecordingError(f'{path}: column x0 is missing')
     for name in (*fields, *pose):
         if header.count(name) != 1:
-            there = 'missing' if name not in header else 'given twice'
-            raise RecordingError(f'{path}: column {name} is {there}')
-    places = [header.index(name) for name in (*fields, *pose)]
+            problem = 'missing' if name not in header else 'given twice'
+            raise RecordingError(f'{path}: column {name} is {problem}')
+    indices = [header.index(name) for name in (*fields, *pose)]
     values = np.array([[number(path, line, name, row[i], name in pose)
-                        for name, i in zip((*fields, *pose), places, strict=True)]
+                        for name, i in zip((*fields, *pose), indices, strict=True)]
                        for line, row in rows])
     return rows, values

@@ -1,7 +1,7 @@
 """Reader of recordings (MCAP, SQLite bags, ROS 1 bags) that tolerates and reports damage.
 
-A damaged chunk of an MCAP file is skipped and reported; a truncated file is read up to the cut.
-Memory is limited to about one chunk.
+A damaged chunk of an MCAP file is skipped and reported. A truncated file is read up to its last
+complete record. Memory use is limited to about one chunk.
 """
 
 from collections import Counter
@@ -23,7 +23,7 @@ SUFFIXES = ('.mcap', *BAG_SUFFIXES)
 
 
 class Recording:
-    """One file (MCAP, an SQLite bag `.db3`, a ROS 1 `.bag`), or a rosbag2 folder.
+    """Recording in one file (MCAP, SQLite bag `.db3`, ROS 1 `.bag`) or in a rosbag2 folder.
 
     Parameters
     ----------
@@ -39,13 +39,13 @@ class Recording:
     start_ns, end_ns : int, ns, or None
         Log times of the first and last message. None if unknown.
     losses : Counter
-        Number of occurrences of everything that could not be read, by description; grows while
-        reading.
+        Number of unreadable parts by description, updated while messages are read. The
+        description begins with the plural of the part, such as 'damaged chunks (a.mcap)'.
 
     Raises
     ------
     RecordingError
-        If there is no readable recording at `path`.
+        If `path` is not a readable recording.
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
@@ -56,9 +56,9 @@ class Recording:
         self._files = _files(self.path)
         empty = [f for f in self._files if f.stat().st_size == 0]
         if len(empty) < len(self._files):
-            # A crash at a split leaves an empty file. A single empty file is an error on opening.
+            # A crash at a split leaves an empty file. A recording of only empty files is an error.
             self._files = [f for f in self._files if f not in empty]
-            self.losses.update(f'{f.name} is empty (0 bytes)' for f in empty)
+            self.losses.update(f'empty files ({f.name})' for f in empty)
         self._opened = [(BagFile if f.suffix in BAG_SUFFIXES else McapFile)(f, self.losses)
                         for f in self._files]
         for file in self._opened:
@@ -96,7 +96,7 @@ class Recording:
         Parameters
         ----------
         topics : collection of str, optional
-            All topics if None.
+            None selects all topics.
         start_ns : int, ns, optional
             Skip messages that were logged earlier.
         progress : callable, optional
@@ -119,7 +119,7 @@ class Recording:
         Parameters
         ----------
         start_ns : int, ns, optional
-            Earlier messages may be skipped. Unlike in `messages`, some of them can remain.
+            Messages that were logged earlier may be skipped; unlike in `messages`, some may remain.
         progress : callable, optional
             Called with the number of bytes read since the last call.
 
@@ -135,7 +135,7 @@ class Recording:
 
 
 def _files(path: Path) -> list[Path]:
-    """Files of a recording, in order."""
+    """Files of a recording, in reading order; raises RecordingError."""
     if not path.exists():
         raise RecordingError(f'{path} does not exist')
     if path.is_file():
@@ -150,7 +150,8 @@ def _files(path: Path) -> list[Path]:
             listed = content['rosbag2_bagfile_information']['relative_file_paths']
             files = [path / name for name in listed]
         except (KeyError, TypeError) as error:
-            raise RecordingError(f'{metadata} is not rosbag2 metadata: {error}') from error
+            raise RecordingError(f'{metadata} is not rosbag2 metadata: relative_file_paths is '
+                                 'missing or not a list') from error
     if not files:
         raise RecordingError(f'{path} contains no recording ({", ".join(SUFFIXES)})')
     for file in files:

@@ -1,8 +1,8 @@
-"""Recorder of serialised messages in a rosbag2 folder of MCAP files, with limited loss on a crash.
+"""Recorder of serialised messages in a rosbag2 folder of MCAP files, with limited loss in a crash.
 
-A chunk is completed and passed to the operating system every `FLUSH_INTERVAL_NS`, so a killed
-program loses less than a second. The file that it leaves has no index: this package can read it
-as it is, other readers after `recording.repair.repair`.
+A chunk is completed and passed to the operating system every `FLUSH_INTERVAL_NS`, so less than a
+second is lost if the program is killed. The remaining file has no index. This package can read it
+directly; other readers require a repair by `recording.repair.repair`.
 """
 
 import errno
@@ -31,7 +31,8 @@ from mag_tracking.recording.rosbag2_folder import (
 from mag_tracking.recording.writer import offered_qos
 
 FLUSH_INTERVAL_NS = 400_000_000
-"""Interval between flushes [ns]. A crash loses at most this plus the time between two ticks."""
+"""Interval between flushes [ns]. A crash loses the messages of at most one flush interval plus one
+tick interval."""
 MIN_FREE_BYTES = 4 << 20
 """Minimum free disk space for a new file after a failure [bytes]."""
 
@@ -43,7 +44,7 @@ _Message: TypeAlias = tuple[int, bytes, int, int]
 class Recorder:
     """Records messages in a rosbag2 folder, in a sequence of files.
 
-    While the disk is full, messages are dropped, counted and reported; as soon as there is space,
+    While the disk is full, messages are dropped, counted and reported. Once space is available,
     recording continues in a new file.
 
     Parameters
@@ -57,7 +58,7 @@ class Recorder:
     retry_ns : int, ns, optional
         Delay before the next attempt after a failure.
     report : callable, optional
-        Called with each line of text for the user.
+        Called with each message to the user.
     opener : callable, optional
         Creates a file and returns an unbuffered stream.
 
@@ -69,8 +70,8 @@ class Recorder:
     dropped : Counter
         Number of messages by topic that were lost because they could not be written.
     repeated : int
-        Number of latched messages that were repeated at the start of a file to make it usable
-        alone.
+        Number of latched messages that were repeated at the start of a file, so that the file is
+        self-contained.
     unfinished : list of Path
         Files without an index.
 
@@ -90,17 +91,18 @@ class Recorder:
         self.dropped: Counter[str] = Counter()
         self.repeated = 0
         self.unfinished: list[Path] = []
-        self._done: list[FileSummary] = []
+        self._summaries: list[FileSummary] = []
         self._topics: dict[str, Topic] = {}
         self._latched: dict[str, deque[_Message]] = {}
         self._sequence: Counter[str] = Counter()
-        self._now = self._flushed = self._retry_at = self._metadata_at = self._done_bytes = 0
+        self._now_ns = self._flushed_ns = self._retry_at_ns = self._metadata_at_ns = \
+            self._finished_bytes = 0
         self._file: McapFileWriter | None = None
-        self._opened: int | None = None
-        self._failing = self._metadata_is_stale = False
+        self._opened_ns: int | None = None
+        self._is_failing = self._metadata_is_stale = False
         check_no_recording(self.folder)
         try:
-            self._open()
+            self._open_next()
         except OSError as error:
             raise OutputError(f'cannot record in {self.folder}: {error.strerror}') from error
 
@@ -112,8 +114,8 @@ class Recorder:
 
     @property
     def size(self) -> int:
-        """Number of bytes written so far."""
-        return self._done_bytes + (self._file.size if self._file else 0)
+        """Number of bytes written to all files."""
+        return self._finished_bytes + (self._file.size if self._file else 0)
 
     def add_topic(self, name: str, type_name: str, definition: str = '', qos: str | None = None,
                   latched: int = 0) -> None:
@@ -128,9 +130,9 @@ class Recorder:
             Definition of the type as a `ros2msg` schema. Without it, only ROS can read the
             messages.
         qos : str, optional
-            QoS profiles from `offered_qos`. None uses its defaults.
+            QoS profiles from `offered_qos`. None selects its defaults.
         latched : int, optional
-            Number of latest messages that are repeated at the start of each further file.
+            Number of latest messages that are repeated at the start of each later file.
         """
         # All files use the same profile, because readers match the channels of the files by it.
         self._topics.setdefault(name, Topic(type_name, definition, qos or offered_qos()))
@@ -160,31 +162,31 @@ class Recorder:
             self.dropped[name] += 1
         else:
             self.counts[name] += 1
-            self._try(file, file.add, name, self._topics[name], *message)
+            self._attempt(file, file.add, name, self._topics[name], *message)
         if name in self._latched:
             self._latched[name].append(message)
 
     def tick(self, now_ns: int) -> None:
-        """Flush, split and retry when due. Must be called several times per second.
+        """Flush, split and retry when due; to be called several times per second.
 
         Parameters
         ----------
         now_ns : int, ns
             Time of a monotonic clock.
         """
-        self._now = now_ns
-        self._opened = now_ns if self._opened is None else self._opened
-        if self._file and now_ns - self._flushed >= FLUSH_INTERVAL_NS:
-            self._flushed = now_ns
-            self._try(self._file, self._file.flush)
+        self._now_ns = now_ns
+        self._opened_ns = now_ns if self._opened_ns is None else self._opened_ns
+        if self._file and now_ns - self._flushed_ns >= FLUSH_INTERVAL_NS:
+            self._flushed_ns = now_ns
+            self._attempt(self._file, self._file.flush)
             self._report_recovery()
-        if self._file and self._file.counts and now_ns - self._opened >= self._split_ns:
+        if self._file and self._file.counts and now_ns - self._opened_ns >= self._split_ns:
             self._finish(self._file)
-        if self._metadata_is_stale and now_ns >= self._metadata_at:
+        if self._metadata_is_stale and now_ns >= self._metadata_at_ns:
             self._write_metadata()
 
     def close(self) -> None:
-        """Complete the file and `metadata.yaml`; incomplete files remain in `unfinished`."""
+        """Complete all files and `metadata.yaml`; incomplete files remain in `unfinished`."""
         if self._file:
             self._finish(self._file)
         for path in list(self.unfinished):
@@ -193,11 +195,12 @@ class Recorder:
                 self.unfinished.remove(path)
         self._write_metadata()
         if self.unfinished or self._metadata_is_stale:
-            self._report(f'{self.folder} could not be completed: free disk space, then run '
-                         f'mag-tracking repair {self.folder}')
+            self._report(f'the recording {self.folder} could not be completed: free disk space, '
+                         f'then run mag-tracking repair {self.folder}')
 
-    def _try(self, file: McapFileWriter, action: Callable[..., None], *arguments: object) -> bool:
-        """Whether `action` of the open file succeeded. The file is abandoned if it failed."""
+    def _attempt(self, file: McapFileWriter, action: Callable[..., None],
+                 *arguments: object) -> bool:
+        """Call `action` of the open file; abandon the file on failure. Return True on success."""
         try:
             action(*arguments)
         except OSError as error:
@@ -206,20 +209,20 @@ class Recorder:
         return True
 
     def _finish(self, file: McapFileWriter) -> None:
-        """Complete the open file."""
-        if self._try(file, file.finish):
+        """Complete and close the open file."""
+        if self._attempt(file, file.finish):
             self._report_recovery()
             self._add_finished(file)
             self._file = None
             self._write_metadata()
 
     def _add_finished(self, file: McapFileWriter) -> None:
-        """Add a file to which nothing more is written."""
-        self._done.append(file.summary())
-        self._done_bytes += file.size
+        """Add the summary and the size of a closed file."""
+        self._summaries.append(file.summary())
+        self._finished_bytes += file.size
 
     def _abandon(self, file: McapFileWriter, error: OSError) -> None:
-        """Keep the intact part of the open file, count the rest as dropped, and schedule a
+        """Close the open file at its last complete chunk, count the lost messages, and schedule a
         retry."""
         self._file = None
         lost = file.pending if file.path.exists() else file.counts
@@ -234,38 +237,38 @@ class Recorder:
         self._schedule_retry(error)
 
     def _schedule_retry(self, error: OSError) -> None:
-        """Suspend writing until the next retry; reported once."""
-        self._retry_at = self._now + self._retry_ns
-        if not self._failing:
+        """Suspend writing until the next retry; report only the first failure."""
+        self._retry_at_ns = self._now_ns + self._retry_ns
+        if not self._is_failing:
             self._report(f'cannot write to {self.folder} ({error.strerror}): messages are dropped '
                          'until writing is possible again')
-        self._failing = True
+        self._is_failing = True
 
     def _reopen(self, log_ns: int) -> McapFileWriter | None:
-        """New file with the latched messages, or None while none can be written."""
-        if self._failing and self._now < self._retry_at:
+        """Open a new file with the latched messages; return None if that is not possible yet."""
+        if self._is_failing and self._now_ns < self._retry_at_ns:
             return None
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            if self._failing and shutil.disk_usage(self.folder).free < MIN_FREE_BYTES:
+            if self._is_failing and shutil.disk_usage(self.folder).free < MIN_FREE_BYTES:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            self._open(log_ns)
+            self._open_next(log_ns)
         except OSError as error:
             self._schedule_retry(error)
             return None
         return self._file
 
     def _report_recovery(self) -> None:
-        """Report that messages are written again, after the first of them."""
-        if self._failing and self._file and self._file.counts:
-            self._failing = False
+        """Report the end of a failure, after the first message has been written."""
+        if self._is_failing and self._file and self._file.counts:
+            self._is_failing = False
             self._report(f'recording resumed; messages dropped so far: {self.dropped.total()}')
 
-    def _open(self, log_ns: int = 0) -> None:
-        """Begin the next file; raises OSError and leaves no file if that fails."""
+    def _open_next(self, log_ns: int = 0) -> None:
+        """Create the next file; if that fails, remove it and raise OSError."""
         self.folder.mkdir(parents=True, exist_ok=True)
         names = (self.folder / f'{self.folder.resolve().name}_{n}.mcap'
-                 for n in itertools.count(len(self._done)))
+                 for n in itertools.count(len(self._summaries)))
         file = McapFileWriter(next(p for p in names if not p.exists()), self._opener)
         try:
             file.start()
@@ -278,15 +281,15 @@ class Recorder:
             file.path.unlink(missing_ok=True)
             raise
         self.repeated += file.counts.total()
-        self._file, self._opened = file, None
+        self._file, self._opened_ns = file, None
         self._write_metadata()
 
     def _write_metadata(self) -> None:
         """Update `metadata.yaml`, or schedule a retry."""
-        files = self._done + ([self._file.summary()] if self._file else [])
+        files = self._summaries + ([self._file.summary()] if self._file else [])
         try:
             write_metadata(self.folder, files, self._topics, self._opener)
             self._metadata_is_stale = False
         except OSError:
             # Messages have priority: recording continues without up-to-date metadata.
-            self._metadata_is_stale, self._metadata_at = True, self._now + self._retry_ns
+            self._metadata_is_stale, self._metadata_at_ns = True, self._now_ns + self._retry_ns

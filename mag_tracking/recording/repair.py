@@ -1,4 +1,4 @@
-"""Repair of recordings that were truncated by a crash or a full disk: adds the missing index."""
+"""Repair of recordings that a crash or a full disk has truncated, by writing the missing index."""
 
 import fcntl
 import io
@@ -43,7 +43,7 @@ _MAGIC = b'\x89MCAP0\r\n'
 
 
 class _Scan:
-    """Scan of the intact part of a file up to the first damage: its end, and the data of its
+    """Scan of a file up to the first damage: the end of the intact records, and the data for an
     index."""
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -89,13 +89,13 @@ class _Scan:
             index.message_index_length += length
 
     def _count(self, channel: int, time_ns: int) -> None:
-        """Count a message."""
+        """Update the message counts and the time range with a message."""
         self.counts[channel] += 1
         low, high = self.times or (time_ns, time_ns)
         self.times = [min(low, time_ns), max(high, time_ns)]
 
     def _add_chunk(self, chunk: Chunk, end: int) -> None:
-        """Add a chunk and its records; raises one of `DECODE_ERRORS` if it is damaged."""
+        """Add a chunk and its records; raises one of `DECODE_ERRORS` if the chunk is damaged."""
         stream, length = get_chunk_data_stream(chunk, validate_crc=True)
         data = stream.read(length)
         self._index, offset = {}, 0
@@ -113,10 +113,10 @@ class _Scan:
                 self._add_record(
                     kind.read(ReadDataStream(io.BytesIO(data[offset:offset + size]))), end)
             offset += size
-        whole = 9 + 40 + len(chunk.compression.encode()) + len(chunk.data)
+        record_length = 9 + 40 + len(chunk.compression.encode()) + len(chunk.data)
         self.chunks.append(ChunkIndex(
-            whole, end - whole, chunk.compression, len(chunk.data), chunk.message_end_time, 0, {},
-            chunk.message_start_time, chunk.uncompressed_size))
+            record_length, end - record_length, chunk.compression, len(chunk.data),
+            chunk.message_end_time, 0, {}, chunk.message_start_time, chunk.uncompressed_size))
 
     def _lacks_index(self) -> bool:
         """Whether the message index of any channel in the last chunk is missing."""
@@ -124,13 +124,12 @@ class _Scan:
             set(self.chunks[-1].message_index_offsets) != set(self._index))
 
     def _drop_index(self) -> None:
-        """Discard the indexes of the last chunk: an incomplete set would hide the other
-        channels."""
+        """Discard the message indexes of the last chunk: an incomplete set would hide channels."""
         self.chunks[-1].message_index_offsets = {}
         self.chunks[-1].message_index_length = 0
 
     def _rebuild_index(self) -> None:
-        """Rebuild the indexes of the last chunk; their place is directly after the chunk."""
+        """Rebuild the message indexes of the last chunk, which directly follow the chunk."""
         self._drop_index()
         chunk, builder = self.chunks[-1], RecordBuilder()
         self.end = chunk.chunk_start_offset + chunk.chunk_length
@@ -141,7 +140,7 @@ class _Scan:
         self._rebuilt_index = builder.end()
 
     def index(self) -> bytes:
-        """Complete end section of the file, to be written at byte `end`."""
+        """Serialise the end section of the file, which begins at byte `end`."""
         builder = RecordBuilder()
         DataEnd(0).write(builder)
         data_end: bytes = self._rebuilt_index + builder.end()
@@ -159,7 +158,7 @@ class _Scan:
 
 
 def _summary(stream: BinaryIO) -> Summary | None:
-    """Index of a file, or None if it has none."""
+    """Read the index of a file; return None if there is no valid index."""
     stream.seek(0)
     try:
         return make_reader(stream).get_summary()
@@ -170,7 +169,7 @@ def _summary(stream: BinaryIO) -> Summary | None:
 def finish_file(path: str | PathLike[str]) -> list[str]:
     """Add the index to a truncated file in place; a complete file is not modified.
 
-    A torn record at the end, which cannot be read, is moved to `<name>.cut`.
+    An incomplete record at the end is moved to `<name>.cut`.
 
     Parameters
     ----------
@@ -188,7 +187,7 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
     OutputError
         If the file is still being recorded.
     OSError
-        If the file cannot be written. Its messages are then unchanged.
+        If the file cannot be written. The messages in the file are then unchanged.
     """
     path = Path(path)
     with open(path, 'r+b', buffering=0) as raw, open(path, 'rb') as stream:
@@ -203,24 +202,23 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
             raise RecordingError(f'{path} is not an MCAP file')
         stream.seek(0)
         scan = _Scan(stream)
-        torn = 0 if scan.has_data_end else path.stat().st_size - scan.end
-        if torn:
+        n_cut = 0 if scan.has_data_end else path.stat().st_size - scan.end
+        if n_cut:
             stream.seek(scan.end)
             with new_binary_file(f'{path}.cut') as cut:
                 shutil.copyfileobj(stream, cut)
         _replace_end(raw, scan.end, scan.index())
-    lines = [f'{path.name}: {scan.counts.total()} messages, index written']
-    if torn:
-        lines.append(f'{path.name}: the last {torn} bytes are incomplete and were moved to '
-                     f'{path.name}.cut')
+    lines = [f'{path.name}: index written; messages: {scan.counts.total()}']
+    if n_cut:
+        lines.append(f'{path.name}: the incomplete end was moved to {path.name}.cut; bytes: '
+                     f'{n_cut}')
     if scan.damaged:
         lines.append(f'{path.name}: damaged chunks skipped: {scan.damaged}')
     return lines
 
 
 def _replace_end(raw: io.FileIO, end: int, index: bytes) -> None:
-    """Write the index at the end of the intact records; writes nothing if there is no space for
-    it."""
+    """Write the index after the intact records, or write nothing if the space is insufficient."""
     raw.truncate(end)
     raw.seek(end)
     try:
@@ -236,9 +234,9 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     Parameters
     ----------
     path : path_like
-        An MCAP file, or a folder of them. A folder gets a new `metadata.yaml`.
+        MCAP file, or folder of MCAP files, in which `metadata.yaml` is written again.
     report : callable, optional
-        Called with each line of text for the user.
+        Called with each message to the user.
 
     Returns
     -------
@@ -248,7 +246,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     Raises
     ------
     RecordingError
-        If there is no recording.
+        If `path` does not contain a recording.
     OutputError
         If the recording cannot be written or is still being recorded.
     """
@@ -261,7 +259,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     # A crash at a split leaves an empty file.
     empty = [file for file in files if file.stat().st_size < len(_MAGIC)]
     if len(empty) == len(files):
-        raise RecordingError(f'{path}: all {len(files)} files are empty')
+        raise RecordingError(f'{path} contains only empty .mcap files: {len(files)}')
     for file in empty:
         report(f'{file} is empty and was skipped')
     for file in [file for file in files if file not in empty]:
@@ -282,17 +280,17 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
 
 
 def _number(file: Path) -> tuple[int, str]:
-    """Sort key of a file: the number at the end of its name, as recorders count."""
+    """Sort key of a file: the number at the end of its name, which recorders increment."""
     number = file.stem.rpartition('_')[2]
     return (int(number) if number.isdigit() else -1, file.name)
 
 
 def _summary_of(file: Path, topics: dict[str, Topic]) -> FileSummary:
-    """`FileSummary` of a complete file; its topics are added to `topics`."""
+    """Return the `FileSummary` of a complete file, and add the topics of the file to `topics`."""
     with open(file, 'rb') as stream:
         summary = make_reader(stream).get_summary()
     if summary is None or summary.statistics is None:
-        raise RecordingError(f'{file}: its index has no statistics')
+        raise RecordingError(f'the index of {file} has no statistics')
     counts: Counter[str] = Counter()
     for i, channel in summary.channels.items():
         schema = summary.schemas.get(channel.schema_id)

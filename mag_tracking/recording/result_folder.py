@@ -1,4 +1,4 @@
-"""Results of an offline run: CSV tables during the run, a summary at its end, and a recording."""
+"""Results of an offline run: CSV tables and a recording during the run, a summary at its end."""
 
 import csv
 import json
@@ -45,7 +45,7 @@ _TRACK_FILE = re.compile(r'(map|weights|field)_track_[0-9]+\.png|track_[0-9]+(_s
 
 
 def figure_name(kind: str, track_id: int) -> str:
-    """File name of a figure of a track.
+    """File name of a track's figure.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def figure_name(kind: str, track_id: int) -> str:
 class ResultFolder:
     """Writes the tables and the recording of one run; a context manager.
 
-    Rows are written immediately, so an interrupted run keeps them.
+    Rows are written immediately, so that an interrupted run does not lose them.
 
     Parameters
     ----------
@@ -75,8 +75,8 @@ class ResultFolder:
     ----------
     folder : Path
     replaces_earlier : bool
-        Whether the folder contained results of an earlier run. They are removed, including the
-        figures and trajectories of its tracks. All other files remain.
+        Whether the folder contained results of an earlier run. These results are removed,
+        including figures and trajectories of tracks. All other files remain.
 
     Raises
     ------
@@ -89,7 +89,7 @@ class ResultFolder:
         refuse_other_recording(self.folder / _RECORDING)
         self._files = ExitStack()
         try:
-            self.replaces_earlier = self._remove_earlier()
+            self.replaces_earlier = self._remove_earlier_results()
             *streams, self._hypotheses = (
                 self._stream(name, columns) for name, columns in _TABLES.items())
             self._poses, self._smoothed, self._detections, self._disturbances = (
@@ -102,9 +102,9 @@ class ResultFolder:
             self._files.close()
             raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
 
-    def _remove_earlier(self) -> bool:
-        """Remove the results of an earlier run; returns whether there were any."""
-        # The summary and figures of an earlier run could be mistaken for those of this run.
+    def _remove_earlier_results(self) -> bool:
+        """Remove the results of an earlier run; return whether there were any."""
+        # The summary and figures of an earlier run could be mistaken for results of this run.
         earlier = [path for path in self.folder.iterdir()
                    if (path.name in _RESULTS or _TRACK_FILE.fullmatch(path.name))
                    and (path.is_symlink() or not path.is_dir())]
@@ -122,7 +122,7 @@ class ResultFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # Closing a file fails on a full disk; the other files must be closed nevertheless.
+        # Closing a file fails on a full disk. All other files must still be closed.
         try:
             self._files.close()
         finally:
@@ -150,7 +150,9 @@ class ResultFolder:
         self._recording.add_frame(frame)
 
     def add_track(self, track: Track) -> None:
-        """Write a row for a pose and one per hypothesis. The final record of a track has none.
+        """Write a row for a pose and a row for each hypothesis.
+
+        The final record of a track, which has no new pose, adds no rows.
 
         Parameters
         ----------
@@ -170,18 +172,18 @@ class ResultFolder:
         """Write one row per hypothesis."""
         h = track.hypotheses
         if not isinstance(h, Hypotheses):
-            assert not h, 'the hypotheses of a bank are arrays'
+            assert not h, 'expected the hypotheses as arrays'
             return
         sd = np.sqrt(np.diagonal(h.covariances, axis1=1, axis2=2))
         rows = core.number_rows(np.column_stack([h.weights, h.states, sd, h.moments]))
         begin = f'{track.stamp_ns},{track.id},'
         pairs = [*zip(h.arrivals, h.kinds, strict=True)]
-        names = {pair: ','.join(map(_quoted, pair)) for pair in {*pairs}}
+        names = {pair: ','.join(map(_csv_cell, pair)) for pair in {*pairs}}
         self._hypotheses.write(''.join(
             f'{begin}{names[pair]},{row}\r\n' for pair, row in zip(pairs, rows, strict=True)))
 
     def add_disturbance(self, d: Disturbance) -> None:
-        """Write a row for a disturbance, when it is found and again when it has ended.
+        """Write a row for a disturbance, at its detection and again at its end.
 
         Parameters
         ----------
@@ -193,7 +195,7 @@ class ResultFolder:
             repr(d.uniform), d.track_id])
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Write a row for a smoothed pose of a whole track. Poses of a fixed lag are ignored.
+        """Write a row for a smoothed pose of a complete track; fixed-lag poses are ignored.
 
         Parameters
         ----------
@@ -212,17 +214,18 @@ class ResultFolder:
         Parameters
         ----------
         summary : mapping
+            Content of the file; NaN is written as null.
         """
         with new_text_file(self.folder / _SUMMARY) as stream:
             json.dump(without_nan(summary), stream, indent=1, allow_nan=False)
             stream.write('\n')
 
 
-def _quoted(text: str) -> str:
-    """Text as one field of a CSV file."""
+def _csv_cell(text: str) -> str:
+    """Quote a string for a CSV file, if necessary."""
     return f'"{text.replace(_QUOTE, 2 * _QUOTE)}"' if _SPECIAL & {*text} else text
 
 
 def _floats(*groups: Iterable[float]) -> list[str]:
-    """Shortest texts that read back as the same numbers."""
+    """Format numbers as the shortest strings that are parsed to the same numbers."""
     return [repr(float(v)) for group in groups for v in group]

@@ -27,7 +27,7 @@ class Topic(NamedTuple):
     definition: str = ''
     """Definition of the type as a `ros2msg` schema. Empty if unknown."""
     qos: str = OFFERED_QOS
-    """Offered QoS profiles as YAML text."""
+    """Offered QoS profiles, as YAML."""
 
 
 class FileSummary(NamedTuple):
@@ -84,17 +84,17 @@ class UnbufferedWriter:
         self.raw, self.offset = raw, 0
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Append data.
+        """Append data to the file.
 
         Parameters
         ----------
         data : bytes-like
         """
-        rest = memoryview(data)
-        while rest:
-            n = self.raw.write(rest)
+        remaining = memoryview(data)
+        while remaining:
+            n = self.raw.write(remaining)
             self.offset += n
-            rest = rest[n:]
+            remaining = remaining[n:]
 
     def tell(self) -> int:
         """Number of bytes written.
@@ -110,7 +110,7 @@ class UnbufferedWriter:
 
 
 def check_no_recording(folder: Path) -> None:
-    """Check that a folder can hold a new recording.
+    """Check that a folder does not contain a recording.
 
     Parameters
     ----------
@@ -123,10 +123,10 @@ def check_no_recording(folder: Path) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f'{folder} is not a folder')
-    there = sorted(p.name for pattern in ('metadata.yaml', '*.mcap', '*.db3')
+    existing = sorted(p.name for pattern in ('metadata.yaml', '*.mcap', '*.db3')
                    for p in folder.glob(pattern))
-    if there:
-        raise OutputError(f'{folder} already contains a recording ({there[0]}): choose another '
+    if existing:
+        raise OutputError(f'{folder} already contains a recording ({existing[0]}): choose another '
                           f'folder, or run mag-tracking repair to complete a truncated recording')
 
 
@@ -139,7 +139,7 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
     folder : Path
     files : sequence of FileSummary
     topics : mapping of str to Topic
-        By name.
+        Topics by name.
     opener : callable, optional
         Creates a file and returns an unbuffered stream.
 
@@ -150,8 +150,8 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
     RecordingError
         If the QoS profiles of a topic are not valid YAML.
     """
-    nothing: Counter[str] = Counter()
-    counts = sum((f.counts for f in files), nothing)
+    no_counts: Counter[str] = Counter()
+    counts = sum((f.counts for f in files), no_counts)
     firsts = [f.first_ns for f in files if f.first_ns is not None]
     lasts = [f.last_ns for f in files if f.last_ns is not None]
     content = {'rosbag2_bagfile_information': {
@@ -180,7 +180,7 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
 
 
 def _qos_profiles(name: str, topic: Topic) -> object:
-    """List of the QoS profiles of a topic, which recordings and `Topic` store as YAML text."""
+    """Parse the QoS profiles of a topic, which are stored as YAML; raises RecordingError."""
     return parse_yaml(topic.qos, f'offered_qos_profiles of {name}', RecordingError)
 
 

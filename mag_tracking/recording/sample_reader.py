@@ -53,7 +53,7 @@ class SampleReader:
     Raises
     ------
     RecordingError
-        If the recording has none of the network's topics, its namespace is ambiguous, or `truth`
+        If the recording contains no topic of the network, its namespace is ambiguous, or `truth`
         is not a topic with poses.
     """
 
@@ -121,7 +121,7 @@ class SampleReader:
                     yield readings
 
     def _block_readings(self, block: MessageBlock) -> Readings:
-        """Readings of all messages from the network's sensors, in order."""
+        """Decode the readings of the network's sensors in a block, in order of log time."""
         names = {number: self._sensors[kind.topic] for number, kind in block.kinds.items()
                  if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD and kind.is_cdr}
         rows = np.flatnonzero(np.isin(block.channel, list(names)))
@@ -129,21 +129,22 @@ class SampleReader:
         rows = rows[fields.is_decoded]
         # The same sensor may have several channels.
         sensors = tuple(dict.fromkeys(names.values()))
-        place = np.zeros(max(names, default=0) + 1, dtype=np.int64)
-        place[list(names)] = [sensors.index(name) for name in names.values()]
+        sensor_index = np.zeros(max(names, default=0) + 1, dtype=np.int64)
+        sensor_index[list(names)] = [sensors.index(name) for name in names.values()]
         C = fields.covariance
         batch = Readings(
-            sensors, place[block.channel[rows]], fields.stamp_ns[fields.is_decoded],
+            sensors, sensor_index[block.channel[rows]], fields.stamp_ns[fields.is_decoded],
             fields.field[fields.is_decoded], None if C is None else C[fields.is_decoded])
-        others = np.setdiff1d(np.arange(len(block)), np.append(rows, self._truth.add_block(block)))
-        parts, done = [], 0
-        for k in others:
+        other_messages = np.setdiff1d(np.arange(len(block)),
+                                      np.append(rows, self._truth.add_block(block)))
+        parts, n_added = [], 0
+        for k in other_messages:
             for record, _ in self._records_of([block.message(k)], {}):
                 if isinstance(record, Readings):
                     n = int(np.searchsorted(rows, k))
-                    parts += [batch.part(slice(done, n)), record]
-                    done = n
-        return Readings.joined([*parts, batch.part(slice(done, None))])
+                    parts += [batch.part(slice(n_added, n)), record]
+                    n_added = n
+        return Readings.joined([*parts, batch.part(slice(n_added, None))])
 
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:
@@ -181,13 +182,13 @@ class SampleReader:
 
     def _records(self, imus: Mapping[str, Sequence[str]], progress: Progress | None
                  ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """(record, log time) of the sensors and of the accelerometers in `imus`, {topic:
-        sensors}."""
+        """Iterate over (record, log time): readings, and accelerations from the topics in
+        `imus`, {topic: sensors}."""
         return self._records_of(self._recording.messages(progress=progress), imus)
 
     def _records_of(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
                     ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """As `_records`, for given messages. Unusable messages are counted."""
+        """Iterate as `_records` over the given messages, and count unusable messages."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
             truth = self._truth.accepts(message.topic, message.type)
@@ -212,7 +213,7 @@ class SampleReader:
                 yield reading_of(content, sensor), message.log_time_ns
 
     def _network_readings(self, readings: Readings) -> Readings:
-        """Readings of the network's sensors. Readings of other sensors are counted."""
+        """Select the readings of the network's sensors, and count readings of other sensors."""
         known = set(self._sensors.values())
         is_known = np.array([name in known for name in readings.names], dtype=bool)[readings.sensor]
         if is_known.all():
@@ -222,7 +223,7 @@ class SampleReader:
         return readings.part(is_known)
 
     def truth_arrays(self) -> dict[str, Truth]:
-        """True poses that have been read so far.
+        """True poses in the messages that have been read.
 
         Returns
         -------
@@ -235,7 +236,7 @@ class SampleReader:
 
 
 def _namespace(recording: Recording, network: SensorNetwork) -> str:
-    """Namespace of the network's relative topics in a recording, or the root if none is recorded.
+    """Namespace of the network's relative topics in a recording; the root without such topics.
 
     Raises RecordingError if several namespaces are possible.
     """

@@ -1,7 +1,7 @@
 """Labelled signatures in CSV, labelled intervals of a recording, and trained classes in JSON.
 
 A table of signatures has one row per sample (`label`, `signature`, `time_s` and fields) or one row
-per signature (`label`, and its samples in order). A table of intervals has `label`, `begin_s` and
+per signature (`label`, and the samples in order). A table of intervals has `label`, `begin_s` and
 `end_s` (or `begin_ns` and `end_ns`), and optionally `sensor`.
 """
 
@@ -23,7 +23,7 @@ from mag_tracking.units import NS
 
 LABEL, TIME, PASS = 'label', 'time_s', 'pass'
 MIN_EPOCH_S = 1e8
-"""Larger times are since 1970, smaller ones since the first reading [s]."""
+"""Larger times [s] are measured from 1970, smaller times from the first reading."""
 
 MAX_TIME_S = 1e11
 """Maximum valid time [s]."""
@@ -49,7 +49,7 @@ class LabelledInterval:
     sensor: str
     """Name of the sensor. Empty for all sensors."""
     row: int
-    """Row of the table."""
+    """Line number in the table, for error messages."""
 
 
 def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list[Signature]:
@@ -82,11 +82,11 @@ def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list
 
 
 def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
-    """Signatures with one row per sample; the other columns identify the signature."""
+    """Read signatures with one row per sample; further columns identify the signature of a row."""
     axes = {name: match for name in header if (match := _AXIS.fullmatch(name.lower()))}
     names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
     if not axes:
-        raise LabelsError(f'{path}: no column holds a field; expected x, y, z (or x_nt and so on)')
+        raise LabelsError(f'{path}: no column contains a field; expected x, y, z (or x_nt, ...)')
     if not names:
         raise LabelsError(f'{path}: no column identifies the signatures; expected a column '
                           'such as \'signature\'')
@@ -109,7 +109,7 @@ def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> li
 
 
 def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> str:
-    """Unique value of a column, or empty if it is missing; raises LabelsError for several."""
+    """Value of a column, empty if it is missing; raises LabelsError if it has several values."""
     values = sorted({cells.get(column, '').strip() for _, cells in rows})
     if len(values) > 1:
         raise LabelsError(f'{source} has several values of {column}: {", ".join(values)}')
@@ -117,7 +117,7 @@ def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]
 
 
 def _by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
-    """Signatures with one row each: columns x0, x1, ... (and y0, ...)."""
+    """Read signatures with one row per signature, with columns x0, x1, ... (and y0, ...)."""
     axes: dict[tuple[str, str], list[tuple[int, str]]] = {}
     for name in header:
         match = _SAMPLE.fullmatch(name.lower())
@@ -155,9 +155,9 @@ class _Fields:
                  ) -> None:
         columns = sorted(columns)
         axes = [axis for axis, _, _ in columns]
-        twice = sorted({axis for axis in axes if axes.count(axis) > 1})
-        if twice:
-            raise LabelsError(f'{path}: several columns hold the axis {twice[0]}')
+        duplicates = sorted({axis for axis in axes if axes.count(axis) > 1})
+        if duplicates:
+            raise LabelsError(f'{path}: several columns contain the axis {duplicates[0]}')
         known = [unit for _, unit, _ in columns if unit]
         if known and len(known) < len(columns):
             raise LabelsError(f'{path}: only some fields have a unit (_t, _ut or _nt)')
@@ -171,12 +171,12 @@ class _Fields:
 
     def signature(self, t: FloatArray, field: FloatArray, label: str, source: str,
                   group: str) -> Signature:
-        """Signature without unmeasured axes, and without unmeasured samples at its ends."""
-        there = np.flatnonzero(~np.isnan(field).all(axis=0))
-        field = field[:, there]
-        whole = np.flatnonzero(~np.isnan(field).any(axis=1)) if len(there) else there
-        inner = slice(whole[0], whole[-1] + 1) if len(whole) else slice(0, 0)
-        axes = tuple(self._columns[k][0] for k in there.tolist())
+        """Create a signature without unmeasured axes and without unmeasured samples at its ends."""
+        measured = np.flatnonzero(~np.isnan(field).all(axis=0))
+        field = field[:, measured]
+        complete = np.flatnonzero(~np.isnan(field).any(axis=1)) if len(measured) else measured
+        inner = slice(complete[0], complete[-1] + 1) if len(complete) else slice(0, 0)
+        axes = tuple(self._columns[k][0] for k in measured.tolist())
         return Signature(t[inner], field[inner], label, source, axes, self._unit, group or source)
 
 
@@ -198,7 +198,8 @@ def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInt
     RecordingError
         If the table cannot be read.
     LabelsError
-        If a column or label is missing, an interval ends before it begins, or two overlap.
+        If a column or label is missing, an interval ends before it begins, or two intervals of a
+        sensor overlap.
     """
     header, lines = read_csv(path)
     unit = 'ns' if 'begin_ns' in header else 's'
@@ -223,7 +224,7 @@ def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInt
 
 def _stamp(path: str | PathLike[str], line: int, column: str, cells: dict[str, str],
            first_ns: int) -> int:
-    """Time of a cell [ns]."""
+    """Convert a cell to a time [ns]; raises RecordingError or LabelsError."""
     value = number(path, line, column, cells[column], True)
     if abs(value) > (MAX_TIME_S * NS if column.endswith('_ns') else MAX_TIME_S):
         raise LabelsError(f'{path}: row {line}: {column} is not a valid time')
@@ -277,7 +278,7 @@ def read_model(path: str | PathLike[str]) -> SignatureModel:
     Raises
     ------
     RecordingError
-        If the file cannot be read or is not a valid model.
+        If the file cannot be read or is not a valid model of this version.
     """
     path = checked_path(path, RecordingError)
     try:

@@ -1,6 +1,7 @@
-"""`tracks.mcap`: the messages of the nodes, for ROS viewers.
+"""Recording `tracks.mcap` with the messages of the nodes, for ROS viewers.
 
-Fields, tracks, poses, odometry, path, smoothed tracks, markers, transforms and disturbances.
+It contains fields, tracks, poses, odometry, paths, smoothed tracks, markers, transforms and
+disturbances.
 """
 
 from os import PathLike
@@ -59,18 +60,18 @@ class TrackRecording:
             network.names, network.absolute_topics, strict=True)}
         self._path: list[MessageDict] = []
         self._smoothed: list[SmoothedPose] = []
-        self._is_begun = False
+        self._has_sensors = False
 
     def close(self) -> None:
         """Complete the file."""
         self._write_smoothed()
         self._writer.close()
 
-    def _begin(self, stamp_ns: int) -> None:
-        """Write the poses of the sensors, once, at the time of the first message."""
-        if self._is_begun:
+    def _write_sensors(self, stamp_ns: int) -> None:
+        """Write the poses of the sensors before the first message."""
+        if self._has_sensors:
             return
-        self._is_begun = True
+        self._has_sensors = True
         self._writer.write('/tf_static', TRANSFORMS, {'transforms': sensor_transform_dicts(
             self._network, stamp_ns)}, stamp_ns)
         self._writer.write('/tracker_node/sensor_markers', MARKERS,
@@ -84,7 +85,7 @@ class TrackRecording:
         frame : FieldFrame
         """
         self._write_smoothed()
-        self._begin(frame.stamp_ns)
+        self._write_sensors(frame.stamp_ns)
         for j, name in enumerate(self._network.names):
             if frame.n_samples[j]:
                 stamp_ns = frame.stamp_ns + round(1e9 * frame.time_offset[j])
@@ -100,7 +101,7 @@ class TrackRecording:
         track : Track
         """
         self._write_smoothed()
-        self._begin(track.stamp_ns)
+        self._write_sensors(track.stamp_ns)
         stamp_ns, frame = track.stamp_ns, self._frame
         content = track_dict(track, frame)
         self._write('tracks', TRACK_ARRAY, {'header': content['header'], 'tracks': [content]},
@@ -135,7 +136,7 @@ class TrackRecording:
         self._smoothed.append(pose)
 
     def _write_smoothed(self) -> None:
-        """Write the collected poses of a smoothed track."""
+        """Write the buffered poses of a smoothed track."""
         poses = self._smoothed
         if not poses:
             return
@@ -147,7 +148,7 @@ class TrackRecording:
                       for p in poses]}, last_ns)
 
     def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Write a disturbance, when it is found and again when it has ended.
+        """Write a disturbance, at its detection and again at its end.
 
         Parameters
         ----------

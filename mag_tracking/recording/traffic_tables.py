@@ -17,7 +17,7 @@ DIRECTIONS = {True: 'forward', False: 'backward'}
 
 _PASSAGE = (
     *columns_of('s', '', recording='name of the recording'),
-    *columns_of('i', '', number='number of the passage in order of time'),
+    *columns_of('i', '', number='number of the passage, chronological'),
     *columns_of('i', 'ns', stamp_ns='time at which the middle of the vehicle was on the line'),
     *columns_of('s', '', line='name of the counting line'),
     *columns_of('i', '', track_id='number of the track'),
@@ -28,33 +28,35 @@ _PASSAGE = (
                 lateral='distance to the left of the middle of the line, in forward direction'),
     *columns_of('f', 'm/s', vx='velocity, x', vy='velocity, y', vz='velocity, z'),
     *columns_of('f', 'deg', heading_deg='direction of the velocity, from x towards y',
-                sd_heading_deg='its standard deviation'),
-    *columns_of('f', 'm/s', speed='horizontal speed', sd_speed='its standard deviation',
+                sd_heading_deg='standard deviation of the heading'),
+    *columns_of('f', 'm/s', speed='horizontal speed', sd_speed='standard deviation of the speed',
                 delay_speed='model-free speed from the delay between sensors',
-                sd_delay_speed='its standard deviation'),
-    *columns_of('b', '', speeds_contradict='whether track and delay contradict each other'),
+                sd_delay_speed='standard deviation of the model-free speed'),
+    *columns_of('b', '',
+                speeds_contradict='whether the speeds of track and delay contradict each other'),
     *columns_of('f', 'm', length='length of the row of dipoles; 0 = point target',
-                sd_length='its standard deviation'),
+                sd_length='standard deviation of the length'),
     *columns_of('f', 'A m^2', mx='magnetic moment, x', my='magnetic moment, y',
                 mz='magnetic moment, z', moment_size='magnitude of the magnetic moment'),
     Column('class', 's', '', 'most probable class, or unknown'))
 _VEHICLE = (
     *columns_of('s', '', vehicle='enrolled vehicle, or unknown'),
-    *columns_of('f', '', p_vehicle='its probability among the comparable vehicles'))
+    *columns_of('f', '', p_vehicle='probability of the vehicle among the comparable vehicles'))
 _PASSAGE_END = (
     *columns_of('f', 's', headway='time since the previous vehicle in the same direction'),
     *columns_of('b', '', ambiguous='whether the passage is ambiguous'),
     *columns_of('s', '', doubts='reasons why the passage is ambiguous'))
 _INTERVAL = (
     *columns_of('s', '', recording='name of the recording'),
-    *columns_of('i', 'ns', begin_ns='beginning of the interval', end_ns='its end'),
+    *columns_of('i', 'ns', begin_ns='beginning of the interval',
+                end_ns='end of the interval'),
     *columns_of('s', '', line='name of the counting line'),
     *columns_of('f', 's', observed_s='part of the interval that is covered by frames'),
     *columns_of('s', '', direction='forward or backward'),
     Column('class', 's', '', 'class of the vehicles'),
     *columns_of('i', '', count='number of vehicles', n_ambiguous='number of ambiguous passages'),
-    *columns_of('f', 'm/s', mean_speed='mean of their speeds'),
-    *columns_of('f', 's', mean_headway='mean of their headways'))
+    *columns_of('f', 'm/s', mean_speed='mean speed of the vehicles'),
+    *columns_of('f', 's', mean_headway='mean headway of the vehicles'))
 
 
 def tables_of(class_names: Sequence[str], with_fleet: bool) -> dict[str, tuple[Column, ...]]:
@@ -70,7 +72,7 @@ def tables_of(class_names: Sequence[str], with_fleet: bool) -> dict[str, tuple[C
     Returns
     -------
     dict of str to tuple of Column
-        By table.
+        Columns by table.
     """
     classes = tuple(Column(f'p_{name}', 'f', '', f'probability of the class {name}')
                     for name in class_names)
@@ -89,9 +91,9 @@ def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[s
     passage : VehiclePassage
     class_names : sequence of str
     delay : dict
-        Columns of the speed from the delay between sensors.
+        Values by column, for the speed from the delay between sensors.
     vehicle : dict
-        Columns of the matching enrolled vehicle.
+        Values by column, for the matching enrolled vehicle.
 
     Returns
     -------
@@ -144,8 +146,8 @@ def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
                   tables: Mapping[str, Sequence[Column]]) -> None:
     """Write tables to a folder as CSV and Parquet.
 
-    Tables without rows have only a header. If pyarrow is not installed, no Parquet is written and
-    that of an earlier run is removed.
+    Tables without rows have only a header. If pyarrow is not installed, no Parquet files are
+    written, and the Parquet files of an earlier run are removed.
 
     Parameters
     ----------
@@ -166,7 +168,7 @@ def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
             with new_text_file(folder / f'{name}.csv', newline='') as stream:
                 writer = csv.DictWriter(stream, [c.name for c in columns])
                 writer.writeheader()
-                writer.writerows({k: _text(v) for k, v in row.items()} for row in rows[name])
+                writer.writerows({k: _csv_value(v) for k, v in row.items()} for row in rows[name])
             parquet = folder / f'{name}.parquet'
             if find_spec('pyarrow') is None:
                 parquet.unlink(missing_ok=True)
@@ -179,8 +181,8 @@ def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
         raise OutputError(f'cannot write to {folder}: {error.strerror or error}') from error
 
 
-def _text(value: object) -> object:
-    """Cell of a CSV file; empty if the value is unknown."""
+def _csv_value(value: object) -> object:
+    """Format a value as a cell of a CSV file; unknown numbers are empty."""
     if isinstance(value, float):
         return f'{value:.9g}' if np.isfinite(value) else ''
     return value

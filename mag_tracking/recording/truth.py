@@ -71,7 +71,7 @@ class TruthTopics:
         ----------
         topic : str
         content : object
-            Message.
+            Decoded message.
         """
         frame = content.header.frame_id
         if frame and frame != self._frame:
@@ -84,7 +84,7 @@ class TruthTopics:
              np.array([[p.x, p.y, p.z, q.x, q.y, q.z, q.w]])))
 
     def add_block(self, block: MessageBlock) -> IntArray:
-        """Add the poses of a block that can be read without a decoder.
+        """Add the poses of a block that can be read directly from its bytes.
 
         Parameters
         ----------
@@ -93,7 +93,7 @@ class TruthTopics:
         Returns
         -------
         (n,) int array
-            Rows of the poses that were read.
+            Indices of the messages whose poses were read.
         """
         collected: list[IntArray] = [np.zeros(0, dtype=np.int64)]
         for channel, kind in block.kinds.items():
@@ -106,7 +106,7 @@ class TruthTopics:
         return np.concatenate(collected)
 
     def arrays(self) -> dict[str, Truth]:
-        """True poses of each topic in order of time.
+        """True poses of each topic in chronological order.
 
         Returns
         -------
@@ -160,7 +160,7 @@ def read_truth_table(path: str | PathLike[str]) -> dict[str, Truth]:
 
 
 def _stamp(path: str | PathLike[str], line: int, column: str, text: str) -> int:
-    """Time of a cell [ns], without conversion of nanoseconds to a float, which would round them."""
+    """Convert a cell to a time [ns]; `stamp_ns` is not converted to a float, which would round."""
     try:
         stamp = int(text) if column == 'stamp_ns' else None
     except ValueError:

@@ -26,7 +26,7 @@ def write_tum(path: str | PathLike[str], stamp_ns: Sequence[int], position: Sequ
     """
     lines = []
     for stamp, p, q in zip(stamp_ns, position, orientation, strict=True):
-        # Written from integers: as a float, the present time has a resolution of only 0.2 us.
+        # Formatted from integers: a float has a resolution of only 0.2 us for times since 1970.
         seconds = f'{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d}'
         lines.append(' '.join([seconds, *(f'{float(v):.9g}' for v in (*p, *q))]))
     replace_text(path, '\n'.join(lines) + '\n')

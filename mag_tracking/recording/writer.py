@@ -41,8 +41,8 @@ def refuse_other_recording(path: Path) -> None:
 class RecordingWriter:
     """Writes messages to an MCAP file that rosbag2 can play; a context manager.
 
-    A `metadata.yaml` beside the file makes its folder a rosbag2 recording. Chunks are small, so
-    that a crash loses little.
+    A `metadata.yaml` in the same folder makes the folder a rosbag2 recording. Small chunks limit
+    the loss in a crash.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ class RecordingWriter:
         self._last = time_ns if self._last is None else max(self._last, time_ns)
 
     def _open_channel(self, topic: str, type_name: str) -> None:
-        """Register schema and channel."""
+        """Register the schema and the channel of a topic."""
         if type_name not in self._schemas:
             self._schemas[type_name] = self._writer.register_schema(
                 type_name, 'ros2msg', definition(type_name).encode())
@@ -172,14 +172,14 @@ def offered_qos(reliable: bool = True, latched: bool = False) -> str:
     Parameters
     ----------
     reliable : bool, optional
-        Reliable instead of best-effort.
+        Whether the topic is reliable instead of best-effort.
     latched : bool, optional
-        Transient local instead of volatile.
+        Whether the durability is transient local instead of volatile.
 
     Returns
     -------
     str
-        YAML text.
+        QoS profile as YAML.
     """
     text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
                                                             'reliability: best_effort')

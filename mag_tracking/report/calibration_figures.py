@@ -72,9 +72,9 @@ def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> 
     ----------
     found : Calibration
     stated : SensorNetwork
-        Network as installed.
+        Nominal network, as installed.
     most : int
-        Maximum number of sensors whose knocks are drawn.
+        Maximum number of sensors in the plot of the knocks.
 
     Returns
     -------
@@ -82,8 +82,8 @@ def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> 
     """
     figure = Figure(figsize=(11.0, 4.6), layout='constrained')
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
-    _knocks(left, middle, found, most)
-    _headings(right, found, stated)
+    _plot_knocks(left, middle, found, most)
+    _plot_headings(right, found, stated)
     return figure
 
 
@@ -98,14 +98,14 @@ def first_knock(shocks: Mapping[str, tuple[FloatArray, FloatArray]]) -> float:
     Returns
     -------
     float, s
-        0 without any knock.
+        0 if there is no knock.
     """
     return min((float(t[s > 0.3 * s.max()][0]) for t, s in shocks.values()
                 if len(s) and s.max() > 0.0), default=0.0)
 
 
-def _knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> None:
-    """Plot the time around the first knock for each sensor, before and after the correction."""
+def _plot_knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> None:
+    """Plot the acceleration around the first knock, before and after the clock correction."""
     shocks = {name: found.survey.shocks[name] for name in list(found.survey.shocks)[:most]}
     first = first_knock(shocks)
     for k, (name, (t, s)) in enumerate(shocks.items()):
@@ -123,8 +123,8 @@ def _knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> None:
         after.legend(fontsize=8)
 
 
-def _headings(axes: Axes, found: _Calibration, stated: _Network) -> None:
-    """Plot the rotation of each sensor from its stated orientation, by calibration step."""
+def _plot_headings(axes: Axes, found: _Calibration, stated: _Network) -> None:
+    """Plot the rotation of each sensor from its nominal orientation, by calibration step."""
     n = len(stated)
     steps = [('compass', found.survey.network, 'tab:orange', 0.12)]
     if found.evidence is not None:
@@ -150,7 +150,7 @@ def tumble_figure(fits: Mapping[str, _EllipsoidFit], readings: Mapping[str, Floa
     ----------
     fits : dict of str to EllipsoidFit
     readings : dict of str to (n, 3) array
-        Readings of each sensor, in order of time.
+        Readings of each sensor, in chronological order.
 
     Returns
     -------
@@ -162,9 +162,9 @@ def tumble_figure(fits: Mapping[str, _EllipsoidFit], readings: Mapping[str, Floa
         y = readings[name][~np.isnan(readings[name]).any(axis=1)]
         B = fit.correct(y)
         for values, colour, label in ((y, 'tab:orange', 'raw data'), (B, 'tab:blue', 'corrected')):
-            size = np.linalg.norm(values, axis=1)
-            left.plot(size / size.mean(), '.', ms=2, color=colour, rasterized=True,
-                      label=f'{label}: std {100 * size.std() / size.mean():.2f} %')
+            magnitude = np.linalg.norm(values, axis=1)
+            left.plot(magnitude / magnitude.mean(), '.', ms=2, color=colour, rasterized=True,
+                      label=f'{label}: std {100 * magnitude.std() / magnitude.mean():.2f} %')
         left.set_title(literal(name), fontsize=9)
         left.set_xlabel('reading')
         left.set_ylabel('field magnitude\nrelative to its mean')

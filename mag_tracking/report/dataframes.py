@@ -1,6 +1,6 @@
 """Results as pandas DataFrames, with the columns of the CSV files that `mag-tracking` writes.
 
-`DataFrame.attrs['units']` maps columns to units; a column without an entry is dimensionless.
+`DataFrame.attrs['units']` contains the units by column; columns without a unit are dimensionless.
 """
 
 from collections.abc import Mapping
@@ -25,13 +25,13 @@ STATE_UNITS = {
 
 
 def dataframe(columns: Mapping[str, Any], units: Mapping[str, str]) -> 'pd.DataFrame':
-    """Return a DataFrame with units.
+    """Create a DataFrame with units.
 
     Parameters
     ----------
     columns : dict of str to (n,) array
     units : dict of str to str
-        Unit of each column; other columns are ignored.
+        Units by column; units without a column are ignored.
 
     Returns
     -------
@@ -46,14 +46,14 @@ def dataframe(columns: Mapping[str, Any], units: Mapping[str, str]) -> 'pd.DataF
         import pandas as pd
     except ModuleNotFoundError as error:
         raise MissingDependencyError(
-            'DataFrames need pandas: pip install mag_tracking[pandas]') from error
+            'DataFrames require pandas: run pip install mag_tracking[pandas]') from error
     frame = pd.DataFrame(dict(columns))
     frame.attrs['units'] = {name: unit for name, unit in units.items() if name in frame}
     return frame
 
 
 def poses_dataframe(poses: StructArray) -> 'pd.DataFrame':
-    """Return poses with the columns of `poses.csv`.
+    """Convert poses to a DataFrame with the columns of `poses.csv`.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def poses_dataframe(poses: StructArray) -> 'pd.DataFrame':
 
 
 def smoothed_dataframe(smoothed: StructArray) -> 'pd.DataFrame':
-    """Return smoothed poses with the columns of `poses_smoothed.csv`, and `complete`.
+    """Convert smoothed poses to the columns of `poses_smoothed.csv`, and `complete`.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def smoothed_dataframe(smoothed: StructArray) -> 'pd.DataFrame':
 
 
 def detections_dataframe(detections: StructArray) -> 'pd.DataFrame':
-    """Return onsets and releases with the columns of `detections.csv`.
+    """Convert onsets and releases to the columns of `detections.csv`.
 
     Parameters
     ----------

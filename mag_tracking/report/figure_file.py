@@ -1,4 +1,4 @@
-"""Figure files."""
+"""Writing of figures to image files."""
 
 import io
 from os import PathLike
@@ -12,7 +12,7 @@ _DOTS_PER_INCH = 110
 
 
 def save_figure(figure: Figure, path: str | PathLike[str]) -> None:
-    """Write a figure in the format given by the suffix, replacing any file or link of that name.
+    """Write a figure in the format of the suffix; an existing file or link is replaced.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ def save_figure(figure: Figure, path: str | PathLike[str]) -> None:
     OSError
         If the file cannot be written.
     """
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format=Path(path).suffix.removeprefix('.').lower(), dpi=_DOTS_PER_INCH)
+    image = io.BytesIO()
+    figure.savefig(image, format=Path(path).suffix.removeprefix('.').lower(), dpi=_DOTS_PER_INCH)
     with new_binary_file(path) as stream:
-        stream.write(drawn.getbuffer())
+        stream.write(image.getbuffer())

@@ -1,6 +1,6 @@
 """Figures of a run; each function returns one figure.
 
-Uncertainty is drawn as 90 % regions throughout.
+All figures show uncertainty as 90 % regions.
 """
 
 from typing import Protocol
@@ -19,12 +19,12 @@ from mag_tracking.report.style import legend_beside
 from mag_tracking.report.track_log import TrackLog
 
 SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
-"""Standard deviations to the edge of a 90 % ellipse in the plane."""
+"""Radius of a 90 % ellipse in the plane, in standard deviations."""
 SCALE_1D = 1.645
-"""Standard deviations to the edge of a 90 % interval."""
+"""Half width of a 90 % interval, in standard deviations."""
 
 MIN_DRAWN = 0.01
-"""Minimum weight of a drawn hypothesis of an arrival; lighter ones would extend the map."""
+"""Minimum weight of a plotted hypothesis. Hypotheses with less weight would extend the map."""
 
 
 class _Network(Protocol):
@@ -49,17 +49,17 @@ def _ellipse(position: FloatArray, covariance: FloatArray, n: int = 48) -> Float
 
 
 def _colours(log: TrackLog) -> dict[str, str]:
-    """Colour of each arrival, in a fixed order."""
+    """Assign a colour to each arrival, in alphabetical order."""
     names = sorted({name for row in log.arrivals for name in row})
     return {name: SERIES[i % len(SERIES)] for i, name in enumerate(names)}
 
 
 def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Points (n, 2), with NaN where the best hypothesis changes and the position jumps."""
-    certain = 3.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+    """Insert NaN into points (n, 2) where the best hypothesis changes and the position jumps."""
+    uncertainty = 3.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     steps = np.hypot(*np.diff(points, axis=0).T)
-    usual = 4.0 * np.median(steps) if len(steps) else 0.0
-    switch = np.flatnonzero(steps > np.maximum(usual, 0.5 * certain[1:])) + 1
+    typical_step = 4.0 * np.median(steps) if len(steps) else 0.0
+    switch = np.flatnonzero(steps > np.maximum(typical_step, 0.5 * uncertainty[1:])) + 1
     return np.insert(points, switch, np.nan, axis=0)
 
 
@@ -72,7 +72,9 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
     log : TrackLog
     network : SensorNetwork
     truth : (n, 3) array, m, world frame, optional
+        True positions.
     smoothed : (n, 3) array, m, world frame, optional
+        Smoothed positions.
 
     Returns
     -------
@@ -115,7 +117,7 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
 
 
 def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
-    """Plot the best hypothesis of each arrival while it has weight, if there are several."""
+    """Plot the best hypothesis of each of several arrivals while its weight is significant."""
     colours = _colours(log)
     if len(colours) < 2:
         return
@@ -151,9 +153,9 @@ def weights_figure(log: TrackLog) -> Figure:
     top.set_ylim(-0.03, 1.03)
     top.set_ylabel('weight')
     legend_beside(top)
-    what = 'each arrival direction (a line ends when its direction is pruned)' \
+    subject = 'each arrival direction (a line ends when its direction is pruned)' \
         if any(_colours(log)) else 'the hypotheses, which have no arrival directions'
-    top.set_title(f'Track {log.id}: weight of {what}')
+    top.set_title(f'Track {log.id}: weight of {subject}')
     bottom.set_ylim(1e-13, 3.0)
     bottom.set_ylabel('weight (log)')
     bottom.set_xlabel('time since the first pose [s]')
@@ -163,15 +165,15 @@ def weights_figure(log: TrackLog) -> Figure:
 
 
 def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
-    """Plot the measured field and that of the best hypothesis, per sensor and axis.
+    """Plot the measured field and the field of the best hypothesis, per sensor and axis.
 
     Parameters
     ----------
     log : TrackLog
     network : SensorNetwork
     most : int
-        Maximum number of sensors; with more, those with the strongest field are drawn, as the title
-        states.
+        Maximum number of sensors. In a larger network, only the sensors with the strongest fields
+        are plotted. The title contains their number.
 
     Returns
     -------
@@ -202,6 +204,7 @@ def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
         axes.set_xlabel('time since the first pose [s]')
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=8, ncol=6, loc='outside lower center')
-    shown = '' if len(rows) == len(network) else f' (the strongest {len(rows)} of {len(network)})'
-    figure.suptitle(f'Track {log.id}: measured and predicted field, sensor frame{shown}')
+    selection = '' if len(rows) == len(network) \
+        else f' (the strongest {len(rows)} of {len(network)})'
+    figure.suptitle(f'Track {log.id}: measured and predicted field, sensor frame{selection}')
     return figure

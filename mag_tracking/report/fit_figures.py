@@ -87,7 +87,7 @@ class _FittedPass(Protocol):
 
 
 def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
-    """Plot the measured and the fitted field with bands that should contain 90 % of the readings.
+    """Plot the measured and the fitted field, with bands that should contain 90 % of the readings.
 
     The bands include noise and `PassFit.robust_covariance`. If the normalised cost exceeds 1,
     errors of the model are treated as additional noise.
@@ -97,7 +97,8 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
     fit : PassFit
     title : str
     most : int
-        Maximum number of sensors; with more, those with the strongest field are drawn.
+        Maximum number of sensors. In a larger network, only the sensors with the strongest fields
+        are plotted.
 
     Returns
     -------
@@ -110,24 +111,24 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
     data = fit.data
     level = fit.predicted - target_alone(fit)
     strength = {j: np.nanmax(np.abs(data.field - level)[data.sensor == j]) for j in data.sensors}
-    shown = sorted(sorted(strength, key=lambda j: -strength[j])[:most])
+    strongest = sorted(sorted(strength, key=lambda j: -strength[j])[:most])
     f, unit = field_unit(max(strength.values()))
-    more = max(1.0, fit.normalised_cost)
-    figure = Figure(figsize=(10.0, 1.0 + 2.6 * len(shown)), layout='constrained')
-    for axes, j in zip(figure.subplots(len(shown), 1, squeeze=False, sharex=True).flat, shown,
-                       strict=True):
-        mine = data.sensor == j
-        t = data.t[mine]
-        # The minimum excludes the covariance of a coarse sensor at rest, which is enlarged so that
-        # all its readings count as one.
-        noise = np.nanmin(np.einsum('nii->ni', data.covariance[mine]), axis=0, initial=np.inf)
+    factor = max(1.0, fit.normalised_cost)
+    figure = Figure(figsize=(10.0, 1.0 + 2.6 * len(strongest)), layout='constrained')
+    for axes, j in zip(figure.subplots(len(strongest), 1, squeeze=False, sharex=True).flat,
+                       strongest, strict=True):
+        rows = data.sensor == j
+        t = data.t[rows]
+        # At rest, a coarse sensor has an enlarged covariance, so that all its readings count as one
+        # reading. The minimum excludes these covariances.
+        noise = np.nanmin(np.einsum('nii->ni', data.covariance[rows]), axis=0, initial=np.inf)
         for a, colour in enumerate(AXIS_COLOURS):
-            if np.isnan(data.field[mine, a]).all():
+            if np.isnan(data.field[rows, a]).all():
                 continue
-            middle = f * (fit.predicted - level)[mine, a]
-            half = f * SCALE_1D * np.sqrt(fit.predicted_std[mine, a]**2 + more * noise[a])
+            middle = f * (fit.predicted - level)[rows, a]
+            half = f * SCALE_1D * np.sqrt(fit.predicted_std[rows, a]**2 + factor * noise[a])
             axes.fill_between(t, middle - half, middle + half, color=colour, alpha=0.25, lw=0)
-            axes.plot(t, f * (data.field - level)[mine, a], '.', ms=2.5, color=colour,
+            axes.plot(t, f * (data.field - level)[rows, a], '.', ms=2.5, color=colour,
                       label=f'{"xyz"[a]}')
             axes.plot(t, middle, '-', lw=0.9, color='k')
         axes.set_title(literal(data.network.names[j]), fontsize=9)
@@ -161,7 +162,7 @@ def target_alone(fit: _Fit) -> FloatArray:
 def order_figure(passes: Sequence[_FittedPass]) -> Figure:
     """Plot the normalised cost over the number of dipoles, one line per pass.
 
-    The chosen order is marked by a filled symbol.
+    A filled symbol marks the chosen order.
 
     Parameters
     ----------

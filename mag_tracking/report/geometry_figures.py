@@ -12,8 +12,8 @@ from mag_tracking.report.literal_text import literal
 
 _SUSPECT = 'tab:red'
 _MAX_NAMES = 60
-"""Maximum number of sensor names on an axis; with more sensors only every second, third, ... is
-named."""
+"""Maximum number of sensor names on an axis. For more sensors, only every second, third, ... name
+is drawn."""
 
 
 class _Network(Protocol):
@@ -93,20 +93,20 @@ def geometry_figure(found: _Survey) -> Figure:
     figure = Figure(figsize=(15.0, 9.5), layout='constrained')
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.15))
     board, poses = left.subplots(2, 1, height_ratios=(2.4, 1.0))
-    _moves(left, board, found, suspect)
-    _poses(poses, found)
+    _plot_displacements(left, board, found, suspect)
+    _plot_pose_residuals(poses, found)
     rows = right.subplots(4, 1, sharex=True)
     along = np.arange(n)
     moved = found.network.positions - found.stated.positions
-    _spread(rows[0], along, 1e3 * np.linalg.norm(moved, axis=1), 1e3 * g.position_std,
+    _plot_corrections(rows[0], along, 1e3 * np.linalg.norm(moved, axis=1), 1e3 * g.position_std,
             'displacement [mm]')
-    _spread(rows[1], along, np.rad2deg(found.rotation_angle), np.rad2deg(g.rotation_std),
+    _plot_corrections(rows[1], along, np.rad2deg(found.rotation_angle), np.rad2deg(g.rotation_std),
             'rotation [deg]')
     rows[2].errorbar(along, g.gain, yerr=SCALE_1D * g.gain_std, fmt='o', ms=4, capsize=2,
                      color='tab:blue')
     rows[2].axhline(1.0, color='k', lw=0.8, ls=':')
     rows[2].set_title('gain (90 %)', fontsize=10, loc='left')
-    _bars(rows[3], along, g.sensor_residual, suspect,
+    _plot_residuals(rows[3], along, g.sensor_residual, suspect,
           'residual in standard deviations (RMS; about 1 if noise and field error are right)')
     step = -(-n // _MAX_NAMES)
     rows[3].set_xticks(along[::step], [literal(name) for name in names[::step]], rotation=90,
@@ -115,10 +115,10 @@ def geometry_figure(found: _Survey) -> Figure:
     return figure
 
 
-def _moves(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) -> None:
-    """Plot the board from its flattest side, with magnified arrows of the corrections."""
+def _plot_displacements(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) -> None:
+    """Plot the board along its thinnest axis, with magnified arrows for the displacements."""
     places = found.stated.positions
-    a, b = _widest(places)
+    a, b = _widest_axes(places)
     c = 3 - a - b
     shift = 1e3 * (found.network.positions - places)
     extent = np.ptp(places, axis=0).max() or 1.0
@@ -132,7 +132,7 @@ def _moves(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) ->
         clim=(-most, most), angles='xy', scale_units='xy', width=0.006, edgecolor='k',
         linewidth=0.4, scale=8.0 * (longest or 1.0) / extent, zorder=2)
     axes.quiverkey(arrows, 0.86, 1.03, key, f'{key:g} mm', labelpos='E')
-    axes.plot(places[:, a], places[:, b], 'k.', ms=3, zorder=3, label='stated positions')
+    axes.plot(places[:, a], places[:, b], 'k.', ms=3, zorder=3, label='nominal positions')
     if suspect.any():
         axes.plot(places[suspect, a], places[suspect, b], 'o', ms=12, mfc='none', mew=1.5,
                   color=_SUSPECT, label='does not fit')
@@ -140,44 +140,45 @@ def _moves(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) ->
         for name, place in zip(found.network.names, places, strict=True):
             axes.annotate(literal(name), place[[a, b]], xytext=(3, -8), textcoords='offset points',
                           fontsize=6, color='0.35')
-    # A few distant poses do not extend the axes.
+    # A few distant poses must not extend the axes.
     low, high = places.min(axis=0) - 0.15 * extent, places.max(axis=0) + 0.15 * extent
     axes.set_xlim(low[a], high[a])
     axes.set_ylim(low[b], high[b])
     axes.set_aspect('equal')
     axes.set_xlabel(f'{"xyz"[a]} [m]')
     axes.set_ylabel(f'{"xyz"[b]} [m]')
-    axes.set_title('displacement from the stated positions', fontsize=10, loc='left')
+    axes.set_title('displacement from the nominal positions', fontsize=10, loc='left')
     axes.legend(fontsize=7, ncols=3, loc='upper center', bbox_to_anchor=(0.5, -0.12),
                 frameon=False)
     figure.colorbar(arrows, ax=axes, shrink=0.7, label=f'displacement along {"xyz"[c]} [mm]')
 
 
-def _widest(places: FloatArray) -> tuple[int, int]:
-    """Axes along which the board is widest, in ascending order."""
+def _widest_axes(places: FloatArray) -> tuple[int, int]:
+    """Indices of the two axes along which the board is widest, in ascending order."""
     a, b = sorted(np.argsort(np.ptp(places, axis=0), kind='stable')[1:])
     return int(a), int(b)
 
 
 def _round_down(value: float) -> float:
-    """Largest of 1, 2, 5, 10, ... that does not exceed the value; 0 for 0."""
+    """Round down to 1, 2 or 5 times a power of ten; 0 for 0."""
     if not value > 0.0:
         return 0.0
     power = 10.0 ** np.floor(np.log10(value))
     return float(power * max(m for m in (1.0, 2.0, 5.0) if m * power <= value * (1.0 + 1e-9)))
 
 
-def _spread(axes: Axes, along: IntArray, size: FloatArray, std: FloatArray, title: str) -> None:
-    """Plot the sizes of the corrections, and their uncertainty per axis."""
+def _plot_corrections(axes: Axes, along: IntArray, magnitude: FloatArray, std: FloatArray,
+                      title: str) -> None:
+    """Plot the magnitudes of the corrections, and their uncertainty per axis."""
     axes.bar(along, SCALE_1D * np.sqrt(np.square(std).mean(axis=1)), color='0.85', width=0.8,
              label='uncertainty (90 %, per axis)')
-    axes.plot(along, size, 'o', ms=4, color='tab:blue', label='found')
+    axes.plot(along, magnitude, 'o', ms=4, color='tab:blue', label='correction')
     axes.set_title(title, fontsize=10, loc='left')
     axes.legend(fontsize=7, ncols=2, loc='lower right', bbox_to_anchor=(1.0, 1.0), frameon=False)
     axes.grid(alpha=0.3)
 
 
-def _bars(axes: Axes, along: IntArray, residual: FloatArray, suspect: BoolArray,
+def _plot_residuals(axes: Axes, along: IntArray, residual: FloatArray, suspect: BoolArray,
           title: str) -> None:
     """Plot residuals as bars, suspect sensors in red."""
     axes.bar(along, np.nan_to_num(residual), width=0.8,
@@ -187,8 +188,8 @@ def _bars(axes: Axes, along: IntArray, residual: FloatArray, suspect: BoolArray,
     axes.grid(alpha=0.3)
 
 
-def _poses(axes: Axes, found: _Survey) -> None:
-    """Plot the residual of each pose by its row in the table."""
+def _plot_pose_residuals(axes: Axes, found: _Survey) -> None:
+    """Plot the residual of each pose over the row of the pose in the table."""
     suspect = np.isin(found.rows, found.suspect_rows)
     residual = found.geometry.pose_residual
     axes.plot(found.rows[~suspect], residual[~suspect], '.', ms=4, color='tab:blue')

@@ -1,4 +1,4 @@
-"""JSON text in which NaN, which is invalid in JSON, is replaced."""
+"""JSON in which null replaces NaN and infinity, which JSON does not permit."""
 
 import json
 import math
@@ -25,7 +25,7 @@ def without_nan(value: Any) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """Return nested dicts and lists as valid JSON.
+    """Serialise nested dicts and lists as JSON, with null for NaN and infinity.
 
     Parameters
     ----------

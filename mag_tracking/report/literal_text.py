@@ -1,14 +1,14 @@
-"""Text that figures draw literally."""
+"""Escaping of strings that figures draw literally."""
 
 _ZERO_WIDTH_SPACE = '\u200b'
 
 
 def literal(text: str) -> str:
-    r"""Return text that matplotlib draws character by character.
+    r"""Escape a string so that matplotlib draws it character by character.
 
     Matplotlib parses text between two `$` as mathematics, and fails on invalid mathematics such as
-    `$\road$`. It omits labels that begin with `_` from a legend. Lone surrogates, such as those of
-    a file name that is not UTF-8, are drawn as `\udcff`.
+    `$\road$`. It omits labels that begin with `_` from a legend. Unpaired surrogates, which stand
+    for bytes of a file name that are not UTF-8, are escaped as in `\udcff`.
 
     Parameters
     ----------

@@ -18,14 +18,14 @@ class PassErrors(TypedDict):
     """Errors of a vehicle's track, as returned by `pass_errors`."""
 
     rms: float | None
-    """Horizontal RMS error within the radius of the centre [m]; None if the target was never
-    there."""
+    """Horizontal RMS error within the radius of the centre [m]; None if the target was never within
+    the radius."""
     closest: float
     """Horizontal error at the pose closest to the centre [m]."""
     closest_distance: float
     """Distance of that pose from the centre [m]."""
     anees: float
-    """Mean NEES per axis of the poses within the radius, or of the closest one."""
+    """Mean NEES per axis of the poses within the radius, or of the closest pose."""
     n: int
     """Number of poses within the radius."""
 
@@ -76,7 +76,7 @@ def pass_errors(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
     centre : (3,) array, m, world frame
         Centre of the region that is evaluated.
     radius : float, m
-        Radius of that region.
+        Radius of the region.
 
     Returns
     -------
@@ -88,13 +88,13 @@ def pass_errors(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
     if not len(rows):
         return None
     error = np.array(log.position)[:, :2] - true
-    size = np.hypot(*error.T)
+    magnitude = np.hypot(*error.T)
     distance = np.hypot(*(true - centre[:2]).T)
     closest = int(np.nanargmin(distance))
     near = distance[rows] < radius
     nees = [error[k] @ np.linalg.solve(log.covariance[k][:2, :2], error[k]) / 2 for k in rows]
-    return {'rms': float(np.sqrt(np.mean(size[rows] ** 2))) if near.all() else None,
-            'closest': float(size[closest]), 'closest_distance': float(distance[closest]),
+    return {'rms': float(np.sqrt(np.mean(magnitude[rows] ** 2))) if near.all() else None,
+            'closest': float(magnitude[closest]), 'closest_distance': float(distance[closest]),
             'anees': float(np.mean(nees)), 'n': int(near.sum())}
 
 
@@ -102,11 +102,11 @@ class UnflaggedPoses(TypedDict):
     """Counts of poses that are not flagged as ambiguous, as returned by `unflagged_poses`."""
 
     n: int
-    """Number of poses with a truth at their time."""
+    """Number of poses with a known truth."""
     wrong: int
-    """Number of these that are wrong."""
+    """Number of wrong poses among the poses with a known truth."""
     without_truth: int
-    """Number of poses without a truth at their time."""
+    """Number of poses without a known truth."""
 
 
 WRONG_M, WRONG_STD = 2.0, 3.0
@@ -115,13 +115,13 @@ standard deviations in the direction of the error."""
 
 
 def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> UnflaggedPoses:
-    """Count the vehicle poses that are not flagged as ambiguous, and those of them that are wrong.
+    """Count the vehicle poses without the ambiguous flag, and the wrong poses among them.
 
     Parameters
     ----------
     logs : iterable of TrackLog
     truths : iterable of Truth
-        A pose is wrong if it is wrong for every target that was present at its time.
+        A pose is wrong if its error is too large for every target present at the time of the pose.
 
     Returns
     -------
@@ -129,21 +129,21 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
     """
     truths, n, n_wrong, n_without = list(truths), 0, 0, 0
     for log in logs:
-        sure = ~np.array(log.ambiguous, dtype=bool)
-        if not sure.any():
+        is_unflagged = ~np.array(log.ambiguous, dtype=bool)
+        if not is_unflagged.any():
             continue
-        stamps = np.array(log.stamp_ns, dtype=np.int64)[sure]
-        position = np.array(log.position)[sure][:, :2]
-        P = np.array(log.covariance)[sure][:, :2, :2]
+        stamps = np.array(log.stamp_ns, dtype=np.int64)[is_unflagged]
+        position = np.array(log.position)[is_unflagged][:, :2]
+        P = np.array(log.covariance)[is_unflagged][:, :2, :2]
         known, wrong = np.zeros(len(stamps), dtype=bool), np.ones(len(stamps), dtype=bool)
         for truth in truths:
             error = position - interpolate_truth(truth, stamps)[:, :2]
-            there = np.isfinite(error).all(axis=1)
-            error = np.where(there[:, None], error, 0.0)
-            size = np.hypot(*error.T)
-            std = np.sqrt(np.einsum('ni,nij,nj->n', error, P, error)) / np.maximum(size, 1e-9)
-            known |= there
-            wrong &= ~there | (size > WRONG_M) & (size > WRONG_STD * std)
+            is_covered = np.isfinite(error).all(axis=1)
+            error = np.where(is_covered[:, None], error, 0.0)
+            magnitude = np.hypot(*error.T)
+            std = np.sqrt(np.einsum('ni,nij,nj->n', error, P, error)) / np.maximum(magnitude, 1e-9)
+            known |= is_covered
+            wrong &= ~is_covered | (magnitude > WRONG_M) & (magnitude > WRONG_STD * std)
         n, n_wrong = n + int(known.sum()), n_wrong + int((known & wrong).sum())
         n_without += int((~known).sum())
     return {'n': n, 'wrong': n_wrong, 'without_truth': n_without}
@@ -163,7 +163,8 @@ def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
     Returns
     -------
     (k,) int array
-        The closest pose if the target was never within the radius; empty without truth.
+        Index of the closest pose if the target was never within the radius. Empty if no pose has
+        a known truth.
     """
     true = interpolate_truth(truth, log.stamp_ns)[:, :2]
     known = np.isfinite(true).all(axis=1)
@@ -180,7 +181,7 @@ MAGNET_SKIP = 3
 
 def magnet_errors(log: TrackLog | SmoothedLog, truth: Truth, axis: ArrayLike = (0.0, 0.0, 1.0),
                   skip: int = MAGNET_SKIP) -> MagnetErrors | None:
-    """Return the errors of a magnet's track, each pose compared with the truth nearest in time.
+    """Return the errors of a magnet's track, relative to the truth nearest in time.
 
     Parameters
     ----------
@@ -194,7 +195,7 @@ def magnet_errors(log: TrackLog | SmoothedLog, truth: Truth, axis: ArrayLike = (
     Returns
     -------
     MagnetErrors or None
-        None if no pose is left.
+        None if the track has at most `skip` poses.
     """
     stamps = np.array(log.stamp_ns, dtype=np.int64)[skip:]
     if not len(stamps):
@@ -207,7 +208,7 @@ def magnet_errors(log: TrackLog | SmoothedLog, truth: Truth, axis: ArrayLike = (
         np.linalg.norm(moment, axis=1) * np.linalg.norm(true_axis, axis=1))
     C = np.array(log.covariance)[skip:, :3, :3]
     nees = np.einsum('ni,ni->n', error, np.linalg.solve(C, error[:, :, None])[:, :, 0]) / 3
-    size = np.linalg.norm(error, axis=1)
-    return {'position_mean': float(size.mean()), 'position_max': float(size.max()),
+    magnitude = np.linalg.norm(error, axis=1)
+    return {'position_mean': float(magnitude.mean()), 'position_max': float(magnitude.max()),
             'axis_median_deg': float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1))))),
             'anees': float(nees.mean()), 'n': len(stamps)}

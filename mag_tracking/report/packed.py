@@ -1,4 +1,4 @@
-"""Arrays as base64 in JSON: exact, and a third of the size of decimal numbers."""
+"""Exact arrays as base64 in JSON, about a third as large as decimal numbers."""
 
 import base64
 
@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 Packed = dict[str, str]
-"""Maps the number type to base64 text of little-endian numbers; `scene.js` decodes it."""
+"""Maps the number type to little-endian numbers in base64, which `scene.js` decodes."""
 
 
 def packed(values: ArrayLike, kind: str = 'f8') -> Packed:
-    """Return an array as a JSON object.
+    """Encode an array as a JSON object.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Static chart."""
+    """Static Plotly chart."""
 
     title: str
     traces: Sequence[Mapping[str, Any]]
@@ -89,25 +89,25 @@ def live_html() -> str:
 
 
 def _html(title: str, data: Mapping[str, Any]) -> str:
-    """Template with title, style, scripts and data filled in.
+    """Fill title, style, scripts and data into the template.
 
-    In the data `<` is escaped, so that no text can close the script element.
+    In the data, `<` is escaped so that no string can close the script element.
     """
     folder = resources.files('mag_tracking.report') / 'page'
     plotly = resources.files('plotly') / 'package_data' / 'plotly.min.js'
-    script = '\n'.join(_text(folder / f'{name}.js') for name in SCRIPTS)
-    parts = (('@TITLE@', escape(title)), ('@STYLE@', _text(folder / 'page.css')),
-             ('@PLOTLY@', _text(plotly)), ('@SCRIPT@', script),
+    script = '\n'.join(_read(folder / f'{name}.js') for name in SCRIPTS)
+    parts = (('@TITLE@', escape(title)), ('@STYLE@', _read(folder / 'page.css')),
+             ('@PLOTLY@', _read(plotly)), ('@SCRIPT@', script),
              ('@DATA@', json_text(data).replace('<', '\\u003c')))
-    out, rest = [], _text(folder / 'page.html')
-    by_place = sorted(parts, key=lambda part: rest.index(part[0]))
-    for mark, text in by_place:
-        before, rest = rest.split(mark, 1)
+    out, remaining = [], _read(folder / 'page.html')
+    ordered_parts = sorted(parts, key=lambda part: remaining.index(part[0]))
+    for placeholder, text in ordered_parts:
+        before, remaining = remaining.split(placeholder, 1)
         out += [before, text]
-    return ''.join([*out, rest])
+    return ''.join([*out, remaining])
 
 
-def _text(path: Any) -> str:
-    """Text of a package file."""
+def _read(path: Any) -> str:
+    """Read a file of the package."""
     text: str = path.read_text(encoding='utf-8')
     return text

@@ -10,11 +10,11 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.report.palette import SERIES
 
 DASHES = ('solid', 'dash', 'dot', 'dashdot', 'longdash')
-"""Dash styles, one per colour."""
+"""Dash styles, one for each colour."""
 
 
 def plain(text: str) -> str:
-    """Return text with the markup characters of Plotly escaped.
+    """Escape the markup characters of Plotly.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def plain(text: str) -> str:
 
 
 def numbers(values: ArrayLike) -> list[Any]:
-    """Return nested lists of numbers, in which None replaces non-finite values.
+    """Convert an array to nested lists, with None for non-finite values.
 
     Parameters
     ----------
@@ -45,13 +45,13 @@ def numbers(values: ArrayLike) -> list[Any]:
 
 
 def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') -> dict[str, Any]:
-    """Return the trace of a curve.
+    """Create the trace of a curve.
 
     Parameters
     ----------
     x, y : (n,) array
     name : str
-        Legend entry; empty for none.
+        Legend entry; empty for no entry.
     k : int
         Index of the colour and the dash style.
     mode : str
@@ -70,7 +70,7 @@ def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') ->
 
 def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str,
              low: float | None = None, high: float | None = None) -> dict[str, Any]:
-    """Return the trace of a heat map in a perceptually uniform colour scale.
+    """Create the trace of a heat map in a perceptually uniform colour scale.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str
     title : str
         Title of the colour bar.
     low, high : float, optional
-        Limits of the colour scale; by default those of the values.
+        Limits of the colour scale; by default the minimum and maximum of `z`.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str
 
 
 def places(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
-    """Return the trace of the sensors on a map.
+    """Create the trace of the sensors on a map.
 
     Parameters
     ----------
@@ -114,16 +114,16 @@ def places(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
 
 
 def axes(x: str, y: str, is_map: bool = False, log_y: bool = False) -> dict[str, Any]:
-    """Return a layout with axis titles.
+    """Create a layout with axis titles.
 
     Parameters
     ----------
     x, y : str
         Axis titles.
     is_map : bool
-        Both axes have the same scale.
+        Whether both axes have the same scale.
     log_y : bool
-        The y axis is logarithmic.
+        Whether the y axis is logarithmic.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""JSON of the map with time slider: sensors, tracks, hypotheses and fields."""
+"""Map with a time slider as JSON: sensors, tracks, hypotheses and fields."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
@@ -13,17 +13,17 @@ from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
 MAX_SENSORS = 8
-"""Maximum number of sensors with fields per track; those with the strongest field are shown."""
+"""Maximum number of fields per track. The sensors with the strongest fields are selected."""
 MAX_BYTES = 4_000_000
-"""Approximate size limit of the track data; larger reports show fewer poses of each track."""
+"""Approximate size limit of the track data [bytes]. Larger reports show fewer poses per track."""
 MAX_TRACKS = 1_000
 """Maximum number of tracks in a report."""
 MIN_POSES, TRACK_SIZE = 4, 2_500
-"""Minimum number of poses per track, and its size in bytes without poses."""
+"""Minimum number of poses per track, and size of a track without its poses [bytes]."""
 MAX_EXTENT = 6.0
-"""Limit of the map on each side of the network, in spans of the network."""
+"""Maximum margin of the map around the network, as a multiple of the span of the network."""
 MIN_REACH_M = 10.0
-"""Limit of the map for a single sensor [m]."""
+"""Maximum margin of the map around a single sensor [m]."""
 
 
 class Sensors(Protocol):
@@ -46,7 +46,7 @@ class Sensors(Protocol):
 
 def scene_of(network: Sensors, begin_ns: int, end_ns: int,
              tracks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a map with a time slider as JSON.
+    """Return the map with a time slider as JSON.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
     begin_ns, end_ns : int, ns
         Time range; the page shows seconds since `begin_ns`.
     tracks : sequence of dict
-        As returned by `track_entry`.
+        Tracks, as returned by `track_entry`.
 
     Returns
     -------
@@ -74,13 +74,13 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
 
 
 def _box(low: FloatArray, high: FloatArray) -> list[float]:
-    """Limits [x0, x1, y0, y1] [m]."""
+    """Bounding box [x0, x1, y0, y1] [m] between two corners."""
     return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
 
 
 def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
                       most: int = MAX_SENSORS) -> IntArray:
-    """Return the sensors with the strongest field during a track.
+    """Return the sensors with the strongest fields during a track.
 
     Parameters
     ----------
@@ -102,12 +102,13 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
 
 
 def max_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
-    """Return the number of poses per track that keeps a report within a size limit, approximately.
+    """Return the maximum number of poses per track for a limited size of a report.
 
     Parameters
     ----------
     logs : sequence of TrackLog
     most_bytes : int
+        Approximate size limit of the track data [bytes].
 
     Returns
     -------
@@ -127,7 +128,7 @@ def max_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
 
 
 def _pose_size(log: TrackLog) -> int:
-    """Size of a pose in bytes of base64, with its true and smoothed position."""
+    """Size of a pose in base64 [bytes], with its true and smoothed positions."""
     n_sensors = min(MAX_SENSORS, len(log.measured[0]))
     n_arrivals = len({name for row in log.arrivals for name in row})
     # Base64 needs four bytes for three.
@@ -201,7 +202,7 @@ def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance
     covariance : (n, 6, 6) array
     ambiguous : bool
     fields : sequence of dict
-        As returned by `field_entry`.
+        Fields, as returned by `field_entry`.
 
     Returns
     -------
@@ -222,6 +223,7 @@ def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
     Parameters
     ----------
     sensor : int
+        Index of the sensor.
     measured, predicted : (n, 3) array, T, sensor frame
     times : (n,) array, s, optional
         Scene time; None if the field was measured at the times of the poses.
@@ -251,7 +253,7 @@ def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
 
 
 def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row of the table of tracks as JSON.
+    """Return the row of a track in the table of tracks as JSON.
 
     Parameters
     ----------
@@ -275,7 +277,7 @@ def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _array(values: Sequence[FloatArray], *shape: int) -> FloatArray:
-    """Array (n, *shape), also for n = 0."""
+    """Stack arrays to an array (n, *shape), also for n = 0."""
     return np.array(values, dtype=float).reshape(-1, *shape)
 
 
@@ -290,7 +292,7 @@ def _speed_std(velocity: FloatArray, C: FloatArray) -> FloatArray:
 
 def _columns(times: FloatArray, position: FloatArray, velocity: FloatArray, C: FloatArray,
              ambiguous: BoolArray) -> dict[str, Packed]:
-    """Columns of n poses."""
+    """Encode the times, states and standard deviations of n poses by column."""
     return {
         't': packed(times), 'x': packed(position[:, 0]), 'y': packed(position[:, 1]),
         'z': packed(position[:, 2]), 'vx': packed(velocity[:, 0]), 'vy': packed(velocity[:, 1]),
@@ -308,7 +310,7 @@ def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Pa
 
 
 def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]]:
-    """Columns of the weight and the best hypothesis of each arrival; NaN after it was pruned."""
+    """Weight and best hypothesis of each arrival, by column; NaN after the arrival was pruned."""
     log_rows = [log.arrivals[k] for k in rows]
     out = {}
     for name in sorted({name for row in log_rows for name in row}):

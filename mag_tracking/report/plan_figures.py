@@ -81,8 +81,8 @@ class _Plan(Protocol):
     def best_place(self) -> tuple[float, float]: ...
 
 
-def _map(plan: _Plan, title: str) -> tuple[Figure, Axes, float, str]:
-    """Figure, axes, factor and unit of a map with the sensors and the lanes."""
+def _draw_map(plan: _Plan, title: str) -> tuple[Figure, Axes, float, str]:
+    """Draw a map with the sensors and the lanes; return figure, axes, length factor and unit."""
     f, unit = scale_of(np.ptp(plan.x))
     figure = Figure(figsize=(8.0, 6.8), layout='constrained')
     axes = figure.add_subplot()
@@ -104,7 +104,7 @@ def _map(plan: _Plan, title: str) -> tuple[Figure, Axes, float, str]:
 
 
 def _levels(values: FloatArray, factor: float) -> FloatArray:
-    """Round contour levels (1-2-5) within the range of the values."""
+    """Contour levels of 1, 2 or 5 times a power of ten, within the range of the values."""
     tens = 10.0 ** np.arange(-6, 7)
     levels = np.sort(np.concatenate([tens, 2.0 * tens, 5.0 * tens]))
     low, high = factor * np.nanmin(values), factor * np.nanmax(values)
@@ -113,7 +113,7 @@ def _levels(values: FloatArray, factor: float) -> FloatArray:
 
 
 def position_figure(plan: _Plan) -> Figure:
-    """Plot a map of the position bound from a whole pass through each point.
+    """Plot a map of the position bound of a whole pass through each point.
 
     Parameters
     ----------
@@ -123,8 +123,8 @@ def position_figure(plan: _Plan) -> Figure:
     -------
     Figure
     """
-    figure, axes, f, unit = _map(
-        plan, 'Position bound from a whole pass through each point (standard deviation)')
+    figure, axes, f, unit = _draw_map(
+        plan, 'Position bound of a whole pass through each point (standard deviation)')
     z = f * np.clip(plan.position_std, None, np.ptp(plan.x))
     mesh = axes.pcolormesh(f * plan.x, f * plan.y, z, norm=LogNorm(), cmap='viridis',
                            shading='nearest', rasterized=True)
@@ -146,7 +146,7 @@ def detection_figure(plan: _Plan) -> Figure:
     -------
     Figure
     """
-    figure, axes, f, _ = _map(plan, 'Probability that one frame detects the target')
+    figure, axes, f, _ = _draw_map(plan, 'Probability that one frame detects the target')
     mesh = axes.pcolormesh(f * plan.x, f * plan.y, plan.detection, vmin=0.0, vmax=1.0,
                            cmap='magma', shading='nearest', rasterized=True)
     levels = [p for p in (0.1, 0.5, 0.9, 0.99) if plan.detection.min() < p < plan.detection.max()]
@@ -159,7 +159,7 @@ def detection_figure(plan: _Plan) -> Figure:
 
 
 def sensor_figure(plan: _Plan) -> Figure:
-    """Plot a map of the improvement by one more sensor; white where none may be placed.
+    """Plot a map of the improvement by one more sensor; white where no sensor may be placed.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def sensor_figure(plan: _Plan) -> Figure:
     """
     gain = 1.0 - plan.with_one_more / plan.without
     possible = np.isfinite(gain).any()
-    figure, axes, f, unit = _map(
+    figure, axes, f, unit = _draw_map(
         plan, f'Improvement by one more sensor; the median bound near the sensors is now '
         f'{length_text(plan.without)}')
     ny, nx = gain.shape
@@ -182,7 +182,7 @@ def sensor_figure(plan: _Plan) -> Figure:
         return figure
     best = plan.best_place
     axes.plot(f * best[0], f * best[1], 'r*', ms=15, mec='w', clip_on=False, zorder=6,
-              label=f'best: ({f * best[0]:.3g}, {f * best[1]:.3g}) {unit}, then '
+              label=f'best: ({f * best[0]:.3g}, {f * best[1]:.3g}) {unit}, bound '
               f'{length_text(np.nanmin(plan.with_one_more))}')
     axes.legend(fontsize=9, loc='upper right')
     figure.colorbar(mesh, ax=axes, label='reduction of the bound [%]')
@@ -204,7 +204,7 @@ def length_text(metres: float) -> str:
 
 
 def distinct_lanes(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
-    """Return the lanes with distinct curves; of identical curves, one would hide the other.
+    """Group lanes with identical curves, which would overlap in a plot.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def distinct_lanes(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
     Returns
     -------
     list of (str, Lane)
-        The name combines the names of lanes with the same curves.
+        Combined names of each group, and the first lane of the group.
     """
     out: list[tuple[list[str], _Lane]] = []
     for lane in lanes:

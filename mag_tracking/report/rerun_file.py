@@ -1,4 +1,4 @@
-"""Recordings for the Rerun viewer; they need the optional package rerun-sdk."""
+"""Recordings for the Rerun viewer, which require the optional package rerun-sdk."""
 
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -17,13 +17,13 @@ from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.units import NS
 
 RERUN_FILE = 'tracks.rrd'
-"""File name in a result folder."""
+"""File name of the Rerun recording in a result folder."""
 TIME = 'stamp'
 """Name of the timeline."""
 MIN_MOMENT = 1e-12
-"""Minimum moment that has a direction [A m²]."""
+"""Minimum magnitude of a moment with a defined direction [A m²]."""
 SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))
-"""Standard deviations to the surface of the 90 % region in 3-D."""
+"""Radius of a 90 % ellipsoid, in standard deviations."""
 
 
 def check_rerun() -> None:
@@ -32,15 +32,16 @@ def check_rerun() -> None:
     Raises
     ------
     MissingDependencyError
-        If it is not installed.
+        If rerun-sdk is not installed.
     """
     if find_spec('rerun') is None:
-        raise MissingDependencyError('Rerun recordings need rerun-sdk: pip install rerun-sdk')
+        raise MissingDependencyError(
+            'Rerun recordings require rerun-sdk: run pip install rerun-sdk')
 
 
 def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, TrackLog],
                 smoothed: Mapping[int, SmoothedLog]) -> None:
-    """Write sensors, poses with 90 % ellipsoids, speeds and fields over time.
+    """Write a recording of the sensors, and of poses, 90 % ellipsoids, speeds and fields over time.
 
     Parameters
     ----------
@@ -80,23 +81,23 @@ def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, 
 
 
 def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> None:
-    """Log the poses of a track, and clear them after its end."""
+    """Log the poses of a track, and clear its display after the end of the track."""
     root = f'{network.frame}/track_{log.id}'
     for k, ns in enumerate(log.stamp_ns):
         stream.set_time(TIME, timestamp=np.datetime64(ns, 'ns'))
-        size, orientation = _ellipsoid(log.covariance[k][:3, :3])
+        half_axes, orientation = _ellipsoid(log.covariance[k][:3, :3])
         stream.log(f'{root}/region', rerun.Ellipsoids3D(
-            centers=[log.position[k]], half_sizes=[size],
+            centers=[log.position[k]], half_sizes=[half_axes],
             quaternions=[rerun.Quaternion(xyzw=orientation)]))
         stream.log(f'{root}/pose', rerun.Points3D([log.position[k]], labels=[
             f'{log.id} {log.kind[k]}{"?" if log.ambiguous[k] else ""}']))
-        size_of_moment = max(float(np.linalg.norm(log.moment[k])), MIN_MOMENT)
+        magnitude = max(float(np.linalg.norm(log.moment[k])), MIN_MOMENT)
         stream.log(f'{root}/moment', rerun.Arrows3D(
-            origins=[log.position[k]], vectors=[log.moment[k] / size_of_moment]))
+            origins=[log.position[k]], vectors=[log.moment[k] / magnitude]))
         stream.log(f'speed/track_{log.id}', rerun.Scalars(float(np.hypot(*log.velocity[k][:2]))))
         for j, name in enumerate(network.names):
-            for what, fields in (('measured', log.measured[k]), ('predicted', log.predicted[k])):
-                stream.log(f'field/{name}/{what}', rerun.Scalars(1e9 * fields[j]))
+            for source, fields in (('measured', log.measured[k]), ('predicted', log.predicted[k])):
+                stream.log(f'field/{name}/{source}', rerun.Scalars(1e9 * fields[j]))
     # The last pose stays visible for one period.
     period = log.stamp_ns[-1] - log.stamp_ns[-2] if len(log.stamp_ns) > 1 else NS
     stream.set_time(TIME, timestamp=np.datetime64(log.stamp_ns[-1] + period, 'ns'))

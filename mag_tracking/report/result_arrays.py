@@ -12,7 +12,7 @@ _Fields: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 """Maps field names to (type, shape of one element)."""
 
 _TEXT_WIDTH = 16
-"""Minimum width of a text field in characters; longer names widen it."""
+"""Minimum width of a string field in characters. Longer names widen the field."""
 
 _STATE_FIELDS: _Fields = {
     'stamp_ns': ('i8', ()), 'track_id': ('i8', ()),
@@ -37,7 +37,7 @@ _DETECTION_FIELDS: _Fields = {
 
 
 def pose_array(tracks: Sequence[Track]) -> StructArray:
-    """Return poses of tracks as a structured array.
+    """Convert the poses of tracks to a structured array.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def pose_array(tracks: Sequence[Track]) -> StructArray:
 
 
 def smoothed_array(poses: Sequence[SmoothedPose]) -> StructArray:
-    """Return smoothed poses as a structured array.
+    """Convert smoothed poses to a structured array.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def smoothed_array(poses: Sequence[SmoothedPose]) -> StructArray:
 
 
 def detection_array(detections: Sequence[Detection]) -> StructArray:
-    """Return onsets and releases of the detector as a structured array.
+    """Convert onsets and releases of the detector to a structured array.
 
     Parameters
     ----------
@@ -94,6 +94,6 @@ def _array(records: Sequence[Track | SmoothedPose | Detection], fields: _Fields)
 
 
 def _value(record: Track | SmoothedPose | Detection, name: str) -> Any:
-    """Value of an array field; several doubts are joined by blanks."""
+    """Value of an array field; several doubts are joined by spaces."""
     value = getattr(record, 'id' if name == 'track_id' else name)
     return ' '.join(value) if name == 'doubts' else value

@@ -1,8 +1,8 @@
-"""Units in which lengths and fields are readable."""
+"""Readable units of lengths and fields."""
 
 
 def scale_of(extent: float) -> tuple[float, str]:
-    """Return the unit for lengths of a given extent.
+    """Select a readable unit for lengths up to a given extent.
 
     Parameters
     ----------
@@ -11,14 +11,15 @@ def scale_of(extent: float) -> tuple[float, str]:
     Returns
     -------
     factor : float
-        From metres to the unit.
+        Factor from metres to the unit.
     unit : str
+        Symbol of the unit.
     """
     return (1.0, 'm') if extent > 1.0 else (1e3, 'mm')
 
 
 def field_unit(strongest: float) -> tuple[float, str]:
-    """Return the unit for fields up to a given strength.
+    """Select a readable unit for fields up to a given strength.
 
     Parameters
     ----------
@@ -27,7 +28,8 @@ def field_unit(strongest: float) -> tuple[float, str]:
     Returns
     -------
     factor : float
-        From tesla to the unit.
+        Factor from tesla to the unit.
     unit : str
+        Symbol of the unit.
     """
     return (1e9, 'nT') if strongest < 1e-5 else (1e6, 'µT') if strongest < 1e-2 else (1e3, 'mT')

@@ -4,7 +4,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 MINOR_LABEL_DECADES = 1.5
-"""Maximum range of a logarithmic axis with labels between the powers of ten, in decades."""
+"""Maximum range of a logarithmic axis that has labels between powers of ten [decades]."""
 
 
 def legend_beside(axes: Axes, **named: float) -> None:
@@ -14,7 +14,7 @@ def legend_beside(axes: Axes, **named: float) -> None:
     ----------
     axes : Axes
     **named : float
-        Further arguments of `Axes.legend`.
+        Additional arguments of `Axes.legend`.
     """
     axes.legend(fontsize=8, loc='upper left', bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0,
                 **named)

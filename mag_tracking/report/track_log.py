@@ -42,12 +42,12 @@ class SmoothedLog:
         Returns
         -------
         dict of str to float
-            Speed, size of the moment and standard deviation of the position, JSON-ready.
+            Speed, magnitude of the moment and standard deviation of the position.
         """
-        sure = int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
-        return {'speed': float(np.hypot(*self.velocity[sure][:2])),
-                'moment_size': float(np.linalg.norm(self.moment[sure])),
-                'smallest_sd': float(np.sqrt(np.trace(self.covariance[sure][:2, :2])))}
+        best = int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
+        return {'speed': float(np.hypot(*self.velocity[best][:2])),
+                'moment_size': float(np.linalg.norm(self.moment[best])),
+                'smallest_sd': float(np.sqrt(np.trace(self.covariance[best][:2, :2])))}
 
 
 @dataclass
@@ -102,7 +102,7 @@ class TrackLog:
                               for h in best_of_arrivals(track.hypotheses)})
 
     def forget(self, n: int) -> None:
-        """Remove the first poses.
+        """Remove the oldest poses.
 
         Parameters
         ----------
@@ -159,7 +159,7 @@ class TrackLog:
     def nis_of(self, names: Sequence[str]) -> dict[str, float | None]:
         """Mean normalised innovation squared per axis of each sensor.
 
-        It is about 1 or less if the sensor agrees with the model and the other sensors.
+        The value is about 1 or less if a sensor agrees with the model and with the other sensors.
 
         Parameters
         ----------
@@ -177,16 +177,16 @@ class TrackLog:
                 for name, q, n in zip(names, total, axes, strict=True)}
 
     def summary(self) -> dict[str, Any]:
-        """Summarise the track in JSON-ready numbers.
+        """Summarise the track in values that JSON can represent.
 
-        Speed and moment are those of the `most_certain` pose, arrival and kind those of the last
+        Speed and moment are taken from the `most_certain` pose, arrival and kind from the last
         pose. The verdict is `unique` if neither pose is ambiguous.
 
         Returns
         -------
         dict
         """
-        sure = self.most_certain()
+        best = self.most_certain()
         final = self.arrivals[-1]
         arrival = max(final, key=lambda name: final[name][0])
         nis = np.array(self.nis) / np.maximum(1, self.degrees_of_freedom)
@@ -196,16 +196,16 @@ class TrackLog:
             'poses': len(self.stamp_ns), 'ended': self.ended, 'arrival': arrival,
             'arrival_weights': {k: v[0] for k, v in sorted(final.items())},
             'kind': self.kind[-1], 'kind_weight': self.kind_weight[-1],
-            'length': self.length[sure],
-            'verdict': 'ambiguous' if self.ambiguous[-1] or self.ambiguous[sure] else 'unique',
+            'length': self.length[best],
+            'verdict': 'ambiguous' if self.ambiguous[-1] or self.ambiguous[best] else 'unique',
             'ambiguous_share': float(np.mean(self.ambiguous)),
             'doubts': dict(Counter(name for names in self.doubts for name in names)),
             'existence': self.existence,
-            'speed': float(np.linalg.norm(self.velocity[sure][:2])),
-            'heading_deg': float(np.degrees(np.arctan2(self.velocity[sure][1],
-                                                       self.velocity[sure][0]))),
-            'moment': [float(v) for v in self.moment[sure]],
-            'moment_size': float(np.linalg.norm(self.moment[sure])),
+            'speed': float(np.linalg.norm(self.velocity[best][:2])),
+            'heading_deg': float(np.degrees(np.arctan2(self.velocity[best][1],
+                                                       self.velocity[best][0]))),
+            'moment': [float(v) for v in self.moment[best]],
+            'moment_size': float(np.linalg.norm(self.moment[best])),
             'smallest_sd': float(np.sqrt(min(np.trace(C[:2, :2]) for C in self.covariance))),
             'nis_per_axis': float(nis[known].mean()) if known.any() else None,
         }

@@ -13,7 +13,7 @@ MAX_GAP_S = 5.0
 
 
 class TrafficIntervals:
-    """Summaries of equal time intervals, each reported when it is complete.
+    """Counter of passages in equal time intervals, which returns a summary of each interval.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ class TrafficIntervals:
     interval_s : float, s
         Length of an interval.
     counts : Counter
-        Counted events, updated in place.
+        Numbers of events by description, updated in place.
     """
 
     def __init__(self, line_names: Sequence[str], interval_s: float,
@@ -37,7 +37,7 @@ class TrafficIntervals:
         self._last_ns: int | None = None
 
     def add(self, passage: VehiclePassage) -> None:
-        """Add a passage; a late one counts in the earliest interval that is open.
+        """Add a passage; a late passage is counted in the earliest open interval.
 
         Parameters
         ----------
@@ -51,12 +51,12 @@ class TrafficIntervals:
         self._observed.setdefault(begin, 0)
 
     def due(self, before_ns: int, now_ns: int) -> list[TrafficSummary]:
-        """Return the summaries of the intervals that are complete.
+        """Close the complete intervals, and return their summaries.
 
         Parameters
         ----------
         before_ns : int, ns
-            All passages before this time have been added.
+            Time before which all passages have been added.
         now_ns : int, ns
             Time of the latest frame.
 
@@ -69,7 +69,7 @@ class TrafficIntervals:
                             if begin + self._length <= before_ns])
 
     def flush(self) -> list[TrafficSummary]:
-        """Return the summaries of all open intervals.
+        """Close all open intervals, and return their summaries.
 
         Returns
         -------
@@ -97,15 +97,15 @@ class TrafficIntervals:
             last_ns = until
 
     def _close(self, begins: list[int]) -> list[TrafficSummary]:
-        """Summaries of intervals, for each line; the intervals are removed."""
+        """Remove intervals, and return a summary of each interval and line."""
         out: list[TrafficSummary] = []
         for begin in sorted(begins):
             end, observed_s = begin + self._length, self._observed.pop(begin) / NS
-            mine = [p for first, p in self._passages if first == begin]
+            in_interval = [p for first, p in self._passages if first == begin]
             self._passages = [(first, p) for first, p in self._passages if first != begin]
             self._closed_ns = end
             out += [TrafficSummary(begin, end, name, observed_s,
-                                   counts_of([p for p in mine if p.line == name]))
+                                   counts_of([p for p in in_interval if p.line == name]))
                     for name in self._names]
         return out
 
@@ -124,9 +124,9 @@ def counts_of(passages: Sequence[VehiclePassage]) -> tuple[TrafficCount, ...]:
     groups = sorted({(not p.forward, p.vehicle_class) for p in passages})
     out = []
     for backward, name in groups:
-        mine = [p for p in passages if p.forward is not backward and p.vehicle_class == name]
-        headways = [p.headway for p in mine if np.isfinite(p.headway)]
-        out.append(TrafficCount(not backward, name, len(mine), sum(p.ambiguous for p in mine),
-                                float(np.mean([p.speed for p in mine])),
+        group = [p for p in passages if p.forward is not backward and p.vehicle_class == name]
+        headways = [p.headway for p in group if np.isfinite(p.headway)]
+        out.append(TrafficCount(not backward, name, len(group), sum(p.ambiguous for p in group),
+                                float(np.mean([p.speed for p in group])),
                                 float(np.mean(headways)) if headways else float('nan')))
     return tuple(out)

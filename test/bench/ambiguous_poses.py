@@ -1,9 +1,9 @@
 """Consistency of ambiguous poses on the pose topics, for each choice of `track.ambiguous_poses`.
 
-Random passes of trucks, cars and turning cars of two simulators are tracked with two sensors at 100
-Hz. The figures are the normalised errors (ANEES per axis) by the covariances on the topics. The aim
-is an ANEES of at most 2 for ambiguous poses with `mixture`. With `hold`, no ambiguous pose may be
-published.
+Random passes of trucks, cars and turning cars from two simulators are tracked with two sensors at
+100 Hz. The figures are the normalised errors (ANEES per axis) for the covariances on the topics.
+The aim is an ANEES of at most 2 for ambiguous poses with `mixture`. With `hold`, no ambiguous pose
+may be published.
 """
 
 import argparse
@@ -21,18 +21,18 @@ MAX_ANEES = 2.0
 
 
 def one_pass(policy, simulator, kind, seed):
-    """`Tracked` of a random pass with a policy for ambiguous poses."""
+    """Track a random pass with a policy for ambiguous poses; return its `Tracked`."""
     return one_random_pass(simulator, kind, seed, {'track.ambiguous_poses': policy})
 
 
 def passes_of(policy, seed):
-    """[`Tracked`] of one pass of each kind of each simulator."""
+    """Track one pass of each kind and simulator; return [`Tracked`]."""
     return [one_pass(policy, s, k, seed) for s in SIMULATORS for k in KINDS]
 
 
 def summary(figures, policy, found):
-    """(line, whether the aim is met) of [[`Tracked`]]."""
-    found = [f for some in found for f in some]
+    """Record the figures of a policy; return a line and whether the aim is met."""
+    found = [f for passes in found for f in passes]
     ambiguous = np.concatenate([f.ambiguous for f in found])
     nees = np.concatenate([f.topic_nees for f in found])
     error = np.concatenate([f.error for f in found])
@@ -40,7 +40,7 @@ def summary(figures, policy, found):
     if policy == HOLD:
         figures.keep(f'{policy}: ambiguous poses on the topics', on_topic.sum(), '', 0)
         return (f'  {policy}: {on_topic.sum()} of {ambiguous.sum()} ambiguous poses on the topics, '
-                f'{np.isfinite(nees[~ambiguous]).sum()} of {(~ambiguous).sum()} others',
+                f'{np.isfinite(nees[~ambiguous]).sum()} of {(~ambiguous).sum()} other poses',
                 not on_topic.any())
     met = not figures.keep(f'{policy}: ANEES of ambiguous poses', nees[on_topic].mean(), '',
                            MAX_ANEES if policy == MIXTURE else None,
@@ -49,14 +49,15 @@ def summary(figures, policy, found):
     return (f'  {policy}: {len(found)} passes, {on_topic.sum()} ambiguous poses, ANEES '
             f'{nees[on_topic].mean():.2f}{f" (aim {MAX_ANEES:g})" if policy == MIXTURE else ""}, '
             f'99 % below {np.quantile(nees[on_topic], 0.99):.1f}, largest error '
-            f'{error[on_topic].max():.1f} m; others {nees[~ambiguous].mean():.2f}'
+            f'{error[on_topic].max():.1f} m; other poses {nees[~ambiguous].mean():.2f}'
             f'{"" if met else "  MISSED"}', met)
 
 
 def main():
-    """Print a line for each policy; return 1 if the aim is missed."""
+    """Print a line for each policy; return 1 if an aim is missed."""
     parser = argparse.ArgumentParser()
-    parser.add_argument('--passes', type=int, default=17, help='passes of each kind and simulator')
+    parser.add_argument('--passes', type=int, default=17,
+                        help='number of passes of each kind and simulator')
     n = parser.parse_args().passes
     print('Poses on ~/pose, two sensors, 100 Hz, random passes of two simulators')
     figures = Figures('ambiguous_poses')

@@ -2,10 +2,10 @@
 
     PYTHONPATH=test python -m bench.archive [--passes 10000]
 
-Each recording contains one simulated pass; two simulators alternate. One worker and two workers
-track all recordings into new folders and must yield equal rows. The figures are the passes per
-hour, the share of tracked passes and the error of the speed. The aim is that two workers are at
-least 1.8 times as fast as one.
+Each recording contains one pass, simulated by two simulators alternately. All recordings are
+archived by one worker and by two workers, which must yield equal rows. The figures are the passes
+per hour, the fraction of tracked passes and the error of the speed. The aim is that two workers are
+at least 1.8 times as fast as one worker.
 """
 
 import argparse
@@ -30,12 +30,12 @@ from mag_tracking.simulation import scenario
 from support.bundled import NETWORK_FILE
 from support.random_passes import KINDS, SIMULATORS, random_pass
 
-STATIONS, A_DAY = 100, 5000
-"""Number of stations, and of vehicles per station and day, for the projection."""
+N_STATIONS, VEHICLES_A_DAY = 100, 5000
+"""Number of stations, and number of vehicles per station and day, in the projection."""
 
 
 def write_pass(path, seed):
-    """Write a recording of one pass; return its path and the true speed [m/s] at the CPA."""
+    """Write a recording of a pass; return its path and the true speed [m/s] at the CPA."""
     network = read_network(NETWORK_FILE)
     simulator, kind = SIMULATORS[seed % 2], KINDS[seed // 2 % len(KINDS)]
     body, course, duration, flaws = random_pass(simulator, kind, seed)
@@ -51,17 +51,17 @@ def write_pass(path, seed):
 
 
 def hours_of(recordings, out, workers):
-    """(duration [h] of an archive run without the start of its processes, its result)."""
+    """Archive the recordings; return (duration [h], result)."""
     with tqdm(total=len(recordings), desc=f'{workers} workers', disable=None) as bar:
-        begun = time.perf_counter()
+        start = time.perf_counter()
         run = archive(recordings, NETWORK_FILE, settings_for('vehicle'), out, workers,
                       progress=lambda _: bar.update())
     assert len(run.done) == len(recordings) and not run.failed, run.failed
-    return (time.perf_counter() - begun) / 3600.0, run
+    return (time.perf_counter() - start) / 3600.0, run
 
 
 def main():
-    """Print the figures; exit status 1 if an aim is missed."""
+    """Print the figures; return 1 if an aim is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--passes', type=int, default=200)
     args = parser.parse_args()
@@ -77,21 +77,22 @@ def main():
         tables = [[pq.read_table(folder / f'out_{n}' / table).sort_by(
             [('source', 'ascending'), ('stamp_ns', 'ascending')]) for n in (1, 2)]
             for table in ('tracks', 'poses', 'smoothed', 'passes', 'health')]
-        assert all(a.equals(b) for a, b in tables), 'two workers yield other rows than one worker'
+        assert all(a.equals(b) for a, b in tables), 'one and two workers yield different rows'
         tracks = tables[0][0].to_pandas()
     print(f'{args.passes} recordings of one pass each')
-    for n, of_n in zip((1, 2), hours, strict=True):
-        figures.add(f'passes an hour, {n} workers', args.passes / of_n, '', more_is_better=True)
+    for n, duration in zip((1, 2), hours, strict=True):
+        figures.add(f'passes an hour, {n} workers', args.passes / duration, '', more_is_better=True)
     figures.add('two workers over one', hours[0] / hours[1], '', 1.8, True)
     first = tracks.drop_duplicates('source')
     ratio = first['speed'] / [speeds[Path(source)] for source in first['source']]
     figures.add('passes tracked', len(first) / args.passes, '', more_is_better=True)
     figures.add('speed off, median', 100.0 * float((ratio - 1.0).abs().median()), '%')
-    a_year = STATIONS * A_DAY * 365.25
-    cores = a_year * hours[0] / args.passes / (24 * 365.25)
-    print(f'  projection: {STATIONS} stations with {A_DAY} vehicles per day have {a_year:.3g} '
-          f'passes per year, which load {cores:.1f} such cores; one core processes a year of one '
-          f'station in {a_year / STATIONS * hours[0] / args.passes / 24:.0f} days')
+    passes_a_year = N_STATIONS * VEHICLES_A_DAY * 365.25
+    cores = passes_a_year * hours[0] / args.passes / (24 * 365.25)
+    print(f'  projection: {N_STATIONS} stations with {VEHICLES_A_DAY} vehicles per day have '
+          f'{passes_a_year:.3g} passes per year, which occupy {cores:.1f} such cores; one core '
+          'processes a year of one station in '
+          f'{passes_a_year / N_STATIONS * hours[0] / args.passes / 24:.0f} days')
     return figures.save()
 
 

@@ -2,9 +2,9 @@
 
 A bank of hypotheses of a point vehicle is updated with one frame of 2 to 100 sensors. The peers
 compute the same update with a loop of filterpy EKFs, with a model that loops over the sensors or
-with a vectorised one. Each figure is the median over rounds of the peer's time over the time of the
-bank, measured alternately on one thread. The aims are ratios of 350, 120, 40 and 25 for 2, 8, 32
-and 100 sensors, against the model that loops over the sensors.
+with a vectorised model. Each figure is the ratio of the peer's time to the bank's time, as the
+median over rounds. Both times are measured alternately on one thread. The aims are ratios of 350,
+120, 40 and 25 for 2, 8, 32 and 100 sensors, against the model that loops over the sensors.
 """
 
 import os
@@ -38,22 +38,23 @@ SIGMA = 4e-9
 
 
 N_TARGET = 12
-"""States of a point target."""
+"""Number of states of a point target."""
 
 
 def moment(x):
     """Moment (3,) of a vehicle's state and its Jacobian (3, 12).
 
-    ICASSP11 eq. (8), with a diagonal tensor in the axes of the vehicle.
+    ICASSP11 eq. (8), with a tensor that is diagonal in the axes of the vehicle.
     """
     speed2 = x[3] ** 2 + x[4] ** 2
     c, s = x[3] / np.sqrt(speed2), x[4] / np.sqrt(speed2)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     b = R.T @ EARTH / MU0
     m = R @ (x[6:9] + x[9:12] * b)
-    # z x m, less the rotation of b against the heading. np.cross would slow the peer down.
-    turned = R @ (x[9:12] * [-b[1], b[0], 0.0])
-    by_heading = np.array([-m[1], m[0], 0.0]) - turned
+    # z x m, minus the effect of the rotation of b in the axes of the vehicle. np.cross would slow
+    # the peer down.
+    rotation_of_b = R @ (x[9:12] * [-b[1], b[0], 0.0])
+    by_heading = np.array([-m[1], m[0], 0.0]) - rotation_of_b
     J = np.zeros((3, N_TARGET))
     J[:, 3:5] = np.outer(by_heading, [-x[4], x[3]]) / speed2
     J[:, 6:9] = R
@@ -62,7 +63,7 @@ def moment(x):
 
 
 def dipole(d, m):
-    """Field and Jacobians of one dipole at one point, in textbook form."""
+    """Field of a dipole at one point and its Jacobians, in textbook form."""
     n2 = d @ d
     k3 = 1e-7 / n2**1.5
     dm = d @ m
@@ -76,7 +77,8 @@ def dipole(d, m):
 class Peer:
     """Loop of filterpy EKFs, each with a NumPy model that loops over the sensors.
 
-    State: target (12), three mounting angles per sensor or none, three backgrounds per sensor.
+    The state contains the target (12), three mounting angles per sensor if they are estimated, and
+    three background components per sensor.
     """
 
     def __init__(self, positions, R_sw, x, P):
@@ -106,7 +108,7 @@ class Peer:
         return out
 
     def h(self, x):
-        """Predicted measurement in standard deviations of the noise."""
+        """Predicted measurement, divided by the standard deviation of the noise."""
         B = self.fields(x)
         if self.turned:
             B = B + np.cross(x[N_TARGET:N_TARGET + self.n].reshape(-1, 3), B)
@@ -127,14 +129,14 @@ class Peer:
         return out / SIGMA
 
     def update(self, y):
-        """Update every filter with one measurement."""
+        """Update all filters with one measurement."""
         z = y.ravel() / SIGMA
         for f in self.filters:
             f.update(z, self.H, self.h)
 
 
 class VectorPeer(Peer):
-    """The same filters with all sensors in one NumPy expression."""
+    """Loop of filterpy EKFs, each with a NumPy model that is vectorised over the sensors."""
 
     def _common(self, x):
         m, J = moment(x)
@@ -162,7 +164,7 @@ class VectorPeer(Peer):
 
 
 def bank_case(n_sensors, n_hyp, rng, turned):
-    """Filter, geometry, states and one measurement near the truth."""
+    """Create a filter, the sensor poses, a bank of hypotheses and a frame near the truth."""
     positions = np.zeros((n_sensors, 3))
     positions[:, 0] = 9.0 * (np.arange(n_sensors) // 2)
     positions[:, 1] = np.where(np.arange(n_sensors) % 2, 4.5, -4.5)
@@ -175,14 +177,14 @@ def bank_case(n_sensors, n_hyp, rng, turned):
     settings = settings_for('vehicle', {
         **POINT, 'track.vehicle.near_field_lengths': [0.0], 'track.field_error': 0.0,
         'track.model_error_time_s': 0.0, 'track.mounting_std_deg': 5.0 if turned else 0.0}).track
-    n_own = 3 * n_sensors if turned else 0
-    x = np.zeros((n_hyp, N_TARGET + n_own + 3 * n_sensors))
+    n_mounting = 3 * n_sensors if turned else 0
+    x = np.zeros((n_hyp, N_TARGET + n_mounting + 3 * n_sensors))
     x[:, :3] = [-6.0, -1.0, 0.5] + 0.3 * rng.standard_normal((n_hyp, 3))
     x[:, 3:6] = [10.0, 0.0, 0.0] + 0.3 * rng.standard_normal((n_hyp, 3))
     x[:, 6:9] = 200.0 * rng.standard_normal((n_hyp, 3))
     x[:, 9:12] = [6.0, 5.0, 4.0]
     P = np.repeat(np.diag(np.r_[1.0, 1.0, 0.1, 4.0, 1.0, 0.01, [1e4] * 3, [4.0] * 3,
-                                np.full(n_own, 0.0076), np.full(3 * n_sensors, 4e-16)])[None],
+                                np.full(n_mounting, 0.0076), np.full(3 * n_sensors, 4e-16)])[None],
                   n_hyp, axis=0)
     y = sensor_fields(positions, R_sw, *model.dipoles(x[:1, :N_TARGET]))[0][0]
     frame = FieldFrame(0, y + SIGMA * rng.standard_normal(y.shape),
@@ -194,51 +196,51 @@ def bank_case(n_sensors, n_hyp, rng, turned):
 
 
 def bank_ratio(peer_class, n_sensors, turned, n_hyp=64, rounds=12, repeats=100):
-    """(median, lowest, highest ratio, [us] of the bank, [us] of the peer) of an update."""
+    """Time an update; return (median, minimum, maximum ratio, [us] of bank, [us] of peer)."""
     rng = np.random.default_rng(n_sensors)
     bank_filter, positions, R_sw, bank, frame = bank_case(n_sensors, n_hyp, rng, turned)
     x, P = bank.x, bank.P
-    ours, theirs = [], []
+    bank_times, peer_times = [], []
     for k in range(rounds + 1):
         peer = peer_class(positions, R_sw, x, P)
         start = time.perf_counter()
         peer.update(frame.field)
         t_peer = time.perf_counter() - start
-        xi, Pi, t_ours = np.empty_like(x), np.empty_like(P), 0.0
+        xi, Pi, t_bank = np.empty_like(x), np.empty_like(P), 0.0
         for _ in range(repeats):
-            # Freshly written, as by the prediction before an update; so are those of the peer.
+            # The arrays are freshly written, as after a prediction. This also applies to the peer.
             xi[:], Pi[:] = x, P
             bank.x, bank.P = xi, Pi
             start = time.perf_counter()
             bank_filter.advance(bank, frame, 0.0)
-            t_ours += (time.perf_counter() - start) / repeats
+            t_bank += (time.perf_counter() - start) / repeats
         worst = max(np.abs((f.x - a) / np.sqrt(np.diagonal(f.P))).max()
                     for f, a in zip(peer.filters, bank.x, strict=True))
         assert worst < 1e-6, f'bank and peer differ by {worst} standard deviations'
         if k:
-            ours.append(t_ours)
-            theirs.append(t_peer)
-    ratio = np.array(theirs) / np.array(ours)
-    return (np.median(ratio), ratio.min(), ratio.max(), 1e6 * np.median(ours),
-            1e6 * np.median(theirs))
+            bank_times.append(t_bank)
+            peer_times.append(t_peer)
+    ratio = np.array(peer_times) / np.array(bank_times)
+    return (np.median(ratio), ratio.min(), ratio.max(), 1e6 * np.median(bank_times),
+            1e6 * np.median(peer_times))
 
 
 def main():
-    """Print the figures; exit status 1 if an aim is missed."""
+    """Print the figures; return 1 if an aim is missed."""
     figures = Figures('bank')
     print('bank update against a loop of filterpy EKFs, one thread')
     for n_sensors, n_hyp, turned, aim in (
             (2, 64, False, 350.0), (8, 64, False, 120.0), (32, 64, False, 40.0),
             (100, 16, False, 25.0), (2, 64, True, None), (8, 64, True, None)):
-        for peer, goal in ((Peer, aim), (VectorPeer, None)):
+        for peer, peer_aim in ((Peer, aim), (VectorPeer, None)):
             rounds, repeats = (12, 100) if n_sensors <= 8 else (4, 3)
-            ratio, low, high, ours, theirs = bank_ratio(peer, n_sensors, turned, n_hyp, rounds,
-                                                        repeats)
+            ratio, low, high, bank_us, peer_us = bank_ratio(peer, n_sensors, turned, n_hyp, rounds,
+                                                            repeats)
             state = 'target, backgrounds' + (', mounting' if turned else '')
             kind = 'a model from sensor to sensor' if peer is Peer else 'a vectorised model'
             figures.add(f'{n_sensors} sensors x {n_hyp} hypotheses; {state}; {kind}', ratio,
-                        'times', goal, True,
-                        f'  ({low:.0f} .. {high:.0f}; {ours:.0f} us against {theirs:.0f} us)')
+                        'times', peer_aim, True,
+                        f'  ({low:.0f} .. {high:.0f}; {bank_us:.0f} us against {peer_us:.0f} us)')
     return figures.save()
 
 

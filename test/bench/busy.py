@@ -1,10 +1,11 @@
 """Tracking of several vehicles at once: detection, accuracy and cost.
 
 Recordings and simulated worlds with meeting and following vehicles and dense traffic are tracked.
-The figures are the share of vehicles found, RMS error, NEES, false tracks, and the time of a search
-for another vehicle. At most 1 % of the poses without a flag may be wrong, including passes of
-single vehicles. A frame of two vehicles may take four times as long as a frame of one vehicle. With
-`--data FOLDER`, the recordings of another folder are used (`*.mcap` with `*.truth.json`).
+The figures are the fraction of detected vehicles, the RMS error, the NEES, the number of false
+tracks and the time of a search for another vehicle. At most 1 % of the poses without a flag may be
+wrong, including passes of single vehicles. A frame of two vehicles may take four times as long as a
+frame of one vehicle. With `--data FOLDER`, the recordings of another folder are used (`*.mcap` with
+`*.truth.json`).
 """
 
 import argparse
@@ -30,7 +31,8 @@ from support.random_passes import KINDS, are_wrong, one_random_pass
 
 AIMS = {'meeting': (1.0, 4.0, 1.0), 'meeting more': (0.7, 3.0, 1.0),
         'following': (0.9, None, 1.0), 'traffic': (None, None, 11 / 12)}
-"""{recordings: median RMS [m], median NEES of two axes, share found}; None = no aim."""
+"""{kind of recording: (median RMS [m], median NEES of two axes, fraction of vehicles found)};
+None = no aim."""
 MIN_MEETING = 15 / 16
 """With two sensors, one of sixteen vehicles may be missed."""
 MAX_WRONG, MAX_COST = 0.01, 4.0
@@ -38,21 +40,21 @@ N_HYP, RUNS = 20, 25
 
 
 def aims_of(name):
-    """(RMS [m], NEES, share found) of a recording, by its name."""
+    """Aims (RMS [m], NEES, fraction of vehicles found) of a recording with a given name."""
     kind = next((k for k in ('meeting', 'following', 'traffic') if name.startswith(k)), 'traffic')
     rms, nees, found = AIMS['meeting more' if kind == 'meeting' and '2_sensors' not in name
                             else kind]
     return rms, nees, MIN_MEETING if name.startswith('meeting_2') else found
 
 
-def shown(items, what):
-    """The items, with a progress bar on a terminal."""
-    return tqdm(items, desc=what, disable=None, leave=False)
+def with_progress_bar(items, label):
+    """Iterate over the items, with a progress bar on a terminal."""
+    return tqdm(items, desc=label, disable=None, leave=False)
 
 
 @contextmanager
-def searches():
-    """Durations [s] of the searches for another vehicle."""
+def timed_searches():
+    """Context manager that records the duration [s] of each search for another vehicle."""
     seconds, find = [], NewTargetSearch.find
 
     def timed(search):
@@ -70,11 +72,11 @@ def searches():
 
 
 def recordings(figures, folder):
-    """[(number of poses without a flag, number of wrong ones)] of the recordings."""
+    """Track the recordings; return the numbers [(unflagged poses, wrong unflagged poses)]."""
     counted = []
-    for path in shown(sorted(folder.glob('*.truth.json')), 'recordings'):
+    for path in with_progress_bar(sorted(folder.glob('*.truth.json')), 'recordings'):
         name = path.name.removesuffix('.truth.json')
-        with searches() as seconds:
+        with timed_searches() as seconds:
             tracked = tracked_recording(name, folder)
             got = tracked.score
         rms, nees, found = aims_of(name)
@@ -94,11 +96,11 @@ def recordings(figures, folder):
 
 
 def simulated(figures, seeds):
-    """[(number of poses without a flag, of wrong ones)] of worlds of the second simulator."""
+    """Track worlds of the second simulator; return [(unflagged poses, wrong unflagged poses)]."""
     counted = []
     for how in ('meeting', 'following', 'traffic'):
         scores = [tracked(busy(how, n, 'boxes', seed))[0]
-                  for n in (2, 4) for seed in shown(range(seeds), how)]
+                  for n in (2, 4) for seed in with_progress_bar(range(seeds), how)]
         found = np.concatenate([s.is_found for s in scores])
         figures.add(f'boxes, {how}: found', float(found.mean()), '', note=f' (of {len(found)})')
         figures.add(f'boxes, {how}: RMS',
@@ -108,30 +110,31 @@ def simulated(figures, seeds):
     return counted
 
 
-def of_one(passes):
-    """[(number of poses without a flag, number of wrong ones)] of single vehicles.
+def single_vehicles(passes):
+    """Track single vehicles; return the numbers [(unflagged poses, wrong unflagged poses)].
 
-    These are the bundled recordings and passes of each kind of the second simulator.
+    The vehicles are in the bundled recordings, and in passes of each kind of the second simulator.
     """
     counted = []
-    for name in shown(VEHICLES, 'vehicles'):
+    for name in with_progress_bar(VEHICLES, 'vehicles'):
         result = track(vehicle_path(name), NETWORK_FILE)
         poses = result.poses[~result.poses['ambiguous']]
         t, true, _ = next(iter(result.truth.values()))
         error = poses['position'][:, :2] - np.stack([np.interp(
             poses['stamp_ns'], t, true[:, k]) for k in (0, 1)], axis=1)
-        size = np.hypot(*error.T)
+        error_m = np.hypot(*error.T)
         along = np.sqrt(np.einsum('ni,nij,nj->n', error, poses['covariance'][:, :2, :2], error))
-        counted.append((len(poses), int(are_wrong(size, along / np.maximum(size, 1e-9)).sum())))
+        counted.append((len(poses), int(are_wrong(
+            error_m, along / np.maximum(error_m, 1e-9)).sum())))
     for kind in KINDS:
-        for seed in shown(range(passes), kind):
+        for seed in with_progress_bar(range(passes), kind):
             got = one_random_pass('boxes', kind, seed)
             counted.append((int((~got.ambiguous).sum()), int(got.sure_and_wrong.sum())))
     return counted
 
 
 def cost():
-    """Time of a frame of two vehicles over that of one, with equal numbers of hypotheses."""
+    """Ratio of the times of a frame with two vehicles and with one vehicle, for equal banks."""
     settings, network = settings_for('vehicle').track, NETWORKS[2]
     model, C = vehicle_model(settings.vehicle, network), np.tile(3.6e-17 * np.eye(3), (2, 1, 1))
     frame = FieldFrame(0, np.full((2, 3), 2e-8), C, np.full(2, 4), np.zeros(2), True)
@@ -142,8 +145,8 @@ def cost():
     two = one.copy()
     two.x = np.insert(one.x, [n] * n, one.x[::-1, :n], axis=1)
     two.P = np.zeros((N_HYP, two.x.shape[1], two.x.shape[1]))
-    rest = np.append(np.arange(n), np.arange(2 * n, two.x.shape[1]))
-    two.P[:, rest[:, None], rest] = one.P
+    others = np.append(np.arange(n), np.arange(2 * n, two.x.shape[1]))
+    two.P[:, others[:, None], others] = one.P
     two.P[:, n:2 * n, n:2 * n] = one.P[::-1, :n, :n]
     two.label, two.kind = (np.stack([a, a[::-1]], axis=1) for a in (one.label, one.kind))
     best = [np.inf, np.inf]
@@ -163,13 +166,14 @@ def main():
     """Print the figures; return 1 if an aim is missed."""
     parser = argparse.ArgumentParser()
     parser.add_argument('--data', type=Path, metavar='FOLDER', default=BUSY)
-    parser.add_argument('--seeds', type=int, default=3, help='worlds of each kind')
-    parser.add_argument('--passes', type=int, default=33, help='single vehicles of each kind')
-    given = parser.parse_args()
+    parser.add_argument('--seeds', type=int, default=3, help='number of worlds of each kind')
+    parser.add_argument('--passes', type=int, default=33,
+                        help='number of single vehicles of each kind')
+    args = parser.parse_args()
     figures = Figures('busy')
     print('Several vehicles at once')
-    counted = np.array([*recordings(figures, given.data), *simulated(figures, given.seeds),
-                        *of_one(given.passes)])
+    counted = np.array([*recordings(figures, args.data), *simulated(figures, args.seeds),
+                        *single_vehicles(args.passes)])
     sure, wrong = counted.sum(axis=0)
     figures.add('poses without a flag that are wrong', wrong / sure, '', MAX_WRONG,
                 note=f' ({wrong} of {sure})')

@@ -4,8 +4,8 @@
 
 A source publishes a message of a hundred readings at 100 Hz, two nodes forward it, and the last
 node publishes a pose for every eighth message. The figure is the delay of a pose after its readings
-were sent, by the clock of this machine. It is the reference for `bench.load`, whose nodes do their
-work in addition, and has no aim.
+were sent, by the clock of this machine. It is the reference for `bench.load`, whose nodes also
+process the readings. There is no aim.
 """
 
 import argparse
@@ -24,7 +24,7 @@ ROLES = ('last', 'second', 'first', 'source')
 
 
 def readings(k):
-    """`FieldReadings` message with covariances."""
+    """Create a `FieldReadings` message with covariances."""
     from mag_tracking_msgs.msg import FieldReadings
 
     from mag_tracking.messages.schema import readings_dict
@@ -36,7 +36,7 @@ def readings(k):
         np.tile(1e-16 * np.eye(3), (N_SENSORS, 1, 1)))))
 
 
-def play(role):
+def run_node(role):
     """Run the node of a role until it is stopped."""
     import rclpy
     from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -51,7 +51,7 @@ def play(role):
     kind = PoseWithCovarianceStamped if role == 'last' else FieldReadings
     publisher = node.create_publisher(kind, f'/chain/{out}', STREAM)
 
-    def hand_on(message):
+    def forward(message):
         count[0] += 1
         if role != 'last':
             publisher.publish(message)
@@ -59,10 +59,10 @@ def play(role):
             publisher.publish(PoseWithCovarianceStamped(header=message.header))
 
     if role == 'source':
-        node.create_timer(1.0 / RATE, lambda: hand_on(readings(count[0])))
+        node.create_timer(1.0 / RATE, lambda: forward(readings(count[0])))
     else:
         source = {'last': 'c', 'second': 'b', 'first': 'a'}[role]
-        node.create_subscription(FieldReadings, f'/chain/{source}', hand_on, STREAM)
+        node.create_subscription(FieldReadings, f'/chain/{source}', forward, STREAM)
     executor.add_node(node)
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         spin(executor, lambda: bool(seen))
@@ -75,17 +75,17 @@ def main():
     parser.add_argument('--role', choices=ROLES, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.role:
-        return play(args.role)
+        return run_node(args.role)
     import rclpy
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
     from mag_tracking.nodes.middleware import begin
     from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
     begin()
-    node, executor, late = rclpy.create_node('chain'), make_executor(), []
+    node, executor, delays = rclpy.create_node('chain'), make_executor(), []
     executor.add_node(node)
     node.create_subscription(
-        PoseWithCovarianceStamped, '/chain/pose', lambda m: late.append(
+        PoseWithCovarianceStamped, '/chain/pose', lambda m: delays.append(
             time.time() - m.header.stamp.sec - m.header.stamp.nanosec / 1e9), STREAM)
     processes = [subprocess.Popen([sys.executable, __file__, '--role', role]) for role in ROLES]
     try:
@@ -95,15 +95,15 @@ def main():
         for process in processes:
             process.terminate()
             process.wait(30.0)
-    late = 1e3 * np.array(late[60:])
+    delays = 1e3 * np.array(delays[60:])
     from bench.figures import Figures
     figures = Figures('chain')
-    figures.keep('four bare nodes: pose after its readings, median', np.median(late), 'ms')
-    figures.keep('four bare nodes: pose after its readings, 99 %', np.quantile(late, 0.99), 'ms')
+    figures.keep('four bare nodes: pose after its readings, median', np.median(delays), 'ms')
+    figures.keep('four bare nodes: pose after its readings, 99 %', np.quantile(delays, 0.99), 'ms')
     figures.save()
-    print(f'{len(late)} poses of four bare nodes, delay after their readings were sent: median '
-          f'{np.median(late):.1f} ms, p99 {np.quantile(late, 0.99):.1f} ms, worst '
-          f'{late.max():.1f} ms')
+    print(f'{len(delays)} poses of four bare nodes, delay after their readings were sent: median '
+          f'{np.median(delays):.1f} ms, p99 {np.quantile(delays, 0.99):.1f} ms, worst '
+          f'{delays.max():.1f} ms')
 
 
 if __name__ == '__main__':

@@ -1,11 +1,10 @@
 """Classification of vehicles by moment and length, and by signatures of one sensor.
 
 Random passes of motorcycles, cars and trucks of two simulators are tracked with two sensors. The
-figures are the share of counted vehicles, the share of correct classes, the recall of each class
-and the expected calibration error of the class probabilities ("reliability error" in the names of
-the figures). In addition, a classifier is trained and
-tested on splits of simulated signatures of one sensor. The aims are 95 % correct classes and an
-expected calibration error of at most 0.05.
+figures are the fraction of counted vehicles, the fraction of correct classes, the recall of each
+class and the expected calibration error of the class probabilities. In addition, a classifier is
+trained and tested on splits of simulated signatures of one sensor. The aims are 95 % correct
+classes and an expected calibration error of at most 0.05.
 """
 
 import sys
@@ -28,26 +27,26 @@ from support.random_passes import SIMULATORS, random_course
 from support.samples import scenario
 from support.situation_worlds import car, small, truck
 
-SHARES = {'motorcycle': 0.05, 'car': 0.8, 'truck': 0.15}
-"""Shares of the classes, as in `traffic.class_shares`."""
+FRACTIONS = {'motorcycle': 0.05, 'car': 0.8, 'truck': 0.15}
+"""Fractions of the classes, as in `traffic.class_shares`."""
 N = 120
 """Number of passes per simulator."""
 EXAMPLES = {'motorcycle': 30, 'car': 160, 'truck': 30}
 """Number of signatures of each class."""
-MIN_RIGHT, MAX_SEPARATION = 0.95, 0.05
+MIN_CORRECT, MAX_RELIABILITY_ERROR = 0.95, 0.05
 
 
 def body_of(rng, name, simulator):
-    """Body of a vehicle of a class; two-wheelers are as heavy as a touring motorcycle."""
+    """Random body of a vehicle of a class; motorcycles are heavy touring motorcycles."""
     if name == 'motorcycle':
         return small(rng, simulator, rng.uniform(1.9, 2.3), rng.uniform(40.0, 120.0))
     return (car if name == 'car' else truck)(rng, simulator)
 
 
-def classified(simulator, seed):
-    """(class, `VehiclePassage` or None) of one pass, 2.9 to 6.1 m from the sensors."""
+def classified_pass(simulator, seed):
+    """Track one pass, 2.9 to 6.1 m from the sensors; return (class, `VehiclePassage` or None)."""
     rng = np.random.default_rng([seed, SIMULATORS.index(simulator)])
-    name = str(rng.choice(list(SHARES), p=list(SHARES.values())))
+    name = str(rng.choice(list(FRACTIONS), p=list(FRACTIONS.values())))
     path, duration, closest_s = random_course(rng, False)
     course, flaws = (path, SensorErrorModel()) if simulator == 'clouds' else \
         (random_drive(rng, path, closest_s), BOUGHT)
@@ -66,31 +65,31 @@ def main():
     print('Vehicle classes by moment and length, two sensors')
     classes = settings_for('vehicle').traffic.class_names
     for simulator in SIMULATORS:
-        found = [classified(simulator, seed) for seed in tqdm(
+        found = [classified_pass(simulator, seed) for seed in tqdm(
             range(N), desc=simulator, disable=None, leave=False)]
         counted = [(name, p) for name, p in found if p is not None]
-        right = np.array([p.vehicle_class == name for name, p in counted])
+        is_correct = np.array([p.vehicle_class == name for name, p in counted])
         figures.add(f'{simulator}: counted', len(counted) / N, '', None, True)
-        figures.add(f'{simulator}: class right', float(right.mean()), '', MIN_RIGHT, True)
+        figures.add(f'{simulator}: class right', float(is_correct.mean()), '', MIN_CORRECT, True)
         for kind in classes:
-            mine = np.array([name == kind for name, _ in counted])
-            figures.add(f'{simulator}: recall of {kind}', float(right[mine].mean()), '', None, True,
-                        f' (of {mine.sum()})')
-        stated = np.array([p.class_probabilities.max() for _, p in counted])
-        best = np.array([classes[int(np.argmax(p.class_probabilities))] == name
+            of_kind = np.array([name == kind for name, _ in counted])
+            figures.add(f'{simulator}: recall of {kind}', float(is_correct[of_kind].mean()), '',
+                        None, True, f' (of {of_kind.sum()})')
+        probability = np.array([p.class_probabilities.max() for _, p in counted])
+        is_best = np.array([classes[int(np.argmax(p.class_probabilities))] == name
                          for name, p in counted])
-        figures.add(f'{simulator}: reliability error', reliability_error(stated, best), '',
-                    MAX_SEPARATION)
+        figures.add(f'{simulator}: reliability error', reliability_error(probability, is_best), '',
+                    MAX_RELIABILITY_ERROR)
     for simulator in SIMULATORS:
         examples = examples_of(signatures(EXAMPLES, simulator))
         found = evaluate_classes(examples, progress=partial(
             tqdm, desc='splits', disable=None, leave=False))
         figures.add(f'{simulator}, one sensor: accuracy', float(found.accuracy.mean()), '', None,
-                    True, f' (share of the largest class {found.majority:.3f})')
+                    True, f' (fraction of the largest class {found.majority:.3f})')
         figures.add(f'{simulator}, one sensor: balanced accuracy',
                     float(found.balanced_accuracy.mean()), '', None, True)
         figures.add(f'{simulator}, one sensor: reliability error', found.reliability, '',
-                    MAX_SEPARATION)
+                    MAX_RELIABILITY_ERROR)
     return figures.save()
 
 

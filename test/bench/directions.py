@@ -1,10 +1,10 @@
 """Driving directions by single sensors, in a replica of the traffic of PHD15 Paper B.
 
 Three replicas of 511 vehicles on a road with two lanes are simulated by each of two simulators,
-with a two-axis sensor on each side of the road. The figures are the shares of correct directions by
-the sensor of the near lane, by that of the far lane, and by fusion of both, for the correlation and
-for the likelihood ratio. The aims for the correlation are 99.8 % near and 97 % fused. The stated
-error probabilities may differ by 0.05 from the measured ones.
+with a two-axis sensor on each side of the road. The figures are the fractions of correct directions
+from the sensor of the near lane, from the sensor of the far lane and from their fusion, for the
+correlation and for the likelihood ratio. The aims for the correlation are 99.8 % near and 97 %
+fused. The reported error probabilities may differ by 0.05 from the measured error rates.
 """
 
 import sys
@@ -20,8 +20,8 @@ SEEDS = (1, 2, 3)
 PUBLISHED = {'near': 510 / 511, 'far': 454 / 511, 'fused': 494 / 511}
 LIKELIHOOD = {'near': 488 / 511, 'far': 379 / 511, 'fused': 480 / 511}
 AIMS = {'near': 0.998, 'far': None, 'fused': 0.97}
-MAX_SEPARATION = 0.05
-"""Maximum difference between stated and measured error probability."""
+MAX_DIFFERENCE = 0.05
+"""Maximum difference between reported error probability and measured error rate."""
 
 
 def main():
@@ -36,15 +36,15 @@ def main():
                 ('likelihood ratio', LIKELIHOOD, [
                     v.likelihood_ratio_of_north() for v in tqdm(
                         vehicles, desc='likelihood ratio', disable=None, leave=False)])):
-            share = shares(vehicles, found)
-            for name, at_least in AIMS.items():
-                figures.add(f'{simulator}, {method}, {name}', getattr(share, name), '',
-                            at_least if method == 'correlation' else None, True,
+            fractions = shares(vehicles, found)
+            for name, aim in AIMS.items():
+                figures.add(f'{simulator}, {method}, {name}', getattr(fractions, name), '',
+                            aim if method == 'correlation' else None, True,
                             f' (published {published[name]:.4f})')
-        stated, measured = calibration(vehicles)
+        reported, measured = calibration(vehicles)
         figures.add(f'{simulator}, far lane: stated less measured error probability',
-                    abs(stated - measured), '', MAX_SEPARATION, False,
-                    f' ({stated:.3f} stated, {measured:.3f} measured)')
+                    abs(reported - measured), '', MAX_DIFFERENCE, False,
+                    f' ({reported:.3f} reported, {measured:.3f} measured)')
     return figures.save()
 
 

@@ -1,10 +1,10 @@
 """Accuracy and consistency of tracks of extended vehicles.
 
 Simulated cars and trucks, each a cloud of sixty dipoles, are tracked as points and with the default
-kinds of vehicles, at two frame rates, with perfect sensors and with sensors with errors. The
-figures are the RMS within 5 m, the error at the closest point and the ANEES per axis, of tracks
-that are not ambiguous at their closest point. For each bundled vehicle recording, the error at the
-closest point is averaged over eight starts of the frame grid. There are no aims.
+kinds of vehicles, at two frame rates, with perfect and with imperfect sensors. The figures are the
+RMS error within 5 m, the error at the closest point and the ANEES per axis, for tracks that are not
+ambiguous at their closest point. For each bundled vehicle recording, the error at the closest point
+is averaged over eight starts of the frame grid. There are no aims.
 """
 
 import os
@@ -43,7 +43,7 @@ STUDIES = (
 
 
 def longest_track(samples, network, changes):
-    """(`TrackLog` of the longest track, its `SmoothedLog` or None), or None without a track."""
+    """Track samples; return (longest `TrackLog`, its `SmoothedLog`), or None without a track."""
     pipeline = Pipeline(network, settings_for('vehicle', changes))
     logs, smoothed, frame = {}, {}, None
     for record in [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush():
@@ -60,26 +60,26 @@ def longest_track(samples, network, changes):
 
 
 def vehicle(seed, kind):
-    """(body, path, duration [s]) of a straight pass; every second vehicle turns at the sensors."""
+    """Draw (body, path, duration [s]) of a pass; every second vehicle turns at the sensors."""
     rng = np.random.default_rng(1000 + seed)
     if kind == 'car':
         body = random_vehicle(rng, length=rng.uniform(3.6, 4.8), moment=rng.uniform(300.0, 600.0))
     else:
         body = random_vehicle(rng, length=rng.uniform(8.0, 13.0), width=2.4, height=2.8,
                               moment=rng.uniform(1200.0, 2200.0))
-    lane, turns = rng.uniform(0.8, 1.6), seed % 2
-    speed = rng.uniform(4.0, 6.5) if turns else rng.uniform(7.0, 20.0)
-    away = 6.0 * speed + (15.0 if turns else 25.0)
-    if not turns:
-        return body, Path(np.array([-away, -lane]), 0.0, speed), 6.0 + 50.0 / speed + 2.0
+    lane, is_turning = rng.uniform(0.8, 1.6), seed % 2
+    speed = rng.uniform(4.0, 6.5) if is_turning else rng.uniform(7.0, 20.0)
+    start_distance = 6.0 * speed + (15.0 if is_turning else 25.0)
+    if not is_turning:
+        return body, Path(np.array([-start_distance, -lane]), 0.0, speed), 6.0 + 50.0 / speed + 2.0
     radius = rng.uniform(4.0, 6.5)
-    before = away + rng.uniform(3.5, 5.5) - radius
-    return (body, Path(np.array([-away, -lane]), 0.0, speed, before, -0.5 * np.pi, radius),
-            6.0 + 40.0 / speed + 2.0)
+    turn_distance = start_distance + rng.uniform(3.5, 5.5) - radius
+    return (body, Path(np.array([-start_distance, -lane]), 0.0, speed, turn_distance,
+                       -0.5 * np.pi, radius), 6.0 + 40.0 / speed + 2.0)
 
 
 def one_pass(seed, kind, changes, flaws):
-    """(filtered errors, smoothed errors, is ambiguous at the CPA), or None without a track."""
+    """Track a pass; return (filtered errors, smoothed errors, is ambiguous at CPA) or None."""
     network = read_network(NETWORK)
     body, path, duration = vehicle(seed, kind)
     samples, t, position, _ = simulate(network, body, path, 100.0, duration,
@@ -97,30 +97,31 @@ def one_pass(seed, kind, changes, flaws):
 
 
 def simulated(figures, pool, name, kind, changes, flaws, n=40):
-    """Print one line of the table: `n` passes of one kind."""
+    """Track `n` passes of one kind, record the figures and print a line."""
     jobs = [pool.submit(one_pass, seed, kind, changes, flaws) for seed in range(n)]
     found = [job.result() for job in tqdm(jobs, desc=name, disable=None, leave=False)]
     sure = [f for f in found if f is not None and not f[2]]
     filtered, smoothed = [f[0] for f in sure], [f[1] for f in sure]
     closest = np.array([e['closest'] for e in filtered])
-    anees, later = (np.array([e['anees'] for e in errors]) for errors in (filtered, smoothed))
+    anees, anees_smoothed = (np.array([e['anees'] for e in errors])
+                             for errors in (filtered, smoothed))
     rms = np.array([(e['rms'], s['rms']) for e, s in zip(filtered, smoothed, strict=True)
                     if e['rms'] is not None])
-    for text, value, unit in (('RMS within 5 m', np.median(rms[:, 0]), 'm'),
+    for label, value, unit in (('RMS within 5 m', np.median(rms[:, 0]), 'm'),
                               ('RMS within 5 m, smoothed', np.median(rms[:, 1]), 'm'),
                               ('error at the closest point', np.median(closest), 'm'),
                               ('ANEES', anees.mean(), '')):
-        figures.keep(f'{name}: {text}', value, unit, note=f'{len(sure)} of {n} passes')
-    print(f'  {name}: {len(sure)} of {n} tracked and unambiguous; within 5 m RMS '
+        figures.keep(f'{name}: {label}', value, unit, note=f'{len(sure)} of {n} passes')
+    print(f'  {name}: {len(sure)} of {n} tracked and unambiguous; RMS error within 5 m '
           f'{np.median(rms[:, 0]):.2f} m, smoothed {np.median(rms[:, 1]):.2f} m (ratio '
           f'{np.median(rms[:, 1] / rms[:, 0]):.2f}); at the closest point '
           f'{np.median(closest):.2f} m, 90 % below {np.quantile(closest, 0.9):.2f} m; '
           f'ANEES mean {anees.mean():.1f}, median {np.median(anees):.1f}, smoothed '
-          f'{later.mean():.1f}, {np.median(later):.1f}', flush=True)
+          f'{anees_smoothed.mean():.1f}, {np.median(anees_smoothed):.1f}', flush=True)
 
 
 def grids(figures, n=8, period=0.08):
-    """Print the errors of the bundled recordings for `n` starts of the frame grid."""
+    """Track the bundled recordings for `n` starts of the frame grid, and print the errors."""
     network = read_network(NETWORK)
     print(f'error at the closest point for {n} starts of the frame grid')
     for path in sorted((ROOT / 'test' / 'data' / 'vehicles').glob('*.mcap')):
@@ -129,8 +130,8 @@ def grids(figures, n=8, period=0.08):
         truth = next(iter(reader.truth_arrays().values()))
         begin, closest = samples[0].stamp_ns, []
         for k in tqdm(range(n), desc=path.stem, disable=None, leave=False):
-            late = [s for s in samples if s.stamp_ns - begin >= k * period / n * 1e9]
-            found = longest_track(late, network, {})
+            later_samples = [s for s in samples if s.stamp_ns - begin >= k * period / n * 1e9]
+            found = longest_track(later_samples, network, {})
             if found is not None:
                 closest.append([pass_errors(log, truth, network.centre)['closest']
                                 for log in found])
@@ -143,7 +144,7 @@ def grids(figures, n=8, period=0.08):
 
 
 def main():
-    """Print both studies."""
+    """Run both studies and print their results."""
     figures = Figures('extended_target')
     print('simulated vehicles, half of them turning')
     with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:

@@ -1,10 +1,10 @@
-"""Benchmark results: the latest figures of each benchmark, and the history of all runs.
+"""Results of benchmarks: the latest figures of each benchmark, and the history of all runs.
 
     PYTHONPATH=test python -m bench.figures
 
 Each benchmark writes its figures to `benchmarks/latest.json`, with commit, date and machine; the
-Benchmarks page of the documentation is generated from that file. This command, the last one of
-`make bench`, appends the figures to `benchmarks/history.jsonl`, one line per run, and lists those
+Benchmarks page of the documentation is generated from that file. This command, the last command of
+`make bench`, appends the figures to `benchmarks/history.jsonl`, one line per run. It lists figures
 that are more than 15 % worse than the best of the latest five runs on the same kind of machine.
 """
 
@@ -27,13 +27,13 @@ RED, PLAIN = '\033[31m', '\033[0m'
 
 
 class Figures:
-    """The figures of one benchmark, by name."""
+    """Figures of one benchmark, by name."""
 
     def __init__(self, benchmark):
         self._benchmark, self._figures, self.missed = benchmark, {}, 0
 
     def keep(self, name, value, unit='', aim=None, more_is_better=False, note=''):
-        """Record a figure; `aim` is the worst acceptable value. Returns whether it is missed."""
+        """Record a figure; return whether it misses `aim`, the worst acceptable value."""
         # NaN misses every aim.
         is_missed = aim is not None and not (value >= aim if more_is_better else value <= aim)
         self.missed += is_missed
@@ -65,7 +65,7 @@ def run_facts():
 
 
 def read_history():
-    """Earlier runs, oldest first."""
+    """Read the earlier runs, oldest first."""
     if not HISTORY.exists():
         return []
     return [json.loads(line) for line in HISTORY.read_text().splitlines()]
@@ -83,9 +83,9 @@ def machine():
 
 
 def worse(run, before):
-    """[(benchmark, name, figure, best earlier value)] of the figures that got worse or are NaN.
+    """List (benchmark, name, figure, best earlier value) of figures that got worse or are NaN.
 
-    `before` holds the earlier runs on the same kind of machine.
+    `before` contains the earlier runs on the same kind of machine.
     """
     out = []
     for benchmark, figures in run.items():
@@ -103,9 +103,9 @@ def worse(run, before):
 
 
 def commit():
-    """Measured commit, with a + if the package differs from it."""
-    def git(*words):
-        return subprocess.run(['git', *words], cwd=ROOT, capture_output=True, text=True,
+    """Hash of the measured commit, with a + if the package has uncommitted changes."""
+    def git(*arguments):
+        return subprocess.run(['git', *arguments], cwd=ROOT, capture_output=True, text=True,
                               check=True).stdout.strip()
     try:
         return git('rev-parse', '--short', 'HEAD') + (
@@ -115,9 +115,9 @@ def commit():
 
 
 def main():
-    """Append the run to the history, and print figures that got worse in red."""
+    """Append the run to the history, and print the figures that got worse, in red."""
     if not LATEST.exists():
-        print('no benchmark has been run: there is no benchmarks/latest.json')
+        print('no benchmark has been run (benchmarks/latest.json is missing): run make bench')
         return 1
     figures = {name: run['figures'] for name, run in json.loads(LATEST.read_text()).items()}
     before = [run for run in read_history() if run['machine'] == machine()]
@@ -128,9 +128,9 @@ def main():
     run = run_facts() | {'figures': figures}
     with HISTORY.open('a') as stream:
         stream.write(json.dumps(run, sort_keys=True) + '\n')
-    compared = f'{len(found)} got worse' if before else \
+    compared = f'worse than before: {len(found)}' if before else \
         f'none were compared: no earlier run on such a machine ({machine()})'
-    print(f'{sum(map(len, figures.values()))} figures added to {HISTORY.relative_to(ROOT)}; '
+    print(f'figures added to {HISTORY.relative_to(ROOT)}: {sum(map(len, figures.values()))}; '
           f'{compared}')
     return int(bool(found))
 

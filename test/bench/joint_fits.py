@@ -1,11 +1,11 @@
-"""Batch fit of several vehicles at once: accuracy, wrong answers and duration.
+"""Batch fit of several simultaneous vehicles: accuracy, wrong fits and duration.
 
-Recordings and simulated worlds with two vehicles at a time are fitted, and passes of single
-vehicles. The figures are the share of vehicles fitted in the correct direction, the share of speeds
-within 10 %, the position error and the time per pass. The aims for the recordings are 90 % correct
-directions and 90 % of the speeds within 10 %. At most 1 % of single vehicles may be fitted as
-several, and at most 1 % of the answers without a flag may be wrong. With `--data FOLDER`, the
-recordings of another folder are used.
+Recordings and simulated worlds with two simultaneous vehicles are fitted, and passes of single
+vehicles. The figures are the fraction of vehicles fitted in the correct direction, the fraction of
+speeds within 10 %, the position error and the time per pass. The aims for the recordings are 90 %
+correct directions and 90 % of the speeds within 10 %. At most 1 % of single vehicles may be fitted
+as several vehicles, and at most 1 % of the fits without a flag may be wrong. With `--data FOLDER`,
+the recordings of another folder are used.
 """
 
 import argparse
@@ -26,13 +26,14 @@ from support.random_passes import KINDS, SIMULATORS, random_pass
 from support.samples import scenario
 from support.worlds import World
 
-OFF, SD = 0.1, 3.0
-"""A speed is wrong if its error exceeds both this share and this number of standard deviations."""
-MIN_RIGHT, MAX_WRONG = 0.9, 0.01
+MAX_ERROR, MAX_ERROR_STD = 0.1, 3.0
+"""A speed is wrong if its relative error exceeds both `MAX_ERROR` and this number of standard
+deviations."""
+MIN_CORRECT, MAX_WRONG = 0.9, 0.01
 
 
 class Tally:
-    """Counts of vehicles and passes, and their fits."""
+    """Fits of vehicles, their duration, and the numbers of vehicles and passes."""
 
     def __init__(self):
         self.n_vehicles = self.n_passes = 0
@@ -45,27 +46,27 @@ class Tally:
         self.found += of_vehicles
         self.seconds += seconds
 
-    def figures(self, figures, what, aim=None):
-        """Print the figures; return (number of fits without a flag, number of wrong ones)."""
-        off = np.array([of.one.chosen.speed[0] / of.speed - 1.0 for of in self.found])
+    def figures(self, figures, label, aim=None):
+        """Print the figures; return (number of unflagged fits, number of wrong unflagged fits)."""
+        error = np.array([of.one.chosen.speed[0] / of.speed - 1.0 for of in self.found])
         sd = np.array([of.one.chosen.speed[1] / of.speed for of in self.found])
         sure = np.array([not of.one.chosen.ambiguous for of in self.found], dtype=bool)
-        wrong = sure & (np.abs(off) > OFF) & (np.abs(off) > SD * sd)
+        wrong = sure & (np.abs(error) > MAX_ERROR) & (np.abs(error) > MAX_ERROR_STD * sd)
         n = max(self.n_vehicles, 1)
-        figures.add(f'{what}: fitted in the right direction', len(off) / n, '', aim, True,
+        figures.add(f'{label}: fitted in the right direction', len(error) / n, '', aim, True,
                     f' (of {self.n_vehicles})')
-        figures.add(f'{what}: speed within 10 %', float((np.abs(off) < OFF).mean()), '',
-                    MIN_RIGHT if aim else None, True)
-        figures.add(f'{what}: median error of the position',
+        figures.add(f'{label}: speed within 10 %', float((np.abs(error) < MAX_ERROR).mean()), '',
+                    MIN_CORRECT if aim else None, True)
+        figures.add(f'{label}: median error of the position',
                     float(np.median([of.error for of in self.found])), 'm')
-        figures.add(f'{what}: without a flag', float(sure.mean()), '',
+        figures.add(f'{label}: without a flag', float(sure.mean()), '',
                     note=f' ({wrong.sum()} of them wrong)')
-        figures.add(f'{what}: a pass', self.seconds / max(self.n_passes, 1), 's')
+        figures.add(f'{label}: a pass', self.seconds / max(self.n_passes, 1), 's')
         return int(sure.sum()), int(wrong.sum())
 
 
 def recordings(folder):
-    """`Tally` of the recordings of a folder that have two vehicles at a time."""
+    """Fit the recordings of a folder with two simultaneous vehicles; return their `Tally`."""
     tally = Tally()
     for path in tqdm(sorted(folder.glob('[mf]*.truth.json')), disable=None, leave=False):
         name = path.name.removesuffix('.truth.json')
@@ -76,22 +77,22 @@ def recordings(folder):
 
 
 def worlds(how, simulator, seeds, trucks=TRUCKS):
-    """`Tally` of worlds of pairs of vehicles, with a share of `trucks`."""
+    """Fit worlds with pairs of vehicles and a fraction `trucks` of trucks; return their `Tally`."""
     tally = Tally()
     for n_sensors in (2, 4):
         for seed in tqdm(range(seeds), disable=None, leave=False):
             a_world = busy(how, n_sensors, simulator, seed, trucks=trucks)
             begin = time.perf_counter()
             passes = fits_of_world(a_world)
-            took = time.perf_counter() - begin
+            duration_s = time.perf_counter() - begin
             vehicles = [(a_world.t, position) for position in a_world.positions]
-            tally.add(passes, with_vehicles(passes, vehicles), len(vehicles), took)
+            tally.add(passes, with_vehicles(passes, vehicles), len(vehicles), duration_s)
     return tally
 
 
-def of_one(simulator, passes):
-    """(number of single vehicles fitted as several, number of single vehicles)."""
-    network, split, n = read_network(NETWORK_FILE), 0, 0
+def single_vehicles(simulator, passes):
+    """Fit single vehicles; return the number fitted as several vehicles, and the total number."""
+    network, n_split, n = read_network(NETWORK_FILE), 0, 0
     for kind in KINDS:
         for seed in tqdm(range(passes), disable=None, leave=False):
             body, course, duration, flaws = random_pass(simulator, kind, seed)
@@ -99,30 +100,31 @@ def of_one(simulator, passes):
                                              np.random.default_rng(seed), flaws)
             found = fits_of_world(World(network, readings, np.zeros(0), np.zeros((0, 0, 2))),
                                   (1, 2, 3))
-            split += any(one.n_vehicles > 1 and one.chosen is not None for one in found)
+            n_split += any(one.n_vehicles > 1 and one.chosen is not None for one in found)
             n += bool(found)
-    return split, n
+    return n_split, n
 
 
 def main():
     """Print the figures; return 1 if an aim is missed."""
     parser = argparse.ArgumentParser()
     parser.add_argument('--data', type=Path, metavar='FOLDER', default=BUSY)
-    parser.add_argument('--seeds', type=int, default=2, help='worlds of each kind')
-    parser.add_argument('--passes', type=int, default=20, help='single vehicles of each kind')
-    given = parser.parse_args()
+    parser.add_argument('--seeds', type=int, default=2, help='number of worlds of each kind')
+    parser.add_argument('--passes', type=int, default=20,
+                        help='number of single vehicles of each kind')
+    args = parser.parse_args()
     figures = Figures('joint_fits')
     print('Fits of several vehicles at once')
-    counted = [recordings(given.data).figures(figures, 'recordings', MIN_RIGHT)]
+    counted = [recordings(args.data).figures(figures, 'recordings', MIN_CORRECT)]
     for simulator in SIMULATORS:
         for how in ('meeting', 'following'):
-            counted.append(worlds(how, simulator, given.seeds).figures(
+            counted.append(worlds(how, simulator, args.seeds).figures(
                 figures, f'{simulator}, {how}'))
-        counted.append(worlds('meeting', simulator, given.seeds, 0.5).figures(
+        counted.append(worlds('meeting', simulator, args.seeds, 0.5).figures(
             figures, f'{simulator}, meeting, every other one a truck'))
-        split, n = of_one(simulator, given.passes)
-        figures.add(f'{simulator}: single vehicles taken for several', split / n, '', MAX_WRONG,
-                    note=f' ({split} of {n})')
+        n_split, n = single_vehicles(simulator, args.passes)
+        figures.add(f'{simulator}: single vehicles taken for several', n_split / n, '', MAX_WRONG,
+                    note=f' ({n_split} of {n})')
     sure, wrong = np.sum(counted, axis=0)
     figures.add('answers without a flag that are wrong', wrong / sure, '', MAX_WRONG,
                 note=f' ({wrong} of {sure})')

@@ -1,9 +1,9 @@
 """Causes of the position error of a turning car at its closest point.
 
 The recording `junction_left_turns_to_rear` is replayed with the network file, with exact clocks,
-with exact mountings, and with other settings. The figures are the errors at the closest point. A
-least squares fit of dipoles that move exactly as the truth locates the magnetic centre of the car.
-There is no aim.
+with exact mountings, and with other settings. The figures are the errors at the closest point. The
+magnetic centre of the car is located by a least-squares fit of dipoles that move along the true
+path. There is no aim.
 """
 
 import json
@@ -35,7 +35,7 @@ SETTINGS = {'iron three times as uneven': {'track.vehicle.difference_stds': [0.0
 
 
 def network_with(mountings, clocks):
-    """Network of the file, optionally with exact mountings and exact clocks."""
+    """Network from the network file, optionally with exact mountings and exact clocks."""
     network = read_network(NETWORK_FILE)
     truth = json.loads(vehicle_path(NAME).with_suffix('.truth.json').read_text())['sensor_truth']
     if mountings:
@@ -45,15 +45,15 @@ def network_with(mountings, clocks):
     return network
 
 
-def replayed(network, changes):
-    """`Run` of the recording; its files are temporary."""
+def replay_recording(network, changes):
+    """Replay the recording into a temporary folder; return the `Run`."""
     with tempfile.TemporaryDirectory() as out:
         return replay(Recording(vehicle_path(NAME)), network, settings_for('vehicle', changes), out)
 
 
 def errors(network, changes, figures=None, name=''):
-    """One line with the errors of the track, which are also recorded in `figures`."""
-    track, = replayed(network, changes).summary['tracks']
+    """Replay the recording; record the errors of the track, and return a line with the errors."""
+    track, = replay_recording(network, changes).summary['tracks']
     truth, smoothed = track['truth'], track['smoothed']['truth']
     if figures is not None:
         figures.keep(f'{name}: error at the closest point', truth['closest'], 'm')
@@ -68,28 +68,28 @@ def true_motion(data, truth):
     t = (stamps - data.stamp_ns) / 1e9
     place, v = (np.stack([np.interp(data.t, t, column) for column in table.T], axis=1)
                 for table in (position, np.gradient(position, t, axis=0)))
-    way = v / np.linalg.norm(v, axis=1, keepdims=True)
+    direction = v / np.linalg.norm(v, axis=1, keepdims=True)
     R = np.zeros((len(data.t), 3, 3))
-    R[:, :2, 0], R[:, 2, 2] = way[:, :2], 1.0
-    R[:, 0, 1], R[:, 1, 1] = -way[:, 1], way[:, 0]
+    R[:, :2, 0], R[:, 2, 2] = direction[:, :2], 1.0
+    R[:, 0, 1], R[:, 1, 1] = -direction[:, 1], direction[:, 0]
     return place, R
 
 
 def magnetic_centre(network, row):
-    """Centre (3,) [m] in the body frame, half length [m], total moments and normalised cost."""
+    """Fit dipoles; return centre (3,) [m] in the body frame, half length [m], moments and cost."""
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
     collector = PassCollector(network, settings_for('vehicle'))
     passes = [p for s in recorded(reader) for p in collector.feed(one(s))] + collector.flush()
     (data, _), = passes
-    place, R = true_motion(data, next(iter(replayed(network, {}).truth.values())))
+    place, R = true_motion(data, next(iter(replay_recording(network, {}).truth.values())))
     y = np.einsum('nij,nj->ni', network.R_ws[data.sensor], data.field).ravel() / NOISE
     induction = network.earth_field / MU0
     backgrounds = np.kron(np.eye(len(network))[data.sensor], np.eye(3))
 
     def linear(p):
         columns = []
-        for share in row:
-            r = data.positions - place - R @ (p[:3] + [share * p[3], 0.0, 0.0])
+        for offset in row:
+            r = data.positions - place - R @ (p[:3] + [offset * p[3], 0.0, 0.0])
             columns += [dipole_field(r, m).ravel() / NOISE for m in (
                 *np.moveaxis(R, 2, 0), np.broadcast_to(induction, r.shape))]
         A = np.column_stack([*columns, backgrounds])
@@ -105,7 +105,7 @@ def magnetic_centre(network, row):
 
 
 def main():
-    """Print the table."""
+    """Print the errors and the magnetic centres."""
     figures = Figures('junction_error')
     for name, exact in (('network file', (False, False)), ('exact clocks', (False, True)),
                         ('exact mountings', (True, False)), ('both exact', (True, True))):

@@ -3,13 +3,13 @@
     PYTHONPATH=test python -m bench.load                         # 100 sensors x 100 Hz, ten minutes
     PYTHONPATH=test python -m bench.load --pages 10              # the same with ten live pages open
     PYTHONPATH=test python -m bench.load --sensors 2 --minutes 2 --lean  # two, 126 hypotheses
-                                --one-process --batches          # the same at minimum cost
+                                --one-process --batches          # further options for minimum cost
 
 Driver, calibration, detection and tracker run as processes; a simulator in the driver replaces the
 hardware. The figures are the delay of a pose after the sample that completed its frame, by the
 clock of this machine, the CPU time of all nodes, their growth of memory, and the kinds of losses.
 The aim is a median delay of 10 ms, or 5 ms with all nodes in one process, without losses. The exit
-status is 1 if a sample or a frame was lost.
+status is 1 if a sample or a frame is lost.
 """
 
 import argparse
@@ -35,15 +35,15 @@ RATE, PERIOD_S = 100.0, 0.08
 """[Hz] Rate of each sensor; [s] period of a frame (`align.period_s`)."""
 WARM_UP_S = 20.0
 BEGINS_AFTER_S = 0.5
-"""[s] A pose that is later than the previous one by more than this is the first of a track."""
+"""[s] Minimum time since the previous pose of a pose that is the first of a track."""
 MANY, GATHER_S = 16, 0.002
-"""More sensors than this send their readings in batches; [s] of each batch if in sequence."""
+"""Maximum number of sensors without batches; [s] duration of a batch in sequential measurement."""
 LEAN = {'arrival_names': "['left']", 'arrival_headings_deg': '[0.0]'}
-"""One kind, one arrival: 3 offsets x 14 moments x 3 speeds = 126 hypotheses, all are kept."""
+"""One kind, one arrival: all 3 offsets x 14 moments x 3 speeds = 126 hypotheses are kept."""
 
 
 def network_yaml(n):
-    """Network file of `n` sensors in pairs along a road."""
+    """Content of a network file with `n` sensors in pairs along a road."""
     rows = [f'  mag_{i + 1}: {{position: [{9.0 * (i // 2)}, {4.5 if i % 2 else -4.5}, 0.0], '
             'orientation: [0, 0, 0, 1], noise_std: 1.2e-8}' for i in range(n)]
     return '\n'.join(['frame: map', 'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]', 'sensors:', *rows,
@@ -51,7 +51,7 @@ def network_yaml(n):
 
 
 def drivers_yaml(n, network, sequential):
-    """Driver file of a simulator for all sensors: a car at 20 m/s whenever the road is free."""
+    """Content of a driver file that simulates a car at 20 m/s whenever the road is free."""
     gather = f'  batch_s: {GATHER_S}\n' if sequential and n > MANY else ''
     return (f'road:\n  device: simulator\n{gather}  simulator: {{network: {network}, '
             f'rate_hz: {RATE}, speed: 20.0, period_s: 5.0, offset: 1.0, '
@@ -60,74 +60,75 @@ def drivers_yaml(n, network, sequential):
 
 
 def usage(process):
-    """(CPU seconds, resident MB) of a process."""
+    """CPU time [s] and resident memory [MB] of a process."""
     fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
     cpu = (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
     return cpu, int(fields[21]) * os.sysconf('SC_PAGE_SIZE') / 1e6
 
 
-class Ear:
-    """Subscriptions to poses and diagnostics."""
+class PoseMonitor:
+    """Subscriber that records the latency of poses and the losses in diagnostics."""
 
     def __init__(self, node, sequential):
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PoseWithCovarianceStamped
 
         from mag_tracking.nodes.stage_node import STREAM
-        self.latencies, self.values, self.troubles, self._before = [], {}, {}, {}
+        self.delays, self.values, self.warnings, self._initial_losses = [], {}, {}, {}
         # Whether each pose is the first of a track.
         self.begins, self._stamp = [], 0.0
         self._unread = []
-        # The timestamp is the mean of the samples. The sample that completes the frame is later by
-        # half a frame and the time between the sensors.
+        # The timestamp of a frame is the mean of its samples. The sample that completes the frame
+        # is later by half a frame and the time between the sensors.
         self._completed_s = PERIOD_S / 2.0 + (1.0 if sequential else 0.5) / RATE
-        node.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose', self._pose,
+        node.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose', self._record_pose,
                                  STREAM)
         # Diagnostics are parsed later, so that they do not delay the reception of poses.
         self._type = DiagnosticArray
         node.create_subscription(DiagnosticArray, '/diagnostics', self._unread.append, STREAM,
                                  raw=True)
 
-    def _pose(self, message):
-        """Record the delay after the sample that completed the frame."""
+    def _record_pose(self, message):
+        """Record the delay of a pose after the sample that completed its frame."""
         stamp = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
-        self.latencies.append(time.time() - stamp - self._completed_s)
+        self.delays.append(time.time() - stamp - self._completed_s)
         self.begins.append(stamp - self._stamp > BEGINS_AFTER_S)
         self._stamp = stamp
 
-    def _read(self):
-        """Parse the received diagnostics; keep the latest values."""
+    def _parse_diagnostics(self):
+        """Parse the received diagnostics, and store the latest values."""
         from rclpy.serialization import deserialize_message
         for raw in self._unread:
             for status in deserialize_message(raw, self._type).status:
                 self.values[status.name] = {v.key: v.value for v in status.values}
                 if status.level != b'\x00':
-                    self.troubles[status.name] = status.message
+                    self.warnings[status.name] = status.message
         self._unread.clear()
 
     def begin(self):
-        """Discard the warm-up, in which sensors next to a car learn their background later."""
-        self._before, self.latencies, self.begins, self.troubles = self._losses(), [], [], {}
+        """Discard the warm-up, during which sensors near a car still learn their background."""
+        self._initial_losses, self.delays, self.begins, self.warnings = \
+            self._total_losses(), [], [], {}
 
     def losses(self):
-        """{counter: number} of all losses since `begin`."""
-        return {k: n - self._before.get(k, 0) for k, n in self._losses().items()
-                if n != self._before.get(k, 0)}
+        """Number of losses since `begin`, by counter; counters without losses are omitted."""
+        return {k: n - self._initial_losses.get(k, 0) for k, n in self._total_losses().items()
+                if n != self._initial_losses.get(k, 0)}
 
-    def _losses(self):
-        """{counter: number} of all losses since the start."""
-        self._read()
+    def _total_losses(self):
+        """Number of losses since the start, by counter."""
+        self._parse_diagnostics()
         return {f'{name}: {key}': int(value) for name, values in self.values.items()
                 for key, value in values.items() if value and key.startswith(
                     ('rejected', 'lost', 'readings lost', 'frames with a sensor'))}
 
 
-def start(folder, n, parameters, sequential, batches, together):
-    """Start the nodes as processes, the driver last, or all `together` in one process."""
+def start(folder, n, parameters, sequential, batches, is_one_process):
+    """Start the nodes as processes, the driver last, or all nodes in one process."""
     network, drivers = folder / 'network.yaml', folder / 'drivers.yaml'
     network.write_text(network_yaml(n))
     drivers.write_text(drivers_yaml(n, network, sequential))
-    if together:
+    if is_one_process:
         return {'all_in_one': subprocess.Popen(
             [Path(sys.executable).with_name('mag-tracking'), 'run', '--network', network,
              '--drivers', drivers, '--params', parameters,
@@ -135,11 +136,12 @@ def start(folder, n, parameters, sequential, batches, together):
             stdout=subprocess.DEVNULL, stderr=sys.stderr)}
     processes = {}
     for node in NODES:
-        more = ['-p', f'drivers:={drivers}', '-p', f'batches:={str(batches or n > MANY).lower()}'] \
+        options = ['-p', f'drivers:={drivers}',
+                   '-p', f'batches:={str(batches or n > MANY).lower()}'] \
             if node == 'driver_node' else ['--params-file', str(parameters)]
         processes[node] = subprocess.Popen(
             [sys.executable, '-m', f'mag_tracking.nodes.{node}', '--ros-args', '-p',
-             f'network:={network}', *more], stdout=subprocess.DEVNULL, stderr=sys.stderr)
+             f'network:={network}', *options], stdout=subprocess.DEVNULL, stderr=sys.stderr)
         time.sleep(3.0 if node == 'tracker_node' else 0.0)
     return processes
 
@@ -156,7 +158,7 @@ def open_pages(n):
 
 
 def parameters_of(folder, lean):
-    """Write the parameter file; return its path."""
+    """Write the parameter file of the nodes; return its path."""
     text = (ROOT / 'config' / 'large_network.yaml').read_text()
     if lean:
         text = re.sub(r'max_hypotheses: \d+', 'max_hypotheses: 126', text) \
@@ -166,99 +168,100 @@ def parameters_of(folder, lean):
     return path
 
 
-def watch(processes, ear, executor, minutes):
-    """[(t, {node: (CPU s, MB)})] every ten seconds."""
+def watch(processes, monitor, executor, minutes):
+    """Wait `minutes`; return [(t [s], {node: (CPU [s], memory [MB])})] for every ten seconds."""
     from mag_tracking.nodes.stage_node import spin
     begin, rows = time.monotonic(), []
     while time.monotonic() - begin < 60.0 * minutes:
         until = begin + 10.0 * (len(rows) + 1)
         spin(executor, lambda until=until: time.monotonic() > until)
         if time.monotonic() < until:
-            # Ctrl-C, which also stops the nodes.
+            # Interrupted by Ctrl-C, which also stops the nodes.
             break
         rows.append((time.monotonic() - begin, {k: usage(p) for k, p in processes.items()}))
-        print(f'{rows[-1][0]:6.0f} s  {len(ear.latencies):6d} poses  ' + '  '.join(
+        print(f'{rows[-1][0]:6.0f} s  {len(monitor.delays):6d} poses  ' + '  '.join(
             f'{k.removesuffix("_node")} {mb:.0f} MB' for k, (_, mb) in rows[-1][1].items()),
             flush=True)
     return rows
 
 
-def report(ear, rows, figures, aim):
-    """Print and record the results; return (99 % quantile of the latency [ms], any losses)."""
-    late = 1e3 * np.array(ear.latencies)
-    if not len(late):
+def report(monitor, rows, figures, aim):
+    """Print and record the results; return (99 % quantile of the latency [ms], has losses)."""
+    delays = 1e3 * np.array(monitor.delays)
+    if not len(delays):
         print('no pose was received')
     else:
-        figures.keep('pose after the last sample of its frame, median', np.median(late), 'ms', aim)
-        figures.keep('pose after the last sample of its frame, 99 %', np.quantile(late, 0.99),
+        figures.keep('pose after the last sample of its frame, median', np.median(delays), 'ms',
+                     aim)
+        figures.keep('pose after the last sample of its frame, 99 %', np.quantile(delays, 0.99),
                      'ms')
-        print(f'{len(late)} poses, delay after the sample that completed the frame: median '
-          f'{np.median(late):.1f} ms, p99 {np.quantile(late, 0.99):.1f} ms, '
-          f'worst {late.max():.1f} ms')
-        begins = np.array(ear.begins)
-        first, rest = late[begins], late[~begins]
+        print(f'{len(delays)} poses, delay after the sample that completed the frame: median '
+          f'{np.median(delays):.1f} ms, p99 {np.quantile(delays, 0.99):.1f} ms, '
+          f'worst {delays.max():.1f} ms')
+        begins = np.array(monitor.begins)
+        first, rest = delays[begins], delays[~begins]
         if len(first) and len(rest):
             print(f'{len(first)} are the first pose of a track: median {np.median(first):.1f} '
-                  f'ms, worst {first.max():.1f} ms; the others: p99 {np.quantile(rest, 0.99):.1f} '
+                  f'ms, worst {first.max():.1f} ms; other poses: p99 {np.quantile(rest, 0.99):.1f} '
                   f'ms, worst {rest.max():.1f} ms')
     first, last = rows[0], rows[-1]
     minute = rows[min(len(rows) - 1, 5)]
     total = 0.0
     for node in last[1]:
-        share = (last[1][node][0] - first[1][node][0]) / max(1e-9, last[0] - first[0])
-        total += share
-        print(f'{node}: {100.0 * share:.1f} % of a core, {last[1][node][1]:.1f} MB, '
+        cpu_fraction = (last[1][node][0] - first[1][node][0]) / max(1e-9, last[0] - first[0])
+        total += cpu_fraction
+        print(f'{node}: {100.0 * cpu_fraction:.1f} % of a core, {last[1][node][1]:.1f} MB, '
               f'{last[1][node][1] - minute[1][node][1]:+.1f} MB since the first minute')
     print(f'all nodes: {100.0 * total:.1f} % of a core')
     figures.keep('all nodes', 100.0 * total, '% of a core')
     figures.keep('growth of the largest process after the first minute',
                  max(last[1][node][1] - minute[1][node][1] for node in last[1]), 'MB')
-    losses = ear.losses()
+    losses = monitor.losses()
     figures.keep('kinds of losses', len(losses), '', 0)
     figures.save()
     print(f'lost: {losses or "nothing"}')
-    for text, n in Counter(ear.troubles.values()).most_common(5):
+    for text, n in Counter(monitor.warnings.values()).most_common(5):
         print(f'diagnostics of {n} components: {text}')
-    return float(np.quantile(late, 0.99)) if len(late) else float('nan'), bool(losses)
+    return float(np.quantile(delays, 0.99)) if len(delays) else float('nan'), bool(losses)
 
 
 def main():
-    """Run the benchmark; exit status 1 if something was lost."""
+    """Run the benchmark; return 1 after losses or an early interruption."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--sensors', type=int, default=100)
     parser.add_argument('--minutes', type=float, default=10.0)
     parser.add_argument('--batches', action='store_true',
-                        help='send readings in batches, as always with many sensors')
+                        help='send readings in batches, as with many sensors')
     parser.add_argument('--one-process', action='store_true',
                         help='all nodes in one process, as with `mag-tracking run`')
-    parser.add_argument('--lean', action='store_true', help='126 hypotheses')
+    parser.add_argument('--lean', action='store_true', help='track with 126 hypotheses')
     parser.add_argument('--sequential', action='store_true',
-                        help='the sensors measure one after the other, not simultaneously')
+                        help='the sensors measure in sequence, not simultaneously')
     parser.add_argument('--pages', type=int, default=0, help='number of open live pages')
     found = measure(parser.parse_args())
     return 1 if found is None else int(found[1])
 
 
 def name_of(args):
-    """The name of the benchmark with these options."""
+    """Name of the benchmark with these options."""
     return (f'load, {args.sensors} sensors'
             + (', one process' if args.one_process else ', four processes')
             + (f', {args.pages} pages' if args.pages else ''))
 
 
 def measure(args):
-    """Run the nodes; return the result of `report`, or None if interrupted before the first row."""
+    """Run the nodes; return the result of `report`, or None if interrupted within ten seconds."""
     import rclpy
 
     from mag_tracking.nodes.stage_node import make_executor, spin
-    # Like a subscriber of a user, without the middleware profile of the nodes.
+    # Initialised as in a user's subscriber, without the middleware profile of the nodes.
     rclpy.init()  # noqa: TID251
     node, executor = rclpy.create_node('load'), make_executor()
     executor.add_node(node)
-    ear = Ear(node, args.sequential)
+    monitor = PoseMonitor(node, args.sequential)
     with tempfile.TemporaryDirectory() as folder:
         os.environ['ROS_HOME'] = folder
-        # Garbage collection in this process must not add to the latency.
+        # Garbage collection in this process must not increase the latency.
         gc.disable()
         processes = start(Path(folder), args.sensors, parameters_of(Path(folder), args.lean),
                           args.sequential, args.batches, args.one_process)
@@ -267,8 +270,8 @@ def measure(args):
         try:
             end = time.monotonic() + WARM_UP_S
             spin(executor, lambda: time.monotonic() > end)
-            ear.begin()
-            rows = watch(processes, ear, executor, args.minutes)
+            monitor.begin()
+            rows = watch(processes, monitor, executor, args.minutes)
         finally:
             if viewers is not None:
                 viewers.terminate()
@@ -282,7 +285,7 @@ def measure(args):
     rclpy.try_shutdown()
     if not rows:
         return None
-    return report(ear, rows, Figures(name_of(args)), 5.0 if args.one_process else 10.0)
+    return report(monitor, rows, Figures(name_of(args)), 5.0 if args.one_process else 10.0)
 
 
 if __name__ == '__main__':

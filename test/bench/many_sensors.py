@@ -3,9 +3,9 @@
     PYTHONPATH=test python -m bench.many_sensors
 
 A simulated car passes 32 sensors, whose mounting and model errors are estimated. The track uses the
-default number of sensors, or all of them. The figures are the time of the start (aim: 2 s), the
+default number of sensors, or all sensors. The figures are the time of the start (aim: 2 s), the
 peak memory of the process (aim: 500 MB) and the mean time of a frame. Each case runs on one thread,
-in a process of its own.
+in a separate process.
 """
 
 import json
@@ -29,11 +29,11 @@ from support.samples import one, simulate  # noqa: E402
 
 N_SENSORS, SPEED = 32, 15.0
 FRAMES = 20
-"""Number of frames of the track that are measured."""
+"""Number of measured frames of the track."""
 
 
-def measured(max_sensors):
-    """Print as JSON: time [s] of the start and of a frame, and peak memory [MB]."""
+def measure_case(max_sensors):
+    """Track the car; print the times [s] of start and frame and the memory [MB] as JSON."""
     network = line_network(N_SENSORS, tilt=0.02)
     path = Path(np.array([-60.0, -1.5]), 0.0, SPEED)
     samples, *_ = simulate(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5), path, 50.0,
@@ -44,14 +44,14 @@ def measured(max_sensors):
     feed = track.feed
 
     def timed(frame):
-        was_running, begun = track.bank is not None, track.counts['tracks']
+        was_running, n_tracks = track.bank is not None, track.counts['tracks']
         start = time.perf_counter()
         out = feed(frame)
-        taken = time.perf_counter() - start
+        duration = time.perf_counter() - start
         if was_running:
-            frames.append(taken)
-        elif track.counts['tracks'] > begun:
-            starts.append(taken)
+            frames.append(duration)
+        elif track.counts['tracks'] > n_tracks:
+            starts.append(duration)
         return out
     track.feed = timed
     for sample in samples:
@@ -63,15 +63,15 @@ def measured(max_sensors):
 
 
 def main():
-    """Print the figures; exit status 1 if an aim is missed."""
+    """Print the figures; return 1 if an aim is missed."""
     if len(sys.argv) > 1:
-        measured(int(sys.argv[1]))
+        measure_case(int(sys.argv[1]))
         return 0
     figures = Figures('many_sensors')
     print(f'a car along {N_SENSORS} sensors; mounting and model error are estimated')
-    for name, most in (('those that a track uses by default', 0), ('all', N_SENSORS)):
+    for name, max_sensors in (('those that a track uses by default', 0), ('all', N_SENSORS)):
         found = json.loads(subprocess.run(
-            [sys.executable, '-m', 'bench.many_sensors', str(most)], check=True,
+            [sys.executable, '-m', 'bench.many_sensors', str(max_sensors)], check=True,
             capture_output=True, text=True).stdout)
         figures.add(f'{name}: start', found['start'], 's', 2.0)
         figures.add(f'{name}: memory of the process at most', found['memory'], 'MB', 500.0)

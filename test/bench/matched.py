@@ -1,10 +1,10 @@
-"""Error of the tracker over the path bound, for targets that match its model.
+"""Error of the tracker relative to the path bound, for targets that match its model.
 
-Truths of a point and of a row of three dipoles are drawn from a wide prior, moved with the process
-noise of the model and measured with the noise of two sensors. The tracker starts at the first
-frame. The bound is the covariance of a filter that is linearised at the truth and starts with the
-covariance of the prior. The figures are the ratio of error to bound in the last half of each run,
-which is 1 at best, and the share of failures.
+Points and rows of three dipoles are drawn from a wide prior, moved with the process noise of the
+model and measured with the noise of two sensors. The tracker starts at the first frame. The bound
+is the covariance of a filter that is linearised at the truth and starts with the covariance
+of the prior. The figures are the ratio of error to bound in the last half of each run, which is 1
+at best, and the fraction of failures.
 """
 
 import os
@@ -50,7 +50,7 @@ TARGETS = {
 
 
 def prior_of(settings, n_t):
-    """Mean and covariance of the prior: the target moves along x, from a distance of 12 m."""
+    """Mean and covariance of the prior: the target moves along x from a distance of 12 m."""
     v = settings.vehicle
     x, P = np.zeros(n_t + 6), np.zeros((n_t + 6, n_t + 6))
     assert v.induced_share == 0.0
@@ -71,23 +71,23 @@ def prior_of(settings, n_t):
 
 
 def truths(model, settings, rng):
-    """(states (n_x,), F, Q), lists over the steps, of a truth that is drawn from the prior."""
+    """Draw a truth from the prior; return its states (n_x,), F and Q as lists over the steps."""
     n_t = len(model.state_names)
     x0, P0 = prior_of(settings, n_t)
     states, F, Q = [rng.multivariate_normal(x0, P0, method='eigh')], [np.eye(n_t + 6)], []
     Q.append(np.zeros((n_t + 6, n_t + 6)))
     walk = settings.background_drift**2 * PERIOD * np.eye(6)
     for _ in range(STEPS - 1):
-        moved, F_t, Q_t = model.propagate(states[-1][None, :n_t], PERIOD)
+        propagated, F_t, Q_t = model.propagate(states[-1][None, :n_t], PERIOD)
         F.append(block_diag(F_t, np.eye(6)))
         Q.append(block_diag(Q_t[0], walk))
-        states.append(np.append(moved[0], states[-1][n_t:])
+        states.append(np.append(propagated[0], states[-1][n_t:])
                       + rng.multivariate_normal(np.zeros(n_t + 6), Q[-1], method='eigh'))
     return states, F, Q
 
 
 def one_run(target, seed):
-    """(horizontal error [m], its bound [m]) at each step."""
+    """Track one target; return (horizontal error [m], its bound [m]) at each step."""
     settings = settings_for('vehicle', TARGETS[target]).track
     model, rng = vehicle_model(settings.vehicle, NETWORK), np.random.default_rng(seed)
     n_t = len(model.state_names)
@@ -115,15 +115,15 @@ def main(n=200):
             jobs = [pool.submit(one_run, target, seed) for seed in range(n)]
             found = [j.result() for j in tqdm(jobs, desc=target, disable=None, leave=False)]
             error, bound = (np.array(a)[:, STEPS // 2:] for a in zip(*found, strict=True))
-            size = np.sqrt((error**2).mean(axis=1))
+            rms = np.sqrt((error**2).mean(axis=1))
             ratios = []
-            for share in (0.05, 0.1):
-                kept = np.argsort(size)[:round(n * (1.0 - share))]
-                ratio = np.sqrt((error[kept]**2).mean() / (bound[kept]**2).mean())
-                figures.keep(f'{target}: error over the path bound, without the worst {share:.0%}',
-                             ratio)
-                ratios.append(f'{ratio:.2f} without the worst {share:.0%}')
-            median = np.median(size / np.sqrt((bound**2).mean(axis=1)))
+            for fraction in (0.05, 0.1):
+                selected = np.argsort(rms)[:round(n * (1.0 - fraction))]
+                ratio = np.sqrt((error[selected]**2).mean() / (bound[selected]**2).mean())
+                figures.keep(
+                    f'{target}: error over the path bound, without the worst {fraction:.0%}', ratio)
+                ratios.append(f'{ratio:.2f} without the worst {fraction:.0%}')
+            median = np.median(rms / np.sqrt((bound**2).mean(axis=1)))
             figures.keep(f'{target}: error over the path bound, median of the runs', median)
             figures.keep(f'{target}: failures (> 2 m at the end)',
                          100.0 * np.mean(error[:, -1] > 2.0), '%')

@@ -1,10 +1,10 @@
-"""Batch fit of a pass: share of global optima found, and duration.
+"""Batch fit of a pass: fraction of global optima found, and duration.
 
 Random passes of rows of one, two and three dipoles are simulated at 100 Hz, along the road and with
 any heading. The optimum is found if the cost is not above the minimum at the truth (aim: 99 %). The
-time is that of the whole fit, search and covariance. It is compared, alternately, with one run of
-`scipy.optimize.least_squares` (defaults and x_scale='jac') over all unknowns of the same compiled
-model, from a plausible guess and from the best of the 432 starts of the search.
+time includes the whole fit, with search and covariance. It is compared, alternately, with one run
+of `scipy.optimize.least_squares` (defaults and x_scale='jac') over all unknowns of the same
+compiled model, from a plausible guess and from the best of the 432 starts of the search.
 """
 
 import sys
@@ -23,15 +23,16 @@ from support.passes import NOISE, ROAD, measured, random_path
 
 
 def timed(function, *args, **kwargs):
-    """(result, seconds)."""
+    """Call a function; return (result, duration [s])."""
     start = time.perf_counter()
     return function(*args, **kwargs), time.perf_counter() - start
 
 
 def one(seed, n_dipoles, road, compared=True):
-    """(optimum found, [s] of the fit, [s] of scipy from a guess, [s] of scipy from the best start).
+    """Fit one pass; return (is optimal, duration [s] of the fit, durations [s] of scipy).
 
-    The times of scipy are NaN unless `compared`.
+    scipy starts from a plausible guess and from the best start of the search. Its durations are NaN
+    unless `compared`.
     """
     rng = np.random.default_rng([seed, n_dipoles, road])
     path, moments = random_path(rng, n_dipoles, road)
@@ -40,12 +41,12 @@ def one(seed, n_dipoles, road, compared=True):
     def model_of(t, positions, M):
         return RowPass(t, positions, M, n_dipoles)
 
-    fit, took = timed(fit_pass, data, n_dipoles)
+    fit, duration = timed(fit_pass, data, n_dipoles)
     problem = separable_problem(data, model_of)
     _, truth, _, _ = refine(problem.residual_and_jacobian, path[None], 100, 1e-8)
     found = fit.cost <= truth[0] * (1.0 + 1e-6)
     if not compared:
-        return found, took, np.nan, np.nan
+        return found, duration, np.nan, np.nan
     model = RowPass(data.t, data.positions, data.whitening, n_dipoles)
     columns, y = background_columns(data, data.whitening), (data.field / NOISE).ravel()
     first = len(path)
@@ -61,11 +62,11 @@ def one(seed, n_dipoles, road, compared=True):
     for start in (guess, starts[np.argmin(problem.cost(starts))]):
         x0 = np.concatenate([start, problem.linear(start), np.zeros(columns.shape[1])])
         seconds.append(timed(least_squares, residual, x0, x_scale='jac')[1])
-    return found, took, *seconds
+    return found, duration, *seconds
 
 
 def main(n=200, n_compared=40):
-    """Print a line for each kind of pass and order."""
+    """Print a line for each kind of pass and number of dipoles."""
     print(f'{n} random passes each: global optimum found; time of the whole fit, compared with '
           f'scipy for {n_compared} of them')
     figures = Figures('pass_search')

@@ -1,10 +1,10 @@
-"""Poses without a flag and errors against the truth, in recordings and simulated controls.
+"""Poses without a flag and errors of poses, in recordings and simulated controls.
 
 All bundled recordings with one vehicle or magnet are replayed, and simulated passes are tracked
-live. The figures are the number of poses without a flag, the number of them within 2 m of the
+live. The figures are the number of poses without a flag, the number of these within 2 m of the
 truth, and the errors of the first track. With `--against FOLDER`, the package of another checkout
-is measured as well: at most 5 % of the correct poses may be lost, and errors may grow by at most 3
-%.
+is measured for comparison. At most 5 % of the correct poses may be lost, and errors may grow by at
+most 3 %.
 """
 
 import argparse
@@ -34,30 +34,30 @@ from support.situation_worlds import FOUR, car, straight, usual
 RUNS = 5
 """Number of simulated passes of each control and simulator."""
 MIN_CONFIDENCE = 0.95
-"""Minimum ratio to the number of poses without a flag of the other checkout: of the correct poses
-in each row, of all poses in the total."""
+"""Minimum ratio of the number of unflagged poses to the number with the other checkout, for correct
+poses in each row and for all poses in the total."""
 MAX_ERROR = 1.03
-"""Maximum ratio to an error of the other checkout that is not worse."""
+"""Maximum ratio of an error to the error with the other checkout."""
 SURE, RIGHT = 'no flag', f'no flag, within {WRONG_M:g} m'
 ERRORS = {'rms': 'RMS [m]', 'closest': 'closest [m]', 'anees': 'ANEES', 'position_mean': 'mean [m]',
           'axis_median_deg': 'axis [deg]'}
 
 
 def recordings(folder):
-    """{name: (recording, network file, preset)}; tables are imported to `folder`."""
+    """Return {name: (recording, network file, preset)}; import tables of readings to `folder`."""
     found = {name: (vehicle_path(name), NETWORK_FILE, 'vehicle') for name in VEHICLES}
     corridor = DATA / 'corridor'
     found['corridor'] = (corridor / 'corridor_8_sensors.mcap', corridor / 'network.yaml', 'vehicle')
     for run in (1, 2):
-        source = DATA / 'magnet_16_sensors' / f'lisa_data{run}'
-        made = import_pose_table(source.with_suffix('.csv'), f'{source}_background.csv',
+        table = DATA / 'magnet_16_sensors' / f'lisa_data{run}'
+        imported = import_pose_table(table.with_suffix('.csv'), f'{table}_background.csv',
                                  folder / f'magnet{run}', 1e-6)
-        found[f'magnet {run}'] = (*made[:2], 'magnet')
+        found[f'magnet {run}'] = (*imported[:2], 'magnet')
     return found
 
 
-def of_table(table, truth):
-    """(number of poses without a flag in a table of results, number of correct ones)."""
+def counts_of_table(table, truth):
+    """Numbers of unflagged poses and of correct unflagged poses in a table of results."""
     with open(table, newline='', encoding='utf-8') as stream:
         sure = [row for row in csv.DictReader(stream) if row['ambiguous'] == '0']
     found = np.array([[float(row['x']), float(row['y'])] for row in sure]).reshape(-1, 2)
@@ -65,13 +65,13 @@ def of_table(table, truth):
     return len(sure), int((np.linalg.norm(found - true, axis=1) <= WRONG_M).sum())
 
 
-def of_recording(recording, network, preset, folder):
-    """{figure: value} of a replay: poses without a flag, and each error of the first track."""
+def figures_of_recording(recording, network, preset, folder):
+    """Replay a recording; return the numbers of poses and the errors of the first track."""
     run = replay(Recording(recording), read_network(network), settings_for(preset), folder)
     truth = next(iter(run.truth.values()))
     found = {}
     for prefix, table in (('', 'poses.csv'), ('smoothed: ', 'poses_smoothed.csv')):
-        found[prefix + SURE], found[prefix + RIGHT] = of_table(folder / table, truth)
+        found[prefix + SURE], found[prefix + RIGHT] = counts_of_table(folder / table, truth)
     for track in run.summary['tracks'][:1]:
         for prefix, of in (('', track), ('smoothed: ', track.get('smoothed') or {})):
             found |= {prefix + text: of['truth'][error] for error, text in ERRORS.items()
@@ -79,8 +79,8 @@ def of_recording(recording, network, preset, folder):
     return found
 
 
-def of_control(name):
-    """{figure: value} of `RUNS` simulated passes by each simulator, live."""
+def figures_of_control(name):
+    """Track `RUNS` passes by each simulator live; return the numbers of poses."""
     total = {SURE: 0, RIGHT: 0}
     for s, simulator in enumerate(SIMULATORS):
         for seed in range(RUNS):
@@ -96,25 +96,25 @@ def of_control(name):
     return total
 
 
-def shown(items, what):
-    """The items, with a progress bar on a terminal."""
-    return tqdm(items, desc=what, disable=None, leave=False)
+def with_progress_bar(items, label):
+    """Iterate over the items, with a progress bar on a terminal."""
+    return tqdm(items, desc=label, disable=None, leave=False)
 
 
-def measured():
-    """{name: {figure: value}} of all recordings and controls."""
+def measure():
+    """Measure all recordings and controls; return {name: {figure: value}}."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        found = {name: of_recording(*given, folder / 'results' / name.replace(' ', '_'))
-                 for name, given in shown(recordings(folder).items(), 'recordings')}
-    found |= {f'simulated {name}': of_control(name)
-              for name in shown((*KINDS, 'car, four sensors'), 'controls')}
+        found = {name: figures_of_recording(*source, folder / 'results' / name.replace(' ', '_'))
+                 for name, source in with_progress_bar(recordings(folder).items(), 'recordings')}
+    found |= {f'simulated {name}': figures_of_control(name)
+              for name in with_progress_bar((*KINDS, 'car, four sensors'), 'controls')}
     return found | {'all': {f: sum(x.get(f, 0) for x in found.values()) for f in (SURE, RIGHT)}}
 
 
-def measured_by(checkout):
-    """`measured` with the package of another checkout."""
-    # Python looks for packages first in the folder in which `-m` is run.
+def measure_checkout(checkout):
+    """Measure all recordings and controls with the package of another checkout."""
+    # With `-m`, Python searches for packages first in the working folder.
     done = subprocess.run([sys.executable, '-m', 'bench.recordings', '--json'], check=True,
                           cwd=checkout, env=os.environ | {'PYTHONPATH': str(ROOT / 'test')},
                           stdout=subprocess.PIPE, text=True)
@@ -130,8 +130,8 @@ def is_worse(name, figure, now, before):
     return now > max(MAX_ERROR * before, 1.0 if 'ANEES' in figure else 0.0)
 
 
-def compared(name, figure, now, before):
-    """(line, whether it is worse) of a figure; `now` or `before` is None if not measured."""
+def comparison(name, figure, now, before):
+    """Return a line for a figure, and whether it is worse; None = not measured."""
     worse = before is not None and (now is None or is_worse(name, figure, now, before))
     values = [f'{"-" if now is None else f"{now:.4g}":>8s}']
     values += [] if before is None else [f'before {before:8.4g}']
@@ -139,16 +139,16 @@ def compared(name, figure, now, before):
 
 
 def main():
-    """Print the figures; return 1 if one is worse than that of the other checkout."""
+    """Print the figures; return 1 if a figure is worse than with the other checkout."""
     parser = argparse.ArgumentParser()
     parser.add_argument('--against', type=Path, metavar='FOLDER', help='checkout to compare with')
     parser.add_argument('--json', action='store_true', help='print only the figures, as JSON')
-    given = parser.parse_args()
-    if given.against and not (given.against / 'mag_tracking' / '__init__.py').is_file():
+    args = parser.parse_args()
+    if args.against and not (args.against / 'mag_tracking' / '__init__.py').is_file():
         # The installed package would be measured instead.
-        parser.error(f'{given.against} is not a checkout: it has no package mag_tracking')
-    found = measured()
-    if given.json:
+        parser.error(f'{args.against} is not a checkout: it has no package mag_tracking')
+    found = measure()
+    if args.json:
         print(json.dumps(found))
         return 0
     results = Figures('recordings')
@@ -156,13 +156,13 @@ def main():
         for figure, value in figures.items():
             results.keep(f'{name}: {figure}', value)
     results.save()
-    before = measured_by(given.against) if given.against else {}
+    before = measure_checkout(args.against) if args.against else {}
     n_worse = 0
     for name, figures in found.items():
         print(f'{name}:')
-        old = before.get(name, {})
-        for figure in figures | old:
-            text, worse = compared(name, figure, figures.get(figure), old.get(figure))
+        old_figures = before.get(name, {})
+        for figure in figures | old_figures:
+            text, worse = comparison(name, figure, figures.get(figure), old_figures.get(figure))
             print(text)
             n_worse += worse
     return 1 if n_worse else 0

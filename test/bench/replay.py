@@ -2,10 +2,10 @@
 
     PYTHONPATH=test python -m bench.replay [--minutes 60]
 
-The command `replay` processes a road of five minutes with thirty vehicles and two sensors (aim: 40
-times real time), and a quiet road with two sensors at 100 Hz (aim: 600 times). The duration of the
-frames of tracks is measured with the bundled vehicle recordings. The aims are a mean of 5 ms and a
-maximum of 15 ms.
+The command `replay` processes five minutes of a road with thirty vehicles and two sensors (aim: 40
+times real time), and a quiet road with two sensors at 100 Hz (aim: 600 times). The processing time
+of the frames of a track is measured with the bundled vehicle recordings. The aims are a mean of
+5 ms and a maximum of 15 ms.
 """
 
 import argparse
@@ -34,38 +34,38 @@ ROAD = DATA / 'two_way_road' / 'two_way_road.mcap'
 
 
 def road_network(folder):
-    """Write the network file of the road, whose sensors are farther apart; return its path."""
+    """Write the network file of the road, with a larger sensor spacing; return its path."""
     path = folder / 'network.yaml'
     path.write_text(NETWORK_FILE.read_text().replace('4.5', '5.5'))
     assert np.abs(read_network(path).positions[:, 1]).tolist() == [5.5, 5.5]
     return path
 
 
-def real_time(recording, network_file, folder):
-    """How many times faster than real time the command replays a recording, without figures."""
+def speed_of_replay(recording, network_file, folder):
+    """Speed of the command `replay` relative to real time, without figures."""
     start = time.perf_counter()
     subprocess.run([*COMMAND, 'replay', str(recording), '--network', str(network_file), '--out',
                     str(folder / 'out'), '--no-figures'], check=True, capture_output=True)
-    taken, opened = time.perf_counter() - start, Recording(recording)
-    return (opened.end_ns - opened.start_ns) / 1e9 / taken
+    duration, opened = time.perf_counter() - start, Recording(recording)
+    return (opened.end_ns - opened.start_ns) / 1e9 / duration
 
 
 def frame_times():
-    """Durations [s] of (frames of running tracks, starts of tracks), of the bundled vehicles."""
+    """Track the bundled vehicles; return the durations [s] of frames and of starts of tracks."""
     network, frames, starts = read_network(NETWORK_FILE), [], []
     for name in VEHICLES:
         pipeline = Pipeline(network, settings_for('vehicle'))
         feed = pipeline.track.feed
 
         def timed(frame, feed=feed, pipeline=pipeline):
-            was_running, begun = pipeline.track.bank is not None, pipeline.track.counts['tracks']
+            was_running, n_tracks = pipeline.track.bank is not None, pipeline.track.counts['tracks']
             start = time.perf_counter()
             out = feed(frame)
-            taken = time.perf_counter() - start
+            duration = time.perf_counter() - start
             if was_running:
-                frames.append(taken)
-            elif pipeline.track.counts['tracks'] > begun:
-                starts.append(taken)
+                frames.append(duration)
+            elif pipeline.track.counts['tracks'] > n_tracks:
+                starts.append(duration)
             return out
         pipeline.track.feed = timed
         for readings in SampleReader(Recording(vehicle_path(name)), network).readings():
@@ -75,21 +75,23 @@ def frame_times():
 
 
 def main():
-    """Print the figures; exit status 1 if an aim is missed."""
+    """Print the figures; return 1 if an aim is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--minutes', type=float, default=60.0, help='duration of the quiet road')
+    parser.add_argument('--minutes', type=float, default=60.0,
+                        help='duration of the quiet road [min]')
     args = parser.parse_args()
     figures = Figures('replay')
     print('times real time, one thread, mag-tracking replay --no-figures')
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        times = [real_time(ROAD, road_network(folder), folder) for _ in range(3)]
+        times = [speed_of_replay(ROAD, road_network(folder), folder) for _ in range(3)]
         figures.add('a road with 30 vehicles in 5 minutes', np.median(times), '', 40.0, True,
                     f'  ({min(times):.1f} .. {max(times):.1f})')
         quiet = folder / 'quiet' / 'quiet.mcap'
         write_quiet_road(quiet, read_network(NETWORK_FILE), 60.0 * args.minutes)
-        figures.add('a quiet road, two sensors at 100 Hz', real_time(quiet, NETWORK_FILE, folder),
-                    '', 600.0, True, f'  ({args.minutes:g} minutes)')
+        figures.add('a quiet road, two sensors at 100 Hz',
+                    speed_of_replay(quiet, NETWORK_FILE, folder), '', 600.0, True,
+                    f'  ({args.minutes:g} minutes)')
     frames, starts = frame_times()
     print(f'frames of tracks of two sensors ({len(frames)}), and starts of tracks ({len(starts)})')
     figures.add('a frame, mean', 1e3 * frames.mean(), 'ms', 5.0)

@@ -1,10 +1,10 @@
 """Wrong poses without a flag, in situations that no model assumes.
 
-Each situation is simulated by two simulators and tracked live, with two sensors unless stated
-otherwise. The figure is the share of poses without a flag that are more than 2 m and three standard
-deviations from every vehicle. Each situation has its aim; over all situations with one vehicle or
-none it is 0.5 %. At least 90 % of the runs with a detection but without a vehicle must yield a
-disturbance, and the disturbance model may take at most 10 % of the time of a frame.
+Each situation is simulated by two simulators and tracked live, by default with two sensors. The
+figure is the fraction of poses without a flag that are more than 2 m and three standard deviations
+from every vehicle. Each situation has an aim; the aim for all situations with
+at most one vehicle is 0.5 %. At least 90 % of the runs with a detection but without a vehicle must
+yield a disturbance. The disturbance model may use at most 10 % of the time of a frame.
 """
 
 import argparse
@@ -22,56 +22,56 @@ from support.random_passes import SIMULATORS
 from support.situations import SITUATIONS, made, verdict
 
 MIN_EVENTS = 0.9
-"""Minimum share of the runs with a detection but without a vehicle that yield a disturbance."""
+"""Minimum fraction of runs with a disturbance among runs with a detection but no vehicle."""
 MAX_COST = 0.1
-"""Maximum share of the time of a tracked frame for the disturbance model and the tests."""
+"""Maximum fraction of the time of a tracked frame for the disturbance model and the tests."""
 
 HEAD = """# Situations
 
-Simulated worlds that the tracker's model does not assume, past two sensors 9 m apart unless
-stated, live (no prescan), {n} runs of each of two simulators: clouds of magnetised points, and
-boxes of sheets with imperfect sensors. A published pose without the `ambiguous` flag is wrong if it
-is more than 2 m and three standard deviations from every vehicle. Without a vehicle every such
-pose is wrong.
+Simulated situations that the tracker's model does not assume are tracked live (no prescan), by
+default with two sensors at a distance of 9 m, in {n} runs of each of two simulators: clouds of
+magnetised points, and boxes of sheets with imperfect sensors. A published pose without the
+`ambiguous` flag is wrong if it is more than 2 m and three standard deviations from every vehicle.
+Without a vehicle, every such pose is wrong.
 
-| situation | poses | without a flag | of them wrong | smoothed, wrong | disturbances | aim |
+| situation | poses | without a flag | wrong among these | smoothed, wrong | disturbances | aim |
 |---|---|---|---|---|---|---|
 """
 
 
-def share(part, whole):
-    """A share as text."""
+def percentage(part, whole):
+    """Format a fraction as a percentage."""
     return f'{part / whole:.1%}' if whole else '-'
 
 
 def row(name, found):
-    """Table row of a situation, from its `Verdict`s."""
+    """Format the table row of a situation from its `Verdict`s."""
     sure, wrong = sum(v.n_sure for v in found), sum(v.n_wrong for v in found)
     smoothed, smoothed_wrong = (sum(getattr(v, f'smoothed_{k}') for v in found)
                                 for k in ('sure', 'wrong'))
-    with_events, detected = n_events(found)
+    with_events, detected = event_counts(found)
     aim = SITUATIONS[name].aim
     missed = ' **missed**' if sure and wrong > aim * sure else ''
     return (f'| {name} | {sum(len(v.wrong) for v in found)} | {sure} | '
-            f'{share(wrong, sure)} | {share(smoothed_wrong, smoothed)} | '
+            f'{percentage(wrong, sure)} | {percentage(smoothed_wrong, smoothed)} | '
             f'{with_events} of {detected} detected | {aim:.0%}{missed} |')
 
 
 def keep(figures, name, found):
-    """Record the share of wrong poses of a situation; return whether its aim is missed."""
+    """Record the fraction of wrong poses of a situation; return whether its aim is missed."""
     sure, wrong = sum(v.n_sure for v in found), sum(v.n_wrong for v in found)
     n = sum(len(v.wrong) for v in found)
     return figures.keep(f'{name}: wrong', 100.0 * wrong / max(sure, 1), '%',
                         100.0 * SITUATIONS[name].aim, note=f'{wrong} of {sure}; {n} poses in all')
 
 
-def n_events(found):
-    """(runs with a disturbance, runs with a detection) of `Verdict`s."""
+def event_counts(found):
+    """Numbers of runs with a disturbance and of runs with a detection."""
     return sum(v.n_disturbances > 0 for v in found), sum(v.n_tracks > 0 for v in found)
 
 
 def cost():
-    """Share of the time of a tracked frame for the disturbance model and the tests."""
+    """Fraction of the time of a tracked frame for the disturbance model and the tests."""
     spent = {'_update_evidence': 0.0, '_doubts': 0.0, 'step': 0.0}
     owner = {'_update_evidence': RunningTrack, '_doubts': Member, 'step': RunningTrack}
 
@@ -104,48 +104,48 @@ def cost():
 def main():
     """Print a row for each situation; return 1 if an aim is missed."""
     parser = argparse.ArgumentParser()
-    parser.add_argument('--runs', type=int, default=5, help='runs per simulator')
+    parser.add_argument('--runs', type=int, default=5, help='number of runs per simulator')
     parser.add_argument('--only', nargs='+', default=list(SITUATIONS), choices=list(SITUATIONS),
                         metavar='SITUATION')
-    given = parser.parse_args()
-    figures, everything, missed = Figures('situations'), [], []
+    args = parser.parse_args()
+    figures, verdicts, missed = Figures('situations'), [], []
 
     def summary(name, found):
-        everything.extend(found)
+        verdicts.extend(found)
         missed.append(keep(figures, name, found))
         return row(name, found), not missed[-1]
 
-    print(HEAD.format(n=given.runs), end='')
-    status = count_over([(name,) for name in given.only], both_simulators, 2 * given.runs, summary)
+    print(HEAD.format(n=args.runs), end='')
+    status = count_over([(name,) for name in args.only], both_simulators, 2 * args.runs, summary)
     print(summary_of(figures,
-                     list(zip(np.repeat(given.only, 2 * given.runs), everything, strict=True))))
-    if given.only == list(SITUATIONS):
+                     list(zip(np.repeat(args.only, 2 * args.runs), verdicts, strict=True))))
+    if args.only == list(SITUATIONS):
         figures.save()
     return status
 
 
 def summary_of(figures, found):
-    """The text below the table, of [(situation, `Verdict`)]."""
+    """Record the totals of [(situation, `Verdict`)]; return the paragraph below the table."""
     one = [v for name, v in found if SITUATIONS[name].group != 'several']
     nothing = [v for name, v in found if SITUATIONS[name].group == 'nothing']
     sure, wrong = sum(v.n_sure for v in one), sum(v.n_wrong for v in one)
-    events, detected = n_events(nothing)
+    events, detected = event_counts(nothing)
     figures.keep('all with one vehicle or none: wrong', 100.0 * wrong / max(sure, 1), '%', 0.5,
                  note=f'{wrong} of {sure}')
     figures.keep('without a vehicle: runs with a disturbance', events / max(detected, 1), '',
                  MIN_EVENTS, True, note=f'{events} of {detected}')
-    share_of_frame = cost()
-    figures.keep('disturbance model and tests, share of a frame', 100.0 * share_of_frame, '%',
+    frame_fraction = cost()
+    figures.keep('disturbance model and tests, share of a frame', 100.0 * frame_fraction, '%',
                  100.0 * MAX_COST)
     return (f'\nWithout a vehicle, {events} of {detected} runs with a detection yield a '
-            f'disturbance (aim {MIN_EVENTS:.0%}). All situations with one vehicle or none: '
-            f'{share(wrong, sure)} of {sure} poses without a flag are wrong (aim 0.5 %). '
-            f'The disturbance model and the tests take {share_of_frame:.1%} of a tracked frame '
+            f'disturbance (aim {MIN_EVENTS:.0%}). All situations with at most one vehicle: '
+            f'{percentage(wrong, sure)} of {sure} poses without a flag are wrong (aim 0.5 %). '
+            f'The disturbance model and the tests use {frame_fraction:.1%} of a tracked frame '
             f'(aim at most {MAX_COST:.0%}).\n')
 
 
 def both_simulators(name, run):
-    """`Verdict` of a situation; runs alternate between the simulators."""
+    """Return the `Verdict` of a run; even and odd runs use different simulators."""
     return verdict(name, SIMULATORS[run % 2], run // 2)
 
 

@@ -1,9 +1,9 @@
 """Random passes with each fault of a poor sensor.
 
-Passes of two simulators are spoilt by one fault at a time and tracked live with two sensors at 100
-Hz, without a prescan. The figures are the share of tracked passes, and the share of poses that are
-wrong although they have no flag (sure and wrong). The aim is at most 1 % of such poses. A flagged
-or missing track is not an error.
+Each pass is simulated by one of two simulators, modified by one fault and tracked live with two
+sensors at 100 Hz, without a prescan. The figures are the fraction of tracked passes, and the
+fraction of unflagged poses that are wrong (sure and wrong). The aim is at most 1 % of such poses. A
+flagged or missing track is not an error.
 """
 
 import argparse
@@ -11,7 +11,7 @@ import sys
 from functools import partial
 
 from bench.figures import Figures
-from bench.two_simulators import MAX_WRONG, count_over, share_of_wrong
+from bench.two_simulators import MAX_WRONG, count_over, fraction_of_wrong
 from support import spoiler
 from support.dense_traffic import dense_traffic
 from support.random_passes import KINDS, SIMULATORS, one_random_pass
@@ -39,7 +39,7 @@ FAULTS = {
 
 
 def spoil_with(what):
-    """[function of `Readings`] that applies the fault `what` of `FAULTS`."""
+    """List of functions that apply a fault of `FAULTS` to `Readings`; empty for `none`."""
     if not FAULTS[what]:
         return []
     fault, *arguments = FAULTS[what]
@@ -47,36 +47,36 @@ def spoil_with(what):
 
 
 def spoilt_pass(what, simulator, kind, seed):
-    """`Tracked` of a random pass with the fault `what` of `FAULTS`."""
+    """Track a random pass with a fault of `FAULTS`; return its `Tracked`."""
     return one_random_pass(simulator, kind, seed, faults=spoil_with(what))
 
 
 def summary(figures, what, simulator, kind, found):
-    """(line, whether the aim is met) of the `Tracked` of one combination."""
-    n_sure, share = share_of_wrong(found)
+    """Record the figures of one combination; return a line and whether the aim is met."""
+    n_sure, rate = fraction_of_wrong(found)
     n_tracked = sum(len(f.error) > 0 for f in found)
-    right = sum(bool(f.heading > HEADING) for f in found)
-    met = not figures.keep(f'{what}; {simulator}, {kind}: sure and wrong', 100.0 * share, '%',
+    n_tracked_right = sum(bool(f.heading > HEADING) for f in found)
+    met = not figures.keep(f'{what}; {simulator}, {kind}: sure and wrong', 100.0 * rate, '%',
                            100.0 * MAX_WRONG, note=f'of {n_sure} poses')
     figures.keep(f'{what}; {simulator}, {kind}: tracked', n_tracked / len(found), '', None, True)
     return (f'  {what:27s} {simulator}, {kind}: {sum(f.detected for f in found):2d} of '
-            f'{len(found)} detected, {n_tracked:2d} tracked, {right:2d} in the right direction; '
-            f'{sum((~f.ambiguous).any() for f in found):2d} with unflagged poses, sure and wrong '
-            f'{share:5.1%} in {sum(f.sure_and_wrong.any() for f in found)} passes'
+            f'{len(found)} detected, {n_tracked:2d} tracked, {n_tracked_right:2d} in the right '
+            f'direction; {sum((~f.ambiguous).any() for f in found):2d} with unflagged poses, '
+            f'sure and wrong {rate:5.1%} in {sum(f.sure_and_wrong.any() for f in found)} passes'
             f'{"" if met else "  MISSED"}', met)
 
 
 def main():
-    """Print a line for each combination; return 1 if more than 1 % are sure and wrong."""
+    """Print a line for each combination; return 1 if an aim is missed."""
     parser = argparse.ArgumentParser()
     parser.add_argument('--passes', type=int, default=8)
     parser.add_argument('--kinds', nargs='+', choices=KINDS, default=['car'])
-    given = parser.parse_args()
-    print(f'{given.passes} random passes of each combination, two sensors, 100 Hz; the aim is at '
+    args = parser.parse_args()
+    print(f'{args.passes} random passes of each combination, two sensors, 100 Hz; the aim is at '
           f'most {MAX_WRONG:.0%} sure and wrong')
     figures = Figures('spoilt_passes')
-    status = count_over([(w, s, k) for w in FAULTS for s in SIMULATORS for k in given.kinds],
-                        spoilt_pass, given.passes, partial(summary, figures))
+    status = count_over([(w, s, k) for w in FAULTS for s in SIMULATORS for k in args.kinds],
+                        spoilt_pass, args.passes, partial(summary, figures))
     figures.save()
     return status
 

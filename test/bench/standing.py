@@ -1,9 +1,9 @@
-"""Vehicles that stop, and vehicles that stand at a sensor when the nodes start.
+"""Vehicles that stop, and vehicles that are parked at a sensor when the nodes start.
 
-Stops of 5, 20 and 60 s and departures of a vehicle that is present at the start are simulated. The
-figures are the share of runs in which one track continues after the stop (aim: 90 %), the share in
-which the backgrounds are correct within 3 s after the departure (aim: all), and the results for the
-first vehicle afterwards, offline (aims: all tracked, no wrong pose without a flag).
+Stops of 5, 20 and 60 s are simulated, and departures of a vehicle that is present at the start. The
+figures are the fraction of runs in which one track continues after the stop (aim: 90 %), the
+fraction of runs in which the backgrounds are correct within 3 s after the departure (aim: all), and
+the results for the next vehicle, offline (aims: all tracked, no wrong pose without a flag).
 """
 
 import argparse
@@ -20,14 +20,14 @@ RUNS = 20
 
 
 def one(what, run):
-    """Result of one run of a case, by `support.standing`."""
+    """Run one case; return the result of its function in `support.standing`."""
     if what == 'stops':
         return goes_on(STOPS[run % len(STOPS)], run // len(STOPS))
     return right_after(run) if what == 'leaves' else first_after(run)
 
 
 def summary(figures, what, found):
-    """(line, whether the aim is met) of one case."""
+    """Record the figures of one case; return a line and whether the aim is met."""
     n = len(found)
     if what == 'stops':
         figures.keep('stopped for 5, 20 and 60 s: runs with one track', sum(found) / n, '', 0.9,
@@ -35,12 +35,12 @@ def summary(figures, what, found):
         return (f'stopped for 5, 20 and 60 s: in {sum(found)} of {n} runs the same track continues '
                 'and departs (aim 90 %)', sum(found) >= 0.9 * n)
     if what == 'leaves':
-        soon = sum(s <= SOON_S for s in found)
-        figures.keep(f'stood at the start: background right within {SOON_S:g} s', soon / n, '', 1.0,
-                     True, note=f'{n} runs')
-        return (f'present at the start: in {soon} of {n} runs the background is correct within '
+        n_soon = sum(s <= SOON_S for s in found)
+        figures.keep(f'stood at the start: background right within {SOON_S:g} s', n_soon / n, '',
+                     1.0, True, note=f'{n} runs')
+        return (f'present at the start: in {n_soon} of {n} runs the background is correct within '
                 f'{SOON_S:g} s after the departure, median {np.median(found):.1f} s '
-                '(aim all)', soon == n)
+                '(aim all)', n_soon == n)
     tracked = sum(error < TRACKED_M for error, *_ in found)
     sure, wrong = (sum(f[k] for f in found) for k in (1, 2))
     figures.keep('first vehicle afterwards, offline: tracked', tracked / n, '', 1.0, True,
@@ -56,9 +56,9 @@ def main():
     """Print a line for each case; return 1 if an aim is missed."""
     parser = argparse.ArgumentParser()
     parser.add_argument('--runs', type=int, default=RUNS)
-    given = parser.parse_args()
+    args = parser.parse_args()
     figures = Figures('standing')
-    status = count_over([('stops',), ('leaves',), ('first',)], one, given.runs,
+    status = count_over([('stops',), ('leaves',), ('first',)], one, args.runs,
                         partial(summary, figures))
     figures.save()
     return status

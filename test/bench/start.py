@@ -1,4 +1,4 @@
-"""Duration of commands, and time to the first pose.
+"""Duration of commands, and time from the start of a process to its first pose.
 
     PYTHONPATH=test python -m bench.start
 
@@ -41,20 +41,20 @@ for readings in SampleReader(Recording(sys.argv[3]), network).readings():
 '''
 
 
-def seconds_of(*words, rounds=7):
-    """Median duration [s] of a command."""
+def seconds_of(*arguments, rounds=7):
+    """Run a command several times; return the median duration [s]."""
     times = []
     for _ in range(rounds):
         start = time.perf_counter()
-        subprocess.run([*COMMAND, *words], check=True, capture_output=True)
+        subprocess.run([*COMMAND, *arguments], check=True, capture_output=True)
         times.append(time.perf_counter() - start)
     return float(np.median(times))
 
 
 def first_pose(cache=None):
-    """Time [s] from the start of a process to its first pose.
+    """Start a process; return the time [s] until its first pose.
 
-    With an empty folder for `cache`, Python compiles all imported modules.
+    If `cache` is an empty folder, Python compiles all imported modules.
     """
     environment = {k: v for k, v in os.environ.items() if k != 'PYTHONDONTWRITEBYTECODE'}
     if cache is not None:
@@ -67,7 +67,7 @@ def first_pose(cache=None):
 
 
 def first_pose_times(rounds):
-    """(cold, warm) lists of times [s] to the first pose, measured alternately."""
+    """Measure the times [s] to the first pose, with cold and warm cache; return both lists."""
     first_pose()
     cold, warm = [], []
     for _ in tqdm(range(rounds), desc='first pose', disable=None):
@@ -79,7 +79,7 @@ def first_pose_times(rounds):
 
 
 def main():
-    """Print the figures; exit status 1 if an aim is missed."""
+    """Print the figures; return 1 if an aim is missed."""
     figures = Figures('start')
     print('from the start of a process')
     figures.add('mag-tracking --help', seconds_of('--help'), 's', 0.3)

@@ -1,10 +1,9 @@
-"""Random trucks, cars and turning cars of two simulators of different structure.
+"""Random trucks, cars and turning cars from two simulators of different structure.
 
-Passes of each kind of each simulator are tracked with two sensors at 100 Hz. The figures are the
-share of poses that are wrong although they have no flag (sure and wrong), filtered and smoothed,
-the normalised errors and the errors of the speed. The aims are at most 1 % of such poses, a mean
-NEES per axis within 5 m of at most 5 for trucks and 2.5 for cars, and 90 % of the speeds within 10
-%.
+Passes of each kind from each simulator are tracked with two sensors at 100 Hz. The figures are the
+fraction of unflagged poses that are wrong (sure and wrong), filtered and smoothed, the normalised
+errors and the errors of the speed. The aims are at most 1 % of such poses, a mean NEES per axis
+within 5 m of at most 5 for trucks and 2.5 for cars, and 90 % of the speeds within 10 %.
 """
 
 import argparse
@@ -23,41 +22,41 @@ MAX_NEES = {'truck': 5.0, 'car': 2.5, 'turning': 2.5}
 MAX_WRONG, MIN_SPEED = 0.01, 0.9
 
 
-def share_of_wrong(found):
-    """(number of unflagged poses, share of wrong ones) of [`Tracked`]."""
+def fraction_of_wrong(found):
+    """Number of unflagged poses of [`Tracked`], and fraction of wrong poses among them."""
     n_sure = sum(int((~f.ambiguous).sum()) for f in found)
     return n_sure, sum(int(f.sure_and_wrong.sum()) for f in found) / max(n_sure, 1)
 
 
 def count_over(products, one_pass, n, summary):
-    """Print the `summary` of `n` passes per product (str, ...); return 1 if an aim is missed."""
+    """Run `n` passes per product (str, ...), and print summaries; return 1 if an aim is missed."""
     met = True
     with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
         jobs = {p: [pool.submit(one_pass, *p, seed) for seed in range(n)] for p in products}
-        for product, some in jobs.items():
-            found = [job.result() for job in tqdm(some, desc=', '.join(product), disable=None,
+        for product, passes in jobs.items():
+            found = [job.result() for job in tqdm(passes, desc=', '.join(product), disable=None,
                                                   leave=False)]
-            line, good = summary(*product, found)
+            line, is_met = summary(*product, found)
             print(line, flush=True)
-            met &= good
+            met &= is_met
     return 0 if met else 1
 
 
 def summary(figures, simulator, kind, found):
-    """(line, whether the aims are met) of the `Tracked` of one kind of one simulator."""
+    """Record the figures of one kind and simulator; return a line and whether the aims are met."""
     sure = [f for f in found if (~f.ambiguous).any()]
     near = [~f.ambiguous & (f.distance < 5.0) for f in sure]
     nees = np.array([f.nees[rows].mean() for f, rows in zip(sure, near, strict=True)
                      if rows.any()])
     closest = [f.error[np.argmin(f.distance)] for f in sure]
-    fast = np.array([f.speed_ratio for f in found])
-    within = np.mean(np.abs(fast - 1.0) < 0.1)
-    n_sure, share = share_of_wrong(sure)
+    speed_ratio = np.array([f.speed_ratio for f in found])
+    within = np.mean(np.abs(speed_ratio - 1.0) < 0.1)
+    n_sure, rate = fraction_of_wrong(sure)
     n_smoothed = sum(f.smoothed_sure for f in found)
     smoothed = sum(f.smoothed_wrong for f in found) / max(n_smoothed, 1)
     name = f'{simulator}, {kind}'
     missed = [
-        figures.keep(f'{name}: sure and wrong', 100.0 * share, '%', 100.0 * MAX_WRONG,
+        figures.keep(f'{name}: sure and wrong', 100.0 * rate, '%', 100.0 * MAX_WRONG,
                      note=f'of {n_sure} poses'),
         figures.keep(f'{name}: NEES per axis within 5 m, mean', nees.mean(), '', MAX_NEES[kind]),
         figures.keep(f'{name}: speed within 10 %', 100.0 * within, '%', 100.0 * MIN_SPEED, True)]
@@ -66,7 +65,7 @@ def summary(figures, simulator, kind, found):
                  note=f'of {n_smoothed} poses')
     met = not any(missed)
     return (f'  {simulator}, {kind}: {len(sure)} of {len(found)} with unflagged '
-            f'poses; {n_sure} such poses, sure and wrong {share:.1%} (aim 1 %), in '
+            f'poses; {n_sure} such poses, sure and wrong {rate:.1%} (aim 1 %), in '
             f'{sum(f.sure_and_wrong.any() for f in sure)} passes; within 5 m NEES per axis mean '
             f'{nees.mean():.1f} (aim {MAX_NEES[kind]:.1f}), median {np.median(nees):.1f}; speed '
             f'within 10 % in {within:.0%} (aim 90 %); at the closest point median '

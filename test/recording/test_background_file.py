@@ -1,4 +1,4 @@
-"""Stored backgrounds: resumption after a restart of the calibration, and their file."""
+"""Stored backgrounds: their file, and their use after a restart of the calibration."""
 
 import json
 import os
@@ -28,7 +28,7 @@ STEP = np.array([0.0, 4e-7, 0.0])
 
 
 def readings(begin_s, seconds, seed, step=0.0):
-    """Samples of mag_1."""
+    """Simulated samples of mag_1, with the Earth's field plus `step`."""
     rng = np.random.default_rng(seed)
     return [MagSample(int((begin_s + k / RATE) * NS), 'mag_1',
                       EARTH + step + STD * rng.standard_normal(3))
@@ -36,13 +36,13 @@ def readings(begin_s, seconds, seed, step=0.0):
 
 
 def network_without_backgrounds(n=2):
-    """A network without backgrounds."""
+    """Network in which backgrounds and noise levels are unknown."""
     network = line_network(n, tilt=0.0)
     return replace(network, background=(None,) * n, noise_std=(None,) * n)
 
 
 def learnt_stage():
-    """(network, `Calibrate` stage that has learnt the background of mag_1 for 10 s)."""
+    """Return a network, and a `Calibrate` stage after it has learnt mag_1 for 10 s."""
     network = network_without_backgrounds()
     assert network.names[0] == 'mag_1'
     stage = Calibrate(network, CalibrateSettings())
@@ -52,7 +52,7 @@ def learnt_stage():
 
 
 def write_and_read_back(path):
-    """Write the background of mag_1 to `path`; return (network, backgrounds read back)."""
+    """Write the background of mag_1 to `path`, and read it; return network and backgrounds."""
     network, stage = learnt_stage()
     write_backgrounds(path, {'mag_1': background_text(
         stage.stored('mag_1'), network, 0, SETTINGS)})
@@ -74,7 +74,7 @@ def test_a_stored_background_is_read_back_unchanged(tmp_path):
 
 
 def test_the_first_reading_after_a_restart_is_calibrated(tmp_path):
-    """A target that is present by then must not become the background."""
+    """A target that has arrived during the restart must not become part of the background."""
     network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings())
     stage.resume(stored)
@@ -87,7 +87,7 @@ def test_the_first_reading_after_a_restart_is_calibrated(tmp_path):
     for s in readings(1020.0, 10.0, 2):
         out += fed(stage, s)
     assert not stage.backgrounds()['mag_1'].frozen
-    # The end of a line through 10 s is known to 2 nT.
+    # The end of a line fitted to 10 s of readings has a standard deviation of 2 nT.
     np.testing.assert_allclose(stage.background('mag_1'), EARTH, atol=6e-9)
 
 
@@ -126,7 +126,7 @@ def test_a_changed_calibration_discards_stored_backgrounds(tmp_path, change):
 
 
 def test_a_sensor_moved_before_the_restart_is_relearnt_soon(tmp_path):
-    """This applies even if steady changes are otherwise never relearnt."""
+    """This applies even with `relearn_s` = 0, which disables the relearning of steady changes."""
     network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
     stage.resume(stored)
@@ -134,13 +134,13 @@ def test_a_sensor_moved_before_the_restart_is_relearnt_soon(tmp_path):
     late = np.array([c.field for c in out if c.stamp_ns > 1052 * NS])
     assert np.abs(late.mean(axis=0)).max() < 6e-9
     assert stage.backgrounds()['mag_1'].n_relearnt == 1
-    # A later steady change is a target, without a time limit.
+    # A later steady change is treated as a target, without a time limit.
     out = [c for s in readings(1060.0, 60.0, 2, 26.0 * STEP) for c in fed(stage, s)]
     np.testing.assert_allclose(np.mean([c.field for c in out], axis=0), STEP, atol=1e-8)
 
 
 def test_a_confirmed_background_is_not_relearnt_sooner(tmp_path):
-    """A target that arrives later and stays does not become the background sooner."""
+    """A target that arrives later and stays must not become the background sooner than usual."""
     network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
     stage.resume(stored)
@@ -183,9 +183,10 @@ def test_an_invalid_file_is_refused(tmp_path, change, message):
 
 
 @pytest.mark.parametrize('key, value, reason', [
-    ('background', [1.0, 2.0], 'ValueError: invalid background'),
+    ('background', [1.0, 2.0], 'not valid: invalid background'),
     ('covariance', [[0.0] * 3] * 3, 'not positive definite'), ('stamp_ns', None, 'at None'),
-    ('made_of', None, 'another network file')])
+    ('made_of', None, 'another network file'), ('covariance', ..., 'entry has no covariance'),
+    ('background', {}, 'the stored entry is not valid')])
 def test_an_invalid_entry_affects_no_other(tmp_path, key, value, reason):
     path = tmp_path / 'kept.json'
     network, stage = learnt_stage()
@@ -195,6 +196,8 @@ def test_an_invalid_entry_affects_no_other(tmp_path, key, value, reason):
                              for j, name in enumerate(network.names)})
     content = json.loads(path.read_text())
     content['sensors']['mag_1'][key] = value
+    if value is ...:
+        del content['sensors']['mag_1'][key]
     path.write_text(json.dumps(content))
     stored, refused = read_backgrounds(path, network, SETTINGS)
     assert list(stored) == ['mag_2'] and list(refused) == ['mag_1'] and reason in refused['mag_1']

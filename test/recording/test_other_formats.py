@@ -1,4 +1,4 @@
-"""SQLite and ROS 1 bags, JSON and protobuf messages, and tables: same results as with MCAP."""
+"""SQLite and ROS 1 bags, JSON and protobuf messages and tables give the same results as MCAP."""
 
 import json
 
@@ -87,12 +87,12 @@ def test_a_bag_gives_the_same_result_as_the_mcap_file(kind, source, expected, tm
 
 
 @pytest.mark.parametrize('kind', ['db3', 'bag'])
-@pytest.mark.parametrize('share', [0.0, 0.1, 0.5, 0.9])
-def test_a_truncated_bag_is_refused_or_read_up_to_its_end(kind, share, source, tmp_path):
+@pytest.mark.parametrize('fraction', [0.0, 0.1, 0.5, 0.9])
+def test_a_truncated_bag_is_refused_or_read_up_to_its_end(kind, fraction, source, tmp_path):
     path = write_ros1_bag(source, tmp_path / 'one.bag') if kind == 'bag' \
         else write_sqlite_bag(source, tmp_path / 'two') / 'two.db3'
     data = bytearray(path.read_bytes())
-    path.write_bytes(data[:int(share * len(data))])
+    path.write_bytes(data[:int(fraction * len(data))])
     try:
         recording = Recording(path)
         n = sum(1 for _ in recording.messages())
@@ -119,7 +119,7 @@ def test_flipped_bytes_in_a_bag_do_not_crash_the_reader(kind, seed, source, tmp_
 
 
 def write_mcap(path, encoding, schema, messages):
-    """Write an MCAP file with messages (topic, time, bytes)."""
+    """Write an MCAP file with the given messages [(topic, time [ns], bytes)]."""
     with open(path, 'wb') as stream:
         writer = Writer(stream)
         writer.start()
@@ -135,7 +135,7 @@ def write_mcap(path, encoding, schema, messages):
 
 
 def fields_of(source):
-    """[(topic, time [ns], field (3,))] of a recording."""
+    """Read the [(topic, time [ns], field (3,))] of a recording."""
     read = mt.read_recording(source.path, NETWORK_FILE).readings
     return [(f'/{name}/imu/mag', stamp, field) for name, stamp, field in zip(
         read.sensor_names(), read.stamp_ns.tolist(), read.field, strict=True)]
@@ -187,7 +187,7 @@ def test_invalid_json_messages_are_rejected(change, cause, tmp_path):
 
 
 def protobuf_class():
-    """(class of a message with timestamp and magnetic_field, its serialised descriptors)."""
+    """Create a message class with timestamp and magnetic_field; return class and descriptors."""
     double, whole, message = (FieldDescriptorProto.TYPE_DOUBLE, FieldDescriptorProto.TYPE_INT64,
                               FieldDescriptorProto.TYPE_MESSAGE)
     file = FileDescriptorProto(name='m.proto', package='lab', syntax='proto3')
@@ -234,7 +234,7 @@ def test_a_table_of_readings_becomes_a_recording(source, expected, tmp_path, cap
     np.testing.assert_allclose(result.poses['position'], expected.poses['position'], rtol=1e-6)
 
 
-def test_a_row_may_hold_several_sensors(tmp_path):
+def test_a_row_may_contain_several_sensors(tmp_path):
     table = tmp_path / 'wide.csv'
     table.write_text('ms,a,b,c\n1,0.5,,2\n2,,,\n3,1.5,0.25,-2\n')
     recording, counts = import_field_table(
@@ -251,7 +251,7 @@ def test_a_row_may_hold_several_sensors(tmp_path):
     (['time=t', 'a.x=x'], 'T', 't,x\n1,b\n', "row 2: x: expected a number, got 'b'"),
     (['time=t', 'a.x=x'], 'T', 't,x\n1,inf\n', 'row 2: x is infinite'),
     (['time=t', 'a.x=x'], 'T', 't,x\n-1,2\n', 'row 2: t: -1 is not a time'),
-    (['time=t', 'a.x=x'], 'T', 't,x\n,2\n', 'row 2: t: an empty field is not a time'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n,2\n', 'row 2: t: an empty cell is not a time'),
     (['time=t', 'a.x=x'], 'T', 't,x\n1\n', 'row 2 has too few columns'),
     (['time=t', 'a.x=x'], 'T', 't,x\n0,1,5\n', 'row 2 has too many columns'),
     (['time=t', 'a.x=x'], 'T', 't,x\n--5,1\n', "row 2: t: expected a number, got '--5'"),
@@ -264,7 +264,7 @@ def test_a_row_may_hold_several_sensors(tmp_path):
     (['time=t', 'x=x'], 'T', 't,x\n1,2\n', "got 'x'"),
     (['time=t', 'sensor=s', 'a.x=x'], 'T', 't,x\n1,2\n', "got 'a.x'"),
     (['a.x=x'], 'T', 't,x\n1,2\n', 'time and at least one axis'),
-    (['time=t', 'time=u', 'a.x=x'], 'T', 't,x\n1,2\n', 'is given twice'),
+    (['time=t', 'time=u', 'a.x=x'], 'T', 't,x\n1,2\n', 'repeats a key'),
     (['time'], 'T', 't,x\n1,2\n', 'expected KEY=COLUMN such as time=t')])
 def test_an_invalid_table_is_refused(columns, unit, text, message, tmp_path):
     table = tmp_path / 'a.csv'

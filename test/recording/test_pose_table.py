@@ -10,7 +10,7 @@ from support.real_board import board_of_41
 
 @pytest.fixture(scope='module')
 def recorded():
-    """(network, field, positions, axes) of the board with 41 sensors."""
+    """Network, fields, magnet positions and magnet axes of the board with 41 sensors."""
     return board_of_41()
 
 

@@ -1,6 +1,7 @@
-"""Recordings: readable by other software, and read in spite of damage."""
+"""Recordings are readable by other software, and are read in spite of damage."""
 
 import io
+import re
 import tracemalloc
 
 import numpy as np
@@ -40,7 +41,7 @@ def write(path, n, topics=2, step_ms=10):
 
 
 def read(path, network=None):
-    """(messages, recording)."""
+    """Read a recording; return its messages and the `Recording`."""
     recording = Recording(path)
     return list(recording.messages()), recording
 
@@ -91,7 +92,7 @@ def test_rosbags_reads_poses_and_tracks(vehicle_replays):
 
 
 def declarations(text):
-    """Declarations of a definition without comments and spacing."""
+    """Declarations of a message definition, without comments and with single spaces."""
     lines = (line.split('#')[0].split() for line in text.splitlines())
     return [' '.join(line) for line in lines if line]
 
@@ -108,7 +109,7 @@ def test_definitions_match_ros_jazzy():
     for name, text in DEFINITIONS.items():
         if not name.startswith('mag_tracking_msgs/'):
             ours = get_types_from_msg(text, name)[name]
-            # The names of the fields and their order are compared.
+            # Only the names and the order of the fields are compared.
             theirs = store.fielddefs[name]
             assert [f[0] for f in ours[1]] == [f[0] for f in theirs[1]], name
 
@@ -133,8 +134,12 @@ def test_a_truncated_file_is_read_up_to_its_end(tmp_path):
     path.write_bytes(whole[:int(0.6 * len(whole))])
     messages, recording = read(path)
     assert 0.3 * 30_000 < len(messages) < 0.65 * 30_000
-    assert any('has no valid index (truncated?)' in k for k in recording.losses)
-    assert any('unreadable after byte' in k for k in recording.losses)
+    no_index, partially_read = sorted(recording.losses)
+    assert no_index == 'files without a valid index (cut.mcap, possibly truncated)'
+    match = re.fullmatch(r'partially read files \(cut.mcap, up to byte ([0-9]+) of ([0-9]+)\)',
+                         partially_read)
+    end, size = map(int, match.groups())
+    assert 0.5 * size < end < size == path.stat().st_size
     assert [m.log_time_ns for m in messages] == sorted(m.log_time_ns for m in messages)
 
 
@@ -149,7 +154,34 @@ def test_flipped_bytes_cost_only_their_chunk_and_are_reported(tmp_path):
     path.write_bytes(data)
     messages, recording = read(path)
     assert 0.5 * 30_000 < len(messages) < 30_000
-    assert any('damaged segment' in k for k in recording.losses)
+    ((loss, n),) = recording.losses.items()
+    assert n == 1 and re.fullmatch(
+        r'damaged segments \(a.mcap, [0-9.]+ s long, [0-9.]+ s after the start\)', loss)
+
+
+@pytest.mark.parametrize('has_index', [True, False])
+def test_a_loss_is_counted_once_if_a_recording_is_read_repeatedly(tmp_path, has_index):
+    path = tmp_path / 'a.mcap'
+    write(path, 15_000)
+    data = bytearray(path.read_bytes())
+    for chunk in make_reader(io.BytesIO(data)).get_summary().chunk_indexes[1:3]:
+        data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+    path.write_bytes(data if has_index else data[:-100])
+    recording = Recording(path)
+    for _ in range(2):
+        assert sum(1 for _ in recording.messages()) < 30_000
+        n_damaged = {loss.partition(' (')[0]: n for loss, n in recording.losses.items()}
+        assert sum(n for loss, n in recording.losses.items() if loss.startswith('damaged')) == 2
+        assert has_index or n_damaged['damaged chunks'] == 2
+
+
+def test_a_file_that_ends_after_a_complete_record_lacks_only_its_index(tmp_path):
+    write(tmp_path / 'a.mcap', 15_000)
+    data = (tmp_path / 'a.mcap').read_bytes()
+    chunk = make_reader(io.BytesIO(data)).get_summary().chunk_indexes[1]
+    (tmp_path / 'cut.mcap').write_bytes(data[:chunk.chunk_start_offset + chunk.chunk_length])
+    _, recording = read(tmp_path / 'cut.mcap')
+    assert recording.losses == {'files without a valid index (cut.mcap, possibly truncated)': 1}
 
 
 @pytest.mark.parametrize('seed', range(12))
@@ -185,7 +217,7 @@ def test_reader_memory_does_not_grow_with_the_recording(tmp_path):
 
 
 def test_overlapping_chunks_are_read_in_order(tmp_path):
-    """The file is written topic by topic, so all chunks of the second topic lie in the past."""
+    """The file is written topic by topic, so the second topic begins again at the start time."""
     path = tmp_path / 'a.mcap'
     with RecordingWriter(path) as writer:
         for j in range(2):
@@ -219,9 +251,10 @@ def test_unusable_recordings_are_refused(tmp_path, road_network):
                           (folder, 'contains no recording')):
         with pytest.raises(RecordingError, match=message):
             Recording(path)
-    (folder / 'metadata.yaml').write_text('a: 1')
-    with pytest.raises(RecordingError, match='not rosbag2 metadata'):
-        Recording(folder)
+    for text in ('a: 1', 'rosbag2_bagfile_information: 3'):
+        (folder / 'metadata.yaml').write_text(text)
+        with pytest.raises(RecordingError, match='metadata: relative_file_paths is missing'):
+            Recording(folder)
 
 
 def test_the_error_for_missing_topics_lists_the_recorded_ones(tmp_path, road_network):
@@ -241,7 +274,7 @@ def test_a_topic_of_another_type_is_refused(tmp_path, road_network):
         SampleReader(Recording(path), road_network)
 
 
-def test_a_recording_without_messages_gives_no_samples(tmp_path, road_network):
+def test_a_recording_without_messages_has_no_samples(tmp_path, road_network):
     path = tmp_path / 'a.mcap'
     with RecordingWriter(path):
         pass
@@ -267,7 +300,7 @@ def write_raw(path, log_times, use_chunking=True):
 
 
 @pytest.mark.parametrize('use_chunking', [True, False])
-def test_log_times_beyond_63_bits_are_limited_without_loss(tmp_path, use_chunking):
+def test_log_times_beyond_63_bits_are_clipped_without_loss(tmp_path, use_chunking):
     """MCAP stores log times as unsigned 64-bit integers."""
     write_raw(tmp_path / 'a.mcap', [1, 2, 2**63, 2**64 - 1], use_chunking)
     messages, recording = read(tmp_path / 'a.mcap')
@@ -276,7 +309,7 @@ def test_log_times_beyond_63_bits_are_limited_without_loss(tmp_path, use_chunkin
 
 
 def test_messages_without_chunks_are_read_in_blocks(tmp_path):
-    """The messages before the end of a truncated file are read."""
+    """A truncated file is read up to its last complete message."""
     write_raw(tmp_path / 'a.mcap', range(1000), use_chunking=False)
     blocks = list(Recording(tmp_path / 'a.mcap').blocks())
     assert sum(map(len, blocks)) == 1000 and len(blocks) <= 5

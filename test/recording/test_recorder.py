@@ -1,4 +1,4 @@
-"""Recorder: readability by other software, splits and latched messages."""
+"""Recorder: recordings that other software can read, splits and latched messages."""
 
 import errno
 
@@ -83,14 +83,14 @@ def test_each_file_of_a_split_recording_is_complete(tmp_path, split_by):
     files = sorted((tmp_path / 'a').glob('*.mcap'), key=lambda p: int(p.stem.split('_')[1]))
     assert len(files) == 5 if split_by == 'time' else max(p.stat().st_size for p in files) < 23_000
     assert len(files) >= 4
-    # During the recording, metadata.yaml lists the finished files and the open one.
+    # During the recording, metadata.yaml lists the finished files and the open file.
     listed = metadata['rosbag2_bagfile_information']['relative_file_paths']
     assert listed == [p.name for p in files[:len(listed)]] and 1 < len(listed) < len(files)
     all_rows = []
     for n, file in enumerate(files):
         rows = by_rosbags(file)
         assert rows and rows == by_rosbags(file) and numbers(file)[0] == [k for _, k in rows]
-        # Later files begin with the latest latched message, at the time of the first other one.
+        # Later files begin with the latest latched message, at the log time of the next message.
         assert by_rosbags(file, '/map') == ([(107, 7), (108, 8), (109, 9)] if n == 0
                                             else [(rows[0][0], 9)])
         all_rows += rows
@@ -102,7 +102,7 @@ def test_each_file_of_a_split_recording_is_complete(tmp_path, split_by):
         assert (reader.start_time, reader.end_time) == (107, 2000)
 
 
-def test_each_publisher_adds_a_latched_message(tmp_path):
+def test_a_second_publisher_adds_a_latched_message(tmp_path):
     recorder, _ = started(tmp_path / 'a', split_ns=S)
     recorder.add_topic(TOPIC, MAGNETIC_FIELD, latched=1)
     recorder.write(TOPIC, field(1), 1)

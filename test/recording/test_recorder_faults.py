@@ -1,4 +1,4 @@
-"""Recorder during kills and disk failures: losses are small and reported."""
+"""Recorder: kills and disk failures cause only small losses, which are reported."""
 
 import errno
 import io
@@ -26,7 +26,7 @@ TEST_FOLDER = str(ROOT / 'test')
 
 
 class SmallDisk:
-    """Opener of files on a disk with `room` free bytes."""
+    """File opener that simulates a disk with `room` free bytes."""
 
     def __init__(self, room):
         self.room = room
@@ -68,7 +68,7 @@ for k, d in enumerate(data):
 
 
 def record_until_killed(folder, after_s):
-    """(numbers, times [ns]) of the messages that a process had recorded when it was killed."""
+    """Kill a recording process; return the numbers and times [ns] of the messages it recorded."""
     process = subprocess.Popen([sys.executable, '-c', RECORD_UNTIL_KILLED, folder,
                                 TEST_FOLDER], stdout=subprocess.PIPE)
     with process:
@@ -89,14 +89,14 @@ def test_kills_lose_less_than_a_second(tmp_path, n_kills):
         recorded, times = record_until_killed(folder, 0.1 + 0.05 * n)
         found, recording = numbers(folder)
         assert found == list(range(len(found))) and len(found) <= len(recorded) + 1
-        assert all(re.search('no valid index|unreadable after byte', loss)
+        assert all(re.match('files without a valid index|partially read files', loss)
                    for loss in recording.losses), recording.losses
         lost = len(recorded) - len(found)
         if lost > 0:
             worst_n, worst_s = max(worst_n, lost), max(
                 worst_s, (times[-1] - times[len(found)]) / S)
-        # Other readers need the index. The last file has none before the repair, unless the
-        # process was killed between two files.
+        # Other readers require the index. Before the repair, the last file has no index, unless
+        # the process was killed between two files.
         if recording.losses:
             n_cut += 1
             with pytest.raises(AnyReaderError, match='end magic'):
@@ -163,7 +163,7 @@ print(recorder.counts[TOPIC], recorder.dropped[TOPIC], len(reports), len(recorde
 
 
 def test_recording_survives_a_file_size_limit_of_the_system(tmp_path):
-    """The short writes are real. An unfinished file has no room for its index until the end."""
+    """The limit causes real short writes, and leaves no space for the index of a full file."""
     done = subprocess.run([sys.executable, '-c', RECORD_WITH_FILE_LIMIT, tmp_path / 'a',
                            TEST_FOLDER], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.alone
 
 
 def unfinished_recording(tmp_path, tick=True):
-    """(bytes of an unfinished recording file with two topics, bytes of the finished file)."""
+    """Record two topics; return the bytes of the file before and after it was finished."""
     recorder, _ = started(tmp_path / 'source')
     recorder.add_topic('/other', MAGNETIC_FIELD, definition(MAGNETIC_FIELD))
     for k in range(200):
@@ -54,24 +54,24 @@ def test_repair_recovers_a_file_truncated_at_any_byte(tmp_path):
                 assert [stamp_ns_of(m) for _, _, m in reader.iter_messages([topic])] == found
         for topic, found in before.items():
             assert [k for _, k in by_rosbags(file.parent, topic)] == found
-        torn = file.with_name('x_0.mcap.cut')
-        kept = torn.read_bytes() if torn.exists() else b''
-        assert any(f'last {len(kept)} bytes' in line for line in reports) == bool(kept)
+        cut_file = file.with_name('x_0.mcap.cut')
+        kept = cut_file.read_bytes() if cut_file.exists() else b''
+        assert any(f'bytes: {len(kept)}' in line for line in reports) == bool(kept)
         if cut <= len(unfinished):
             head = file.read_bytes()
             assert head.startswith(data[:cut - len(kept)]) and data[:cut].endswith(kept)
-        torn.unlink(missing_ok=True)
+        cut_file.unlink(missing_ok=True)
         repaired = file.read_bytes()
         start, _, crc = struct.unpack('<QQI', repaired[-28:-8])
         assert crc == zlib.crc32(repaired[start:-12])
         if last_chunk_end <= cut <= len(unfinished):
-            # The rebuilt indexes of the last chunk equal the original ones.
+            # The rebuilt indexes of the last chunk equal the original indexes.
             assert repaired.startswith(unfinished)
         assert repair(file.parent) == 0 and file.read_bytes() == repaired
 
 
 def stamp_ns_of(message):
-    """Timestamp of a serialised magnetic field, which comes first in its bytes."""
+    """Timestamp [ns] of a serialised magnetic field, at the beginning of its bytes."""
     sec, nanosec = struct.unpack_from('<iI', message.data, 4)
     return sec * S + nanosec
 
@@ -92,7 +92,7 @@ def test_repair_keeps_the_order_of_many_files(tmp_path):
 
 @pytest.mark.parametrize('name', ['a_0.mcap', 'a_12.mcap'])
 def test_an_empty_file_after_a_crash_costs_no_other_file(tmp_path, name):
-    """The empty file is the first one, or that of a split that had just begun."""
+    """The empty file is the first file, or a later file that had just been created."""
     recorder, _ = started(tmp_path / 'a', split_ns=S)
     for k in range(24):
         recorder.write(TOPIC, field(k), k)
@@ -104,7 +104,7 @@ def test_an_empty_file_after_a_crash_costs_no_other_file(tmp_path, name):
     (tmp_path / 'a' / 'metadata.yaml').unlink()
     recording = Recording(tmp_path / 'a')
     assert len(list(recording.messages())) == len(kept)
-    assert recording.losses[f'{name} is empty (0 bytes)'] == 1
+    assert recording.losses == {f'empty files ({name})': 1}
     reports = []
     repair(tmp_path / 'a', reports.append)
     assert reports == [f'{tmp_path / "a" / name} is empty and was skipped']
@@ -114,10 +114,10 @@ def test_an_empty_file_after_a_crash_costs_no_other_file(tmp_path, name):
 def test_repair_skips_and_reports_a_damaged_chunk(tmp_path):
     unfinished, finished = unfinished_recording(tmp_path)
     file = tmp_path / 'x.mcap'
-    broken = bytearray(unfinished)
+    damaged = bytearray(unfinished)
     middle = make_reader(io.BytesIO(finished)).get_summary().chunk_indexes[2]
-    broken[middle.chunk_start_offset + middle.chunk_length // 2] ^= 0xFF
-    file.write_bytes(broken)
+    damaged[middle.chunk_start_offset + middle.chunk_length // 2] ^= 0xFF
+    file.write_bytes(damaged)
     before, reports = numbers(file)[0], []
     assert 0 < len(before) < 200
     assert repair(file, reports.append) == 1

@@ -1,4 +1,4 @@
-"""Result folder of a run: results of an earlier run are replaced, other files are kept."""
+"""Result folder of a run: it replaces the results of an earlier run, and keeps other files."""
 
 import csv
 
@@ -81,7 +81,7 @@ def test_arrival_names_may_contain_commas(tmp_path):
     with open(tmp_path / 'hypotheses.csv', newline='') as stream:
         rows = list(csv.DictReader(stream))
     assert names[0] in {row['arrival'] for row in rows} <= {*names}
-    # The heaviest hypothesis of the last frame is near the published pose.
+    # The hypothesis with the largest weight in the last frame is near the published pose.
     with open(tmp_path / 'poses.csv', newline='') as stream:
         *_, pose = csv.DictReader(stream)
     best = max((row for row in rows if row['stamp_ns'] == pose['stamp_ns']),

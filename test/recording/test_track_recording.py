@@ -1,4 +1,4 @@
-"""`tracks.mcap` contains what ROS viewers need; it is read by an independent library."""
+"""`tracks.mcap`, read by an independent library, contains all messages for ROS viewers."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ TOPICS = {'/mag_1/imu/mag_calibrated', '/mag_2/imu/mag_calibrated', '/tf', '/tf_
 
 @pytest.fixture(scope='module')
 def read(vehicle_replays):
-    """(Run, {topic: [(log time, message)]}, {topic: durability}) of a replay."""
+    """`Run`, {topic: [(log time, message)]} and {topic: durability} of a replay."""
     run, folder = vehicle_replays['straight_car_right']
     messages, durability = {}, {}
     with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
@@ -31,7 +31,7 @@ def test_every_topic_is_recorded(read):
     assert messages.keys() == TOPICS
     latched = {topic for topic, name in durability.items() if name == 'TRANSIENT_LOCAL'}
     assert latched == {'/tf_static', '/tracker_node/sensor_markers'}
-    # The positions of the sensors come with the first message.
+    # The positions of the sensors have the log time of the first message.
     first = min(time_ns for rows in messages.values() for time_ns, _ in rows)
     assert all(messages[topic][0][0] == first and len(messages[topic]) == 1 for topic in latched)
 
@@ -71,7 +71,7 @@ def test_paths_contain_the_whole_track(read):
     assert len(smoothed.poses) == len(run.smoothed[1].position)
 
 
-def test_recorded_fields_are_those_that_were_tracked(read):
+def test_recorded_fields_equal_the_tracked_fields(read):
     run, messages, _ = read
     log = run.logs[1]
     for j in (0, 1):

@@ -1,4 +1,4 @@
-"""Truth from topics of two types and from tables, and trajectory files."""
+"""Truth from topics of two message types and from tables; trajectory files."""
 
 import csv
 import dataclasses
@@ -32,12 +32,12 @@ NAME = 'straight_car_fast_left'
 
 
 def pose(x):
-    """geometry_msgs/Pose at (x, 2, 3)."""
+    """Content of a geometry_msgs/Pose at (x, 2, 3)."""
     return {'position': {'x': x, 'y': 2.0, 'z': 3.0}, 'orientation': {'w': 1.0}}
 
 
 def recording_of(path, frame):
-    """Recording with a field, and with poses of two types on two topics."""
+    """Write a recording with a field, and with poses of two message types on two topics."""
     sample = MagSample(10**9, 'mag_1', [0.0, 0.0, 0.0])
     with RecordingWriter(path) as writer:
         writer.write('/mag_1/imu/mag', MAGNETIC_FIELD, sample_dict(sample, 'mag_1'), 10**9)
@@ -51,13 +51,13 @@ def recording_of(path, frame):
 
 
 def truth_of(recording, topic, network=None):
-    """(truth arrays, rejected messages) of a reader."""
+    """Read a recording; return its truth arrays and the number of rejections by cause."""
     reader = SampleReader(recording, network or line_network(2), topic)
     list(reader.readings())
     return reader.truth_arrays(), dict(reader.rejected)
 
 
-def test_poses_of_either_type_are_truth_in_order_of_time(tmp_path):
+def test_poses_of_either_type_become_chronological_truth(tmp_path):
     recording = recording_of(tmp_path / 'a.mcap', 'map')
     assert truth_of(recording, None) == ({}, {})
     for topic, name, first in (('/gnss/pose', '/gnss', 1.0), ('/slam', '/slam', 10.0)):
@@ -70,7 +70,7 @@ def test_poses_of_either_type_are_truth_in_order_of_time(tmp_path):
 
 
 def test_poses_are_read_in_blocks_and_sorted_by_timestamp():
-    """Other frames and encodings are left to the decoder."""
+    """Messages in other frames or encodings are not read in blocks."""
     def message(topic, stamp_ns, frame='map', kind=POSE):
         return RawMessage(topic, kind, 0, encoder(POSE)({
             'header': header_dict(stamp_ns, frame), 'pose': pose(float(stamp_ns))}),
@@ -110,7 +110,7 @@ def test_a_topic_without_poses_is_refused_as_truth(tmp_path, topic, message):
 
 
 def test_a_table_gives_the_same_errors_as_the_topic(tmp_path, road_network):
-    """The time is in ns or in s; the errors of the track equal those with the topic."""
+    """Times are in ns or in s. The errors of the track equal the errors with the topic."""
     settings = settings_for('vehicle', QUICK)
     run = replay(Recording(vehicle_path(NAME)), road_network, settings, tmp_path / 'a')
     ((stamps, position, _),) = run.truth.values()
@@ -157,7 +157,7 @@ def test_a_missing_table_is_reported(tmp_path, road_network):
                truth=str(tmp_path / 'missing.csv'))
 
 
-def test_trajectory_files_hold_the_track(tmp_path, vehicle_replays):
+def test_trajectory_files_contain_the_track(tmp_path, vehicle_replays):
     run, _ = vehicle_replays[NAME]
     paths = write_trajectories(run, tmp_path)
     assert [p.name for p in paths] == ['track_1.tum', 'track_1_smoothed.tum']

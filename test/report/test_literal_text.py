@@ -20,14 +20,14 @@ NAMES = ('$\\foo$', '_hidden $^{$', '\\$5$')
 
 
 def texts_of(figure):
-    """All texts of a figure after drawing, which fails for a name parsed as mathematics."""
+    """Draw a figure and return its strings; drawing fails for a name parsed as mathematics."""
     figure.savefig(io.BytesIO(), dpi=40)
     return {t.get_text().replace('\\$', '$').replace('\u200b', '') for t in figure.findobj(
         lambda artist: hasattr(artist, 'get_text'))}
 
 
 @pytest.mark.parametrize('text', [*NAMES, '$', '$a\n$', '__', 'left', ''])
-def test_a_text_is_drawn_literally(text):
+def test_a_string_is_drawn_literally(text):
     figure = Figure()
     axes = figure.add_subplot()
     axes.plot([0, 1], label=literal(text) or 'none')
@@ -98,7 +98,7 @@ def test_every_figure_draws_names_literally(draw, label):
 
 
 def test_equal_lanes_share_a_curve_and_a_label():
-    """One of two equal curves would hide the other."""
+    """Otherwise one of two equal curves would hide the other curve."""
     lanes = plan()
     lanes.lanes[2].filter_std = lanes.lanes[0].filter_std
     texts = texts_of(lane_figure(lanes))
@@ -106,7 +106,7 @@ def test_equal_lanes_share_a_curve_and_a_label():
 
 
 def test_the_first_pose_is_on_the_line_of_the_track():
-    """This applies even if the best hypothesis of its arrival is elsewhere."""
+    """The best hypothesis of an arrival may be at another position."""
     log = log_of_track()
     (axes,) = map_figure(log, NETWORK).axes
     lines = {line.get_label(): line.get_xydata() for line in axes.get_lines()}
@@ -117,7 +117,7 @@ def test_the_first_pose_is_on_the_line_of_the_track():
     assert not any(label.startswith('from ') for label in labels)
 
 
-def test_lone_surrogates_in_a_file_name_are_escaped():
+def test_unpaired_surrogates_in_a_file_name_are_escaped():
     assert 'a\\udcff: measured (dots), fitted (lines), 90 % bands' in texts_of(
         pass_figure(fitted_pass(), 'a\udcff'))
 

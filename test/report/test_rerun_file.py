@@ -1,4 +1,4 @@
-"""Files for the Rerun viewer."""
+"""Recordings for the Rerun viewer."""
 
 import importlib.util
 
@@ -21,7 +21,7 @@ def test_a_missing_rerun_sdk_is_reported_before_the_replay(tmp_path, capsys, mon
 
 
 @pytest.mark.skipif(importlib.util.find_spec('rerun') is None, reason='rerun-sdk is not installed')
-def test_the_poses_in_the_file_are_those_of_the_track(tmp_path, vehicle_replays, road_network):
+def test_the_poses_in_the_file_equal_the_track(tmp_path, vehicle_replays, road_network):
     from rerun.chunk import RrdReader
 
     run, _ = vehicle_replays[NAME]

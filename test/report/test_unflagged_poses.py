@@ -1,4 +1,4 @@
-"""Wrong poses without the ambiguous flag, counted against truth."""
+"""Counts of wrong poses without the ambiguous flag, by comparison with the truth."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def counts(n, wrong=0, without_truth=0):
 
 
 def log(off_m=0.0, std_m=0.1, ambiguous=False):
-    """A track at the lateral distance `off_m` from the first vehicle."""
+    """Track at the lateral distance `off_m` from the first vehicle."""
     out = TrackLog(1)
     for t in T:
         out.add(track_pose(t, 10.0 * t, off_m, ambiguous=ambiguous,
@@ -29,7 +29,7 @@ def log(off_m=0.0, std_m=0.1, ambiguous=False):
     return out
 
 
-def test_a_wrong_pose_is_off_in_metres_and_in_standard_deviations():
+def test_a_wrong_pose_has_a_large_error_in_metres_and_in_standard_deviations():
     n = len(T)
     assert unflagged_poses([log(0.5)], [truth()]) == counts(n)
     assert unflagged_poses([log(2.1)], [truth()]) == counts(n, n)
@@ -40,7 +40,7 @@ def test_a_wrong_pose_is_off_in_metres_and_in_standard_deviations():
 def test_a_pose_near_any_present_vehicle_is_not_wrong():
     assert unflagged_poses([log(5.0)], [truth(), truth(5.0)])['wrong'] == 0
     assert unflagged_poses([log(5.0)], [truth(), truth(-5.0)])['wrong'] == len(T)
-    # A vehicle at another time does not count. Without truth, a pose is not judged.
+    # A vehicle at another time is ignored. Without truth, a pose is not evaluated.
     assert unflagged_poses([log(5.0)], [truth(), truth(5.0, 100.0)])['wrong'] == len(T)
     assert unflagged_poses([log(5.0)], [truth(shift_s=100.0)]) == counts(0, 0, len(T))
 

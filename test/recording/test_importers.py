@@ -1,0 +1,39 @@
+"""Import of tables of magnet poses: invalid tables are refused."""
+
+import pytest
+
+from mag_tracking.errors import RecordingError
+from mag_tracking.recording.importers import import_pose_table
+from mag_tracking.recording.reader import Recording
+
+HEADER = ('id,timestamp,Bx,By,Bz,sensor_x,sensor_y,sensor_z,sensor_ox,sensor_oy,sensor_oz,'
+          'm_x,m_y,m_z,m_ox,m_oy,m_oz\n')
+ROW = '1,0.5,10,20,30,0,0,0,0,0,0,5,5,50,0,0,0\n'
+
+
+def import_tables(folder, table, background):
+    """Write and import a pose table and a table of backgrounds; return the result."""
+    (folder / 'poses.csv').write_text(table)
+    (folder / 'background.csv').write_text(background)
+    return import_pose_table(folder / 'poses.csv', folder / 'background.csv', folder / 'out', 1e-6)
+
+
+def test_a_pose_table_becomes_a_recording(tmp_path):
+    recording, network, n = import_tables(tmp_path, HEADER + ROW, '1,2,3\n')
+    assert n == 1 and network.is_file()
+    assert {m.topic for m in Recording(recording).messages()} == {
+        '/mag_1/imu/mag', '/ground_truth/magnet/pose'}
+
+
+@pytest.mark.parametrize('table, background, message', [
+    ('', '1,2,3\n', 'poses.csv has no rows'), (HEADER, '1,2,3\n', 'poses.csv has no rows'),
+    (HEADER.replace('Bz', 'Bw') + ROW, '1,2,3\n', 'column Bz is missing'),
+    (HEADER + ROW.replace('30', 'x'), '1,2,3\n', "row 2: Bz is 'x', not a number"),
+    (HEADER + '1,0.5\n', '1,2,3\n', 'row 2: expected 17 columns, got 2'),
+    (HEADER + ROW + ROW.replace('50', 'inf'), '1,2,3\n', 'row 3: m_z is not a finite number'),
+    (HEADER + '1.5' + ROW[1:], '1,2,3\n', 'numbers that are not integers'),
+    (HEADER + ROW, '1,2\n', 'background.csv: expected 3 columns, got 2'),
+    (HEADER + ROW, '1,2,3\n4,5,6\n', r'different numbers of sensors: .*background.csv 2, .* 1$')])
+def test_an_invalid_pose_table_is_refused(tmp_path, table, background, message):
+    with pytest.raises(RecordingError, match=message):
+        import_tables(tmp_path, table, background)
