@@ -107,7 +107,7 @@ def faulty(fault):
     ('step', True, 'its clock stepped 1 times relative to the host, by up to -1.00 s'),
     ('late', False, 'ms to arrive'),
     ('ahead', False, 'the delay from timestamp to receipt is -3.0 s'),
-    ('stuck', True, 'readings are identical to all of the 1 s before'),
+    ('stuck', True, 'readings are identical to all readings of the previous 1 s'),
     ('saturated', True, 'are at the end of the range'),
     ('spikes', False, '14 of 3000 readings are spikes'),
     ('dead', True, 'x does not change'),

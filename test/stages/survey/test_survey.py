@@ -205,8 +205,8 @@ def test_a_compass_heading_far_from_the_stated_one_is_named():
     rotations = (ROTATIONS[0], Rotation.from_euler('z', 25.0, True), ROTATIONS[2])
     found, _ = surveyed(rotations=rotations)
     assert warnings(found) == {'mag_2': (
-        'the compass heading differs by +25 degrees from the network file; the stated heading is '
-        'kept',)}
+        'the compass heading differs by +25 degrees from the network file, whose heading is '
+        'retained',)}
     np.testing.assert_allclose(found.network.R_ws[1], np.eye(3), atol=2e-3)
     assert np.degrees(found.network.orientation_std[1][2]) == pytest.approx(5.0)
     assert found.sensors[1].by == 'accelerometer, heading as stated'
