@@ -73,7 +73,7 @@ def test_each_arrival_needs_a_heading(road_network):
         Pipeline(road_network, settings)
 
 
-def test_the_targets_of_file_and_caller_must_agree():
+def test_the_targets_in_parameters_and_call_must_agree():
     with pytest.raises(SettingsError, match='magnet'):
         settings_for('vehicle', {'track.target': 'magnet'})
     with pytest.raises(SettingsError, match='expected vehicle or magnet'):
@@ -126,8 +126,8 @@ def test_related_lists_are_checked_against_each_other(road_network, changes, mes
         TrackManager(road_network, settings_for('vehicle', changes).track)
 
 
-def test_every_former_name_leads_to_a_setting():
-    """Of the pipeline or of a drivers file."""
+def test_every_former_name_has_a_current_setting():
+    """The settings of the pipeline and of drivers files are searched."""
     known = {p.name.rpartition('.')[2] for group in (Settings(), *settings_by_kind().values())
              for p in flatten(group)}
     assert set(RENAMED_SETTINGS.values()) - known == set()

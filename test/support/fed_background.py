@@ -1,4 +1,4 @@
-"""Background that is fed reading by reading, as the calibration does it."""
+"""Background that accepts individual readings, as in the calibration stage."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from mag_tracking.calibration.sensor_state import new_sensors
 
 
 class FedBackground(RunningBackground):
-    """Background fed reading by reading."""
+    """`RunningBackground` that accepts individual readings."""
 
     def __init__(self, *arguments, **named):
         self.sensors = new_sensors(1)
@@ -28,7 +28,7 @@ class FedBackground(RunningBackground):
             self.evaluate_block()
 
     def note(self, stamp, raw):
-        """Plain Python version of `core.note_step`."""
+        """Update the quantisation steps; Python version of `core.note_step`."""
         s = self.sensors[0]
         for a in np.flatnonzero(~np.isnan(raw)):
             change = abs(raw[a] - s['raw'][a])

@@ -1,4 +1,4 @@
-"""Sensor health and `doctor`: each fault is found and named, and valid sensors have none."""
+"""Sensor health and `doctor`: each fault is reported, and valid sensors have no findings."""
 
 from dataclasses import replace
 
@@ -25,22 +25,22 @@ SIGMA = 1.2e-8
 
 
 def readings(n=3000, rate=100.0, seed=0):
-    """(timestamps [ns], fields) of a valid sensor."""
+    """Simulate a valid sensor; return (timestamps [ns], fields)."""
     rng = np.random.default_rng(seed)
     return (10**18 + (np.arange(n) * NS / rate).astype(np.int64),
             EARTH + SIGMA * rng.standard_normal((n, 3)))
 
 
 def examined(stamps, fields, received=None):
-    """`SensorHealth` of readings."""
+    """Feed readings to a `SensorHealth`, and return it."""
     health = SensorHealth()
     for k, (stamp, field) in enumerate(zip(stamps, fields, strict=True)):
         health.add(int(stamp), field, None if received is None else int(received[k]))
     return health
 
 
-def texts(health, **known):
-    return [str(f) for f in health.findings('mag_1', **known)]
+def texts(health, **arguments):
+    return [str(f) for f in health.findings('mag_1', **arguments)]
 
 
 def test_a_valid_sensor_has_no_findings():
@@ -64,7 +64,7 @@ def test_noise_is_estimated_despite_coarse_steps_or_a_passing_target():
 
 
 def faulty(fault):
-    """(timestamps, fields, times of receipt) of a sensor with a fault."""
+    """Simulate a sensor with a fault; return (timestamps, fields, times of receipt)."""
     stamps, fields = readings()
     received = stamps + 1_000_000
     if fault == 'lost':
@@ -122,7 +122,7 @@ def test_each_fault_is_named(fault, serious, message):
     match = [f for f in found if message in str(f)]
     assert len(match) == 1 and match[0].serious == serious, [str(f) for f in found]
     assert match[0].subject == 'mag_1' and match[0].advice
-    # A timestamp that goes back is a clock step as well.
+    # A backward timestamp is also a clock step.
     assert len(found) == 1 + (fault == 'back'), [str(f) for f in found]
 
 
@@ -135,7 +135,7 @@ def test_a_sensor_with_noise_below_its_resolution_has_no_spikes():
 
 
 def test_a_stalled_host_is_not_a_clock_step():
-    """The delayed readings arrive in a burst."""
+    """Readings that are delayed by the host arrive in a burst."""
     stamps, fields = readings()
     received = stamps + 1_000_000
     for first in range(500, 3000, 500):
@@ -150,7 +150,7 @@ def test_lost_readings_are_counted():
     keep = np.ones(3000, dtype=bool)
     keep[[500, 900, 901, 902, 2000]] = False
     assert examined(stamps[keep], fields[keep]).counts['lost'] == 5
-    # An interval of 1.4 periods is a late reading, one of 1.7 periods contains a lost one.
+    # An interval of 1.4 periods means a late reading; an interval of 1.7 periods, a lost reading.
     for n_periods, lost in ((1.4, 0), (1.7, 1)):
         later = np.array(stamps)
         later[1500:] += round((n_periods - 1.0) * 1e7)
@@ -167,7 +167,7 @@ def test_a_steep_slope_is_not_a_spike():
 def test_saturated_readings_are_counted_once():
     stamps, fields, _ = faulty('saturated')
     clipped = np.isin(fields[:, 1], [1.5e-5, 1.6e-5]).sum()
-    # Their neighbours are suspect and counted as well.
+    # Neighbouring readings are suspect and also counted.
     assert clipped <= examined(stamps, fields).counts['saturated'] <= 200 + 12
 
 
@@ -194,7 +194,7 @@ def test_a_sensor_without_readings_is_reported():
 
 
 def doctor_findings(change=lambda k, field: field, seconds=10.0, **settings):
-    """Findings of `Doctor` for three sensors; `change` modifies the fields of the second."""
+    """Findings of `Doctor` for three sensors; `change` modifies the fields of the second sensor."""
     network = line_network(3)
     doctor = Doctor(network, settings_for('vehicle', settings))
     rng = np.random.default_rng(5)
@@ -211,7 +211,7 @@ def doctor_findings(change=lambda k, field: field, seconds=10.0, **settings):
 
 
 def test_a_target_that_stays_causes_no_findings():
-    """Sensors are compared by their backgrounds, which are frozen during the target."""
+    """Sensors are compared by their backgrounds, which are frozen while the target is present."""
     assert doctor_findings(lambda k, field: field + 2e-5 * (k > 750), seconds=25.0) == []
 
 
@@ -226,19 +226,19 @@ def test_the_doctor_compares_sensors_with_the_earth_field():
     # The first spike is not counted, because the noise is not known yet.
     few = doctor_findings(lambda k, field: field * (1e6 if k % 100 == 1 else 1.0), seconds=20.0)
     assert 'mag_2: 9 of 1000 readings are spikes' in few[0] and '10 readings rejected' in few[1]
-    # A large share of rejections is serious and comes first.
+    # A large proportion of rejections is serious and comes first.
     many = doctor_findings(lambda k, field: field * (1e6 if k % 8 == 1 else 1.0), seconds=20.0)
     assert '125 readings rejected' in many[0] and 'are spikes' in many[1]
 
 
 def test_a_background_in_the_file_does_not_hide_a_flipped_axis():
     network = line_network(3)
-    given = tuple(network.R_sw[j] @ network.earth_field for j in range(3))
-    doctor = Doctor(replace(network, background=given), settings_for('vehicle'))
+    backgrounds = tuple(network.R_sw[j] @ network.earth_field for j in range(3))
+    doctor = Doctor(replace(network, background=backgrounds), settings_for('vehicle'))
     rng = np.random.default_rng(6)
     for k in range(600):
         for j, name in enumerate(network.names):
-            field = given[j] * ([1.0, 1.0, -1.0] if j == 2 else np.ones(3))
+            field = backgrounds[j] * ([1.0, 1.0, -1.0] if j == 2 else np.ones(3))
             doctor.feed(one(MagSample(k * 20_000_000, name,
                                       field + SIGMA * rng.standard_normal(3))))
     found = [str(f) for f in doctor.findings()]
@@ -279,7 +279,7 @@ def test_clocks_far_apart_are_named_and_the_age_of_a_replay_is_not():
 
 
 def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
-    # A background that was learnt for a short time only would be replaced earlier.
+    # A background that was learnt only for a short time would be replaced earlier.
     steps = doctor_findings(lambda k, field: field + 1e-6 * (k > 1000), seconds=75.0)
     assert len(steps) == 2 and 'its background has been frozen for 5' in steps[1]
     assert 'its background is doubtful' in steps[0]
@@ -353,9 +353,9 @@ def test_batches_give_the_same_health_as_single_readings():
     for t, f in zip(stamps.tolist(), fields, strict=True):
         single.add(t, f, t + 10**6)
     for begin, end in ((0, 0), (0, 300), (300, 301), (301, 700)):
-        given = stamps[begin:end].copy(), fields[begin:end].copy(), stamps[begin:end] + 10**6
-        many.add_batch(*given)
-        for array in given:
+        arrays = stamps[begin:end].copy(), fields[begin:end].copy(), stamps[begin:end] + 10**6
+        many.add_batch(*arrays)
+        for array in arrays:
             array[:] = 0
     assert many.counts == single.counts and many.counts['readings'] == 700
     assert many.rate == single.rate == pytest.approx(100.0)
@@ -365,7 +365,7 @@ def test_batches_give_the_same_health_as_single_readings():
 
 
 def test_a_reading_buffer_returns_the_readings_of_each_sensor_in_order():
-    """A full buffer accepts no further readings until it has been emptied."""
+    """A full buffer accepts no readings until it has been emptied."""
     rng, buffer = np.random.default_rng(4), ReadingBuffer(5, 8)
     rows, stamps = rng.integers(-1, 5, 300), np.arange(300)
     fields, found, i = rng.standard_normal((300, 3)), {j: [] for j in range(5)}, 0
@@ -383,7 +383,7 @@ def test_a_reading_buffer_returns_the_readings_of_each_sensor_in_order():
 
 
 def test_counts_do_not_depend_on_the_update_interval():
-    """Events between two updates are counted as well."""
+    """Faults between two updates are also counted."""
     rng, fields = np.random.default_rng(5), []
     for k in range(3000):
         stuck = k % 900 > 600
