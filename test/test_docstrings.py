@@ -17,7 +17,7 @@ CHECKS = {
     'RT01', 'RT02', 'RT04', 'RT05', 'YD01'}
 """All checks of numpydoc except those that contradict the project's style: the summary begins on
 the first line (GL01, GL02); extended summary, examples and see-also are optional (ES01, EX01,
-SA01), and so is a description if name and type state everything (PR07, RT03); a summary may be a
+SA01), and so is a description if name and type are sufficient (PR07, RT03); a summary may be a
 noun phrase, which SS05 treats as a verb if its first word is a plural."""
 ARRAY = re.compile(r'\b(FloatArray|IntArray|BoolArray|ArrayLike|NDArray|StructArray)\b')
 PROGRAMMING_ERRORS = {'AssertionError', 'NotImplementedError', 'AttributeError'}

@@ -46,7 +46,7 @@ class BoxVehicle:
         return self.permanent + self.induced * B_body[:, None] / MU0
 
     def field(self, earth_field, position, heading, points):
-        """See `mag_tracking.simulation.scenario.Body`."""
+        """Field of the vehicle at `points`; implements `mag_tracking.simulation.scenario.Body`."""
         R, origin = body_poses(position, heading)
         m = self.moments(np.einsum('nji,j->ni', R, earth_field))
         J = MU0 * m / self.sides.prod(axis=1)[:, None]
@@ -154,7 +154,7 @@ class Drive:
         return self.path.speed * (1.0 + self.change / (1.0 + np.exp(-z)))
 
     def at(self, t):
-        """See `mag_tracking.simulation.scenario.Trajectory`."""
+        """Position and heading at times `t`; implements `scenario.Trajectory`."""
         t = np.asarray(t, dtype=float)
         position, heading = self.path.at(self._on_path(t))
         z = (t - self.aside_at) / (self.aside_s / 2.0)

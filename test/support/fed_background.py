@@ -21,7 +21,7 @@ class FedBackground(RunningBackground):
         self.collect(time, field)
 
     def collect(self, time, field):
-        """Add a reading whose quantisation steps have been noted."""
+        """Add a reading that `note` has already evaluated for quantisation steps."""
         self.evaluate_block()
         core.collect(self.sensors, time, np.array(field, dtype=float))
         if np.isnan(self.sensors[0]['phase']):

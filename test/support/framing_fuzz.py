@@ -131,9 +131,9 @@ def fuzz(case, n_frames, seed=0, share=0.4):
 
 
 def _skipped(expected, reading):
-    """Remove `reading` and all earlier ones from `expected`; return the number of earlier ones.
+    """Remove `reading` and all readings before it from `expected`; return the number before it.
 
-    None if `reading` is not expected.
+    None if `expected` does not contain `reading`.
     """
     for i in range(min(200, len(expected))):
         if expected[i] == reading:

@@ -1,4 +1,4 @@
-"""Pytest marks of parameters."""
+"""Pytest marks for test parameters with long run times."""
 
 import pytest
 

@@ -53,7 +53,7 @@ class StepByStep:
 
 
 class PlainFilter(StepByStep, BankFilter):
-    """`BankFilter` that performs one step at a time for the whole bank."""
+    """`BankFilter` with separate steps in NumPy, each for the whole bank."""
 
     def __init__(self, network, model, settings, n_targets=1):
         super().__init__(network, model, settings, n_targets)

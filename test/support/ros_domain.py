@@ -10,7 +10,7 @@ N_DOMAINS = 100
 
 
 class RosDomain:
-    """Reserves the first free domain, starting at one that depends on the process."""
+    """Reserves the first free domain, searching from a number that depends on the process."""
 
     def __init__(self):
         folder = Path(tempfile.gettempdir()) / f'mag_tracking_domains_{os.getuid()}'

@@ -25,7 +25,7 @@ class Ride:
     """Speeds at `times`, (k,) m/s, with linear interpolation; negative = backwards."""
 
     def at(self, t):
-        """See `mag_tracking.simulation.scenario.Trajectory`."""
+        """Position and heading at times `t`; implements `scenario.Trajectory`."""
         t = np.asarray(t, dtype=float)
         grid = np.arange(0.0, max(self.times[-1], t.max()) + 2 * GRID_S, GRID_S)
         speed = np.interp(grid, self.times, self.speeds)
@@ -44,7 +44,7 @@ class Convoy:
     """[m] Distance of the centre of each body behind the centre of the convoy."""
 
     def field(self, earth_field, position, heading, points):
-        """See `mag_tracking.simulation.scenario.Body`."""
+        """Field of all bodies at `points`; implements `mag_tracking.simulation.scenario.Body`."""
         forward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
         return sum(body.field(earth_field, position - back * forward, heading, points)
                    for body, back in zip(self.bodies, self.behind, strict=True))

@@ -42,7 +42,7 @@ def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
 
 
 def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
-    """Frame period: the configured value, or a value derived from the geometry if that is 0.
+    """Frame period: the setting, or a period derived from the geometry if the setting is 0.
 
     A frame that is longer than the delay between two sensors mixes their signals, so in a compact
     network the period is half the shortest delay. A larger network does not use the delay, and

@@ -327,7 +327,7 @@ class SensorHealth:
         return sorted(found, key=lambda f: not f.serious)
 
     def _clock_findings(self, name: str) -> Iterator[Finding]:
-        """Faults of the clock."""
+        """Yield findings about clock steps and backward timestamps."""
         if n := self.counts['clock steps']:
             yield Finding(True, name, f'its clock stepped {n} times relative to the '
                           f'host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
@@ -337,7 +337,7 @@ class SensorHealth:
                           'on one topic, a clock that was set, or a looped replay')
 
     def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
-        """Faults of the timestamps."""
+        """Yield findings about duplicate timestamps, lost readings and delays."""
         c = self.counts
         middle, low, high = self.delay_s
         if c['duplicates'] > 0.001 * n:
@@ -357,7 +357,7 @@ class SensorHealth:
                           'the clocks of sensor and host disagree: calibrate them with knocks')
 
     def _value_findings(self, name: str, n: int, max_field: float) -> Iterator[Finding]:
-        """Faults of the fields."""
+        """Yield findings about the values and the axes of the readings."""
         c = self.counts
         magnitude = float(np.sqrt(np.nansum(self.field**2)))
         if magnitude > max_field:

@@ -228,7 +228,7 @@ def test_every_sample_passes_or_is_rejected_once_and_in_order(seed):
         for i in range(n):
             own = [stamp for k, stamp in held(clock_filter) if k == i]
             assert len(own) <= max_held
-            # No sample is held longer than the limit, by its own timestamps or those of others.
+            # No sample is held longer than the limit, by the timestamps of any sensor.
             assert not own or min(own) >= own[-1] - LIMIT
         assert all(newest - h[2] <= LIMIT for h in clock_filter.held)
     passed += clock_filter.flush()

@@ -199,7 +199,7 @@ def test_the_clock_offset_is_subtracted_from_timestamps():
     (first,), (second,) = fed(s, sample(5.0)), fed(s, sample(5.0213, sensor='mag_2'))
     assert first.stamp_ns == second.stamp_ns == 5_000_000_000
     assert s.last_stamp_ns('mag_2') == 5_000_000_000
-    # The samples of a sensor still have to be in order.
+    # The samples of each sensor must remain in chronological order.
     assert fed(s, sample(5.0213, sensor='mag_2')) == []
     assert rejected(s.counts) == {'duplicate timestamp': 1}
 
