@@ -1,6 +1,6 @@
 """Tracks and poses of magnetic targets from a network of stationary magnetometers.
 
-The names in `__all__` are the public Python interface. The gallery has more examples:
+The names in `__all__` are the public Python interface (the gallery has more examples):
 
     import mag_tracking as mt
 

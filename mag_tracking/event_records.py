@@ -73,7 +73,7 @@ class Disturbance:
 
 @dataclass(frozen=True, slots=True)
 class VehiclePassage:
-    """A vehicle that crossed a counting line, estimated from its whole track."""
+    """Passage of a vehicle across a counting line, estimated from the whole track."""
 
     stamp_ns: int
     """Time at which the middle of the vehicle was on the line, ns since 1970."""
@@ -123,7 +123,7 @@ class VehiclePassage:
 
 @dataclass(frozen=True, slots=True)
 class TrafficCount:
-    """Vehicles of one direction and class in an interval."""
+    """Number of vehicles of one direction and class in an interval, and their mean speed."""
 
     forward: bool
     """Whether the vehicles moved in the forward direction of the line."""

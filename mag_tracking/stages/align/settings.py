@@ -1,4 +1,4 @@
-"""Settings of the alignment."""
+"""Settings of the alignment of samples into frames."""
 
 from dataclasses import dataclass
 

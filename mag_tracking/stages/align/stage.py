@@ -178,7 +178,7 @@ class Align:
         """Do nothing: no work is deferred."""
 
     def _reject(self, cause: str) -> None:
-        """Count a rejection."""
+        """Count a rejected sample by cause."""
         self.counts[f'rejected: {cause}'] += 1
 
     def _frames(self, final: bool = False) -> list[FieldFrame]:

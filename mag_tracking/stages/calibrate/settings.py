@@ -1,4 +1,4 @@
-"""Settings of the calibration."""
+"""Settings of the calibration of readings."""
 
 from dataclasses import dataclass
 

@@ -363,7 +363,7 @@ class Calibrate:
         return self._finish(out)
 
     def _reject(self, sensor: str, cause: str, n: int = 1) -> None:
-        """Count `n` rejections."""
+        """Count `n` rejected readings of a sensor by cause."""
         if n:
             self.counts[f'rejected: {cause}'] += n
             self._per_sensor[sensor].update({'rejected': n, f'rejected: {cause}': n})

@@ -1,4 +1,4 @@
-"""Settings of the detection."""
+"""Settings of the detection of targets."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class DetectSettings:
-    """Settings of the detection."""
+    """Settings of thresholds, hold time and background uncertainty of the detection."""
 
     false_alarm_probability: float = param(
         1e-3, 'Probability that a single frame of noise exceeds the threshold. The actual '

@@ -1,4 +1,4 @@
-"""Settings of the events."""
+"""Settings of single-sensor pass events."""
 
 from dataclasses import dataclass
 

@@ -52,7 +52,7 @@ def median_field(fields: FloatArray) -> FloatArray:
 
 
 def sample_noise_std(fields: FloatArray) -> FloatArray:
-    """Standard deviation of each axis from second differences without outliers.
+    """Noise standard deviation of each axis, from second differences without outliers.
 
     Second differences suppress a passing target, whose field has a slope but hardly any curvature
     from one reading to the next. The result is at least the quantisation error.

@@ -1,4 +1,4 @@
-"""Settings of the survey."""
+"""Settings of the survey of orientations and clock offsets."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class SurveySettings:
-    """Settings of the survey."""
+    """Settings of the survey of orientations and clock offsets."""
 
     compass_bias_std: float = param(
         6e-7, 'Prior standard deviation, per axis, of the field that a sensor and nearby iron add '
