@@ -148,8 +148,8 @@ def _scalar(name: str, value: object, kind: _Class) -> Scalar:
     if kind is int and isinstance(value, int) and not isinstance(value, bool):
         return value
     if kind is str and isinstance(value, str) and not is_text(value):
-        raise SettingsError(f'{name}: {shown(value)} is not valid Unicode text: it contains an '
-                            'unpaired surrogate')
+        raise SettingsError(f'{name}: {shown(value)} is not text: it contains an unpaired '
+                            'surrogate')
     if kind in (bool, str) and isinstance(value, kind):
         return value
     raise SettingsError(f'{name}: expected {kind.__name__}, got {shown(value)}')
@@ -225,9 +225,18 @@ def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
     checked = {}
     for name, value in _flattened(changes).items():
         if name not in known:
-            raise SettingsError(f'unknown setting {name}{_suggestion(name, known)}')
+            raise SettingsError(_unknown_message(name, value, known))
         checked[name] = _validated(known[name], value)
     return _rebuild(settings, checked, '')
+
+
+def _unknown_message(name: str, value: object, known: Iterable[str]) -> str:
+    """Error message for the name of a group, or for an unknown name with a suggestion."""
+    members = [k for k in known if k.startswith(f'{name}.')]
+    if members:
+        return (f'{name} is a group of settings, such as {members[0]}; expected a mapping, got '
+                f'{"nothing" if value is None else shown(value)}')
+    return f'unknown setting {name}{_suggestion(name, known)}'
 
 
 def _suggestion(name: str, known: Iterable[str]) -> str:
@@ -242,8 +251,28 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
     renamed = f'{group}{dot}{RENAMED_SETTINGS.get(leaf)}'
     if renamed in known:
         return f'; it was renamed to {renamed}'
-    near = difflib.get_close_matches(name, known, n=1)
-    return f'; did you mean {near[0]}?' if near else ''
+    if group and not any(k.startswith(f'{group}.') for k in known):
+        return _group_suggestion(group, leaf, known)
+    near = _closest(name, known)
+    return f'; did you mean {near}?' if near else ''
+
+
+def _group_suggestion(group: str, leaf: str, known: Iterable[str]) -> str:
+    """Suggestion for the setting `leaf` of an unknown group; empty if there are no groups."""
+    groups = list(dict.fromkeys(k[:i] for k in known for i, c in enumerate(k) if c == '.'))
+    near_group = _closest(group, groups)
+    if near_group:
+        near = _closest(leaf, [k.removeprefix(f'{near_group}.') for k in known
+                               if k.startswith(f'{near_group}.')])
+        return (f'; there is no group {group}; did you mean {near_group}'
+                f'{"." + near if near else ""}?')
+    top = [g for g in groups if '.' not in g]
+    return f'; there is no group {group}; the groups are {", ".join(top)}' if top else ''
+
+
+def _closest(name: str, candidates: Iterable[str]) -> str:
+    """Candidate that is most similar to `name`; empty if none is similar."""
+    return next(iter(difflib.get_close_matches(name, list(candidates), n=1)), '')
 
 
 def _rebuild(settings: _Settings, checked: Mapping[str, Value], prefix: str) -> _Settings:

@@ -47,6 +47,12 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
     ({'track.explained_ratio': 4.0}, 'it was renamed to track.min_bayes_factor'),
     ({'calibrate.jump_back_s': 4.0}, 'it was renamed to calibrate.max_backward_jump_s'),
     ({'align': {'perod_s': 0.1}}, 'unknown setting align.perod_s; did you mean align.period_s'),
+    ({'trak': {'x': 1}}, 'unknown setting trak.x; there is no group trak; did you mean track'),
+    ({'trak': {'iteration': 1}}, r'there is no group trak; did you mean track.iterations\?'),
+    ({'track.vehicel.x': 1}, r'no group track.vehicel; did you mean track.vehicle\?'),
+    ({'foo': {'x': 1}}, 'no group foo; the groups are calibrate, align, detect, events, track, '),
+    ({'track': 3}, 'track is a group of settings, such as track.target; .* got 3'),
+    ({'track.vehicle': None}, 'track.vehicle is a group of settings, .* a mapping, got nothing'),
     ({'align.period_s': 'long'}, 'align.period_s: expected float'),
     ({'align.period_s': -1.0}, 'align.period_s: -1.0 is outside'),
     ({'align.period_s': float('nan')}, 'NaN'),
@@ -58,7 +64,7 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
     ({'track.vehicle.speeds': 5.0}, 'expected a list'),
     ({'track.vehicle.speeds': [5.0, 1e9]}, 'outside'),
     ({'track.vehicle.kinds': ['small', 'c\ud800r', 'truck']},
-     r"track.vehicle.kinds: 'c\\ud800r' is not valid Unicode text: it contains an unpaired "),
+     r"track.vehicle.kinds: 'c\\ud800r' is not text: it contains an unpaired surrogate"),
     ({'track.vehicle.arrival_names': ['left', 'right', '\udcff']}, 'arrival_names: .* surrogate'),
 ])
 def test_errors_name_the_invalid_setting(changes, message):
