@@ -122,8 +122,9 @@ def test_the_default_file_is_plain_yaml_with_floats():
 
 
 @pytest.mark.parametrize('changes, message', [
-    ({'track.vehicle.lengths': [0.0, 3.0]}, r'lengths: expected 3 values \(one per kinds\), got 2'),
-    ({'track.vehicle.arrival_names': ['a']}, 'arrival_headings_deg: expected 1 values'),
+    ({'track.vehicle.lengths': [0.0, 3.0]}, r'lengths: expected 3 values \(one per kind\), got 2'),
+    ({'track.vehicle.arrival_names': ['a']},
+     r'arrival_headings_deg: expected 1 value \(one per arrival name\), got 3'),
     ({'track.vehicle.kinds': ['car', 'car', 'truck']}, 'kinds: a name is duplicated'),
     ({'track.vehicle.length_stds': [1.0, 1.0, 3.0]}, 'length_stds: 1 for small, which is a point'),
     ({'track.vehicle.difference_stds': [9.0, 30.0, 120.0]}, 'difference_stds: 9 for small')])

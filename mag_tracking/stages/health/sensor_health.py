@@ -39,6 +39,11 @@ SPIKE_STD = 30.0
 deviations of the noise."""
 
 
+def _times(n: int) -> str:
+    """Number of occurrences in words."""
+    return 'once' if n == 1 else f'{n} times'
+
+
 @dataclass(frozen=True)
 class Finding:
     """A fault, and advice on how to fix it."""
@@ -329,12 +334,12 @@ class SensorHealth:
     def _clock_findings(self, name: str) -> Iterator[Finding]:
         """Yield findings about clock steps and backward timestamps."""
         if n := self.counts['clock steps']:
-            yield Finding(True, name, f'its clock stepped {n} times relative to the '
+            yield Finding(True, name, f'its clock stepped {_times(n)} relative to the '
                           f'host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
                           'clocks (chrony, PTP), and take timestamps from a monotonic clock')
         if n := self.counts['backward timestamps']:
-            yield Finding(True, name, f'timestamps went back {n} times', 'check for two publishers '
-                          'on one topic, a clock that was set, or a looped replay')
+            yield Finding(True, name, f'timestamps went back {_times(n)}', 'check for two '
+                          'publishers on one topic, a clock that was set, or a looped replay')
 
     def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
         """Yield findings about duplicate timestamps, lost readings and delays."""

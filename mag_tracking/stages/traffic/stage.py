@@ -282,12 +282,14 @@ def _are_same_vehicle(one: _PendingCrossing, other: _PendingCrossing) -> bool:
 
 def _check_lists(settings: TrafficSettings) -> None:
     """Raise SettingsError if lists differ in length or names are invalid."""
-    for names, lists in (('line_names', PER_LINE), ('class_names', PER_CLASS)):
+    for names, item, lists in (('line_names', 'line', PER_LINE),
+                               ('class_names', 'class', PER_CLASS)):
         values = getattr(settings, names)
         for name in lists:
             if len(getattr(settings, name)) != len(values):
-                raise SettingsError(f'traffic.{name}: expected {len(values)} values (one per '
-                                    f'{names}), got {len(getattr(settings, name))}')
+                raise SettingsError(f'traffic.{name}: expected {len(values)} value'
+                                    f'{"" if len(values) == 1 else "s"} (one per {item}), '
+                                    f'got {len(getattr(settings, name))}')
         if len(set(values)) < len(values):
             raise SettingsError(f'traffic.{names}: duplicate names in {values}')
         if '' in values or UNKNOWN in values:

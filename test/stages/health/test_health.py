@@ -103,8 +103,8 @@ def faulty(fault):
 @pytest.mark.parametrize('fault, serious, message', [
     ('lost', False, 'readings were lost, '),
     ('twice', False, '3000 of 6000 readings repeat the previous timestamp'),
-    ('back', True, 'timestamps went back 1 times'),
-    ('step', True, 'its clock stepped 1 times relative to the host, by up to -1.00 s'),
+    ('back', True, 'timestamps went back once'),
+    ('step', True, 'its clock stepped once relative to the host, by up to -1.00 s'),
     ('late', False, 'ms to arrive'),
     ('ahead', False, 'the delay from timestamp to receipt is -3.0 s'),
     ('stuck', True, 'readings are identical to all readings of the previous 1 s'),

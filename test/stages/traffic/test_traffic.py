@@ -283,8 +283,8 @@ def test_magnets_are_not_counted():
 
 
 @pytest.mark.parametrize(('changes', 'message'), [
-    ({'line_offsets': (0.0, 1.0)}, r'traffic.line_offsets: expected 1 values'),
-    ({'class_lengths': (3.0,)}, r'traffic.class_lengths: expected 3 values'),
+    ({'line_offsets': (0.0, 1.0)}, r'line_offsets: expected 1 value \(one per line\), got 2'),
+    ({'class_lengths': (3.0,)}, r'class_lengths: expected 3 values \(one per class\), got 1'),
     ({'class_names': ('car', 'car', 'truck')}, 'duplicate names'),
     ({'class_names': ('car', 'unknown', 'truck')}, "'unknown' is not a valid name"),
     ({'line_names': ('',)}, 'is not a valid name')])
