@@ -50,7 +50,7 @@ class Page:
             self.complaints.append(message.text)
 
     def value(self, expression):
-        """Value of a JavaScript expression."""
+        """Evaluate a JavaScript expression in the page, and return its value."""
         return self.page.evaluate(expression)
 
     def wait(self, expression, seconds=60.0):

@@ -168,7 +168,7 @@ class Calibrate:
         return {n: b.doubtful_times for n, b in self._background.items() if b.doubtful_times}
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
-        """Number of accepted and rejected readings of a sensor, also by cause of rejection.
+        """Number of accepted and rejected readings of a sensor, in total and by cause of rejection.
 
         Parameters
         ----------

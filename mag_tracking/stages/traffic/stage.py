@@ -106,7 +106,7 @@ class Traffic:
     Attributes
     ----------
     counts : Counter of str
-        Number of passages and of special cases.
+        Number of passages, repeated crossings, tracks that crossed no line, and backward jumps.
 
     Raises
     ------

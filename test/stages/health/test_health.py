@@ -118,12 +118,12 @@ def faulty(fault):
 ])
 def test_each_fault_is_named(fault, serious, message):
     health = examined(*faulty(fault))
-    found = health.findings('mag_1', noise_std=np.full(3, SIGMA))
-    match = [f for f in found if message in str(f)]
-    assert len(match) == 1 and match[0].serious == serious, [str(f) for f in found]
+    findings = health.findings('mag_1', noise_std=np.full(3, SIGMA))
+    match = [f for f in findings if message in str(f)]
+    assert len(match) == 1 and match[0].serious == serious, [str(f) for f in findings]
     assert match[0].subject == 'mag_1' and match[0].advice
     # A backward timestamp is also a clock step.
-    assert len(found) == 1 + (fault == 'back'), [str(f) for f in found]
+    assert len(findings) == 1 + (fault == 'back'), [str(f) for f in findings]
 
 
 def test_a_sensor_with_noise_below_its_resolution_has_no_spikes():
@@ -141,8 +141,8 @@ def test_a_stalled_host_is_not_a_clock_step():
     for first in range(500, 3000, 500):
         until = received[first] + 400_000_000
         received[first:] = np.maximum(received[first:], until)
-    found = texts(examined(stamps, fields, received))
-    assert not any('stepped' in text for text in found), found
+    findings = texts(examined(stamps, fields, received))
+    assert not any('stepped' in text for text in findings), findings
 
 
 def test_lost_readings_are_counted():
@@ -204,10 +204,10 @@ def doctor_findings(change=lambda k, field: field, seconds=10.0, **settings):
             if j == 1:
                 field = change(k, field)
             doctor.feed(one(MagSample(10**18 + k * 20_000_000, name, field)))
-    found = doctor.findings()
+    findings = doctor.findings()
     # Serious findings come first.
-    assert found == sorted(found, key=lambda f: not f.serious)
-    return [str(f) for f in found]
+    assert findings == sorted(findings, key=lambda f: not f.serious)
+    return [str(f) for f in findings]
 
 
 def test_a_target_that_stays_causes_no_findings():
@@ -217,12 +217,12 @@ def test_a_target_that_stays_causes_no_findings():
 
 def test_the_doctor_compares_sensors_with_the_earth_field():
     assert doctor_findings() == []
-    found = doctor_findings(lambda k, field: field * [1.0, -1.0, 1.0])
-    assert len(found) == 1 and "mag_2: differs from the Earth's field by" in found[0]
-    assert 'y is flipped' in found[0]
-    found = doctor_findings(lambda k, field: field * 1e6)
-    assert any('its unit is microtesla' in text for text in found), found
-    assert any(text.startswith('calibrate: 500 readings rejected: above') for text in found)
+    findings = doctor_findings(lambda k, field: field * [1.0, -1.0, 1.0])
+    assert len(findings) == 1 and "mag_2: differs from the Earth's field by" in findings[0]
+    assert 'y is flipped' in findings[0]
+    findings = doctor_findings(lambda k, field: field * 1e6)
+    assert any('its unit is microtesla' in text for text in findings), findings
+    assert any(text.startswith('calibrate: 500 readings rejected: above') for text in findings)
     # The first spike is not counted, because the noise is not known yet.
     few = doctor_findings(lambda k, field: field * (1e6 if k % 100 == 1 else 1.0), seconds=20.0)
     assert 'mag_2: 9 of 1000 readings are spikes' in few[0] and '10 readings rejected' in few[1]
@@ -241,8 +241,9 @@ def test_a_background_in_the_file_does_not_hide_a_flipped_axis():
             field = backgrounds[j] * ([1.0, 1.0, -1.0] if j == 2 else np.ones(3))
             doctor.feed(one(MagSample(k * 20_000_000, name,
                                       field + SIGMA * rng.standard_normal(3))))
-    found = [str(f) for f in doctor.findings()]
-    assert "mag_3: differs from the Earth's field by" in found[0] and 'z is flipped' in found[0]
+    findings = [str(f) for f in doctor.findings()]
+    assert "mag_3: differs from the Earth's field by" in findings[0]
+    assert 'z is flipped' in findings[0]
 
 
 def test_without_an_earth_field_sensors_are_compared_with_each_other():
@@ -256,8 +257,8 @@ def test_without_an_earth_field_sensors_are_compared_with_each_other():
                 field = network.R_sw[j] @ EARTH * ([1.0, -1.0, 1.0] if j == 1 else np.ones(3))
                 doctor.feed(one(MagSample(k * 20_000_000, name,
                                       field + SIGMA * rng.standard_normal(3))))
-        found = [str(f) for f in doctor.findings()]
-        assert len(found) == 1 and found[0].startswith(message), found
+        findings = [str(f) for f in doctor.findings()]
+        assert len(findings) == 1 and findings[0].startswith(message), findings
 
 
 def test_clocks_far_apart_are_named_and_the_age_of_a_replay_is_not():
@@ -272,9 +273,9 @@ def test_clocks_far_apart_are_named_and_the_age_of_a_replay_is_not():
                 # All timestamps are years old, as in a replay.
                 stamp = received - 10**17 - (offset_ns if j else 0)
                 doctor.feed(one(MagSample(stamp, name, field)), received)
-        found = [str(f) for f in doctor.findings()]
-        assert len(found) == n, found
-        assert not n or found[0].startswith(
+        findings = [str(f) for f in doctor.findings()]
+        assert len(findings) == n, findings
+        assert not n or findings[0].startswith(
             'mag_2: its timestamps differ by -120 s from those of other')
 
 
@@ -292,11 +293,11 @@ def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
 @pytest.mark.parametrize('name', VEHICLES)
 def test_the_doctor_finds_no_faults_in_the_bundled_recordings(name, road_network):
     doctor, lost = examine(Recording(vehicle_path(name)), road_network, settings_for('vehicle'))
-    found = [str(f) for f in doctor.findings()]
+    findings = [str(f) for f in doctor.findings()]
     if name == 'straight_truck_right':
         # The truck passes so close that a sensor reaches its limit of 100 uT.
-        assert found.pop().startswith('mag_2: 9 of 1400 readings are at the end of the range')
-    assert not lost and not found
+        assert findings.pop().startswith('mag_2: 9 of 1400 readings are at the end of the range')
+    assert not lost and not findings
 
 
 def test_the_doctor_reports_saturated_sensors_of_the_corridor(capsys):
@@ -368,18 +369,18 @@ def test_a_reading_buffer_returns_the_readings_of_each_sensor_in_order():
     """A full buffer accepts no readings until it has been emptied."""
     rng, buffer = np.random.default_rng(4), ReadingBuffer(5, 8)
     rows, stamps = rng.integers(-1, 5, 300), np.arange(300)
-    fields, found, i = rng.standard_normal((300, 3)), {j: [] for j in range(5)}, 0
+    fields, popped, i = rng.standard_normal((300, 3)), {j: [] for j in range(5)}, 0
     fields[7, 1] = np.nan
 
     def collect(j):
-        found[j] += [(int(t), f.tolist(), int(r)) for t, f, r in zip(*buffer.pop(j), strict=True)]
+        popped[j] += [(int(t), f.tolist(), int(r)) for t, f, r in zip(*buffer.pop(j), strict=True)]
 
     while (i := buffer.add(rows, stamps, fields, 1000, i)) < len(rows):
         collect(rows[i])
     for j in range(5):
         collect(j)
         expected = [(k, fields[k].tolist(), 1000) for k in np.flatnonzero(rows == j).tolist()]
-        assert repr(found[j]) == repr(expected) and len(expected) > 30
+        assert repr(popped[j]) == repr(expected) and len(expected) > 30
 
 
 def test_counts_do_not_depend_on_the_update_interval():
@@ -389,12 +390,12 @@ def test_counts_do_not_depend_on_the_update_interval():
         stuck = k % 900 > 600
         fields.append(fields[-1] if stuck else 1e-5 + 1e-8 * rng.standard_normal(3))
     stamps = np.cumsum([NS // 100 * (40 if k % 256 == 0 else 1) for k in range(3000)])
-    found = []
+    counts = []
     for update_interval in (1, 64, 256):
         health = SensorHealth(update_interval)
         for t, f in zip(stamps.tolist(), fields, strict=True):
             health.add(t, f)
-        found.append({k: health.counts[k] for k in ('readings', 'lost', 'stuck readings')})
-    assert found[1] == found[2]
-    assert found[0]['stuck readings'] == found[1]['stuck readings'] > 500
-    assert found[1]['lost'] > 300
+        counts.append({k: health.counts[k] for k in ('readings', 'lost', 'stuck readings')})
+    assert counts[1] == counts[2]
+    assert counts[0]['stuck readings'] == counts[1]['stuck readings'] > 500
+    assert counts[1]['lost'] > 300
