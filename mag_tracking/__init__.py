@@ -1,6 +1,6 @@
 """Tracks and poses of magnetic targets from a network of stationary magnetometers.
 
-The names below are the public Python interface. The gallery of the documentation has examples:
+The names in `__all__` are the public Python interface (the gallery has more examples):
 
     import mag_tracking as mt
 
@@ -46,8 +46,8 @@ __all__ = [
     'TrafficResult', 'UnknownTrackError', 'events', 'fit', 'plan', 'read_network',
     'read_parameter_file', 'read_recording', 'readings_from_arrays', 'track', 'traffic']
 
-# Modules of the names above. They are imported on first use, because every command and node imports
-# `mag_tracking` at its start, and the compiled code and the figures take seconds to load.
+# Public names by module. The modules are imported on first use, because every command and node
+# imports `mag_tracking` at startup, and the compiled code and the figures take seconds to load.
 _MODULES = {
     'analysis.placement': ('PlannedTarget', 'Sampling'),
     'apps.events': ('EventsResult', 'events'),
@@ -67,11 +67,11 @@ _MODULES = {
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 
-if not TYPE_CHECKING:  # A type checker uses the imports above and reports all other names.
+if not TYPE_CHECKING:  # Type checkers use the imports above and report all other names as errors.
     def __getattr__(name: str) -> object:
         """Import a public name on first use (PEP 562)."""
         if name == '__version__':
-            # As installed: the version stands in package.xml only.
+            # The version is set only in package.xml and is read from the installed metadata.
             return importlib.import_module('importlib.metadata').version(__name__)
         if name not in _MODULE_OF:
             raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
@@ -81,5 +81,5 @@ if not TYPE_CHECKING:  # A type checker uses the imports above and reports all o
 
 
 def __dir__() -> list[str]:
-    """Return the public names, imported or not."""
+    """Return all names of the module, including public names that are not imported yet."""
     return sorted({*globals(), *__all__})

@@ -1,4 +1,4 @@
-"""Type aliases for arrays; docstrings state the shapes and units."""
+"""Type aliases for arrays. Shapes and units are given where the aliases are used."""
 
 from typing import Any, TypeAlias
 

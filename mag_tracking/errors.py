@@ -30,7 +30,7 @@ class ReadingsError(MagTrackingError, ValueError):
 
 
 class UnknownTrackError(MagTrackingError, LookupError):
-    """A result has no track with this number."""
+    """A result has no track with the requested number."""
 
 
 class MissingDependencyError(MagTrackingError, ImportError):

@@ -1,11 +1,12 @@
-"""Event records: passes of a single sensor, disturbances, vehicles that crossed a counting line."""
+"""Event records: single-sensor passes, disturbances, vehicle passages and traffic summaries."""
 
 from dataclasses import dataclass
 
 from mag_tracking.arrays import FloatArray
 
 SIGNATURE_SPAN = 4.0
-"""A signature extends this many time scales to either side of the closest point."""
+"""Half the length of a signature, which is centred on the closest point of approach [time
+scales]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +34,7 @@ class PassEvent:
     noise_std: FloatArray
     """Standard deviation of one reading, (3,) T, sensor frame."""
     closest_ns: int
-    """Time of the closest point of approach of a dipole on a straight line, ns since 1970."""
+    """Time of the closest point of approach, ns since 1970, for a dipole on a straight line."""
     closest_std: float
     """Standard deviation of `closest_ns`, s. inf if unobservable."""
     time_scale: float
@@ -43,54 +44,55 @@ class PassEvent:
     unknown, for example without two horizontal axes."""
     signature: FloatArray
     """Field at equal steps from -4 to 4 time scales about the closest point, (33, 3) T, sensor
-    frame. NaN outside of the readings."""
+    frame. NaN where there are no readings."""
 
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """A field that something other than a target explains better, from its onset on."""
+    """A change of the field that is better explained by something other than a target."""
 
     stamp_ns: int
-    """Time of the latest information about it, ns since 1970."""
+    """Latest known time of the disturbance, ns since 1970."""
     id: int
     """Number of the disturbance, from 1."""
     ended: bool
-    """True if the network is quiet again or the frames have ended. False while it continues."""
+    """True if the network is quiet again or the frames have ended. False while the disturbance
+    continues."""
     begin_ns: int
-    """Time of its beginning, ns since 1970."""
+    """Start time of the disturbance, ns since 1970."""
     largest: float
     """Magnitude of the largest field at any sensor, T."""
     sensors: tuple[str, ...]
     """Names of the affected sensors, the strongest first."""
     uniform: float
-    """Probability that a single field across the network caused it, rather than a separate field at
+    """Probability of one common field across the network, as opposed to an independent field at
     each sensor."""
     track_id: int
-    """Number of the latest track that it made ambiguous."""
+    """Number of the latest track that is ambiguous because of the disturbance."""
 
 
 @dataclass(frozen=True, slots=True)
 class VehiclePassage:
-    """A vehicle that crossed a counting line, estimated from its whole track."""
+    """Passage of a vehicle across a counting line, estimated from the whole track."""
 
     stamp_ns: int
     """Time at which the middle of the vehicle was on the line, ns since 1970."""
     number: int
-    """Number of the passage, from 1, over all lines in order of time."""
+    """Number of the passage, from 1, in chronological order over all lines."""
     line: str
     """Name of the counting line."""
     track_id: int
     """Number of the track."""
     forward: bool
-    """Whether it moved in the forward direction of the line."""
+    """Whether the vehicle moved in the forward direction of the line."""
     direction_error: float
-    """Probability that the direction is wrong. It is derived from the rotation of the field at each
-    sensor beside the path, independently of the track. NaN if the rotation is inconclusive or
-    another vehicle was near."""
+    """Probability that the direction is wrong, from the rotation of the field at each sensor near
+    the path, independently of the track. NaN if the rotation is inconclusive or another vehicle was
+    nearby."""
     position: FloatArray
     """Position on the line, (3,) m, world frame."""
     lateral: float
-    """Distance to the left of the middle of the line, seen in its forward direction, m."""
+    """Distance from the middle of the line, m. Positive to the left of the forward direction."""
     velocity: FloatArray
     """Velocity, (3,) m/s, world frame."""
     speed: float
@@ -121,16 +123,16 @@ class VehiclePassage:
 
 @dataclass(frozen=True, slots=True)
 class TrafficCount:
-    """Vehicles of one direction and class in an interval."""
+    """Number of vehicles of one direction and class in an interval, and their mean speed."""
 
     forward: bool
-    """Whether they moved in the forward direction of the line."""
+    """Whether the vehicles moved in the forward direction of the line."""
     vehicle_class: str
     """Class of the vehicles, or `unknown`."""
     count: int
     """Number of passages."""
     ambiguous: int
-    """Number of ambiguous passages among them."""
+    """Number of these passages that are ambiguous."""
     mean_speed: float
     """Mean horizontal speed, m/s."""
     mean_headway: float
@@ -142,12 +144,12 @@ class TrafficSummary:
     """Traffic across one line in one interval."""
 
     begin_ns: int
-    """Beginning of the interval, ns since 1970."""
+    """Start of the interval, ns since 1970."""
     end_ns: int
     """End of the interval, ns since 1970."""
     line: str
     """Name of the counting line."""
     observed_s: float
-    """Part of the interval that is covered by frames, s."""
+    """Duration within the interval that is covered by frames, s."""
     counts: tuple[TrafficCount, ...]
-    """One count per observed direction and class."""
+    """Count for each observed direction and class."""

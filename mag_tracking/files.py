@@ -1,5 +1,4 @@
-"""Validated paths, and result files that are created from scratch and never written through a
-link."""
+"""Path validation, and creation of result files without following links."""
 
 import os
 import secrets
@@ -11,13 +10,13 @@ from mag_tracking.errors import MagTrackingError, OutputError
 
 
 def checked_path(path: str | PathLike[str], error: type[MagTrackingError]) -> Path:
-    """Convert a path to a `Path`.
+    """Validate a path and convert it to a `Path`.
 
     Parameters
     ----------
     path : path_like
     error : type of MagTrackingError
-        Exception to raise if no file can have this name.
+        Exception to raise if the path is invalid.
 
     Returns
     -------
@@ -55,14 +54,14 @@ def output_folder(path: str | PathLike[str]) -> Path:
 def new_text_file(path: str | PathLike[str], newline: str | None = None) -> TextIO:
     """Create an empty UTF-8 file and open it for writing.
 
-    A file or link of that name is removed first; the target of a link stays untouched. Lone
-    surrogates, such as those of a file name that is not UTF-8, are written as `\\udcff`.
+    An existing file or link with this name is removed first; the target of a link is not modified.
+    Unpaired surrogates, for example from file names that are not UTF-8, are escaped as `\\udcff`.
 
     Parameters
     ----------
     path : path_like
     newline : str, optional
-        As for `open`.
+        Newline translation, as for `open`.
 
     Returns
     -------
@@ -73,14 +72,16 @@ def new_text_file(path: str | PathLike[str], newline: str | None = None) -> Text
     OSError
         If the file cannot be created.
     OutputError
-        If no file can have this name.
+        If the path is invalid.
     """
     return open(_unlinked_path(path), 'x', newline=newline, encoding='utf-8',
                 errors='backslashreplace')
 
 
 def new_binary_file(path: str | PathLike[str]) -> BinaryIO:
-    """Create an empty binary file and open it for writing, as `new_text_file` does.
+    """Create an empty binary file and open it for writing.
+
+    An existing file or link with this name is removed first; the target of a link is not modified.
 
     Parameters
     ----------
@@ -95,16 +96,16 @@ def new_binary_file(path: str | PathLike[str]) -> BinaryIO:
     OSError
         If the file cannot be created.
     OutputError
-        If no file can have this name.
+        If the path is invalid.
     """
     return open(_unlinked_path(path), 'xb')
 
 
 def replace_text(path: str | PathLike[str], text: str) -> None:
-    """Write a UTF-8 file atomically: an existing file stays in place until the new one is complete.
+    """Write a UTF-8 file atomically.
 
-    The text is written under a random name and moved into place. No link is written through,
-    neither one of the final name nor one that was planted under the temporary name.
+    The text is written to a temporary file with a random name, which then replaces `path`. Links
+    are not followed, neither at `path` nor at the temporary name.
 
     Parameters
     ----------
@@ -122,7 +123,7 @@ def replace_text(path: str | PathLike[str], text: str) -> None:
         with open(draft, 'x', encoding='utf-8', errors='backslashreplace') as stream:
             stream.write(text)
             stream.flush()
-            # Without this, a power cut could leave an empty file in place of the old one.
+            # Without fsync, a power failure could leave an empty file in place of the old one.
             os.fsync(stream.fileno())
         draft.replace(path)
     except OSError as error:
@@ -131,7 +132,7 @@ def replace_text(path: str | PathLike[str], text: str) -> None:
 
 
 def _unlinked_path(path: str | PathLike[str]) -> Path:
-    """Remove the file or link at `path`, on which an exclusive creation would fail."""
+    """Return `path` after removing any file or link there, so that exclusive creation succeeds."""
     path = checked_path(path, OutputError)
     path.unlink(missing_ok=True)
     return path

@@ -55,14 +55,14 @@ def quaternion_from_rotation_vector(v: ArrayLike) -> FloatArray:
 
 
 def rotation_vectors_between(q: ArrayLike, other: ArrayLike) -> FloatArray:
-    """Shortest rotations about world axes from one orientation to others.
+    """Rotation vectors, in world axes, of the shortest rotations from one orientation to others.
 
     Parameters
     ----------
     q : (4,) array
-        Unit quaternion xyzw.
+        Initial orientation, unit quaternion xyzw.
     other : (..., 4) array
-        Unit quaternions xyzw.
+        Final orientations, unit quaternions xyzw.
 
     Returns
     -------
@@ -125,7 +125,7 @@ def left_jacobian(v: ArrayLike) -> FloatArray:
     angle = np.sqrt(square)
     K = cross_matrix(v)
     half = np.sinc(0.5 * angle / np.pi)
-    # (angle - sin(angle)) / angle^3, by its series where the difference would cancel.
+    # (angle - sin(angle)) / angle^3, by its Taylor series where the subtraction would cancel.
     small = angle < 1e-2
     third = np.where(small, (1.0 - square / 20.0) / 6.0,
                      (1.0 - np.sinc(angle / np.pi)) / np.where(small, 1.0, square))
@@ -178,7 +178,7 @@ def yaw_between(R: FloatArray, other: FloatArray) -> float:
     Returns
     -------
     float, rad
-        From -pi to pi.
+        Angle from -pi to pi.
     """
     M = other @ R.T
     return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
@@ -195,7 +195,7 @@ def quaternion_from_rotation(R: FloatArray) -> FloatArray:
     Returns
     -------
     (4,) array
-        Unit quaternion xyzw; the sign is that of a positive largest component.
+        Unit quaternion xyzw whose largest component is positive.
     """
     w2 = np.array([1 + R[0, 0] - R[1, 1] - R[2, 2], 1 - R[0, 0] + R[1, 1] - R[2, 2],
                    1 - R[0, 0] - R[1, 1] + R[2, 2], 1 + R[0, 0] + R[1, 1] + R[2, 2]])
@@ -210,20 +210,20 @@ def quaternion_from_rotation(R: FloatArray) -> FloatArray:
 
 
 def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
-    """Shortest rotation that takes one direction to another.
+    """Shortest rotation from one direction to another.
 
     Parameters
     ----------
     a : (3,) array
-        Initial direction, of any norm but zero.
+        Initial direction, with non-zero norm.
     b : (3,) array
-        Final direction, of any norm but zero.
+        Final direction, with non-zero norm.
 
     Returns
     -------
     (4,) array
-        Unit quaternion xyzw. For opposite directions the axis is an arbitrary one perpendicular to
-        `a`.
+        Unit quaternion xyzw. For opposite directions, the rotation axis is an arbitrary vector
+        perpendicular to `a`.
     """
     u: FloatArray = np.asarray(a, dtype=float) / np.linalg.norm(a)
     v: FloatArray = np.asarray(b, dtype=float) / np.linalg.norm(b)
@@ -249,7 +249,7 @@ def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float
     -------
     speed : float, m/s
     std : float, m/s
-        At zero speed the largest standard deviation of any direction.
+        At zero speed, the largest standard deviation in any direction.
     """
     speed = float(np.linalg.norm(velocity))
     if speed == 0.0:
@@ -270,7 +270,7 @@ def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, flo
     Returns
     -------
     heading : float, rad
-        From x, anticlockwise seen from above; zero at zero speed.
+        Anticlockwise from the x axis, seen from above; zero at zero speed.
     std : float, rad
         Infinite at zero speed.
     """
@@ -282,19 +282,19 @@ def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, flo
 
 
 def propagated_path(path: FloatArray, seconds: float) -> FloatArray:
-    """Straight paths with the time origin moved forwards.
+    """Straight paths with a later time origin.
 
     Parameters
     ----------
     path : (..., n) array
-        Position [m] and velocity [m/s], then constants; n >= 6.
+        Position [m], velocity [m/s] and n - 6 constant states.
     seconds : float, s
         Shift of the time origin.
 
     Returns
     -------
     (..., n) array
-        The same paths, starting `seconds` later.
+        The same paths with the new time origin.
     """
     moved: FloatArray = path.copy()
     moved[..., :3] += seconds * path[..., 3:6]
@@ -312,18 +312,18 @@ def overlap(position: FloatArray, velocity: FloatArray, need: ArrayLike,
     velocity : (2, n, 2 or 3) array, m/s
         Velocities of the two bodies.
     need : float or (n,) array, m
-        Minimum distance along the heading at which they do not overlap.
+        Minimum distance along the heading at which the bodies do not overlap.
     width : float, m
-        Minimum distance across the heading at which they do not overlap.
+        Minimum distance across the heading at which the bodies do not overlap.
 
     Returns
     -------
     (n,) array, m
-        Zero if they do not overlap.
+        Zero if the bodies do not overlap.
     """
-    away = position[0, :, :2] - position[1, :, :2]
-    size = np.maximum(np.linalg.norm(velocity[1, :, :2], axis=1), 1e-6)
-    forward = velocity[1, :, :2] / size[:, None]
-    along = np.abs(np.einsum('ni,ni->n', away, forward))
-    across = np.abs(away[:, 0] * forward[:, 1] - away[:, 1] * forward[:, 0])
+    offset = position[0, :, :2] - position[1, :, :2]
+    speed = np.maximum(np.linalg.norm(velocity[1, :, :2], axis=1), 1e-6)
+    forward = velocity[1, :, :2] / speed[:, None]
+    along = np.abs(np.einsum('ni,ni->n', offset, forward))
+    across = np.abs(offset[:, 0] * forward[:, 1] - offset[:, 1] * forward[:, 0])
     return np.where(across < width, np.maximum(need - along, 0.0), 0.0)

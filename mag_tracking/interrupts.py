@@ -1,6 +1,6 @@
-"""Termination signals that are recorded or obeyed at once instead of raising an exception.
+"""Handling of termination signals without exceptions: recording, or immediate exit.
 
-Programs import this module first, so it imports nothing that takes time.
+Programs import this module first, so it has no slow imports.
 """
 
 import os
@@ -13,12 +13,12 @@ from types import FrameType
 
 @contextmanager
 def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
-    """Record termination signals, so that a program can check them where it is safe to stop.
+    """Record termination signals, so that a program can check for them where it is safe to stop.
 
-    An exception raised in the middle of an update or of a table row would leave half of it, and a
-    library could swallow the exception or convert it. The third signal nevertheless raises
-    KeyboardInterrupt. A signal that is ignored (SIGINT in a background job) remains ignored.
-    Outside the main thread, where no handler can be set, the list stays empty.
+    An exception could interrupt an update or a table row halfway, and a library could suppress or
+    convert the exception. Only the third signal raises KeyboardInterrupt. Ignored signals (SIGINT
+    in a background job) remain ignored. Outside the main thread, no handler can be installed, and
+    the list stays empty.
 
     Parameters
     ----------
@@ -29,24 +29,24 @@ def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
     list of int
         Numbers of the signals received so far.
     """
-    seen: list[int] = []
+    received: list[int] = []
 
-    def note(signum: int, _: FrameType | None) -> None:
-        seen.append(signum)
-        if len(seen) > 2:
+    def record(signum: int, _: FrameType | None) -> None:
+        received.append(signum)
+        if len(received) > 2:
             raise KeyboardInterrupt
 
-    with _handler_installed(note, signals):
-        yield seen
+    with _temporary_handler(record, signals):
+        yield received
 
 
 @contextmanager
 def exit_on_signals(status: int, *signals: signal.Signals, message: str = '') -> Iterator[None]:
-    """End the process at once when one of `signals` arrives.
+    """Exit immediately when one of `signals` arrives.
 
-    For the imports at the start of a program, when there is nothing to clean up: an exception
-    raised in the middle of an import may be swallowed or converted. No buffer is flushed and no
-    `finally` runs. Ignored signals and other threads are handled as in `recorded_signals`.
+    This is intended for the imports at the start of a program, when there is nothing to clean up:
+    an exception during an import may be suppressed or converted. Buffers are not flushed, and no
+    `finally` block runs. Ignored signals and other threads are handled as by `recorded_signals`.
 
     Parameters
     ----------
@@ -68,22 +68,22 @@ def exit_on_signals(status: int, *signals: signal.Signals, message: str = '') ->
         finally:
             os._exit(status)
 
-    with _handler_installed(shut_down, signals):
+    with _temporary_handler(shut_down, signals):
         yield
 
 
 @contextmanager
-def _handler_installed(handler: Callable[[int, FrameType | None], None],
+def _temporary_handler(handler: Callable[[int, FrameType | None], None],
                        signals: tuple[signal.Signals, ...]) -> Iterator[None]:
-    """Install `handler` for those `signals` that are not ignored."""
-    before = {}
+    """Install `handler` temporarily for all `signals` that are not ignored."""
+    old_handlers = {}
     if threading.current_thread() is threading.main_thread():
-        before = {s: signal.getsignal(s) for s in signals}
-        before = {s: known for s, known in before.items() if known is not signal.SIG_IGN}
-    for s in before:
+        old_handlers = {s: signal.getsignal(s) for s in signals}
+        old_handlers = {s: old for s, old in old_handlers.items() if old is not signal.SIG_IGN}
+    for s in old_handlers:
         signal.signal(s, handler)
     try:
         yield
     finally:
-        for s, known in before.items():
-            signal.signal(s, known)
+        for s, old in old_handlers.items():
+            signal.signal(s, old)

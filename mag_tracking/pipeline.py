@@ -65,14 +65,15 @@ TARGET_DEFAULTS: dict[str, dict[str, Any]] = {
 
 
 def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Settings:
-    """Settings of a type of target.
+    """Settings for a type of target.
 
     Parameters
     ----------
     target : str
         Key of `TARGET_DEFAULTS`.
     changes : mapping of str to setting, optional
-        Values by dotted name, applied on top. A `track.target` among them must equal `target`.
+        Values by dotted name that override the defaults of the target. A value of `track.target`
+        must equal `target`.
 
     Returns
     -------
@@ -81,14 +82,14 @@ def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Setti
     Raises
     ------
     SettingsError
-        If `target` is unknown or contradicts `changes`, or a change is invalid.
+        If `target` is unknown or contradicts `changes`, or if a change is invalid.
     """
     if target not in TARGET_DEFAULTS:
         raise SettingsError(f'target: expected {" or ".join(TARGET_DEFAULTS)}, got {target!r}')
     changes = dict(changes or {})
     if changes.setdefault('track.target', target) != target:
-        raise SettingsError(f'track.target: {changes["track.target"]!r} in the parameters, '
-                            f'but the requested target is {target!r}')
+        raise SettingsError(f'track.target: the parameters contain {changes["track.target"]!r}, '
+                            f'but {target!r} was requested; remove one of them')
     return replace(replace(Settings(), TARGET_DEFAULTS[target]), changes)
 
 
@@ -98,7 +99,7 @@ Output: TypeAlias = (FieldFrame | Detection | Track | SmoothedPose | Disturbance
 
 
 class Pipeline:
-    """Raw readings in; frames, detections and tracks out. Uses neither ROS nor a clock.
+    """Chain of stages from raw readings to frames, detections and tracks, without ROS or a clock.
 
     Parameters
     ----------
@@ -146,11 +147,12 @@ class Pipeline:
         return self._process_calibrated(calibrated)
 
     def flush(self) -> list[Output]:
-        """Process what is still buffered after the end of the input.
+        """Process all records that are still buffered at the end of the input.
 
         Returns
         -------
         list of Output
+            Remaining records, in order of processing.
         """
         out = [*self._process_calibrated(self._calibrate.flush()),
                *self._process_frames(self._align.flush()),
@@ -165,16 +167,15 @@ class Pipeline:
                 'track': self._track, 'traffic': self._traffic}
 
     def _process_calibrated(self, batches: Iterable[Readings]) -> list[Output]:
-        """Process calibrated readings."""
+        """Align calibrated readings, and process the resulting frames."""
         return self._process_frames([f for b in batches for f in self._align.feed(b)])
 
     def _process_frames(self, frames: Iterable[FieldFrame]) -> list[Output]:
-        """Process frames."""
+        """Run the detection on frames, and process the results."""
         return self._process_detected([r for f in frames for r in self._detect.feed(f)])
 
     def _process_detected(self, records: Iterable[FieldFrame | Detection]) -> list[Output]:
-        """Process frames with a detection flag and detections; each precedes the records it
-        causes."""
+        """Track targets in frames with a detection flag; a record precedes those that it causes."""
         out: list[Output] = []
         for record in records:
             out.append(record)
@@ -189,17 +190,17 @@ class Pipeline:
         Returns
         -------
         dict of str to dict of str to int
-            Counters of each stage by name.
+            Counters of each stage, by name of the stage.
         """
         return {name: dict(sorted(stage.counts.items())) for name, stage in self._stages().items()}
 
     def rejections(self) -> dict[str, int]:
-        """Rejections of all stages.
+        """Number of rejections in all stages together.
 
         Returns
         -------
         dict of str to int
-            Number of rejections by cause.
+            Number by cause.
         """
         total: Counter[str] = Counter()
         for stage in self._stages().values():

@@ -24,8 +24,8 @@ using Array = ArrayOf<double>;
 using Integers = ArrayOf<std::int64_t>;
 using Size = py::ssize_t;
 
-// A structured array whose elements are structs. Its dtype is nearly always the very object that
-// the module created; comparing the fields instead takes ten microseconds.
+// Structured array with elements of type T. Its dtype is nearly always the object that the module
+// created, so identity is checked first; comparing the fields takes ten microseconds.
 template <class T>
 class Structs {
   public:

@@ -1,4 +1,4 @@
-"""Records that flow between the stages: frozen, SI units, time as integer nanoseconds since 1970.
+"""Immutable records passed between stages: SI units, time as integer nanoseconds since 1970.
 
 A missing axis or sensor is NaN. The arrays of a record must not be modified.
 """
@@ -27,7 +27,7 @@ def plain(values: ArrayLike, dtype: type[_Number]) -> NDArray[_Number]:
 
 
 def plain(values: ArrayLike, dtype: type[Any] = float) -> NDArray[Any]:
-    """C-contiguous, writable array that compiled code accepts.
+    """Return a C-contiguous, writable array that compiled code accepts.
 
     Parameters
     ----------
@@ -38,9 +38,9 @@ def plain(values: ArrayLike, dtype: type[Any] = float) -> NDArray[Any]:
     Returns
     -------
     array
-        `values` itself if it already fulfils the requirements, otherwise a copy.
+        `values` itself if it already meets the requirements, otherwise a copy.
     """
-    # Most arrays fulfil the requirements, and this test costs a fifth of `np.require`.
+    # Most arrays meet the requirements, and this check takes a fifth of the time of `np.require`.
     if isinstance(values, np.ndarray) and values.dtype == dtype and values.flags.carray:
         return values
     return np.require(values, dtype, ['C', 'W'])
@@ -48,7 +48,7 @@ def plain(values: ArrayLike, dtype: type[Any] = float) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """A batch of magnetometer readings of any sensors, in the order of arrival.
+    """A batch of magnetometer readings from any sensors, in order of arrival.
 
     A single reading is a batch of one. Raises ReadingsError if the shapes do not match.
     """
@@ -56,18 +56,18 @@ class Readings:
     names: tuple[str, ...]
     """Names of the sensors."""
     sensor: IntArray
-    """Sensor of each reading, an index of `names`, (n,)."""
+    """Index of the sensor of each reading in `names`, (n,)."""
     stamp_ns: IntArray
     """Time of each measurement, (n,) int64 ns since 1970."""
     field: FloatArray
     """Flux density, (n, 3) T, sensor frame. NaN where an axis is missing. Calibrated readings
     exclude the background."""
     covariance: FloatArray | None = None
-    """Noise covariance, (n, 3, 3) T², sensor frame. A matrix of NaN is unknown; None if all are
-    unknown."""
+    """Noise covariance, (n, 3, 3) T², sensor frame. A matrix of NaN is unknown. None means that all
+    are unknown."""
 
     def __post_init__(self) -> None:
-        """Check the shapes, which compiled code does not."""
+        """Check the shapes, because compiled code does not."""
         n = len(self.sensor)
         for name, values, shape in (
                 ('sensor', self.sensor, (n,)), ('stamp_ns', self.stamp_ns, (n,)),
@@ -93,12 +93,12 @@ class Readings:
         return unknown
 
     def rows(self, index: Mapping[str, int]) -> IntArray:
-        """Row of each reading's sensor in an index.
+        """Look up the index of the sensor of each reading.
 
         Parameters
         ----------
         index : mapping of str to int
-            Row of each sensor by name.
+            Index of each sensor, by name.
 
         Returns
         -------
@@ -122,7 +122,7 @@ class Readings:
         Parameters
         ----------
         which : (n,) bool array, (k,) int array, or slice
-            Rows in any order.
+            Selected readings: a mask, indices in any order, or a range.
 
         Returns
         -------
@@ -143,7 +143,7 @@ class Readings:
         Returns
         -------
         Readings
-            In the order of `parts`.
+            All readings, in the order of `parts`.
         """
         parts = [p for p in parts if len(p)]
         if len(parts) <= 1:
@@ -233,8 +233,7 @@ class FieldFrame:
     statistic: float = float('nan')
     """Whitened energy of the frame, chi-square distributed under noise. NaN before detection."""
     degrees_of_freedom: int = 0
-    """Degrees of freedom of `statistic`: the number of axes that were measured. 0 before
-    detection."""
+    """Degrees of freedom of `statistic`: the number of measured axes. 0 before detection."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +243,7 @@ class Detection:
     stamp_ns: int
     """Time of the frame, ns since 1970."""
     id: int
-    """Number of the onset. A release has the number of its onset."""
+    """Number of the detection. Onset and release have the same number."""
     onset: bool
     """True for an onset, false for a release."""
     statistic: float
@@ -256,7 +255,7 @@ class Detection:
     false_alarm_probability: float
     """Probability that noise alone exceeds `threshold` in a single frame."""
     strongest_sensor: str
-    """Name of the sensor with the most whitened energy per axis."""
+    """Name of the sensor with the largest whitened energy per axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,9 +280,9 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypotheses(Sequence[Hypothesis]):
-    """The hypotheses of a bank as arrays, a sequence of `Hypothesis`.
+    """Sequence of the hypotheses of a bank, stored as arrays.
 
-    There may be hundreds in every frame, so a `Hypothesis` is created only on access.
+    A frame may have hundreds of hypotheses, so a `Hypothesis` object is created only on access.
     """
 
     arrivals: tuple[str, ...]
@@ -325,7 +324,7 @@ def best_of_arrivals(members: Sequence[Hypothesis]) -> list[Hypothesis]:
     Returns
     -------
     list of Hypothesis
-        Heaviest first. `weight` is the total weight of the arrival direction.
+        In descending order of weight. `weight` is the total weight of the arrival direction.
     """
     if isinstance(members, Hypotheses):
         arrivals, weights = members.arrivals, members.weights.tolist()
@@ -342,7 +341,7 @@ def best_of_arrivals(members: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 @dataclass(frozen=True, slots=True)
 class PoseUncertainty:
-    """Covariances about a pose."""
+    """Covariances of position, velocity and orientation about a pose."""
 
     covariance: FloatArray
     """Covariance of [position, velocity], (6, 6) m and m/s, world frame."""
@@ -383,7 +382,7 @@ class SmoothedPose:
     length_std: float
     """Standard deviation of `length`, m. 0 for a point target."""
     ambiguous: bool
-    """Whether another explanation was still possible at the time of smoothing, or the pose is
+    """Whether other hypotheses were still possible at the time of smoothing, or the pose is
     doubtful."""
     complete: bool
     """True if the whole track was used, false for fixed-lag smoothing."""
@@ -391,7 +390,7 @@ class SmoothedPose:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """State of a track at one time: its best hypothesis, and a summary of the others."""
+    """State of a track at one time: its best hypothesis, and a summary of all hypotheses."""
 
     stamp_ns: int
     """Time of the frame, ns since 1970."""
@@ -405,14 +404,14 @@ class Track:
     """Velocity, (3,) m/s, world frame."""
     covariance: FloatArray
     """Covariance of [position, velocity] about this pose, (6, 6) m and m/s, world frame. It covers
-    all hypotheses at this place. For a vehicle it also covers the part of its length that has not
-    been observed yet, and a straight path that explains the whole pass but leads elsewhere. The
-    covariances of `hypotheses` include neither."""
+    all hypotheses near this position. For a vehicle, it also covers the length that has not been
+    observed yet, and an alternative straight path that explains the whole pass. The covariances of
+    `hypotheses` include neither."""
     orientation: FloatArray
     """Orientation, (4,) quaternion xyzw, body to world frame."""
     orientation_covariance: FloatArray
     """Covariance of small rotations about the fixed world axes, (3, 3) rad². This and the following
-    covariances cover all hypotheses at this place."""
+    covariances cover all hypotheses near this position."""
     position_orientation_covariance: FloatArray
     """Cross-covariance of position and orientation, (3, 3) m rad, world frame."""
     moment: FloatArray
@@ -420,16 +419,16 @@ class Track:
     moment_covariance: FloatArray
     """Covariance of `moment`, (3, 3) (A m²)², world frame."""
     existence: float
-    """Probability that there is a target, against noise alone."""
+    """Probability of a target, as opposed to noise alone."""
     weight: float
     """Probability of the published hypothesis within the bank, 0 to 1."""
     nis: float
     """Normalised innovation squared of the published hypothesis. NaN without a measurement."""
     nis_by_sensor: FloatArray
-    """Contribution of each sensor to `nis`, conditional on the sensors before it, (n_sensors,). NaN
+    """Contribution of each sensor to `nis`, conditional on the preceding sensors, (n_sensors,). NaN
     for a missing sensor."""
     degrees_of_freedom: int
-    """Degrees of freedom of `nis`: the number of axes that were measured."""
+    """Degrees of freedom of `nis`: the number of measured axes."""
     arrival: str
     """Arrival direction of the published hypothesis. Empty for a magnet."""
     kind: str
@@ -454,12 +453,13 @@ class Track:
     mounting_covariance: FloatArray
     """Covariance of `mounting`, (n_sensors, 3, 3) rad². (0, 3, 3) if not estimated."""
     hypotheses: Sequence[Hypothesis] = field(default=())
-    """All hypotheses including the published one, heaviest first."""
+    """All hypotheses, including the published one, in descending order of weight."""
     doubts: tuple[str, ...] = ()
     """Reasons why the pose is ambiguous: names from `stages.track.doubts`."""
     topic_uncertainty: PoseUncertainty | None = None
-    """Uncertainty for messages that carry no ambiguity flag. For an ambiguous track it covers the
-    hypotheses at all places. None: such messages are not published (`track.ambiguous_poses`)."""
+    """Uncertainty for messages without an ambiguity flag. For an ambiguous track, it covers all
+    hypotheses, including distant ones. None if such messages are withheld (see
+    `track.ambiguous_poses`)."""
 
     @property
     def mounting_std(self) -> FloatArray:

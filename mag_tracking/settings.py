@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = Scalar | tuple[Scalar, ...]
-"""Type of a setting."""
+"""Type of the value of a setting."""
 
 REPLACED_SETTINGS = {'track.vehicle.soft_iron': 'track.vehicle.induced_share',
                      'track.vehicle.soft_iron_std': 'track.vehicle.induced_share_std'}
-"""Former settings and their replacements, which have another unit."""
+"""Former settings, and their replacements in another unit."""
 
 RENAMED_SETTINGS = {
     'jump_ahead_s': 'max_forward_jump_s', 'jump_back_s': 'max_backward_jump_s',
@@ -39,7 +39,7 @@ RENAMED_SETTINGS = {
     'shortest_delay_s': 'min_delay_s', 'longest_delay_s': 'max_delay_s',
     'least_step_s': 'min_step_s', 'most_drift_ppm': 'max_drift_ppm', 'longest': 'max_length',
     'longest_message': 'max_message', 'most_failures': 'max_failures', 'in_turn': 'sequential'}
-"""Former names of settings, within the same group."""
+"""Former names of settings, and their current names within the same group."""
 
 _Class: TypeAlias = type[object]
 _Default = TypeVar('_Default')
@@ -59,7 +59,7 @@ def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float
     range : (low, high), optional
         Inclusive bounds of a number, or of every element of a tuple.
     live : bool, optional
-        Whether it may change at run time (a ROS parameter that is not read-only).
+        Whether the setting may change at run time (its ROS parameter is not read-only).
     length : int, optional
         Required length of a tuple. None allows any length except zero.
     choices : tuple of str, optional
@@ -93,11 +93,11 @@ class Parameter:
     range: tuple[float, float] | None
     """Inclusive bounds, or None."""
     live: bool
-    """Whether it may change at run time."""
+    """Whether the setting may change at run time."""
     length: int | None
     """Required length of a tuple, or None."""
     choices: tuple[str, ...]
-    """Permitted values of a string. Empty if any is allowed."""
+    """Permitted values of a string. Empty if any string is allowed."""
 
 
 def _types_of_hint(hint: Any) -> tuple[_Class, _Class | None]:
@@ -139,15 +139,17 @@ def flatten(settings: 'DataclassInstance', prefix: str = '') -> list[Parameter]:
 
 
 def _scalar(name: str, value: object, kind: _Class) -> Scalar:
-    """Convert `value` to `kind`; raises SettingsError naming the setting."""
+    """Check a scalar and convert it to `kind`; raises SettingsError that names the setting."""
     if isinstance(value, int) and value.bit_length() > 1000:
-        raise SettingsError(f'{name}: an integer of {value.bit_length()} bits is too large')
+        raise SettingsError(f'{name}: an integer of {value.bit_length()} bits is too large; the '
+                            'maximum is 1000 bits')
     if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         return float(value)
     if kind is int and isinstance(value, int) and not isinstance(value, bool):
         return value
     if kind is str and isinstance(value, str) and not is_text(value):
-        raise SettingsError(f'{name}: {shown(value)} is not text: it contains a lone surrogate')
+        raise SettingsError(f'{name}: {shown(value)} is not text: it contains an unpaired '
+                            'surrogate')
     if kind in (bool, str) and isinstance(value, kind):
         return value
     raise SettingsError(f'{name}: expected {kind.__name__}, got {shown(value)}')
@@ -192,7 +194,7 @@ def _flattened(mapping: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
 
 
 def _merge(out: dict[str, Any], more: Mapping[str, Any]) -> None:
-    """Merge `more` into `out`; raises SettingsError if two values differ."""
+    """Merge `more` into `out`; raises SettingsError if a setting has two different values."""
     for name, value in more.items():
         if out.setdefault(name, value) is not value and out[name] != value:
             raise SettingsError(f'{name} is given twice, as {shown(out[name])} and as '
@@ -211,7 +213,7 @@ def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
     Returns
     -------
     dataclass instance
-        Of the type of `settings`.
+        Same type as `settings`.
 
     Raises
     ------
@@ -223,13 +225,25 @@ def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
     checked = {}
     for name, value in _flattened(changes).items():
         if name not in known:
-            raise SettingsError(f'unknown setting {name}{_suggestion(name, known)}')
+            raise SettingsError(_unknown_message(name, value, known))
         checked[name] = _validated(known[name], value)
     return _rebuild(settings, checked, '')
 
 
+def _unknown_message(name: str, value: object, known: Iterable[str]) -> str:
+    """Error message for the name of a group, or for an unknown name with a suggestion."""
+    members = [k for k in known if k.startswith(f'{name}.')]
+    if members:
+        return (f'{name} is a group of settings, such as {members[0]}; expected a mapping, got '
+                f'{"nothing" if value is None else shown(value)}')
+    return f'unknown setting {name}{_suggestion(name, known)}'
+
+
 def _suggestion(name: str, known: Iterable[str]) -> str:
-    """Suggestion for an unknown setting: its replacement or the closest name, or empty."""
+    """Suggestion for an unknown setting: its replacement, its new name or the closest known name.
+
+    Empty if there is no suggestion.
+    """
     known = list(known)
     group, dot, leaf = name.rpartition('.')
     if name in REPLACED_SETTINGS:
@@ -237,12 +251,32 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
     renamed = f'{group}{dot}{RENAMED_SETTINGS.get(leaf)}'
     if renamed in known:
         return f'; it was renamed to {renamed}'
-    near = difflib.get_close_matches(name, known, n=1)
-    return f'; did you mean {near[0]}?' if near else ''
+    if group and not any(k.startswith(f'{group}.') for k in known):
+        return _group_suggestion(group, leaf, known)
+    near = _closest(name, known)
+    return f'; did you mean {near}?' if near else ''
+
+
+def _group_suggestion(group: str, leaf: str, known: Iterable[str]) -> str:
+    """Suggestion for the setting `leaf` of an unknown group; empty if there are no groups."""
+    groups = list(dict.fromkeys(k[:i] for k in known for i, c in enumerate(k) if c == '.'))
+    near_group = _closest(group, groups)
+    if near_group:
+        near = _closest(leaf, [k.removeprefix(f'{near_group}.') for k in known
+                               if k.startswith(f'{near_group}.')])
+        return (f'; there is no group {group}; did you mean {near_group}'
+                f'{"." + near if near else ""}?')
+    top = [g for g in groups if '.' not in g]
+    return f'; there is no group {group}; the groups are {", ".join(top)}' if top else ''
+
+
+def _closest(name: str, candidates: Iterable[str]) -> str:
+    """Candidate that is most similar to `name`; empty if none is similar."""
+    return next(iter(difflib.get_close_matches(name, list(candidates), n=1)), '')
 
 
 def _rebuild(settings: _Settings, checked: Mapping[str, Value], prefix: str) -> _Settings:
-    """Copy of the tree with the validated values inserted."""
+    """Copy a settings tree and insert the validated values."""
     changes: dict[str, Any] = {}
     for f in dataclasses.fields(settings):
         name, value = prefix + f.name, getattr(settings, f.name)
@@ -259,7 +293,7 @@ def read_parameter_file(path: str | PathLike[str]) -> dict[str, Any]:
     Parameters
     ----------
     path : path_like
-        A plain mapping, or a ROS parameter file (`node: ros__parameters:`), whose sections of all
+        A plain mapping, or a ROS parameter file (`node: ros__parameters:`). The sections of all
         nodes are merged.
 
     Returns
@@ -270,7 +304,7 @@ def read_parameter_file(path: str | PathLike[str]) -> dict[str, Any]:
     Raises
     ------
     SettingsError
-        If the file cannot be read, is not a mapping, or gives a setting two values.
+        If the file cannot be read, is not a mapping, or contains two values of a setting.
     """
     content = read_yaml(path, SettingsError)
     if content is None:
@@ -311,7 +345,7 @@ def as_ros_parameters(path: str | PathLike[str]) -> str | None:
 
 
 def _merged_sections(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a plain mapping, or of all nodes of a ROS parameter file."""
+    """Read the settings of a plain mapping, or of all nodes of a ROS parameter file."""
     nodes = [k for k, v in content.items() if isinstance(v, Mapping) and 'ros__parameters' in v]
     if not nodes:
         return _flattened(content)
@@ -326,7 +360,7 @@ def _merged_sections(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _yaml_value(value: Value) -> str:
-    """Write a value as YAML that reads back with the same type."""
+    """Format a value as YAML that is read back with the same type."""
     if isinstance(value, tuple):
         return '[' + ', '.join(_yaml_value(v) for v in value) + ']'
     if isinstance(value, bool):

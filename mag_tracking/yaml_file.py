@@ -1,4 +1,4 @@
-"""Reading of YAML that people write by hand."""
+"""Reading of hand-written YAML, with limits on its expanded size and depth."""
 
 from collections.abc import Hashable
 from os import PathLike
@@ -11,16 +11,16 @@ from mag_tracking.errors import MagTrackingError
 from mag_tracking.files import checked_path
 
 MAX_NODES = 1_000_000
-"""Maximum number of keys, values, lists and mappings in a file, aliases expanded."""
+"""Maximum number of keys, values, lists and mappings in a file after expansion of aliases."""
 MAX_DEPTH = 64
-"""Maximum depth of lists and mappings, aliases expanded."""
+"""Maximum depth of lists and mappings after expansion of aliases."""
 MAX_BITS = 14_000
-"""Maximum size of an integer. Python does not convert integers of more than 4300 decimal digits to
-text."""
+"""Maximum size of an integer [bits]. Python does not format integers of more than 4300 decimal
+digits."""
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """Loader that rejects duplicate keys, of which YAML keeps the last: a sensor would be lost."""
+    """Loader that rejects duplicate keys, instead of silently keeping only the last value."""
 
     def get_single_node(self) -> yaml.Node | None:
         """Return the root after checking that its expanded size is bounded."""
@@ -45,7 +45,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
-        """Return an integer that is small enough to be written in a message."""
+        """Return an integer; raises YAMLError if it exceeds `MAX_BITS`."""
         value = super().construct_yaml_int(node)
         if value.bit_length() > MAX_BITS:
             raise yaml.YAMLError(f'an integer of {value.bit_length()} bits exceeds the maximum of '
@@ -57,10 +57,9 @@ _UniqueKeyLoader.add_constructor('tag:yaml.org,2002:int', _UniqueKeyLoader.const
 
 
 def _check_size(root: yaml.Node) -> None:
-    """Raise YAMLError if aliases make a file too large, too deep or endless.
+    """Raise YAMLError if a file with expanded aliases is too large, too deep or infinite.
 
-    A node that several aliases refer to is a single object and is visited once: nothing is
-    expanded.
+    Aliases are not expanded here: a node with several aliases is one object and is visited once.
     """
     # {id of a node: (nodes, depth)}; None while its children are being counted.
     sizes: dict[int, tuple[int, int] | None] = {}
@@ -77,9 +76,9 @@ def _check_size(root: yaml.Node) -> None:
                 elif sizes[id(child)] is None:
                     raise yaml.YAMLError(f'an alias contains itself (line {line})')
         else:
-            below = [size for c in _children(node) if (size := sizes[id(c)]) is not None]
-            nodes = 1 + sum(n for n, _ in below)
-            depth = 1 + max((d for _, d in below), default=0)
+            child_sizes = [size for c in _children(node) if (size := sizes[id(c)]) is not None]
+            nodes = 1 + sum(n for n, _ in child_sizes)
+            depth = 1 + max((d for _, d in child_sizes), default=0)
             sizes[id(node)] = nodes, depth
             if nodes > MAX_NODES:
                 raise yaml.YAMLError(f'aliases expand to more than {MAX_NODES} values '
@@ -109,7 +108,7 @@ def read_yaml(path: str | PathLike[str], error: type[MagTrackingError]) -> Any:
     Returns
     -------
     object
-        Content of the file.
+        Parsed content of the file.
     """
     path = checked_path(path, error)
     try:
@@ -126,18 +125,18 @@ def parse_yaml(text: str | TextIO, name: str, error: type[MagTrackingError]) -> 
     ----------
     text : str or text stream
     name : str
-        Name of the text, with which error messages begin.
+        Name of the source, with which error messages begin.
     error : type of MagTrackingError
         Exception to raise, as for `read_yaml`.
 
     Returns
     -------
     object
-        Content of the text.
+        Parsed content.
     """
     try:
         return yaml.load(text, Loader=_UniqueKeyLoader)
-    # ValueError: an invalid date or number (2001-13-45), or bytes that are not text.
+    # ValueError: an invalid date or number (2001-13-45), or bytes that are not UTF-8.
     except (yaml.YAMLError, ValueError) as problem:
         raise error(f'{name} is not valid YAML: {problem}') from problem
     except RecursionError as problem:
@@ -145,7 +144,7 @@ def parse_yaml(text: str | TextIO, name: str, error: type[MagTrackingError]) -> 
 
 
 def is_text(value: str) -> bool:
-    """Whether a string can be encoded as UTF-8. Lone surrogates, such as "\\ud800" in YAML, cannot.
+    """Whether a string can be encoded as UTF-8: it has no unpaired surrogate such as "\\ud800".
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ os.environ['ROS_HOME'] = _HOME.name
 LONGEST = ('test_site.py', 'test_wheel.py', 'test_busy.py', 'test_pass_fit.py', 'test_archive.py',
            'test_archive_faults.py', 'test_traffic.py', 'test_situations.py', 'test_cli.py',
            'test_nodes.py', 'test_node_faults.py', 'test_shutdown.py', 'test_health_node.py')
-"""Files with the longest run times; those without nodes come first."""
+"""Files with the longest run times; files without nodes come first."""
 
 
 def pytest_collection_modifyitems(items):
@@ -48,7 +48,7 @@ def road_network():
 
 @pytest.fixture(scope='session')
 def magnet_runs(tmp_path_factory):
-    """{run: (recording path, network path)} of the imported magnet tables."""
+    """Import the bundled magnet tables: {run: (recording path, network path)}."""
     folder = tmp_path_factory.mktemp('magnet')
     source = DATA / 'magnet_16_sensors'
     return {n: import_pose_table(source / f'lisa_data{n}.csv',
@@ -58,7 +58,7 @@ def magnet_runs(tmp_path_factory):
 
 @pytest.fixture(scope='session')
 def vehicle_replays(tmp_path_factory, road_network):
-    """{name: (Run, folder)} of the bundled vehicle recordings, replayed on first access."""
+    """Replay bundled vehicle recordings on first access: {name: (Run, folder)}."""
     out = tmp_path_factory.mktemp('replays')
 
     class Replays(dict):
@@ -72,7 +72,7 @@ def vehicle_replays(tmp_path_factory, road_network):
 
 @pytest.fixture(scope='session')
 def magnet_replays(tmp_path_factory, magnet_runs):
-    """{run: (Run, folder)} of the magnet recordings."""
+    """Replay the magnet recordings: {run: (Run, folder)}."""
     out = tmp_path_factory.mktemp('magnet_replays')
     return {n: (replay(Recording(recording), read_network(network), settings_for('magnet'),
                        out / str(n)), out / str(n))
@@ -81,7 +81,7 @@ def magnet_replays(tmp_path_factory, magnet_runs):
 
 @pytest.fixture
 def ros():
-    """(node, spin_until): a node of the test in an executor."""
+    """Create a node in an executor: (node, spin_until)."""
     # Imported here because only the node tests require ROS.
     import rclpy
     from rclpy.node import Node

@@ -1,4 +1,4 @@
-"""Architecture: floors of the rooms, sizes of files and functions, and imports of the tests."""
+"""Architecture: layering of imports, lengths of files and functions, and imports of the tests."""
 
 import ast
 import re
@@ -13,19 +13,20 @@ from support.bundled import ROOT
 
 PACKAGE = ROOT / 'mag_tracking'
 FILES = sorted(PACKAGE.rglob('*.py'))
-MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_ROOM_SHARE = 350, 40, 0.2
-"""Lines of a file and of a function without docstrings; share of all lines in one room."""
+MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_ROOM_FRACTION = 350, 40, 0.2
+"""Maximum lines of a file and of a function, without docstrings; maximum fraction of all lines in
+one room."""
 
 
 def checked_floors():
-    """Sets of rooms, highest floor first, as `lint-imports` checks them."""
+    """Rooms of each floor, highest floor first, from the contracts of `lint-imports`."""
     contracts = api.read_configuration(str(ROOT / 'pyproject.toml'))['contracts_options']
     rows = next(c['layers'] for c in contracts if c['type'] == 'layers')
     return [set(re.split(r'\s*[|:]\s*', row)) for row in rows]
 
 
 def documented_floors():
-    """Sets of rooms, highest floor first, as in docs/contributing/architecture.md."""
+    """Rooms of each floor, highest floor first, from docs/contributing/architecture.md."""
     text = (ROOT / 'docs' / 'contributing' / 'architecture.md').read_text()
     rows = re.findall(r'^\| (\d) \| ([^|]+)\|', text, re.M)
     assert [int(n) for n, _ in rows] == list(range(len(rows), 0, -1))
@@ -63,24 +64,24 @@ def test_compiled_sources_include_only_headers_of_lower_floors():
 def test_the_import_graph_has_no_cycle():
     graph = grimp.build_graph('mag_tracking')
     imports = {m: graph.find_modules_directly_imported_by(m) for m in graph.modules}
-    done, on_path = set(), []
+    visited, on_path = set(), []
 
     def visit(module):
         assert module not in on_path, f'import cycle: {on_path[on_path.index(module):]}'
-        if module not in done:
+        if module not in visited:
             on_path.append(module)
             for imported in imports[module]:
                 visit(imported)
             on_path.pop()
-            done.add(module)
+            visited.add(module)
 
     for module in sorted(imports):
         visit(module)
-    assert len(done) > 100
+    assert len(visited) > 100
 
 
 def n_lines(path):
-    """Lines of a module without its docstrings."""
+    """Number of lines of a module without its docstrings."""
     text = path.read_text()
     docstrings = (ast.get_docstring(node, clean=False) for node in ast.walk(ast.parse(text))
                   if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef,
@@ -93,16 +94,16 @@ def test_no_file_exceeds_the_maximum_length():
             if n_lines(p) > MAX_FILE_LINES} == {}
 
 
-def test_no_room_exceeds_its_share_of_all_lines():
+def test_no_room_exceeds_the_maximum_fraction_of_all_lines():
     rooms = Counter()
     for path in FILES:
         rooms[path.relative_to(PACKAGE).parts[0]] += n_lines(path)
     largest, n = rooms.most_common(1)[0]
-    assert n <= MAX_ROOM_SHARE * rooms.total(), f'{largest}: {n} of {rooms.total()} lines'
+    assert n <= MAX_ROOM_FRACTION * rooms.total(), f'{largest}: {n} of {rooms.total()} lines'
 
 
 def definitions(path):
-    """(node, whether it is public) of every class, function and method of a module."""
+    """Yield (node, whether it is public) for every class, function and method of a module."""
     def walk(body, public):
         for node in body:
             if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
@@ -114,7 +115,7 @@ def definitions(path):
 
 
 def n_function_lines(node):
-    """Lines of a function without its docstring."""
+    """Number of lines of a function without its docstring."""
     text = ast.get_docstring(node, clean=False)
     return node.end_lineno - node.lineno + 1 - (text.count('\n') + 1 if text is not None else 0)
 
@@ -131,7 +132,7 @@ def test_functions_are_short_and_public_names_have_docstrings(path):
 
 
 def private_uses(tree):
-    """Private names that a test imports from the package or reads from anything but `self`."""
+    """Yield private names that a test imports from the package or reads from other objects."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('mag_tracking'):
             yield from (a.name for a in node.names if a.name.startswith('_'))
@@ -148,7 +149,7 @@ def test_tests_use_no_private_names(path):
 
 
 def test_the_tests_mirror_the_package():
-    """Every folder of tests, except those listed, is a room of the package."""
+    """Every folder of tests, with the listed exceptions, is a room of the package."""
     exceptions = {'data', 'support', 'system', 'bench', '__pycache__'}
     folders = [p.relative_to(ROOT / 'test') for p in (ROOT / 'test').rglob('*')
                if p.is_dir() and not set(p.relative_to(ROOT / 'test').parts) & exceptions]
@@ -157,7 +158,7 @@ def test_the_tests_mirror_the_package():
 
 
 def paths_in_documents():
-    """(document, path) of every file or folder that a document names in backticks."""
+    """Yield (document, path) for every file or folder that a document names in backticks."""
     pages = [p for p in sorted((ROOT / 'docs').rglob('*.md'))
              if not {'reference', 'gallery'} & set(p.parts)]
     for document in [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *pages]:

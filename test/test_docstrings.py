@@ -17,14 +17,14 @@ CHECKS = {
     'RT01', 'RT02', 'RT04', 'RT05', 'YD01'}
 """All checks of numpydoc except those that contradict the project's style: the summary begins on
 the first line (GL01, GL02); extended summary, examples and see-also are optional (ES01, EX01,
-SA01), and so is a description if name and type state everything (PR07, RT03); a summary may be a
+SA01), and so is a description if name and type are sufficient (PR07, RT03); a summary may be a
 noun phrase, which SS05 treats as a verb if its first word is a plural."""
 ARRAY = re.compile(r'\b(FloatArray|IntArray|BoolArray|ArrayLike|NDArray|StructArray)\b')
 PROGRAMMING_ERRORS = {'AssertionError', 'NotImplementedError', 'AttributeError'}
 
 
 def public_definitions(tree):
-    """(node, its ancestors) of every public function, method and class."""
+    """Yield (node, its ancestors) for every public function, method and class."""
     def walk(node, ancestors):
         for child in node.body:
             if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)) \
@@ -46,7 +46,7 @@ def is_property(node):
 
 
 def numpydoc_issues(path, node, ancestors):
-    """Findings of numpydoc itself."""
+    """Issues found by numpydoc."""
     report = validate.validate(node.name, AstValidator, ast_node=node, filename=str(path),
                                ancestry=ancestors)
     return [f'{code} {text}' for code, text in report['errors']
@@ -54,17 +54,17 @@ def numpydoc_issues(path, node, ancestors):
 
 
 def shape_issues(node, doc):
-    """Arrays whose type line has no shape."""
+    """Array arguments and return values without a shape."""
     types = {name: p.type for p in doc['Parameters'] for name in re.split(r',\s*', p.name)}
     arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-    found = [f'no shape: {a.arg}' for a in arguments
-             if a.annotation is not None and ARRAY.search(ast.unparse(a.annotation))
-             and not has_shape(types.get(a.arg, '('))]
+    missing = [f'no shape: {a.arg}' for a in arguments
+               if a.annotation is not None and ARRAY.search(ast.unparse(a.annotation))
+               and not has_shape(types.get(a.arg, '('))]
     returns_array = node.returns is not None and ARRAY.search(ast.unparse(node.returns))
     if returns_array and doc['Returns'] and not is_property(node) \
             and not any(has_shape(r.type) or has_shape(r.name) for r in doc['Returns']):
-        found.append('no shape: return value')
-    return found
+        missing.append('no shape: return value')
+    return missing
 
 
 def has_shape(text):
@@ -72,7 +72,7 @@ def has_shape(text):
 
 
 def error_issues(node, doc):
-    """Errors that the function itself raises and does not document."""
+    """Errors that the function itself raises but does not document."""
     raised = {n.exc.func.id for n in ast.walk(node)
               if isinstance(n, ast.Raise) and isinstance(n.exc, ast.Call)
               and isinstance(n.exc.func, ast.Name) and n.exc.func.id.endswith('Error')}
@@ -81,7 +81,7 @@ def error_issues(node, doc):
 
 
 def issues(path):
-    """[(line, name, finding)] of a module."""
+    """Yield the issues of a module as (line, name, issue)."""
     for node, ancestors in public_definitions(ast.parse(path.read_text(encoding='utf-8'))):
         if 'overload' in decorators(node):
             continue
@@ -103,16 +103,16 @@ def test_public_names_have_complete_docstrings(path):
     assert list(issues(path)) == []
 
 
-@pytest.mark.parametrize('text, finding', [
+@pytest.mark.parametrize('source, issue', [
     ('def f(x: int) -> None:\n    """Do it."""\n    print(x)', "PR01"),
     ('def f() -> int:\n    """Do it."""\n    return 1', 'RT01'),
     ('def f(x: FloatArray) -> None:\n    """Do it.\n\n    Parameters\n    ----------\n'
      '    x : metres\n        Position.\n    """', 'no shape: x'),
     ('def f() -> None:\n    """Do it."""\n    raise ValueError("no")', 'undocumented: ValueError'),
-    ('class C:\n    """Of it."""\n    def __init__(self) -> None:\n        """Make it."""',
+    ('class C:\n    """Example."""\n    def __init__(self) -> None:\n        """Create it."""',
      'belong to the docstring of the class'),
     ('def f() -> None:\n    pass', 'GL08')])
-def test_incomplete_docstrings_are_found(tmp_path, text, finding):
+def test_incomplete_docstrings_are_reported(tmp_path, source, issue):
     path = tmp_path / 'module.py'
-    path.write_text(text)
-    assert [found for *_, found in issues(path) if finding in found]
+    path.write_text(source)
+    assert [text for *_, text in issues(path) if issue in text]

@@ -1,4 +1,4 @@
-"""Output files: each is created from scratch and replaces a link or pipe of its name."""
+"""Output files: each is newly created and replaces an existing link or pipe with its name."""
 
 import os
 
@@ -73,24 +73,24 @@ def test_results_are_not_written_through_a_symbolic_link(tmp_path, write, more):
 def test_a_new_file_replaces_a_link_or_pipe_of_its_name(tmp_path, make):
     path, other = tmp_path / 'a', tmp_path / 'other'
     other.write_text('theirs')
-    for occupy in (lambda: path.symlink_to(other), lambda: path.symlink_to(tmp_path / 'nowhere'),
+    for create in (lambda: path.symlink_to(other), lambda: path.symlink_to(tmp_path / 'nowhere'),
                    lambda: path.hardlink_to(other), lambda: os.mkfifo(path), lambda: None):
         path.unlink(missing_ok=True)
-        occupy()
+        create()
         with make(path) as stream:
             stream.write('' if make is new_text_file else b'')
         assert path.is_file() and not path.is_symlink() and path.stat().st_size == 0
         assert other.read_text() == 'theirs' and sorted(tmp_path.iterdir()) == [path, other]
 
 
-def test_a_row_is_readable_as_soon_as_it_is_flushed(tmp_path):
+def test_a_line_can_be_read_as_soon_as_it_is_flushed(tmp_path):
     with new_text_file(tmp_path / 'a') as stream:
         stream.write('row\n')
         stream.flush()
         assert (tmp_path / 'a').read_text() == 'row\n'
 
 
-def test_lone_surrogates_are_escaped(tmp_path):
+def test_unpaired_surrogates_are_escaped(tmp_path):
     with new_text_file(tmp_path / 'a') as stream:
         stream.write('\udcff\u00e4')
     assert (tmp_path / 'a').read_text(encoding='utf-8') == '\\udcff\u00e4'

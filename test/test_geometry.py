@@ -1,4 +1,4 @@
-"""Speed and heading of a velocity against samples of it, and overlap of bodies."""
+"""Speed and heading against random samples of a velocity, and overlap of bodies."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ V = np.array([6.0, -8.0, 0.5])
 P = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.02], [0.0, 0.02, 0.03]])
 
 
-def test_standard_deviations_match_those_of_samples():
+def test_standard_deviations_match_random_samples():
     samples = np.random.default_rng(0).multivariate_normal(V, P, 400_000)
     speed, heading = speed_of(V, P), heading_of(V, P)
     assert speed == pytest.approx((np.linalg.norm(V), np.linalg.norm(samples, axis=1).std()),
@@ -25,8 +25,8 @@ def test_the_heading_is_unknown_at_rest():
     assert heading_of(np.zeros(3), P) == (0.0, np.inf)
 
 
-def test_bodies_overlap_along_the_heading_of_the_second_but_not_beside_it():
-    """The second body moves to the left; the first is behind, beside, ahead of and near it."""
+def test_bodies_overlap_along_the_heading_of_the_second_but_not_across_it():
+    """The second body moves left; the first is behind it, beside it, ahead of it and near it."""
     position = np.array([[[2.0, 0.0], [0.0, 2.0], [-2.0, 0.1], [0.5, -1.0]], np.zeros((4, 2))])
     velocity = np.array([np.tile([9.0, 0.0], (4, 1)), np.tile([-9.0, 0.0], (4, 1))])
     np.testing.assert_allclose(overlap(position, velocity, 5.0, 1.5), [3.0, 0.0, 3.0, 4.5])

@@ -35,19 +35,19 @@ def result():
 
 @pytest.fixture(scope='module')
 def readings():
-    """Three readings of each of two sensors."""
+    """Three readings from each of two sensors."""
     return mt.readings_from_arrays(['mag_1', 'mag_2'] * 3, np.arange(6) * 10_000_000,
                                    np.full((6, 3), 1e-6))
 
 
 def run_python(code):
-    """Output of `code` in another interpreter."""
+    """Run `code` in another interpreter; return its output."""
     return subprocess.run([sys.executable, '-c', code], check=True, capture_output=True, text=True,
                           cwd=ROOT).stdout.strip()
 
 
 def are_identical(a, b):
-    """Whether the arrays of two results are equal to the last bit."""
+    """Whether the arrays of two results are bitwise identical."""
     return all(getattr(a, name).dtype == getattr(b, name).dtype
                and getattr(a, name).tobytes() == getattr(b, name).tobytes()
                for name in ('poses', 'smoothed', 'detections'))
@@ -73,8 +73,8 @@ def test_type_checkers_see_the_public_names():
         assert getattr(mt, name) is getattr(importlib.import_module(module), there)
 
 
-def test_no_public_name_is_that_of_a_module():
-    """Importing the module would replace the name."""
+def test_no_public_name_equals_the_name_of_a_module():
+    """Importing a module of the same name would replace the public object."""
     assert not set(mt.__all__) & {p.stem for p in (ROOT / 'mag_tracking').iterdir()}
 
 
@@ -265,13 +265,13 @@ def test_masked_axes_become_nan():
     assert len(mt.readings_from_arrays([], [], [])) == 0
 
 
-@pytest.mark.parametrize('of_recording', [False, True])
+@pytest.mark.parametrize('is_recording', [False, True])
 def test_masked_timestamps_are_refused(
-        recorded, of_recording):
+        recorded, is_recording):
     r = recorded.readings
-    broken = replace(r, stamp_ns=np.ma.masked_equal(r.stamp_ns, r.stamp_ns[5]))
+    masked = replace(r, stamp_ns=np.ma.masked_equal(r.stamp_ns, r.stamp_ns[5]))
     with pytest.raises(mt.ReadingsError, match='stamp_ns: masked arrays are not supported'):
-        mt.track(replace(recorded, readings=broken) if of_recording else broken, NETWORK_FILE)
+        mt.track(replace(recorded, readings=masked) if is_recording else masked, NETWORK_FILE)
 
 
 @pytest.mark.parametrize('changes, text', [
@@ -289,7 +289,7 @@ def test_invalid_readings_are_refused(readings, changes, text):
 
 
 def test_slightly_late_readings_are_tracked(recorded):
-    """A recording stores readings in order of arrival, which need not be the order of time."""
+    """A recording stores readings in order of arrival, which may not be chronological."""
     r = recorded.readings
     later = replace(r, stamp_ns=r.stamp_ns + np.where(r.sensor == 1, -30_000_000, 0))
     assert (np.diff(later.stamp_ns) < 0).any()
@@ -361,7 +361,7 @@ def test_fit_refuses_invalid_arguments(arguments, text):
         mt.fit(vehicle_path(NAME), NETWORK_FILE, **arguments)
 
 
-def test_the_plan_equals_that_of_the_command(tmp_path):
+def test_the_plan_from_python_equals_the_plan_of_the_command(tmp_path):
     assert main(['plan', '--network', str(NETWORK_FILE), '--target', 'truck', '--heading', '0',
                  '--grid', '9', '--out', str(tmp_path)]) == 0
     written = json.loads((tmp_path / 'plan.json').read_text())

@@ -1,4 +1,4 @@
-"""README: its length, its pictures and links, and every command in it."""
+"""README: length, pictures, links and commands."""
 
 import re
 import subprocess
@@ -16,10 +16,10 @@ PYTHON, = re.findall(r'```python\n(.+?)```', TEXT, re.S)
 
 
 def recipe(target):
-    """The commands that `make` would run, without the set-up."""
-    done = subprocess.run(['make', '-n', target], cwd=ROOT, capture_output=True, text=True,
-                          check=True)
-    return done.stdout
+    """Commands that `make` would run for a target."""
+    process = subprocess.run(['make', '-n', target], cwd=ROOT, capture_output=True, text=True,
+                             check=True)
+    return process.stdout
 
 
 def test_it_is_short_and_has_two_pictures():
@@ -28,13 +28,13 @@ def test_it_is_short_and_has_two_pictures():
     assert len(pictures) == 2 and all((ROOT / p).is_file() for p in pictures)
 
 
-def test_its_links_lead_to_files():
+def test_its_links_refer_to_existing_files():
     links = re.findall(r'\]\(((?!http)[^)]+)\)', TEXT)
     assert len(links) > 8 and [link for link in links if not (ROOT / link).exists()] == []
 
 
-def test_every_command_is_known_here():
-    """A new command in README needs a test."""
+def test_every_command_has_a_test():
+    """The commands listed here are tested below; a new command in README needs another test."""
     assert [line for line in SHELL if not line.startswith('mag-tracking ')] == [
         '. .venv/bin/activate']
     assert re.findall(r'^    (make \w+)', TEXT, re.M) == ['make demo', 'make test']
@@ -44,7 +44,7 @@ def test_every_command_is_known_here():
 
 
 def test_make_demo_runs_the_demonstration():
-    """`test/cli/test_cli.py` runs the script."""
+    """The script itself is run by `test/cli/test_cli.py`."""
     assert 'examples/demo.py --out out/demo' in recipe('demo')
 
 
@@ -60,11 +60,11 @@ def test_commands_run(line, tmp_path, monkeypatch, capsys):
     assert '--out' not in words or (tmp_path / 'report.html').is_file()
 
 
-def test_python_runs(tmp_path):
-    """From the root of the project, as it is written there."""
+def test_the_python_example_runs(tmp_path):
+    """The code is run unchanged, except for the path of the picture, in the project folder."""
     assert len(PYTHON.split('\n\n')[1].strip().splitlines()) + 1 <= 5
     code = PYTHON.replace("'map.png'", repr(str(tmp_path / 'map.png')))
-    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,
-                          check=False)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True,
+                             text=True, check=False)
+    assert process.returncode == 0, process.stderr
     assert (tmp_path / 'map.png').stat().st_size > 10_000

@@ -1,4 +1,4 @@
-"""Version, licence and description stand once and agree everywhere."""
+"""Version, licence and description agree in all files."""
 
 import re
 from importlib.metadata import metadata, version
@@ -14,7 +14,7 @@ MESSAGES = ElementTree.parse(ROOT / 'msg_defs' / 'package.xml').getroot()
 VERSION = PACKAGE.findtext('version')
 
 
-def test_the_version_is_that_of_package_xml():
+def test_the_version_is_taken_from_package_xml():
     assert re.fullmatch(r'\d+\.\d+\.\d+', VERSION)
     assert mag_tracking.__version__ == version('mag_tracking') == VERSION
     assert MESSAGES.findtext('version') == version('mag_tracking_msgs') == VERSION
@@ -40,13 +40,13 @@ def test_licence_and_description_agree():
     assert citation['version'] == VERSION and citation['title'] == PACKAGE.findtext('name')
 
 
-def test_dependencies_of_package_xml_are_those_of_the_wheel():
-    """`python3-X` of apt is X of PyPI; what apt lacks is named in a comment there."""
+def test_dependencies_of_package_xml_and_wheel_agree():
+    """The apt package `python3-X` is X on PyPI. Comments name the packages that apt lacks."""
     text = (ROOT / 'package.xml').read_text(encoding='utf-8')
     names = {'python3-serial': 'pyserial', 'python3-yaml': 'PyYAML'}
-    stated = {names.get(e.text, e.text.removeprefix('python3-')).lower()
-              for e in PACKAGE.iter('exec_depend') if e.text.startswith('python3-')}
-    needed = {re.match(r'[\w-]+', r).group().lower()
-              for r in metadata('mag_tracking').get_all('Requires-Dist') if 'extra ==' not in r}
-    assert stated <= needed
-    assert [n for n in needed - stated if n not in text.lower()] == []
+    declared = {names.get(e.text, e.text.removeprefix('python3-')).lower()
+                for e in PACKAGE.iter('exec_depend') if e.text.startswith('python3-')}
+    required = {re.match(r'[\w-]+', r).group().lower()
+                for r in metadata('mag_tracking').get_all('Requires-Dist') if 'extra ==' not in r}
+    assert declared <= required
+    assert [n for n in required - declared if n not in text.lower()] == []

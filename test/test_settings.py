@@ -47,6 +47,12 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
     ({'track.explained_ratio': 4.0}, 'it was renamed to track.min_bayes_factor'),
     ({'calibrate.jump_back_s': 4.0}, 'it was renamed to calibrate.max_backward_jump_s'),
     ({'align': {'perod_s': 0.1}}, 'unknown setting align.perod_s; did you mean align.period_s'),
+    ({'trak': {'x': 1}}, 'unknown setting trak.x; there is no group trak; did you mean track'),
+    ({'trak': {'iteration': 1}}, r'there is no group trak; did you mean track.iterations\?'),
+    ({'track.vehicel.x': 1}, r'no group track.vehicel; did you mean track.vehicle\?'),
+    ({'foo': {'x': 1}}, 'no group foo; the groups are calibrate, align, detect, events, track, '),
+    ({'track': 3}, 'track is a group of settings, such as track.target; .* got 3'),
+    ({'track.vehicle': None}, 'track.vehicle is a group of settings, .* a mapping, got nothing'),
     ({'align.period_s': 'long'}, 'align.period_s: expected float'),
     ({'align.period_s': -1.0}, 'align.period_s: -1.0 is outside'),
     ({'align.period_s': float('nan')}, 'NaN'),
@@ -58,7 +64,7 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
     ({'track.vehicle.speeds': 5.0}, 'expected a list'),
     ({'track.vehicle.speeds': [5.0, 1e9]}, 'outside'),
     ({'track.vehicle.kinds': ['small', 'c\ud800r', 'truck']},
-     r"track.vehicle.kinds: 'c\\ud800r' is not text: it contains a lone surrogate"),
+     r"track.vehicle.kinds: 'c\\ud800r' is not text: it contains an unpaired surrogate"),
     ({'track.vehicle.arrival_names': ['left', 'right', '\udcff']}, 'arrival_names: .* surrogate'),
 ])
 def test_errors_name_the_invalid_setting(changes, message):
@@ -73,7 +79,7 @@ def test_each_arrival_needs_a_heading(road_network):
         Pipeline(road_network, settings)
 
 
-def test_the_targets_of_file_and_caller_must_agree():
+def test_the_targets_in_parameters_and_call_must_agree():
     with pytest.raises(SettingsError, match='magnet'):
         settings_for('vehicle', {'track.target': 'magnet'})
     with pytest.raises(SettingsError, match='expected vehicle or magnet'):
@@ -116,8 +122,9 @@ def test_the_default_file_is_plain_yaml_with_floats():
 
 
 @pytest.mark.parametrize('changes, message', [
-    ({'track.vehicle.lengths': [0.0, 3.0]}, r'lengths: expected 3 values \(one per kinds\), got 2'),
-    ({'track.vehicle.arrival_names': ['a']}, 'arrival_headings_deg: expected 1 values'),
+    ({'track.vehicle.lengths': [0.0, 3.0]}, r'lengths: expected 3 values \(one per kind\), got 2'),
+    ({'track.vehicle.arrival_names': ['a']},
+     r'arrival_headings_deg: expected 1 value \(one per arrival name\), got 3'),
     ({'track.vehicle.kinds': ['car', 'car', 'truck']}, 'kinds: a name is duplicated'),
     ({'track.vehicle.length_stds': [1.0, 1.0, 3.0]}, 'length_stds: 1 for small, which is a point'),
     ({'track.vehicle.difference_stds': [9.0, 30.0, 120.0]}, 'difference_stds: 9 for small')])
@@ -126,8 +133,8 @@ def test_related_lists_are_checked_against_each_other(road_network, changes, mes
         TrackManager(road_network, settings_for('vehicle', changes).track)
 
 
-def test_every_former_name_leads_to_a_setting():
-    """Of the pipeline or of a drivers file."""
+def test_every_former_name_has_a_current_setting():
+    """The settings of the pipeline and of drivers files are searched."""
     known = {p.name.rpartition('.')[2] for group in (Settings(), *settings_by_kind().values())
              for p in flatten(group)}
     assert set(RENAMED_SETTINGS.values()) - known == set()

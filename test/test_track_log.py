@@ -1,4 +1,4 @@
-"""Verdict in the summary of a track log."""
+"""Summary of a track log: the verdict on ambiguity."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from mag_tracking.report.track_log import TrackLog
 @pytest.mark.parametrize('ambiguous, verdict', [
     ([True, False, False], 'unique'), ([False, True, False], 'ambiguous'),
     ([False, False, True], 'ambiguous')])
-def test_a_track_is_unique_if_its_most_certain_and_last_poses_are(ambiguous, verdict):
+def test_a_track_is_unique_if_its_most_certain_and_last_poses_are_unique(ambiguous, verdict):
     log = TrackLog(1)
     for k, variance in enumerate((9.0, 1.0, 4.0)):
         log.stamp_ns.append(k)

@@ -1,4 +1,4 @@
-"""The wheel: complete, without junk, and usable without ROS and the source tree."""
+"""The wheel is complete, contains no other files, and works without ROS and the source tree."""
 
 import csv
 import json
@@ -85,7 +85,7 @@ def contained_files(wheel):
 
 @pytest.fixture
 def copy(tmp_path):
-    """A copy of the tracked files, as they are in the working tree."""
+    """Copy the tracked files of the working tree to a folder; return the folder."""
     folder = tmp_path / 'tree'
     for name in tracked_files():
         # The build needs no tests. Git still lists deleted files.
@@ -96,41 +96,41 @@ def copy(tmp_path):
 
 
 def bare_environment():
-    """The environment without variables of ROS, this tree or another interpreter."""
+    """Environment without variables of ROS, the source tree or another interpreter."""
     own = ('PYTHON', 'ROS_', '_ROS', 'AMENT_', 'COLCON_', 'VIRTUAL_ENV', 'LD_LIBRARY_PATH')
     return {k: v for k, v in os.environ.items() if not k.startswith(own)}
 
 
 def run(*command, cwd, **variables):
-    """Run a command, which must succeed; return its output."""
-    done = subprocess.run([str(c) for c in command], cwd=cwd,
-                          env=bare_environment() | variables, capture_output=True, text=True)
-    assert done.returncode == 0, f'{command}\n{done.stdout}\n{done.stderr}'
-    return done.stdout
+    """Run a command, assert that it succeeds, and return its output."""
+    process = subprocess.run([str(c) for c in command], cwd=cwd,
+                             env=bare_environment() | variables, capture_output=True, text=True)
+    assert process.returncode == 0, f'{command}\n{process.stdout}\n{process.stderr}'
+    return process.stdout
 
 
 def interpreter(version):
-    """Path of a Python of this version with venv; skips the test if there is none."""
+    """Path of a Python interpreter of `version` with venv; skips the test if not installed."""
     if version == RUNNING_VERSION:
         return sys.executable
     check = 'import sys, venv, ensurepip; print("%d.%d" % sys.version_info[:2])'
     candidates = [shutil.which(f'python{version}'), *sorted(
         Path.home().glob(f'.pyenv/versions/{version}.*/bin/python'))]
     for path in filter(None, candidates):
-        found = subprocess.run([str(path), '-c', check], env=bare_environment(),
-                               capture_output=True, text=True)
-        if found.returncode == 0 and found.stdout.strip() == version:
+        process = subprocess.run([str(path), '-c', check], env=bare_environment(),
+                                 capture_output=True, text=True)
+        if process.returncode == 0 and process.stdout.strip() == version:
             return path
     pytest.skip(f'python{version} with venv is neither on PATH nor installed by pyenv')
 
 
-def test_the_wheel_contains_every_file_and_no_junk(tmp_path, copy):
-    """Build isolation would need a network."""
+def test_the_wheel_contains_all_required_files_and_no_others(tmp_path, copy):
+    """The wheel is built without build isolation, which would need a network."""
     pytest.importorskip('setuptools', minversion='70.1', reason='builds wheels from 70.1 on')
     for name in JUNK:
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
         (copy / name).write_text('')
-    # The compiled modules are not run, and building without optimisation is faster.
+    # The compiled modules are not run, so they are built without optimisation, which is faster.
     compiler = tmp_path / 'compiler'
     compiler.write_text('#!/bin/sh\nexec c++ "$@" -O0\n')
     compiler.chmod(0o755)
@@ -150,19 +150,19 @@ def rows(path):
 
 
 def assert_same_track(actual, expected):
-    """Check that poses and summary agree: numbers to 1e-9 of the column maximum, text exactly."""
+    """Assert equal poses and summaries: numbers to 1e-9 of the column maximum, strings exactly."""
     for name in ('poses.csv', 'poses_smoothed.csv', 'detections.csv'):
         a, b = rows(actual / name), rows(expected / name)
         assert len(a) == len(b) > 0 and a[0].keys() == b[0].keys()
         for column in a[0]:
-            found, wanted = ([row[column] for row in table] for table in (a, b))
+            x, y = ([row[column] for row in table] for table in (a, b))
             try:
-                found, wanted = np.array(found, dtype=float), np.array(wanted, dtype=float)
+                x, y = np.array(x, dtype=float), np.array(y, dtype=float)
             except ValueError:
-                assert found == wanted, column
+                assert x == y, column
             else:
                 np.testing.assert_allclose(
-                    found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max(),
+                    x, y, rtol=1e-9, atol=1e-9 * np.abs(y).max(),
                     err_msg=f'{name}: {column}')
     summaries = [json.loads((folder / 'summary.json').read_text())
                  for folder in (actual, expected)]
@@ -183,12 +183,12 @@ def install_wheel(version, tmp_path, copy):
     bin_folder = tmp_path / 'venv' / 'bin'
     pip = bin_folder / 'python', '-m', 'pip', '--quiet', '--disable-pip-version-check', '--no-input'
     run(*pip, 'install', '-c', pins, '--upgrade', 'pip', 'setuptools', 'pybind11', cwd=tmp_path)
-    # As `python -m build` does: a wheel contains only files of the source distribution.
+    # As with `python -m build`, a wheel contains only files of the source distribution.
     run(bin_folder / 'python', '-c', 'import sys, setuptools.build_meta as b; b.build_sdist('
         'sys.argv[1])', tmp_path / 'sdist', cwd=copy)
     source, = (tmp_path / 'sdist').glob('*.tar.gz')
-    for name, what in (('wheel', copy), ('wheel_of_sdist', source)):
-        run(*pip, 'wheel', '--no-deps', '--build-constraint', pins, '-w', tmp_path / name, what,
+    for name, project in (('wheel', copy), ('wheel_of_sdist', source)):
+        run(*pip, 'wheel', '--no-deps', '--build-constraint', pins, '-w', tmp_path / name, project,
             cwd=tmp_path)
     wheel, = (tmp_path / 'wheel').glob('*.whl')
     wheel_of_sdist, = (tmp_path / 'wheel_of_sdist').glob('*.whl')

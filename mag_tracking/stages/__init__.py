@@ -1,1 +1,1 @@
-"""Stages of the pipeline: each takes one record at a time and returns the resulting records."""
+"""Stages of the pipeline: each processes one record at a time and returns the resulting records."""

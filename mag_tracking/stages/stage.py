@@ -9,14 +9,14 @@ Out = TypeVar('Out')
 
 
 class Stage(Protocol[In, Out]):
-    """A step of the pipeline that takes one item at a time.
+    """A step of the pipeline that processes one item at a time.
 
-    A stage never pulls, never sleeps and never reads a clock. Time is that of the records.
+    A stage does not request input, sleep or read a clock. All times come from the records.
 
     Attributes
     ----------
     counts : Counter of str
-        Number of accepted, held back and rejected items, by cause. Every rejection is counted.
+        Number of accepted, buffered and rejected items, by cause. Every rejection is counted.
     """
 
     counts: Counter[str]
@@ -32,14 +32,14 @@ class Stage(Protocol[In, Out]):
         Returns
         -------
         list of Out
-            The records that follow from it.
+            Resulting records.
         """
 
     def idle(self) -> None:
-        """Do deferred work after the outputs are published; results do not depend on it."""
+        """Do deferred work after the outputs have been published; this does not change results."""
 
     def flush(self) -> list[Out]:
-        """Return the records that are held back when the input ends.
+        """Return the remaining records at the end of the input.
 
         Returns
         -------
@@ -48,11 +48,12 @@ class Stage(Protocol[In, Out]):
 
 
 def rejected(counts: Mapping[str, int]) -> dict[str, int]:
-    """Rejections among the counts of a stage.
+    """Select the rejections from the counts of a stage.
 
     Parameters
     ----------
     counts : mapping of str to int
+        Number by cause; rejections have the prefix `rejected:`.
 
     Returns
     -------

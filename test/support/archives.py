@@ -1,4 +1,4 @@
-"""Archives of a few bundled recordings."""
+"""Archive command and archive tables for a few bundled recordings."""
 
 import shutil
 import sys
@@ -13,7 +13,7 @@ NAMES = ('straight_car_right', 'straight_small_left', 'junction_left_to_right')
 
 
 def archive_recordings(folder):
-    """Folder with three recordings, one of them in a subfolder, and a file that is no recording."""
+    """Fill a folder with three recordings, one in a subfolder, and two other files; return it."""
     (folder / 'below').mkdir()
     for name in NAMES:
         shutil.copy(vehicle_path(name), folder / ('below' if 'junction' in name else '.'))
@@ -23,7 +23,7 @@ def archive_recordings(folder):
 
 
 def rows(folder, table):
-    """All rows of a table, sorted."""
+    """Read all rows of an archive table, sorted."""
     # DuckDB requires another library for times with a time zone.
     columns = [c.name for c in TABLES[table] if c.kind != 't']
     files = folder / ('recordings.parquet' if table == 'recordings' else f'{table}/**/*.parquet')
@@ -39,14 +39,14 @@ def same_tables(a, b):
 
 
 def command(recordings, out, folder, *options):
-    """The archive command with fast settings."""
+    """Command line of the archive command with fast settings."""
     return [sys.executable, '-m', 'mag_tracking.cli', 'archive', str(recordings), '--network',
             str(NETWORK_FILE), '--params', str(parameter_file(folder / 'quick.yaml', QUICK)),
             '--out', str(out), *options]
 
 
 def wait_for(condition, seconds=120.0):
-    """Wait until a condition holds."""
+    """Wait until `condition()` is true; fail after `seconds`."""
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until

@@ -1,9 +1,10 @@
 """Second vehicle simulator: uniformly magnetised boxes and plates, computed by magpylib.
 
-The first simulator scatters magnetised points. This one builds a body of sheets, an engine, axles
-and frame rails. Each is a cuboid with a permanent magnetisation and an induced one that depends on
-its shape: a sheet is magnetised in its plane, an axle along its length. The driver brakes and
-swerves, and the sensors have gain errors. Nothing was tuned to the tracker's models.
+The first simulator scatters magnetised points. This simulator builds a body of sheets, an engine,
+axles and frame rails. Each part is a cuboid with permanent and induced magnetisation. The induced
+magnetisation depends on the shape: a sheet is magnetised in its plane, an axle along its length.
+The driver brakes and swerves, and the sensors have gain errors. No parameter was tuned to the
+tracker's models.
 """
 
 from dataclasses import dataclass
@@ -16,10 +17,10 @@ from mag_tracking.simulation.scenario import Path, SensorErrorModel, body_poses
 from support.passes import EARTH
 
 BOUGHT = SensorErrorModel(noise_std=1.2e-8, tilt_std=np.deg2rad(1.0), gain_std=0.01)
-"""Uncalibrated sensors, mounted with care."""
+"""Errors of uncalibrated sensors that are mounted carefully."""
 
 SHEET = 0.01
-"""[m] Thickness of a sheet; the field outside hardly depends on it."""
+"""[m] Thickness of a sheet; it hardly affects the external field."""
 
 CHI = 60.0
 """Apparent susceptibility of iron without demagnetisation; low, because parts have gaps."""
@@ -30,28 +31,28 @@ class BoxVehicle:
     """Cuboids in a body frame (x forward, z up) with its origin on the ground below the centre."""
 
     centres: np.ndarray
-    """(n, 3) [m]."""
+    """Centre of each cuboid, (n, 3) m."""
     sides: np.ndarray
-    """(n, 3) [m]."""
+    """Side lengths of each cuboid, (n, 3) m."""
     permanent: np.ndarray
-    """(n, 3) [A m²]."""
+    """Permanent moment of each cuboid, (n, 3) A m²."""
     induced: np.ndarray
-    """(n, 3) [m³]: induced moment = induced * B0 / mu0, body frame."""
+    """Induced moment of each cuboid is `induced` * B0 / mu0, (n, 3) m³, body frame."""
     length: float
-    """[m]."""
+    """Length of the vehicle, m."""
 
     def moments(self, B_body):
-        """(k, n, 3) [A m²] in ambient fields (k, 3) [T], body frame."""
+        """Moments (k, n, 3) [A m²] of the cuboids in ambient fields (k, 3) [T], body frame."""
         return self.permanent + self.induced * B_body[:, None] / MU0
 
     def field(self, earth_field, position, heading, points):
-        """See `mag_tracking.simulation.scenario.Body`."""
+        """Field of the vehicle at `points`; implements `mag_tracking.simulation.scenario.Body`."""
         R, origin = body_poses(position, heading)
         m = self.moments(np.einsum('nji,j->ni', R, earth_field))
         J = MU0 * m / self.sides.prod(axis=1)[:, None]
-        seen = np.einsum('nji,nsj->nsi', R, points[None] - origin[:, None])
+        in_body = np.einsum('nji,nsj->nsi', R, points[None] - origin[:, None])
         k, n_points, n = len(heading), len(points), len(self.sides)
-        observers = seen[:, :, None] - self.centres
+        observers = in_body[:, :, None] - self.centres
         shape = (k, n_points, n, 3)
         B = magpylib.getB(
             'Cuboid', observers.reshape(-1, 3),
@@ -61,30 +62,30 @@ class BoxVehicle:
 
 
 def magnetised(rng, parts, length, moment):
-    """`BoxVehicle` of [(centre, sides, weight)] with a total moment of `moment` [A m²]."""
-    # Total moments are as measured on real vehicles (TSP14 Table V), heading along x in `EARTH`.
-    # The permanent and the induced part are about `moment` / 1.4 each.
+    """Create a `BoxVehicle` from [(centre, sides, weight)] with a total `moment` [A m²]."""
+    # The total moment is defined for a heading along x in `EARTH`, as measured on real vehicles
+    # (TSP14 Table V). The permanent and the induced part are about `moment` / 1.4 each.
     centres, sides, weights = (np.array(column, dtype=float) for column in zip(*parts, strict=True))
-    share = weights * rng.lognormal(0.0, 0.4, len(weights))
-    share /= share.sum()
-    # Approximation: the longer a side, the weaker the demagnetisation by the poles at its ends.
+    fraction = weights * rng.lognormal(0.0, 0.4, len(weights))
+    fraction /= fraction.sum()
+    # Approximation: demagnetisation along a side is inversely proportional to the side length.
     N = (1.0 / sides) / (1.0 / sides).sum(axis=1, keepdims=True)
     easy = 1.0 / (N + 1.0 / CHI)
-    easy *= share[:, None] / easy.mean(axis=1, keepdims=True)
+    easy *= fraction[:, None] / easy.mean(axis=1, keepdims=True)
     induced = easy * moment / 1.4 * MU0 / 50e-6
     while True:
         common = rng.standard_normal(3)
-        along = common / np.linalg.norm(common) + 0.6 * rng.standard_normal((len(share), 3))
-        permanent = share[:, None] * along * moment / 1.4
-        whole = np.linalg.norm((permanent + induced * EARTH / MU0).sum(axis=0))
-        # If the two parts nearly cancel, scaling them up would not give a realistic vehicle.
-        if whole > 0.6 * moment:
-            return BoxVehicle(centres, sides, permanent * moment / whole,
-                              induced * moment / whole, length)
+        along = common / np.linalg.norm(common) + 0.6 * rng.standard_normal((len(fraction), 3))
+        permanent = fraction[:, None] * along * moment / 1.4
+        total = np.linalg.norm((permanent + induced * EARTH / MU0).sum(axis=0))
+        # Parts that nearly cancel are drawn again; scaling them up would be unrealistic.
+        if total > 0.6 * moment:
+            return BoxVehicle(centres, sides, permanent * moment / total,
+                              induced * moment / total, length)
 
 
 def box_car(rng, length=None, moment=None):
-    """Car: floor, roof, bonnet, boot, sides, engine, two axles."""
+    """Random car with floor, roof, bonnet, boot, sides, engine and two axles."""
     length = rng.uniform(3.6, 4.8) if length is None else length
     width, height = rng.uniform(1.55, 1.85), rng.uniform(1.35, 1.7)
     rear = 1.0 if rng.random() < 0.85 else -1.0
@@ -99,7 +100,7 @@ def box_car(rng, length=None, moment=None):
 
 
 def box_truck(rng, length=None, moment=None):
-    """Truck: frame rails, cab, engine, axles; a bed, a steel box or a load at a random position."""
+    """Random truck with frame rails, cab, engine and axles, and a bed, a steel box or a load."""
     length = rng.uniform(7.0, 16.0) if length is None else length
     width, front = rng.uniform(2.3, 2.55), 0.5 * length
     parts = [((0.0, side * 0.4, 0.85), (0.95 * length, 0.08, 0.25), 2.0) for side in (-1, 1)]
@@ -130,9 +131,9 @@ class Drive:
     change: float = 0.0
     """Relative change of the speed; negative = braking."""
     change_at: float = 0.0
-    """[s] Middle of the change."""
+    """[s] Middle of the speed change."""
     change_s: float = 2.0
-    """[s] Approximate duration of the change."""
+    """[s] Approximate duration of the speed change."""
     aside: float = 0.0
     """[m] Lateral displacement of the swerve, positive to the left."""
     aside_at: float = 0.0
@@ -141,10 +142,10 @@ class Drive:
     """[s] Approximate duration of the swerve."""
 
     def _on_path(self, t):
-        """Time (n,) on the `Path`: travelled distance over the initial speed."""
+        """Time (n,) on the `Path`, which is the travelled distance divided by the initial speed."""
         width = self.change_s / 4.0
         z, z0 = (t - self.change_at) / width, -self.change_at / width
-        # Integral of a logistic step.
+        # This is the integral of a logistic step.
         return t + self.change * width * (np.logaddexp(0.0, z) - np.logaddexp(0.0, z0))
 
     def speed(self, t):
@@ -153,7 +154,7 @@ class Drive:
         return self.path.speed * (1.0 + self.change / (1.0 + np.exp(-z)))
 
     def at(self, t):
-        """See `mag_tracking.simulation.scenario.Trajectory`."""
+        """Position and heading at times `t`; implements `scenario.Trajectory`."""
         t = np.asarray(t, dtype=float)
         position, heading = self.path.at(self._on_path(t))
         z = (t - self.aside_at) / (self.aside_s / 2.0)
@@ -164,7 +165,7 @@ class Drive:
 
 
 def random_drive(rng, path, at):
-    """`Drive`: up to 20 % slower or 10 % faster, up to 0.4 m aside, around a time [s]."""
+    """Random `Drive` that changes speed by -20 to 10 % and swerves by up to 0.4 m near `at` [s]."""
     return Drive(path, change=rng.uniform(-0.2, 0.1), change_at=at + rng.uniform(-2.0, 2.0),
                  change_s=rng.uniform(1.5, 4.0), aside=rng.uniform(-0.4, 0.4),
                  aside_at=at + rng.uniform(-2.0, 2.0), aside_s=rng.uniform(1.5, 4.0))

@@ -1,4 +1,4 @@
-"""Headless Chromium for tests of pages."""
+"""Headless Chromium for tests of web pages."""
 
 import contextlib
 import shutil
@@ -10,7 +10,7 @@ NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'chrome')
 
 
 def chromium():
-    """Path of a browser, or None."""
+    """Path of the first Chromium browser on PATH, or None."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
@@ -19,43 +19,43 @@ needs_browser = pytest.mark.skipif(chromium() is None, reason='there is no Chrom
 
 @contextlib.contextmanager
 def browser():
-    """Playwright browser."""
+    """Open a Playwright browser, and close it afterwards."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         # In a container, root cannot create a sandbox, and shared memory is small. The pages are
         # trusted.
-        found = playwright.chromium.launch(executable_path=chromium(), args=[
+        opened = playwright.chromium.launch(executable_path=chromium(), args=[
             '--no-sandbox', '--disable-dev-shm-usage'])
         try:
-            yield found
+            yield opened
         finally:
-            found.close()
+            opened.close()
 
 
 class Page:
-    """Page, with the messages of its console."""
+    """Open page, with its console errors and its requests."""
 
     def __init__(self, browser, url, **options):
         self.page = browser.new_page(**options)
         self.complaints = []
-        self.page.on('console', self._heard)
+        self.page.on('console', self._record_message)
         self.page.on('pageerror', lambda error: self.complaints.append(str(error)))
         self.requests = []
         self.page.on('request', lambda request: self.requests.append(request.url))
         self.page.goto(url)
 
-    def _heard(self, message):
+    def _record_message(self, message):
         if message.type in ('error', 'warning'):
             self.complaints.append(message.text)
 
     def value(self, expression):
-        """Value of a JavaScript expression."""
+        """Evaluate a JavaScript expression in the page, and return its value."""
         return self.page.evaluate(expression)
 
     def wait(self, expression, seconds=60.0):
-        """Wait until a JavaScript expression is true."""
-        # Playwright's own wait function uses `eval`, which the page's security policy forbids.
+        """Wait until a JavaScript expression is true; fail after `seconds`."""
+        # Playwright's wait function uses `eval`, which the security policy of the page forbids.
         end = time.monotonic() + seconds
         while not self.value(expression):
             assert time.monotonic() < end, f'{expression} has not become true'
@@ -76,7 +76,7 @@ class Page:
             return pose ? [pose.x[0], pose.y[0]] : null; })()''')
 
     def lines(self):
-        """Times of the time lines of the plots."""
+        """Time at which the vertical line of each plot is drawn."""
         return self.value('''[...document.querySelectorAll('#field .plot'),
             ...['weights', 'innovation', 'speed'].map(id => document.getElementById(id))]
             .map(plot => plot.layout.shapes[0].x0)''')

@@ -13,12 +13,12 @@ POINT = {f'track.vehicle.{name}': [value] for name, value in {
     'kinds': 'car', 'lengths': 0.0, 'length_stds': 0.0, 'moments': 400.0, 'moment_stds': 150.0,
     'difference_stds': 0.0, 'heights': 0.5, 'height_stds': 0.2,
     'near_field_lengths': 1.0}.items()} | {'track.vehicle.turn_acceleration': 0.0}
-"""Settings of a tracker that knows only point targets on straight paths."""
+"""Settings of a tracker that models only point targets on straight paths."""
 LINEARISED_ONCE = {'track.relinearise_window_s': 0.0}
 """Settings without relinearisation, which takes most of the computing time."""
 QUICK = POINT | LINEARISED_ONCE
-"""Settings of a point target without relinearisation: a third of the computing time, for tests
-that do not check tracking itself."""
+"""Settings for point targets without relinearisation, for tests that do not check the tracking.
+They need a third of the computing time."""
 
 
 def parameter_file(path, changes):

@@ -1,4 +1,4 @@
-"""Batch fits of several vehicles at once, and their assignment to vehicles."""
+"""Batch fits of several vehicles at once, and their assignment to the true vehicles."""
 
 from typing import NamedTuple
 
@@ -13,11 +13,11 @@ from support.busy_recordings import BUSY, network_of_recording
 
 ORDERS = (1, 2, 3, 4)
 FAR_M = 8.0
-"""[m] A fit at a larger distance from a vehicle belongs to another one."""
+"""[m] Maximum distance of a fit from the vehicle that it is assigned to."""
 
 
 class OfVehicle(NamedTuple):
-    """Fit, and the vehicle it belongs to."""
+    """A fit, and the true vehicle that it is assigned to."""
 
     one: FittedPass
     vehicle: int
@@ -28,13 +28,13 @@ class OfVehicle(NamedTuple):
 
 
 def fits_of_world(a_world, orders=ORDERS):
-    """[FittedPass] of a `World`."""
+    """Fit all passes of a `World`; return [FittedPass]."""
     fitter = PassFitter('world', a_world.network, settings_for('vehicle'), orders)
     return [*fitter.feed(a_world.readings), *fitter.flush()]
 
 
 def fits_of_recording(name, folder=BUSY, orders=ORDERS):
-    """([FittedPass], [OfVehicle]) of a recording of several vehicles."""
+    """Fit a recording of several vehicles; return ([FittedPass], [OfVehicle])."""
     network = network_of_recording(name, folder)
     recording = Recording(folder / f'{name}.mcap')
     passes = list(RecordingFit(recording, network, settings_for('vehicle'), orders).passes())
@@ -44,17 +44,17 @@ def fits_of_recording(name, folder=BUSY, orders=ORDERS):
 
 
 def with_vehicles(passes, vehicles):
-    """[OfVehicle] of the fits with a result, for vehicles [(t (n,) [s], positions (n, 2) [m])]."""
+    """Assign fits to vehicles [(t (n,) [s], positions (n, 2) [m])]; return [OfVehicle]."""
     candidates = []
     for i, one in enumerate(passes):
         fit = one.chosen
         if fit is None:
             continue
-        at = fit.data.stamp_ns / 1e9
+        time = fit.data.stamp_ns / 1e9
         for k, (t, position) in enumerate(vehicles):
-            if not t[0] + 0.5 < at < t[-1] - 0.5:
+            if not t[0] + 0.5 < time < t[-1] - 0.5:
                 continue
-            here, ahead, behind = (np.array([np.interp(at + s, t, position[:, a])
+            here, ahead, behind = (np.array([np.interp(time + s, t, position[:, a])
                                              for a in (0, 1)]) for s in (0.0, 0.2, -0.2))
             velocity = (ahead - behind) / 0.4
             error = float(np.linalg.norm(fit.position[:2] - here))

@@ -1,6 +1,6 @@
-"""Tracking of the recordings with several vehicles at once, compared with the true vehicles.
+"""Tracking of recordings with several vehicles at once, and comparison with the true vehicles.
 
-`test/data/busy` contains some of nine recordings; `folder` selects others.
+`test/data/busy` contains some of the nine recordings; `folder` selects another folder.
 """
 
 import json
@@ -25,25 +25,25 @@ NAMES = tuple(sorted(p.name.removesuffix('.truth.json') for p in BUSY.glob('*.tr
 
 
 class TrackedRecording(NamedTuple):
-    """Results of a recording."""
+    """Tracking results of a recording."""
 
     score: Score
     poses: list[Track]
     pipeline: Pipeline
     smoothed: list[SmoothedPose]
-    """Poses of complete tracks."""
+    """Smoothed poses of complete tracks."""
     passages: list[VehiclePassage]
 
 
 def network_of_recording(name, folder=BUSY):
-    """Network as an installer would describe it."""
+    """Network of a recording, with the sensor positions and the Earth field of its truth file."""
     truth = json.loads((folder / f'{name}.truth.json').read_text())
     return replace(network_of(truth['sensors_m']),
                    earth_field=np.array(truth['earth_field_T']))
 
 
 def tracked_recording(name, folder=BUSY, changes=None):
-    """`TrackedRecording` of a recording."""
+    """Track a recording; return a `TrackedRecording`."""
     network = network_of_recording(name, folder)
     pipeline = Pipeline(network, settings_for('vehicle', changes))
     recording = Recording(folder / f'{name}.mcap')
@@ -61,15 +61,16 @@ def tracked_recording(name, folder=BUSY, changes=None):
 
 
 def rightly_counted(name, passages, folder=BUSY):
-    """[(passage, vehicle)] of passages within 1 s of a true vehicle in the same direction."""
+    """Match passages with true vehicles within 1 s in the same direction; [(passage, vehicle)]."""
     truth, out = json.loads((folder / f'{name}.truth.json').read_text()), []
-    left = list(truth['vehicles'])
+    unmatched = list(truth['vehicles'])
     for p in passages:
-        def apart(vehicle, at=p.stamp_ns / 1e9 - truth['epoch_s']):
-            return abs(vehicle['cpa_time_s'] - at)
+        def time_error(vehicle, time=p.stamp_ns / 1e9 - truth['epoch_s']):
+            return abs(vehicle['cpa_time_s'] - time)
 
-        near = [v for v in left if (v['direction'] > 0) == p.forward and apart(v) < 1.0]
+        near = [v for v in unmatched
+                if (v['direction'] > 0) == p.forward and time_error(v) < 1.0]
         if near:
-            left.remove(best := min(near, key=apart))
+            unmatched.remove(best := min(near, key=time_error))
             out.append((p, best))
     return out

@@ -1,7 +1,7 @@
 """Worlds with several vehicles at once, and a score of the tracks of each vehicle.
 
-The traffic resembles that of the bundled recordings (meeting, following, free). The vehicles and
-sensors differ: boxes with spinning wheels, drivers who brake and swerve, gain errors.
+The traffic (meeting, following, free) resembles the bundled recordings. The vehicles and sensors
+differ: bodies of boxes with spinning wheels, drivers who brake and swerve, gain errors.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ NEAR_M = 8.0
 """[m] Errors of a track are evaluated within this distance of the origin."""
 LANE_M = 1.75
 TRUCKS = 0.1
-"""Share of long vehicles."""
+"""Proportion of long vehicles."""
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,16 @@ class OnWheels:
 
     body: object
     moments: np.ndarray
-    """(4, 2) [A m²] across the axle and in the plane of the wheel."""
+    """Two components of each belt's moment perpendicular to the axle, (4, 2) A m²."""
     radius: float = 0.3
 
     def field(self, earth_field, position, heading, points):
-        """See `mag_tracking.simulation.scenario.Body`."""
+        """Field of the vehicle at `points`; implements `mag_tracking.simulation.scenario.Body`."""
         B = self.body.field(earth_field, position, heading, points)
         R, origin = body_poses(position, heading)
-        way = np.concatenate([[0.0], np.hypot(*np.diff(position[:, :2], axis=0).T).cumsum()])
+        distance = np.concatenate([[0.0], np.hypot(*np.diff(position[:, :2], axis=0).T).cumsum()])
         for k, (x, y) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
-            a = way / self.radius + 1.7 * k
+            a = distance / self.radius + 1.7 * k
             ahead, up = self.moments[k]
             m = np.stack([ahead * np.cos(a) - up * np.sin(a), np.zeros_like(a),
                           ahead * np.sin(a) + up * np.cos(a)], axis=1)
@@ -59,13 +59,13 @@ class OnWheels:
 
 
 def vehicle(rng, simulator, trucks=TRUCKS):
-    """Car, or truck with probability `trucks`; a vehicle of boxes has rolling wheels."""
+    """Random car, or truck with probability `trucks`; a vehicle of boxes has rotating wheels."""
     body = (truck if rng.random() < trucks else car)(rng, simulator)
     return OnWheels(body, rng.normal(0.0, 2.0, (4, 2))) if simulator == 'boxes' else body
 
 
 def passing(rng, simulator, at_s, direction, speed, trucks=TRUCKS):
-    """(body, course) of a vehicle that passes the origin at a time [s]."""
+    """Random vehicle that passes the origin at `at_s` [s]; return (body, course)."""
     lane = -direction * (LANE_M + rng.uniform(-0.3, 0.3))
     path = Path(np.array([-direction * speed * at_s, lane]), 0.0 if direction > 0 else np.pi, speed)
     body = vehicle(rng, simulator, trucks)
@@ -73,7 +73,7 @@ def passing(rng, simulator, at_s, direction, speed, trucks=TRUCKS):
 
 
 def pair(rng, how, at_s):
-    """[(time [s], direction, speed [m/s])] of two vehicles that meet or follow."""
+    """[(time [s], direction, speed [m/s])] of two vehicles that meet or follow each other."""
     speed, direction = rng.uniform(8.0, 20.0), int(rng.choice([-1, 1]))
     if how == 'meeting':
         return [(at_s, direction, speed),
@@ -83,13 +83,13 @@ def pair(rng, how, at_s):
 
 
 def busy(how, n_sensors, simulator, seed, n=4, trucks=TRUCKS):
-    """`World` of `n` pairs 'meeting' or 'following', or of 3 `n` vehicles in 'traffic'."""
+    """Simulate `n` pairs 'meeting' or 'following', or 3 `n` vehicles in 'traffic'; a `World`."""
     rng = np.random.default_rng([seed, n_sensors, len(how), len(simulator)])
     if how == 'traffic':
         times = LEAD_S + np.cumsum(rng.exponential(3.0, 3 * n))
         plan = [(t, int(rng.choice([-1, 1])), rng.uniform(8.0, 20.0)) for t in times]
         plan = [p for k, p in enumerate(plan) if not any(
-            # Vehicles do not drive through others in the same lane.
+            # Vehicles do not drive through other vehicles in the same lane.
             q[1] == p[1] and (p[0] - q[0]) * min(p[2], q[2]) < 14.0 for q in plan[:k])]
     else:
         plan = [p for k in range(n) for p in pair(rng, how, LEAD_S + 14.0 * k)]
@@ -103,45 +103,45 @@ class Score:
     """Agreement of a set of tracks with a set of vehicles."""
 
     rms: np.ndarray
-    """(n_vehicles,) [m] within `NEAR_M` of the origin; NaN without a track."""
+    """RMS error within `NEAR_M` of the origin, (n_vehicles,) m. NaN without a track."""
     nees: np.ndarray
-    """(n_vehicles,) Median, two degrees of freedom; NaN without a track."""
+    """Median NEES with two degrees of freedom, (n_vehicles,). NaN without a track."""
     is_found: np.ndarray
-    """(n_vehicles,) Whether the track has the right direction."""
+    """Whether a vehicle has an accurate track in the right direction, (n_vehicles,)."""
     n_extra: int
-    """Tracks that belong to no vehicle."""
+    """Number of tracks that belong to no vehicle."""
     n_sure: int
-    """Unflagged poses."""
+    """Number of unflagged poses."""
     n_wrong: int
-    """Unflagged poses that are wrong for every vehicle."""
+    """Number of unflagged poses that are wrong for every vehicle."""
 
     def __str__(self):
         return (f'found {self.is_found.sum()} of {len(self.rms)}, RMS {np.nanmedian(self.rms):.2f} '
-                f'm, NEES {np.nanmedian(self.nees):.2f}, of nobody {self.n_extra}, sure '
-                f'{self.n_sure}, of them wrong {self.n_wrong}')
+                f'm, NEES {np.nanmedian(self.nees):.2f}, extra tracks {self.n_extra}, unflagged '
+                f'poses {self.n_sure}, of which wrong {self.n_wrong}')
 
 
 FOUND_M = 5.0
-"""[m] A track with a larger RMS error does not belong to the vehicle."""
+"""[m] Maximum RMS error of a track that belongs to a vehicle."""
 
 
 def score(poses, vehicles):
-    """`Score` of `Track`s without closing records, for vehicles [(t (n,) [s], position (n, 2))]."""
+    """`Score` of poses (`Track` records) for vehicles [(t (n,) [s], position (n, 2) [m])]."""
     of_track = {i: [p for p in poses if p.id == i] for i in sorted({p.id for p in poses})}
     candidates, sure = [], [p for p in poses if not p.ambiguous]
     wrong = np.ones(len(sure), dtype=bool)
     for k, (t, position) in enumerate(vehicles):
         wrong &= are_wrong(*errors_of(sure, t, position)[:2]) | _outside(sure, t)
-        for i, mine in of_track.items():
-            error, _, nees, true = errors_of(mine, t, position)
-            near = (np.hypot(*true.T) < NEAR_M) & ~_outside(mine, t)
+        for i, own in of_track.items():
+            error, _, nees, true = errors_of(own, t, position)
+            near = (np.hypot(*true.T) < NEAR_M) & ~_outside(own, t)
             if near.any():
-                way = np.interp([mine[0].stamp_ns / 1e9, mine[-1].stamp_ns / 1e9], t,
-                                position[:, 0])
-                velocity = np.median([p.velocity[0] for p, n in zip(mine, near, strict=True) if n])
+                ends = np.interp([own[0].stamp_ns / 1e9, own[-1].stamp_ns / 1e9], t,
+                                 position[:, 0])
+                velocity = np.median([p.velocity[0] for p, n in zip(own, near, strict=True) if n])
                 candidates.append((float(np.sqrt(np.mean(error[near]**2))), i, k,
                                    2.0 * float(np.median(nees[near])),
-                                   bool(velocity * (way[1] - way[0]) > 0.0)))
+                                   bool(velocity * (ends[1] - ends[0]) > 0.0)))
     n = len(vehicles)
     rms, nees, found = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, dtype=bool)
     used = set()
@@ -153,13 +153,13 @@ def score(poses, vehicles):
 
 
 def _outside(poses, t):
-    """(n,) Whether poses are before or after the truth."""
+    """Whether each pose is before or after the true trajectory, (n,)."""
     stamps = np.array([p.stamp_ns for p in poses]) / 1e9
     return (stamps < t[0]) | (stamps > t[-1])
 
 
 def tracked(a_world, changes=None):
-    """(`Score`, `Pipeline`) of a `World`."""
+    """Track a `World`; return (`Score`, `Pipeline`)."""
     pipeline = Pipeline(a_world.network, settings_for('vehicle', changes))
     records = pipeline.feed(a_world.readings) + pipeline.flush()
     poses = [r for r in records if isinstance(r, Track) and not r.ended]

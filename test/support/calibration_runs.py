@@ -1,4 +1,4 @@
-"""Samples for a calibration, and a background that is fed with them."""
+"""Samples, backgrounds and stages for tests of the calibration."""
 
 import dataclasses
 

@@ -8,11 +8,11 @@ NAME = 'junction_left_to_right'
 
 
 def quick_file(folder):
-    """Parameter file in `folder` with the settings `QUICK`."""
+    """Write a parameter file with the settings `QUICK` to `folder`; return its path."""
     return parameter_file(folder / 'quick.yaml', QUICK)
 
 
 def replay_one(out, *options):
-    """Exit status of a replay of one recording with the settings `QUICK`, results in `out`."""
+    """Replay one recording with the settings `QUICK` into `out`; return the exit status."""
     return main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--params',
                  str(quick_file(out.parent)), '--out', str(out), *options])

@@ -12,17 +12,17 @@ def sample(t, j):
 
 
 def stream(n, begin, end, step=10, skip=()):
-    """[(sensor, timestamp)] of `n` sensors that take turns, with interval `step` each."""
+    """[(sensor, timestamp)] of `n` sensors with a sample interval of `step` each."""
     return [(j, t + j) for t in range(begin, end, step) for j in range(n) if j not in skip]
 
 
 def stepped(arrivals, which, begin, end, by):
-    """Arrivals with the clocks of `which` ahead by `by` from `begin` to `end`."""
+    """Copy arrivals with the clocks of the sensors `which` ahead by `by` from `begin` to `end`."""
     return [(j, t + by if j in which and begin <= t < end else t) for j, t in arrivals]
 
 
 def wild(rng, n, length):
-    """Arrivals [(sensor, timestamp)] with clock steps, dead sensors, time jumps and gaps."""
+    """Generate (sensor, timestamp) with clock steps, dead sensors, time jumps and gaps."""
     offset, t, dead = [0] * n, 0, set()
     for _ in range(length):
         t += int(rng.choice([0, 1, 10, 10, 10, 400, 700, 5000],

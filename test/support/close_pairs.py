@@ -1,7 +1,7 @@
-"""Car of boxes past two coarse sensors 0.5 m apart, and the speeds estimated from it.
+"""Passes of a car past two coarse sensors 0.5 m apart, and the speeds estimated from them.
 
-As in real installations beside a lane: 200 Hz, a resolution of 1 µT, one reading in a thousand with
-a bus error, the side of the car at 0.8 m, 5 to 20 m/s.
+The values are those of real installations beside a lane: 200 Hz, a resolution of 1 µT, a bus error
+in one of a thousand readings, the side of the car at 0.8 m, and 5 to 20 m/s.
 """
 
 from dataclasses import dataclass
@@ -26,22 +26,22 @@ STEP, RATE, SIDE = 1e-6, 200.0, 0.8
 
 
 def readings_of(seed):
-    """(`Readings`, velocity along x [m/s], time of the CPA [s]) of a random pass."""
+    """Simulate a random pass; return (`Readings`, velocity along x [m/s], time of the CPA [s])."""
     rng = np.random.default_rng([seed, 77])
     body = box_car(rng)
     half = 0.5 * body.sides[0, 1] / 0.9
     speed, heading = rng.uniform(5.0, 20.0), np.pi * rng.integers(2)
-    aside = rng.choice([-1.0, 1.0]) * (SIDE + half)
-    away = 8.0 * speed + 10.0
-    path = Path(np.array([-away * np.cos(heading), aside]), heading, speed)
-    readings, *_ = scenario.simulate(PAIR, body, path, RATE, 2.0 * away / speed, rng, BOUGHT)
-    spoilt = spoiler.apply(readings, spoiler.steps(STEP), spoiler.glitches(0.001, 1e-4, seed))
-    return spoilt, speed * np.cos(heading), away / speed
+    lateral = rng.choice([-1.0, 1.0]) * (SIDE + half)
+    lead = 8.0 * speed + 10.0
+    path = Path(np.array([-lead * np.cos(heading), lateral]), heading, speed)
+    readings, *_ = scenario.simulate(PAIR, body, path, RATE, 2.0 * lead / speed, rng, BOUGHT)
+    faulty = spoiler.apply(readings, spoiler.steps(STEP), spoiler.glitches(0.001, 1e-4, seed))
+    return faulty, speed * np.cos(heading), lead / speed
 
 
 @dataclass(frozen=True)
 class Answers:
-    """Estimates for a pass, each (velocity along x, its standard deviation) [m/s] or None."""
+    """Estimates for a pass. A pair is (velocity along x, standard deviation) [m/s]."""
 
     truth: float
     fit: tuple[float, float] | None
@@ -49,16 +49,16 @@ class Answers:
     smoothed: tuple[float, float] | None
     delay: CorrelatedMotion
     ambiguous: bool
-    """Of the track at the CPA."""
+    """Whether the track is ambiguous at the CPA."""
 
 
-def _of_pose(pose):
+def _velocity_along_x(pose):
     return float(pose.velocity[0]), float(np.sqrt(pose.covariance[3, 3]))
 
 
 @cache
 def pass_of(seed):
-    """`PassData` of a random pass."""
+    """Collect the `PassData` of a random pass."""
     collector = PassCollector(PAIR, settings_for('vehicle'))
     passes = collector.feed(readings_of(seed)[0]) + collector.flush()
     return max((data for data, _ in passes), key=lambda data: data.n_values)
@@ -66,7 +66,7 @@ def pass_of(seed):
 
 @cache
 def answers(seed):
-    """`Answers` of a random pass."""
+    """Estimate the velocity of a random pass by all methods; return `Answers`."""
     readings, truth, closest_s = readings_of(seed)
     pipeline = Pipeline(PAIR, settings_for('vehicle'))
     records = pipeline.feed(readings) + pipeline.flush()
@@ -81,6 +81,6 @@ def answers(seed):
     return Answers(
         truth, None if best is None else (float(best.velocity[0]), float(
             np.sqrt(best.robust_covariance[3, 3]))),
-        None if track is None else _of_pose(track),
-        None if smoothed is None else _of_pose(smoothed), correlated_motion(data),
+        None if track is None else _velocity_along_x(track),
+        None if smoothed is None else _velocity_along_x(smoothed), correlated_motion(data),
         track is not None and track.ambiguous)

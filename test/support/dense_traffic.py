@@ -1,4 +1,4 @@
-"""Dense traffic, so that the beginning of a recording has no quiet interval."""
+"""Dense traffic that leaves no quiet interval at the beginning of a recording."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from support.spoilt_runs import recorded
 
 
 def traffic(gap, begin=0.0, end=np.inf, size=2e-6, seed=0):
-    """Field (3,) [T] over time [s] of vehicles about every `gap` [s], each with its own field."""
+    """Function from a time [s] to the field (3,) [T] of random vehicles about every `gap` [s]."""
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(0.7, 1.3, 200) * gap) + begin
     times, sizes = times[times < end], size * rng.normal(size=(200, 3))
@@ -17,15 +17,15 @@ def traffic(gap, begin=0.0, end=np.inf, size=2e-6, seed=0):
 
 
 def dense_traffic(seconds):
-    """Dense traffic for the first `seconds`, as a fault of `support.spoiler`."""
-    def spoil(readings):
+    """Fault for `support.spoiler` that adds dense traffic to the first `seconds`."""
+    def modify(readings):
         t = (readings.stamp_ns - readings.stamp_ns.min()) / NS
         of = [traffic(1.5, begin=-1.0, end=seconds, seed=j) for j in range(len(readings.names))]
         added = [of[j](s) for j, s in zip(readings.sensor.tolist(), t, strict=True)]
         return dataclasses.replace(readings, field=readings.field + np.array(added))
-    return spoil
+    return modify
 
 
 def after_dense_traffic(name, seconds):
-    """`Readings` of the bundled recording `name` with dense traffic for the first `seconds`."""
+    """`Readings` of the bundled recording `name` with dense traffic in the first `seconds`."""
     return dense_traffic(seconds)(recorded(name).readings)

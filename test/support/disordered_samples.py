@@ -1,4 +1,4 @@
-"""Samples with all kinds of transport faults."""
+"""Samples with random transport faults."""
 
 import numpy as np
 
@@ -8,7 +8,10 @@ C = 1.44e-16 * np.eye(3)
 
 
 def disorder(rng, n):
-    """Samples of `n` sensors with losses, delays, reordering and invalid axes; None = flush."""
+    """Generate samples of `n` sensors with losses, delays, reordering and invalid axes.
+
+    None requests a flush.
+    """
     arrivals = []
     for j in range(n):
         step, count = rng.choice([10.0, 10.0, 10.0, 31.7]), rng.integers(5, 80)

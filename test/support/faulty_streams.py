@@ -1,4 +1,4 @@
-"""Sample streams of a vehicle's pass while one sensor is faulty."""
+"""Sample streams of a vehicle's pass with one faulty sensor."""
 
 from dataclasses import replace
 
@@ -22,20 +22,20 @@ def swapped(sample, rng):
 
 
 def spiky(size):
-    """Add a spike of `size` [T] to one reading in twenty, up or down, on every axis."""
-    def spoil(sample, rng):
-        off = size * rng.choice([-1.0, 1.0], 3) if rng.random() < 0.05 else 0.0
-        return [replace(sample, field=sample.field + off)]
-    return spoil
+    """Add a spike of +/- `size` [T] on every axis to one of twenty readings."""
+    def modify(sample, rng):
+        spike = size * rng.choice([-1.0, 1.0], 3) if rng.random() < 0.05 else 0.0
+        return [replace(sample, field=sample.field + spike)]
+    return modify
 
 
 def late_by(seconds):
-    """Delay the clock by `seconds` (negative = ahead)."""
+    """Set the clock back by `seconds` (negative = ahead)."""
     return lambda sample, rng: [replace(sample, stamp_ns=sample.stamp_ns - round(seconds * NS))]
 
 
 class Frozen:
-    """Repeat the first reading."""
+    """Fault that repeats the first reading."""
 
     def __init__(self):
         self._field = None
@@ -60,7 +60,10 @@ FAULTS = {
 
 
 def stream(n_sensors, seed, fault=None, lasting_s=1.5, sensor='mag_2'):
-    """(network, samples of a pass, truth: t [s] -> (2,) [m], (begin, end) of the fault [s])."""
+    """Simulate a pass with a fault of `sensor`.
+
+    Returns (network, samples, truth: t [s] -> position (2,) [m], (begin, end) of the fault [s]).
+    """
     network = line_network(n_sensors, tilt=0.0)
     rng = np.random.default_rng(seed)
     farthest = float(network.positions[:, 0].max())
@@ -70,10 +73,10 @@ def stream(n_sensors, seed, fault=None, lasting_s=1.5, sensor='mag_2'):
                            start_s=START_S)
     begin = START_S + 6.0 + max(0.0, farthest / 2.0 - 5.0) / SPEED - 0.4
     end = begin + lasting_s
-    spoil, out = None if fault is None else FAULTS[fault](), []
+    modify, out = None if fault is None else FAULTS[fault](), []
     for sample in samples:
-        hit = spoil and sample.sensor == sensor and begin <= sample.stamp_ns / NS < end
-        out += spoil(sample, rng) if hit else [sample]
+        is_faulty = modify and sample.sensor == sensor and begin <= sample.stamp_ns / NS < end
+        out += modify(sample, rng) if is_faulty else [sample]
 
     def truth(t):
         return FIRST + [SPEED * (t - START_S), 0.0]

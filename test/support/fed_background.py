@@ -1,4 +1,4 @@
-"""Background that is fed reading by reading, as the calibration does it."""
+"""Background that accepts individual readings, as in the calibration stage."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from mag_tracking.calibration.sensor_state import new_sensors
 
 
 class FedBackground(RunningBackground):
-    """Background fed reading by reading."""
+    """`RunningBackground` that accepts individual readings."""
 
     def __init__(self, *arguments, **named):
         self.sensors = new_sensors(1)
@@ -21,14 +21,14 @@ class FedBackground(RunningBackground):
         self.collect(time, field)
 
     def collect(self, time, field):
-        """Add a reading whose quantisation steps have been noted."""
+        """Add a reading that `note` has already evaluated for quantisation steps."""
         self.evaluate_block()
         core.collect(self.sensors, time, np.array(field, dtype=float))
         if np.isnan(self.sensors[0]['phase']):
             self.evaluate_block()
 
     def note(self, stamp, raw):
-        """Plain Python version of `core.note_step`."""
+        """Update the quantisation steps; Python version of `core.note_step`."""
         s = self.sensors[0]
         for a in np.flatnonzero(~np.isnan(raw)):
             change = abs(raw[a] - s['raw'][a])

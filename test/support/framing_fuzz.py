@@ -1,9 +1,9 @@
-"""Fuzz test of the framings: frames between garbage must be found, and none invented.
+"""Fuzz test of the framings: all frames between garbage must be found, and no false ones.
 
 PYTHONPATH=test python -m support.framing_fuzz --frames 1000000
 
-prints per framing the frames sent and found, the bytes of garbage and the parsing time, and exits
-with 1 on any loss. A framing is added by an entry in `CASES`.
+For each framing, the command prints the frames sent and found, the bytes of garbage and the parsing
+time. It exits with 1 on any loss. To add a framing, add an entry to `CASES`.
 """
 
 import argparse
@@ -28,14 +28,14 @@ GARBAGE = ('random', 'head', 'half', 'damaged')
 
 
 class Case(NamedTuple):
-    """Framing, and a generator of its frames."""
+    """A framing, and a generator of its frames."""
 
     make_framing: Callable
-    """Creates the framing."""
+    """Function that creates the framing."""
     encode_random_frame: Callable
-    """From a `random.Random` to (bytes, [Reading, ...])."""
+    """Function from a `random.Random` to (bytes, [Reading, ...])."""
     end_of_garbage: bytes = b''
-    """Appended to garbage that would otherwise merge with the next frame."""
+    """Bytes after garbage that would otherwise merge with the next frame."""
     garbage: tuple = GARBAGE
     """Kinds of garbage that cannot be valid frames."""
     chance: float = 0.0
@@ -43,35 +43,35 @@ class Case(NamedTuple):
 
 
 class Result(NamedTuple):
-    """Result for one framing."""
+    """Result of the fuzz test for one framing."""
 
     sent: int
-    """Number of frames."""
+    """Number of frames sent."""
     readings: int
     """Number of readings in the frames sent."""
     found: int
-    """Number of readings, like `lost` and `invented`."""
+    """Number of readings that were found."""
     lost: int
     invented: int
     garbage: int
-    """Number of bytes."""
+    """Number of bytes of garbage."""
     suspects: int
     """Number of frames with a wrong checksum."""
     seconds: float
     """Processor time for parsing."""
     worst_rest: int
-    """Longest unconsumed rest in bytes."""
+    """Maximum number of unconsumed bytes."""
 
     def failed(self, chance):
-        """Whether there are more errors than a probability `chance` of false frames explains."""
+        """Whether there are more errors than expected if a fraction `chance` of frames is false."""
         mean = chance * self.suspects
-        most = math.floor(mean + 6.0 * math.sqrt(mean)) if mean > 0.01 else 0
-        # A false frame hides at most one true frame, because it has the same length.
-        return max(self.invented, self.lost) > most * self.readings / self.sent
+        limit = math.floor(mean + 6.0 * math.sqrt(mean)) if mean > 0.01 else 0
+        # A false frame hides at most one true frame, because all frames have the same length.
+        return max(self.invented, self.lost) > limit * self.readings / self.sent
 
 
 def some_garbage(rng, case, frame):
-    """Random garbage, partly derived from `frame` (bytes)."""
+    """Generate random garbage, partly derived from `frame` (bytes)."""
     out = b''
     for _ in range(rng.randint(1, 3)):
         kind = rng.choice(case.garbage)
@@ -90,7 +90,7 @@ def some_garbage(rng, case, frame):
 
 
 def fuzz(case, n_frames, seed=0, share=0.4):
-    """`Result` of `n_frames` with garbage before a `share` of them."""
+    """Parse `n_frames` with garbage before a fraction `share` of them; return the `Result`."""
     rng, framing = random.Random(seed), case.make_framing()
     expected, sent, n_readings = deque(), 0, 0
     found = lost = invented = n_garbage = suspects = worst = 0
@@ -131,7 +131,10 @@ def fuzz(case, n_frames, seed=0, share=0.4):
 
 
 def _skipped(expected, reading):
-    """Number of `expected` before `reading`, both removed; None if it is not expected."""
+    """Remove `reading` and all readings before it from `expected`; return the number before it.
+
+    None if `expected` does not contain `reading`.
+    """
     for i in range(min(200, len(expected))):
         if expected[i] == reading:
             for _ in range(i + 1):
@@ -141,7 +144,7 @@ def _skipped(expected, reading):
 
 
 def _axes(rng, scale, digits):
-    """Three axes, one of them missing in 5 % of cases."""
+    """Three random axes; in 5 % of cases, one axis is missing."""
     axes = [round(rng.uniform(-scale, scale), digits) for _ in range(3)]
     if rng.random() < 0.05:
         axes[rng.randrange(3)] = math.nan
@@ -149,7 +152,7 @@ def _axes(rng, scale, digits):
 
 
 def text_frame(rng):
-    """$MAG,sensor,sequence,ticks,x,y,z*hh, for `text_framing`."""
+    """Random frame $MAG,sensor,sequence,ticks,x,y,z*hh for `text_framing`, and its readings."""
     sensor, axes = rng.choice(('A', 'B7', 'north', 'ß')), _axes(rng, 6e4, 2)
     sequence, ticks = rng.randrange(1 << 32), rng.randrange(1 << 40)
     numbers = ','.join(rng.choice(('', 'nan')) if math.isnan(v) else str(v) for v in axes)
@@ -160,13 +163,13 @@ def text_frame(rng):
 
 
 def text_framing():
-    """Framing of `text_frame`."""
+    """Create the framing of `text_frame`."""
     return TextFraming(TextSettings(fields=('sensor', 'sequence', 'ticks', 'x', 'y', 'z'),
                                     prefix='$MAG,', checksum='nmea', max_length=120))
 
 
 def json_frame(rng):
-    """{"id", "n", "t", "mag": {x, y, z}, "acc": [...]} on one line, for `json_framing`."""
+    """Random line {"id", "n", "t", "mag": {x, y, z}, "acc": [...]} for `json_framing`."""
     sensor, axes, acceleration = rng.choice('ABC'), _axes(rng, 6e4, 2), _axes(rng, 20.0, 3)
     sequence, ticks = rng.randrange(1 << 32), rng.random() * 1e6
     x, y, z = ('null' if math.isnan(v) else str(v) for v in axes)
@@ -177,13 +180,13 @@ def json_frame(rng):
 
 
 def json_framing():
-    """Framing of `json_frame`."""
+    """Create the framing of `json_frame`."""
     return JsonFraming(JsonSettings(sensor='id', ticks='t', sequence='n', acceleration=('acc',),
                                     field=('mag.x', 'mag.y', 'mag.z'), max_length=256))
 
 
 def binary_frame(rng):
-    """A5 5A, u16, u32, three f32, CRC-32, for `binary_framing`."""
+    """Random frame A5 5A, u16, u32, three f32, CRC-32 for `binary_framing`, and its reading."""
     sequence, ticks = rng.randrange(1 << 16), rng.choice((rng.randrange(1 << 32), 0x5AA55AA5))
     packed = struct.pack('<3f', *_axes(rng, 6e4, 2))
     payload = struct.pack('<HI', sequence, ticks) + packed
@@ -192,7 +195,7 @@ def binary_frame(rng):
 
 
 def binary_framing():
-    """Framing of `binary_frame`."""
+    """Create the framing of `binary_frame`."""
     return BinaryFraming(BinarySettings(
         sync='A5 5A', fields=('sequence:u16', 'ticks:u32', 'x:f32', 'y:f32', 'z:f32'),
         checksum='crc32'))
@@ -200,16 +203,16 @@ def binary_framing():
 
 @functools.cache
 def _eight_steps(crc):
-    """CRC-16/MODBUS, bit by bit."""
+    """Update a CRC-16/MODBUS with eight zero bits."""
     for _ in range(8):
         crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
     return crc
 
 
 def board_frame(rng):
-    """FF, u8, four sensors of three i24, CRC-16 including the sync, 0D, big endian."""
+    """Random frame FF, u8, four sensors of three i24, CRC-16, 0D, big endian, and its readings."""
     sequence = rng.randrange(256)
-    # Many bytes equal the sync.
+    # The CRC includes the sync byte, and many bytes equal the sync byte.
     counts = [tuple(rng.choice((-1, -256, 255, rng.randrange(-1 << 23, 1 << 23)))
                     for _ in range(3)) for _ in range(4)]
     covered = bytes([0xFF, sequence]) + b''.join(
@@ -221,7 +224,7 @@ def board_frame(rng):
 
 
 def board_framing():
-    """Framing of `board_frame`."""
+    """Create the framing of `board_frame`."""
     return BinaryFraming(BinarySettings(
         sync='FF', fields=('sequence:u8',), each=('x:i24', 'y:i24', 'z:i24'), count=4, tail='0D',
         byte_order='big', checksum='crc16_modbus', checksum_from='sync'))
@@ -233,15 +236,15 @@ CASES = {
     'binary': Case(binary_framing, binary_frame),
     'binary of a board': Case(board_framing, board_frame, chance=2.0**-16),
 }
-"""Cases by their printed names."""
+"""{printed name: case}."""
 
 
 def main():
-    """Run the command; 1 on any loss."""
+    """Run the command; return 1 if any framing fails, otherwise 0."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--frames', type=int, default=20_000, help='per framing')
+    parser.add_argument('--frames', type=int, default=20_000, help='number of frames per framing')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--only', choices=CASES, help='this framing alone')
+    parser.add_argument('--only', choices=CASES, help='test only this framing')
     arguments = parser.parse_args()
     failed = False
     for name, case in CASES.items():
@@ -252,7 +255,7 @@ def main():
         failed |= bad
         print(f'{name}: {result.sent} frames sent, {result.found} readings found, '
               f'{result.lost} lost, {result.invented} invented, {result.garbage} bytes of garbage, '
-              f'{result.suspects} suspects, longest rest {result.worst_rest} bytes, '
+              f'{result.suspects} wrong checksums, at most {result.worst_rest} unconsumed bytes, '
               f'{result.seconds:.2f} s{": FAILED" if bad else ""}', flush=True)
     return 1 if failed else 0
 

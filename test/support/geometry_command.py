@@ -12,7 +12,7 @@ from support.samples import MagSample, fed
 
 
 def write_table(path, field, positions, axes):
-    """Write a pose table of readings (K, n, 3), positions and axes (K, 3)."""
+    """Write a pose table with readings (K, n, 3), positions and axes (K, 3); return its path."""
     names = [f'{a}{j}' for j in range(field.shape[1]) for a in 'xyz']
     names += [f'mag_{v}0' for v in ('x', 'y', 'z', 'mx', 'my', 'mz')]
     with open(path, 'w', newline='') as stream:
@@ -23,13 +23,13 @@ def write_table(path, field, positions, axes):
 
 
 def command(table, *options, out):
-    """Exit status of the command."""
+    """Run the command on a table; return its exit status."""
     return main(['board-geometry', str(table), '--moment', str(MOMENT), '--out', str(out),
                  *map(str, options)])
 
 
 def through_calibrate(network, readings):
-    """Calibrated fields (K, n, 3) of raw readings by the stage; NaN if it returns none."""
+    """Calibrate raw readings (K, n, 3) by the stage; NaN where the stage returns no reading."""
     stage = Calibrate(network, settings_for('magnet').calibrate)
     out = np.full(readings.shape, np.nan)
     for k, frame in enumerate(readings):

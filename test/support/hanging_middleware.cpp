@@ -1,5 +1,6 @@
-// Preloaded, it lets a process hang where Fast DDS 2.14 may (eProsima/Fast-DDS 6513): in
-// DomainParticipant::set_listener(nullptr), while a participant is destroyed.
+// When preloaded, this library makes a process hang where Fast DDS 2.14 sometimes does
+// (eProsima/Fast-DDS 6513): in DomainParticipant::set_listener(nullptr), while a participant is
+// destroyed.
 
 #include <unistd.h>
 

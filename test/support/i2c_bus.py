@@ -1,4 +1,4 @@
-"""Bus of simulated chips with multiplexers and faults, in place of `smbus2.SMBus`."""
+"""Simulated I2C bus with chips, multiplexers and faults, in place of `smbus2.SMBus`."""
 
 import errno
 
@@ -23,7 +23,7 @@ FAKES = {'mmc5983ma': (FakeMmc5983ma, 0x30), 'mmc5603': (FakeMmc5603, 0x30),
 
 
 class FakeMultiplexer(FakeChip):
-    """TCA9548A: one register with a bit for each channel; `channels` are {number: {address}}."""
+    """TCA9548A: a register with one bit per channel; `channels` is {number: {address: chip}}."""
 
     def __init__(self, clock, channels):
         self.channels, self.mask = channels, 0xFF
@@ -39,7 +39,7 @@ class FakeMultiplexer(FakeChip):
 
 
 class FakeBus:
-    """Simulated bus, to be returned by `open_bus`."""
+    """Simulated bus, which the driver opens by `open_bus`."""
 
     def __init__(self, clock, chips, hz=400_000):
         self.clock, self.chips, self._hz = clock, chips, hz
@@ -57,7 +57,7 @@ class FakeBus:
         self.closed += 1
 
     def _chip(self, address, n_bytes):
-        """Chip that answers at an address."""
+        """Advance the clock by a transaction, and return the chip that answers at an address."""
         assert self.open
         if self.hangs:
             self.clock.ns += 1000 * MS
@@ -66,15 +66,15 @@ class FakeBus:
         error = self.next_errors.pop(0) if self.next_errors else None
         if error is not None:
             raise error
-        there = [self.chips[address]] if address in self.chips else []
+        answering = [self.chips[address]] if address in self.chips else []
         for chip in self.chips.values():
             if isinstance(chip, FakeMultiplexer):
-                there += chip.behind(address)
-        there = [chip for chip in there if chip.answers]
-        assert len(there) < 2, f'two chips answer at {address:#04x}'
-        if not there:
+                answering += chip.behind(address)
+        answering = [chip for chip in answering if chip.answers]
+        assert len(answering) < 2, f'two chips answer at {address:#04x}'
+        if not answering:
             raise OSError(errno.EREMOTEIO, 'Remote I/O error')
-        return there[0]
+        return answering[0]
 
     def write_byte(self, address, value):
         self._chip(address, 1).write(bytes([value]))
@@ -105,7 +105,7 @@ class FakeBus:
 
 
 def rig(entries, chips=None, clock=None, **changes):
-    """(clock, bus, device); there is a chip for every entry without a multiplexer."""
+    """Create (clock, bus, device), by default with one chip per entry and no multiplexer."""
     clock = clock or Clock()
     if chips is None:
         chips = {}
@@ -118,7 +118,7 @@ def rig(entries, chips=None, clock=None, **changes):
 
 
 def one(chip, **changes):
-    """(clock, bus, device, simulated chip), opened, with one sensor A."""
+    """Create and open (clock, bus, device, simulated chip) with one sensor A."""
     address = FAKES[chip][1]
     clock, bus, device = rig([f'A:{chip}:{address:#04x}'], **changes)
     device.open()

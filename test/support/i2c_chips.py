@@ -1,7 +1,7 @@
 """Simulated magnetometer chips that follow their data sheets register by register.
 
-They are written from the data sheets, not from the drivers: behaviour that a data sheet does not
-guarantee is not provided.
+They follow the data sheets and not the drivers: behaviour that a data sheet does not guarantee is
+not simulated.
 """
 
 import math
@@ -11,7 +11,7 @@ MS = 1_000_000
 
 
 class Clock:
-    """Clock that advances only while someone waits."""
+    """Clock that advances only by `sleep` and by bus transactions."""
 
     def __init__(self):
         self.ns = 5_000_000_000
@@ -25,7 +25,7 @@ class Clock:
 
 
 class FakeChip:
-    """Registers with an auto-incremented pointer; `field` [T] is constant or a function of ns."""
+    """Chip with an auto-incremented register pointer; `field` [T] may depend on the time [ns]."""
 
     def __init__(self, clock, field=(2e-5, -1e-5, 4e-5)):
         self.clock = clock
@@ -68,7 +68,7 @@ class FakeChip:
 
 
 class FakeMmc5983ma(FakeChip):
-    """18 bits about 131072, 16384 counts per gauss; the bridge has an offset in counts."""
+    """MMC5983MA: 18 bits about 131072, 16384 counts per gauss, bridge offset in counts."""
 
     ID, STATUS, DONE, CONTROL = (0x2F, 0x30), 0x08, 0x01, 0x09
     RESET_MS, CONVERSION_MS = 10, (8.0, 4.0, 2.0, 0.5)
@@ -77,7 +77,7 @@ class FakeMmc5983ma(FakeChip):
 
     def reset(self):
         self.memory[self.ID[0]] = self.ID[1]
-        # The calibration has been loaded from the chip's own memory.
+        # This bit means that the chip has loaded its calibration from its memory.
         self.memory[self.STATUS] = 0x10
         self.polarity = 0
         self.ready_ns = self.pulse_ns = 0
@@ -98,9 +98,9 @@ class FakeMmc5983ma(FakeChip):
             else:
                 self.memory[register] = value
         elif register == self.CONTROL:
-            assert value in (0x01, 0x08, 0x10), 'one thing at a time'
+            assert value in (0x01, 0x08, 0x10), 'only one command may be given at a time'
             if value != 0x01:
-                # The direction after RESET is that of the axes as drawn in the data sheet.
+                # After RESET, the axes point as drawn in the data sheet.
                 self.polarity, self.pulse_ns = (-1 if value == 0x08 else 1), now
                 self.pulses.append((now, value))
             elif now >= self.pulse_ns + MS and not self.memory[self.CONTROL + 2]:
@@ -132,7 +132,7 @@ class FakeMmc5983ma(FakeChip):
 
 
 class FakeMmc5603(FakeMmc5983ma):
-    """20 bits about 524288, 16384 counts per gauss."""
+    """MMC5603: 20 bits about 524288, 16384 counts per gauss."""
 
     ID, STATUS, DONE, CONTROL = (0x39, 0x10), 0x18, 0x40, 0x1B
     RESET_MS, CONVERSION_MS = 20, (6.6, 3.5, 2.0, 1.2)
@@ -145,7 +145,7 @@ class FakeMmc5603(FakeMmc5983ma):
 
 
 class FakeHmc5883l(FakeChip):
-    """Single measurements; the first one after a change of gain still has the old gain."""
+    """HMC5883L in single-measurement mode; a change of gain takes effect one measurement later."""
 
     GAINS = (1370, 1090, 820, 660, 440, 390, 330, 230)
 
@@ -173,7 +173,7 @@ class FakeHmc5883l(FakeChip):
     def finish(self):
         if self.end_ns is None or self.clock.ns < self.end_ns:
             return
-        # Bias of the self-test, if enabled.
+        # The self-test adds a bias.
         bias = 1.16 * GAUSS if self.memory[0] & 3 else 0.0
         x, y, z = (b + bias for b in self.field((self.start_ns + self.end_ns) // 2))
         for i, b in enumerate((x, z, y)):
@@ -207,14 +207,14 @@ class Continuous(FakeChip):
         return self.start_ns is not None and self.complete > self.taken
 
     def latest(self):
-        """(3,) [T] at the middle of the last complete conversion."""
+        """Field (3,) [T] at the middle of the last complete conversion."""
         if not self.complete:
             return 0.0, 0.0, 0.0
         return self.field(self.start_ns + round((self.complete - 0.5) * self.period_ns))
 
 
 class FakeRm3100(Continuous):
-    """Results are latched when their first byte is read."""
+    """RM3100; results are latched when their first byte is read."""
 
     GAIN = {50: (20.0, 534.0), 100: (38.0, 283.0), 200: (75.0, 147.0)}
 
@@ -238,7 +238,7 @@ class FakeRm3100(Continuous):
         if register == 0x01:
             self.stop()
             if value & 1:
-                assert value & 0x7C == 0x78, 'all axes, and ready when all are'
+                assert value & 0x7C == 0x78, 'all axes must be enabled, ready when all are complete'
                 slowest = {0x92: 1.7 * MS, 0x96: 27 * MS}[self.memory[0x0B]]
                 self.begin(max(round(1e9 / self.GAIN[self.cycles][1]), slowest))
 
@@ -256,7 +256,7 @@ class FakeRm3100(Continuous):
 
 
 class FakeLis3mdl(Continuous):
-    """With `strict`, bit 7 of the register number enables auto-increment."""
+    """LIS3MDL; if `strict`, bit 7 of the register number enables auto-increment."""
 
     GAIN = (6842, 3421, 2281, 1711)
     strict = True
@@ -285,8 +285,8 @@ class FakeLis3mdl(Continuous):
             self.stop()
             if value & 3 == 0:
                 assert self.memory[0x20] & 0x62 == 0x62, 'only the fast rate is simulated'
-                assert self.memory[0x23] & 0x0C == 0x0C, 'Z does not keep up'
-                assert self.memory[0x24] & 0x40 or not self.strict, 'halves of two conversions'
+                assert self.memory[0x23] & 0x0C == 0x0C, 'Z is in a slower mode'
+                assert self.memory[0x24] & 0x40 or not self.strict, 'two conversions may be mixed'
                 self.begin(round(1e9 / 155.0))
 
     def fetch(self, register):

@@ -11,17 +11,17 @@ from support.bundled import NETWORK_FILE
 from support.samples import sample_dict, simulate
 
 HARD, SOFT = [240.0, -130.0, 90.0], 6.0
-"""m0 [A m²] in the vehicle frame and D [m³] of the simulated vehicle."""
+"""Hard iron m0 [A m²] in the vehicle frame and soft iron D [m³] of the simulated vehicle."""
 ERRORS = SensorErrorModel(tilt_std=SensorErrors().rotation_std, gain_std=SensorErrors().gain_std)
-"""Sensor errors that the fit assumes for uncalibrated sensors."""
+"""Errors of uncalibrated sensors, as assumed by the fit."""
 START_S, DURATION_S, SPEED = 1_000.0, 24.0, 10.0
 
 
 def recorded(folder, heading_deg, rng, hard=HARD, soft=SOFT):
-    """Recording of one pass with the CPA at its middle; return its path."""
+    """Record one pass with the CPA in the middle; return the path of the recording."""
     network, heading = read_network(NETWORK_FILE), np.deg2rad(heading_deg)
-    way = np.array([np.cos(heading), np.sin(heading)])
-    start = np.array([0.3, 0.4]) - 0.5 * DURATION_S * SPEED * way
+    along = np.array([np.cos(heading), np.sin(heading)])
+    start = np.array([0.3, 0.4]) - 0.5 * DURATION_S * SPEED * along
     samples, *_ = simulate(network, point_body(hard, soft, 0.5), Path(start, heading, SPEED),
                            100.0, DURATION_S, rng, ERRORS, start_s=START_S)
     path = folder / 'pass.mcap'

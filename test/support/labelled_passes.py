@@ -20,14 +20,14 @@ def body_of(rng, name, simulator):
 
 
 def signature(rng, name, simulator, n_axes=3):
-    """One pass at a random speed and distance, with drift and noise."""
+    """Signature of one pass at a random speed and distance, with drift and noise."""
     body, speed = body_of(rng, name, simulator), rng.uniform(8.0, 25.0)
     lateral = rng.uniform(2.0, 4.0)
     half = 20.0 / speed + rng.uniform(0.0, 1.0)
     t = np.arange(0.0, 2.0 * half, 1.0 / RATE)
-    way = rng.choice([-1.0, 1.0])
-    position = np.stack([way * speed * (t - half), np.full(len(t), lateral)], axis=1)
-    heading = np.full(len(t), 0.0 if way > 0 else np.pi)
+    direction = rng.choice([-1.0, 1.0])
+    position = np.stack([direction * speed * (t - half), np.full(len(t), lateral)], axis=1)
+    heading = np.full(len(t), 0.0 if direction > 0 else np.pi)
     B = body.field(EARTH, position, heading, SENSOR)[:, 0]
     B = B + NOISE * rng.standard_normal(B.shape) + 1e-8 * rng.standard_normal(3) * t[:, None]
     return Signature(t, B[:, :n_axes], name, f'{name} of {simulator}', tuple('xyz'[:n_axes]), 'T',
@@ -35,27 +35,27 @@ def signature(rng, name, simulator, n_axes=3):
 
 
 def signatures(counts, simulator, seed=0, n_axes=3):
-    """Signatures in the numbers {class: number}."""
+    """Generate the number of signatures given by `counts` ({class: number})."""
     rng = np.random.default_rng(seed)
     return [signature(rng, name, simulator, n_axes) for name, n in counts.items()
             for _ in range(n)]
 
 
-def write_by_sample(path, found, unit=1e9):
+def write_by_sample(path, signatures, unit=1e9):
     with open(path, 'w', newline='') as stream:
         writer = csv.writer(stream)
         writer.writerow(['label', 'signature', 'time_s', 'x_nt', 'y_nt', 'z_nt'])
-        for k, s in enumerate(found):
+        for k, s in enumerate(signatures):
             writer.writerows([s.label, k, t, *(unit * b)]
                              for t, b in zip(s.t, s.field, strict=True))
 
 
-def write_by_row(path, found, n=80):
+def write_by_row(path, signatures, n=80):
     """Write signatures resampled to `n` samples, one per row."""
     with open(path, 'w', newline='') as stream:
         writer = csv.writer(stream)
         writer.writerow(['label', *(f'{a}_nt_{k}' for a in 'xyz' for k in range(n))])
-        for s in found:
-            at = np.linspace(s.t[0], s.t[-1], n)
+        for s in signatures:
+            times = np.linspace(s.t[0], s.t[-1], n)
             writer.writerow([s.label, *(1e9 * v for axis in s.field.T
-                                        for v in np.interp(at, s.t, axis))])
+                                        for v in np.interp(times, s.t, axis))])

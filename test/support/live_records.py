@@ -12,7 +12,7 @@ NS = 1_000_000_000
 
 
 def records_of(name, network):
-    """Frames and tracks of a recording, in order."""
+    """Frames and tracks of a recording, in chronological order."""
     pipeline, out = Pipeline(network, settings_for('vehicle', QUICK)), []
     for readings in SampleReader(Recording(vehicle_path(name)), network).readings():
         out += pipeline.feed(readings)
@@ -32,5 +32,5 @@ def poses(records):
 
 
 def later(records, seconds):
-    """The same records with later timestamps."""
+    """Copy records with timestamps later by `seconds`."""
     return [replace(r, stamp_ns=r.stamp_ns + round(seconds * NS)) for r in records]

@@ -19,7 +19,7 @@ LOW, HIGH = np.array([-0.08, -0.08, 0.03]), np.array([0.2, 0.2, 0.25])
 
 
 def board(n_side=3, spacing=0.06, noise=1e-7, seed=3):
-    """Sensors on a grid, each with a random orientation."""
+    """Network of sensors on a square grid, each with a random orientation."""
     places = np.array([(x, y, 0.0) for y in range(n_side) for x in range(n_side)]) * spacing
     R = rotation(np.random.default_rng(seed).standard_normal((n_side**2, 3)))
     names = tuple(f'mag_{j}' for j in range(len(places)))
@@ -28,14 +28,14 @@ def board(n_side=3, spacing=0.06, noise=1e-7, seed=3):
 
 
 def tracked(n_poses, rng):
-    """Positions and axes of a tool above the board."""
+    """Random positions and axes of a tool above the board."""
     positions = rng.uniform([0.0, 0.0, 0.05], [0.12, 0.12, 0.13], (n_poses, 3))
     axes = np.array([0.0, 0.0, 1.0]) + 0.6 * rng.uniform(-1.0, 1.0, (n_poses, 3))
     return positions, axes / np.linalg.norm(axes, axis=1)[:, None]
 
 
 def truth(network, n_poses, rng, settings=SETTINGS):
-    """Unknowns drawn from their priors: sensors (n, 10), shared (12,), poses (K, 8)."""
+    """Draw the unknowns from their priors: sensors (n, 10), shared (12,), poses (K, 8)."""
     s, deg = settings, np.pi / 180.0
     n = len(network)
     sensor = rng.standard_normal((n, 10)) * np.repeat(
@@ -49,16 +49,19 @@ def truth(network, n_poses, rng, settings=SETTINGS):
 
 
 def simulated(seed, n_poses=40, network=None, settings=SETTINGS):
-    """(network, field (K, n, 3), positions, axes, truth) of a board with all modelled errors."""
+    """Simulate a board with all modelled errors.
+
+    Returns (network, field (K, n, 3), positions, axes, truth).
+    """
     rng = np.random.default_rng(seed)
     network = network or board()
     positions, axes = tracked(n_poses, rng)
     x = truth(network, n_poses, rng, settings)
     magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0), MOMENT)
     f, signal, *_ = predicted_readings(network, magnet, *x)
-    size = np.linalg.norm(signal, axis=2)[:, :, None]
+    magnitude = np.linalg.norm(signal, axis=2)[:, :, None]
     std = np.sqrt(np.square(np.array(network.noise_std))[:, None]
-                  + (settings.field_error * size) ** 2)
+                  + (settings.field_error * magnitude) ** 2)
     f = f + std * rng.standard_normal(f.shape)
     return network, np.swapaxes(f, 0, 1).copy(), positions, axes, x
 
@@ -66,9 +69,9 @@ def simulated(seed, n_poses=40, network=None, settings=SETTINGS):
 def estimated(geometry, network):
     """Estimates (10 n + 12,) in the order of the covariance."""
     n = len(network)
-    turn = [_rotation_vector(a.T @ b)
+    rotations = [_rotation_vector(a.T @ b)
             for a, b in zip(network.R_ws, geometry.network.R_ws, strict=True)]
-    sensor = np.hstack([geometry.bias, geometry.gain[:, None] - 1.0, np.array(turn),
+    sensor = np.hstack([geometry.bias, geometry.gain[:, None] - 1.0, np.array(rotations),
                         geometry.network.positions - network.positions])
     return np.append(sensor.reshape(10 * n), geometry.shared)
 
@@ -82,7 +85,10 @@ def _rotation_vector(R):
 
 @cache
 def calibrated_boards():
-    """((simulated, geometry), ...) of several boards; not to be modified."""
+    """Simulate and calibrate several boards; return ((simulated, geometry), ...).
+
+    The result is cached and must not be modified.
+    """
     out = []
     for seed in range(16):
         case = simulated(seed)

@@ -1,9 +1,9 @@
-"""Marks of test parameters."""
+"""Pytest marks for test parameters with long run times."""
 
 import pytest
 
 
 def studied(names, kept=(), also=lambda name: ()):
-    """Parameters: those in `kept` run in `make test`, the others in `make studies`."""
+    """Mark all parameters except those in `kept` as studies, which only `make studies` runs."""
     return [pytest.param(name, marks=[*also(name), *([] if name in kept else [pytest.mark.study])])
             for name in names]

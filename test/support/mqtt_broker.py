@@ -1,4 +1,4 @@
-"""Real MQTT broker (mosquitto) for tests, and a scripted one."""
+"""Real MQTT broker (mosquitto) and scripted MQTT broker for tests."""
 
 import base64
 import hashlib
@@ -16,11 +16,11 @@ from contextlib import closing, suppress
 import pytest
 
 CONNECTED = bytes([0x20, 2, 0, 0])
-"""CONNACK, accepted."""
+"""CONNACK packet that accepts the connection."""
 
 
 def free_port(kind=socket.SOCK_STREAM):
-    """Free port outside the range that the kernel assigns automatically."""
+    """Find a free port outside the range that the kernel assigns automatically."""
     while True:
         port = random.randrange(20000, 32000)
         with closing(socket.socket(socket.AF_INET, kind)) as probe, suppress(OSError):
@@ -29,7 +29,7 @@ def free_port(kind=socket.SOCK_STREAM):
 
 
 def executable(name):
-    """Path of a program of mosquitto; `make test` installs it if permitted."""
+    """Path of a program of mosquitto, which `make test` installs; skips the test if missing."""
     path = shutil.which(name, path='/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin')
     if not path:
         pytest.skip(f'{name} is not installed: sudo apt install mosquitto')
@@ -37,7 +37,7 @@ def executable(name):
 
 
 class Broker:
-    """Mosquitto with its own configuration, on a fixed port; `lines` extend the configuration."""
+    """Mosquitto on a fixed port; `lines` extend its configuration."""
 
     def __init__(self, folder, *lines):
         self.port = free_port()
@@ -67,11 +67,11 @@ class Broker:
         raise AssertionError(f'mosquitto does not start:\n{self.log()}')
 
     def log(self):
-        """Output so far."""
+        """Output of the broker so far."""
         return (self._folder / 'mosquitto.log').read_text()
 
     def kill(self):
-        """Kill the broker without notice to its clients; may be called twice."""
+        """Kill the broker without closing its connections; may be called twice."""
         self._process.kill()
         self._process.wait(timeout=10)
 
@@ -81,7 +81,7 @@ class Broker:
 
 
 def password_lines(folder, user, password):
-    """Configuration of a broker that admits only `user`."""
+    """Configuration lines of a broker that admits only `user`."""
     path = folder / 'passwords'
     path.touch(mode=0o600)
     subprocess.run([executable('mosquitto_passwd'), '-b', path, user, password], check=True,
@@ -90,7 +90,7 @@ def password_lines(folder, user, password):
 
 
 def subscription_lines(folder, user, password, pattern):
-    """Configuration of a broker that permits `user` to subscribe only to `pattern`."""
+    """Configuration lines of a broker that permits `user` to subscribe only to `pattern`."""
     executable('mosquitto')
     salt = b'twelve bytes'
     hashed = hashlib.pbkdf2_hmac('sha512', password.encode(), salt, 101)
@@ -113,7 +113,7 @@ def subscription_lines(folder, user, password, pattern):
 
 
 def certificate(folder):
-    """(certificate, key) of localhost, self-signed, as paths."""
+    """Create a self-signed certificate of localhost; return the paths of certificate and key."""
     cert, key = folder / 'cert.pem', folder / 'key.pem'
     subprocess.run(['openssl', 'req', '-x509', '-newkey', 'rsa:2048', '-nodes', '-days', '2',
                     '-subj', '/CN=localhost', '-addext', 'subjectAltName=DNS:localhost',
@@ -122,10 +122,10 @@ def certificate(folder):
 
 
 class ScriptedBroker:
-    """Accept one connection, answer each message with the next scripted one, then stay silent."""
+    """Accepts one connection, answers each message with the next response, then stays silent."""
 
-    def __init__(self, *says):
-        self._says = says
+    def __init__(self, *responses):
+        self._responses = responses
         self._server = socket.create_server(('127.0.0.1', 0))
         self.port = self._server.getsockname()[1]
         self.heard = []
@@ -142,7 +142,7 @@ class ScriptedBroker:
         assert not self._thread.is_alive()
 
     def hang_up(self):
-        """Close the connection, and accept no other."""
+        """Close the connection, and accept no further connection."""
         self._server.close()
         if self._connection is not None:
             with suppress(OSError):
@@ -152,20 +152,21 @@ class ScriptedBroker:
         self._connection = self._server.accept()[0]
         self._server.close()
         with suppress(OSError), closing(self._connection):
-            for say in self._says:
+            for response in self._responses:
                 self.heard.append(self._connection.recv(65536))
-                self._connection.sendall(say(self.heard[-1]) if callable(say) else say)
-            while heard := self._connection.recv(65536):
-                self.heard.append(heard)
+                self._connection.sendall(
+                    response(self.heard[-1]) if callable(response) else response)
+            while message := self._connection.recv(65536):
+                self.heard.append(message)
 
 
 def granted(subscribe, *codes):
-    """SUBACK for the SUBSCRIBE packet `subscribe`; one code per filter (0x80 = refused)."""
+    """SUBACK packet for the SUBSCRIBE packet `subscribe`, one code per filter (0x80 = refused)."""
     return bytes([0x90, 2 + len(codes or (0,)), *subscribe[2:4], *(codes or (0,))])
 
 
 def publish_packet(topic, payload, flags=0):
-    """PUBLISH with QoS 0; `flags` are the low four bits of its first byte."""
+    """PUBLISH packet with QoS 0; `flags` are the low four bits of the first byte."""
     body = len(topic).to_bytes(2, 'big') + topic + payload
     assert len(body) < 128
     return bytes([0x30 | flags, len(body)]) + body

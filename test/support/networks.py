@@ -6,7 +6,7 @@ from mag_tracking.network import SensorNetwork
 
 
 def line_network(n, spacing=9.0, earth=(2e-6, 1.55e-5, -4.9e-5), noise=1.2e-8, tilt=0.3):
-    """`n` sensors across and along a road, each with another orientation."""
+    """Network of `n` sensors on both sides of a road, each with a random orientation."""
     rng = np.random.default_rng(n)
     positions = np.zeros((n, 3))
     positions[:, 0] = spacing * (np.arange(n) // 2)

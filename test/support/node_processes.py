@@ -9,20 +9,20 @@ import tempfile
 from mag_tracking.nodes.middleware import PROFILE_VARIABLE
 
 MAX_S = 120.0
-"""[s] Time limit for any event, also on a slow and busy machine."""
+"""[s] Time limit for any event, even on a slow and busy machine."""
 
 
 USUAL_START_S = 1.8
-"""[s] Start-up time of a node's process on an idle machine."""
+"""[s] Start-up time of a node process on an idle machine."""
 
 
 def scaled(limit_s, start_s):
-    """Time limit for an idle machine, extended in proportion if a node takes `start_s` to start."""
+    """Extend the time limit of an idle machine in proportion to the start-up time `start_s`."""
     return limit_s * max(1.0, start_s / USUAL_START_S)
 
 
 def start(module, *arguments, home=None):
-    """Start a node as a process without files from earlier runs."""
+    """Start a node as a process, in a home folder without files of earlier runs."""
     return subprocess.Popen(
         [sys.executable, '-m', f'mag_tracking.nodes.{module}', '--ros-args', *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -30,7 +30,7 @@ def start(module, *arguments, home=None):
 
 
 def environment(**more):
-    """Environment of a process that must find the middleware profile itself."""
+    """Environment without the path of the middleware profile, which a node must find itself."""
     return {n: v for n, v in os.environ.items() if n != PROFILE_VARIABLE} | more
 
 
@@ -48,13 +48,13 @@ def stop(processes):
 
 
 def without_states(output):
-    """Output of nodes without the lines about what they wait for."""
+    """Output of nodes without INFO lines."""
     return ''.join(line for line in output.splitlines(keepends=True)
                    if not line.startswith('[INFO]'))
 
 
 def call(ros, kind, name, request):
-    """Response of a service, requested again if none arrives."""
+    """Call a service, repeat the request if no response arrives, and return the response."""
     node, spin_until = ros
     client = node.create_client(kind, name)
     assert spin_until(client.service_is_ready), f'there is no {name}'

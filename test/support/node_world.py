@@ -1,4 +1,4 @@
-"""World for tests of faults: a roadside, a broker, a serial line, and the nodes as processes."""
+"""Environment for fault tests: a roadside, a broker, a serial line, and the nodes as processes."""
 
 import signal
 import time
@@ -26,25 +26,25 @@ from support.roadside import NOISE, Roadside
 from support.serial_line import SerialLine
 
 WRONG = chi2.ppf(1.0 - 1e-4, 2)
-"""A pose is wrong if its squared error in its own covariance exceeds this."""
+"""A pose is wrong if its squared error, normalised by its covariance, exceeds this."""
 BODY = point_body([0.0, 300.0, -300.0], 5.0, 0.5)
-"""Hard and soft iron do not cancel, so the vehicle is detected at 12 m."""
+"""Vehicle whose hard and soft iron do not cancel, so that it is detected at 12 m."""
 TOPICS = {'driver_node': (MagneticField, '/mag_1/imu/mag'),
           'calibration_node': (MagneticField, '/mag_1/imu/mag_calibrated'),
           'detection_node': (NetworkFrame, '/network_frame'),
           'tracker_node': (TrackArray, '/tracker_node/tracks')}
-"""Output of each node."""
+"""Message type and topic of the output of each node."""
 FRAME_S = 0.2
 """[s] `align.period_s`: longer than the default, so that a tracker on a busy machine keeps up."""
 NS = 1_000_000_000
 STEADY = {'calibration_node': {'calibrate.learn_s': 3600.0},
           'detection_node': {'detect.background_drift': 0.0}}
-"""Settings of a constant background as in the network file: it is not learnt between vehicles,
-and has no uncertainty."""
+"""Settings of a constant background, as given in the network file: it is not learnt between
+vehicles, and has no uncertainty."""
 
 
 def network_file(folder):
-    """Copy of the road network with noise and backgrounds, so that nothing is learnt."""
+    """Write the road network with known noise and backgrounds; return the path."""
     content = yaml.safe_load(NETWORK_FILE.read_text())
     for sensor in content['sensors'].values():
         sensor.update(noise_std=NOISE, background=content['earth_field'])
@@ -54,7 +54,10 @@ def network_file(folder):
 
 
 def drivers_files(folder, broker, guarded, line):
-    """{link: path} of drivers files for `mqtt` and `serial`; one device of `mqtt` is refused."""
+    """Write the drivers files for `mqtt` and `serial`; return {link: path}.
+
+    The broker refuses one device of `mqtt`.
+    """
     common = {'clock': {'tick_s': 1e-6, 'wrap': 0}, 'unit': 'nT'}
     content = {
         'mqtt': {'transport': 'mqtt', 'framing': 'json',
@@ -76,7 +79,7 @@ def drivers_files(folder, broker, guarded, line):
 
 
 class World:
-    """The nodes, which may be killed, and all their messages."""
+    """The node processes, which may be killed, and all their messages."""
 
     def __init__(self, folder, broker, guarded, roadside, line):
         self.broker, self.guarded, self.roadside, self.line = broker, guarded, roadside, line
@@ -88,14 +91,14 @@ class World:
         self._processes, self.heard, self.statuses = {}, {name: [] for name in TOPICS}, []
         self.link = None
         for name, (kind, topic) in TOPICS.items():
-            self._listen(kind, topic, STREAM, self.heard[name].append)
-        self._listen(DiagnosticArray, '/diagnostics', RESULTS, lambda heard: self.statuses.extend(
-            (heard[0], status) for status in heard[1].status))
+            self._subscribe(kind, topic, STREAM, self.heard[name].append)
+        self._subscribe(DiagnosticArray, '/diagnostics', RESULTS, lambda e: self.statuses.extend(
+            (e[0], status) for status in e[1].status))
 
-    def _listen(self, kind, topic, qos, take):
-        """Pass (arrival [ns], message) to `take`."""
+    def _subscribe(self, kind, topic, qos, callback):
+        """Subscribe to a topic, and pass (arrival [ns], message) to `callback`."""
         self.node.create_subscription(
-            kind, topic, lambda m: take((time.time_ns(), m)), qos)
+            kind, topic, lambda m: callback((time.time_ns(), m)), qos)
 
     def close(self):
         """Interrupt all processes as Ctrl-C does; return (exit codes, outputs)."""
@@ -109,28 +112,28 @@ class World:
     def wait(self, condition, seconds=MAX_S):
         """Spin until `condition()` is true, at 100 Hz; return its last value."""
         end = time.monotonic() + seconds
-        while not (found := condition()) and time.monotonic() < end:
+        while not (value := condition()) and time.monotonic() < end:
             self._executor.spin_until_future_complete(Future(), 0.01)
-        return found
+        return value
 
     def pause(self, seconds):
-        """Spin for some seconds."""
+        """Spin for `seconds`."""
         self.wait(lambda: False, seconds)
 
     def start(self, name):
         """Start a node as a process with the parameters of this world."""
-        given = {'driver_node': {'drivers': self.drivers[self.link]},
+        parameters = {'driver_node': {'drivers': self.drivers[self.link]},
                  'tracker_node': POINT, **STEADY}[name]
         if name == 'detection_node':
-            given = {'align.period_s': FRAME_S, **given}
+            parameters = {'align.period_s': FRAME_S, **parameters}
         if name != 'driver_node':
-            # The driver refuses sensors outside the network, such as that of `guarded`.
-            given = {'network': self.network, **given}
+            # The driver gets no network: it would refuse `mag_3` of the device `guarded`.
+            parameters = {'network': self.network, **parameters}
         self._processes[name] = start(name, *(
-            a for key, value in given.items() for a in ('-p', f'{key}:={value}')))
+            a for key, value in parameters.items() for a in ('-p', f'{key}:={value}')))
 
     def kill(self, name):
-        """Kill a node without notice."""
+        """Kill a node by SIGKILL."""
         process = self._processes.pop(name)
         process.send_signal(signal.SIGKILL)
         process.communicate(timeout=MAX_S)
@@ -138,14 +141,14 @@ class World:
         self.pause(0.05)
 
     def publishers(self):
-        """Publishers of diagnostics that were announced, including those of killed nodes."""
+        """Discovered publishers of diagnostics, including publishers of killed nodes."""
         return {tuple(p.endpoint_gid) for p in
                 self.node.get_publishers_info_by_topic('/diagnostics')}
 
     def recovery(self, name):
-        """Start a node: (seconds until it is up, seconds from then to its first output)."""
-        # It is up when its publisher appears, or at its first output. The tracker has no output
-        # without a vehicle; its first output is the first frame that it counts.
+        """Start a node; return the seconds until it is up and from then to its first output."""
+        # A node is up when its publisher appears, or at its first output. The tracker has no output
+        # without a vehicle, so the first frame that it counts is used instead.
         known, began_ns = self.publishers(), time.time_ns()
         self.start(name)
         up, first_ns = None, None
@@ -154,18 +157,18 @@ class World:
             first_ns = self._first_ns(name, began_ns)
             if up is None and (first_ns or self.publishers() - known):
                 up = (time.time_ns() - began_ns) / NS
-        assert first_ns is not None, f'{name} gives nothing'
+        assert first_ns is not None, f'{name} has no output'
         up = min(up, (first_ns - began_ns) / NS)
         return up, (first_ns - began_ns) / NS - up
 
     def _first_ns(self, name, since_ns):
-        """Time of the first output of a node after `since_ns`; None = none yet."""
+        """Time [ns] of the first output of a node after `since_ns`; None without an output."""
         if name != 'tracker_node':
-            return next((came for came, _ in self.since(since_ns, name)), None)
-        for came, status in self.told(since_ns, 'tracker_node: track'):
+            return next((arrival for arrival, _ in self.since(since_ns, name)), None)
+        for arrival, status in self.told(since_ns, 'tracker_node: track'):
             frames = next((int(v.value) for v in status.values if v.key == 'frames'), 0)
             if frames:
-                return came - round(frames * FRAME_S * NS)
+                return arrival - round(frames * FRAME_S * NS)
         return None
 
     def use(self, link):
@@ -179,17 +182,18 @@ class World:
         self.start('driver_node')
         assert self.wait(lambda: self.since(began_ns, 'driver_node'))
 
-    def since(self, came_ns, name):
-        """[(arrival [ns], message)] of a node after `came_ns`."""
-        return [h for h in self.heard[name] if h[0] > came_ns]
+    def since(self, since_ns, name):
+        """Messages of a node after `since_ns`, as [(arrival [ns], message)]."""
+        return [entry for entry in self.heard[name] if entry[0] > since_ns]
 
     def told(self, since_ns, name, *words):
-        """[(arrival [ns], DiagnosticStatus)] of a name after `since_ns` with all `words`."""
-        return [(came, s) for came, s in self.statuses if came > since_ns and s.name == name
+        """Statuses called `name` after `since_ns` with all `words`: [(arrival [ns], status)]."""
+        return [(arrival, s) for arrival, s in self.statuses
+                if arrival > since_ns and s.name == name
                 and all(word in s.message for word in words)]
 
     def tracks(self, since_ns):
-        """[Track] with a timestamp after `since_ns`."""
+        """List the `Track`s with a timestamp after `since_ns`."""
         # On a busy machine, poses of the previous vehicle arrive while the next one is passing.
         tracks = (track_of(t) for _, m in self.since(since_ns, 'tracker_node') for t in m.tracks)
         return [t for t in tracks if t.stamp_ns > since_ns]
@@ -200,7 +204,7 @@ class World:
         return frames and not frames[-1][1].target_present and self.roadside.is_gone()
 
     def call(self):
-        """Start a vehicle after the previous one has left; return the time [ns]."""
+        """Start a vehicle after the previous vehicle has left; return the time [ns]."""
         assert self.wait(self.is_quiet)
         self.roadside.call()
         return time.time_ns()
@@ -210,7 +214,7 @@ class World:
         assert self.wait(lambda: self.roadside.truth(time.time_ns())[0] >= x)
 
     def wrong(self, since_ns):
-        """Wrong poses with a timestamp after `since_ns`."""
+        """List the wrong poses with a timestamp after `since_ns`."""
         return [t for t in self.tracks(since_ns)
                 if not t.ended and is_wrong(t, self.roadside.truth(t.stamp_ns))]
 
@@ -223,7 +227,7 @@ def is_wrong(track, truth):
 
 @contextmanager
 def world(folder):
-    """`World` with running nodes, all of which must end cleanly."""
+    """Run a `World` with all nodes, which must exit cleanly."""
     line = SerialLine(folder / 'port')
     own = folder / 'guarded'
     own.mkdir()

@@ -1,7 +1,7 @@
 """Viewers of a live page that read all messages: `page_viewers.py URL N`.
 
-They print the amount received, because a viewer without messages would cost nothing. They stand for
-browsers on other machines, and run at a lower priority than the measured process.
+They simulate browsers on other machines, and run at a lower priority than the measured process. The
+amount received is printed to show that the viewers did receive messages.
 """
 
 import asyncio
@@ -12,24 +12,24 @@ import sys
 from websockets.asyncio.client import connect
 
 
-async def look(url, heard):
-    """Read all messages of one viewer."""
+async def look(url, sizes):
+    """Read all messages of one viewer, and append their sizes [bytes] to `sizes`."""
     async with connect(url.replace('http', 'ws') + 'stream', max_size=None,
                        compression=None) as viewer:
         async for message in viewer:
-            heard.append(len(message))
+            sizes.append(len(message))
 
 
 async def main(url, n):
-    """Run all viewers until SIGTERM."""
-    heard = [[] for _ in range(n)]
-    tasks = [asyncio.create_task(look(url, one)) for one in heard]
+    """Run `n` viewers until SIGTERM."""
+    sizes = [[] for _ in range(n)]
+    tasks = [asyncio.create_task(look(url, one)) for one in sizes]
     asyncio.get_running_loop().add_signal_handler(
         signal.SIGTERM, lambda: [task.cancel() for task in tasks])
     ended = await asyncio.gather(*tasks, return_exceptions=True)
     lost = sum(not isinstance(e, asyncio.CancelledError) for e in ended)
-    counts = [len(one) for one in heard]
-    print(f'{n}, each {min(counts)} to {max(counts)} messages, {sum(heard[0]) / 1e6:.1f} MB; '
+    counts = [len(one) for one in sizes]
+    print(f'{n}, each {min(counts)} to {max(counts)} messages, {sum(sizes[0]) / 1e6:.1f} MB; '
           f'{lost} disconnected')
 
 

@@ -13,7 +13,7 @@ EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 
 
 def network_of(positions):
-    """Upright sensors at `positions`."""
+    """Network of upright sensors at `positions`."""
     positions = np.asarray(positions, dtype=float)
     names = tuple(f'mag_{i + 1}' for i in range(len(positions)))
     return SensorNetwork(names, positions, np.tile(np.eye(3), (len(names), 1, 1)),
@@ -24,22 +24,22 @@ ROAD = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0]])
 
 
 def random_moments(rng, n_dipoles):
-    """Moments (d, 3) [A m²] of a row of dipoles."""
-    whole = rng.standard_normal(3)
-    whole *= rng.uniform(200.0, 600.0) / np.linalg.norm(whole)
-    moments = np.tile(whole / n_dipoles, (n_dipoles, 1))
+    """Random moments (d, 3) [A m²] of a row of dipoles."""
+    total = rng.standard_normal(3)
+    total *= rng.uniform(200.0, 600.0) / np.linalg.norm(total)
+    moments = np.tile(total / n_dipoles, (n_dipoles, 1))
     return moments if n_dipoles == 1 else moments + 60.0 * rng.standard_normal((n_dipoles, 3))
 
 
 def random_path(rng, n_dipoles, road):
-    """Path (6 or 7,) and moments (d, 3): along the road, or with any heading past its centre."""
+    """Random path (6 or 7,) and moments (d, 3), along the road or with any heading."""
     heading = rng.uniform(0.0, 2.0 * np.pi)
     if road:
         heading = np.pi * rng.integers(2) + 0.03 * rng.standard_normal()
-    along, aside = np.array([[1, 0], [0, 1]]) @ [[np.cos(heading), np.sin(heading)],
+    along, across = np.array([[1, 0], [0, 1]]) @ [[np.cos(heading), np.sin(heading)],
                                                  [-np.sin(heading), np.cos(heading)]]
     offset = rng.uniform(-2.5, 2.5) if road else rng.uniform(-6.0, 6.0)
-    position = np.append(offset * aside + rng.uniform(-2.0, 2.0) * along, rng.uniform(0.3, 1.0))
+    position = np.append(offset * across + rng.uniform(-2.0, 2.0) * along, rng.uniform(0.3, 1.0))
     velocity = np.append(rng.uniform(4.0, 20.0) * along, 0.05 * rng.standard_normal())
     moments = random_moments(rng, n_dipoles)
     length = [rng.uniform(2.0, 5.0)] if n_dipoles > 1 else []
@@ -47,7 +47,7 @@ def random_path(rng, n_dipoles, road):
 
 
 def measured(network, path, moments, rng, rate=100.0, seconds=4.0, noise=NOISE):
-    """`PassData` of a row of dipoles; time zero of the path is at the middle."""
+    """Simulate the `PassData` of a row of dipoles; the middle of the pass is at time zero."""
     n = int(seconds * rate)
     t = np.tile((np.arange(n) - n / 2) / rate, len(network))
     sensor = np.repeat(np.arange(len(network)), n)
@@ -58,12 +58,12 @@ def measured(network, path, moments, rng, rate=100.0, seconds=4.0, noise=NOISE):
 
 
 def together(first, second):
-    """Two targets at once: the sum of the fields, the noise of the first."""
+    """`PassData` of two targets at once: the sum of their fields, with the noise of the first."""
     return replace(first, field=first.field + second.field)
 
 
 def unknowns_at(path, moments, seconds):
-    """Unknowns of a fit whose time zero is `seconds` after that of `path`."""
+    """Unknowns of a fit whose time zero is `seconds` later than time zero of `path`."""
     moved = path.copy()
     moved[:3] += seconds * path[3:6]
     return np.concatenate([moved, moments.ravel()])

@@ -1,17 +1,17 @@
-"""Permissions of files, also for root."""
+"""Context in which file permissions also apply to root."""
 
 import ctypes
 from contextlib import contextmanager
 
 VERSION = 0x20080522
-"""_LINUX_CAPABILITY_VERSION_3."""
+"""_LINUX_CAPABILITY_VERSION_3 of the system call."""
 OVERRIDING = 1 << 1 | 1 << 2
-"""CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH."""
+"""Bits of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH."""
 
 
 @contextmanager
 def as_files_say():
-    """Make this thread respect file permissions, which root otherwise overrides."""
+    """Drop the capabilities by which root overrides file permissions, in this thread."""
     libc = ctypes.CDLL(None, use_errno=True)
     # Header: version, thread (0 = this one). Two rows: effective, permitted, inheritable.
     header, rows = (ctypes.c_uint32 * 2)(VERSION, 0), (ctypes.c_uint32 * 6)()

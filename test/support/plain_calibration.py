@@ -1,6 +1,6 @@
-"""Rules of the calibration in plain Python, sample by sample: an oracle for the compiled ones.
+"""Rules of the calibration in plain Python, sample by sample, as an oracle for the compiled rules.
 
-The background itself is that of the package; the rules for updating it are here.
+The background estimator is taken from the package; the rules for updating it are implemented here.
 """
 
 from collections import Counter
@@ -16,7 +16,7 @@ NS = 1_000_000_000
 
 
 class Repetition:
-    """A sensor is stuck if a run of equal readings has a probability below 1e-9."""
+    """Detects a stuck sensor: a run of equal readings with a probability below 1e-9."""
 
     def __init__(self):
         self.last, self.run, self.repeats, self.changes = None, 0, 0.0, 0.0
@@ -41,7 +41,7 @@ class Repetition:
 
 
 class Spikes:
-    """Holds up to three readings whose steps far exceed the eight previous ones."""
+    """Holds up to three readings whose steps far exceed the eight previous steps."""
 
     def __init__(self, threshold):
         self.threshold = threshold
@@ -51,7 +51,7 @@ class Spikes:
         self.held, self.before, self.steps = [], None, []
 
     def feed(self, sample, noise_std, step):
-        """[(sample, whether it is a spike)] of the samples classified so far."""
+        """Add a sample; return [(sample, whether it is a spike)] of the samples now classified."""
         if self.before is None:
             return self.step(sample)
         steps = np.abs(sample.field - self.before.field)
@@ -81,8 +81,8 @@ class Spikes:
         return [(sample, False)]
 
     def is_off(self, sample, steps, noise_std):
-        share = 30.0 * (sample.stamp_ns - self.before.stamp_ns) * 1e-9
-        steeper = max(8.0, 130.0 * share ** 3)
+        interval = 30.0 * (sample.stamp_ns - self.before.stamp_ns) * 1e-9
+        steeper = max(8.0, 130.0 * interval ** 3)
         for axis in range(3):
             recent = [s[axis] for s in self.steps[-8:] if not np.isnan(s[axis])]
             if recent and steps[axis] > self.threshold * noise_std[axis] \
@@ -91,14 +91,14 @@ class Spikes:
         return False
 
     def step(self, sample):
-        """Release the held samples, and this one without a comparison."""
+        """Release the held samples and `sample` as valid, without a comparison."""
         known = [(h, False) for h, _ in self.held] + [(sample, False)]
         self.held, self.before = [], sample
         return known
 
 
 class PlainCalibration:
-    """Like `Calibrate`, without restored backgrounds and without a change of the calibration."""
+    """Like `Calibrate`, but without restored backgrounds and changes of the calibration."""
 
     def __init__(self, network, settings):
         self.network, self.settings = network, settings
@@ -148,16 +148,16 @@ class PlainCalibration:
         return []
 
     def fault(self, sample):
-        values, most = np.abs(sample.field[~np.isnan(sample.field)]), self.settings.max_field
+        values, limit = np.abs(sample.field[~np.isnan(sample.field)]), self.settings.max_field
         if not len(values):
             return 'no axis reported (all NaN)'
         if np.isinf(values).any():
             return 'infinite value'
-        if values.max() > most:
-            return f'above {most:g} T (gauss or microtesla as tesla?)'
+        if values.max() > limit:
+            return f'above {limit:g} T (gauss or microtesla as tesla?)'
         if sample.covariance is not None and self.settings.trust_covariances:
-            there = ~np.isnan(sample.field)
-            C = sample.covariance[np.ix_(there, there)]
+            present = ~np.isnan(sample.field)
+            C = sample.covariance[np.ix_(present, present)]
             if not np.isfinite(C).all() or not np.allclose(C, C.T, atol=1e-6 * np.abs(C).max()) \
                     or not np.linalg.eigvalsh(C).min() > 0.0:
                 return 'covariance is not positive definite'
@@ -202,15 +202,15 @@ class PlainCalibration:
         out = []
         for s in samples:
             self.accepted[s.sensor] += 1
-            found = [s]
+            decimated = [s]
             if self.settings.decimate_to_hz:
                 decimator = self.decimators[s.sensor]
-                found = [MagSample(stamp, s.sensor, field, None if s.covariance is None
-                                   else s.covariance * decimator.noise_gain())
-                         for stamp, field in decimator.feed(s.stamp_ns, s.field)]
-                self.counts['removed by decimation'] += 1 - len(found)
+                decimated = [MagSample(stamp, s.sensor, field, None if s.covariance is None
+                                       else s.covariance * decimator.noise_gain())
+                             for stamp, field in decimator.feed(s.stamp_ns, s.field)]
+                self.counts['removed by decimation'] += 1 - len(decimated)
                 self.backgrounds[s.sensor].sensors[0]['n_averaged'] = decimator.factor or 1
-            out += [c for f in found for c in self.calibrated(f)]
+            out += [c for d in decimated for c in self.calibrated(d)]
         return out
 
     def calibrated(self, sample):
@@ -231,9 +231,9 @@ class PlainCalibration:
         return [MagSample(sample.stamp_ns, sample.sensor, field, C)]
 
     def is_credible(self, own, noise):
-        """Positive definite, variances within a factor of 25, similar correlations."""
-        there = ~np.isnan(noise.diagonal())
-        own, noise = own[np.ix_(there, there)], noise[np.ix_(there, there)]
+        """Whether `own` is positive definite and similar to `noise`, within a factor of 25."""
+        present = ~np.isnan(noise.diagonal())
+        own, noise = own[np.ix_(present, present)], noise[np.ix_(present, present)]
         if not np.isfinite(own).all() \
                 or not np.allclose(own, own.T, atol=1e-6 * np.abs(own).max()) \
                 or not np.linalg.eigvalsh(own).min() > 0.0:

@@ -1,4 +1,4 @@
-"""Filters of a bank step by step in NumPy: an oracle for the compiled ones."""
+"""Filters of a bank in NumPy, step by step, as an oracle for the compiled filters."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from support.plain_smoother import Step, smoothed_covariances, smoothed_states
 
 
 class StepByStep:
-    """Runs a bank along paths by its `predict` and `update`; see `BankFilter.run_along`."""
+    """Implementation of `BankFilter.run_along` by separate calls of `predict` and `update`."""
 
     def run_along(self, bank, frames, intervals, paths, *, passes, step, first_is_updated,
                   rejects_outliers=False, wants_covariances=False):
@@ -21,28 +21,28 @@ class StepByStep:
             variance = np.array([np.einsum('pii->p', step.P[:, :3, :3]) for step in steps]).T
             log_likelihood[~(variance >= 0.0).all(axis=1)] = -np.inf
             std = np.sqrt(np.where(variance >= 0.0, variance, np.nan))
-            away = np.linalg.norm((smoothed - paths)[:, :, :3], axis=2) / std
+            shift = np.linalg.norm((smoothed - paths)[:, :, :3], axis=2) / std
             new = np.isnan(paths)
             paths += step * (smoothed - paths)
             paths[new] = smoothed[new]
         covariances = np.stack(smoothed_covariances(steps), axis=1) if wants_covariances \
             else np.empty(0)
-        return PathResult(log_likelihood, away.max(axis=1), used, covariances)
+        return PathResult(log_likelihood, shift.max(axis=1), used, covariances)
 
     def filtered(self, bank, frames, intervals, paths, first_is_updated, rejects_outliers):
-        """(`Step`s, log-likelihood, which frames were used) of one pass through the frames."""
+        """Filter all frames once; return (`Step`s, log-likelihood, whether each frame was used)."""
         steps, total = [], np.zeros(len(bank))
         used = np.ones((len(bank), len(frames)), dtype=bool)
         for k, (frame, dt) in enumerate(zip(frames, intervals, strict=True)):
-            before, at = (None if np.isnan(path).any() else path
-                          for path in (paths[:, k - 1], paths[:, k]))
-            F, decay = self.predict(bank, dt, before) if k else (None, None)
+            previous, current = (None if np.isnan(path).any() else path
+                                 for path in (paths[:, k - 1], paths[:, k]))
+            F, decay = self.predict(bank, dt, previous) if k else (None, None)
             gains = None
             if k == 0 and first_is_updated:
                 used[:, k] = False
             else:
                 prior = bank.x.copy(), bank.P.copy()
-                of_frame, gains = self.update(bank, frame, dt, at)
+                of_frame, gains = self.update(bank, frame, dt, current)
                 if rejects_outliers and self.is_implausible(bank, 0, frame):
                     bank.x, bank.P = prior
                     gains, used[:, k] = None, False
@@ -53,29 +53,29 @@ class StepByStep:
 
 
 class PlainFilter(StepByStep, BankFilter):
-    """`BankFilter` whose steps are made one after the other, each for the whole bank."""
+    """`BankFilter` with separate steps in NumPy, each for the whole bank."""
 
     def __init__(self, network, model, settings, n_targets=1):
         super().__init__(network, model, settings, n_targets)
         self.model = model
 
     def _propagate(self, x, dt, P):
-        """`SourceModel.propagate` of all targets, one after the other."""
+        """Propagate all targets by `SourceModel.propagate`, one after the other."""
         n, n_one = self.observation.n_target, self.observation.n_one
         moved, F, Q = np.empty_like(x), np.zeros((len(x), n, n)), np.zeros((len(x), n, n))
         for first in range(0, n, n_one):
-            mine = slice(first, first + n_one)
-            moved[:, mine], F[:, mine, mine], Q[:, mine, mine] = self.model.propagate(
-                x[:, mine], dt, P[:, mine, mine])
+            own = slice(first, first + n_one)
+            moved[:, own], F[:, own, own], Q[:, own, own] = self.model.propagate(
+                x[:, own], dt, P[:, own, own])
         return moved, F, Q
 
     def predict(self, bank, dt, x_lin=None):
         """Time update in place, linearised at `x_lin` or the bank; return (Jacobian, decay)."""
         n_t = self.observation.n_target
-        at = (bank.x if x_lin is None else x_lin)[:, :n_t]
-        x_target, F, Q = self._propagate(at, dt, bank.P[:, :n_t, :n_t])
+        x_start = (bank.x if x_lin is None else x_lin)[:, :n_t]
+        x_target, F, Q = self._propagate(x_start, dt, bank.P[:, :n_t, :n_t])
         if x_lin is not None:
-            x_target = x_target + (F @ (bank.x[:, :n_t] - at)[:, :, None])[:, :, 0]
+            x_target = x_target + (F @ (bank.x[:, :n_t] - x_start)[:, :, None])[:, :, 0]
         decay, variance = (v[0] for v in self.observation.drift(
             np.array([dt]), self._settings.background_drift))
         plain_kalman.predict(bank.x, bank.P, x_target, F, Q if dt > 0.0 else 0.0 * Q, variance,
@@ -93,12 +93,12 @@ class PlainFilter(StepByStep, BankFilter):
             h, H, inflation = self.observation.fields(
                 x_lin, self.time_offset(frame, dt), self._lengths(bank.kind),
                 self._settings.field_error)
-            lost = ~(np.isfinite(h).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3)))
-            h[lost], H[lost], inflation[lost] = 0.0, 0.0, 0.0
+            invalid = ~(np.isfinite(h).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3)))
+            h[invalid], H[invalid], inflation[invalid] = 0.0, 0.0, 0.0
             log_likelihood, bank.nis, gains = plain_kalman.update(
                 bank.x, bank.P, frame.field, h, H, covariance, inflation, x_lin,
                 self.observation.n_own)
-            log_likelihood[lost] = -np.inf
+            log_likelihood[invalid] = -np.inf
             x_lin = bank.x.copy()
         bank.nis[:, np.isnan(frame.field).all(axis=1)] = np.nan
         return log_likelihood, gains

@@ -10,11 +10,11 @@ from mag_tracking.units import NS
 
 BEGIN_NS = 1_790_000_000 * NS
 NOISE, DRIFT, STEP = 1.2e-8, 3e-10, 6.25e-9
-"""[T] Noise of a reading, [T/s^0.5] drift of the background, [T] quantisation step."""
+"""Noise of a reading [T], drift of the background [T/s^0.5], and quantisation step [T]."""
 
 
 def write_quiet_road(path, network, duration_s, rate_hz=100.0, seed=0):
-    """Write readings of a network in the Earth's field, which drifts slightly, as an .mcap file."""
+    """Write an .mcap file with readings of a network in a slightly drifting Earth field."""
     rng, n = np.random.default_rng(seed), round(duration_s * rate_hz)
     t_ns = BEGIN_NS + np.round(np.arange(n) * NS / rate_hz).astype(np.int64)
     with RecordingWriter(path) as writer:

@@ -1,4 +1,4 @@
-"""Passes of random vehicles of both simulators, and their tracks."""
+"""Random passes of vehicles from both simulators, and their tracks."""
 
 from dataclasses import dataclass, replace
 
@@ -16,25 +16,25 @@ from support.spoiler import apply
 SIMULATORS = ('clouds', 'boxes')
 KINDS = ('truck', 'car', 'turning')
 WRONG_M, WRONG_SD = 2.0, 3.0
-"""A pose whose error exceeds both is wrong; it is sure and wrong if it is not flagged."""
+"""A pose is wrong if its error exceeds both WRONG_M [m] and WRONG_SD standard deviations."""
 
 
 def random_course(rng, turns):
-    """(`Path`, duration [s], approximate time of the CPA [s]) past sensors at the origin."""
+    """Random (`Path`, duration [s], approximate time of the CPA [s]) past sensors at the origin."""
     # A turn has a lateral acceleration of 2 to 5 m/s², like a tight turn at a junction.
     lane, radius = rng.uniform(0.8, 1.6), rng.uniform(4.5, 8.0)
     speed = np.sqrt(radius * rng.uniform(2.0, 5.0)) if turns else rng.uniform(7.0, 20.0)
-    away = 6.0 * speed + (15.0 if turns else 25.0)
-    start = np.array([-away, -lane])
+    lead = 6.0 * speed + (15.0 if turns else 25.0)
+    start = np.array([-lead, -lane])
     if not turns:
-        return Path(start, 0.0, speed), 8.0 + 50.0 / speed, away / speed
-    before = away + rng.uniform(3.5, 5.5) - radius
+        return Path(start, 0.0, speed), 8.0 + 50.0 / speed, lead / speed
+    before = lead + rng.uniform(3.5, 5.5) - radius
     return (Path(start, 0.0, speed, before, -0.5 * np.pi, radius), 8.0 + 40.0 / speed,
-            away / speed)
+            lead / speed)
 
 
 def random_pass(simulator, kind, seed):
-    """(body, course, duration [s], `SensorErrorModel`) of one pass of a kind in `KINDS`."""
+    """Random pass of a kind in `KINDS`: (body, course, duration [s], `SensorErrorModel`)."""
     rng = np.random.default_rng([seed, KINDS.index(kind), SIMULATORS.index(simulator)])
     path, duration, closest_s = random_course(rng, kind == 'turning')
     if simulator == 'clouds':
@@ -48,22 +48,22 @@ def random_pass(simulator, kind, seed):
 
 @dataclass(frozen=True)
 class Tracked:
-    """Tracking results of one pass; the arrays are over its poses."""
+    """Tracking results of one pass; the arrays have one element per pose."""
 
     error: np.ndarray
-    """(n,) [m] Horizontal error."""
+    """Horizontal error, (n,) m."""
     deviation: np.ndarray
-    """(n,) [m] Stated standard deviation in the direction of the error."""
+    """Published standard deviation in the direction of the error, (n,) m."""
     nees: np.ndarray
-    """(n,) NEES per axis."""
+    """NEES per axis, (n,)."""
     topic_nees: np.ndarray
-    """(n,) NEES by the covariance of the pose topics; NaN if they have none."""
+    """NEES per axis by the covariance of the pose topics, (n,). NaN for withheld poses."""
     distance: np.ndarray
-    """(n,) [m] True distance from the centre of the sensors."""
+    """True distance from the centre of the sensors, (n,) m."""
     ambiguous: np.ndarray
-    """(n,)."""
+    """Whether the pose is flagged as ambiguous, (n,)."""
     speed_ratio: float
-    """Tracked over true speed at the CPA; NaN without a pose."""
+    """Tracked speed divided by true speed at the CPA. NaN without a pose."""
     heading: float
     """Cosine of the angle between tracked and true velocity at the CPA; NaN without a pose."""
     detected: bool
@@ -74,58 +74,58 @@ class Tracked:
 
     @property
     def sure_and_wrong(self):
-        """(n,) Whether a pose is wrong and not flagged."""
+        """Whether each pose is wrong and not flagged, (n,)."""
         return ~self.ambiguous & are_wrong(self.error, self.deviation)
 
 
 def are_wrong(error, deviation):
-    """Whether errors [m] with these stated standard deviations [m] are wrong."""
+    """Whether errors [m] with published standard deviations [m] count as wrong."""
     return (error > WRONG_M) & (error > WRONG_SD * deviation)
 
 
 def errors_of(poses, t, position):
-    """Horizontal (error [m], stated std [m], NEES per axis, true position (n, 2) [m]) of poses."""
+    """Horizontal (error [m], its std [m], NEES per axis, true position (n, 2) [m]) of poses."""
     stamps = np.array([r.stamp_ns for r in poses]) / 1e9
     true = np.stack([np.interp(stamps, t, position[:, k]) for k in (0, 1)], axis=1)
     error = np.array([r.position[:2] for r in poses]).reshape(-1, 2) - true
     P = np.array([r.covariance[:2, :2] for r in poses]).reshape(-1, 2, 2)
-    size = np.hypot(*error.T)
-    along = np.sqrt(np.einsum('ni,nij,nj->n', error, P, error)) / np.maximum(size, 1e-9)
+    distance = np.hypot(*error.T)
+    std = np.sqrt(np.einsum('ni,nij,nj->n', error, P, error)) / np.maximum(distance, 1e-9)
     nees = np.einsum('ni,ni->n', error, np.linalg.solve(P, error[:, :, None])[:, :, 0]) / 2
-    return size, along, nees, true
+    return distance, std, nees, true
 
 
 def tracked(network, body, course, duration, flaws, seed, changes=None, faults=()):
-    """`Tracked` of a simulated pass with `faults` of `support.spoiler`."""
+    """Simulate a pass with `faults` of `support.spoiler`, and track it; return `Tracked`."""
     readings, t, position, _ = scenario.simulate(network, body, course, 100.0, duration,
                                                  np.random.default_rng(seed), flaws)
     readings = apply(readings, *faults)
     pipeline = Pipeline(network, settings_for('vehicle', changes))
     records = pipeline.feed(readings) + pipeline.flush()
     tracks = [r for r in records if isinstance(r, Track) and not r.ended]
-    size, along, nees, true = errors_of(tracks, t, position)
+    error, std, nees, true = errors_of(tracks, t, position)
     topic_nees = np.full(len(tracks), np.nan)
-    sent = [k for k, r in enumerate(tracks) if r.topic_uncertainty is not None]
-    topic_nees[sent] = errors_of([replace(tracks[k], covariance=tracks[
-        k].topic_uncertainty.covariance) for k in sent], t, position)[2]
+    published = [k for k, r in enumerate(tracks) if r.topic_uncertainty is not None]
+    topic_nees[published] = errors_of([replace(tracks[k], covariance=tracks[
+        k].topic_uncertainty.covariance) for k in published], t, position)[2]
     velocity = np.gradient(position, t, axis=0)
     distance = np.hypot(*(true - network.centre[:2]).T)
     ratio = heading = np.nan
     if len(tracks):
         k = int(np.argmin(distance))
         v = np.array([np.interp(tracks[k].stamp_ns / 1e9, t, v) for v in velocity.T[:2]])
-        stated = tracks[k].velocity[:2]
-        ratio = np.hypot(*stated) / np.hypot(*v)
-        heading = stated @ v / np.hypot(*stated) / np.hypot(*v)
+        w = tracks[k].velocity[:2]
+        ratio = np.hypot(*w) / np.hypot(*v)
+        heading = w @ v / np.hypot(*w) / np.hypot(*v)
     sure = [r for r in records if isinstance(r, SmoothedPose) and not r.ambiguous]
-    smoothed_error, smoothed_deviation, *_ = errors_of(sure, t, position)
+    smoothed_error, smoothed_std, *_ = errors_of(sure, t, position)
     ambiguous = np.array([r.ambiguous for r in tracks], dtype=bool)
-    return Tracked(size, along, nees, topic_nees, distance, ambiguous,
+    return Tracked(error, std, nees, topic_nees, distance, ambiguous,
                    float(ratio), float(heading), pipeline.detect.counts['onsets'] > 0, len(sure),
-                   int(are_wrong(smoothed_error, smoothed_deviation).sum()))
+                   int(are_wrong(smoothed_error, smoothed_std).sum()))
 
 
 def one_random_pass(simulator, kind, seed, changes=None, faults=()):
-    """`Tracked` of a random pass through the bundled network, with {setting: value} and faults."""
+    """Track a random pass by the bundled network, with {setting: value} and faults."""
     return tracked(read_network(NETWORK_FILE), *random_pass(simulator, kind, seed), seed, changes,
                    faults)

@@ -13,7 +13,7 @@ BOX = np.array([-0.05, -0.05, 0.03]), np.array([0.2, 0.22, 0.3])
 
 
 def board_of_41():
-    """(network, field, positions, axes)."""
+    """Read the bundled data of the board: (network, field, positions, axes)."""
     places = read_sensor_positions(FOLDER / 'sensor_positions_m.csv')
     names = tuple(f'mag_{j}' for j in range(len(places)))
     noise = (np.full(3, 4e-8),) * 25 + (np.array([3.2e-7, 3.2e-7, 4.1e-7]),) * 16
@@ -23,14 +23,14 @@ def board_of_41():
 
 
 def errors(geometry, field, positions, axes, poses):
-    """Errors of single poses [m] and of their axes [deg]; `poses` maps the tracker to the world."""
+    """Errors of individual positions [m] and axes [deg]; `poses` converts from tracker to world."""
     r, u = poses(positions, axes)
-    found = [locate_magnet(geometry.network, B, geometry.moment[0], *BOX, PoseSettings())
-             for B in geometry.signal(field)]
-    assert all(p.converged for p in found)
-    turn = [np.rad2deg(np.arccos(np.clip(p.axis @ a, -1.0, 1.0)))
-            for p, a in zip(found, u, strict=True)]
-    return np.linalg.norm([p.position for p in found] - r, axis=1), np.array(turn)
+    estimates = [locate_magnet(geometry.network, B, geometry.moment[0], *BOX, PoseSettings())
+                 for B in geometry.signal(field)]
+    assert all(p.converged for p in estimates)
+    angle = [np.rad2deg(np.arccos(np.clip(p.axis @ a, -1.0, 1.0)))
+             for p, a in zip(estimates, u, strict=True)]
+    return np.linalg.norm([p.position for p in estimates] - r, axis=1), np.array(angle)
 
 
 def said(what, place, turn, low):
@@ -39,7 +39,7 @@ def said(what, place, turn, low):
 
 
 def within_limits(place, turn, low):
-    """Check the project's limits, and the tighter ones that it has reached."""
+    """Assert the specified limits, and the tighter limits that have been reached."""
     assert np.median(place) <= 2.0e-3 and np.median(place[low]) <= 0.8e-3
     assert np.median(turn) <= 2.5
     assert np.median(place) <= 1.0e-3 and np.median(place[low]) <= 0.55e-3

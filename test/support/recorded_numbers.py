@@ -1,4 +1,4 @@
-"""Numbers as messages, and recordings of them."""
+"""Messages that encode numbers, and recordings of these messages."""
 
 import numpy as np
 from rosbags.highlevel import AnyReader
@@ -21,22 +21,22 @@ def field(k):
 
 
 def started(folder, **arguments):
-    """(recorder with the topic, ticked once, list of its reports)."""
-    told = []
-    recorder = Recorder(folder, report=told.append, **arguments)
+    """Start a recorder with one topic; return (recorder, list of its reports)."""
+    reports = []
+    recorder = Recorder(folder, report=reports.append, **arguments)
     recorder.add_topic(TOPIC, MAGNETIC_FIELD, definition(MAGNETIC_FIELD))
     recorder.tick(S)
-    return recorder, told
+    return recorder, reports
 
 
 def numbers(path, topic=TOPIC):
-    """(message numbers in recorded order, recording)."""
+    """Read a recording; return (message numbers in recorded order, recording)."""
     recording = Recording(path)
     return [stamp_ns(decode(m).header.stamp) for m in recording.messages([topic])], recording
 
 
 def by_rosbags(path, topic=TOPIC):
-    """[(time, number)] as read by rosbags."""
+    """Read a recording by rosbags; return [(time, number)]."""
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         rows = [(t, reader.deserialize(raw, c.msgtype).header.stamp)
                 for c, t, raw in reader.messages() if c.topic == topic]

@@ -1,8 +1,8 @@
-"""Roadside in real time: two boards measure, and a vehicle passes on request.
+"""Simulated roadside in real time: two boards measure, and a vehicle passes on request.
 
-The boards have a sample counter and a clock, and send their readings over MQTT and a serial line at
-the same time. Readings that are not received are lost. A lost connection is soon re-established, as
-by a real board.
+Each board has a sample counter and a clock, and sends its readings over MQTT and a serial line at
+the same time. Readings that are not received are lost. As on a real board, a lost connection is
+soon re-established.
 """
 
 import json
@@ -21,23 +21,23 @@ RATE_HZ = 100.0
 NOISE = 1.2e-8
 """[T] Noise of a reading."""
 FIRST = np.array([-20.0, -1.5])
-"""[m] Position where a vehicle appears; it is detected some metres later."""
+"""[m] Initial position of a vehicle, some metres before it can be detected."""
 SPEED = 6.0
 PASSING_S = 8.0
-"""[s] Duration of a pass. The vehicle is then 28 m away, and its field below 2 nT."""
+"""[s] Duration of a pass. At its end, the vehicle is 28 m away and its field is below 2 nT."""
 CONNECT = b'\x10\x12\x00\x04MQTT\x04\x02\x00\x00\x00\x06boards'
-"""MQTT 3.1.1, 3.1: CONNECT of the client `boards`, clean session, no keep-alive."""
+"""CONNECT packet (MQTT 3.1.1, section 3.1) of client `boards`: clean session, no keep-alive."""
 TWIN_S = 3.0
 
 
 class MqttSender:
-    """Connection of the boards to a broker, retried in every round."""
+    """Connection of the boards to a broker; after a failure, each round retries it."""
 
     def __init__(self, port):
         self._port, self._socket = port, None
 
     def send(self, readings):
-        """Send one message for each reading (board, sequence, ticks, field [nT])."""
+        """Send one message per reading (board, sequence, ticks, field [nT])."""
         with suppress(OSError):
             if self._socket is None:
                 self._connect()
@@ -62,13 +62,13 @@ class MqttSender:
 
 
 def nmea_line(board, k, ticks, field):
-    """Line of text with the reading [nT] and the checksum of NMEA 0183."""
+    """Line with a reading [nT] and its NMEA 0183 checksum."""
     body = ','.join([board, str(k), str(ticks), *(f'{v:.1f}' for v in field)]).encode()
     return body + b'*%02X\n' % reduce(lambda a, b: a ^ b, body)
 
 
 class Roadside:
-    """Boards of a network, in their own thread; board `A` is the first sensor, `B` the second."""
+    """Boards of a network, in their own thread; board `A` has the first sensor, `B` the second."""
 
     def __init__(self, network, body, port, line):
         assert len(network) == 2
@@ -112,9 +112,9 @@ class Roadside:
             self.plugged = True
 
     def call(self):
-        """Start a vehicle; the previous one must have left."""
+        """Start a vehicle; the previous vehicle must have left."""
         assert self.is_gone()
-        # It starts in the next round, because this one may have been sent in part.
+        # It starts in the next round, because the current round may have been sent in part.
         self._called = round((time.time_ns() - self._start_ns) / 1e9 * RATE_HZ) + 1
 
     def is_gone(self):
@@ -122,7 +122,7 @@ class Roadside:
         return self._called is None or self._elapsed(time.time_ns()) > PASSING_S
 
     def truth(self, stamp_ns):
-        """(2,) [m] Position of the vehicle, also out of range; NaN before the first one."""
+        """Position (2,) [m] of the vehicle, even out of range; NaN before the first vehicle."""
         if self._called is None:
             return np.full(2, np.nan)
         return FIRST + [SPEED * self._elapsed(stamp_ns), 0.0]
@@ -137,8 +137,8 @@ class Roadside:
         while not self._stopping.wait(max(
                 0.0, k / RATE_HZ - (time.time_ns() - self._start_ns) / 1e9)):
             row = None if self._called is None else k - self._called
-            there = row is not None and 0 <= row < len(self._table)
-            field = self._table[row] if there else self._still
+            is_passing = row is not None and 0 <= row < len(self._table)
+            field = self._table[row] if is_passing else self._still
             field = 1e9 * (field + NOISE * self._rng.standard_normal(field.shape))
             readings = self._readings(k, field)
             self._mqtt.send(readings)
@@ -148,9 +148,9 @@ class Roadside:
             k += 1
 
     def _readings(self, k, field):
-        """[(board, sequence, ticks [µs], field [nT])] of round `k`."""
-        said = [('A', k, field[0]), ('B', k, field[1])]
+        """Readings of round `k`: [(board, sequence, ticks [µs], field [nT])]."""
+        readings = [('A', k, field[0]), ('B', k, field[1])]
         if self.twin:
-            said.append(('A', k - round(TWIN_S * RATE_HZ), field[0] + 50.0))
+            readings.append(('A', k - round(TWIN_S * RATE_HZ), field[0] + 50.0))
         return [(board, n, round(1e6 * n / RATE_HZ), tuple(np.round(values, 1).tolist()))
-                for board, n, values in said]
+                for board, n, values in readings]

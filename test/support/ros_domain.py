@@ -6,11 +6,11 @@ import tempfile
 from pathlib import Path
 
 N_DOMAINS = 100
-"""Domains 1 to 101 do not use ports that Linux assigns automatically."""
+"""Number of domains. Domains 1 to 101 do not use ports that Linux assigns automatically."""
 
 
 class RosDomain:
-    """First free domain from one that depends on the process; released when closed."""
+    """Reserves the first free domain, searching from a number that depends on the process."""
 
     def __init__(self):
         folder = Path(tempfile.gettempdir()) / f'mag_tracking_domains_{os.getuid()}'
@@ -32,5 +32,5 @@ class RosDomain:
         self.close()
 
     def close(self):
-        """Release the domain; the end of the process also releases it."""
+        """Release the domain, which is also released at the end of the process."""
         self._lock.close()

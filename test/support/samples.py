@@ -1,4 +1,4 @@
-"""Single samples, which tests modify and reorder, and batches of readings made from them."""
+"""Individual samples, which tests modify and reorder, and conversion to batches of readings."""
 
 from dataclasses import dataclass
 
@@ -20,18 +20,18 @@ class MagSample:
 
 
 def one(sample):
-    """Batch of one `MagSample`."""
+    """Convert a `MagSample` to a batch of one reading."""
     return Readings.single(sample.sensor, sample.stamp_ns, np.asarray(sample.field, dtype=float),
                            sample.covariance)
 
 
 def batch(samples):
-    """Batch of [`MagSample`]."""
+    """Convert a list of `MagSample` to a batch of readings."""
     return Readings.joined([one(s) for s in samples])
 
 
 def samples_of(*batches):
-    """[`MagSample`] of batches."""
+    """Convert batches of readings to a list of `MagSample`."""
     out = []
     for readings in batches:
         C = readings.covariance
@@ -43,33 +43,33 @@ def samples_of(*batches):
 
 
 def fed(stage, sample):
-    """[`MagSample`] that a `Calibrate` returns for a `MagSample`."""
+    """Feed a `MagSample` to a `Calibrate` stage; return a list of `MagSample`."""
     return samples_of(*stage.feed(one(sample)))
 
 
 def flushed(stage):
-    """[`MagSample`] that a `Calibrate` has held."""
+    """Flush a `Calibrate` stage; return a list of `MagSample`."""
     return samples_of(*stage.flush())
 
 
 def recorded(reader):
-    """[`MagSample`] of a `SampleReader`."""
+    """Read all samples of a `SampleReader`; return a list of `MagSample`."""
     return samples_of(*reader.readings())
 
 
 def simulate(*arguments, **named):
-    """`scenario.simulate` that returns [`MagSample`]."""
+    """Call `scenario.simulate`; return a list of `MagSample`, and the truth."""
     readings, *truth = scenario.simulate(*arguments, **named)
     return samples_of(readings), *truth
 
 
 def sample_dict(sample, frame):
-    """sensor_msgs/MagneticField of a `MagSample`."""
+    """Content of the sensor_msgs/MagneticField message of a `MagSample`."""
     ((_, content),) = magnetic_field_dicts(one(sample), frame)
     return content
 
 
 def field_dict(stamp_ns, sensor, field):
-    """sensor_msgs/MagneticField of one reading, without a covariance."""
+    """Content of a sensor_msgs/MagneticField message without a covariance."""
     ((_, content),) = magnetic_field_dicts(Readings.single(sensor, stamp_ns, field), sensor)
     return content

@@ -1,11 +1,11 @@
-"""Serial line: a pseudo-terminal under a path, which can be removed and restored."""
+"""Serial line: a pseudo-terminal at a given path, which can be removed and restored."""
 
 import os
 import tty
 
 
 class SerialLine:
-    """The device's end of a line whose other end is `path`."""
+    """Device end of a serial line; the other end is the port `path`."""
 
     def __init__(self, path):
         self.path = path

@@ -1,7 +1,7 @@
-"""Worlds for `support.situations`: bodies, courses, disturbances.
+"""Worlds for `support.situations`: bodies, courses and disturbances.
 
-Each function takes a random generator and the name of a simulator ('clouds' or 'boxes'), and
-returns a body or a `World`. Sizes, speeds and lanes are random for each seed.
+Most functions take a random generator and the name of a simulator ('clouds' or 'boxes'), and return
+a body or a `World` with random sizes, speeds and lanes.
 """
 
 from dataclasses import replace
@@ -40,7 +40,7 @@ def truck(rng, simulator, length=None, moment=None):
 
 
 def small(rng, simulator, length, moment, iron=1.0):
-    """Motorcycle, bicycle or trolley."""
+    """Random motorcycle, bicycle or trolley."""
     if simulator == 'boxes':
         return box_two_wheeler(rng, length, moment, iron)
     return random_vehicle(rng, length, 0.5, 1.0, n_parts=20, moment=moment)
@@ -59,7 +59,7 @@ def wagon(rng, simulator):
 # Courses.
 
 def lane(rng, speed, away=None, y=None):
-    """Straight `Path` along the road; the vehicle passes the sensors after away / speed [s]."""
+    """Straight `Path` along the road, and the distance `away` of its start from the sensors [m]."""
     away = QUIET_S * speed + 25.0 if away is None else away
     y = rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6) if y is None else y
     forward = rng.random() < 0.5
@@ -73,14 +73,15 @@ def straight(rng, simulator, body, speed, network=ROAD, **of_lane):
 
 
 def stop_and(rng, stop_s, then):
-    """(`Ride`, duration [s]) with a stop near the sensors, then `then` times the speed."""
+    """(`Ride`, duration [s]) that stops near the sensors, then continues at `then` times the speed.
+    """
     speed = rng.uniform(6.0, 12.0)
     brake = rng.uniform(1.5, 3.0)
     path, away = lane(rng, speed, y=rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6))
-    at = away + rng.uniform(-5.0, 3.0)
-    braked = speed / brake
-    begin = (at - 0.5 * speed * braked) / speed
-    times = [0.0, begin, begin + braked, begin + braked + stop_s]
+    stop_m = away + rng.uniform(-5.0, 3.0)
+    braking_s = speed / brake
+    begin = (stop_m - 0.5 * speed * braking_s) / speed
+    times = [0.0, begin, begin + braking_s, begin + braking_s + stop_s]
     times += [times[-1] + max(abs(then), 0.1) * speed / 2.0]
     duration = times[-1] + (50.0 / speed if then else 0.0)
     return Ride(path, tuple(times), (speed, speed, 0.0, 0.0, then * speed)), duration
@@ -103,13 +104,13 @@ def u_turn(rng, simulator):
 
 def leaves(rng, simulator, cars=0):
     """A car is parked near the sensors from the beginning and leaves; other cars may then pass."""
-    at, y = rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.0)
-    stands = rng.uniform(10.0, 20.0)
+    x, y = rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.0)
+    parked_s = rng.uniform(10.0, 20.0)
     top = rng.uniform(6.0, 12.0)
     forward = rng.random() < 0.5
-    path = Path(np.array([at, y]), 0.0 if forward else np.pi, top)
-    ride = Ride(path, (0.0, stands, stands + top / 2.0), (0.0, 0.0, top))
-    duration = stands + top / 2.0 + 60.0 / top + 6.0
+    path = Path(np.array([x, y]), 0.0 if forward else np.pi, top)
+    ride = Ride(path, (0.0, parked_s, parked_s + top / 2.0), (0.0, 0.0, top))
+    duration = parked_s + top / 2.0 + 60.0 / top + 6.0
     movers = [(car(rng, simulator), ride)]
     for _ in range(cars):
         speed = rng.uniform(7.0, 15.0)
@@ -120,12 +121,12 @@ def leaves(rng, simulator, cars=0):
 
 
 def parked(rng, simulator):
-    """A car is parked permanently 5 to 8 m beside the sensors; another one passes."""
+    """A car is parked permanently, 7 to 9 m from the middle of the road; another car passes."""
     place = np.array([rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(7.0, 9.0)])
-    stands = Ride(Path(place, 0.0, 1.0), (0.0, 1.0), (0.0, 0.0))
+    stop = Ride(Path(place, 0.0, 1.0), (0.0, 1.0), (0.0, 0.0))
     speed = rng.uniform(7.0, 15.0)
     path, away = lane(rng, speed)
-    return world(ROAD, [(car(rng, simulator), stands), (car(rng, simulator), path)],
+    return world(ROAD, [(car(rng, simulator), stop), (car(rng, simulator), path)],
                  2.0 * away / speed, rng, FLAWS[simulator])
 
 
@@ -148,13 +149,13 @@ def two(rng, simulator, how, network=ROAD):
 
 
 def spoilt_car(rng, simulator, *faults):
-    """Car past sensors with faults of `support.spoiler`."""
-    made = straight(rng, simulator, car(rng, simulator), rng.uniform(7.0, 20.0))
-    return replace(made, readings=spoiler.apply(made.readings, *faults))
+    """A car passes sensors with faults of `support.spoiler`."""
+    clean = straight(rng, simulator, car(rng, simulator), rng.uniform(7.0, 20.0))
+    return replace(clean, readings=spoiler.apply(clean.readings, *faults))
 
 
 def usual(rng, simulator, kind):
-    """Pass of `support.random_passes`."""
+    """Random pass of `support.random_passes`."""
     seed = int(rng.integers(1 << 30))
     body, course, duration, flaws = random_pass(simulator, kind, seed)
     return world(ROAD, [(body, course)], duration, rng, flaws)
@@ -163,7 +164,7 @@ def usual(rng, simulator, kind):
 # Worlds without a target, or with one during a disturbance.
 
 def ambient_world(rng, simulator, ambient, duration, rate=100.0, cars=0):
-    """Field over the whole network, optionally with cars."""
+    """World with an `ambient` field, and optionally with passing cars."""
     movers = []
     for k in range(cars):
         speed = rng.uniform(7.0, 15.0)
@@ -173,7 +174,7 @@ def ambient_world(rng, simulator, ambient, duration, rate=100.0, cars=0):
 
 
 def uniform(vector, of_time):
-    """Field (3,) [T] equal at all sensors, times a function of time."""
+    """Ambient field that is equal at all sensors: `vector` (3,) [T] times a function of time."""
     return lambda t: np.broadcast_to(of_time(t)[:, None, None] * vector, (len(t), len(ROAD), 3))
 
 
@@ -183,16 +184,16 @@ def direction(rng):
 
 
 def hum(rng, simulator, frequency, rate):
-    """Power line to one side; its field is larger at the nearer sensor."""
+    """A power line to one side, whose field is larger at the nearer sensor."""
     near = rng.uniform(0.5, 1.0, 2)
     v = rng.uniform(1e-7, 3e-7) * direction(rng)
-    turns = 2.0 * np.pi * frequency * rng.uniform(0.9995, 1.0005)
-    return ambient_world(rng, simulator, lambda t: np.sin(turns * t)[:, None, None]
+    omega = 2.0 * np.pi * frequency * rng.uniform(0.9995, 1.0005)
+    return ambient_world(rng, simulator, lambda t: np.sin(omega * t)[:, None, None]
                          * near[:, None] * v, 60.0, rate)
 
 
 def tram(rng, simulator):
-    """Current of 100 to 500 A in a line 30 to 60 m away, switched on and off with ramps."""
+    """A current of 100 to 500 A in a line 30 to 60 m away is switched on and off with ramps."""
     times = np.sort(rng.uniform(12.0, 55.0, 4))
     away, current = rng.uniform(30.0, 60.0), rng.uniform(100.0, 500.0)
     y = ROAD.positions[:, 1]
@@ -206,7 +207,7 @@ def tram(rng, simulator):
 
 
 def storm(rng, simulator, cars=0):
-    """500 nT in ten minutes as a sum of slow waves; the steepest minutes are used."""
+    """Geomagnetic storm: 500 nT in ten minutes as a sum of slow waves, for two minutes."""
     v = 5e-7 * direction(rng)
     periods, phases = rng.uniform(60.0, 400.0, 6), rng.uniform(0.0, 2.0 * np.pi, 6)
     return ambient_world(rng, simulator, uniform(v, lambda t: sum(
@@ -222,23 +223,24 @@ def pulsations(rng, simulator):
 
 
 def knocked(rng, simulator):
-    """A sensor is rotated by some degrees within 0.1 s."""
-    made = ambient_world(rng, simulator, None, 40.0)
+    """A sensor is suddenly rotated by 1 to 5 degrees."""
+    quiet = ambient_world(rng, simulator, None, 40.0)
     angles = np.deg2rad(rng.uniform(1.0, 5.0)) * direction(rng)
     n = int(15.0 * 100.0) * 2
-    field = made.readings.field.copy()
-    mine = np.flatnonzero(made.readings.sensor == 0)
-    mine = mine[mine >= n]
-    field[mine] += np.cross(field[mine], angles)
-    return replace(made, readings=replace(made.readings, field=field))
+    field = quiet.readings.field.copy()
+    rotated = np.flatnonzero(quiet.readings.sensor == 0)
+    rotated = rotated[rotated >= n]
+    field[rotated] += np.cross(field[rotated], angles)
+    return replace(quiet, readings=replace(quiet.readings, field=field))
 
 
 def ramps(rng, simulator):
-    """Each sensor warms up independently: up to 5 nT/s for 10 to 30 s, then back."""
+    """Each sensor drifts independently by up to 5 nT/s for 10 to 30 s, then back."""
     rates = rng.uniform(1e-9, 5e-9, (2, 1)) * np.array([direction(rng), direction(rng)])
-    lasts = rng.uniform(10.0, 30.0)
+    ramp_s = rng.uniform(10.0, 30.0)
     return ambient_world(rng, simulator, lambda t: np.interp(
-        t, [12.0, 12.0 + lasts, 12.0 + 2 * lasts], [0.0, lasts, 0.0])[:, None, None] * rates, 90.0)
+        t, [12.0, 12.0 + ramp_s, 12.0 + 2 * ramp_s], [0.0, ramp_s, 0.0])[:, None, None] * rates,
+        90.0)
 
 
 def far(rng, simulator, body):
@@ -248,7 +250,7 @@ def far(rng, simulator, body):
 
 
 def train(rng, simulator, y):
-    """Five wagons of 18 m; a pose at any of them is correct."""
+    """A train of five wagons of 18 m passes; a pose at any wagon is correct."""
     speed = rng.uniform(10.0, 20.0)
     path, away = lane(rng, speed, away=250.0, y=rng.choice([-1.0, 1.0]) * y)
     along = np.array([np.cos(path.heading), np.sin(path.heading)])

@@ -1,4 +1,4 @@
-"""Situations outside the assumptions of the tracker's model, and how often it is sure and wrong."""
+"""Situations beyond the assumptions of the tracker's model, and its unflagged wrong poses."""
 
 from dataclasses import dataclass
 
@@ -36,14 +36,14 @@ from support.situation_worlds import (
 
 @dataclass(frozen=True)
 class Situation:
-    """Row of the table of situations."""
+    """Entry of the table of situations."""
 
     make: object
-    """Function from a random generator and a simulator's name to a `World`."""
+    """Function from a random generator and the name of a simulator to a `World`."""
     aim: float = 0.02
-    """Maximum share of wrong poses among the unflagged ones."""
+    """Maximum proportion of wrong poses among the unflagged poses."""
     group: str = 'one'
-    """'control' (tracked well), 'one' vehicle or none, 'several' vehicles, or 'nothing'."""
+    """'control' (tracked well), 'one' vehicle, 'several' vehicles, or 'nothing' (no target)."""
 
 
 SITUATIONS = {
@@ -77,11 +77,11 @@ SITUATIONS = {
         r, s, small(r, s, 2.1, r.uniform(40.0, 60.0)), r.uniform(8.0, 18.0))),
     'a car with a trailer': Situation(lambda r, s: straight(
         r, s, car_with_trailer(r, s), r.uniform(7.0, 15.0))),
-    # Distance from the nearer sensor.
+    # The distance is from the nearer sensor.
     'a train at 9 m': Situation(lambda r, s: train(r, s, 13.5)),
     'there at the start, leaves': Situation(leaves),
     'there at the start, then cars': Situation(lambda r, s: leaves(r, s, cars=2)),
-    # Longer than `relearn_s`: it has become part of the background when it leaves.
+    # The stop is longer than `relearn_s`, so the vehicle has become part of the background.
     'was parked for minutes, leaves': Situation(lambda r, s: stopping(r, s, 150.0)),
     'parked beside a passing car': Situation(parked),
     'one sensor alone': Situation(lambda r, s: spoilt_car(r, s, spoiler.only_sensor('mag_1'))),
@@ -108,11 +108,11 @@ SITUATIONS = {
     'a truck far away': Situation(lambda r, s: far(r, s, truck(r, s))),
     'a train far away': Situation(lambda r, s: train(r, s, r.uniform(40.0, 60.0))),
 }
-"""Situations by name."""
+"""{name: situation}."""
 
 
 def made(name, simulator, seed):
-    """`World` of a situation."""
+    """Simulate a situation; return a `World`."""
     rng = np.random.default_rng([seed, sorted(SITUATIONS).index(name),
                                  SIMULATORS.index(simulator)])
     return SITUATIONS[name].make(rng, simulator)
@@ -120,22 +120,22 @@ def made(name, simulator, seed):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Evaluation of one `World`; the arrays are over its published poses."""
+    """Evaluation of one `World`; the arrays have one element per published pose."""
 
     stamps: np.ndarray
-    """(n,) [s]."""
+    """Timestamp of each pose, (n,) s."""
     ids: np.ndarray
     ambiguous: np.ndarray
     wrong: np.ndarray
-    """(n,) Whether the error exceeds 2 m and 3 standard deviations for every body."""
+    """Whether the error exceeds 2 m and 3 standard deviations for every body, (n,)."""
     smoothed_sure: int
     smoothed_wrong: int
     n_tracks: int
     n_disturbances: int
     n_mistaken: int
-    """Number of disturbances that are in fact a body: their tracks follow it."""
+    """Number of reported disturbances that are in fact a body, which their tracks follow."""
     doubts: tuple
-    """(n,) Doubts of each pose."""
+    """Doubts of each pose."""
 
     @property
     def n_sure(self):
@@ -147,16 +147,16 @@ class Verdict:
 
 
 def wrong_of(poses, a_world):
-    """(n,) Whether `Track`s or `SmoothedPose`s are wrong for every body of a `World`."""
+    """Whether each `Track` or `SmoothedPose` is wrong for every body of a `World`, (n,)."""
     wrong = np.ones(len(poses), dtype=bool)
     for position in a_world.positions:
-        size, along, *_ = errors_of(poses, a_world.t, position)
-        wrong &= are_wrong(size, along)
+        error, std, *_ = errors_of(poses, a_world.t, position)
+        wrong &= are_wrong(error, std)
     return wrong
 
 
 def mistaken(disturbances, tracks, a_world):
-    """Those of [`Disturbance`] whose tracks follow a body of a `World` within 5 m."""
+    """Select the disturbances whose tracks follow a body of a `World` within 5 m."""
     out = []
     for d in disturbances:
         poses = [r for r in tracks if r.id == d.track_id]
@@ -167,7 +167,7 @@ def mistaken(disturbances, tracks, a_world):
 
 
 def verdict(name, simulator, seed, changes=None):
-    """`Verdict` on a situation with the settings `changes` ({name: value})."""
+    """Simulate and track a situation with the settings `changes`; return its `Verdict`."""
     a_world = made(name, simulator, seed)
     pipeline = Pipeline(a_world.network, settings_for('vehicle', changes))
     records = pipeline.feed(a_world.readings) + pipeline.flush()

@@ -1,4 +1,4 @@
-"""Runs of bundled vehicle recordings with faults through the tracker and the doctor."""
+"""Results of the tracker and the doctor for bundled vehicle recordings with faults."""
 
 import dataclasses
 import functools
@@ -19,12 +19,12 @@ HEADING = np.cos(np.deg2rad(45.0))
 
 ROADS = {'two_way_road_start': (DATA / 'two_way_road', NETWORK_FILE),
          'corridor_8_sensors': (DATA / 'corridor', DATA / 'corridor' / 'network.yaml')}
-"""{name: (folder, network file)} of recordings with other networks than those of `VEHICLES`."""
+"""{name: (folder, network file)} of the recordings that are not in `VEHICLES`."""
 
 
 @functools.cache
 def recorded(name):
-    """`RecordedReadings` of a bundled vehicle recording."""
+    """Read a bundled vehicle recording; return `RecordedReadings`."""
     if name in ROADS:
         folder, network = ROADS[name]
         return mt.read_recording(folder / f'{name}.mcap', network)
@@ -33,7 +33,7 @@ def recorded(name):
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Tracking results of a recording with faults, for the track nearest to the truth."""
+    """Tracking results of a recording with faults, for the track closest to the truth."""
 
     result: mt.TrackingResult
     detected: int
@@ -41,10 +41,10 @@ class Outcome:
     heading: float
     """Cosine of the angle between true and tracked velocity at the CPA."""
     ambiguous: bool
-    """At the CPA."""
+    """Whether the track is ambiguous at the CPA."""
     closest: float
     nees: float
-    """Per axis."""
+    """NEES per axis."""
 
     @property
     def direction_is_right(self):
@@ -52,7 +52,7 @@ class Outcome:
 
 
 def outcome(name, *faults, network=NETWORK_FILE, settings=None):
-    """`Outcome` of the bundled recording `name` with `faults`."""
+    """Track the bundled recording `name` with `faults`; return the `Outcome`."""
     source = recorded(name)
     readings = apply(source.readings, *faults)
     result = mt.track(dataclasses.replace(source, readings=readings), network,
@@ -73,7 +73,7 @@ def outcome(name, *faults, network=NETWORK_FILE, settings=None):
 
 
 def findings(name, *faults):
-    """[str] findings of the doctor for the bundled recording `name` with `faults`."""
+    """Findings of the doctor, as strings, for the bundled recording `name` with `faults`."""
     network = mt.read_network(ROADS[name][1] if name in ROADS else NETWORK_FILE)
     settings = settings_for('vehicle')
     readings = apply(recorded(name).readings, *faults)

@@ -1,4 +1,4 @@
-"""Stopped vehicles: their tracks in the worlds of `support.situations`, and the backgrounds."""
+"""Stopped vehicles in the worlds of `support.situations`: their tracks, and the backgrounds."""
 
 import numpy as np
 
@@ -10,15 +10,15 @@ from support.situations import made, wrong_of
 
 STOPS = ('stops for 5 s', 'stops for 20 s', 'stops for 60 s')
 STANDING = 0.05
-"""[m/s] Slower vehicles are stopped."""
+"""[m/s] Speed below which a vehicle counts as stopped."""
 RIGHT = 2.0
-"""A background is wrong if its error exceeds this number of standard deviations of a reading."""
+"""Maximum error of a correct background, in standard deviations of a reading."""
 SOON_S = 3.0
-"""[s] Time after the departure of a parked vehicle by which the background must be right."""
+"""[s] Maximum time from the departure of a parked vehicle until the background is correct."""
 TRACKED_M = 2.0
-"""[m] A vehicle is tracked if the median error is smaller."""
+"""[m] Maximum median error of a tracked vehicle."""
 PART = 50
-"""Number of readings fed at once."""
+"""Number of readings per batch."""
 
 
 def poses_of(records):
@@ -26,14 +26,14 @@ def poses_of(records):
 
 
 def stands(a_world, body=0):
-    """(begin, end) [s] of the stop of a body of a `World`."""
+    """(begin, end) [s] of the stop of a body in a `World`."""
     velocity = np.gradient(a_world.positions[body], a_world.t, axis=0)
     still = a_world.t[np.linalg.norm(velocity, axis=1) < STANDING]
     return still.min(), still.max()
 
 
 def goes_on(name, run):
-    """Whether one track contains a vehicle before it stops and 2 s after it continues."""
+    """Whether one track covers a vehicle from before its stop until 2 s after it."""
     a_world = made(name, SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))
     poses = poses_of(pipeline.feed(a_world.readings) + pipeline.flush())
@@ -45,9 +45,9 @@ def goes_on(name, run):
 
 
 def right_after(run):
-    """[s] from the departure of a parked vehicle until all backgrounds stay right; inf if never."""
-    # It has left when no sensor differs from its final level by more than `RIGHT`. The stage runs
-    # live, without a first pass.
+    """Time [s] from a vehicle's departure until all backgrounds remain correct; inf if never."""
+    # The vehicle has left when no sensor differs from its final level by more than `RIGHT`. The
+    # stage runs as in live operation, without a first pass over the readings.
     a_world = made('there at the start, leaves', SIMULATORS[run % 2], run // 2)
     stage = Pipeline(a_world.network, settings_for('vehicle')).calibrate
     readings, names = a_world.readings, a_world.network.names
@@ -58,21 +58,25 @@ def right_after(run):
     width = 25
     smooth = np.stack([[np.convolve(field[:, j, a], np.ones(width) / width, 'same')
                         for a in range(3)] for j in range(n)]).transpose(2, 0, 1)
-    off = (np.abs(smooth - level) > RIGHT * std).any(axis=(1, 2))[width:-width]
-    gone = a_world.t[width + np.flatnonzero(off).max()]
-    times, right = [], []
+    deviates = (np.abs(smooth - level) > RIGHT * std).any(axis=(1, 2))[width:-width]
+    departure = a_world.t[width + np.flatnonzero(deviates).max()]
+    times, is_correct = [], []
     for a in range(0, len(readings), PART):
         stage.feed(readings.part(slice(a, a + PART)))
         times.append(readings.stamp_ns[min(a + PART, len(readings)) - 1] / 1e9)
-        right.append(not stage.unready() and all(
+        is_correct.append(not stage.unready() and all(
             (np.abs(stage.background(name) - level[j]) < RIGHT * std[j]).all()
             for j, name in enumerate(names)))
-    wrong = np.flatnonzero(~np.array(right))
-    return np.inf if wrong.max() == len(times) - 1 else max(times[wrong.max() + 1] - gone, 0.0)
+    wrong = np.flatnonzero(~np.array(is_correct))
+    return np.inf if wrong.max() == len(times) - 1 else max(
+        times[wrong.max() + 1] - departure, 0.0)
 
 
 def first_after(run):
-    """(median error [m] or inf, n_sure, n_wrong) of the vehicle after a parked one, offline."""
+    """(median error [m] or inf, n_sure, n_wrong) of the first vehicle after the parked vehicle.
+
+    The recording is processed offline, with a first pass.
+    """
     a_world = made('there at the start, then cars', SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))
     prescan([a_world.readings], a_world.network,
@@ -80,8 +84,8 @@ def first_after(run):
     poses = poses_of(pipeline.feed(a_world.readings) + pipeline.flush())
     best = np.inf, 0, 0
     for id in {pose.id for pose in poses}:
-        mine = [pose for pose in poses if pose.id == id]
-        error = float(np.median(errors_of(mine, a_world.t, a_world.positions[1])[0]))
-        sure = np.array([not pose.ambiguous for pose in mine])
-        best = min(best, (error, int(sure.sum()), int((sure & wrong_of(mine, a_world)).sum())))
+        own = [pose for pose in poses if pose.id == id]
+        error = float(np.median(errors_of(own, a_world.t, a_world.positions[1])[0]))
+        sure = np.array([not pose.ambiguous for pose in own])
+        best = min(best, (error, int(sure.sum()), int((sure & wrong_of(own, a_world)).sum())))
     return best

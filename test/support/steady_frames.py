@@ -1,4 +1,4 @@
-"""Frames of a row of dipoles on a steady path, for the tests of `rigid_pass`."""
+"""Frames of a row of dipoles on a steady path."""
 
 import numpy as np
 
@@ -16,9 +16,9 @@ MOMENTS = np.array([[150.0, 40.0, -120.0], [90.0, -60.0, -160.0], [110.0, 70.0, 
 
 def steady_frames(rng, network=ROAD, path=STRAIGHT, clocks=(), change=None, period_s=0.08,
                   until_s=1.2):
-    """Frames from 1.6 s before to `until_s` after the CPA."""
-    # `clocks` [s] are the offsets of all sensors but the first; `change` is a function of the
-    # fields (n_frames, n_sensors, 3).
+    """Simulate the frames from 1.6 s before to `until_s` after the CPA."""
+    # `clocks` [s] are the clock offsets of all sensors except the first. `change` is a function
+    # that modifies the fields (n_frames, n_sensors, 3).
     t = np.arange(-1.6, until_s, period_s)
     n = len(network)
     theta = np.concatenate([path, np.zeros(n - 1)])
@@ -26,7 +26,7 @@ def steady_frames(rng, network=ROAD, path=STRAIGHT, clocks=(), change=None, peri
     times, sensor = np.repeat(t, n), np.tile(np.arange(n), len(t))
     model = SteadyPass(times, network.positions[sensor], np.tile(np.eye(3), (len(times), 1, 1)),
                        sensor - 1, np.arange(len(theta)), theta, len(MOMENTS))
-    # Linear parameters are combinations of the moments.
+    # The linear parameters are combinations of the moments.
     places = np.linspace(-0.5, 0.5, len(MOMENTS))
     combinations = np.kron(np.linalg.qr(np.vander(places, increasing=True))[0], np.eye(3))
     B = (model.basis(theta[None])[0] @ combinations.T @ MOMENTS.ravel()).reshape(len(t), n, 3)
@@ -39,6 +39,6 @@ def steady_frames(rng, network=ROAD, path=STRAIGHT, clocks=(), change=None, peri
 
 
 def state_at(t, path=STRAIGHT):
-    """(6,) [m], [m/s] at time `t` [s] on a straight path."""
+    """Position [m] and velocity [m/s] at time `t` [s] on a straight path, (6,)."""
     velocity = path[3] * np.array([np.cos(path[4]), np.sin(path[4]), 0.0])
     return np.append(path[:3] + t * velocity, velocity)

@@ -1,4 +1,4 @@
-"""Records of synthetic tracks, as published by a tracker."""
+"""Synthetic records of tracks, as published by a tracker."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ NS = 1_000_000_000
 
 
 def _common(t, x, y, v, **changes):
-    """Fields common to both kinds of pose."""
+    """Fields common to `Track` and `SmoothedPose`."""
     return {'stamp_ns': round(t * NS), 'id': 1, 'position': np.array([x, y, 0.5]),
             'velocity': np.array([v, 0.0, 0.0]), 'covariance': 0.01 * np.eye(6),
             'orientation': np.array([0.0, 0.0, 0.0, 1.0]),
@@ -19,7 +19,7 @@ def _common(t, x, y, v, **changes):
 
 
 def track_pose(t, x, y=-1.5, v=10.0, ended=False, **changes):
-    """`Track` at a time [s] and a position [m], with a speed [m/s] along x."""
+    """`Track` at time `t` [s] and position (`x`, `y`) [m], with speed `v` [m/s] along x."""
     return Track(**{
         'ended': ended, 'existence': 1.0, 'weight': 1.0, 'nis': 1.0,
         'nis_by_sensor': np.ones(2), 'degrees_of_freedom': 6, 'arrival': 'left',
@@ -29,12 +29,12 @@ def track_pose(t, x, y=-1.5, v=10.0, ended=False, **changes):
 
 
 def smoothed_pose(t, x, y=-1.5, v=10.0, **changes):
-    """`SmoothedPose` of a complete track."""
+    """`SmoothedPose` of a complete track, with arguments as for `track_pose`."""
     return SmoothedPose(**{'complete': True, **_common(t, x, y, v), **changes})
 
 
 def frame(t, n_sensors=2, field=None):
-    """`FieldFrame` at a time [s]."""
+    """`FieldFrame` at time `t` [s]; the default `field` is zero."""
     return FieldFrame(round(t * NS), np.zeros((n_sensors, 3)) if field is None else field,
                       np.tile(1e-16 * np.eye(3), (n_sensors, 1, 1)),
                       np.ones(n_sensors, dtype=np.int64), np.zeros(n_sensors))

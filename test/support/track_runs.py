@@ -1,4 +1,4 @@
-"""Simulated passes and poses through the tracker."""
+"""Tracking of simulated passes, and simulated frames of a magnet."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ NOISE = 1.2e-8
 
 
 def drive(network, body, path, changes=None, duration=12.0, flaws=None, seed=0):
-    """(tracks without closing records, pipeline, truth at their timestamps)."""
+    """Simulate and track a pass; return (`Track` records, pipeline, true positions)."""
     samples, t, position, _ = simulate(network, body, path, 100.0, duration,
                                        np.random.default_rng(seed), flaws)
     pipeline = Pipeline(network, settings_for('vehicle', changes))
@@ -26,7 +26,7 @@ def drive(network, body, path, changes=None, duration=12.0, flaws=None, seed=0):
 
 
 def magnet_frames(n=40, dt=0.1, lost=None):
-    """(frames, truth) of a magnet that circles above a board of nine sensors."""
+    """Simulate a magnet that circles above a board of nine sensors: (network, frames, truth)."""
     grid = np.array([[x, y, 0.0] for x in (-0.05, 0.0, 0.05) for y in (-0.05, 0.0, 0.05)])
     network = dataclasses.replace(
         line_network(9), positions=grid, background=(np.zeros(3),) * 9,

@@ -1,7 +1,7 @@
-"""Simulation of the traffic of PHD15 Paper B: 511 vehicles between two sensors with two axes.
+"""Simulation of the traffic in PHD15 Paper B: 511 vehicles between two sensors with two axes.
 
-Lanes, counts of both directions, distances and speed are those of the paper. The vehicles are those
-of either simulator, the sensors have errors, and some vehicles meet or follow closely.
+The lanes, counts per direction, distances and speed are taken from the paper. The vehicles come
+from either simulator, the sensors have errors, and some vehicles meet or follow closely.
 """
 
 from dataclasses import dataclass
@@ -22,13 +22,15 @@ from support.situation_worlds import car, truck
 
 SENSORS = np.array([[0.0, -5.0, 0.0], [0.0, 5.0, 0.0]])
 LANE_M = 1.5
-"""[m] Lanes at y = -1.5 (northbound, along x) and y = 1.5, 3.5 m and 6.5 m from the sensors."""
+"""[m] Distance of each lane from the x axis; each is 3.5 m from one sensor and 6.5 m from the
+other. The northbound lane is at negative y and leads along x."""
 N_NORTH, N_SOUTH = 291, 220
 SPEED, SPEED_STD = 25.0, 2.5
 MINUTES = 120.0
 RATE = 100.0
 WINDOW_S, PAD_S = 0.7, 0.4
-"""[s] The paper uses 1.5 s, which includes more of the other vehicles."""
+"""[s] Length of the window and of its margins. The paper uses 1.5 s, in which other vehicles
+interfere more."""
 SATURATION = 200e-6
 NOISE = 3e-8
 """[T] Noise on each axis."""
@@ -41,19 +43,19 @@ MIN_HEADWAY_S = 1.0
 
 @dataclass(frozen=True)
 class Passing:
-    """Vehicle with the measurements of both sensors and the truth."""
+    """Passing vehicle, with the measurements of both sensors and the truth."""
 
     t: np.ndarray
-    """(n,) [s] from the CPA."""
+    """Time since the CPA, (n,) s."""
     field: np.ndarray
-    """(2, n, 2) [T] Field at each sensor, world axes."""
+    """Field at each sensor, (2, n, 2) T, world axes."""
     is_north: bool
     headway: float
-    """[s] to the nearest other vehicle at the sensors."""
+    """Time to the closest other vehicle, s."""
 
     @property
     def near(self):
-        """Index of the sensor beside the vehicle's own lane."""
+        """Index of the sensor beside the lane of the vehicle."""
         return 0 if self.is_north else 1
 
     def rotations(self):
@@ -63,7 +65,7 @@ class Passing:
                 for field in self.field]
 
     def likelihood_ratio_of_north(self):
-        """([log-likelihood ratio of each sensor], their sum) for a northbound vehicle."""
+        """([log-likelihood ratio of each sensor], their sum) of northbound to southbound."""
         near, far = 5.0 - LANE_M, 5.0 + LANE_M
         one = direction_likelihood_ratio(self.t, self.field[0], NOISE,
                                          LaneHypothesis(SPEED, near), LaneHypothesis(-SPEED, far))
@@ -74,14 +76,14 @@ class Passing:
         return [one, -other], one - other
 
     def log_odds_of_north(self):
-        """([log odds of each sensor], fused log odds) for a northbound vehicle."""
+        """([log odds of each sensor], fused log odds) of northbound."""
         # Seen from the first sensor, a northbound vehicle moves from left to right.
         one, other = (r.log_odds for r in self.rotations())
         return [one, -other], fused_log_odds([one, other], [True, False])
 
 
 def arrivals(rng):
-    """[(time [s], whether northbound, speed [m/s])] in order of time."""
+    """Random arrivals in chronological order: [(time [s], whether northbound, speed [m/s])]."""
     out = []
     for n, is_north in ((N_NORTH, True), (N_SOUTH, False)):
         while True:
@@ -95,7 +97,7 @@ def arrivals(rng):
 
 
 def passings(simulator, seed):
-    """[`Passing`] of all vehicles of one realisation."""
+    """Simulate all vehicles; return [`Passing`]."""
     rng = np.random.default_rng([seed, len(simulator)])
     plan = arrivals(rng)
     bodies = [(truck if rng.random() < TRUCKS else car)(rng, simulator) for _ in plan]
@@ -117,15 +119,15 @@ def passings(simulator, seed):
 def field_of(body, arrival, lateral, t):
     """Field (2, n, 2) [T] of a vehicle at both sensors at times (n,) [s]."""
     at, is_north, speed = arrival
-    way = 1.0 if is_north else -1.0
-    position = np.stack([way * speed * (t - at), np.full(len(t), -way * lateral)], axis=1)
+    sign = 1.0 if is_north else -1.0
+    position = np.stack([sign * speed * (t - at), np.full(len(t), -sign * lateral)], axis=1)
     heading = np.full(len(t), 0.0 if is_north else np.pi)
     return body.field(EARTH, position, heading, SENSORS)[..., :2].swapaxes(0, 1)
 
 
 @dataclass(frozen=True)
 class Shares:
-    """Shares of correct directions."""
+    """Proportions of correct directions by the near sensor, the far sensor and both."""
 
     near: float
     far: float
@@ -133,7 +135,7 @@ class Shares:
 
 
 def shares(vehicles, log_odds):
-    """`Shares` of `Passing`s with ([log odds of each sensor], fused log odds) each."""
+    """`Shares` of vehicles (`Passing`) with ([log odds of each sensor], fused log odds) each."""
     north = np.array([v.is_north for v in vehicles])
     near = np.array([v.near for v in vehicles])
     single = (np.array([each for each, _ in log_odds]) > 0.0) == north[:, None]
@@ -144,8 +146,8 @@ def shares(vehicles, log_odds):
 
 
 def calibration(vehicles):
-    """(stated, measured) error probability in the far lane, for vehicles without others nearby."""
-    alone = [v for v in vehicles if v.headway > 2.0]
-    far = [(v.log_odds_of_north()[0][1 - v.near], v.is_north) for v in alone]
-    stated = [1.0 / (1.0 + np.exp(min(abs(odds), 500.0))) for odds, _ in far]
-    return float(np.mean(stated)), float(np.mean([(odds > 0.0) != north for odds, north in far]))
+    """(predicted, measured) error probability of the far sensor, for isolated vehicles."""
+    isolated = [v for v in vehicles if v.headway > 2.0]
+    far = [(v.log_odds_of_north()[0][1 - v.near], v.is_north) for v in isolated]
+    predicted = [1.0 / (1.0 + np.exp(min(abs(odds), 500.0))) for odds, _ in far]
+    return float(np.mean(predicted)), float(np.mean([(odds > 0.0) != north for odds, north in far]))

@@ -1,8 +1,8 @@
-"""Thirteen published passes of one vehicle."""
+"""Published moments of one vehicle in thirteen passes (T10 Table 6.9)."""
 
 import numpy as np
 
-# T10 Table 6.9: yaw [deg], moment and its standard deviations, in the units of the thesis.
+# Columns: yaw [deg], moment, standard deviations of the moment, in the units of the thesis.
 TABLE = np.array([
     [94.8, -0.28, -0.28, -0.96, 0.01, 0.01, 0.02], [94.8, -0.28, -0.29, -0.98, 0.01, 0.02, 0.03],
     [274.8, 0.27, 0.67, -1.06, 0.01, 0.02, 0.03], [274.8, 0.31, 0.69, -1.10, 0.01, 0.02, 0.03],

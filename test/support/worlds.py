@@ -1,4 +1,4 @@
-"""Worlds with several bodies and disturbances around a network, and the truth of all bodies."""
+"""Simulated worlds with bodies and disturbances around a network, and the true trajectories."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from support.box_vehicles import BOUGHT, magnetised
 from support.samples import scenario
 
 GRID_S = 0.01
-"""[s] Step of the integration of a `Ride`'s speed."""
+"""[s] Step of the integration of the speed in a `Ride`."""
 
 
 @dataclass(frozen=True)
@@ -20,31 +20,31 @@ class Ride:
 
     path: Path
     times: tuple
-    """(k,) [s]."""
+    """Times of the given speeds, (k,) s."""
     speeds: tuple
-    """(k,) [m/s] at those times, linear in between; negative = backwards."""
+    """Speeds at `times`, (k,) m/s, with linear interpolation; negative = backwards."""
 
     def at(self, t):
-        """See `mag_tracking.simulation.scenario.Trajectory`."""
+        """Position and heading at times `t`; implements `scenario.Trajectory`."""
         t = np.asarray(t, dtype=float)
         grid = np.arange(0.0, max(self.times[-1], t.max()) + 2 * GRID_S, GRID_S)
         speed = np.interp(grid, self.times, self.speeds)
-        way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * GRID_S)])
-        # The clock of a sensor may be ahead of the start of the ride.
+        distance = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * GRID_S)])
+        # Because of clock offsets, `t` may be negative.
         before = np.minimum(t, 0.0) * self.speeds[0]
-        return self.path.at((np.interp(t, grid, way) + before) / self.path.speed)
+        return self.path.at((np.interp(t, grid, distance) + before) / self.path.speed)
 
 
 @dataclass(frozen=True)
 class Convoy:
-    """Bodies that follow each other rigidly: a car with a trailer, a train."""
+    """Bodies at fixed distances from each other: a car with a trailer, a train."""
 
     bodies: tuple
     behind: tuple
-    """[m] Distance of each body's centre behind that of the convoy."""
+    """[m] Distance of the centre of each body behind the centre of the convoy."""
 
     def field(self, earth_field, position, heading, points):
-        """See `mag_tracking.simulation.scenario.Body`."""
+        """Field of all bodies at `points`; implements `mag_tracking.simulation.scenario.Body`."""
         forward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
         return sum(body.field(earth_field, position - back * forward, heading, points)
                    for body, back in zip(self.bodies, self.behind, strict=True))
@@ -52,18 +52,18 @@ class Convoy:
 
 @dataclass(frozen=True)
 class World:
-    """Scenario around a network."""
+    """Readings of a network, and the true positions of all bodies."""
 
     network: SensorNetwork
     readings: Readings
     t: np.ndarray
-    """(n,) [s]."""
+    """Times of the true positions, (n,) s."""
     positions: np.ndarray
-    """(n_bodies, n, 2) [m]."""
+    """True positions of the bodies, (n_bodies, n, 2) m."""
 
 
 def box_two_wheeler(rng, length, moment, iron=1.0):
-    """Motorcycle, bicycle or trolley of boxes: a frame, an engine (`iron`), two wheels."""
+    """Motorcycle, bicycle or trolley of boxes: frame, engine with weight `iron`, two wheels."""
     parts = [((0.0, 0.0, 0.5), (0.5 * length, 0.06, 0.5), 1.0),
              ((0.05 * length, 0.0, 0.4), (0.35, 0.3, 0.3), iron)]
     parts += [((0.35 * end * length, 0.0, 0.3), (0.05, 0.15, 0.5), 0.4) for end in (-1, 1)]
@@ -71,8 +71,8 @@ def box_two_wheeler(rng, length, moment, iron=1.0):
 
 
 def world(network, movers, duration, rng, flaws=None, rate=100.0, ambient=None):
-    """`World` of movers [(body, course)] for a `duration` [s], with sensors that have `flaws`."""
-    # `ambient` is a function from times (n,) [s] to a field (n, n_sensors, 3) [T], world frame.
+    """Simulate movers [(body, course)] for `duration` [s] and sensors with `flaws`; a `World`."""
+    # `ambient` is a function from times (n,) [s] to fields (n, n_sensors, 3) [T], world frame.
     flaws = flaws or SensorErrorModel()
     t = np.arange(0.0, duration, 1.0 / rate)
     parts = []
@@ -93,12 +93,12 @@ def world(network, movers, duration, rng, flaws=None, rate=100.0, ambient=None):
 
 
 def _earth(network):
-    """(n_sensors, 3) [T], sensor frames."""
+    """Earth field at each sensor, (n_sensors, 3) T, sensor frames."""
     return np.einsum('jik,i->jk', network.R_ws, network.earth_field)
 
 
 def _flawed(B, flaws, t, rng):
-    """Fields (n, n_sensors, 3) [T] as measured by sensors with `SensorErrorModel`."""
+    """Add the sensor errors `flaws` to fields (n, n_sensors, 3) [T]."""
     out = np.empty_like(B)
     for j in range(B.shape[1]):
         a, b, c = flaws.tilt_std * rng.standard_normal(3)

@@ -1,7 +1,6 @@
-"""Simulated Xsens device: its messages, written from the protocol and not from the parser.
+"""Messages of a simulated Xsens device, according to the protocol and independent of the parser.
 
-`encode_random_frame` and `garbage` generate endless streams; the long run is
-`PYTHONPATH=test python -m support.xsens_messages --frames 1000000`.
+For a long fuzz test, run `PYTHONPATH=test python -m support.xsens_messages --frames 1000000`.
 """
 
 import argparse
@@ -12,14 +11,14 @@ import time
 from mag_tracking.drivers.reading import Reading
 
 LAYOUT = ('temp', 'acc', 'gyr', 'mag', 'counter')
-"""Blocks of the MTData messages of `encode_random_frame`, with float numbers."""
+"""Blocks of the MTData messages of `encode_random_frame`, in float precision."""
 FLOAT, FP1220, FP1632, DOUBLE = range(4)
 MARKS = (0xFA, 0xFA, 0xFF, 0xFF, 0x36, 0x32, 0x3E)
 """Bytes that are frequent in garbage."""
 
 
 def message(mid, data, extended=None):
-    """Complete message; `extended` = its length takes two more bytes."""
+    """Encode a message; if `extended`, its length takes two more bytes."""
     if extended is None:
         extended = len(data) > 254
     length = b'\xff' + struct.pack('>H', len(data)) if extended else bytes([len(data)])
@@ -28,12 +27,12 @@ def message(mid, data, extended=None):
 
 
 def packet(identifier, data):
-    """Packet of MTData2."""
+    """Encode a packet of MTData2."""
     return struct.pack('>HB', identifier, len(data)) + data
 
 
 def reals(numbers, precision):
-    """Bytes of real numbers in a given precision."""
+    """Encode real numbers in a given precision."""
     if precision == FLOAT:
         return struct.pack(f'>{len(numbers)}f', *numbers)
     if precision == DOUBLE:
@@ -48,7 +47,7 @@ def reals(numbers, precision):
 
 
 def mtdata2(reading, precision=FLOAT, before=b'', behind=b''):
-    """MTData2 message of a reading, with other packets before and after it."""
+    """Encode an MTData2 message of a reading, with other packets before and after it."""
     data = before
     if reading.sequence is not None:
         data += packet(0x1020, struct.pack('>H', reading.sequence))
@@ -66,24 +65,24 @@ FRAME = mtdata2(READING)
 
 
 def random_reals(rng, precision, n=3):
-    """Numbers of all magnitudes that `precision` represents exactly."""
+    """Random numbers of all magnitudes that `precision` represents exactly."""
     bits, fraction = {FLOAT: (25, 20), FP1220: (32, 20), FP1632: (48, 32), DOUBLE: (53, 40)}[
         precision]
     return tuple((rng.getrandbits(bits) - 2**(bits - 1)) / 2**fraction for _ in range(n))
 
 
 def random_reading(rng, precision):
-    """Reading with field, acceleration or both."""
-    what = rng.randrange(4)
+    """Random reading with field, acceleration or both."""
+    kind = rng.randrange(4)
     return Reading(
-        field=None if what == 0 else random_reals(rng, precision),
-        acceleration=None if what == 1 else random_reals(rng, precision),
+        field=None if kind == 0 else random_reals(rng, precision),
+        acceleration=None if kind == 1 else random_reals(rng, precision),
         ticks=float(rng.getrandbits(32)) if rng.random() < 0.8 else None,
         sequence=rng.getrandbits(16) if rng.random() < 0.8 else None)
 
 
 def other_packet(rng):
-    """Packet that is not part of a reading, known or unknown."""
+    """Random packet that is not part of a reading, of a known or unknown type."""
     kind, size = rng.choice(((0x0810, 4), (0x1010, 12), (0x1070, 4), (0x2010, 16), (0x2034, 12),
                              (0x4010, 12), (0x4030, 12), (0x8020, 12), (0xE020, 4),
                              (0x5A5F, rng.randrange(40)), (0xFAFF, rng.randrange(40))))
@@ -91,7 +90,7 @@ def other_packet(rng):
 
 
 def encode_random_frame(rng):
-    """(bytes, [Reading]) of a message that a device may send; `rng` is a random.Random."""
+    """Random message of a device, as (bytes, [Reading]); `rng` is a random.Random."""
     kind = rng.random()
     if kind < 0.08:
         mid, size = rng.choice(((0x3E, 0), (0x42, 1), (0x31, 0), (0x0D, 118), (0xC1, 32),
@@ -110,7 +109,7 @@ def encode_random_frame(rng):
 
 
 def garbage(rng, n):
-    """`n` bytes that resemble beginnings of messages."""
+    """Generate `n` random bytes that resemble beginnings of messages."""
     out = bytearray()
     while len(out) < n:
         kind = rng.random()
@@ -126,36 +125,36 @@ def garbage(rng, n):
 
 
 def stream(rng, frames):
-    """(bytes, [Reading], lengths of the frames) of frames with garbage in between."""
+    """Random frames with garbage in between: (bytes, [Reading], lengths of the frames)."""
     parts, readings, lengths = [], [], []
     for _ in range(frames):
         if rng.random() < 0.5:
             parts.append(garbage(rng, rng.randrange(30)))
-        data, said = encode_random_frame(rng)
+        data, new = encode_random_frame(rng)
         parts.append(data)
         lengths.append(len(data))
-        readings += said
+        readings += new
     return b''.join(parts), readings, lengths
 
 
 def lost_and_false(sent, found):
-    """(number of `sent` not in `found`, number of `found` not sent), in order."""
+    """Compare two sequences in order: (number of lost readings, number of false readings)."""
     lost = position = false = 0
     at = {}
     for index, reading in enumerate(sent):
         at.setdefault(repr(reading), []).append(index)
     for reading in found:
-        where = [i for i in at.get(repr(reading), ()) if i >= position]
-        if where:
-            lost += where[0] - position
-            position = where[0] + 1
+        matches = [i for i in at.get(repr(reading), ()) if i >= position]
+        if matches:
+            lost += matches[0] - position
+            position = matches[0] + 1
         else:
             false += 1
     return lost + len(sent) - position, false
 
 
 def main():
-    """Run many frames in pieces of the size that a serial port returns."""
+    """Parse many frames in pieces of 64 bytes, as a serial port returns them."""
     from mag_tracking.drivers.framings.xsens import XsensFraming, XsensSettings
 
     parser = argparse.ArgumentParser(description=__doc__)

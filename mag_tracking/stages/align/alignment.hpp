@@ -1,7 +1,7 @@
-// Alignment of samples, one at a time, and the frames that they complete.
+// Alignment of individual samples into frames.
 //
-// All rules for a sample are implemented here. An event that needs Python (a rejection that is
-// counted by name, a clock step, a complete frame, ...) is returned as a reason.
+// All rules for a sample are implemented here. An event that Python must handle (a rejection that
+// is counted by name, a clock step, a complete frame, ...) is returned as a reason code.
 
 #pragma once
 
@@ -17,19 +17,19 @@ namespace mag_tracking {
 enum Reason {
     // The batch is finished, or the sample has been rejected.
     DONE, UNKNOWN_SENSOR, NO_FIELD, NO_COVARIANCE, DUPLICATE, OUT_OF_ORDER, LATE,
-    // To be handled before the same sample is processed again.
+    // Must be handled before the same sample is processed again.
     JUMPED_BACK,
-    // The clock of the sample may have stepped, and the sample was not added; the sensor has more
-    // pending samples than allowed; the next frame is complete.
+    // CLOCK_STEP: the clock may have stepped, and the sample was not added. TOO_MANY: the sensor
+    // has more pending samples than allowed. COMPLETE: the next frame is complete.
     CLOCK_STEP, TOO_MANY, COMPLETE
 };
 
 // Later than any timestamp.
 constexpr int64_t FAR = std::numeric_limits<int64_t>::max();
 
-// [ns] Length of a frame, maximum silence of a sensor, maximum forward jump of a timestamp, and the
-// backward jump that is a restart; maximum number of pending samples per sensor; whether sensors
-// are read in turn.
+// [ns] Frame period, maximum wait for a silent sensor, maximum forward jump of a timestamp, and
+// backward jump above which time restarts; maximum number of pending samples per sensor; whether
+// the sensors are read sequentially.
 struct AlignmentSettings {
     int64_t period, wait, limit, jump_back, most;
     bool is_burst;
@@ -40,7 +40,7 @@ struct Sample {
     double field[3], covariance[9];
 };
 
-// The pending samples of a sensor, in order of their timestamps.
+// The pending samples of a sensor, in chronological order.
 class Queue {
   public:
     int64_t size() const { return count_; }
@@ -72,7 +72,7 @@ class Queue {
     int64_t count_ = 0;
 };
 
-// Samples of a batch: sensors (negative = unknown), timestamps, fields and covariances.
+// Samples of a batch: sensor indices (negative = unknown), timestamps, fields and covariances.
 struct Samples {
     int64_t n;
     const int64_t *rows, *stamps;
@@ -107,8 +107,8 @@ class Alignment {
         look_ahead();
     }
 
-    // Next sample of the batch; sensor of the sample that the latest reason refers to; newest
-    // timestamp that was not ahead of all others; whether no clock step is suspected.
+    // Index of the next sample of the batch; index of the sensor that the latest reason refers to;
+    // newest timestamp that passed the clock step filter; whether no clock step is suspected.
     int64_t next = 0, row = 0, passed = NEVER;
     bool is_calm = true;
 
@@ -126,9 +126,9 @@ class Alignment {
         look_ahead();
     }
 
-    // Add samples to the pending ones, from `next` on, until Python has to act. With `is_checked`,
-    // the samples have passed the clock step filter. `passed_latest` (n) [ns] is the latest
-    // timestamp of each sensor that was not ahead of all others.
+    // Add samples to the pending ones, starting at `next`, until Python must handle an event. With
+    // `is_checked`, the samples have passed the clock step filter. `passed_latest` (n) [ns] is the
+    // latest timestamp of each sensor that passed the filter.
     Reason hold(bool is_checked, int64_t* passed_latest, const Samples& in) {
         while (next < in.n) {
             const int64_t k = next++, i = row = in.rows[k], t = in.stamps[k];
@@ -153,17 +153,18 @@ class Alignment {
         return DONE;
     }
 
-    // Whether the next frame has to wait for a sensor.
+    // Whether the next frame must wait for a sensor.
     bool waits() {
         const bool is_young = newest_ - first_ < settings_.wait;
-        // A sensor without any sample counts as received up to -1: frames that end before that time
-        // do not wait for it.
+        // A sensor without any sample is treated as complete up to time -1, so frames that end
+        // before this time do not wait for the sensor.
         if (due_ < 0 && is_young && std::find(latest_.begin(), latest_.end(), NEVER) != latest_.end())
             return false;
         return is_one_behind() && (!settings_.is_burst || is_one_missing(is_young));
     }
 
-    // Find the end of the next frame, and reset the watched sensor. False: no sample is pending.
+    // Find the end of the next frame, and reset the watched sensor. Returns false if no sample is
+    // pending.
     bool look_ahead() {
         window_ = settings_.period;
         start_ = due_ = FAR;
@@ -175,13 +176,13 @@ class Alignment {
             if (settings_.is_burst) bring_forward(oldest, taken_[i]);
             earliest = std::min(earliest, oldest);
         }
-        // If sensors are not read in turn, the oldest sample alone decides.
+        // Unless the sensors are read sequentially, only the oldest sample determines the frame.
         if (!settings_.is_burst && earliest != FAR) bring_forward(earliest, NEVER);
         return due_ != FAR;
     }
 
     // Average the samples before the end of the next frame (in burst mode one per sensor) and
-    // return its timestamp. There is at least one sample.
+    // return the timestamp of the frame. Requires at least one sample.
     int64_t frame(const FrameArrays& out) {
         const int64_t end = due_;
         int64_t first = FAR, newest = NEVER, n_all = 0, since_all = 0;
@@ -205,7 +206,7 @@ class Alignment {
         }
         last_taken_ = std::max(last_taken_, newest);
         end_ = settings_.is_burst ? newest + 1 : end;
-        // Rounds of sensors with different rates overlap; the offsets preserve their true times.
+        // Rounds of sensors with different rates overlap; the offsets preserve the sample times.
         const double mean = double(since_all + n_all * (end - first)) / double(n_all);
         stamp_ = std::max(first + int64_t(std::nearbyint(mean)), stamp_ == NEVER ? NEVER : stamp_ + 1);
         for (std::size_t i = 0; i < queues_.size(); ++i) {
@@ -226,25 +227,25 @@ class Alignment {
         for (int a = 0; a < 9; ++a) covariance[a] += sample.covariance[a];
     }
 
-    // Mean of the sums over n samples; NaN for an axis that is missing in all of them.
+    // Divide the sums over n samples by the counts; NaN for an axis that is missing in all samples.
     static void average(int64_t n, const double* n_axis, double* field, double* covariance) {
         double fewest = NAN;
         for (int a = 0; a < 3; ++a) {
             field[a] = n_axis[a] > 0.0 ? field[a] / n_axis[a] : NAN;
             if (n_axis[a] > 0.0) fewest = std::fmin(fewest, n_axis[a]);
         }
-        // The smallest count of any axis applies to all axes, so the variance is not understated.
+        // The smallest count of any axis is used for all axes, so no variance is underestimated.
         const double divisor = double(std::max<int64_t>(n, 1)) * fewest;
         for (int a = 0; a < 9; ++a) covariance[a] /= divisor;
     }
 
-    // Whether a sensor is active and may still deliver a sample from before the end of the frame.
+    // Whether a sensor is active and may still deliver a sample that belongs to the frame.
     bool is_behind(int64_t latest) const {
         if (latest == NEVER) return newest_ - first_ < settings_.wait;
         return newest_ - settings_.wait <= latest && latest < due_;
     }
 
-    // Whether any sensor is behind. That sensor is watched until it no longer is.
+    // Whether any sensor is behind. The sensor found is watched: it is checked first next time.
     bool is_one_behind() {
         if (watch_ >= 0 && is_behind(latest_[watch_])) return true;
         for (std::size_t j = 0; j < latest_.size(); ++j)
@@ -255,16 +256,15 @@ class Alignment {
         return false;
     }
 
-    // Whether a sensor may still deliver its sample of this round.
+    // Whether any sensor may still deliver its sample of this round.
     bool is_one_missing(bool is_young) const {
         for (std::size_t i = 0; i < queues_.size(); ++i) {
             if (queues_[i].size()) {
                 if (queues_[i].oldest().stamp >= due_) return true;
             } else if (latest_[i] == NEVER) {
                 if (is_young) return true;
-            // The sensor has no pending sample although it has delivered some, so earlier frames
-            // contain them. At the start of a round, the latest samples of the others are one round
-            // old.
+            // All samples of the sensor are in earlier frames. At the start of a round, the latest
+            // samples of the other sensors are one round old.
             } else if (last_taken_ == NEVER || latest_[i] >= last_taken_ - settings_.wait) {
                 return true;
             }
@@ -272,8 +272,8 @@ class Alignment {
         return false;
     }
 
-    // Let the next frame start early enough for the oldest pending sample of a sensor. `taken` is
-    // the timestamp of its latest sample in a frame, or NEVER.
+    // Start the next frame early enough to include the oldest pending sample of a sensor. `taken`
+    // is the timestamp of the latest sample of this sensor in a frame, or NEVER.
     void bring_forward(int64_t stamp, int64_t taken) {
         if (settings_.is_burst) {
             // A round lasts at most the period, or half the sample interval of any sensor.
@@ -286,8 +286,8 @@ class Alignment {
         due_ = start_ + window_;
     }
 
-    // Reason why the timestamp of a sample cannot be used, or DONE. `latest` is the latest
-    // timestamp of its sensor.
+    // Check the timestamp of a sample and update `latest`, the latest timestamp of its sensor.
+    // Returns the reason why the timestamp cannot be used, or DONE.
     Reason place(int64_t& latest, int64_t stamp) {
         if (latest != NEVER && stamp <= latest) {
             if (latest - stamp > settings_.jump_back) return JUMPED_BACK;
@@ -305,7 +305,7 @@ class Alignment {
     // [ns] Per sensor: latest timestamp, and latest timestamp of its samples in frames.
     std::vector<int64_t> latest_, taken_;
     // Oldest and newest timestamp; end and timestamp of the latest frame, and newest sample in any
-    // frame; earliest start, end and length of the next frame; a sensor that it has to wait for.
+    // frame; earliest start, end and length of the next frame; index of the watched sensor, or -1.
     int64_t first_ = NEVER, newest_ = NEVER, end_ = NEVER, stamp_ = NEVER, last_taken_ = NEVER;
     int64_t start_ = FAR, due_ = FAR, window_ = 0, watch_ = -1;
 };

@@ -1,7 +1,7 @@
-"""Distinction between a clock that steps ahead and a gap that all sensors share.
+"""Distinguish a forward step of one clock from a gap in the samples of all sensors.
 
-Lateness is measured by timestamps. Without this filter, one clock that steps ahead would make the
-samples of all other sensors late.
+Lateness is determined from timestamps. Without this filter, a forward step of one clock would make
+the samples of all other sensors appear late.
 """
 
 from collections.abc import Callable
@@ -18,17 +18,17 @@ class HeldSample(NamedTuple):
 
     stamp_ns: int
     field: FloatArray
-    """(3,) [T]"""
+    """Flux density, (3,) T, sensor frame."""
     covariance: FloatArray
-    """(3, 3) [T^2]"""
+    """Covariance of `field`, (3, 3) T²."""
 
 
 SensorSamples = list[tuple[int, HeldSample]]
-"""Samples with the row of their sensor, in order of arrival."""
+"""Samples, each with the index of its sensor, in order of arrival."""
 
 
 class ClockStepFilter:
-    """Holds samples that jump ahead until it is decided whether the other sensors jump as well.
+    """Holds samples whose timestamps jump ahead until other sensors confirm or refute the jump.
 
     All other samples pass immediately.
 
@@ -36,17 +36,17 @@ class ClockStepFilter:
     ----------
     n_sensors : int
     max_jump : int, ns
-        Largest forward jump that is not checked. Also the maximum time for which a sample is held,
-        by the timestamps of the other sensors or of its own sensor.
+        Largest forward jump that is not checked. It is also the maximum time for which a sample is
+        held, by the timestamps of the other sensors or of its own sensor.
     max_held : int
         Maximum number of held samples per sensor.
 
     Attributes
     ----------
     latest : (n_sensors,) int array, ns
-        Timestamp of the latest sample of each sensor that passed.
+        Timestamp of the latest accepted sample of each sensor.
     newest : int, ns
-        Newest timestamp that passed.
+        Newest accepted timestamp of any sensor.
     """
 
     def __init__(self, n_sensors: int, max_jump: int, max_held: int) -> None:
@@ -54,9 +54,9 @@ class ClockStepFilter:
         self._max_held = max_held
         self.latest = np.full(n_sensors, NEVER)
         self.newest = NEVER
-        # (sensor, sample, newest timestamp at its arrival), in order of arrival.
+        # (sensor index, sample, newest accepted timestamp at its arrival), in order of arrival.
         self._held: list[tuple[int, HeldSample, int]] = []
-        # {sensor that is ahead: (newest timestamp that passed, its own timestamp at that time)}
+        # {index of a sensor that is ahead: (newest accepted timestamp, its own timestamp then)}
         self._ahead_since: dict[int, tuple[int, int]] = {}
 
     @property
@@ -66,7 +66,7 @@ class ClockStepFilter:
 
     @property
     def held(self) -> list[tuple[int, HeldSample, int]]:
-        """Sensor, sample and newest timestamp [ns] at its arrival, of each held sample."""
+        """Held samples: (sensor index, sample, newest accepted timestamp [ns] at its arrival)."""
         return list(self._held)
 
     @property
@@ -74,17 +74,17 @@ class ClockStepFilter:
         """Whether no sensor is ahead, so that any jump within the limit passes."""
         if not self._held and not self._ahead_since:
             return True
-        # The entry of a sensor without held samples is valid for that newest timestamp only.
+        # The entry of a sensor without held samples expires when a newer timestamp is accepted.
         return not self._held and all(
             newest != self.newest for newest, _ in self._ahead_since.values())
 
     def feed(self, i: int, sample: HeldSample) -> tuple[SensorSamples, SensorSamples]:
-        """Check a sample, and release the held samples that it decides about.
+        """Check a sample, and release the held samples that it confirms or refutes.
 
         Parameters
         ----------
         i : int
-            Row of the sensor.
+            Index of the sensor.
         sample : HeldSample
 
         Returns
@@ -102,12 +102,13 @@ class ClockStepFilter:
             if self._ahead_since.get(i, (NEVER,))[0] != self.newest:
                 self._ahead_since[i] = self.newest, stamp
             if not (self._majority_follows(stamp) or self._is_alone(i, stamp)):
-                return [], self._expired(i, stamp)
-            # Samples that are ahead of these as well remain held.
+                return [], self._release_expired(i, stamp)
+            # Samples that are even further ahead remain held.
             passed = self._pass(self._release(
                 lambda _, s, __: s.stamp_ns <= stamp + self._max_jump))
-        # The sensor agrees with the others again, so its held samples had wrong timestamps. Samples
-        # that the others did not follow in time are wrong, too. The first held one is the oldest.
+        # The sensor agrees with the other sensors again, so its held samples had wrong timestamps.
+        # Samples that were not confirmed in time also had wrong timestamps. The oldest sample is
+        # the first one.
         if i in self._ahead_since or self._held and self.newest - self._held[0][2] > self._max_jump:
             self._ahead_since.pop(i, None)
             return passed, self._release(
@@ -124,21 +125,21 @@ class ClockStepFilter:
         return self._pass(self._release(lambda *_: True))
 
     def _jumps(self, i: int, stamp: int) -> bool:
-        """Whether a timestamp is further ahead of all that have passed than the limit."""
+        """Whether a timestamp exceeds the newest accepted one by more than the limit."""
         if self.newest == NEVER or stamp <= self.newest + self._max_jump:
             return False
-        # With two sensors, the one that reports for the first time is as credible as the other.
+        # With two sensors, a sensor that reports for the first time is as credible as the other.
         return self.latest[i] != NEVER or bool(self._held) or len(self._active()) > 1
 
     def _pass(self, samples: SensorSamples) -> SensorSamples:
-        """Record samples as passed."""
+        """Record samples as accepted, and return them."""
         for i, sample in samples:
             self.latest[i] = sample.stamp_ns
             self.newest = max(self.newest, sample.stamp_ns)
         return samples
 
     def _active(self) -> set[int]:
-        """Sensors whose samples passed recently."""
+        """Indices of the sensors whose samples were accepted recently."""
         return {j for j, latest in enumerate(self.latest.tolist())
                 if latest != NEVER and latest >= self.newest - self._max_jump}
 
@@ -148,18 +149,18 @@ class ClockStepFilter:
         return 2 * len(agree) > len(agree | self._active())
 
     def _is_alone(self, i: int, stamp: int) -> bool:
-        """Whether sensor `i` has been ahead beyond the limit while no other sensor reported."""
+        """Whether sensor `i` was ahead for longer than the limit while no other sensor reported."""
         return stamp - self._ahead_since[i][1] >= self._max_jump
 
-    def _expired(self, i: int, stamp: int) -> SensorSamples:
-        """Release the samples of sensor `i` that are held too long or exceed the maximum."""
-        mine = [s for j, s, _ in self._held if j == i]
-        first = mine[0] if len(mine) > self._max_held else None
+    def _release_expired(self, i: int, stamp: int) -> SensorSamples:
+        """Release samples of sensor `i` that were held too long or exceed the maximum number."""
+        of_sensor = [s for j, s, _ in self._held if j == i]
+        first = of_sensor[0] if len(of_sensor) > self._max_held else None
         return self._release(lambda j, s, _: j == i and (
             s.stamp_ns < stamp - self._max_jump or s is first))
 
     def _release(self, is_released: Callable[[int, HeldSample, int], bool]) -> SensorSamples:
-        """Remove held samples for which `is_released` holds, and return them."""
+        """Remove and return the held samples for which `is_released` returns True."""
         if not self._held:
             return []
         out = [h[:2] for h in self._held if is_released(*h)]

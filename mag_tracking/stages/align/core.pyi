@@ -15,7 +15,7 @@ TOO_MANY: int
 COMPLETE: int
 
 class Alignment:
-    """The samples of a network that wait for their frame.
+    """Pending samples of a network, and the frames that they complete.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ class Alignment:
     period : int, ns
         Length of a frame.
     wait : int, ns
-        Maximum silence of a sensor that frames wait for.
+        Maximum time for which frames wait for a silent sensor.
     limit : int, ns
         Maximum forward jump of a timestamp.
     jump_back : int, ns
@@ -31,16 +31,16 @@ class Alignment:
     most : int
         Maximum number of pending samples per sensor.
     is_burst : bool
-        Whether the sensors are read in turn.
+        Whether the sensors are read sequentially.
 
     Attributes
     ----------
     next : int
-        Next sample of the batch.
+        Index of the next sample of the batch.
     row : int
-        Sensor of the sample that the latest reason refers to.
+        Index of the sensor that the latest reason refers to.
     passed : int, ns
-        Newest timestamp that was not ahead of all others, or NEVER.
+        Newest timestamp that passed the clock step filter, or NEVER.
     is_calm : bool
         Whether no clock step is suspected.
     n_pending : int
@@ -58,16 +58,16 @@ class Alignment:
                  most: int, is_burst: bool) -> None: ...
     def hold(self, is_checked: bool, passed: IntArray, rows: IntArray, stamps: IntArray,
              fields: FloatArray, covariances: FloatArray) -> int:
-        """Add samples to the pending ones, from `next` on, until the caller has to act.
+        """Add samples to the pending ones, starting at `next`, until an event must be handled.
 
         Parameters
         ----------
         is_checked : bool
             Whether the samples have passed the clock step filter.
         passed : (n_sensors,) int array, ns
-            Latest timestamp of each sensor that was not ahead of all others; updated in place.
+            Latest timestamp of each sensor that passed the clock step filter; updated in place.
         rows : (n,) int array
-            Sensors of the samples; negative = unknown.
+            Index of the sensor of each sample; negative = unknown.
         stamps : (n,) int array, ns
         fields : (n, 3) array, T
         covariances : (n, 3, 3) array, T^2
@@ -75,7 +75,7 @@ class Alignment:
         Returns
         -------
         int
-            DONE, or the reason that refers to sensor `row`.
+            Reason code: DONE, or an event of sensor `row`.
         """
 
     def frame(self, is_final: bool) -> tuple[int, FloatArray, FloatArray, IntArray,
@@ -98,4 +98,4 @@ class Alignment:
         """Drop the oldest pending sample of sensor `i`, if there is one."""
 
     def waits(self) -> bool:
-        """Whether the next frame has to wait for a sensor."""
+        """Whether the next frame must wait for a sensor."""

@@ -1,4 +1,4 @@
-"""Length of a frame; by default it follows from the geometry of the network."""
+"""Frame period, by default derived from the geometry of the network."""
 
 import numpy as np
 
@@ -8,17 +8,18 @@ from mag_tracking.network.sensor_network import MIN_DELAY_BASELINE
 from mag_tracking.stages.align.settings import AlignSettings
 
 DEFAULT_PERIOD_S = 0.08
-"""[s] T10 section 6.3 decimates to 12.5 Hz, with sensors nine metres apart."""
+"""[s] Default frame period: 12.5 Hz, as in T10 section 6.3 for sensors nine metres apart."""
 MIN_AUTO_PERIOD_S = 0.02
-"""[s] Shorter frames add little information: at 100 frames per second, tracking occupies a core."""
+"""[s] Minimum automatic frame period. Shorter frames add little information, and at 100 frames per
+second tracking occupies a whole core."""
 MIN_PERIOD_S = 1e-4
-"""[s] Minimum frame length; no sensor is read more often."""
+"""[s] Minimum configurable frame period; no sensor has a shorter sample interval."""
 MAX_TARGET_SPEED = 20.0
 """[m/s] Frames are designed for targets up to this speed."""
 
 
 def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
-    """Shortest time that a fast target takes between two sensors.
+    """Shortest time in which a target at `MAX_TARGET_SPEED` travels between two sensors.
 
     Parameters
     ----------
@@ -27,26 +28,26 @@ def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
     Returns
     -------
     (float, str, str) or None
-        Delay [s] and the names of the two sensors. None if all sensors are at one place, seen from
-        above.
+        Delay [s] and the names of the two sensors. None if all sensors have nearly the same
+        horizontal position.
     """
-    shortest, found = np.inf, None
+    shortest, pair = np.inf, None
     for j, place in enumerate(network.positions):
         distance = np.linalg.norm((network.positions[:j] - place)[:, :2], axis=1)
         distance[distance <= MIN_DELAY_BASELINE] = np.inf
         if distance.min(initial=np.inf) < shortest:
             i = int(np.argmin(distance))
-            shortest, found = float(distance[i]), (network.names[i], network.names[j])
-    return None if found is None else (shortest / MAX_TARGET_SPEED, *found)
+            shortest, pair = float(distance[i]), (network.names[i], network.names[j])
+    return None if pair is None else (shortest / MAX_TARGET_SPEED, *pair)
 
 
 def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
-    """Length of a frame: the setting, or a length that fits the geometry if the setting is 0.
+    """Frame period: the setting, or a period derived from the geometry if the setting is 0.
 
-    A frame that is longer than the delay between two sensors mixes their signals. In a close
-    network the frame is half as long as that delay. A larger network does not depend on the delay,
-    and short frames cost time. With sensors that are read in turn, the period is the maximum length
-    of a round.
+    A frame that is longer than the delay between two sensors mixes their signals, so in a compact
+    network the period is half the shortest delay. A larger network does not use the delay, and
+    short frames need more computing time. In burst mode, the period is the maximum duration of a
+    round.
 
     Parameters
     ----------
@@ -60,11 +61,11 @@ def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
     Raises
     ------
     SettingsError
-        If the frame is shorter than any sample interval.
+        If the configured period is below `MIN_PERIOD_S`.
     """
     if 0.0 < settings.period_s < MIN_PERIOD_S:
         raise SettingsError(f'align.period_s: {settings.period_s:g} s is shorter than the minimum '
-                            f'of {MIN_PERIOD_S:g} s; set 0 for an automatic period')
+                            f'of {MIN_PERIOD_S:g} s; set it to 0 for an automatic period')
     if settings.period_s:
         return settings.period_s
     shortest = shortest_delay(network)
@@ -74,9 +75,9 @@ def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
 
 
 def frame_period_warning(settings: AlignSettings, network: SensorNetwork) -> str | None:
-    """Warning about a configured frame that is longer than a target takes between two sensors.
+    """Warning if the configured period exceeds the travel time of a target between two sensors.
 
-    Sensors that are read in turn cause no warning: their frame is one round, however long it takes.
+    There is no warning in burst mode, where a frame is one round of the sensors.
 
     Parameters
     ----------
@@ -93,4 +94,5 @@ def frame_period_warning(settings: AlignSettings, network: SensorNetwork) -> str
     delay, one, other = shortest
     return (f'align.period_s: a frame of {1e3 * period:.0f} ms is longer than the '
             f'{1e3 * delay:.0f} ms that a target at {MAX_TARGET_SPEED:.0f} m/s takes from {one} to '
-            f'{other}; speed and direction are less accurate. Set 0 for an automatic period')
+            f'{other}, which makes speed and direction less accurate; set it to 0 for an automatic '
+            'period')

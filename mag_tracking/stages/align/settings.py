@@ -1,4 +1,4 @@
-"""Settings of the alignment."""
+"""Settings of the alignment of samples into frames."""
 
 from dataclasses import dataclass
 
@@ -7,25 +7,26 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class AlignSettings:
-    """Settings of the alignment."""
+    """Settings of the alignment of samples into frames."""
 
     period_s: float = param(
-        0.0, 'Length of a frame. The samples of each sensor within a frame are averaged. 0 = '
+        0.0, 'Frame period. The samples of each sensor within a frame are averaged. 0 = '
         'automatic: 0.08 s; in a network within two metres, half the time that a target at 20 m/s '
         'takes between the two closest sensors, but not less than 0.02 s.', 's', (0.0, 60.0))
     burst: bool = param(
-        False, 'Sensors are read in turn, one sample each. A frame is complete as soon as every '
-        'sensor has delivered a sample; period_s is then the maximum duration of a round.')
+        False, 'Set to true if the sensors are read one after the other, one sample each. A frame '
+        'is then complete as soon as every sensor has delivered a sample, and period_s is the '
+        'maximum duration of a round.')
     max_wait_s: float = param(
         0.5, 'Maximum time that frames wait for a sensor. A sensor that is silent for longer is '
-        'treated as dead and no longer delays frames.', 's', (1e-3, 3600.0))
+        'treated as inactive and no longer delays frames.', 's', (1e-3, 3600.0))
     max_clock_jump_s: float = param(
         0.5, 'Maximum forward jump of the timestamps of one sensor. A larger jump that the other '
         'sensors do not share is treated as a clock step: the samples are held back until the '
-        'others follow. 0 disables the check.', 's', (0.0, 3600.0))
+        'other sensors follow. 0 disables the check.', 's', (0.0, 3600.0))
     max_backward_jump_s: float = param(
         1.0, 'Maximum backward jump of a timestamp. A larger jump is treated as a restart (a '
         'looped recording).', 's', (0.0, 3600.0))
     max_buffered: int = param(
-        10000, 'Maximum number of buffered samples per sensor. Beyond it, the oldest are rejected.',
-        '', (2, 10_000_000))
+        10000, 'Maximum number of buffered samples per sensor. If it is exceeded, the oldest '
+        'samples are rejected.', '', (2, 10_000_000))

@@ -21,7 +21,7 @@ from mag_tracking.units import NS
 UNLIMITED = np.iinfo(np.int64).max
 """[ns] Later than any timestamp."""
 MAX_HELD = 16
-"""Maximum number of samples per sensor that are held while a possible clock step is undecided."""
+"""Maximum number of samples per sensor that are held while a clock step is unconfirmed."""
 
 CAUSES = {
     core.NO_FIELD: 'no finite field',
@@ -30,7 +30,7 @@ CAUSES = {
     core.OUT_OF_ORDER: 'out of order',
     core.LATE: 'late',
 }
-"""Cause of rejection for each reason code, except those that name a sensor."""
+"""Cause of rejection for each reason code, except causes that name a sensor."""
 
 
 class Align:
@@ -38,7 +38,7 @@ class Align:
 
     The cost of a sample between two frames does not depend on the number of sensors: as long as
     one sensor is known to be missing, a sample cannot complete a frame. The rules are in
-    `alignment.hpp`; this class handles the reasons that it reports.
+    `alignment.hpp`; this class handles the events that the compiled code reports.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Align:
         self._reset()
 
     def _reset(self) -> None:
-        """Return to the initial state."""
+        """Reset to the initial state."""
         settings = self._settings
         longest_jump = int(round(settings.max_clock_jump_s * NS)) or UNLIMITED
         self._alignment = core.Alignment(
@@ -76,7 +76,7 @@ class Align:
 
     @property
     def n_held(self) -> int:
-        """Number of samples that wait for their frame, or for the clocks of the other sensors."""
+        """Number of samples that wait for their frame or for confirmation of their timestamps."""
         return self._alignment.n_pending + self._clock_steps.n_held
 
     @property
@@ -94,7 +94,7 @@ class Align:
         Returns
         -------
         list of FieldFrame
-            The frames that they complete.
+            Completed frames.
         """
         rows, C = readings.rows(self._index), readings.covariance
         if C is None:
@@ -108,9 +108,9 @@ class Align:
 
     def _hold(self, rows: IntArray, stamps: IntArray, fields: FloatArray, covariances: FloatArray,
               readings: Readings | None = None) -> list[FieldFrame]:
-        """Add samples to the pending ones and return the frames that they complete.
+        """Add samples to the pending ones and return the completed frames.
 
-        Without `readings`, the samples have passed the clock step filter.
+        `readings` is None if the samples have already passed the clock step filter.
         """
         out: list[FieldFrame] = []
         k = 0
@@ -128,12 +128,12 @@ class Align:
                 assert readings is not None
                 self._reject(f'unknown sensor {readings.names[readings.sensor[k - 1]]}')
             elif reason == core.CLOCK_STEP:
-                out += self._after_clock_step(int(rows[k - 1]), HeldSample(
+                out += self._handle_clock_step(int(rows[k - 1]), HeldSample(
                     int(stamps[k - 1]), fields[k - 1], covariances[k - 1]))
             elif reason == core.JUMPED_BACK:
                 out += self._restart()
-                here = slice(k, k + 1)
-                out += self._hold(rows[here], stamps[here], fields[here], covariances[here])
+                sample = slice(k, k + 1)
+                out += self._hold(rows[sample], stamps[sample], fields[sample], covariances[sample])
                 k += 1
             elif reason == core.TOO_MANY:
                 alignment.drop(alignment.row)
@@ -142,8 +142,8 @@ class Align:
             else:
                 self._reject(CAUSES[reason])
 
-    def _after_clock_step(self, i: int, sample: HeldSample) -> list[FieldFrame]:
-        """Handle a sample of sensor `i` whose clock may have stepped."""
+    def _handle_clock_step(self, i: int, sample: HeldSample) -> list[FieldFrame]:
+        """Pass a sample of sensor `i`, whose clock may have stepped, to the clock step filter."""
         passed, rejected = self._clock_steps.feed(i, sample)
         for j, _ in rejected:
             self._reject(f'ahead of all other sensors: {self._names[j]}')
@@ -158,7 +158,7 @@ class Align:
         return out
 
     def _restart(self) -> list[FieldFrame]:
-        """Return the frames of the pending samples after a backward jump in time, and reset."""
+        """Reset after a backward jump in time, and return the frames of the pending samples."""
         out = self.flush()
         self._reset()
         self.counts['time jumped back'] += 1
@@ -178,11 +178,11 @@ class Align:
         """Do nothing: no work is deferred."""
 
     def _reject(self, cause: str) -> None:
-        """Count a rejection."""
+        """Count a rejected sample by cause."""
         self.counts[f'rejected: {cause}'] += 1
 
     def _frames(self, final: bool = False) -> list[FieldFrame]:
-        """Frames that are complete, or all frames if the pending samples are final."""
+        """Return the complete frames, or all frames if the pending samples are final."""
         out: list[FieldFrame] = []
         while (arrays := self._alignment.frame(final)) is not None:
             frame = FieldFrame(*arrays)

@@ -18,8 +18,8 @@ class OutputBuffer:
     Attributes
     ----------
     arrays : tuple of arrays
-        Sensors (capacity,), timestamps (capacity,) ns, fields (capacity, 3) T and covariances
-        (capacity, 3, 3) T^2.
+        Sensor indices (capacity,), timestamps (capacity,) ns, fields (capacity, 3) T and
+        covariances (capacity, 3, 3) T².
     """
 
     def __init__(self, names: tuple[str, ...], capacity: int) -> None:
@@ -33,6 +33,7 @@ class OutputBuffer:
         Parameters
         ----------
         n : int
+            Number of readings that have been appended.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Backgrounds that are restored after a restart if the readings continue soon after it."""
+"""Restoration of backgrounds after a short interruption of the readings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,23 +12,23 @@ from mag_tracking.units import NS
 
 @dataclass(frozen=True)
 class StoredBackground:
-    """Background of one sensor that is restored after a restart."""
+    """Stored background of one sensor, to be restored after a restart."""
 
     stamp_ns: int
     background: FloatArray
-    """(3,) [T]; NaN = axis not reported."""
+    """Background, (3,) T, sensor frame. NaN = axis not reported."""
     covariance: FloatArray
-    """(3, 3) [T^2] Noise of one sample."""
+    """Noise covariance of one sample, (3, 3) T², sensor frame."""
 
 
 def stored_background(background: RunningBackground, stamp_ns: int,
                       level: FloatArray) -> StoredBackground | None:
-    """Background of a sensor in the form that is stored.
+    """Convert the background of a sensor to its stored form.
 
     Parameters
     ----------
     background : RunningBackground
-        A background that is ready.
+        Background estimator; must be ready.
     stamp_ns : int, ns
         Timestamp of the latest reading of the sensor.
     level : (3,) array, T
@@ -37,17 +37,17 @@ def stored_background(background: RunningBackground, stamp_ns: int,
     Returns
     -------
     StoredBackground or None
-        None if no axis has both a level and a noise.
+        None if no axis has both a level and a noise variance.
     """
     C = background.covariance
     assert C is not None
-    # An axis that has only just started to report has a level, but no noise yet.
+    # An axis that has just started to report has a level but no noise variance yet.
     level = np.where(np.isnan(np.diagonal(C)), np.nan, level)
     return None if np.isnan(level).all() else StoredBackground(stamp_ns, level, C)
 
 
 class BackgroundRestoration:
-    """Stored backgrounds of the sensors that have not yet delivered a reading.
+    """Stored backgrounds of the sensors that have not delivered a reading yet.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class BackgroundRestoration:
         return sensor in self._stored
 
     def offer(self, stored: Mapping[str, StoredBackground]) -> None:
-        """Replace the stored backgrounds.
+        """Replace all stored backgrounds.
 
         Parameters
         ----------
@@ -82,7 +82,7 @@ class BackgroundRestoration:
         self._stored.pop(sensor, None)
 
     def restore(self, sensor: str, stamp_ns: int, background: RunningBackground) -> str:
-        """Restore a background at the first reading of its sensor if it is recent.
+        """Restore the background of a sensor at its first reading, unless it is outdated.
 
         Parameters
         ----------
@@ -95,7 +95,7 @@ class BackgroundRestoration:
         Returns
         -------
         str
-            Event to be counted.
+            Name of the event to count.
         """
         stored = self._stored.pop(sensor)
         if 0 < stamp_ns - stored.stamp_ns <= self._max_gap_ns:

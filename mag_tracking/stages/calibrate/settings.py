@@ -1,4 +1,4 @@
-"""Settings of the calibration."""
+"""Settings of the calibration of readings."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class CalibrateSettings:
-    """Settings of the calibration."""
+    """Settings of backgrounds, noise, rejection of readings and decimation."""
 
     learn_s: float = param(
         3.0, 'Duration of the quiet interval from which a background is learnt, unless it is '
@@ -21,8 +21,8 @@ class CalibrateSettings:
         20.0, 'Duration of the quiet interval to which level, drift and noise are fitted.',
         's', (1.0, 36000.0))
     guard_s: float = param(
-        1.5, 'Delay before a quiet reading enters the background, so that the slow approach of a '
-        'target does not enter it.', 's', (0.0, 600.0))
+        1.5, 'Delay before a quiet reading is included in the background, so that the slow '
+        'approach of a target is excluded.', 's', (0.0, 600.0))
     block_s: float = param(
         0.25, 'Duration of a block. The quietness of a sensor is evaluated block by block.',
         's', (0.01, 60.0))
@@ -30,10 +30,10 @@ class CalibrateSettings:
         2.0, 'Threshold for freezing the background: deviation of the mean of a block, in standard '
         'deviations of the noise.', '', (0.5, 1000.0))
     relearn_s: float = param(
-        120.0, 'Time on a steady level after which that level becomes the background (a parked '
-        'car). Unless a target was seen approaching, it is reduced to four times the duration for '
-        'which the background was observed, but not below 10 s. If a parked vehicle was seen '
-        'leaving, it is 2 s for sensors of at least 20 Hz. 0 disables relearning.',
+        120.0, 'Time after which a steady new level becomes the background (a parked car). Unless '
+        'a target was observed approaching, the time is reduced to four times the duration for '
+        'which the background was observed, but not below 10 s. If a parked vehicle was observed '
+        'leaving, the time is 2 s for sensors of at least 20 Hz. 0 disables relearning.',
         's', (0.0, 86400.0))
     max_field: float = param(
         1e-3, 'Maximum absolute value of a field component. Larger readings are rejected, because '
@@ -44,24 +44,26 @@ class CalibrateSettings:
         'next timestamp confirms it.', 's', (1e-3, 1e9))
     spike_std: float = param(
         30.0, 'Threshold for spikes, in standard deviations of the noise. Up to three consecutive '
-        'readings that differ from their neighbours by more are rejected. A possible spike is held '
-        'back until the next reading. Below 30 Hz a larger value is needed, because the field of a '
-        'vehicle changes more between readings. 0 disables the check.', '', (0.0, 1e6))
+        'readings that differ from their neighbours by more than this are rejected. A possible '
+        'spike is held back until the next reading. Below 30 Hz a larger value is needed, because '
+        'the field of a vehicle changes more between readings. 0 disables the check.',
+        '', (0.0, 1e6))
     reject_stuck: bool = param(
         True, 'Reject unchanging readings of a sensor that does not normally repeat its readings. '
         'Set to false for simulated sensors without noise.')
     trust_covariances: bool = param(
-        False, 'Use the covariances of the messages as they are. By default the noise measured in '
-        'quiet intervals replaces a stated standard deviation that differs from it by more than a '
-        'factor of five, because many drivers publish a placeholder, or another unit.')
+        False, 'Use the covariances of the messages unchanged. By default, if a standard deviation '
+        'in a message differs by more than a factor of five from the noise measured in quiet '
+        'intervals, the measured noise is used, because many drivers publish a placeholder or '
+        'another unit.')
     decimate_to_hz: float = param(
         0.0, 'Approximate rate to which faster sensors are low-pass filtered and decimated: an '
         'integer fraction of the rate of the sensor, with 60 dB of alias rejection and a delay of '
         'four output intervals. 0 disables decimation; frames average the samples in any case.',
         'Hz', (0.0, 10000.0))
     max_resume_gap_s: float = param(
-        60.0, 'Maximum interruption, by the timestamps, after which a restarted node restores the '
-        'background that it had learnt. 0 disables restoring.', 's', (0.0, 86400.0))
+        60.0, 'Maximum interruption, by the timestamps, after which a restarted node restores its '
+        'learnt background. 0 disables restoration.', 's', (0.0, 86400.0))
     max_backward_jump_s: float = param(
         1.0, 'Maximum backward jump of a timestamp. A larger jump is treated as a restart (a '
         'looped recording), and the learnt background is discarded.', 's', (0.0, 3600.0))

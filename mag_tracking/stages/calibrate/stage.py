@@ -29,11 +29,11 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.units import NEVER, NS
 
 MAX_SYNCHRONOUS = 16
-"""Maximum number of sensors whose blocks may end at the same time. In larger networks the blocks
-are staggered, because evaluating all of them at once would delay the readings."""
+"""Maximum number of sensors whose blocks may end at the same time. In larger networks, the blocks
+are staggered, because evaluating all blocks at once would delay the readings."""
 
 OVERRULED = 'message covariances overruled by the measured noise'
-"""Key in the counts for covariances that were replaced."""
+"""Key in the counts for message covariances that were replaced by the measured noise."""
 
 CAUSES = {
     core.NO_AXIS: 'no axis reported (all NaN)',
@@ -45,17 +45,18 @@ CAUSES = {
     core.OUT_OF_ORDER: 'out of order',
     core.STUCK: 'stuck sensor (repeated reading)',
 }
-"""Cause of rejection for each reason code, except those that name a value."""
+"""Cause of rejection for each reason code, except causes that name a value."""
 
 
 class Calibrate:
-    """Converts raw readings to calibrated ones: background subtracted, covariance known.
+    """Converts raw readings to calibrated readings without background and with a known covariance.
 
-    The clock offset and the hard and soft iron of the network file are applied first. The field
-    stays in the frame of the sensor. The covariance is that of the reading if it has one, else the
-    configured one, else the estimated one.
+    The clock offset and the corrections of hard and soft iron in the network file are applied
+    first. The field remains in the sensor frame. The covariance is taken from the reading if
+    available, otherwise from the network file; otherwise it is estimated.
 
-    The rules are in `calibration/readings.hpp`; this class handles the reasons that it reports.
+    The rules are in `calibration/readings.hpp`; this class handles the events that the compiled
+    code reports.
 
     Parameters
     ----------
@@ -90,10 +91,10 @@ class Calibrate:
         self.update_network(network)
 
     def update_network(self, network: SensorNetwork) -> None:
-        """Continue with another calibration of the same sensors.
+        """Apply a new calibration of the same sensors.
 
         If the offset or the correction of a sensor has changed, its background is learnt again.
-        Otherwise the background is kept, even while it is frozen.
+        Otherwise the background is retained, even while it is frozen.
 
         Parameters
         ----------
@@ -121,10 +122,10 @@ class Calibrate:
             if not same:
                 self._background[name] = self._new_background(i)
             self._configure(i, shift)
-        self._note_restorable()
+        self._mark_restorable()
 
     def _configure(self, i: int, shift: int) -> None:
-        """Apply the network file to sensor `i`, and add `shift` [ns] to its earlier timestamps."""
+        """Apply the network file to sensor `i`, and shift its previous timestamps [ns]."""
         s, network = self._sensors[i], self._network
         for name in ('first_ns', 'last_ns', 'unconfirmed_ns'):
             if s[name] != NEVER:
@@ -138,7 +139,7 @@ class Calibrate:
         s['correction'] = np.eye(3) if correction is None else correction
 
     def _new_background(self, i: int) -> RunningBackground:
-        """Background estimator of sensor `i`, with the values of the network file."""
+        """Create the background estimator of sensor `i` from the settings and the network file."""
         s, network = self._settings, self._network
         return self._background_type(
             s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std, s.relearn_s,
@@ -162,12 +163,12 @@ class Calibrate:
         Returns
         -------
         dict of str to DoubtfulTimes
-            ((begin, end) [ns], ...) of each sensor that has such intervals.
+            Intervals ((begin, end) [ns], ...) of each sensor that has any.
         """
         return {n: b.doubtful_times for n, b in self._background.items() if b.doubtful_times}
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
-        """Number of accepted and rejected readings of a sensor, also by cause of rejection.
+        """Number of accepted and rejected readings of a sensor, in total and by cause of rejection.
 
         Parameters
         ----------
@@ -193,12 +194,12 @@ class Calibrate:
         Returns
         -------
         list of Readings
-            The calibrated readings that are complete, in one batch; empty if there are none.
+            One batch of the calibrated readings that are complete; empty if there are none.
         """
         rows = readings.rows(self._index)
         own, covariances = _own_covariances(readings)
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
-        out, batch = self._output(len(readings)), self._batches[0]
+        out, batch = self._new_output(len(readings)), self._batches[0]
         batch['next'] = 0
         while reason := core.calibrate_readings(
                 self._sensors, self._limits, rows, stamps, fields, own, covariances,
@@ -208,10 +209,10 @@ class Calibrate:
                 self.counts[f'rejected: unknown sensor {name}'] += 1
             else:
                 self._handle(reason, int(batch['row']), out)
-        return self._finished(out)
+        return self._finish(out)
 
-    def _output(self, n: int) -> OutputBuffer:
-        """Output buffer for the readings that `n` raw readings may complete."""
+    def _new_output(self, n: int) -> OutputBuffer:
+        """Reset the batch counters, and create a buffer for the output of `n` raw readings."""
         capacity = n + int(self._sensors['n_held'].sum())
         if self._settings.decimate_to_hz:
             capacity += sum(d.n_waiting for d in self._decimators.values())
@@ -220,7 +221,7 @@ class Calibrate:
         return OutputBuffer(self._network.names, capacity)
 
     def _handle(self, reason: int, i: int, out: OutputBuffer) -> None:
-        """Handle a reason that compiled code has returned for sensor `i`."""
+        """Handle an event of sensor `i` that the compiled code has reported."""
         batch, name = self._batches[0], self._network.names[i]
         if batch['n_spikes']:
             self._reject(name, 'spike', int(batch['n_spikes']))
@@ -251,10 +252,10 @@ class Calibrate:
                 self._use(i, stamp, field, own, covariance, out)
                 continue
             decimator = self._decimators[name]
-            found = decimator.feed(stamp, field)
-            self.counts['removed by decimation'] += 1 - len(found)
+            decimated = decimator.feed(stamp, field)
+            self.counts['removed by decimation'] += 1 - len(decimated)
             s['n_averaged'] = decimator.factor or 1
-            for stamp, field in found:
+            for stamp, field in decimated:
                 self._use(i, stamp, field, own, covariance * decimator.noise_gain(), out)
         s['n_held'] = s['n_released'] = 0
 
@@ -267,14 +268,14 @@ class Calibrate:
                                    plain(field), own, plain(covariance), *out.arrays):
             background.evaluate_block()
 
-    def _finished(self, out: OutputBuffer) -> list[Readings]:
+    def _finish(self, out: OutputBuffer) -> list[Readings]:
         """Count the calibrated readings of a batch and return them."""
         batch = self._batches[0]
-        for what, name in (('calibrated', 'n_out'), ('held back while learning', 'n_learning'),
-                           ('axes held back while learning', 'n_partly_learning'),
-                           (OVERRULED, 'n_overruled')):
+        for key, name in (('calibrated', 'n_out'), ('held back while learning', 'n_learning'),
+                          ('axes held back while learning', 'n_partly_learning'),
+                          (OVERRULED, 'n_overruled')):
             if batch[name]:
-                self.counts[what] += int(batch[name])
+                self.counts[key] += int(batch[name])
         return out.readings(int(batch['n_out']))
 
     @property
@@ -283,13 +284,13 @@ class Calibrate:
         return int(self._sensors['n_held'].sum())
 
     def _reject_held(self, i: int, why: str) -> None:
-        """Reject the held readings of sensor `i`, as no later reading can decide about them."""
+        """Reject the held readings of sensor `i`, which no later reading can confirm."""
         self._reject(self._network.names[i], f'possible spike when {why}',
                      int(self._sensors[i]['n_held']))
         clear_spikes(self._sensors[i])
 
     def start_from(self, levels: Mapping[str, QuietLevel], steps: Mapping[str, FloatArray]) -> None:
-        """Start with the results of a first pass over the readings.
+        """Initialise the stage with the results of a first pass over the readings.
 
         Parameters
         ----------
@@ -300,11 +301,11 @@ class Calibrate:
         """
         for name, step in steps.items():
             self._state_of(name)['step'] = step
-        for name, found in levels.items():
-            self._background[name].start_from(found.level, found.covariance)
+        for name, quiet in levels.items():
+            self._background[name].start_from(quiet.level, quiet.covariance)
 
     def resume(self, stored: Mapping[str, StoredBackground]) -> None:
-        """Restore backgrounds of sensors whose first reading follows soon enough.
+        """Provide backgrounds to be restored at the first readings of their sensors.
 
         Parameters
         ----------
@@ -312,10 +313,10 @@ class Calibrate:
             Background of each sensor.
         """
         self._restoration.offer(stored)
-        self._note_restorable()
+        self._mark_restorable()
 
-    def _note_restorable(self) -> None:
-        """Let compiled code report the first reading of each sensor with a stored background."""
+    def _mark_restorable(self) -> None:
+        """Mark sensors with a stored background, whose first reading compiled code will report."""
         self._sensors['is_restorable'] = [name in self._restoration for name in self._index]
 
     def stored(self, sensor: str) -> StoredBackground | None:
@@ -336,22 +337,22 @@ class Calibrate:
         return stored_background(background, last, self.background(sensor))
 
     def idle(self) -> None:
-        """Evaluate complete blocks; otherwise the next reading of the sensor triggers that.
+        """Evaluate complete blocks, which the next reading of their sensor would otherwise trigger.
 
-        The result is the same: in a large network, the reading that completes a block is calibrated
-        with the background before that block.
+        The result is the same, because in a large network the reading that completes a block is
+        calibrated with the background before that block.
         """
         for i in np.flatnonzero(self._sensors['is_full']):
             self._background[self._network.names[i]].evaluate_block()
 
     def flush(self) -> list[Readings]:
-        """Return the readings that were held back.
+        """Return the readings that are still held.
 
         Returns
         -------
         list of Readings
         """
-        out = self._output(0)
+        out = self._new_output(0)
         for i in np.flatnonzero(self._sensors['n_held']):
             s = self._sensors[i]
             s['n_released'] = s['n_held']
@@ -359,21 +360,21 @@ class Calibrate:
             self._use_passed(int(i), out)
         for s in self._sensors:
             clear_spikes(s)
-        return self._finished(out)
+        return self._finish(out)
 
     def _reject(self, sensor: str, cause: str, n: int = 1) -> None:
-        """Count `n` rejections."""
+        """Count `n` rejected readings of a sensor by cause."""
         if n:
             self.counts[f'rejected: {cause}'] += n
             self._per_sensor[sensor].update({'rejected': n, f'rejected: {cause}': n})
 
     def forget(self, sensors: Collection[str] = ()) -> None:
-        """Learn the backgrounds of sensors again.
+        """Discard the backgrounds of sensors and learn them again.
 
         Parameters
         ----------
         sensors : collection of str, optional
-            All sensors if empty.
+            Names of the sensors; empty = all sensors.
 
         Raises
         ------
@@ -385,7 +386,7 @@ class Calibrate:
         for name in sensors or self._network.names:
             self._background[name].forget()
             self._restoration.forget(name)
-        self._note_restorable()
+        self._mark_restorable()
 
     def last_stamp_ns(self, sensor: str) -> int | None:
         """Timestamp of the latest accepted reading of a sensor.
@@ -421,7 +422,7 @@ class Calibrate:
         return self._background[sensor].level(int(state['last_ns'] - state['first_ns']) / NS)
 
     def overruled(self, sensor: str) -> tuple[int, FloatArray, FloatArray]:
-        """Covariances of the messages of a sensor that contradict its measured noise.
+        """Message covariances of a sensor that contradict its measured noise.
 
         Parameters
         ----------
@@ -432,9 +433,9 @@ class Calibrate:
         n : int
             Number of overruled covariances.
         stated : (3,) array, T
-            Standard deviation of the latest message; NaN = unknown.
+            Standard deviation in the latest message; NaN = unknown.
         measured : (3,) array, T
-            Standard deviation of the readings; NaN = unknown.
+            Measured standard deviation of the readings; NaN = unknown.
         """
         s = self._state_of(sensor)
         return int(s['n_overruled']), s['stated_std'].copy(), s['noise_std'].copy()

@@ -3,13 +3,13 @@
 from mag_tracking.arrays import FloatArray
 
 def learn(field: FloatArray, memory: float, n: FloatArray, square: FloatArray) -> None:
-    """Update the mean squares of the axes with a frame; a missing axis (NaN) changes nothing.
+    """Update the mean squares of the axes with a frame; missing axes (NaN) are skipped.
 
     Parameters
     ----------
     field : (n_sensors, 3) array, T
     memory : float
-        Maximum number of values that count.
+        Maximum number of values in the average.
     n : (n_sensors, 3) array
         Number of values of each axis; updated in place.
     square : (n_sensors, 3) array, T^2
@@ -20,8 +20,8 @@ def scaled(covariance: FloatArray, n: FloatArray, square: FloatArray, least: flo
            most: float, allowance: float) -> FloatArray:
     """Covariance with smaller variances for axes at rest.
 
-    An axis is at rest if `square`, with at least `least` values, is smaller than its variance by
-    `factor`.
+    An axis is at rest if it has at least `least` values and its `square` is smaller than its
+    variance by `factor`.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Variance of axes with coarse resolution while there is no target.
+"""Reduced variance of axes with coarse resolution while there is no target.
 
-The covariance of such an axis covers the quantisation error of one step. Without a target the axis
-does not move at all, so simultaneous steps of two axes are not noise.
+The covariance of such an axis includes the quantisation error of one step. Without a target the
+readings of the axis do not change, so simultaneous steps of two axes are not noise.
 """
 
 import numpy as np
@@ -15,11 +15,12 @@ MEMORY_FRAMES = 100
 averaged."""
 
 RESTING_RATIO = 25.0
-"""An axis is at rest if its variance is smaller than its stated covariance by this factor."""
+"""An axis is at rest if its measured variance is smaller than its nominal variance by this
+factor."""
 
 VARIANCE_REDUCTION = 20.0
-"""Factor by which the variance of a resting axis is reduced. One step of one axis in a network of
-two sensors, as it occurs while the background drifts, stays below the threshold."""
+"""Factor by which the variance of a resting axis is reduced. In a network of two sensors, a single
+step of one axis, which background drift can cause, remains below the threshold."""
 
 
 class RestingAxes:

@@ -1,4 +1,4 @@
-"""Settings of the detection."""
+"""Settings of the detection of targets."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class DetectSettings:
-    """Settings of the detection."""
+    """Settings of thresholds, hold time and background uncertainty of the detection."""
 
     false_alarm_probability: float = param(
         1e-3, 'Probability that a single frame of noise exceeds the threshold. The actual '
@@ -26,7 +26,7 @@ class DetectSettings:
         'being learnt. It is reset a few seconds after the target has left.', 'T/s', (0.0, 1e-3))
     background_std: float = param(
         4e-9, 'Standard deviation of the background (drift while frozen). Its variance is added to '
-        'that of the noise, which lowers the false alarm probability where the background is '
+        'the noise variance, which lowers the false alarm probability where the background is '
         'exact. With the defaults and two sensors with 12 nT of noise per sample, that probability '
         'is 3.5e-4 per frame of one sample (12.5 Hz) and 1.5e-7 per frame of eight (100 Hz). 0 = '
         'exactly false_alarm_probability.', 'T', (0.0, 1e-3))

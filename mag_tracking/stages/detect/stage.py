@@ -1,6 +1,6 @@
 """Detect: chi-square energy test on whitened frames.
 
-The test is that of T10 section 5.4, eq. (5.14)-(5.19), over all sensors together.
+The test of T10 section 5.4, eq. (5.14)-(5.19), is applied to all sensors together.
 """
 
 from collections import Counter
@@ -19,7 +19,7 @@ from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.units import NS
 
 RECOVERY_S = 5.0
-"""[s] Approximate time that the calibration needs to learn the background again after a target."""
+"""[s] Approximate time in which the calibration learns the background again after a target."""
 
 
 class Detect:
@@ -76,12 +76,14 @@ class Detect:
         self._frozen_s = 0.0
 
     def threshold(self, probability: float, degrees_of_freedom: int) -> float:
-        """Threshold of the energy that noise exceeds with a given probability; cached.
+        """Energy threshold that noise exceeds with a given probability; cached.
 
         Parameters
         ----------
         probability : float
+            Probability of exceeding the threshold.
         degrees_of_freedom : int
+            Number of measured axes.
 
         Returns
         -------
@@ -102,8 +104,8 @@ class Detect:
         Returns
         -------
         list of FieldFrame or Detection
-            The detection, if there is one, and the frame with its verdict. A frame with an invalid
-            covariance is dropped.
+            An onset or release, if there is one, and the frame with its detection flag. A frame
+            with an invalid covariance is dropped.
         """
         out: list[FieldFrame | Detection] = []
         if self._last_ns is not None and frame.stamp_ns <= self._last_ns:
@@ -133,8 +135,8 @@ class Detect:
                            n: int) -> None:
         """Update the largest excursions in frames without a target."""
         if not self._present:
-            share = statistic / self.threshold(self._settings.false_alarm_probability, n)
-            self._max_ratio = max(self._max_ratio, share)
+            ratio = statistic / self.threshold(self._settings.false_alarm_probability, n)
+            self._max_ratio = max(self._max_ratio, ratio)
             np.maximum(self._max_ratios, energy / self._single[axes], out=self._max_ratios)
 
     @property
@@ -152,7 +154,7 @@ class Detect:
         return np.sqrt(self._max_ratios)
 
     def _allowance(self, stamp_ns: int) -> float:
-        """Variance [T^2] of the background error."""
+        """Update the time since the background was frozen; return the background variance [T²]."""
         if self._present and self._onset_ns is not None:
             self._frozen_s = (stamp_ns - self._onset_ns) / NS
         elif self._last_active_ns is not None and stamp_ns - self._last_active_ns > RECOVERY_S * NS:
@@ -162,7 +164,7 @@ class Detect:
 
     def _update_presence(self, stamp_ns: int, statistic: float, n: int,
                          per_axis: FloatArray) -> list[Detection]:
-        """Update onset, hold and release, and return the detections that follow."""
+        """Update the detection state, and return the onset or release that results."""
         s = self._settings
         if statistic > self.threshold(s.false_alarm_probability, n):
             self.counts['frames above the threshold'] += 1
@@ -174,7 +176,8 @@ class Detect:
             self._last_active_ns = stamp_ns
         if not self._present and self._above >= s.onset_frames:
             self._present, self._last_active_ns = True, stamp_ns
-            # The background was not learnt since an earlier target, so the uncertainty continues.
+            # If the background has not been learnt since the previous target, its uncertainty
+            # continues to grow.
             self._onset_ns = stamp_ns - int(self._frozen_s * NS)
             self.counts['onsets'] += 1
             return [self._detection(stamp_ns, True, statistic, n, self._strongest(per_axis))]
@@ -188,7 +191,7 @@ class Detect:
         return self._names[int(per_axis.argmax())]
 
     def _release(self, stamp_ns: int, statistic: float, n: int, strongest: str) -> list[Detection]:
-        """End the detection, if there is one."""
+        """End the detection, if there is one, and return its release."""
         if not self._present:
             return []
         self._present = False
@@ -198,7 +201,7 @@ class Detect:
 
     def _detection(self, stamp_ns: int, onset: bool, statistic: float, n: int,
                    strongest: str) -> Detection:
-        """Detection record of the current target."""
+        """Create the onset or release record of the current detection."""
         p = self._settings.false_alarm_probability
         return Detection(stamp_ns, self._next_id, onset, statistic, n,
                          self.threshold(p, n) if n else float('nan'), p, strongest)
@@ -207,7 +210,7 @@ class Detect:
         """Do nothing: no work is deferred."""
 
     def flush(self) -> list[FieldFrame | Detection]:
-        """Return nothing: no frame is held back.
+        """Return an empty list: no frame is buffered.
 
         Returns
         -------

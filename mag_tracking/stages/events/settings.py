@@ -1,4 +1,4 @@
-"""Settings of the events."""
+"""Settings of single-sensor pass events."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class EventsSettings:
-    """Settings of the events."""
+    """Settings of single-sensor pass events."""
 
     max_sensors: int = param(
         4, 'Maximum number of sensors of a network for which detection_node publishes the passes '

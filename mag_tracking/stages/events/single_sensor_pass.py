@@ -1,4 +1,4 @@
-"""Closest point of approach of a pass from one sensor, without any length scale."""
+"""Closest point of approach of a pass, estimated from one sensor without a length scale."""
 
 from typing import NamedTuple
 
@@ -20,33 +20,34 @@ CORRELATION_TIME = 2.0
 """[time scales] Correlation time of the residual when a dipole is fitted to a vehicle."""
 
 CENTRE_OFFSET = 0.15
-"""[time scales] Distance of the magnetic centre of a vehicle from the middle of its body."""
+"""[time scales] Typical distance of a vehicle's magnetic centre from the middle of its body."""
 
 
 class ClosestPoint(NamedTuple):
-    """Closest point of approach of a pass, from one sensor."""
+    """Closest point of approach of a pass, estimated from one sensor."""
 
     time: float
     """[s] Time of the largest field if the closest point is not observable."""
     time_std: float
     """[s] Standard deviation; inf if the closest point is not observable."""
     time_scale: float
-    """[s] Distance at the closest point divided by the speed; NaN if it is not observable."""
+    """[s] Range at the closest point divided by the speed; NaN if not observable."""
 
 
 def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> ClosestPoint:
     """Fit the Anderson functions of a dipole on a straight line to the field of one sensor.
 
-    Any axis is sufficient. The linear part, three coefficients and a constant per axis, is solved
-    for each time and time scale.
+    One axis is sufficient. The linear parameters (three coefficients and a constant per axis) are
+    solved for each candidate time and time scale.
 
     Parameters
     ----------
     t : (n,) array, s
-        Ascending.
+        Times of the readings, ascending.
     field : (n, 3) array, T
         NaN = missing axis.
     noise_std : (3,) array, T
+        Noise of one reading, per axis.
 
     Returns
     -------
@@ -78,15 +79,15 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
     def cost_of(x: FloatArray) -> float:
         return cost(float(x[0]), float(np.exp(x[1])))
 
-    found = min((minimize(cost_of, np.array([time, np.log(scale)]), method='Nelder-Mead', options={
+    best = min((minimize(cost_of, np.array([time, np.log(scale)]), method='Nelder-Mead', options={
         'xatol': 1e-4 * interval, 'fatol': 1e-9 * (1.0 + at_start), 'maxiter': 200})
         for at_start, time, scale in starts[:MAX_STARTS]), key=lambda result: float(result.fun))
-    time, scale = float(found.x[0]), float(np.exp(found.x[1]))
+    time, scale = float(best.x[0]), float(np.exp(best.x[1]))
     # The residual of a vehicle is larger than noise, so the variance is estimated from it.
-    residual_variance = max(found.fun / max(y.size - 4 * y.shape[1] - 2, 1), 0.0)
+    residual_variance = max(best.fun / max(y.size - 4 * y.shape[1] - 2, 1), 0.0)
     n_correlated = max(1.0, CORRELATION_TIME * scale / interval)
     step = 0.05 * scale
-    curvature = (cost(time + step, scale) + cost(time - step, scale) - 2.0 * found.fun) / step**2
+    curvature = (cost(time + step, scale) + cost(time - step, scale) - 2.0 * best.fun) / step**2
     std = np.sqrt(2.0 * residual_variance * n_correlated / curvature) \
         if curvature > 0.0 else np.inf
     if not (t[0] <= time <= t[-1] and scale <= span and np.isfinite(std)):
@@ -95,7 +96,7 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
 
 
 def _averaged(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means of blocks of consecutive samples (at most `MAX_SAMPLES` blocks of equal length)."""
+    """Average blocks of consecutive samples (at most `MAX_SAMPLES` blocks of equal length)."""
     n = -(-len(t) // MAX_SAMPLES) or 1
     k = len(t) // n
     return t[:k * n].reshape(k, n).mean(axis=1), y[:k * n].reshape(k, n, -1).mean(axis=1)

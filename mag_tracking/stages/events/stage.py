@@ -1,4 +1,4 @@
-"""Events: passes described by each sensor alone, from its calibrated readings."""
+"""Events: passes described by individual sensors, from their calibrated readings."""
 
 from collections import Counter, deque
 
@@ -21,10 +21,10 @@ from mag_tracking.stages.events.single_sensor_pass import closest_point
 from mag_tracking.units import NS
 
 PAD_S = 1.0
-"""[s] Margin before the onset and after the last frame that is not quiet; without the target."""
+"""[s] Length of the margins without a target, before the onset and after the release."""
 
 MAX_DURATION_S = 120.0
-"""[s] Maximum duration of an event; of a longer detection, only the latest readings are used."""
+"""[s] Maximum duration of an event. For a longer detection, only the latest readings are used."""
 
 SIGNATURE_POINTS = 33
 """Number of points of a signature."""
@@ -45,6 +45,7 @@ class Events:
     Attributes
     ----------
     counts : Counter of str
+        Number of events.
     """
 
     def __init__(self, network: SensorNetwork, align: AlignSettings,
@@ -64,7 +65,7 @@ class Events:
         Returns
         -------
         list of PassEvent
-            The events that they complete.
+            Completed events.
         """
         rows = readings.rows(self._index)
         out: list[PassEvent] = []
@@ -76,7 +77,7 @@ class Events:
         """Do nothing: no work is deferred."""
 
     def flush(self) -> list[PassEvent]:
-        """Return the events that have not ended.
+        """Return the events that are still in progress at the end of the input.
 
         Returns
         -------
@@ -86,7 +87,7 @@ class Events:
 
 
 class _SensorEvents:
-    """Events of one sensor."""
+    """Detects the passes of one sensor, and creates the events."""
 
     def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
                  counts: 'Counter[str]') -> None:
@@ -104,19 +105,19 @@ class _SensorEvents:
         self._onset_ns: int | None = None
 
     def feed(self, readings: Readings) -> list[PassEvent]:
-        """Add readings of this sensor and return the events that they complete."""
+        """Add readings of this sensor and return the completed events."""
         last = self._buffer[-1].stamp_ns[-1:] if self._buffer else readings.stamp_ns[:0]
         back = np.flatnonzero(np.diff(np.concatenate([last, readings.stamp_ns])) < 0)
         first, out = 0, []
         for k in (back + 1 - len(last)).tolist():
-            # In a looped recording, the buffered readings belong to another time.
-            out += [*self._feed(readings.part(slice(first, k))), *self.flush()]
+            # In a looped recording, the buffered readings belong to the previous loop.
+            out += [*self._feed_chronological(readings.part(slice(first, k))), *self.flush()]
             self._reset()
             first = k
-        return out + self._feed(readings.part(slice(first, None)))
+        return out + self._feed_chronological(readings.part(slice(first, None)))
 
-    def _feed(self, readings: Readings) -> list[PassEvent]:
-        """Add readings that are in order of time."""
+    def _feed_chronological(self, readings: Readings) -> list[PassEvent]:
+        """Add readings in chronological order and return the completed events."""
         if not len(readings):
             return []
         self._buffer.append(readings)
@@ -132,7 +133,7 @@ class _SensorEvents:
         return out
 
     def flush(self) -> list[PassEvent]:
-        """Return the event that has not ended."""
+        """Return the events that are still in progress at the end of the input."""
         out: list[PassEvent] = []
         for frame in self._align.flush():
             for record in self._detect.feed(frame):
@@ -144,14 +145,14 @@ class _SensorEvents:
         return out
 
     def _on_detection(self, detection: Detection) -> list[PassEvent]:
-        """Store the time of an onset, or return the event that a release completes."""
+        """Store the time of an onset, or return the event of a release."""
         if detection.onset:
             self._onset_ns = detection.stamp_ns
             return []
         return self._event(detection.stamp_ns - self._hold_ns, True)
 
     def _event(self, release_ns: int, ended: bool) -> list[PassEvent]:
-        """Event from the onset until `release_ns`; empty if there are no readings."""
+        """Create the event from the onset until `release_ns`; empty if there are no readings."""
         onset_ns, self._onset_ns = self._onset_ns, None
         assert onset_ns is not None
         readings = Readings.joined(self._buffer)
@@ -167,12 +168,12 @@ class _SensorEvents:
 
     def _describe(self, readings: Readings, onset_ns: int, release_ns: int,
                   ended: bool) -> PassEvent:
-        """Event record of the readings around a detection."""
+        """Create the event record from the readings around a detection."""
         stamp, field = readings.stamp_ns, readings.field
         t = (stamp - onset_ns) / NS
         noise = _median_noise(readings)
-        size = np.nansum(field**2, axis=1)
-        peak = int(np.argmax(size))
+        squared = np.nansum(field**2, axis=1)
+        peak = int(np.argmax(squared))
         inside = (onset_ns <= stamp) & (stamp <= release_ns)
         present = ~np.all(np.isnan(field), axis=0)
         closest = closest_point(t, field, noise)
@@ -182,7 +183,7 @@ class _SensorEvents:
                               int(np.count_nonzero(stamp < onset_ns)))
         return PassEvent(
             self._name, self._n, ended, onset_ns, release_ns, int(stamp[peak]), field[peak],
-            float(np.sum(size[inside]) * _median_interval(stamp)),
+            float(np.sum(squared[inside]) * _median_interval(stamp)),
             ''.join(np.array(list('xyz'))[present]), noise,
             onset_ns + int(round(closest.time * NS)), closest.time_std, closest.time_scale, left,
             _signature(t, field, closest.time, closest.time_scale))
@@ -190,14 +191,14 @@ class _SensorEvents:
 
 def _left_to_right(horizontal: FloatArray, noise_std: float, n_quiet: int) -> float:
     """Probability that the target moves from left to right; 0.5 if it is not observable."""
-    found = rotation_of_pass(horizontal, noise_std, n_quiet)
-    if found is None:
+    rotation = rotation_of_pass(horizontal, noise_std, n_quiet)
+    if rotation is None:
         return 0.5
-    return float(np.clip(found.left_to_right, 1.0 - MAX_CONFIDENCE, MAX_CONFIDENCE))
+    return float(np.clip(rotation.left_to_right, 1.0 - MAX_CONFIDENCE, MAX_CONFIDENCE))
 
 
 def _median_noise(readings: Readings) -> FloatArray:
-    """Median noise (3,) [T] of the readings; NaN for a missing axis."""
+    """Median noise standard deviation (3,) [T] of the readings; NaN for a missing axis."""
     out: FloatArray = np.full(3, np.nan)
     if readings.covariance is not None:
         variance = np.einsum('kii->ki', readings.covariance)
@@ -212,13 +213,13 @@ def _median_interval(stamp: IntArray) -> float:
 
 
 def _signature(t: FloatArray, field: FloatArray, time: float, scale: float) -> FloatArray:
-    """Field (`SIGNATURE_POINTS`, 3) [T] over time in units of the time scale; NaN outside."""
+    """Field (`SIGNATURE_POINTS`, 3) [T] at equal steps of the time scale; NaN without readings."""
     if not np.isfinite(scale):
         return np.full((SIGNATURE_POINTS, 3), np.nan)
-    at = time + scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN, SIGNATURE_POINTS)
+    times = time + scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN, SIGNATURE_POINTS)
     out = np.full((SIGNATURE_POINTS, 3), np.nan)
     for a in range(3):
         known = ~np.isnan(field[:, a])
         if known.any():
-            out[:, a] = np.interp(at, t[known], field[known, a], left=np.nan, right=np.nan)
+            out[:, a] = np.interp(times, t[known], field[known, a], left=np.nan, right=np.nan)
     return out

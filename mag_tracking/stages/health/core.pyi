@@ -4,7 +4,7 @@ from mag_tracking.arrays import FloatArray, IntArray
 
 def add_readings(rows: IntArray, stamps: IntArray, fields: FloatArray, received_ns: int, first: int,
                  count: IntArray, stamp: IntArray, received: IntArray, field: FloatArray) -> int:
-    """As `ReadingBuffer.add`.
+    """Add readings to the arrays of a buffer.
 
     Parameters
     ----------
@@ -13,11 +13,12 @@ def add_readings(rows: IntArray, stamps: IntArray, fields: FloatArray, received_
     count : (n_sensors,) int array
         Number of buffered readings; updated in place.
     stamp, received : (n_sensors, capacity) int array, ns
-        Updated in place.
+        Timestamps and times of receipt; updated in place.
     field : (n_sensors, capacity, 3) array, T
-        Updated in place.
+        Readings; updated in place.
 
     Returns
     -------
     int
+        As for `ReadingBuffer.add`.
     """

@@ -1,6 +1,6 @@
 """Buffer of raw readings, filled by compiled code.
 
-Processing ten thousand readings per second one by one would occupy a whole core.
+Processing ten thousand readings per second individually in Python would occupy a whole core.
 """
 
 import numpy as np
@@ -28,17 +28,18 @@ class ReadingBuffer:
 
     def add(self, rows: IntArray, stamps: IntArray, fields: FloatArray, received_ns: int,
             first: int) -> int:
-        """Add readings, starting with the one at `first`, until the buffer of a sensor is full.
+        """Add readings, starting at index `first`, until the buffer of a sensor is full.
 
         Parameters
         ----------
         rows : (n,) int array
-            Sensors of the readings; negative rows are ignored.
+            Index of the sensor of each reading; readings with a negative index are skipped.
         stamps : (n,) int array, ns
         fields : (n, 3) array, T
         received_ns : int, ns
             Time of receipt of all readings.
         first : int
+            Index of the first reading to add.
 
         Returns
         -------
@@ -50,14 +51,14 @@ class ReadingBuffer:
                                  self._field)
 
     def pop(self, j: int) -> tuple[IntArray, FloatArray, IntArray]:
-        """Remove the readings of a sensor from the buffer.
+        """Remove the readings of a sensor from the buffer and return them.
 
-        The arrays are views: the next readings of the sensor overwrite them.
+        The returned arrays are views, which the next readings of the sensor overwrite.
 
         Parameters
         ----------
         j : int
-            Row of the sensor.
+            Index of the sensor.
 
         Returns
         -------

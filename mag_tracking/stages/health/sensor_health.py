@@ -1,6 +1,6 @@
-"""Health: faults in the readings of a sensor, with advice.
+"""Health: faults in the readings of a sensor, and advice on how to fix them.
 
-Readings are only monitored, never changed or held back. Memory is bounded by a window of readings.
+Readings are monitored without being changed or delayed. Memory is bounded by a window of readings.
 """
 
 from collections import Counter
@@ -21,22 +21,27 @@ WINDOW = 512
 UPDATE_INTERVAL = 64
 """Number of new readings after which the statistics are updated."""
 CLOCK_STEP_S = 0.25
-"""[s] A clock has stepped if a timestamp is off by more although the reading arrived on time."""
+"""[s] Minimum timestamp error of a clock step; the time of receipt must be regular."""
 MAX_LIVE_DELAY_S = 86400.0
-"""[s] Older timestamps belong to a replay, or to another clock; `apps.doctor` compares the
-sensors."""
+"""[s] Maximum age of live timestamps. Older timestamps come from a replay or an unsynchronised
+clock; `apps.doctor` compares the clocks of the sensors."""
 GAP_RATIO = 1.5
-"""Readings are lost in an interval that is longer than the median interval by this factor."""
+"""Ratio of an interval to the median interval above which readings have been lost."""
 MAX_JITTER = 0.3
-"""Lost readings are not counted if the intervals scatter by more than this fraction."""
+"""Maximum relative scatter of the intervals; above it, lost readings are not counted."""
 STUCK_S = 1.0
 """[s] A sensor is stuck if its readings are identical for longer than this."""
 MIN_MOVED_STEPS = 10.0
-"""A target that moves one axis by this number of quantisation steps moves all others by at least
-one."""
+"""A target that changes one axis by this number of quantisation steps changes every other axis by
+at least one step."""
 SPIKE_STD = 30.0
-"""A spike differs from both neighbours, in the same direction, by this number of noise standard
-deviations."""
+"""Minimum difference of a spike from both neighbouring readings, in the same direction, in standard
+deviations of the noise."""
+
+
+def _times(n: int) -> str:
+    """Number of occurrences in words."""
+    return 'once' if n == 1 else f'{n} times'
 
 
 @dataclass(frozen=True)
@@ -44,9 +49,9 @@ class Finding:
     """A fault, and advice on how to fix it."""
 
     serious: bool
-    """Whether results are wrong, not only less accurate."""
+    """True if the fault makes results wrong, false if it only makes them less accurate."""
     subject: str
-    """Sensor or stage."""
+    """Name of the sensor or stage."""
     what: str
     advice: str
 
@@ -63,6 +68,7 @@ class SensorHealth:
     Parameters
     ----------
     update_interval : int, optional
+        Number of readings between two updates.
     """
 
     def __init__(self, update_interval: int = UPDATE_INTERVAL) -> None:
@@ -75,15 +81,15 @@ class SensorHealth:
         self._fields: FloatArray = np.zeros((0, 3))
         self._interval_ns, self._spread = float('nan'), float('inf')
         self._noise: FloatArray = np.full(3, np.nan)
-        # Results for the present window; cleared when readings are added.
+        # Results for the current window; cleared when readings are added.
         self._cache: dict[str, FloatArray] = {}
         self._delays: list[float] | None = None
-        # Timestamp of the first of the identical latest readings; number of readings since the last
-        # stuck one.
+        # Timestamp of the first reading in the current run of identical readings; number of
+        # readings since the last stuck reading.
         self._unchanged_since_ns: int | None = None
         self._n_since_stuck = WINDOW
-        # Length of the present run of identical readings; number of readings that repeated the
-        # previous one, and of those that did not; whether each axis has ever changed.
+        # Length of the current run of identical readings; number of readings that repeated the
+        # previous reading; number of readings that changed; whether each axis has ever changed.
         self._run, self._repeats, self._changes = 0, 0, 0
         self._has_changed = np.zeros(3, dtype=bool)
         self._steps: FloatArray = np.full(3, np.inf)
@@ -115,7 +121,7 @@ class SensorHealth:
         return self._counts
 
     def update(self) -> None:
-        """Include the new readings in the window."""
+        """Add the buffered readings to the window, and update the statistics."""
         if self._new:
             stamps, fields, received = zip(*self._new, strict=True)
             self._new = []
@@ -123,10 +129,10 @@ class SensorHealth:
                            np.array(received, dtype=np.int64))
 
     def add_batch(self, stamps: IntArray, fields: FloatArray, received: IntArray) -> None:
-        """Add readings to the window directly.
+        """Add readings directly to the window, and update the statistics.
 
-        The arrays may be modified afterwards. Readings that `add` has buffered are not included
-        first, so use either `add` or `add_batch`.
+        The arrays may be modified afterwards. Readings that `add` has buffered are not added first,
+        so use either `add` or `add_batch`.
 
         Parameters
         ----------
@@ -148,14 +154,14 @@ class SensorHealth:
 
     def _check_timestamps(self, n: int) -> None:
         """Count the faults in the timestamps of the `n` latest readings."""
-        # Including the interval from the reading before, if there is one.
+        # The first interval starts at the preceding reading, if there is one.
         intervals = np.diff(self._stamps[-n - 1:])
         known = self._received[-n - 1:] != NEVER
         receipts = np.diff(np.where(known, self._received[-n - 1:], 0)) / NS
         steps = receipts - intervals / NS
         usual = 0.0 if np.isnan(self._interval_ns) else self._interval_ns / NS
-        # Only a timestamp that is irregular while the receipt is regular is a step. A host that
-        # stalls and then reads a burst is not.
+        # In a clock step, the timestamp is irregular but the time of receipt is regular. A host
+        # that stalls and then reads a burst causes no step.
         stepped = known[1:] & known[:-1] & (np.abs(steps) > CLOCK_STEP_S) \
             & (np.abs(receipts - usual) < CLOCK_STEP_S) \
             & (np.abs(intervals / NS - usual) > CLOCK_STEP_S)
@@ -165,8 +171,8 @@ class SensorHealth:
         self._counts['duplicates'] += int((intervals == 0).sum())
         self._counts['backward timestamps'] += int((intervals < 0).sum())
         if self._spread < MAX_JITTER:
-            long = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~stepped
-            self._counts['lost'] += int(np.sum(np.round(intervals[long] / self._interval_ns) - 1))
+            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~stepped
+            self._counts['lost'] += int(np.sum(np.round(intervals[gaps] / self._interval_ns) - 1))
         forward = np.diff(self._stamps)
         forward = forward[forward > 0]
         if len(forward) >= 8:
@@ -181,29 +187,29 @@ class SensorHealth:
             self._counts[axis] += count
         self._counts['without any axis'] += int(missing.all(axis=1).sum())
         self._check_stuck(n)
-        # Including the two readings before, because the last reading has no successor yet.
+        # The two preceding readings are included, because the last one had no successor before.
         fields = self._fields[-n - 2:]
         before, after = np.diff(fields, axis=0)[:-1], -np.diff(fields, axis=0)[1:]
         self._steps = np.minimum(self._steps, smallest_steps(fields))
-        # A comparison with NaN is false: as long as the noise is unknown, there are no spikes.
+        # A comparison with NaN is false: while the noise is unknown, no spikes are counted.
         noise = np.maximum(self._noise, self._steps / np.sqrt(12.0))
-        alone = (np.minimum(np.abs(before), np.abs(after)) > SPIKE_STD * noise) \
+        is_spike = (np.minimum(np.abs(before), np.abs(after)) > SPIKE_STD * noise) \
             & (before * after > 0.0)
-        self._counts['spikes'] += int(alone.any(axis=1).sum())
+        self._counts['spikes'] += int(is_spike.any(axis=1).sum())
         if self._n_since_stuck >= WINDOW:
             self._noise = self._cache['noise'] = sample_noise_std(self._fields)
-        cut = np.array([saturated_readings(axis) for axis in self._fields.T])[:, -n:]
-        self._counts['saturated'] += int(np.count_nonzero(cut.any(axis=0)))
+        is_saturated = np.array([saturated_readings(axis) for axis in self._fields.T])[:, -n:]
+        self._counts['saturated'] += int(np.count_nonzero(is_saturated.any(axis=0)))
 
     def _check_stuck(self, n: int) -> None:
-        """Count those of the `n` latest readings that have been identical for too long."""
+        """Count the `n` latest readings that have been identical for too long."""
         stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
         equal = (fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])
         self._has_changed |= (~equal & ~np.isnan(fields[1:]) & ~np.isnan(fields[:-1])).any(axis=0)
         same = equal.all(axis=1)
         if len(same) < n:
             same = np.append(False, same)
-        # Index of the reading that each one repeats; -1 = a reading before these.
+        # Index of the first reading of each run of identical readings; -1 = in an earlier batch.
         origin = np.maximum.accumulate(np.where(same, -1, np.arange(n)))
         since = np.where(origin < 0, self._unchanged_since_ns or 0, stamps[origin])
         stuck = np.flatnonzero(stamps - since > STUCK_S * NS)
@@ -214,14 +220,14 @@ class SensorHealth:
         self._n_since_stuck = n - 1 - int(stuck[-1]) if len(stuck) else self._n_since_stuck + n
 
     def _count_runs(self, same: BoolArray, since: IntArray, stamps: IntArray) -> None:
-        """Count repetitions: `same` (n,) = equal to the previous reading, `since` (n,) [ns]."""
+        """Count repeated readings: `same` (n,) marks them, and their runs start at `since` [ns]."""
         changed = np.flatnonzero(~same)
         if not len(changed):
             self._run += len(same)
             return
         lengths = np.diff(changed) - 1
         lasting = stamps[changed[1:] - 1] - since[changed[1:] - 1] > STUCK_S * NS
-        # A faulty run is counted once, because it is not representative.
+        # A faulty run counts as one repetition, because it is not representative.
         self._repeats += int(np.where(lasting, 1, lengths).sum())
         first = self._run + int(changed[0])
         usual = STUCK_S * NS / self._interval_ns if self._interval_ns > 0 else np.inf
@@ -243,13 +249,13 @@ class SensorHealth:
 
     @property
     def rate(self) -> float:
-        """Rate of the latest readings [Hz]; NaN until there are enough."""
+        """Rate of the latest readings [Hz]; NaN if there are too few."""
         self.update()
         return NS / self._interval_ns
 
     @property
     def noise_std(self) -> FloatArray:
-        """Noise of the readings without passing targets, (3,) T, from second differences."""
+        """Noise standard deviation (3,) [T], from second differences, which suppress targets."""
         return self._cached('noise', sample_noise_std)
 
     @property
@@ -257,33 +263,33 @@ class SensorHealth:
         """Median of the latest readings, (3,) T; NaN for a missing axis."""
         return self._cached('median', median_field)
 
-    def _cached(self, name: str, make: Callable[[FloatArray], FloatArray]) -> FloatArray:
-        """Result of `make` for the fields in the window, computed once."""
+    def _cached(self, name: str, compute: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Return the cached result of `compute` for the fields in the window."""
         self.update()
         if name not in self._cache:
-            self._cache[name] = make(self._fields)
+            self._cache[name] = compute(self._fields)
         return self._cache[name]
 
     @property
     def dead_axes(self) -> str:
-        """Axes that did not change within a window in which another axis did, such as 'xz'.
+        """Axes that did not change within the window although another axis changed, such as 'xz'.
 
-        For a sensor with coarse resolution: axes that have never changed, while another axis moved
-        by more than `MIN_MOVED_STEPS` of its steps.
+        For a sensor with coarse resolution, these are axes that have never changed although another
+        axis changed by more than `MIN_MOVED_STEPS` of its steps.
         """
         self.update()
         if len(self._fields) < WINDOW:
             return ''
-        there = ~np.isnan(self._fields).any(axis=0)
-        still = there & (self._fields == self._fields[0]).all(axis=0)
+        present = ~np.isnan(self._fields).any(axis=0)
+        unchanged = present & (self._fields == self._fields[0]).all(axis=0)
         if self.is_coarse:
             moved = np.ptp(self._fields, axis=0) > MIN_MOVED_STEPS * smallest_steps(self._fields)
-            still &= ~self._has_changed & (moved & there).any()
-        return ''.join(np.array(list('xyz'))[still]) if still.sum() < there.sum() else ''
+            unchanged &= ~self._has_changed & (moved & present).any()
+        return ''.join(np.array(list('xyz'))[unchanged]) if unchanged.sum() < present.sum() else ''
 
     @property
     def delay_s(self) -> list[float]:
-        """Delay [s] from timestamp to receipt: median, 5 % and 95 %; NaN if unknown."""
+        """Delay [s] from timestamp to receipt: median, 5 % and 95 % quantiles; NaN if unknown."""
         self.update()
         if self._delays is None:
             known = self._received != NEVER
@@ -300,9 +306,9 @@ class SensorHealth:
         name : str
             Name of the sensor.
         noise_std : (3,) array, T, optional
-            Noise at the calibration.
+            Noise standard deviation at the calibration.
         max_field : float, T, optional
-            Readings above this value are rejected.
+            Limit above which readings are rejected.
         is_live : bool, optional
             False for a replay, whose timestamps may lag or loop.
 
@@ -326,17 +332,17 @@ class SensorHealth:
         return sorted(found, key=lambda f: not f.serious)
 
     def _clock_findings(self, name: str) -> Iterator[Finding]:
-        """Faults of the clock."""
+        """Yield findings about clock steps and backward timestamps."""
         if n := self.counts['clock steps']:
-            yield Finding(True, name, f'its clock stepped {n} times relative to the '
+            yield Finding(True, name, f'its clock stepped {_times(n)} relative to the '
                           f'host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
                           'clocks (chrony, PTP), and take timestamps from a monotonic clock')
         if n := self.counts['backward timestamps']:
-            yield Finding(True, name, f'timestamps went back {n} times', 'check for two publishers '
-                          'on one topic, a clock that was set, or a looped replay')
+            yield Finding(True, name, f'timestamps went back {_times(n)}', 'check for two '
+                          'publishers on one topic, a clock that was set, or a looped replay')
 
     def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
-        """Faults of the timestamps."""
+        """Yield findings about duplicate timestamps, lost readings and delays."""
         c = self.counts
         middle, low, high = self.delay_s
         if c['duplicates'] > 0.001 * n:
@@ -356,11 +362,11 @@ class SensorHealth:
                           'the clocks of sensor and host disagree: calibrate them with knocks')
 
     def _value_findings(self, name: str, n: int, max_field: float) -> Iterator[Finding]:
-        """Faults of the fields."""
+        """Yield findings about the values and the axes of the readings."""
         c = self.counts
-        size = float(np.sqrt(np.nansum(self.field**2)))
-        if size > max_field:
-            yield Finding(True, name, f'a field of {size:.3g} T is rejected, the limit is '
+        magnitude = float(np.sqrt(np.nansum(self.field**2)))
+        if magnitude > max_field:
+            yield Finding(True, name, f'a field of {magnitude:.3g} T is rejected, the limit is '
                           f'{max_field:g} T', 'check the unit (gauss or microtesla published as '
                           'tesla?), or near a magnet raise calibrate.max_field')
         if c['without any axis'] > 0.01 * n:
@@ -374,8 +380,9 @@ class SensorHealth:
                 yield Finding(False, name, f'{axis} is missing in {c[axis]} of {n} readings',
                               'check the sensor and its driver')
         if c['stuck readings']:
-            yield Finding(True, name, f'{c["stuck readings"]} readings are identical to all of the '
-                          f'{STUCK_S:g} s before', 'the sensor or its driver is stuck: restart it')
+            yield Finding(True, name, f'{c["stuck readings"]} readings are identical to all '
+                          f'readings of the previous {STUCK_S:g} s',
+                          'the sensor or its driver is stuck: restart it')
         if c['saturated'] > 0.001 * n:
             yield Finding(True, name, f'{c["saturated"]} of {n} readings are at the end of the '
                           'range', 'set a larger range, or move the sensor further away')

@@ -23,16 +23,16 @@ def quantiles(values: Sequence[float] | FloatArray | IntArray,
     Returns
     -------
     list of float
-        NaN if there are no values.
+        One value per probability; NaN if `values` is empty.
     """
     if not len(values):
         return [float('nan')] * len(probabilities)
     ordered, out = np.sort(values), []
     for probability in probabilities:
-        place = probability * (len(ordered) - 1)
-        low = int(place)
+        position = probability * (len(ordered) - 1)
+        low = int(position)
         a, b = float(ordered[low]), float(ordered[min(low + 1, len(ordered) - 1)])
-        out.append(a + (place - low) * (b - a))
+        out.append(a + (position - low) * (b - a))
     return out
 
 
@@ -52,10 +52,10 @@ def median_field(fields: FloatArray) -> FloatArray:
 
 
 def sample_noise_std(fields: FloatArray) -> FloatArray:
-    """Standard deviation of each axis from second differences, without outliers.
+    """Noise standard deviation of each axis, from second differences without outliers.
 
-    Second differences suppress a passing target, which has a slope but hardly any curvature from
-    one reading to the next. The result is not smaller than the quantisation error.
+    Second differences suppress a passing target, whose field has a slope but hardly any curvature
+    from one reading to the next. The result is at least the quantisation error.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ def sample_noise_std(fields: FloatArray) -> FloatArray:
     for axis, d in enumerate(np.abs(np.diff(fields, n=2, axis=0)).T):
         d = d[~np.isnan(d)]
         if len(d) >= 8:
-            least = steps[axis] / np.sqrt(12.0) if np.isfinite(steps[axis]) else 0.0
-            # The mean, not the median, because with coarse resolution the median is a whole step.
-            usual = d[d <= max(8.0 * quantiles(d, 0.6)[0], least)]
-            out[axis] = max(np.sqrt(np.pi / 12.0) * usual.mean(), least)
+            minimum = steps[axis] / np.sqrt(12.0) if np.isfinite(steps[axis]) else 0.0
+            # The mean is used, because with coarse resolution the median is a whole step.
+            inliers = d[d <= max(8.0 * quantiles(d, 0.6)[0], minimum)]
+            out[axis] = max(np.sqrt(np.pi / 12.0) * inliers.mean(), minimum)
     return out

@@ -1,4 +1,4 @@
-"""Settings of the survey."""
+"""Settings of the survey of orientations and clock offsets."""
 
 from dataclasses import dataclass
 
@@ -7,12 +7,12 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class SurveySettings:
-    """Settings of the survey."""
+    """Settings of the survey of orientations and clock offsets."""
 
     compass_bias_std: float = param(
-        6e-7, 'Standard deviation, per axis, of the field that a sensor and the iron near it add '
-        'to that of the Earth; it limits the accuracy of the compass. A larger bias that the '
-        'readings show is taken into account.', 'T', (1e-9, 1e-4))
+        6e-7, 'Prior standard deviation, per axis, of the field that a sensor and nearby iron add '
+        'to the field of the Earth; it limits the accuracy of the compass. Biases estimated from '
+        'the readings update it.', 'T', (1e-9, 1e-4))
     accelerometer_bias: float = param(
         0.05, 'Assumed bias of an accelerometer, per axis. 0.05 is equivalent to 0.3 degrees.',
         'm/s^2', (0.0, 5.0))
@@ -20,8 +20,8 @@ class SurveySettings:
         5.0, 'Standard deviation, about each axis, of the orientations in the network file, for '
         'sensors without orientation_std_deg.', 'deg', (0.06, 180.0))
     max_clock_offset_s: float = param(
-        0.5, 'Maximum offset between two clocks. Knocks should be further apart than this, at '
+        0.5, 'Maximum offset between two clocks. The knocks should be further apart than this, at '
         'irregular intervals.', 's', (1e-3, 10.0))
     max_accelerations: int = param(
-        60000, 'Maximum number of stored readings per accelerometer. The latest are kept.', '',
+        60000, 'Maximum number of stored readings per accelerometer. The oldest are dropped.', '',
         (100, 10_000_000))

@@ -1,7 +1,7 @@
 """Survey: orientation and clock offset of each sensor of a network.
 
-The methods are those of T10 section 6.3: knocks that all sensors measure, accelerometers, and the
-field of the Earth.
+It follows T10 section 6.3: knocks that all sensors measure give the clock offsets; accelerometers
+and the field of the Earth give the orientations.
 """
 
 from collections import Counter, deque
@@ -31,10 +31,11 @@ from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NS
 
 MAX_GAP_S = 3600.0
-"""[s] After a longer gap or a backward jump, earlier readings belong to another recording."""
+"""[s] Maximum gap between accelerations. After a longer gap or a backward jump, earlier readings
+belong to another recording."""
 
 MIN_STATED_STD = 1e-3
-"""[rad] Minimum standard deviation of a stated orientation."""
+"""[rad] Minimum standard deviation of an orientation in the network file."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,11 @@ class SensorSurvey:
 
     sensor: str
     orientation: Orientation | None
-    """None if the stated orientation is kept."""
+    """Surveyed orientation; None if the orientation in the network file is retained."""
     by: str
     """Source of the orientation."""
     lag: Lag | None
-    """Offset of its clock; None for the sensor with the reference clock."""
+    """Offset of the sensor clock; None for the sensor with the reference clock."""
     warnings: tuple[str, ...]
 
 
@@ -56,17 +57,19 @@ class NetworkSurvey:
     """Result of the survey for a network."""
 
     network: SensorNetwork
-    """With the surveyed orientations and clock offsets."""
+    """Network with the surveyed orientations and clock offsets."""
     sensors: tuple[SensorSurvey, ...]
     disagreements: tuple[Disagreement, ...]
-    """Sensors that do not measure the field of the Earth; they keep their stated headings."""
+    """Sensors whose field differs from the field of the Earth. Their headings remain as in the
+    network file."""
     bias_std: float
     """[T] Standard deviation of the compass biases."""
     reference: str
-    """Sensor with the reference clock; empty if no two sensors measured the same knock."""
+    """Name of the sensor with the reference clock; empty if no two sensors measured the same
+    knock."""
     shocks: dict[str, tuple[FloatArray, FloatArray]]
-    """{sensor: (t (n,) [s], shock (n,) [m/s^2])} for sensors with accelerations; times by the clock
-    of each sensor, from the first reading of all sensors."""
+    """{sensor: (t (n,) [s], shock (n,) [m/s²])} for sensors with accelerations. Times are by the
+    clock of each sensor, relative to the first reading of any sensor."""
 
     def warnings(self) -> list[str]:
         """Warnings for the user.
@@ -108,7 +111,7 @@ class Survey:
             name: deque(maxlen=settings.max_accelerations) for name in network.names}
 
     def feed(self, sample: AccelerationSample) -> list[NetworkSurvey]:
-        """Add an acceleration.
+        """Add an acceleration, or reject and count it if it is invalid.
 
         Parameters
         ----------
@@ -119,20 +122,20 @@ class Survey:
         list of NetworkSurvey
             Always empty.
         """
-        kept = self._accelerations.get(sample.sensor)
-        if kept is None:
+        recorded = self._accelerations.get(sample.sensor)
+        if recorded is None:
             self.counts[f'rejected: acceleration of unknown sensor {sample.sensor}'] += 1
         elif not np.isfinite(sample.acceleration).all():
             self.counts['rejected: acceleration is not finite'] += 1
-        elif kept and not 0 < sample.stamp_ns - kept[-1][0] < MAX_GAP_S * NS:
-            if abs(kept[-1][0] - sample.stamp_ns) > NS:
-                kept.clear()
-                kept.append((sample.stamp_ns, sample.acceleration))
+        elif recorded and not 0 < sample.stamp_ns - recorded[-1][0] < MAX_GAP_S * NS:
+            if abs(recorded[-1][0] - sample.stamp_ns) > NS:
+                recorded.clear()
+                recorded.append((sample.stamp_ns, sample.acceleration))
                 self.counts['time jumped'] += 1
             else:
                 self.counts['rejected: acceleration out of order'] += 1
         else:
-            kept.append((sample.stamp_ns, sample.acceleration))
+            recorded.append((sample.stamp_ns, sample.acceleration))
             self.counts['accelerations'] += 1
         return []
 
@@ -140,7 +143,7 @@ class Survey:
         """Do nothing: no work is deferred."""
 
     def flush(self) -> list[NetworkSurvey]:
-        """Return nothing: no record is held back.
+        """Return an empty list: no record is buffered.
 
         Returns
         -------
@@ -149,14 +152,14 @@ class Survey:
         return []
 
     def solve(self, fields: Mapping[str, FloatArray], date: str) -> NetworkSurvey:
-        """Compute the survey from the accelerations so far and the fields of the sensors.
+        """Compute the survey from the fields of the sensors and the accelerations added so far.
 
         Parameters
         ----------
         fields : mapping of str to (3,) array, T, sensor frame
             Field of each sensor without a target. NaN = axis not reported; a sensor may be missing.
         date : str
-            Date of the calibration.
+            Date of the survey, for the calibration records.
 
         Returns
         -------
@@ -168,7 +171,7 @@ class Survey:
                                if s is None else np.maximum(s, MIN_STATED_STD)
                                for s in network.orientation_std])
         warnings: dict[str, list[str]] = {name: [] for name in names}
-        ups = [self._up(name, warnings[name]) for name in names]
+        ups = [self._estimate_up(name, warnings[name]) for name in names]
         level = [levelled(up, R, std) for up, R, std in
                  zip(ups, network.R_ws, stated_std, strict=True)]
         for name, before, now, std in zip(names, network.R_ws, level, stated_std, strict=True):
@@ -189,8 +192,8 @@ class Survey:
         return NetworkSurvey(self._updated_network(sensors, reference, date), tuple(sensors),
                              tuple(disagreeing), bias_std, reference, shocks)
 
-    def _up(self, name: str, warnings: list[str]) -> UpDirection | None:
-        """Vertical direction of a sensor, or None with a warning."""
+    def _estimate_up(self, name: str, warnings: list[str]) -> UpDirection | None:
+        """Estimate the vertical direction of a sensor; None, with a warning, if unavailable."""
         if not self._accelerations[name]:
             warnings.append('no accelerations; the orientation is not surveyed')
             return None
@@ -198,13 +201,13 @@ class Survey:
             return up_direction(np.array([a for _, a in self._accelerations[name]]),
                                 self._settings.accelerometer_bias)
         except ValueError as error:
-            warnings.append(f'{error}; the stated orientation is kept')
+            warnings.append(f'{error}; the orientation in the network file is retained')
             return None
 
     def _disagreements(self, field: FloatArray, level: Sequence[Orientation | None],
                        stated_std: FloatArray, warnings: Mapping[str, list[str]]
                        ) -> list[Disagreement]:
-        """Sensors that disagree with the field of the Earth; empty if that field is unknown."""
+        """Sensors that disagree with the field of the Earth; none if this field is unknown."""
         network = self._network
         R = np.array([R if o is None else o.R_ws for o, R in zip(level, network.R_ws, strict=True)])
         std = np.array([s if o is None else o.std for o, s in zip(level, stated_std, strict=True)])
@@ -218,53 +221,53 @@ class Survey:
     def _compass(self, ups: Mapping[int, UpDirection], field: FloatArray, stated_std: FloatArray,
                  warnings: Mapping[str, list[str]]
                  ) -> tuple[float, dict[int, tuple[Orientation, str]]]:
-        """Bias [T] and {row: (orientation, source)} of sensors with accelerometer and compass."""
+        """Estimate the compass bias [T] and {sensor index: (orientation, source)}."""
         network, bias_std = self._network, self._settings.compass_bias_std
         usable = {j: up for j, up in ups.items() if not np.isnan(field[j]).all()}
         if network.earth_field is None or not usable:
             return bias_std, {}
-        found: dict[int, Orientation] = {}
+        estimates: dict[int, Orientation] = {}
         failures: dict[int, str] = {}
         # Two passes, because the biases can be estimated only when the headings are known.
         for _ in range(2):
-            found = {}
+            estimates = {}
             for j, up in usable.items():
                 try:
-                    found[j] = compass_orientation(up, field[j], network.earth_field, bias_std,
-                                                   network.R_ws[j])
+                    estimates[j] = compass_orientation(up, field[j], network.earth_field, bias_std,
+                                                       network.R_ws[j])
                 except ValueError as error:
                     failures[j] = str(error)
-            bias_std = pooled_bias_std(list(found.values()), self._settings.compass_bias_std)
-        for j in failures.keys() - found.keys():
+            bias_std = pooled_bias_std(list(estimates.values()), self._settings.compass_bias_std)
+        for j in failures.keys() - estimates.keys():
             warnings[network.names[j]].append(failures[j])
         out = {}
-        for j, orientation in found.items():
-            both = with_stated_heading(orientation, network.R_ws[j], stated_std[j][2])
+        for j, orientation in estimates.items():
+            fused = with_stated_heading(orientation, network.R_ws[j], stated_std[j][2])
             name = network.names[j]
-            if both is None:
-                away = np.degrees(yaw_between(network.R_ws[j], orientation.R_ws))
-                warnings[name].append(f'the compass heading differs by {away:+.0f} degrees from '
-                                      'the network file; the stated heading is kept')
+            if fused is None:
+                difference = np.degrees(yaw_between(network.R_ws[j], orientation.R_ws))
+                warnings[name].append(f'the compass heading differs by {difference:+.0f} degrees '
+                                      'from the network file, whose heading is retained')
             elif not np.isnan(orientation.rival):
-                warnings[name].append('the compass allows another heading, at '
-                                      f'{np.degrees(orientation.rival):+.0f} degrees from this one')
-            if both is not None:
-                out[j] = both, 'accelerometer, compass and stated heading'
+                warnings[name].append('the compass allows another heading, which differs by '
+                                      f'{np.degrees(orientation.rival):+.0f} degrees')
+            if fused is not None:
+                out[j] = fused, 'accelerometer, compass and stated heading'
         return bias_std, out
 
     def _shocks(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Mechanical shock of each sensor over time."""
-        kept = {name: readings for name, readings in self._accelerations.items() if readings}
+        """Compute the mechanical shock of each sensor over time."""
+        recorded = {name: readings for name, readings in self._accelerations.items() if readings}
         # Times are relative to the first reading, because seconds since 1970 lose digits in a
         # float.
-        first = min((readings[0][0] for readings in kept.values()), default=0)
+        first = min((readings[0][0] for readings in recorded.values()), default=0)
         return {name: (np.array([(stamp - first) / NS for stamp, _ in readings]),
                        shock(np.array([a for _, a in readings])))
-                for name, readings in kept.items()}
+                for name, readings in recorded.items()}
 
     def _lags(self, signals: Mapping[str, tuple[FloatArray, FloatArray]]
               ) -> tuple[str, dict[str, Lag]]:
-        """Reference sensor and {sensor: lag} from the knocks."""
+        """Find the reference sensor and {sensor: lag} from the knocks."""
         longest = self._settings.max_clock_offset_s
         first: dict[str, Lag] = {}
         for reference, (t, s) in signals.items():
@@ -277,12 +280,12 @@ class Survey:
 
     def _updated_network(self, sensors: Sequence[SensorSurvey], reference: str,
                          date: str) -> SensorNetwork:
-        """Network with the surveyed orientations and clock offsets."""
+        """Create a network with the surveyed orientations and clock offsets."""
         network = self._network
         R_ws, clock = network.R_ws.copy(), network.clock_offset.copy()
         # The reference clock keeps its offset, so that clocks without a comparison remain valid.
         zero = clock[network.index(reference)] if reference else 0.0
-        std, done = list(network.orientation_std), list(network.calibrated)
+        std, calibrated = list(network.orientation_std), list(network.calibrated)
         for j, s in enumerate(sensors):
             lag = None if s.lag is None or s.lag.reason else s.lag
             if lag is not None:
@@ -291,13 +294,13 @@ class Survey:
                 R_ws[j], std[j] = s.orientation.R_ws, s.orientation.std
             if s.orientation is not None or lag is not None or s.sensor == reference:
                 lag_std = lag.std if lag is not None else 0.0 if s.sensor == reference else np.nan
-                done[j] = network.calibration_record(j, date, s.by, lag_std)
+                calibrated[j] = network.calibration_record(j, date, s.by, lag_std)
         return replace(network, R_ws=R_ws, orientation_std=tuple(std), clock_offset=clock,
-                       calibrated=tuple(done))
+                       calibrated=tuple(calibrated))
 
 
 class NoiseSource(Protocol):
-    """Interface that `with_measured_noise` needs of a `Calibrate` stage."""
+    """Interface of a `Calibrate` stage that `with_measured_noise` uses."""
 
     def backgrounds(self) -> Mapping[str, RunningBackground]:
         """Background of each sensor of the network, in order.
@@ -309,7 +312,7 @@ class NoiseSource(Protocol):
 
 
 def with_measured_noise(network: SensorNetwork, calibrate: NoiseSource) -> SensorNetwork:
-    """Network with the noise that a `Calibrate` stage has measured.
+    """Create a network with the noise that a `Calibrate` stage has measured.
 
     Parameters
     ----------
@@ -319,7 +322,7 @@ def with_measured_noise(network: SensorNetwork, calibrate: NoiseSource) -> Senso
     Returns
     -------
     SensorNetwork
-        Sensors without a complete measurement keep their noise.
+        Sensors without a complete measurement retain their previous noise.
     """
     noise = list(network.noise_std)
     for j, background in enumerate(calibrate.backgrounds().values()):
@@ -330,10 +333,10 @@ def with_measured_noise(network: SensorNetwork, calibrate: NoiseSource) -> Senso
     return replace(network, noise_std=tuple(noise))
 
 
-def _tilt_warning(stated: FloatArray, found: FloatArray, stated_std: FloatArray,
-                  found_std: FloatArray) -> list[str]:
-    """Warning if the tilt of a sensor differs from the stated one by more than its uncertainty."""
-    tilt = np.arccos(np.clip((stated.T @ [0.0, 0.0, 1.0]) @ (found.T @ [0.0, 0.0, 1.0]), -1.0, 1.0))
-    allowed = 3.0 * np.hypot(stated_std[:2].max(), found_std[:2].max())
+def _tilt_warning(R: FloatArray, surveyed: FloatArray, std: FloatArray,
+                  surveyed_std: FloatArray) -> list[str]:
+    """Warning if the tilt of a sensor differs significantly from the network file."""
+    tilt = np.arccos(np.clip((R.T @ [0.0, 0.0, 1.0]) @ (surveyed.T @ [0.0, 0.0, 1.0]), -1.0, 1.0))
+    limit = 3.0 * np.hypot(std[:2].max(), surveyed_std[:2].max())
     return [f'the tilt differs by {np.degrees(tilt):.0f} degrees from the network file'] \
-        if tilt > allowed else []
+        if tilt > limit else []

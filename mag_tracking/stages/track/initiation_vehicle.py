@@ -134,11 +134,13 @@ def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehic
         If lists that belong together differ in length, a kind is listed twice, or a point has a
         spread.
     """
-    for names, lists in (('arrival_names', ('arrival_headings_deg',)), ('kinds', PER_KIND)):
+    for names, item, lists in (('arrival_names', 'arrival name', ('arrival_headings_deg',)),
+                               ('kinds', 'kind', PER_KIND)):
         n = len(getattr(settings, names))
         for name in lists:
             if len(getattr(settings, name)) != n:
-                raise SettingsError(f'track.vehicle.{name}: expected {n} values (one per {names}), '
+                raise SettingsError(f'track.vehicle.{name}: expected {n} value'
+                                    f'{"" if n == 1 else "s"} (one per {item}), '
                                     f'got {len(getattr(settings, name))}')
     if len(set(settings.kinds)) < len(settings.kinds):
         raise SettingsError(f'track.vehicle.kinds: a name is duplicated in {settings.kinds}')

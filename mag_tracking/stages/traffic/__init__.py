@@ -1,1 +1,1 @@
-"""Traffic: vehicles that cross lines, their classes, and statistics of intervals."""
+"""Traffic: passages of vehicles across counting lines, vehicle classes, and interval summaries."""

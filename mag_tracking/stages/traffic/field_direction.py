@@ -1,4 +1,4 @@
-"""Check of the direction of a track by the rotation of the field at each sensor."""
+"""Check of a vehicle's direction by the rotation of the field at each sensor."""
 
 from collections import deque
 
@@ -16,18 +16,19 @@ from mag_tracking.records import FieldFrame
 from mag_tracking.units import NS
 
 MAX_AGE_S = 70.0
-"""[s] Maximum age of stored frames; more than the longest track that is smoothed."""
+"""[s] Maximum age of stored frames; longer than any smoothed track."""
 
 MIN_LATERAL = 1.5
-"""[m] A sensor closer to the path than this does not observe the direction."""
+"""[m] Minimum distance of a sensor from the path. A closer sensor does not observe the
+direction."""
 
 MAX_ALONG = 12.0
-"""[m] A sensor is not used if its closest point of approach is further than this from the
-crossing."""
+"""[m] Maximum distance along the path between the crossing and the closest point of approach of a
+sensor."""
 
 WINDOW_RATIO = 3.0
-"""Half the window is the time in which the vehicle travels this multiple of the distance between
-sensor and path."""
+"""Distance that the vehicle travels in half the window, relative to the distance between sensor and
+path."""
 
 MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S = 0.5, 4.0
 """[s] Bounds of half the window."""
@@ -37,7 +38,7 @@ MAX_LOG_ODDS = float(np.log(MAX_CONFIDENCE / (1.0 - MAX_CONFIDENCE)))
 
 
 class FieldDirection:
-    """Error probability of a direction, from the latest frames.
+    """Estimates the probability that a direction is wrong, from the latest frames.
 
     Parameters
     ----------
@@ -49,15 +50,15 @@ class FieldDirection:
         self._frames: deque[FieldFrame] = deque()
 
     def add(self, frame: FieldFrame, since_ns: int) -> None:
-        """Store a frame, and drop frames that no crossing needs any more.
+        """Store a frame, and drop frames that are no longer needed.
 
-        All frames are dropped if the time jumps back.
+        If time jumps back, all earlier frames are dropped.
 
         Parameters
         ----------
         frame : FieldFrame
         since_ns : int, ns
-            Crossings since this time may still be found.
+            Earliest time of crossings that may still be found.
         """
         if self._frames and frame.stamp_ns <= self._frames[-1].stamp_ns:
             self._frames.clear()
@@ -91,11 +92,11 @@ class FieldDirection:
                 (np.abs(left) >= MIN_LATERAL) & (np.abs(along) <= MAX_ALONG)).tolist():
             half = np.clip(WINDOW_RATIO * abs(left[j]) / speed,
                            MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S)
-            found = self._log_odds(j, crossing.stamp_ns + round(along[j] / speed * NS),
+            value = self._log_odds(j, crossing.stamp_ns + round(along[j] / speed * NS),
                                    round(half * NS))
-            if found is not None:
-                odds.append(float(np.clip(found, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
-                # A sensor to the left of the path sees the vehicle move from right to left.
+            if value is not None:
+                odds.append(float(np.clip(value, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
+                # From a sensor to the left of the path, the vehicle moves from right to left.
                 same_side.append(bool(left[j] < 0.0))
         fused = fused_log_odds(odds, same_side)
         if not odds or len(odds) > 1 and abs(fused) < 0.5 * max(map(abs, odds)):
@@ -103,7 +104,7 @@ class FieldDirection:
         return float(1.0 / (1.0 + np.exp(fused)))
 
     def _log_odds(self, j: int, middle_ns: int, half_ns: int) -> float | None:
-        """Log odds of left to right at sensor `j`; None without two horizontal axes."""
+        """Log odds of motion from left to right, from sensor `j`; None if not observable."""
         frames = [f for f in self._frames if abs(f.stamp_ns - middle_ns) <= half_ns]
         field = horizontal_field(np.array([f.field[j] for f in frames]).reshape(-1, 3),
                                  self._network.R_ws[j])
@@ -113,5 +114,5 @@ class FieldDirection:
         variance = [np.nanmean(np.diagonal(frames[k].covariance[j]))
                     for k in np.flatnonzero(known).tolist()]
         noise = float(np.sqrt(np.median(variance)))
-        found = rotation_of_pass(field[known], noise, len(frames) // 4)
-        return None if found is None else found.log_odds
+        rotation = rotation_of_pass(field[known], noise, len(frames) // 4)
+        return None if rotation is None else rotation.log_odds

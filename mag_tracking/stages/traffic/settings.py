@@ -13,8 +13,8 @@ class TrafficSettings:
         ('road',), 'Names of the counting lines. A vehicle is counted once on each line that it '
         'crosses.')
     line_headings_deg: tuple[float, ...] = param(
-        (0.0,), 'Forward direction of travel across each line; 0 = along x, anticlockwise. The '
-        'line is perpendicular to this direction.', 'deg', (-360.0, 360.0))
+        (0.0,), 'Forward direction of travel across each line, anticlockwise from x. The line is '
+        'perpendicular to this direction.', 'deg', (-360.0, 360.0))
     line_offsets: tuple[float, ...] = param(
         (0.0,), 'Distance of each line from the centre of the network, along its heading.',
         'm', (-10000.0, 10000.0))
@@ -27,7 +27,7 @@ class TrafficSettings:
         ('motorcycle', 'car', 'truck'), 'Names of the vehicle classes. The settings below have '
         'one value per class.')
     class_shares: tuple[float, ...] = param(
-        (0.05, 0.8, 0.15), 'Prior share of each class in the traffic.', '', (1e-9, 1.0))
+        (0.05, 0.8, 0.15), 'Prior proportion of each class in the traffic.', '', (1e-9, 1.0))
     class_moments: tuple[float, ...] = param(
         (60.0, 440.0, 1800.0), 'Median magnetic moment of each class. TSP14 Table V lists 335 to '
         '581 for cars and 1734 to 1897 for trucks and buses.', 'A m^2', (1e-6, 1e6))

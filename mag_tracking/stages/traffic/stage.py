@@ -1,4 +1,4 @@
-"""Traffic: vehicles that cross counting lines, from their tracks, and summaries of intervals."""
+"""Traffic: passages of tracked vehicles across counting lines, and interval summaries."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -35,14 +35,14 @@ AMBIGUOUS, CONTRADICTED, EXTRAPOLATED = 'ambiguous', 'direction_contradicted', '
 contradicts its direction; the track does not reach the line."""
 
 MAX_DIRECTION_ERROR = 0.9
-"""Error probability, from the fields, above which a direction is in doubt."""
+"""Error probability from the fields above which they contradict a direction."""
 
 INTERFERENCE_S = 2.0
-"""[s] Another vehicle that is tracked within this time of a crossing contributes to the fields."""
+"""[s] Another vehicle tracked within this time of a crossing contributes to the fields."""
 
 REACQUIRED_S, REACQUIRED_M = 1.0, 3.0
-"""[s], [m] A track that ends before the line and one that begins after it belong to the same
-vehicle, which was lost and found again, if they are closer than this."""
+"""[s], [m] Maximum separation in time and along the line of two crossings that belong to one
+vehicle, whose track was lost and reacquired near the line."""
 
 SMOOTHED_LEAD_S = 3.0
 """[s] Maximum time from the first pose of a smoothed path to the first published pose of its
@@ -58,7 +58,7 @@ TrafficRecord: TypeAlias = VehiclePassage | TrafficSummary
 class TrackedFrame(NamedTuple):
     """A frame and the records that the tracker returned for it.
 
-    Without a frame, the records belong to tracks that end because the frames have ended.
+    If `frame` is None, the records belong to tracks that end because the frames have ended.
     """
 
     frame: FieldFrame | None
@@ -67,7 +67,7 @@ class TrackedFrame(NamedTuple):
 
 @dataclass
 class _TrackHistory:
-    """Paths of a running or ended track."""
+    """Published and smoothed paths of a running or ended track."""
 
     begin_ns: int
     last_ns: int
@@ -81,7 +81,7 @@ class _TrackHistory:
 
 
 class _PendingCrossing(NamedTuple):
-    """A crossing that waits for earlier crossings."""
+    """A crossing that waits until all earlier crossings are known."""
 
     crossing: Crossing
     line: CountingLine
@@ -93,20 +93,20 @@ class _PendingCrossing(NamedTuple):
 class Traffic:
     """Converts tracked frames to passages and summaries.
 
-    A vehicle is counted when its track has ended, from its smoothed poses if there are any.
-    Passages are returned in order of time, unless a track runs for longer than others wait for it.
+    A vehicle is counted when its track has ended, from its smoothed poses if available. Passages
+    are returned in chronological order, unless a track lasts longer than `MAX_WAIT_S`.
 
     Parameters
     ----------
     network : SensorNetwork
     settings : TrafficSettings
     counts_vehicles : bool, optional
-        False if the targets are not vehicles; nothing is counted then.
+        False if the targets are not vehicles, which disables counting.
 
     Attributes
     ----------
     counts : Counter of str
-        Number of passages and of special cases.
+        Number of passages, repeated crossings, tracks that crossed no line, and backward jumps.
 
     Raises
     ------
@@ -116,7 +116,7 @@ class Traffic:
 
     def __init__(self, network: SensorNetwork, settings: TrafficSettings,
                  counts_vehicles: bool = True) -> None:
-        _check(settings)
+        _check_lists(settings)
         self.counts: Counter[str] = Counter()
         self._settings = settings
         self._lines = counting_lines(settings.line_names, settings.line_headings_deg,
@@ -141,7 +141,7 @@ class Traffic:
         Returns
         -------
         list of VehiclePassage or TrafficSummary
-            The passages and summaries that are complete.
+            Completed passages and summaries.
         """
         if not self._lines:
             return []
@@ -164,14 +164,14 @@ class Traffic:
         """Do nothing: no work is deferred."""
 
     def flush(self) -> list[TrafficRecord]:
-        """Return the passages of all tracks and the summary of the current interval.
+        """Return the remaining passages of all tracks and the summary of the current interval.
 
         Returns
         -------
         list of VehiclePassage or TrafficSummary
         """
-        for one in self._open.values():
-            one.ended = True
+        for history in self._open.values():
+            history.ended = True
         out: list[TrafficRecord] = [*self._count_ended(None), *self._intervals.flush()]
         self._ended, self._last_ns = [], None
         self._latest.clear()
@@ -180,18 +180,18 @@ class Traffic:
     def _complete_before(self, now_ns: int) -> int:
         """Time [ns] before which no further crossing can be found."""
         oldest = now_ns - round(MAX_WAIT_S * NS)
-        begins = [max(one.begin_ns, oldest) for one in self._open.values()]
+        begins = [max(history.begin_ns, oldest) for history in self._open.values()]
         return min([now_ns, *begins]) - round(SMOOTHED_LEAD_S * NS)
 
     def _add_records(self, records: Iterable[Track | SmoothedPose | Disturbance]) -> None:
-        """Add poses of tracks, and their ends."""
+        """Add the poses and the ends of tracks."""
         for record in records:
             if isinstance(record, Track):
                 self._add_pose(record)
             elif isinstance(record, SmoothedPose) and record.complete and record.id in self._open:
-                one = self._open[record.id]
-                one.begin_ns = min(one.begin_ns, record.stamp_ns)
-                for path in one.smoothed:
+                history = self._open[record.id]
+                history.begin_ns = min(history.begin_ns, record.stamp_ns)
+                for path in history.smoothed:
                     path.add(record)
 
     def _add_pose(self, track: Track) -> None:
@@ -204,63 +204,64 @@ class Traffic:
             self._open[track.id] = _TrackHistory(track.stamp_ns, track.stamp_ns,
                                                  [CrossingDetector(line) for line in self._lines],
                                                  [CrossingDetector(line) for line in self._lines])
-        one = self._open[track.id]
-        one.last_ns = track.stamp_ns
-        for path in one.published:
+        history = self._open[track.id]
+        history.last_ns = track.stamp_ns
+        for path in history.published:
             path.add(track)
 
     def _count_ended(self, now_ns: int | None) -> list[VehiclePassage]:
-        """Passages of ended tracks that no earlier one can precede; all of them at None."""
-        ended = {id: one for id, one in self._open.items() if one.ended}
+        """Return the passages of ended tracks that none can precede; all if `now_ns` is None."""
+        ended = {id: track for id, track in self._open.items() if track.ended}
         self._ended += ended.values()
-        for id, one in ended.items():
+        for id, track in ended.items():
             del self._open[id]
             crossings = [(path.line, path.crossing()) for path in (
                 smoothed if smoothed.has_pose else published
-                for smoothed, published in zip(one.smoothed, one.published, strict=True))]
+                for smoothed, published in zip(track.smoothed, track.published, strict=True))]
             self.counts['tracks that crossed no line'] += all(c is None for _, c in crossings)
-            self._pending += [_PendingCrossing(c, line, id, one, self._direction_error(c, one))
+            self._pending += [_PendingCrossing(c, line, id, track, self._direction_error(c, track))
                               for line, c in crossings if c is not None]
         self._pending.sort(key=lambda f: f.crossing.stamp_ns)
         n = len(self._pending)
         if now_ns is not None:
             before = self._complete_before(now_ns)
             n = sum(f.crossing.stamp_ns < before for f in self._pending)
-            self._ended = [one for one in self._ended
-                           if now_ns - one.last_ns < MAX_WAIT_S * NS]
+            self._ended = [track for track in self._ended
+                           if now_ns - track.last_ns < MAX_WAIT_S * NS]
         due, self._pending = self._pending[:n], self._pending[n:]
         return [p for p in map(self._passage, due) if p is not None]
 
-    def _direction_error(self, crossing: Crossing, mine: _TrackHistory) -> float:
+    def _direction_error(self, crossing: Crossing, track: _TrackHistory) -> float:
         """Error probability of a direction from the fields; NaN if other vehicles interfere."""
         near = round(INTERFERENCE_S * NS)
-        if any(one is not mine and one.overlaps(crossing.stamp_ns - near, crossing.stamp_ns + near)
-               for one in (*self._open.values(), *self._ended)):
+        if any(other is not track
+               and other.overlaps(crossing.stamp_ns - near, crossing.stamp_ns + near)
+               for other in (*self._open.values(), *self._ended)):
             return float('nan')
         return self._direction.error_probability(crossing)
 
-    def _passage(self, found: _PendingCrossing) -> VehiclePassage | None:
-        """Passage of a crossing; None if the vehicle has been counted already."""
-        crossing, pose, line = found.crossing, found.crossing.pose, found.line
+    def _passage(self, pending: _PendingCrossing) -> VehiclePassage | None:
+        """Create the passage of a crossing; None if the vehicle has already been counted."""
+        crossing, pose, line = pending.crossing, pending.crossing.pose, pending.line
         direction = line.name, crossing.forward
         latest = self._latest.get(direction)
-        if latest is not None and _are_same_vehicle(latest, found):
+        if latest is not None and _are_same_vehicle(latest, pending):
             self.counts['repeated crossings after a lost track'] += 1
             return None
-        self._latest[direction] = found
+        self._latest[direction] = pending
         headway = float('nan') if latest is None else \
             (crossing.stamp_ns - latest.crossing.stamp_ns) / NS
         self.counts['passages'] += 1
         doubts = tuple(name for name, applies in (
             (AMBIGUOUS, pose.ambiguous),
-            (CONTRADICTED, found.direction_error > MAX_DIRECTION_ERROR),
+            (CONTRADICTED, pending.direction_error > MAX_DIRECTION_ERROR),
             (EXTRAPOLATED, crossing.is_extrapolated)) if applies)
         moving = pose.velocity[:2], pose.covariance[3:5, 3:5]
         speed, speed_std = speed_of(*moving)
         posterior = _class_of(pose, self._settings)
         passage = VehiclePassage(
-            crossing.stamp_ns, self.counts['passages'], line.name, found.track_id,
-            crossing.forward, found.direction_error, crossing.position,
+            crossing.stamp_ns, self.counts['passages'], line.name, pending.track_id,
+            crossing.forward, pending.direction_error, crossing.position,
             line.lateral(crossing.position), pose.velocity, speed, speed_std,
             heading_of(*moving)[1], pose.length, pose.length_std, pose.moment,
             pose.moment_covariance, posterior.name, posterior.probabilities,
@@ -271,22 +272,24 @@ class Traffic:
 
 def _are_same_vehicle(one: _PendingCrossing, other: _PendingCrossing) -> bool:
     """Whether two crossings belong to one vehicle whose track was lost near the line."""
-    apart_s = abs(other.crossing.stamp_ns - one.crossing.stamp_ns) / NS
-    apart_m = abs(one.line.lateral(one.crossing.position) - one.line.lateral(
+    separation_s = abs(other.crossing.stamp_ns - one.crossing.stamp_ns) / NS
+    separation_m = abs(one.line.lateral(one.crossing.position) - one.line.lateral(
         other.crossing.position))
     return ((one.crossing.is_extrapolated or other.crossing.is_extrapolated)
-            and apart_s < REACQUIRED_S and apart_m < REACQUIRED_M
+            and separation_s < REACQUIRED_S and separation_m < REACQUIRED_M
             and not one.track.overlaps(other.track.begin_ns, other.track.last_ns))
 
 
-def _check(settings: TrafficSettings) -> None:
-    """Raise SettingsError for lists that differ in length, and for invalid names."""
-    for names, lists in (('line_names', PER_LINE), ('class_names', PER_CLASS)):
+def _check_lists(settings: TrafficSettings) -> None:
+    """Raise SettingsError if lists differ in length or names are invalid."""
+    for names, item, lists in (('line_names', 'line', PER_LINE),
+                               ('class_names', 'class', PER_CLASS)):
         values = getattr(settings, names)
         for name in lists:
             if len(getattr(settings, name)) != len(values):
-                raise SettingsError(f'traffic.{name}: expected {len(values)} values (one per '
-                                    f'{names}), got {len(getattr(settings, name))}')
+                raise SettingsError(f'traffic.{name}: expected {len(values)} value'
+                                    f'{"" if len(values) == 1 else "s"} (one per {item}), '
+                                    f'got {len(getattr(settings, name))}')
         if len(set(values)) < len(values):
             raise SettingsError(f'traffic.{names}: duplicate names in {values}')
         if '' in values or UNKNOWN in values:
@@ -300,13 +303,13 @@ def _is_running(record: Track | SmoothedPose | Disturbance) -> bool:
 
 
 def _class_of(pose: Pose, settings: TrafficSettings) -> ClassPosterior:
-    """Class of a vehicle from the size of its moment, and from its length if it has one."""
-    size = float(np.linalg.norm(pose.moment))
-    if not size > 0.0:
-        shares = np.array(settings.class_shares)
-        return ClassPosterior(UNKNOWN, shares / shares.sum())
-    along = pose.moment / size
-    features = [Feature(size, float(np.sqrt(along @ pose.moment_covariance @ along)),
+    """Classify a vehicle by the magnitude of its moment, and by its length if that is known."""
+    magnitude = float(np.linalg.norm(pose.moment))
+    if not magnitude > 0.0:
+        prior = np.array(settings.class_shares)
+        return ClassPosterior(UNKNOWN, prior / prior.sum())
+    along = pose.moment / magnitude
+    features = [Feature(magnitude, float(np.sqrt(along @ pose.moment_covariance @ along)),
                         settings.class_moments, settings.class_moment_spreads)]
     if pose.length > 0.0:
         features.append(Feature(pose.length, pose.length_std, settings.class_lengths,

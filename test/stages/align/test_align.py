@@ -53,14 +53,14 @@ def test_a_frame_averages_its_samples_and_reduces_the_noise():
 
 
 def test_time_offsets_are_the_mean_sample_times_of_each_sensor():
-    """Samples every 10 ms, those of mag_2 3 ms later; then mag_2 samples only every 30 ms."""
+    """Both sensors sample every 10 ms, mag_2 3 ms later; then mag_2 samples only every 30 ms."""
     frames = feed(stage(), stream(2, 800))
     np.testing.assert_allclose(frames[0].time_offset, [-1.5e-3, 1.5e-3])
     assert frames[0].stamp_ns == 36_500_000
     slow = [s for s in stream(2, 800)
             if s.sensor == 'mag_1' or s.stamp_ns % 30_000_000 == 3_000_000]
     first = feed(stage(), slow)[0]
-    # Samples at 0, 10 .. 70 ms and at 3, 33, 63 ms: the timestamp is the mean of all of them.
+    # The samples are at 0, 10 .. 70 ms and at 3, 33, 63 ms; the timestamp is their mean.
     mean = (280 + 99) / 11 * 1e-3
     np.testing.assert_allclose(first.time_offset, [0.035 - mean, 0.033 - mean], atol=1e-9)
     single = feed(stage(), [s for s in stream(2, 800) if s.sensor == 'mag_1'])
@@ -167,7 +167,7 @@ def test_burst_mode_does_not_mix_rounds_after_a_lost_sample():
 
 
 def test_burst_mode_compares_silent_sensors_with_the_newest_used_sample():
-    """The sample at 10 ms forms a frame of its own, after a frame that reached 150 ms."""
+    """The sample at 10 ms forms a separate frame, after a frame that includes 150 ms."""
     align = stage(2, burst=True, period_s=1.0, max_wait_s=0.05)
     arrivals = [(0, 0), (10, 0), (150, 1), (155, 1)]
     assert [len(align.feed(one(sample(ms, j)))) for ms, j in arrivals] == [0, 0, 2, 1]
@@ -203,7 +203,7 @@ def test_frame_timestamps_increase_and_offsets_preserve_sample_times(seed):
 
 
 class PlainAlign:
-    """Reference implementation, which evaluates all sensors at every sample."""
+    """Reference implementation in plain Python, which evaluates all sensors at every sample."""
 
     def __init__(self, n, s):
         self.n, self.burst, self.max_held, self.counts = n, s.burst, s.max_buffered, Counter()
@@ -313,7 +313,7 @@ def test_frames_and_counts_match_the_reference_at_every_sample(seed):
 @pytest.mark.parametrize('changes', [{}, {'burst': True, 'period_s': 0.5, 'max_wait_s': 2.0},
                                      {'max_wait_s': 3600.0, 'max_buffered': 20}])
 def test_the_cost_of_a_sample_does_not_depend_on_the_number_of_sensors(changes):
-    """Cost in attribute look-ups, with lost samples and a gap of one sensor."""
+    """The cost is measured in attribute look-ups; samples are lost and one sensor has a gap."""
     class CountedAlign(Align):
         lookups = Counter()
         def __getattribute__(self, name):

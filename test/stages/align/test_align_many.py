@@ -1,4 +1,4 @@
-"""Frames do not depend on how samples are split into batches."""
+"""Alignment of batches: frames do not depend on how samples are split into batches."""
 
 from collections import Counter
 
@@ -43,7 +43,7 @@ def test_batches_give_the_same_frames_as_single_samples(seed):
 
 
 def steady(n, n_readings, start=0, without=()):
-    """`Readings` every 10 ms, each with one sample of all sensors except those in `without`."""
+    """Batches every 10 ms, each with one sample from all sensors except the indices `without`."""
     names = tuple(f'mag_{j + 1}' for j in range(n))
     present = np.array([j for j in range(n) if j not in without])
     return [Readings(names, present, np.full(len(present), 10**18 + k * 10**7),
@@ -52,7 +52,7 @@ def steady(n, n_readings, start=0, without=()):
 
 
 class CountedAlignment(core.Alignment):
-    """Counts the reason codes that it returns, over all instances."""
+    """`core.Alignment` that counts the returned reason codes over all instances."""
 
     reasons: Counter[int] = Counter()
 
@@ -63,7 +63,7 @@ class CountedAlignment(core.Alignment):
 
 
 def reasons_of(stage, readings):
-    """Number of returns from compiled code, by reason code."""
+    """Feed readings; return the number of returns from compiled code by reason code."""
     CountedAlignment.reasons.clear()
     for r in readings:
         stage.feed(r)
@@ -75,14 +75,14 @@ def test_a_clock_step_leaves_the_compiled_path_only_temporarily(monkeypatch):
     monkeypatch.setattr(core, 'Alignment', CountedAlignment)
     stage = Align(line_network(4), replace(AlignSettings(), {'max_buffered': 40,
                                                              'max_wait_s': 2.0}))
-    usual = {core.DONE, core.COMPLETE}
-    assert set(reasons_of(stage, steady(4, 100))) == usual
+    compiled_only = {core.DONE, core.COMPLETE}
+    assert set(reasons_of(stage, steady(4, 100))) == compiled_only
     ahead = [Readings(('mag_4',), np.array([0]), np.array([10**18 + 10**10 + k]), np.ones((1, 3)),
                       np.eye(3)[None]) for k in range(3)]
     assert reasons_of(stage, ahead)[core.CLOCK_STEP] == 3
     for r in steady(4, 300, 100, without=(3,)):
         stage.feed(r)
-    assert set(reasons_of(stage, steady(4, 100, 400, without=(3,)))) == usual
+    assert set(reasons_of(stage, steady(4, 100, 400, without=(3,)))) == compiled_only
     for r in steady(4, 200, 500):
         stage.feed(r)
-    assert set(reasons_of(stage, steady(4, 100, 700))) == usual
+    assert set(reasons_of(stage, steady(4, 100, 700))) == compiled_only

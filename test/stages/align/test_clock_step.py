@@ -1,4 +1,4 @@
-"""Clock step filter: distinction between a clock that steps ahead and a gap of all sensors."""
+"""Clock step filter: distinction between a forward clock step and a gap of all sensors."""
 
 from math import inf
 
@@ -11,11 +11,12 @@ from mag_tracking.stages.align.clock_step import ClockStepFilter
 from support.clock_steps import sample, stepped, stream, wild
 
 LIMIT = 500
-"""Maximum jump. All timestamps here are in milliseconds; the filter takes them as nanoseconds."""
+"""Maximum jump. Timestamps in these tests are in milliseconds, although the filter documents
+nanoseconds."""
 
 
 def run(clock_filter, arrivals):
-    """Samples that passed and that were rejected, each as [(sensor, timestamp)]."""
+    """Feed arrivals; return the passed and the rejected samples, each as [(sensor, timestamp)]."""
     passed, rejected = [], []
     for j, t in arrivals:
         accepted, wrong = clock_filter.feed(j, sample(t, j))
@@ -30,7 +31,7 @@ def held(clock_filter):
 
 
 def filter_after(n, until=1000, max_held=10_000, **kwargs):
-    """A `ClockStepFilter` after a stream without clock steps."""
+    """Create a `ClockStepFilter` and feed a stream without clock steps to it."""
     clock_filter = ClockStepFilter(n, LIMIT, max_held)
     run(clock_filter, stream(n, 0, until, **kwargs))
     return clock_filter
@@ -39,7 +40,7 @@ def filter_after(n, until=1000, max_held=10_000, **kwargs):
 @settings(derandomize=True, deadline=None, max_examples=25)
 @given(st.integers(0, 10_000))
 def test_streams_without_clock_steps_pass_immediately(seed):
-    """With late, repeated and unordered samples, gaps of one sensor and short gaps of all."""
+    """Samples may be late, repeated and unordered, with gaps of one sensor and of all sensors."""
     rng = np.random.default_rng(seed)
     n, clock_filter = int(rng.integers(1, 7)), ClockStepFilter(6, LIMIT, 10)
     gap = 1000 + int(rng.integers(0, LIMIT - 60))
@@ -61,7 +62,7 @@ def test_samples_of_a_clock_that_steps_ahead_and_back_are_rejected(n, step):
     passed, rejected = run(clock_filter, arrivals)
     wrong = [a for a, b in zip(arrivals, stream(n, 0, 20_000, step), strict=True) if a != b]
     if n == 2 and step == 1000:
-        # Between two samples of the other sensor, it is alone for longer than samples are held.
+        # Between two samples of the other sensor, the sensor is alone for longer than the limit.
         assert set(rejected) <= set(wrong)
         return
     assert rejected == wrong and len(wrong) == 7000 / step
@@ -101,7 +102,7 @@ def test_sensors_that_have_just_stopped_delay_a_jump_by_the_limit_only():
 
 @pytest.mark.parametrize('max_held', [20, 10_000])
 def test_sensors_that_stop_during_a_clock_step_delay_it_by_the_limit_only(max_held):
-    """The sensor that is ahead was once rejected forever, although no other was left."""
+    """Regression: the sensor that is ahead was rejected forever, although no other was active."""
     clock_filter = filter_after(6, max_held=max_held)
     run(clock_filter, stepped(stream(6, 1000, 3000), {2}, 1500, 9999, by=1000))
     alone = [(2, t) for t in range(4000, 6000, 10)]
@@ -127,7 +128,7 @@ def test_the_majority_of_sensors_decides_which_clocks_stepped(which, is_accepted
 
 
 def test_a_clock_ahead_of_all_stays_held_when_the_others_jump():
-    """All held samples once passed together with the jump of the others."""
+    """Regression: all held samples passed together with the jump of the other sensors."""
     clock_filter = filter_after(4)
     run(clock_filter, [(3, 100_000)])
     passed, rejected = run(clock_filter, stream(3, 3000, 4000))
@@ -136,7 +137,7 @@ def test_a_clock_ahead_of_all_stays_held_when_the_others_jump():
 
 
 def test_a_clock_that_is_ahead_in_its_first_sample_is_rejected_by_majority():
-    """With two sensors the right clock is unknown and both pass; otherwise the majority decides."""
+    """With two sensors, the correct clock is unknown and both pass; else the majority decides."""
     two = ClockStepFilter(2, LIMIT, 10)
     assert run(two, [(0, 0), (1, 5000)]) == ([(0, 0), (1, 5000)], [])
     three = ClockStepFilter(3, LIMIT, 10)
@@ -157,7 +158,7 @@ def test_each_jump_needs_its_own_confirmation():
 
 
 def test_a_timestamp_that_no_sensor_follows_is_held_for_the_limit_only():
-    """It is a single sample of a sensor that then falls silent."""
+    """The timestamp is from a single sample of a sensor that then falls silent."""
     clock_filter = filter_after(3)
     run(clock_filter, [(1, 2000)])
     passed, rejected = run(clock_filter, stream(3, 1000, 1490, skip=(1,)))
@@ -227,7 +228,7 @@ def test_every_sample_passes_or_is_rejected_once_and_in_order(seed):
         for i in range(n):
             own = [stamp for k, stamp in held(clock_filter) if k == i]
             assert len(own) <= max_held
-            # No sample is held longer than the limit, by its own timestamps or those of others.
+            # No sample is held longer than the limit, by the timestamps of any sensor.
             assert not own or min(own) >= own[-1] - LIMIT
         assert all(newest - h[2] <= LIMIT for h in clock_filter.held)
     passed += clock_filter.flush()

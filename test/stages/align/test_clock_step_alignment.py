@@ -1,4 +1,4 @@
-"""Alignment with clocks that step ahead: every sample is used, rejected with a cause, or held."""
+"""Alignment during forward clock steps: each sample is used, rejected with a cause, or held."""
 
 from collections import Counter
 
@@ -53,7 +53,7 @@ def test_every_sample_is_used_rejected_or_held(seed):
 
 
 def test_a_jump_back_with_held_samples_that_jump_back_themselves():
-    """Held samples are aligned before the restart, and may cause restarts themselves."""
+    """Held samples are aligned before the restart, and may cause further restarts."""
     stage = align(3)
     frames = frames_of(stage, [*stream(3, 0, 5000), (1, 60_000), (1, 30_000), (1, 20_000)])
     assert stage.n_held_ahead == 3
@@ -65,7 +65,7 @@ def test_a_jump_back_with_held_samples_that_jump_back_themselves():
 
 
 def test_a_clock_step_leaves_the_frames_of_other_sensors_unchanged():
-    """The frames are those of a network in which that sensor falls silent."""
+    """The frames equal the frames of a network in which the sensor with the step falls silent."""
     arrivals = stream(6, 0, 6000)
     stage, other = align(6), align(6)
     frames = frames_of(stage, stepped(arrivals, {2}, 2000, 4000, by=1000)) + stage.flush()
@@ -115,7 +115,7 @@ def test_counts_name_each_sensor():
 
 
 def test_jumps_are_measured_from_the_newest_timestamp_of_all_sensors():
-    """Samples of one sensor arrive 0.45 s late; those of the other are 0.1 s apart."""
+    """One sensor delivers samples every 0.1 s; the samples of the other arrive 0.45 s late."""
     stage = align(2, period_s=0.1, max_clock_jump_s=0.5, max_wait_s=2.0)
     for k in range(50):
         stage.feed(one(sample((1000 + 100 * k) * MS, 0)))

@@ -1,4 +1,4 @@
-"""Frame period from the geometry of the network, and the warning about a long period."""
+"""Frame period from the geometry of the network, and warning about a long configured period."""
 
 import dataclasses
 

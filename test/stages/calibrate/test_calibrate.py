@@ -36,7 +36,7 @@ def test_a_background_is_not_ready_before_it_is_learnt():
 
 @pytest.mark.parametrize('rate', [1.0, 5.0, 8.0, 10.0, 12.5, 15.0, 25.0, 70.0, 200.0])
 def test_a_background_is_learnt_at_any_sample_rate(rate):
-    # At 10 and 12.5 Hz it once was not: blocks of eight samples did not fit into the interval.
+    # Regression: at 10 and 12.5 Hz, blocks of eight samples did not fit into the interval.
     b = running()
     feed(b, np.arange(0, 3.0 + 24 / rate, 1 / rate))
     assert b.ready
@@ -45,7 +45,7 @@ def test_a_background_is_learnt_at_any_sample_rate(rate):
 
 @pytest.mark.parametrize('rate, at', [(1.0, 20.0), (1.0, 8.0), (2.0, 12.0), (2.0, 6.0)])
 def test_a_target_that_passes_while_learning_does_not_raise_the_noise(rate, at):
-    """A block of a slow sensor can contain a whole pass, which its mean hardly shows."""
+    """A block of a slow sensor can contain a whole pass, which hardly changes the block's mean."""
     def target(t):
         return np.array([3e-6, -2e-6, 1e-6]) / (1 + ((t - at) / 0.8) ** 2) ** 2.5
     b = running()
@@ -184,12 +184,13 @@ SOFT = np.array([[1.02, 0.03, 0.0], [-0.01, 0.97, 0.02], [0.0, 0.04, 1.05]])
 HARD = np.array([4e-6, -3e-6, 7e-6])
 
 
-def corrected(**known):
-    """`Calibrate` for a network with backgrounds and these properties of the second sensor."""
+def corrected(**properties):
+    """Create `Calibrate` for a network with backgrounds and `properties` of the second sensor."""
     n = line_network(2)
-    known = {key: (None, value) for key, value in known.items() if key != 'clock_offset'} | {
-        key: np.array([0.0, known[key]]) for key in known if key == 'clock_offset'}
-    n = dataclasses.replace(n, background=(EARTH, EARTH), **known)
+    properties = {key: (None, value) for key, value in properties.items()
+                  if key != 'clock_offset'} | {
+        key: np.array([0.0, properties[key]]) for key in properties if key == 'clock_offset'}
+    n = dataclasses.replace(n, background=(EARTH, EARTH), **properties)
     return Calibrate(n, CalibrateSettings())
 
 
@@ -198,7 +199,7 @@ def test_the_clock_offset_is_subtracted_from_timestamps():
     (first,), (second,) = fed(s, sample(5.0)), fed(s, sample(5.0213, sensor='mag_2'))
     assert first.stamp_ns == second.stamp_ns == 5_000_000_000
     assert s.last_stamp_ns('mag_2') == 5_000_000_000
-    # The samples of a sensor still have to be in order.
+    # The samples of each sensor must remain in chronological order.
     assert fed(s, sample(5.0213, sensor='mag_2')) == []
     assert rejected(s.counts) == {'duplicate timestamp': 1}
 
@@ -215,7 +216,7 @@ def test_hard_and_soft_iron_of_a_sensor_are_corrected():
     np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
 
 
-def test_the_covariance_is_that_of_the_corrected_field():
+def test_the_covariance_is_transformed_by_the_correction():
     own = np.diag([1e-16, 2e-16, 3e-16])
     (out,) = fed(corrected(correction=SOFT), sample(1.0, sensor='mag_2', covariance=own))
     np.testing.assert_allclose(out.covariance, SOFT @ own @ SOFT.T)
@@ -238,7 +239,7 @@ def test_a_reading_without_an_axis_that_the_correction_needs_is_rejected():
 @pytest.mark.parametrize('C', [np.diag([1.02, 0.97, 1.05]),
                                [[1.02, 0.03, 0.0], [-0.01, 0.97, 0.0], [0.0, 0.0, 1.0]]])
 def test_a_reading_without_an_axis_that_the_correction_ignores_passes(C):
-    """Corrections of a sensor with two axes."""
+    """Only two of the axes are needed for these corrections."""
     s, C = corrected(correction=np.array(C)), np.array(C)
     (out,) = fed(s, sample(1.0, [EARTH[0], EARTH[1], np.nan], 'mag_2'))
     np.testing.assert_allclose(out.field[:2], (C[:2, :2] - np.eye(2)) @ EARTH[:2], atol=1e-18)
@@ -246,7 +247,7 @@ def test_a_reading_without_an_axis_that_the_correction_ignores_passes(C):
 
 
 def test_a_new_calibration_keeps_a_background_that_a_target_has_frozen():
-    """Only the clock offset has changed: the parked car must not become the background."""
+    """Only the clock offset changes, so the parked car must not become the background."""
     network = line_network(1)
     stage = Calibrate(network, CalibrateSettings())
     rng = np.random.default_rng(3)
@@ -267,7 +268,7 @@ def test_a_new_calibration_keeps_a_background_that_a_target_has_frozen():
     assert stage.backgrounds()['mag_1'].frozen and stage.backgrounds()['mag_1'].n_relearnt == 0
     assert len(out) == 1000
     np.testing.assert_allclose(np.mean([s.field for s in out], axis=0), car, atol=1e-8)
-    # Timestamps follow the new clock offset and are accepted as in order.
+    # The timestamps use the new clock offset, and are accepted as chronological.
     assert out[0].stamp_ns == 1000 * 10**7 - 250_000_000
     assert stage.counts['rejected: out of order'] == 0
 
@@ -285,7 +286,7 @@ def test_a_new_hard_iron_offset_restarts_learning():
 
 
 def ends_of_blocks(phase, times):
-    """Indices of the readings that complete a block, and the background, for `times` [s]."""
+    """Feed readings at `times` [s]; return (indices of those that complete a block, background)."""
     background = FedBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase)
     state = background.sensors
     rng, ends, now = np.random.default_rng(0), [], 0
@@ -300,9 +301,9 @@ def ends_of_blocks(phase, times):
 
 
 def test_blocks_of_many_sensors_end_at_staggered_times():
-    """Evaluating the blocks of a hundred sensors at once would delay the readings.
+    """The ends remain staggered when all timestamps have the same jitter.
 
-    The ends stay staggered when all timestamps have the same jitter.
+    Evaluating the blocks of a hundred sensors at once would delay the readings.
     """
     n, n_readings, ends_of_all = 10, 10_000, []
     times = (np.arange(n_readings) + np.random.default_rng(1).uniform(0.0, 0.05, n_readings)) / 100

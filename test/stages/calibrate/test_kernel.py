@@ -1,4 +1,4 @@
-"""Compiled calibration: independent of batches, and equal to an implementation in Python."""
+"""Compiled calibration: independence of batches, and agreement with a Python implementation."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from support.samples import MagSample, batch, one, samples_of
 
 
 def assert_equal(found, expected):
-    """Assert that two lists of samples are equal except for rounding."""
+    """Assert that two lists of samples are equal up to rounding errors."""
     assert [(s.stamp_ns, s.sensor) for s in found] == [(s.stamp_ns, s.sensor) for s in expected]
     for name in ('field', 'covariance'):
         a, b = (np.array([getattr(s, name) for s in some]) for some in (found, expected))
@@ -25,14 +25,17 @@ def assert_equal(found, expected):
 
 
 def batches(samples, size, rng):
-    """Samples as `Readings` of about `size` each."""
+    """Split samples into batches of about `size` readings each."""
     ends = np.cumsum(rng.integers(1, 2 * size, len(samples)))
     return [batch(list(some)) for some in np.split(
         np.array(samples, dtype=object), ends[ends < len(samples)])]
 
 
 def calibrated(stage, items, idles=False):
-    """[MagSample] of batches and of the flush; `idles` calls `idle` in between, as nodes do."""
+    """Calibrate batches and flush the stage; return [MagSample].
+
+    With `idles`, `idle` is called between batches, as by the nodes.
+    """
     out = []
     for k, readings in enumerate(items):
         out += stage.feed(readings)
@@ -42,7 +45,10 @@ def calibrated(stage, items, idles=False):
 
 
 def checked_stage(network, samples, size=20, **settings):
-    """The stage, whose results of single readings and of batches equal those of plain Python."""
+    """Assert that single readings and batches give the same results as plain Python.
+
+    Returns the stage that processed the batches.
+    """
     chosen = CalibrateSettings(**settings)
     plain, single, many = (PlainCalibration(network, chosen), Calibrate(network, chosen),
                            Calibrate(network, chosen))
@@ -69,7 +75,7 @@ def test_a_pass_with_a_fault_matches_plain_python(monkeypatch, fault, is_large_a
 
 
 def corrected(network):
-    """Network with clock offsets, hard iron and soft iron of all sensors except the first."""
+    """Add clock offsets, hard iron and soft iron to all sensors of a network except the first."""
     rng, n = np.random.default_rng(5), len(network)
     return dataclasses.replace(
         network, clock_offset=np.array([0.0, *rng.uniform(-0.02, 0.02, n - 1)]),
@@ -79,7 +85,8 @@ def corrected(network):
 
 
 def suspect_samples(samples, rng):
-    """Samples, some with a missing axis, a covariance, an unknown sensor or an old timestamp."""
+    """Yield samples, some with a missing axis, a covariance, an unknown sensor or an old timestamp.
+    """
     for s in samples:
         kind = rng.integers(60)
         field = s.field.copy()
@@ -125,9 +132,9 @@ def test_later_readings_do_not_modify_earlier_outputs():
     network, samples, *_ = stream(2, 9)
     stage = Calibrate(network, CalibrateSettings())
     outputs = [r for b in batches(samples, 30, np.random.default_rng(0)) for r in stage.feed(b)]
-    kept = [(g.field.copy(), g.covariance.copy()) for g in outputs]
+    copies = [(g.field.copy(), g.covariance.copy()) for g in outputs]
     stage.feed(batch(samples[-2:]))
-    for g, (field, C) in zip(outputs, kept, strict=True):
+    for g, (field, C) in zip(outputs, copies, strict=True):
         np.testing.assert_array_equal(g.field, field)
         np.testing.assert_array_equal(g.covariance, C)
 
@@ -148,7 +155,7 @@ def test_valid_readings_need_python_once_per_block(monkeypatch):
 
 @pytest.mark.parametrize('seed', range(4))
 def test_a_stuck_sensor_is_rejected_after_its_correction(seed):
-    """Its corrected readings are equal to the last bit."""
+    """The corrected readings of the sensor are bitwise identical."""
     rng, network = np.random.default_rng(seed), corrected(line_network(2))
     fields = np.array([2e-6, 1.55e-5, -4.9e-5]) + 1.2e-8 * rng.standard_normal((1600, 3))
     fields[400:] = fields[400]
@@ -212,7 +219,7 @@ def test_decimated_samples_do_not_depend_on_batches(is_recalibrated):
 
 
 def test_corrupt_timestamps_do_not_confirm_each_other():
-    """Each jumps ahead of valid ones; two consecutive ones would be a clock step."""
+    """Each corrupt timestamp is followed by a valid one; two in a row would be a clock step."""
     stage = Calibrate(dataclasses.replace(line_network(1), background=(np.zeros(3),)),
                       CalibrateSettings())
     at_s = [1, 2, 1000, 3, 1001, 4, 1000.5, 5]
@@ -222,7 +229,7 @@ def test_corrupt_timestamps_do_not_confirm_each_other():
     assert stage.counts['calibrated'] == 5
 
 
-def test_a_clock_step_is_confirmed_once_also_with_a_stored_background():
+def test_a_clock_step_is_confirmed_once_even_with_a_stored_background():
     network = dataclasses.replace(line_network(1), background=(np.zeros(3),))
     first = Calibrate(network, CalibrateSettings())
     first.feed(one(MagSample(10**9, 'mag_1', np.full(3, 1e-8))))

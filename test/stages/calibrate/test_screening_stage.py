@@ -1,4 +1,4 @@
-"""Screening for spikes and stuck sensors in the calibration; held readings are never lost."""
+"""Screening for spikes and stuck sensors in the calibration, and counting of held readings."""
 
 import dataclasses
 
@@ -77,7 +77,7 @@ def test_readings_held_at_the_end_pass_and_are_counted():
 
 
 def test_readings_held_at_a_jump_back_in_time_are_counted():
-    """They once were lost without being counted."""
+    """Regression: the held readings were lost without being counted."""
     stage, _ = calibrate()
     feed_a_spike_that_is_held(stage)
     assert len(feed(stage, noise(50), first=-1000)) == 50
@@ -87,7 +87,7 @@ def test_readings_held_at_a_jump_back_in_time_are_counted():
 
 @pytest.mark.parametrize('attribute', ['offset', 'correction', 'clock_offset'])
 def test_readings_held_at_a_new_calibration_are_counted(attribute):
-    """They were corrected with the previous calibration."""
+    """The held readings were corrected by the previous calibration, so they are rejected."""
     stage, network = calibrate()
     feed_a_spike_that_is_held(stage)
     new = {'offset': (np.full(3, 1e-6),), 'correction': (1.01 * np.eye(3),),

@@ -39,8 +39,8 @@ def detector(network, **changes):
     return Detect(network, replace(DetectSettings(), {**exact, **changes}))
 
 
-def test_thresholds_match_the_published_ones():
-    """T10 eq. (5.18), (5.19): threshold 11.2 (11.34 exactly), and half detected at SNR 9.2."""
+def test_thresholds_match_the_published_thresholds():
+    """T10 eq. (5.18), (5.19): threshold 11.2 (exactly 11.34); detection rate 0.5 at SNR 9.2."""
     h = energy_threshold(0.01, 3)
     assert h == pytest.approx(chi2.isf(0.01, 3), rel=1e-12)
     assert false_alarm_probability(h, 3) == pytest.approx(0.01, rel=1e-12)
@@ -49,7 +49,7 @@ def test_thresholds_match_the_published_ones():
 
 
 @pytest.mark.parametrize('p', [1e-2, 1e-3])
-def test_the_false_alarm_rate_is_the_configured_one(p):
+def test_the_false_alarm_rate_is_as_configured(p):
     network, rng, n = line_network(2), np.random.default_rng(7), 60_000
     stage = detector(network, false_alarm_probability=p)
     for k in range(n):
@@ -64,7 +64,7 @@ def test_the_false_alarm_rate_is_the_configured_one(p):
     (1, '3.5e-4 per frame of one sample (12.5 Hz)', 1e-3),
     (8, '1.5e-7 per frame of eight (100 Hz)', 0.05)])
 def test_the_default_false_alarm_probability_is_as_documented(per_frame, documented, tested):
-    """Noise of 12 nT per sample, `per_frame` samples per frame, and the background allowance."""
+    """The noise is 12 nT per sample, with `per_frame` samples per frame and `background_std`."""
     settings, variance = DetectSettings(), SIGMA**2 / per_frame
     wider = 1.0 + settings.background_std**2 / variance
     p = chi2.sf(chi2.isf(settings.false_alarm_probability, 6) * wider, 6)
@@ -72,7 +72,7 @@ def test_the_default_false_alarm_probability_is_as_documented(per_frame, documen
     text, = (f.metadata['doc'] for f in fields(DetectSettings)
              if f.name == 'background_std')
     assert documented in text
-    # The stage itself: at the default or, with eight samples, with enough alarms to count.
+    # Test of the stage. With eight samples, a higher probability gives enough alarms to count.
     network, rng, n = line_network(2), np.random.default_rng(12), 60_000
     stage = Detect(network, replace(settings, {'false_alarm_probability': tested,
                                                'release_probability': 0.05}))
@@ -90,7 +90,7 @@ def test_the_default_false_alarm_probability_is_as_documented(per_frame, documen
 
 @pytest.mark.parametrize('n', studied([40_000, 160_000], [40_000]))
 def test_false_alarm_rate_through_calibration_and_alignment(n):
-    """Raw noise at 100 Hz through calibration with learnt backgrounds and frames at 12.5 Hz."""
+    """Raw noise at 100 Hz is calibrated with learnt backgrounds and aligned to 12.5 Hz frames."""
     network, rng = line_network(2), np.random.default_rng(8)
     calibrate = Calibrate(network, replace(CalibrateSettings(), {'memory_s': 300.0,
                                                                  'learn_s': 60.0}))
@@ -111,7 +111,7 @@ def test_false_alarm_rate_through_calibration_and_alignment(n):
         assert low <= alarms <= high
 
 
-def test_the_detection_rate_is_the_theoretical_one():
+def test_the_detection_rate_matches_theory():
     network, rng, n = line_network(2), np.random.default_rng(9), 20_000
     signal = SIGMA * np.array([[1.0, -2.0, 0.5], [0.0, 1.5, 2.0]])
     snr = float((signal**2).sum() / SIGMA**2)
@@ -123,7 +123,7 @@ def test_the_detection_rate_is_the_theoretical_one():
     assert low <= stage.counts['frames above the threshold'] <= high
 
 
-def test_the_energy_is_that_of_the_present_axes():
+def test_the_energy_includes_only_present_axes():
     C = np.repeat((SIGMA**2 * np.array([[2, 1, 0], [1, 2, 0], [0, 0, 1.0]]))[None], 3, axis=0)
     y = SIGMA * np.array([[1.0, 2.0, 3.0], [1.0, np.nan, 2.0], [np.nan] * 3])
     energy, axes = whitened_energy(y, C)
@@ -142,7 +142,7 @@ def test_the_energy_is_that_of_the_present_axes():
 
 
 def test_the_smallest_pivot_identifies_invalid_covariances():
-    """It has the sign of the smallest eigenvalue, in any unit."""
+    """The pivot has the sign of the smallest eigenvalue, for any units of the axes."""
     rng, n = np.random.default_rng(3), 400
     std = 10.0 ** rng.uniform(-12.0, 3.0, (n, 3, 1))
     C = rng.uniform(-1.0, 1.0, (n, 3, 3))

@@ -1,4 +1,4 @@
-"""Pass events of single sensors: time and direction of a pass, with their uncertainty."""
+"""Pass events of single sensors: time and direction of a pass, and their uncertainties."""
 
 import csv
 import dataclasses
@@ -30,9 +30,10 @@ ONE_AXIS = 'mag_1'
 
 
 def passing(rng, noise=0.0, height=0.0, left_to_right=True, n=200):
-    """(t (n,), field (n, 3), time of the CPA, time scale) of a dipole on a straight path.
+    """Simulate a dipole on a straight path: (t (n,), field (n, 3), time of the CPA, time scale).
 
-    The target passes north of the sensor and x points east, in units of its lateral distance.
+    The target passes north of the sensor, and x points east. The unit of length is the lateral
+    distance.
     """
     speed, t_cpa = rng.uniform(0.5, 3.0), rng.uniform(-1.0, 1.0)
     span = 6.0 * np.hypot(1.0, height) / speed
@@ -57,7 +58,7 @@ def test_the_time_of_the_cpa_of_a_dipole_is_found(axes, noise):
         if np.isfinite(found.time_std):
             ratios.append((found.time - t_cpa) / found.time_std)
             errors.append(abs(found.time - t_cpa) / scale)
-    # The magnetic centre of a dipole is its middle, so the standard deviation is conservative.
+    # A dipole has no offset of its magnetic centre, so the standard deviation is conservative.
     assert len(ratios) > 20 and np.mean(np.abs(ratios) < 3.0) > 0.95
     assert noise > 1e-3 or np.median(errors) < 0.02, np.median(errors)
 
@@ -74,16 +75,16 @@ def test_the_rotation_of_the_field_gives_the_direction_for_any_moment(left_to_ri
 
 @pytest.mark.parametrize('noise', [0.1, 0.3, 0.5])
 def test_the_probability_of_the_direction_is_calibrated(noise):
-    """The mean stated probability equals the share of right directions (PHD15 Paper B)."""
-    rng, stated, right = np.random.default_rng(2), [], []
+    """The mean probability equals the proportion of correct directions (PHD15 Paper B)."""
+    rng, probability, is_correct = np.random.default_rng(2), [], []
     for _ in range(600):
         direction = bool(rng.integers(2))
         _, field, _, _ = passing(rng, noise, 0.0, direction)
         p = rotation_of_pass(field[:, :2], noise, 50).left_to_right
-        stated.append(max(p, 1.0 - p))
-        right.append((p > 0.5) == direction)
+        probability.append(max(p, 1.0 - p))
+        is_correct.append((p > 0.5) == direction)
     # 0.05 is the specified limit, to which three standard deviations of the count are added.
-    assert abs(np.mean(stated) - np.mean(right)) < 0.05 + 3.0 * 0.5 / np.sqrt(600)
+    assert abs(np.mean(probability) - np.mean(is_correct)) < 0.05 + 3.0 * 0.5 / np.sqrt(600)
 
 
 def test_the_direction_does_not_depend_on_the_heading_of_the_sensor():
@@ -103,7 +104,7 @@ def test_too_few_readings_give_no_direction_and_no_cpa():
 
 
 def events_of(readings, network=NETWORK, batch=None):
-    """[PassEvent] of raw readings."""
+    """Calibrate raw readings and create the events; return [PassEvent]."""
     settings = settings_for('vehicle')
     calibrate, stage = Calibrate(network, settings.calibrate), Events(
         network, settings.align, settings.detect)
@@ -117,7 +118,7 @@ def events_of(readings, network=NETWORK, batch=None):
 
 
 def truth_of(name, sensor):
-    """(time of the CPA [ns], whether the vehicle passed from left to right)."""
+    """True (time of the CPA [ns], whether the vehicle passed from left to right)."""
     ((stamps, position, _),) = recorded(name).truth.values()
     r = position - NETWORK.positions[NETWORK.index(sensor)]
     k = int(np.linalg.norm(r, axis=1).argmin())
@@ -141,10 +142,10 @@ def test_a_single_sensor_gives_the_time_and_direction_of_a_pass(name, sensor):
 @pytest.mark.parametrize('name', studied(VEHICLES, kept=('straight_truck_right',)))
 @pytest.mark.parametrize('axis', ['x', 'z'])
 def test_a_single_axis_gives_an_event_without_a_direction(name, axis):
-    """The sensor nearer to the vehicle is used; the other may measure nothing on that axis."""
-    size = {s: np.abs(f - np.median(f, axis=0)).max() for s in NETWORK.names for f in [
+    """The sensor closer to the vehicle is used; the signal of the other may be too weak."""
+    peak = {s: np.abs(f - np.median(f, axis=0)).max() for s in NETWORK.names for f in [
         recorded(name).readings.field[np.array(recorded(name).readings.sensor_names()) == s]]}
-    sensor = max(size, key=size.get)
+    sensor = max(peak, key=peak.get)
     single = NETWORK.part(np.array([NETWORK.index(sensor)]))
     readings = spoiler.apply(recorded(name).readings, spoiler.only_sensor(sensor),
                              spoiler.only_axes(axis))
@@ -231,12 +232,12 @@ def test_two_horizontal_axes_give_the_direction(name):
 
 
 def test_a_long_event_does_not_depend_on_batches():
-    """A target stands beside the sensor for 170 s."""
+    """A target stops near the sensor for 170 s."""
     rng, n = np.random.default_rng(0), 20 * 220
     t = np.arange(n) / 20.0
-    size = 1e-6 / ((1.0 + np.exp(-np.clip((t - 20.0) / 0.3, -50, 50))) * (
+    signal = 1e-6 / ((1.0 + np.exp(-np.clip((t - 20.0) / 0.3, -50, 50))) * (
         1.0 + np.exp(np.clip((t - 190.0) / 0.3, -50, 50))))
-    field = np.array([2e-6, 1.5e-5, -4.9e-5]) + size[:, None] + 1e-8 * rng.standard_normal((n, 3))
+    field = np.array([2e-6, 1.5e-5, -4.9e-5]) + signal[:, None] + 1e-8 * rng.standard_normal((n, 3))
     readings = mt.readings_from_arrays(['mag_1'] * n, (t * 1e9).astype(np.int64), field)
     single = NETWORK.part(np.array([0]))
     found = [events_of(readings, single, batch) for batch in (1, 100, n)]

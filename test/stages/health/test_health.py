@@ -1,4 +1,4 @@
-"""Sensor health and `doctor`: each fault is found and named, and valid sensors have none."""
+"""Sensor health and `doctor`: each fault is reported, and valid sensors have no findings."""
 
 from dataclasses import replace
 
@@ -25,22 +25,22 @@ SIGMA = 1.2e-8
 
 
 def readings(n=3000, rate=100.0, seed=0):
-    """(timestamps [ns], fields) of a valid sensor."""
+    """Simulate a valid sensor; return (timestamps [ns], fields)."""
     rng = np.random.default_rng(seed)
     return (10**18 + (np.arange(n) * NS / rate).astype(np.int64),
             EARTH + SIGMA * rng.standard_normal((n, 3)))
 
 
 def examined(stamps, fields, received=None):
-    """`SensorHealth` of readings."""
+    """Feed readings to a `SensorHealth`, and return it."""
     health = SensorHealth()
     for k, (stamp, field) in enumerate(zip(stamps, fields, strict=True)):
         health.add(int(stamp), field, None if received is None else int(received[k]))
     return health
 
 
-def texts(health, **known):
-    return [str(f) for f in health.findings('mag_1', **known)]
+def texts(health, **arguments):
+    return [str(f) for f in health.findings('mag_1', **arguments)]
 
 
 def test_a_valid_sensor_has_no_findings():
@@ -64,7 +64,7 @@ def test_noise_is_estimated_despite_coarse_steps_or_a_passing_target():
 
 
 def faulty(fault):
-    """(timestamps, fields, times of receipt) of a sensor with a fault."""
+    """Simulate a sensor with a fault; return (timestamps, fields, times of receipt)."""
     stamps, fields = readings()
     received = stamps + 1_000_000
     if fault == 'lost':
@@ -103,11 +103,11 @@ def faulty(fault):
 @pytest.mark.parametrize('fault, serious, message', [
     ('lost', False, 'readings were lost, '),
     ('twice', False, '3000 of 6000 readings repeat the previous timestamp'),
-    ('back', True, 'timestamps went back 1 times'),
-    ('step', True, 'its clock stepped 1 times relative to the host, by up to -1.00 s'),
+    ('back', True, 'timestamps went back once'),
+    ('step', True, 'its clock stepped once relative to the host, by up to -1.00 s'),
     ('late', False, 'ms to arrive'),
     ('ahead', False, 'the delay from timestamp to receipt is -3.0 s'),
-    ('stuck', True, 'readings are identical to all of the 1 s before'),
+    ('stuck', True, 'readings are identical to all readings of the previous 1 s'),
     ('saturated', True, 'are at the end of the range'),
     ('spikes', False, '14 of 3000 readings are spikes'),
     ('dead', True, 'x does not change'),
@@ -118,12 +118,12 @@ def faulty(fault):
 ])
 def test_each_fault_is_named(fault, serious, message):
     health = examined(*faulty(fault))
-    found = health.findings('mag_1', noise_std=np.full(3, SIGMA))
-    match = [f for f in found if message in str(f)]
-    assert len(match) == 1 and match[0].serious == serious, [str(f) for f in found]
+    findings = health.findings('mag_1', noise_std=np.full(3, SIGMA))
+    match = [f for f in findings if message in str(f)]
+    assert len(match) == 1 and match[0].serious == serious, [str(f) for f in findings]
     assert match[0].subject == 'mag_1' and match[0].advice
-    # A timestamp that goes back is a clock step as well.
-    assert len(found) == 1 + (fault == 'back'), [str(f) for f in found]
+    # A backward timestamp is also a clock step.
+    assert len(findings) == 1 + (fault == 'back'), [str(f) for f in findings]
 
 
 def test_a_sensor_with_noise_below_its_resolution_has_no_spikes():
@@ -135,14 +135,14 @@ def test_a_sensor_with_noise_below_its_resolution_has_no_spikes():
 
 
 def test_a_stalled_host_is_not_a_clock_step():
-    """The delayed readings arrive in a burst."""
+    """Readings that are delayed by the host arrive in a burst."""
     stamps, fields = readings()
     received = stamps + 1_000_000
     for first in range(500, 3000, 500):
         until = received[first] + 400_000_000
         received[first:] = np.maximum(received[first:], until)
-    found = texts(examined(stamps, fields, received))
-    assert not any('stepped' in text for text in found), found
+    findings = texts(examined(stamps, fields, received))
+    assert not any('stepped' in text for text in findings), findings
 
 
 def test_lost_readings_are_counted():
@@ -150,7 +150,7 @@ def test_lost_readings_are_counted():
     keep = np.ones(3000, dtype=bool)
     keep[[500, 900, 901, 902, 2000]] = False
     assert examined(stamps[keep], fields[keep]).counts['lost'] == 5
-    # An interval of 1.4 periods is a late reading, one of 1.7 periods contains a lost one.
+    # An interval of 1.4 periods means a late reading; an interval of 1.7 periods, a lost reading.
     for n_periods, lost in ((1.4, 0), (1.7, 1)):
         later = np.array(stamps)
         later[1500:] += round((n_periods - 1.0) * 1e7)
@@ -167,7 +167,7 @@ def test_a_steep_slope_is_not_a_spike():
 def test_saturated_readings_are_counted_once():
     stamps, fields, _ = faulty('saturated')
     clipped = np.isin(fields[:, 1], [1.5e-5, 1.6e-5]).sum()
-    # Their neighbours are suspect and counted as well.
+    # Neighbouring readings are suspect and also counted.
     assert clipped <= examined(stamps, fields).counts['saturated'] <= 200 + 12
 
 
@@ -194,7 +194,7 @@ def test_a_sensor_without_readings_is_reported():
 
 
 def doctor_findings(change=lambda k, field: field, seconds=10.0, **settings):
-    """Findings of `Doctor` for three sensors; `change` modifies the fields of the second."""
+    """Findings of `Doctor` for three sensors; `change` modifies the fields of the second sensor."""
     network = line_network(3)
     doctor = Doctor(network, settings_for('vehicle', settings))
     rng = np.random.default_rng(5)
@@ -204,45 +204,46 @@ def doctor_findings(change=lambda k, field: field, seconds=10.0, **settings):
             if j == 1:
                 field = change(k, field)
             doctor.feed(one(MagSample(10**18 + k * 20_000_000, name, field)))
-    found = doctor.findings()
+    findings = doctor.findings()
     # Serious findings come first.
-    assert found == sorted(found, key=lambda f: not f.serious)
-    return [str(f) for f in found]
+    assert findings == sorted(findings, key=lambda f: not f.serious)
+    return [str(f) for f in findings]
 
 
 def test_a_target_that_stays_causes_no_findings():
-    """Sensors are compared by their backgrounds, which are frozen during the target."""
+    """Sensors are compared by their backgrounds, which are frozen while the target is present."""
     assert doctor_findings(lambda k, field: field + 2e-5 * (k > 750), seconds=25.0) == []
 
 
 def test_the_doctor_compares_sensors_with_the_earth_field():
     assert doctor_findings() == []
-    found = doctor_findings(lambda k, field: field * [1.0, -1.0, 1.0])
-    assert len(found) == 1 and "mag_2: differs from the Earth's field by" in found[0]
-    assert 'y is flipped' in found[0]
-    found = doctor_findings(lambda k, field: field * 1e6)
-    assert any('its unit is microtesla' in text for text in found), found
-    assert any(text.startswith('calibrate: 500 readings rejected: above') for text in found)
+    findings = doctor_findings(lambda k, field: field * [1.0, -1.0, 1.0])
+    assert len(findings) == 1 and "mag_2: differs from the Earth's field by" in findings[0]
+    assert 'y is flipped' in findings[0]
+    findings = doctor_findings(lambda k, field: field * 1e6)
+    assert any('its unit is microtesla' in text for text in findings), findings
+    assert any(text.startswith('calibrate: 500 readings rejected: above') for text in findings)
     # The first spike is not counted, because the noise is not known yet.
     few = doctor_findings(lambda k, field: field * (1e6 if k % 100 == 1 else 1.0), seconds=20.0)
     assert 'mag_2: 9 of 1000 readings are spikes' in few[0] and '10 readings rejected' in few[1]
-    # A large share of rejections is serious and comes first.
+    # A large proportion of rejections is serious and comes first.
     many = doctor_findings(lambda k, field: field * (1e6 if k % 8 == 1 else 1.0), seconds=20.0)
     assert '125 readings rejected' in many[0] and 'are spikes' in many[1]
 
 
 def test_a_background_in_the_file_does_not_hide_a_flipped_axis():
     network = line_network(3)
-    given = tuple(network.R_sw[j] @ network.earth_field for j in range(3))
-    doctor = Doctor(replace(network, background=given), settings_for('vehicle'))
+    backgrounds = tuple(network.R_sw[j] @ network.earth_field for j in range(3))
+    doctor = Doctor(replace(network, background=backgrounds), settings_for('vehicle'))
     rng = np.random.default_rng(6)
     for k in range(600):
         for j, name in enumerate(network.names):
-            field = given[j] * ([1.0, 1.0, -1.0] if j == 2 else np.ones(3))
+            field = backgrounds[j] * ([1.0, 1.0, -1.0] if j == 2 else np.ones(3))
             doctor.feed(one(MagSample(k * 20_000_000, name,
                                       field + SIGMA * rng.standard_normal(3))))
-    found = [str(f) for f in doctor.findings()]
-    assert "mag_3: differs from the Earth's field by" in found[0] and 'z is flipped' in found[0]
+    findings = [str(f) for f in doctor.findings()]
+    assert "mag_3: differs from the Earth's field by" in findings[0]
+    assert 'z is flipped' in findings[0]
 
 
 def test_without_an_earth_field_sensors_are_compared_with_each_other():
@@ -256,8 +257,8 @@ def test_without_an_earth_field_sensors_are_compared_with_each_other():
                 field = network.R_sw[j] @ EARTH * ([1.0, -1.0, 1.0] if j == 1 else np.ones(3))
                 doctor.feed(one(MagSample(k * 20_000_000, name,
                                       field + SIGMA * rng.standard_normal(3))))
-        found = [str(f) for f in doctor.findings()]
-        assert len(found) == 1 and found[0].startswith(message), found
+        findings = [str(f) for f in doctor.findings()]
+        assert len(findings) == 1 and findings[0].startswith(message), findings
 
 
 def test_clocks_far_apart_are_named_and_the_age_of_a_replay_is_not():
@@ -272,14 +273,14 @@ def test_clocks_far_apart_are_named_and_the_age_of_a_replay_is_not():
                 # All timestamps are years old, as in a replay.
                 stamp = received - 10**17 - (offset_ns if j else 0)
                 doctor.feed(one(MagSample(stamp, name, field)), received)
-        found = [str(f) for f in doctor.findings()]
-        assert len(found) == n, found
-        assert not n or found[0].startswith(
+        findings = [str(f) for f in doctor.findings()]
+        assert len(findings) == n, findings
+        assert not n or findings[0].startswith(
             'mag_2: its timestamps differ by -120 s from those of other')
 
 
 def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
-    # A background that was learnt for a short time only would be replaced earlier.
+    # A background that was learnt only for a short time would be replaced earlier.
     steps = doctor_findings(lambda k, field: field + 1e-6 * (k > 1000), seconds=75.0)
     assert len(steps) == 2 and 'its background has been frozen for 5' in steps[1]
     assert 'its background is doubtful' in steps[0]
@@ -292,11 +293,11 @@ def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
 @pytest.mark.parametrize('name', VEHICLES)
 def test_the_doctor_finds_no_faults_in_the_bundled_recordings(name, road_network):
     doctor, lost = examine(Recording(vehicle_path(name)), road_network, settings_for('vehicle'))
-    found = [str(f) for f in doctor.findings()]
+    findings = [str(f) for f in doctor.findings()]
     if name == 'straight_truck_right':
         # The truck passes so close that a sensor reaches its limit of 100 uT.
-        assert found.pop().startswith('mag_2: 9 of 1400 readings are at the end of the range')
-    assert not lost and not found
+        assert findings.pop().startswith('mag_2: 9 of 1400 readings are at the end of the range')
+    assert not lost and not findings
 
 
 def test_the_doctor_reports_saturated_sensors_of_the_corridor(capsys):
@@ -353,9 +354,9 @@ def test_batches_give_the_same_health_as_single_readings():
     for t, f in zip(stamps.tolist(), fields, strict=True):
         single.add(t, f, t + 10**6)
     for begin, end in ((0, 0), (0, 300), (300, 301), (301, 700)):
-        given = stamps[begin:end].copy(), fields[begin:end].copy(), stamps[begin:end] + 10**6
-        many.add_batch(*given)
-        for array in given:
+        arrays = stamps[begin:end].copy(), fields[begin:end].copy(), stamps[begin:end] + 10**6
+        many.add_batch(*arrays)
+        for array in arrays:
             array[:] = 0
     assert many.counts == single.counts and many.counts['readings'] == 700
     assert many.rate == single.rate == pytest.approx(100.0)
@@ -365,36 +366,36 @@ def test_batches_give_the_same_health_as_single_readings():
 
 
 def test_a_reading_buffer_returns_the_readings_of_each_sensor_in_order():
-    """A full buffer accepts no further readings until it has been emptied."""
+    """A full buffer accepts no readings until it has been emptied."""
     rng, buffer = np.random.default_rng(4), ReadingBuffer(5, 8)
     rows, stamps = rng.integers(-1, 5, 300), np.arange(300)
-    fields, found, i = rng.standard_normal((300, 3)), {j: [] for j in range(5)}, 0
+    fields, popped, i = rng.standard_normal((300, 3)), {j: [] for j in range(5)}, 0
     fields[7, 1] = np.nan
 
     def collect(j):
-        found[j] += [(int(t), f.tolist(), int(r)) for t, f, r in zip(*buffer.pop(j), strict=True)]
+        popped[j] += [(int(t), f.tolist(), int(r)) for t, f, r in zip(*buffer.pop(j), strict=True)]
 
     while (i := buffer.add(rows, stamps, fields, 1000, i)) < len(rows):
         collect(rows[i])
     for j in range(5):
         collect(j)
         expected = [(k, fields[k].tolist(), 1000) for k in np.flatnonzero(rows == j).tolist()]
-        assert repr(found[j]) == repr(expected) and len(expected) > 30
+        assert repr(popped[j]) == repr(expected) and len(expected) > 30
 
 
 def test_counts_do_not_depend_on_the_update_interval():
-    """Events between two updates are counted as well."""
+    """Faults between two updates are also counted."""
     rng, fields = np.random.default_rng(5), []
     for k in range(3000):
         stuck = k % 900 > 600
         fields.append(fields[-1] if stuck else 1e-5 + 1e-8 * rng.standard_normal(3))
     stamps = np.cumsum([NS // 100 * (40 if k % 256 == 0 else 1) for k in range(3000)])
-    found = []
+    counts = []
     for update_interval in (1, 64, 256):
         health = SensorHealth(update_interval)
         for t, f in zip(stamps.tolist(), fields, strict=True):
             health.add(t, f)
-        found.append({k: health.counts[k] for k in ('readings', 'lost', 'stuck readings')})
-    assert found[1] == found[2]
-    assert found[0]['stuck readings'] == found[1]['stuck readings'] > 500
-    assert found[1]['lost'] > 300
+        counts.append({k: health.counts[k] for k in ('readings', 'lost', 'stuck readings')})
+    assert counts[1] == counts[2]
+    assert counts[0]['stuck readings'] == counts[1]['stuck readings'] > 500
+    assert counts[1]['lost'] > 300

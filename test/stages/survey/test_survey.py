@@ -26,14 +26,14 @@ CLOCK = np.array([0.0, 0.0213, -0.0087])
 
 
 def nominal(n=3, earth=EARTH, **changes):
-    """Network as stated by its installer: all sensors upright, x to the east."""
+    """Network file before the survey: all sensors are upright, with x to the east."""
     names = tuple(f'mag_{i + 1}' for i in range(n))
     return SensorNetwork(names, np.arange(3.0 * n).reshape(n, 3), np.tile(np.eye(3), (n, 1, 1)),
                          tuple(f'/{name}/imu/mag' for name in names), earth_field=earth, **changes)
 
 
 def readings_of(rotation, offset_s, knocks=(1.2, 2.1), seed=0, noise=0.02, duration=4.0):
-    """Accelerations of a rotated sensor as [(timestamp [ns], (3,) [m/s²])]."""
+    """Simulate accelerations of a rotated sensor, as [(timestamp [ns], (3,) [m/s²])]."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, duration, 0.01) + 0.01 * rng.random()
     level = sum((8.0 * np.exp(-np.abs(t - k) / 0.03) for k in knocks), 0.0 * t)
@@ -44,7 +44,10 @@ def readings_of(rotation, offset_s, knocks=(1.2, 2.1), seed=0, noise=0.02, durat
 
 def surveyed(network=None, rotations=ROTATIONS, change=None, fields=None, settings=None,
              knocks=None):
-    """(NetworkSurvey, Survey) of rotated sensors; `change` modifies {name: readings}."""
+    """Survey rotated sensors; return (NetworkSurvey, Survey).
+
+    `change` modifies {name: readings} before the survey.
+    """
     network = nominal(len(rotations)) if network is None else network
     readings = {name: readings_of(R, offset_s, (1.2, 2.1) if knocks is None else knocks, seed)
                 for seed, (name, R, offset_s) in
@@ -61,30 +64,30 @@ def surveyed(network=None, rotations=ROTATIONS, change=None, fields=None, settin
     return survey.solve(fields, DATE), survey
 
 
-def warnings(found):
-    """{sensor: warnings} of the sensors that have some."""
-    return {s.sensor: s.warnings for s in found.sensors if s.warnings}
+def warnings(result):
+    """{sensor: warnings} of all sensors with warnings."""
+    return {s.sensor: s.warnings for s in result.sensors if s.warnings}
 
 
 def test_orientations_and_clock_offsets_are_found():
-    found, survey = surveyed()
+    result, survey = surveyed()
     assert survey.flush() == [] and dict(survey.counts) == {'accelerations': 1200}
-    assert warnings(found) == {} and found.disagreements == ()
-    assert found.reference == 'mag_1' and found.sensors[0].lag is None
+    assert warnings(result) == {} and result.disagreements == ()
+    assert result.reference == 'mag_1' and result.sensors[0].lag is None
     for j, R in enumerate(ROTATIONS):
-        off = Rotation.from_matrix(found.network.R_ws[j] @ R.as_matrix().T).as_rotvec()
-        # Tilt errors are those of the mean of 400 readings; the heading is drawn to the stated one.
+        off = Rotation.from_matrix(result.network.R_ws[j] @ R.as_matrix().T).as_rotvec()
+        # The tilt is the mean of 400 readings; the heading is biased towards the network file.
         assert np.abs(off[:2]).max() < 1e-3
-        std = found.network.orientation_std[j]
-        # Three sensors that agree make the compass more certain than its prior.
+        std = result.network.orientation_std[j]
+        # Three sensors that agree reduce the compass uncertainty below its prior.
         assert abs(off[2]) < std[2] < np.deg2rad(2.5)
         np.testing.assert_allclose(std[:2], 0.05 / 9.81, rtol=0.01)
-        assert found.network.clock_offset[j] == pytest.approx(CLOCK[j], abs=1e-3)
-        done = found.network.calibrated[j]
-        assert (done.date, done.by) == (DATE, 'accelerometer, compass and stated heading')
-        assert done.clock_offset_std < 1e-3
-    assert found.bias_std < 6e-7
-    t, s = found.shocks['mag_2']
+        assert result.network.clock_offset[j] == pytest.approx(CLOCK[j], abs=1e-3)
+        record = result.network.calibrated[j]
+        assert (record.date, record.by) == (DATE, 'accelerometer, compass and stated heading')
+        assert record.clock_offset_std < 1e-3
+    assert result.bias_std < 6e-7
+    t, s = result.shocks['mag_2']
     assert len(t) == len(s) == 400 and abs(t[0]) < 0.05 and s.max() > 4.0
 
 
@@ -92,167 +95,167 @@ def test_the_stated_heading_is_weighted_by_its_standard_deviation():
     for deg, low, high in ((0.06, 0.0, 0.05), (60.0, 3.9, 4.1)):
         network = nominal(orientation_std=(np.deg2rad([5.0, 5.0, deg]),) * 3)
         rotations = (*ROTATIONS[:2], Rotation.from_euler('z', 4.0, True))
-        found, _ = surveyed(network, rotations if deg > 1.0 else (ROTATIONS[0],) * 3)
-        R = found.network.R_ws[2]
+        result, _ = surveyed(network, rotations if deg > 1.0 else (ROTATIONS[0],) * 3)
+        R = result.network.R_ws[2]
         assert low <= abs(np.degrees(np.arctan2(R[1, 0], R[0, 0]))) <= high
-        assert np.degrees(found.network.orientation_std[2][2]) < 1.1 * min(deg, 2.3)
+        assert np.degrees(result.network.orientation_std[2][2]) < 1.1 * min(deg, 2.3)
 
 
 @pytest.mark.parametrize('yaw', [20.0, 45.0, 90.0, -150.0])
 def test_an_unknown_heading_is_found(yaw):
-    """With a stated_std_deg of 180 degrees, the stated heading has no weight."""
+    """If stated_std_deg is 180 degrees, the heading in the network file has no weight."""
     rotations = (ROTATIONS[0], Rotation.from_euler('z', yaw, True), ROTATIONS[2])
-    found, _ = surveyed(rotations=rotations, settings=SurveySettings(stated_std_deg=180.0))
-    R = found.network.R_ws[1]
+    result, _ = surveyed(rotations=rotations, settings=SurveySettings(stated_std_deg=180.0))
+    R = result.network.R_ws[1]
     assert np.degrees(np.arctan2(R[1, 0], R[0, 0])) == pytest.approx(yaw, abs=0.5)
 
 
 def test_a_survey_without_a_heading_can_be_written(tmp_path):
-    """There is neither an Earth field nor a stated heading."""
-    found, _ = surveyed(nominal(earth=None), settings=SurveySettings(stated_std_deg=180.0))
-    write_network(tmp_path / 'network.yaml', found.network)
-    assert read_network(tmp_path / 'network.yaml').names == found.network.names
+    """The network has neither an Earth field nor a known heading."""
+    result, _ = surveyed(nominal(earth=None), settings=SurveySettings(stated_std_deg=180.0))
+    write_network(tmp_path / 'network.yaml', result.network)
+    assert read_network(tmp_path / 'network.yaml').names == result.network.names
 
 
 def test_tilt_and_clock_offset_are_found_without_an_earth_field():
-    found, _ = surveyed(nominal(earth=None))
-    assert warnings(found) == {}
-    for s, R in zip(found.sensors, ROTATIONS, strict=True):
+    result, _ = surveyed(nominal(earth=None))
+    assert warnings(result) == {}
+    for s, R in zip(result.sensors, ROTATIONS, strict=True):
         assert s.by == 'accelerometer, heading as stated'
         np.testing.assert_allclose(s.orientation.R_ws.T[:, 2], R.as_matrix()[2], atol=1e-3)
         assert np.degrees(s.orientation.std[2]) == pytest.approx(5.0)
-    assert found.network.clock_offset[1] == pytest.approx(CLOCK[1], abs=1e-3)
-    # With two sensors, it is unknown which of them is right.
-    found, _ = surveyed(nominal(2, earth=None), ROTATIONS[:2])
-    assert 'three sensors' in found.sensors[0].warnings[0]
+    assert result.network.clock_offset[1] == pytest.approx(CLOCK[1], abs=1e-3)
+    # With two sensors, it is unknown which sensor is correct.
+    result, _ = surveyed(nominal(2, earth=None), ROTATIONS[:2])
+    assert 'three sensors' in result.sensors[0].warnings[0]
 
 
 def test_a_sensor_without_accelerations_keeps_its_stated_orientation():
-    found, _ = surveyed(change=lambda readings: readings.pop('mag_2'))
-    assert warnings(found) == {
+    result, _ = surveyed(change=lambda readings: readings.pop('mag_2'))
+    assert warnings(result) == {
         'mag_2': ('no accelerations; the orientation is not surveyed',)}
-    s = found.sensors[1]
+    s = result.sensors[1]
     assert (s.orientation, s.by, s.lag) == (None, 'as stated', None)
-    np.testing.assert_array_equal(found.network.R_ws[1], np.eye(3))
-    assert found.network.orientation_std[1] is found.network.calibrated[1] is None
-    assert 'mag_2' not in found.shocks and found.network.clock_offset[1] == 0.0
+    np.testing.assert_array_equal(result.network.R_ws[1], np.eye(3))
+    assert result.network.orientation_std[1] is result.network.calibrated[1] is None
+    assert 'mag_2' not in result.shocks and result.network.clock_offset[1] == 0.0
 
 
 def test_a_survey_without_data_keeps_the_network():
-    found = Survey(nominal(2), SurveySettings()).solve({}, DATE)
-    assert found.reference == '' and found.shocks == {} and found.disagreements == ()
-    assert set(warnings(found)) == {'mag_1', 'mag_2'}
-    np.testing.assert_array_equal(found.network.R_ws, nominal(2).R_ws)
+    result = Survey(nominal(2), SurveySettings()).solve({}, DATE)
+    assert result.reference == '' and result.shocks == {} and result.disagreements == ()
+    assert set(warnings(result)) == {'mag_1', 'mag_2'}
+    np.testing.assert_array_equal(result.network.R_ws, nominal(2).R_ws)
 
 
 def changed(name, function):
-    """`change` that applies a function to the accelerations of one sensor."""
+    """Create a `change` that applies a function to the accelerations of one sensor."""
     def change(readings):
         readings[name] = [(stamp, function(a)) for stamp, a in readings[name]]
     return change
 
 
 def test_accelerations_in_g_are_named():
-    found, _ = surveyed(change=changed('mag_3', lambda a: a / 9.81))
-    assert list(warnings(found)) == ['mag_3']
-    assert 'is its unit g?' in found.sensors[2].warnings[0]
-    assert found.sensors[2].orientation is None
+    result, _ = surveyed(change=changed('mag_3', lambda a: a / 9.81))
+    assert list(warnings(result)) == ['mag_3']
+    assert 'is its unit g?' in result.sensors[2].warnings[0]
+    assert result.sensors[2].orientation is None
     # The knocks still give the clock offset.
-    assert found.network.clock_offset[2] == pytest.approx(CLOCK[2], abs=1e-3)
+    assert result.network.clock_offset[2] == pytest.approx(CLOCK[2], abs=1e-3)
 
 
 def test_clock_offsets_are_unchanged_without_a_knock():
     network = nominal(clock_offset=np.array([0.0, 0.5, -0.5]))
-    found, _ = surveyed(network, knocks=())
-    assert found.reference == ''
-    assert found.warnings() == ['clock offsets are unchanged: the reference measured no knock']
-    np.testing.assert_array_equal(found.network.clock_offset, [0.0, 0.5, -0.5])
-    assert np.isnan(found.network.calibrated[1].clock_offset_std)
+    result, _ = surveyed(network, knocks=())
+    assert result.reference == ''
+    assert result.warnings() == ['clock offsets are unchanged: the reference measured no knock']
+    np.testing.assert_array_equal(result.network.clock_offset, [0.0, 0.5, -0.5])
+    assert np.isnan(result.network.calibrated[1].clock_offset_std)
 
 
 def test_a_sensor_that_measured_no_knock_is_named():
     def quiet(readings):
         readings['mag_1'] = readings_of(ROTATIONS[0], 0.0, ())
-    found, _ = surveyed(change=quiet)
+    result, _ = surveyed(change=quiet)
     # Another sensor becomes the reference.
-    assert found.reference == 'mag_2'
-    assert found.sensors[0].lag.reason == 'the sensor measured no knock'
-    assert found.network.clock_offset[2] == pytest.approx(CLOCK[2] - CLOCK[1], abs=1e-3)
-    assert np.isnan(found.network.calibrated[0].clock_offset_std)
-    assert found.network.calibrated[1].clock_offset_std == 0.0
+    assert result.reference == 'mag_2'
+    assert result.sensors[0].lag.reason == 'the sensor measured no knock'
+    assert result.network.clock_offset[2] == pytest.approx(CLOCK[2] - CLOCK[1], abs=1e-3)
+    assert np.isnan(result.network.calibrated[0].clock_offset_std)
+    assert result.network.calibrated[1].clock_offset_std == 0.0
 
 
 def test_known_clock_offsets_keep_their_common_zero():
-    """mag_1 has no accelerations: its offset relative to the others must not change."""
+    """mag_1 has no accelerations, so its offset relative to the other sensors must not change."""
     network = nominal(clock_offset=CLOCK)
-    found, _ = surveyed(network, change=lambda readings: readings.pop('mag_1'))
-    offset = found.network.clock_offset
+    result, _ = surveyed(network, change=lambda readings: readings.pop('mag_1'))
+    offset = result.network.clock_offset
     np.testing.assert_allclose(offset - offset[0], CLOCK, atol=1e-3)
 
 
 def test_a_tilted_sensor_is_named_and_levelled():
     rotations = (ROTATIONS[0], Rotation.from_euler('x', 30.0, True), ROTATIONS[2])
-    found, _ = surveyed(rotations=rotations)
-    assert warnings(found) == {
+    result, _ = surveyed(rotations=rotations)
+    assert warnings(result) == {
         'mag_2': ('the tilt differs by 30 degrees from the network file',)}
-    np.testing.assert_allclose(found.network.R_ws[1], rotations[1].as_matrix(), atol=0.04)
-    # The Earth field is compared in the surveyed orientation, not in the stated one.
-    assert found.disagreements == ()
-    assert found.sensors[1].by == 'accelerometer, compass and stated heading'
+    np.testing.assert_allclose(result.network.R_ws[1], rotations[1].as_matrix(), atol=0.04)
+    # The Earth field is compared in the surveyed orientation, not in the nominal orientation.
+    assert result.disagreements == ()
+    assert result.sensors[1].by == 'accelerometer, compass and stated heading'
 
 
-def test_a_compass_heading_far_from_the_stated_one_is_named():
+def test_a_compass_heading_far_from_the_stated_heading_is_named():
     rotations = (ROTATIONS[0], Rotation.from_euler('z', 25.0, True), ROTATIONS[2])
-    found, _ = surveyed(rotations=rotations)
-    assert warnings(found) == {'mag_2': (
-        'the compass heading differs by +25 degrees from the network file; the stated heading is '
-        'kept',)}
-    np.testing.assert_allclose(found.network.R_ws[1], np.eye(3), atol=2e-3)
-    assert np.degrees(found.network.orientation_std[1][2]) == pytest.approx(5.0)
-    assert found.sensors[1].by == 'accelerometer, heading as stated'
+    result, _ = surveyed(rotations=rotations)
+    assert warnings(result) == {'mag_2': (
+        'the compass heading differs by +25 degrees from the network file, whose heading is '
+        'retained',)}
+    np.testing.assert_allclose(result.network.R_ws[1], np.eye(3), atol=2e-3)
+    assert np.degrees(result.network.orientation_std[1][2]) == pytest.approx(5.0)
+    assert result.sensors[1].by == 'accelerometer, heading as stated'
 
 
 def test_a_sensor_with_a_flipped_axis_keeps_its_stated_heading():
     fields = {name: R.inv().apply(EARTH) for name, R in
               zip(('mag_1', 'mag_2', 'mag_3'), ROTATIONS, strict=True)}
     fields['mag_3'] = fields['mag_3'] * [1.0, 1.0, -1.0]
-    found, _ = surveyed(fields=fields)
-    (d,) = found.disagreements
+    result, _ = surveyed(fields=fields)
+    (d,) = result.disagreements
     assert (d.sensor, d.explanations) == ('mag_3', ('z is flipped',))
-    R = found.network.R_ws[2]
+    R = result.network.R_ws[2]
     assert abs(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])) < 2e-3
-    # The tilt is that of the accelerometer, which is valid.
+    # The tilt is taken from the accelerometer, which is valid.
     np.testing.assert_allclose(R[2], ROTATIONS[2].as_matrix()[2], atol=1e-3)
-    assert found.sensors[2].by == 'accelerometer, heading as stated'
-    assert found.sensors[1].by == 'accelerometer, compass and stated heading'
-    assert found.bias_std < 6e-7
+    assert result.sensors[2].by == 'accelerometer, heading as stated'
+    assert result.sensors[1].by == 'accelerometer, compass and stated heading'
+    assert result.bias_std < 6e-7
 
 
 def test_a_vertical_field_gives_one_warning_per_sensor():
     up = {name: R.inv().apply([0.0, 0.0, -5e-5]) for name, R in
           zip(('mag_1', 'mag_2', 'mag_3'), ROTATIONS, strict=True)}
-    found, _ = surveyed(nominal(earth=np.array([0.0, 0.0, -5e-5])), fields=up)
-    for s in found.sensors:
+    result, _ = surveyed(nominal(earth=np.array([0.0, 0.0, -5e-5])), fields=up)
+    for s in result.sensors:
         assert s.by == 'accelerometer, heading as stated'
         assert len(s.warnings) == 1 and 'heading is not observable' in s.warnings[0]
 
 
 @pytest.mark.parametrize('stated_yaw', [0.0, 165.0, 180.0, 190.0])
 @pytest.mark.parametrize('off', [-3.0, 2.0])
-def test_the_stated_heading_decides_between_two_that_fit(stated_yaw, off):
-    """A sensor with a single horizontal axis across the field: another heading fits as well."""
+def test_the_stated_heading_decides_between_two_headings_that_fit(stated_yaw, off):
+    """For a sensor with a single horizontal axis across the field, two headings fit."""
     yaw = stated_yaw + off
     network = nominal()
     network.R_ws[1] = rotation_about_z(np.deg2rad(stated_yaw))
     rotations = (ROTATIONS[0], Rotation.from_euler('z', yaw, True), ROTATIONS[2])
     fields = {name: R.inv().apply(EARTH) for name, R in zip(network.names, rotations, strict=True)}
     fields['mag_2'] = fields['mag_2'] * [1.0, np.nan, np.nan]
-    found, _ = surveyed(network, rotations, fields=fields)
-    assert found.sensors[1].by == 'accelerometer, compass and stated heading'
-    away = np.degrees(Rotation.from_matrix(
-        found.network.R_ws[1] @ rotations[1].as_matrix().T).as_rotvec())
-    assert np.abs(away).max() < 2.0
-    assert 'allows another heading' in found.sensors[1].warnings[0]
+    result, _ = surveyed(network, rotations, fields=fields)
+    assert result.sensors[1].by == 'accelerometer, compass and stated heading'
+    error = np.degrees(Rotation.from_matrix(
+        result.network.R_ws[1] @ rotations[1].as_matrix().T).as_rotvec())
+    assert np.abs(error).max() < 2.0
+    assert 'allows another heading' in result.sensors[1].warnings[0]
 
 
 def test_invalid_accelerations_are_counted_and_memory_is_bounded():
@@ -274,23 +277,23 @@ def test_a_jump_back_in_time_discards_earlier_accelerations():
     def loops(readings):
         readings['mag_2'] = ([(stamp + 60_000_000_000, a + [3.0, 0.0, -0.5])
                               for stamp, a in readings['mag_2']] + readings['mag_2'])
-    found, survey = surveyed(change=loops)
+    result, survey = surveyed(change=loops)
     assert survey.counts['time jumped'] == 1
-    assert len(found.shocks['mag_2'][0]) == 400
-    np.testing.assert_allclose(found.network.R_ws[1][2], ROTATIONS[1].as_matrix()[2], atol=1e-3)
-    assert found.network.clock_offset[1] == pytest.approx(CLOCK[1], abs=1e-3)
+    assert len(result.shocks['mag_2'][0]) == 400
+    np.testing.assert_allclose(result.network.R_ws[1][2], ROTATIONS[1].as_matrix()[2], atol=1e-3)
+    assert result.network.clock_offset[1] == pytest.approx(CLOCK[1], abs=1e-3)
 
 
 def test_calibration_records_are_replaced_for_surveyed_sensors_only():
     before = CalibrationRecord('2025-01-01', 'by hand', np.nan)
-    found, _ = surveyed(nominal(calibrated=(before,) * 3),
+    result, _ = surveyed(nominal(calibrated=(before,) * 3),
                         change=lambda readings: readings.pop('mag_3'))
-    assert [c.date for c in found.network.calibrated] == [DATE, DATE, '2025-01-01']
-    assert found.network.calibrated[2] is before
+    assert [c.date for c in result.network.calibrated] == [DATE, DATE, '2025-01-01']
+    assert result.network.calibrated[2] is before
 
 
 def imu_network(**changes):
-    """Network of the bundled recordings with two sensors."""
+    """Network with the two sensors and IMU topics of the bundled recordings."""
     return replace(nominal(2), imu_topics=tuple(f'/mag_{i}/imu/data_raw' for i in (1, 2)),
                    **changes)
 
@@ -314,20 +317,20 @@ def test_fields_and_accelerations_are_read_together():
 
 
 def test_an_accelerometer_that_two_sensors_share_serves_both():
-    """Two magnetometers on one board."""
+    """The network has two magnetometers on one board with one accelerometer."""
     _, records = read(replace(imu_network(), imu_topics=('/mag_1/imu/data_raw',) * 2))
     samples = [r.sensor for r in records if isinstance(r, AccelerationSample)]
     assert samples.count('mag_1') == samples.count('mag_2') > 0
 
 
 def test_sensors_on_their_side_are_surveyed():
-    """Their stated orientation is on the side as well."""
+    """The network file also describes the sensors as lying on their side."""
     side = Rotation.from_euler('x', 90.0, True)
     rotations = tuple(R * side for R in ROTATIONS)
     network = replace(nominal(), R_ws=np.tile(side.as_matrix(), (3, 1, 1)))
-    found, _ = surveyed(network, rotations)
-    assert warnings(found) == {}
-    for R, truth in zip(found.network.R_ws, rotations, strict=True):
+    result, _ = surveyed(network, rotations)
+    assert warnings(result) == {}
+    for R, truth in zip(result.network.R_ws, rotations, strict=True):
         off = Rotation.from_matrix(R @ truth.as_matrix().T).as_rotvec()
         assert np.abs(off[:2]).max() < 1e-3 and abs(off[2]) < np.deg2rad(1.5)
 
@@ -348,14 +351,14 @@ def test_the_result_rotates_with_the_world_frame():
 def test_clocks_decades_apart_do_not_fill_the_memory():
     def of_1970(readings):
         readings['mag_2'] = [(stamp - START, a) for stamp, a in readings['mag_2']]
-    found, _ = surveyed(change=of_1970)
-    assert found.reference == 'mag_1' and found.sensors[2].lag.reason == ''
-    assert 'the knocks are 1.79e+09 s apart' in found.sensors[1].lag.reason
-    assert found.network.clock_offset[1] == 0.0
+    result, _ = surveyed(change=of_1970)
+    assert result.reference == 'mag_1' and result.sensors[2].lag.reason == ''
+    assert 'the knocks are 1.79e+09 s apart' in result.sensors[1].lag.reason
+    assert result.network.clock_offset[1] == 0.0
 
 
 def test_the_result_of_an_earlier_survey_is_not_counted_as_evidence():
-    """The same readings, surveyed from the first result, give that result again."""
+    """A survey with the same readings, starting from the first result, reproduces that result."""
     first, _ = surveyed(nominal(orientation_std=(np.deg2rad([4.0, 4.0, 6.0]),) * 3))
     again, _ = surveyed(first.network)
     for name in ('R_ws', 'clock_offset'):

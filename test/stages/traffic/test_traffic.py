@@ -1,4 +1,4 @@
-"""Traffic counting: passages of counting lines, their order, and the check by the fields."""
+"""Traffic counting: passages of counting lines, their order, and the check of the direction."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ STEP = 0.1
 
 
 def drive(begin_s, end_s, at_s, v=10.0, y=-1.5, **changes):
-    """{step: [pose]} of a vehicle that crosses the line at `at_s`; the last pose ends the track."""
+    """Records {step: [Track]} of a vehicle that crosses the line at `at_s`, including the end."""
     steps = range(round(begin_s / STEP), round(end_s / STEP) + 1)
     out = {k: [track_pose(k * STEP, v * (k * STEP - at_s), y, v, **changes)] for k in steps}
     out[steps[-1]].append(replace(out[steps[-1]][0], ended=True))
@@ -33,7 +33,7 @@ def drive(begin_s, end_s, at_s, v=10.0, y=-1.5, **changes):
 
 
 def counted(*drives, settings=None, last_s=30.0, field_at=None, network=NETWORK, first_s=0.0):
-    """(records, `Traffic`) of vehicles in consecutive frames."""
+    """Feed the tracks of vehicles in consecutive frames; return (records, `Traffic`)."""
     stage, out = Traffic(network, settings or TrafficSettings()), []
     for k in range(round(first_s / STEP), round(last_s / STEP) + 1):
         field = None if field_at is None else field_at(k * STEP)
@@ -108,7 +108,7 @@ def test_two_vehicles_that_meet_are_both_counted(ends):
     assert all(np.isnan(p.direction_error) for p in passages(records))
 
 
-def test_a_passage_is_that_of_the_smoothed_path():
+def test_a_passage_is_computed_from_the_smoothed_path():
     car = drive(2.0, 6.0, 4.0)
     car[60] += [smoothed_pose(t, 12.0 * (t - 3.9), v=12.0) for t in np.arange(2.0, 6.0, STEP)]
     (p,) = passages(counted(car)[0])
@@ -156,7 +156,7 @@ def test_several_lines_count_separately():
 
 
 def test_a_restart_at_an_earlier_time_gives_no_negative_headway():
-    """The frames stop, and the recording starts again at an earlier time."""
+    """The frames end, and the recording starts again at an earlier time."""
     stage, out = Traffic(NETWORK, TrafficSettings()), []
     for shift in (20.0, 0.0):
         car = drive(2.0, 6.0, 4.0, id=1 + int(shift == 0.0))
@@ -190,7 +190,7 @@ def test_tracks_that_end_without_a_frame_are_counted():
 
 
 def field_of(direction):
-    """Field of a dipole that moves along x at 10 m/s and crosses the line at 4 s."""
+    """Field of a dipole that moves along x (`direction` 1 or -1) and crosses the line at 4 s."""
     def at(t):
         r = NETWORK.positions - [direction * 10.0 * (t - 4.0), -1.5, 0.2]
         return dipole_field(r, np.array([300.0, 200.0, -300.0])) + 1e-9 * np.sin(50.0 * t)
@@ -257,7 +257,7 @@ def test_no_interval_is_returned_twice():
 
 
 def test_passages_do_not_wait_indefinitely_for_a_standing_vehicle():
-    """The vehicle stands for 400 s while others pass."""
+    """The vehicle stops for 400 s while other vehicles pass."""
     stage, n = Traffic(NETWORK, TrafficSettings()), 0
     for k in range(4000):
         records = [track_pose(k * STEP, -8.0, id=99)]
@@ -283,8 +283,8 @@ def test_magnets_are_not_counted():
 
 
 @pytest.mark.parametrize(('changes', 'message'), [
-    ({'line_offsets': (0.0, 1.0)}, r'traffic.line_offsets: expected 1 values'),
-    ({'class_lengths': (3.0,)}, r'traffic.class_lengths: expected 3 values'),
+    ({'line_offsets': (0.0, 1.0)}, r'line_offsets: expected 1 value \(one per line\), got 2'),
+    ({'class_lengths': (3.0,)}, r'class_lengths: expected 3 values \(one per class\), got 1'),
     ({'class_names': ('car', 'car', 'truck')}, 'duplicate names'),
     ({'class_names': ('car', 'unknown', 'truck')}, "'unknown' is not a valid name"),
     ({'line_names': ('',)}, 'is not a valid name')])
