@@ -74,8 +74,8 @@ def main():
         run = archive([ROOT / 'test' / 'data' / 'vehicles'],
                       mt.read_network(ROOT / 'config' / 'network.yaml'), settings_for('vehicle'),
                       folder, workers=2, report=print)
-        print(f'{len(run.done)} recordings archived in {folder}, {len(run.already_done)} already '
-              'complete')
+        print(f'{len(run.done)} recordings archived in {folder}, {len(run.tracked_earlier)} '
+              'already complete')
     connection = tables_of(folder)
     for question, sql in QUESTIONS.items():
         print(f'\n{question}\n{connection.sql(sql)}')

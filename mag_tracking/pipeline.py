@@ -143,7 +143,7 @@ class Pipeline:
             Frames, detections, tracks and further records, in order of processing.
         """
         calibrated = self._calibrate.feed(readings)
-        self.track.doubt(self.calibrate.doubtful_intervals())
+        self.track.set_doubtful_times(self.calibrate.doubtful_intervals())
         return self._process_calibrated(calibrated)
 
     def flush(self) -> list[Output]:

@@ -13,7 +13,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, TypeVar
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.yaml_file import is_text, read_yaml, shown
+from mag_tracking.yaml_file import is_text, read_yaml, short_repr
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -148,11 +148,11 @@ def _scalar(name: str, value: object, kind: _Class) -> Scalar:
     if kind is int and isinstance(value, int) and not isinstance(value, bool):
         return value
     if kind is str and isinstance(value, str) and not is_text(value):
-        raise SettingsError(f'{name}: {shown(value)} is not text: it contains an unpaired '
+        raise SettingsError(f'{name}: {short_repr(value)} is not text: it contains an unpaired '
                             'surrogate')
     if kind in (bool, str) and isinstance(value, kind):
         return value
-    raise SettingsError(f'{name}: expected {kind.__name__}, got {shown(value)}')
+    raise SettingsError(f'{name}: expected {kind.__name__}, got {short_repr(value)}')
 
 
 def _validated(p: Parameter, value: object) -> Value:
@@ -160,7 +160,7 @@ def _validated(p: Parameter, value: object) -> Value:
     if p.element is not None:
         if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
             raise SettingsError(f'{p.name}: expected a list of {p.element.__name__}, '
-                                f'got {shown(value)}')
+                                f'got {short_repr(value)}')
         values = tuple(_scalar(p.name, v, p.element) for v in value)
         if p.length is not None and len(values) != p.length:
             raise SettingsError(f'{p.name}: expected {p.length} values, got {len(values)}')
@@ -171,7 +171,7 @@ def _validated(p: Parameter, value: object) -> Value:
     for v in values:
         if p.choices and v not in p.choices:
             raise SettingsError(f'{p.name}: expected {", ".join(p.choices[:-1])} or '
-                                f'{p.choices[-1]}, got {shown(v)}')
+                                f'{p.choices[-1]}, got {short_repr(v)}')
         if isinstance(v, float) and math.isnan(v):
             raise SettingsError(f'{p.name}: NaN is not a valid value')
         if isinstance(v, str) or p.range is None:
@@ -197,8 +197,8 @@ def _merge(out: dict[str, Any], more: Mapping[str, Any]) -> None:
     """Merge `more` into `out`; raises SettingsError if a setting has two different values."""
     for name, value in more.items():
         if out.setdefault(name, value) is not value and out[name] != value:
-            raise SettingsError(f'{name} is given twice, as {shown(out[name])} and as '
-                                f'{shown(value)}')
+            raise SettingsError(f'{name} is given twice, as {short_repr(out[name])} and as '
+                                f'{short_repr(value)}')
 
 
 def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
@@ -235,7 +235,7 @@ def _unknown_message(name: str, value: object, known: Iterable[str]) -> str:
     members = [k for k in known if k.startswith(f'{name}.')]
     if members:
         return (f'{name} is a group of settings, such as {members[0]}; expected a mapping, got '
-                f'{"nothing" if value is None else shown(value)}')
+                f'{"nothing" if value is None else short_repr(value)}')
     return f'unknown setting {name}{_suggestion(name, known)}'
 
 
@@ -310,7 +310,7 @@ def read_parameter_file(path: str | PathLike[str]) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, Mapping):
-        raise SettingsError(f'{path}: expected a mapping of settings, got {shown(content)}')
+        raise SettingsError(f'{path}: expected a mapping of settings, got {short_repr(content)}')
     try:
         return _merged_sections(content)
     except SettingsError as error:
@@ -354,7 +354,7 @@ def _merged_sections(content: Mapping[str, Any]) -> dict[str, Any]:
         section = node.get('ros__parameters') if isinstance(node, Mapping) else None
         if name not in nodes or len(node) > 1 or not isinstance(section, Mapping | None):
             raise SettingsError(f'{name}: expected only a mapping under ros__parameters, as for '
-                                f'{nodes[0]}, got {shown(node)}')
+                                f'{nodes[0]}, got {short_repr(node)}')
         _merge(joined, _flattened(section or {}))
     return joined
 

@@ -38,7 +38,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
             key = self.construct_object(key_node, deep=True)
             line = key_node.start_mark.line + 1
             if not isinstance(key, Hashable):
-                raise yaml.YAMLError(f'{shown(key)} is not a valid key (line {line})')
+                raise yaml.YAMLError(f'{short_repr(key)} is not a valid key (line {line})')
             if key in seen:
                 raise yaml.YAMLError(f'duplicate key {key} (line {line})')
             seen.add(key)
@@ -166,7 +166,7 @@ class _ShortRepr(Repr):
         self.maxlist = self.maxtuple = self.maxdict = 20
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """Representation of a value for an error message.
 
     Parameters

@@ -73,9 +73,9 @@ def policies(namespace='/'):
                 ElementTree.SubElement(enclave, 'profiles'), 'profile', {
                     'ns': namespace, 'node': name})
             add_rules(profile, 'topics', 'publish', [p.topic_name for p in node.publishers]
-                + ['/rosout', '/parameter_events'])
+                      + ['/rosout', '/parameter_events'])
             add_rules(profile, 'topics', 'subscribe', [s.topic_name for s in node.subscriptions]
-                + ['/clock'])
+                      + ['/clock'])
             add_rules(profile, 'services', 'reply', [s.service_name for s in node.services])
             node.destroy_node()
     ElementTree.indent(root)

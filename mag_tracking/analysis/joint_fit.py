@@ -224,7 +224,7 @@ class _JointFits:
             for found in theta]), np.inf)
         # If all minima without overlap are much worse, keep the overlap; `fit_targets` rejects it.
         cost = _exclude_solutions(cost, np.array([are_separate(self._rough, split(found))
-                                              for found in theta]), MAX_COST_RATIO)
+                                                  for found in theta]), MAX_COST_RATIO)
         found = fine_minimum(fine, theta, cost, np.concatenate(
             [PATH_TOLERANCE[:6 + (n > 1)] for n in orders]), N_FINE)
         if not np.isfinite(found.cost):

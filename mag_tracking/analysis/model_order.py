@@ -33,7 +33,7 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
     highest_order = max(usable, key=lambda f: f.n_dipoles)
     excess = max(1.0, highest_order.normalised_cost)
     criteria: FloatArray = np.array([f.cost / excess + f.n_unknowns * np.log(f.data.n_values)
-                         if f.determined else np.inf for f in fits])
+                                     if f.determined else np.inf for f in fits])
     relative: FloatArray = criteria - criteria.min()
     return relative
 

@@ -367,7 +367,7 @@ class NormalEquations:
         """Information (N, N) that is lost by the elimination of the poses."""
         N = len(self.g)
         lost: FloatArray = (np.swapaxes(CB, 0, 1).reshape(N, -1)
-                             @ np.swapaxes(self.C, 0, 1).reshape(N, -1).T)
+                            @ np.swapaxes(self.C, 0, 1).reshape(N, -1).T)
         return lost
 
     def _damped(self, damping: float) -> tuple[FloatArray, FloatArray]:

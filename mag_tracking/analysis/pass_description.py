@@ -219,7 +219,7 @@ def assignment(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tup
         For each path, the index of the matching path in `others`.
     """
     distance = [[float(np.square((other[:6] - path[:6]) / PATH_TOLERANCE[:6]).sum())
-             for other in others] for path in paths]
+                 for other in others] for path in paths]
     return min(permutations(range(len(paths))),
                key=lambda order: sum(distance[k][i] for k, i in enumerate(order)))
 

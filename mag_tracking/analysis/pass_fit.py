@@ -188,7 +188,7 @@ def shorter_rows(path: FloatArray) -> FloatArray:
     """
     rows = []
     for ratio, offset in ((0.7, 0.15), (0.7, 0.0), (0.7, -0.15), (0.4, 0.25), (0.4, 0.0),
-                         (0.4, -0.25), (0.1, 0.0), (1.5, 0.0)):
+                          (0.4, -0.25), (0.1, 0.0), (1.5, 0.0)):
         row = path.copy()
         row[:3] += offset * path[6] * path[3:6] / np.linalg.norm(path[3:6])
         row[6] *= ratio

@@ -84,7 +84,7 @@ def fuse_mounting(network: SensorNetwork, prior_std: Iterable[FloatArray],
     covariance = np.linalg.inv(information)
     if information_vectors:
         rotation = np.einsum('jik,jk->ji', covariance,
-                         np.sum(information_vectors, axis=0) / inflation[:, None])
+                             np.sum(information_vectors, axis=0) / inflation[:, None])
     return MountingEvidence(rotation, covariance, scatter, len(tracks))
 
 
@@ -96,7 +96,7 @@ def _remove_negative_eigenvalues(information: FloatArray) -> FloatArray:
 
 
 def _track_scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], rotation: FloatArray,
-             covariance: FloatArray) -> FloatArray:
+                   covariance: FloatArray) -> FloatArray:
     """Mean squared normalised difference (n_sensors,) between each track and the fused estimate."""
     squares, freedom = np.zeros(len(rotation)), np.zeros(len(rotation))
     for gain, pull in zip(gains, pulls, strict=True):
@@ -111,7 +111,7 @@ def _track_scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], rot
     return scatter
 
 
-def with_evidence(network: SensorNetwork, evidence: MountingEvidence) -> SensorNetwork:
+def with_pass_mounting(network: SensorNetwork, evidence: MountingEvidence) -> SensorNetwork:
     """Correct the orientations of a network.
 
     Parameters

@@ -65,7 +65,7 @@ def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, gro
     joint_fits = fit_joint(data, paths, ground, orders, stopped=stopped)
     if not joint_fits:
         return (_reject(alone, n_targets,
-                         'there are too few measurements to fit them together'),)
+                        'there are too few measurements to fit them together'),)
     best, single = [_best_fit(fits) for fits in joint_fits], _best_fit(alone)
     if not single.reason and single.length[0] <= MAX_LENGTH and all(
             fit.determined for fit in best) and (

@@ -114,7 +114,7 @@ def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: Flo
         return size2
 
     plausible = sum((_plausible_residual_fraction(data, row) * energy(row.field) for row in rows),
-                np.zeros(len(residuals)))
+                    np.zeros(len(residuals)))
     excess = np.square(residuals).sum(axis=1) - plausible - NOISE_ENERGY
     total = energy(np.sum([row.field for row in rows], axis=0))
     return float(np.maximum(excess, 0.0).sum() / total.sum())

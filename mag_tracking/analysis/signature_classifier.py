@@ -86,7 +86,7 @@ class SignatureModel:
         (n,) bool array
         """
         known: FloatArray = _squared_distances(self._standardise(x), self.centres,
-                                       self.precision).min(axis=1) <= self.limit
+                                               self.precision).min(axis=1) <= self.limit
         return known
 
     def names(self, x: FloatArray) -> list[str]:
@@ -128,7 +128,7 @@ class Evaluation:
     """(n_sets, n_classes) recall of each class; NaN for a class without test signatures."""
     unknown: FloatArray
     """(n_sets,) fraction of `unknown` predictions."""
-    reliability: float
+    expected_calibration_error: float
     """Expected calibration error: mean absolute difference between predicted probability and
     accuracy over bins of the probability, weighted by the number of predictions."""
 
@@ -260,7 +260,7 @@ def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]'
 
 def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
                     axes: tuple[str, ...], unit: str, n_splits: int = 20,
-                    test_share: float = 0.3, progress: Any = iter) -> Evaluation:
+                    test_fraction: float = 0.3, progress: Any = iter) -> Evaluation:
     """Train and test on stratified random splits.
 
     Method, penalty and temperature are selected within the training part of each split.
@@ -274,7 +274,7 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
         As for `train`.
     n_splits : int
         Number of random splits.
-    test_share : float
+    test_fraction : float
         Fraction of each class in the test part.
     progress : function
         Wraps the iterator over the splits.
@@ -294,7 +294,7 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
     y, g = np.array(labels), np.array(groups)
     parts = []
     for seed in progress(range(n_splits)):
-        inside, outside = _random_split(y, g, test_share, seed)
+        inside, outside = _random_split(y, g, test_fraction, seed)
         model = train(x[inside], y[inside].tolist(), g[inside].tolist(), axes, unit, seed)
         parts.append((model, x[outside], y[outside]))
     return _evaluate_parts(parts)
@@ -342,10 +342,11 @@ def _evaluate_parts(parts: Sequence[tuple[SignatureModel, FloatArray, Any]]) -> 
     recalls = np.array(recall)
     return Evaluation(classes, len(parts[0][2]), max(Counter(y.tolist()).values()) / len(y),
                       np.array(accuracy), np.nanmean(recalls, axis=1), recalls, np.array(unknown),
-                      reliability_error(np.array(probability), np.array(correct)))
+                      expected_calibration_error(np.array(probability), np.array(correct)))
 
 
-def reliability_error(probability: FloatArray, correct: FloatArray, n_bins: int = 10) -> float:
+def expected_calibration_error(probability: FloatArray, correct: FloatArray, n_bins: int = 10
+                               ) -> float:
     """Expected calibration error of predictions.
 
     Parameters
@@ -409,13 +410,14 @@ def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
     return folds.split(np.zeros(len(y)), y, np.array(groups))
 
 
-def _random_split(y: Any, groups: Any, test_share: float, seed: int) -> tuple[IntArray, IntArray]:
+def _random_split(y: Any, groups: Any, test_fraction: float, seed: int
+                  ) -> tuple[IntArray, IntArray]:
     """Stratified random split of whole groups: indices of training and test examples."""
     rng, test_groups = np.random.default_rng(seed), set[str]()
     for name in np.unique(y):
         class_groups = rng.permutation(np.unique(groups[y == name]))
         # At least the minimum number of examples must remain in the training part.
-        n = min(max(1, round(test_share * len(class_groups))),
+        n = min(max(1, round(test_fraction * len(class_groups))),
                 max(len(class_groups) - MIN_SAMPLES, 0))
         test_groups |= set(class_groups[:n].tolist())
     outside = np.isin(groups, list(test_groups))
@@ -439,7 +441,7 @@ def _held_out_distances(z: FloatArray, y: IntArray, inside: IntArray,
     """Squared distances of held-out examples to their own class."""
     centres, precision = _class_statistics(z[inside], y[inside])
     own: FloatArray = _squared_distances(z[outside], centres, precision)[np.arange(len(outside)),
-                                                                 y[outside]]
+                                                                         y[outside]]
     return own
 
 

@@ -34,7 +34,7 @@ class ArchiveRun:
 
     done: list[Path] = field(default_factory=list)
     """Recordings tracked in this run."""
-    already_done: list[Path] = field(default_factory=list)
+    tracked_earlier: list[Path] = field(default_factory=list)
     """Recordings tracked by an earlier run."""
     failed: dict[Path, str] = field(default_factory=dict)
     """Recordings that could not be tracked: {recording: reason}."""
@@ -179,7 +179,7 @@ def archive(recordings: Iterable[str | PathLike[str]],
             if entry is None:
                 remaining.append(path)
             else:
-                run.already_done.append(path)
+                run.tracked_earlier.append(path)
                 if progress is not None:
                     progress(entry['size'])
         try:

@@ -23,7 +23,7 @@ from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
 
-TRACKED = ('tracks', 'poses', 'smoothed', 'passes')
+SEGMENT_TABLES = ('tracks', 'poses', 'smoothed', 'passes')
 """Tables that are filled from the segments."""
 
 
@@ -34,7 +34,7 @@ class SegmentTables:
     ----------
     recording : Path
     paths : dict of str to Path
-        File of each table in `TRACKED`.
+        File of each table in `SEGMENT_TABLES`.
     n_dipoles : int
         Number of dipoles in the row that is fitted to a pass.
     settings : TrackSettings
@@ -51,7 +51,7 @@ class SegmentTables:
         self._tracks, self._ground = PassTracks(settings), ground_prior(settings)
         self._files = ExitStack()
         self._tables = {name: self._files.enter_context(TableWriter(paths[name], TABLES[name]))
-                        for name in TRACKED}
+                        for name in SEGMENT_TABLES}
         self._collector = RunCollector(self)
         self.n_tracks = self.n_passes = 0
 
@@ -71,7 +71,7 @@ class SegmentTables:
         """
         for frame, doubts in chunk.frames():
             if doubts is not None:
-                tracker.doubt(doubts)
+                tracker.set_doubtful_times(doubts)
             records = tracker.feed(frame)
             self._tracks.add(records)
             self._collector.add([frame, *records])

@@ -20,7 +20,7 @@ from typing import Any
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.archive_health import HealthRows
 from mag_tracking.apps.archive_segments import SegmentWriter, read_segment
-from mag_tracking.apps.archive_tracks import TRACKED, SegmentTables
+from mag_tracking.apps.archive_tracks import SEGMENT_TABLES, SegmentTables
 from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import IntArray
@@ -91,14 +91,14 @@ class RecordedEvidence(ClockComparison):
     ----------
     passes : list of (RigidPass, (n,) int array)
         Passes, each with the indices of its sensors in the network.
-    was_apart : bool
+    clocks_differed : bool
         Whether clocks were ever found to differ. Tracks then depend on earlier passes.
     """
 
     def __init__(self, n_sensors: int) -> None:
         super().__init__(n_sensors)
         self.passes: list[tuple[RigidPass, IntArray]] = []
-        self.was_apart = False
+        self.clocks_differed = False
 
     def add(self, found: RigidPass, rows: IntArray) -> None:
         """Add a pass and record it.
@@ -111,7 +111,7 @@ class RecordedEvidence(ClockComparison):
         """
         super().add(found, rows)
         self.passes.append((found, rows))
-        self.was_apart |= self.apart is not None
+        self.clocks_differed |= self.largest_offset is not None
 
 
 @dataclass
@@ -251,7 +251,7 @@ def track_segment(job: Job, k: int) -> None:
 def _track_into(folder: Path, job: Job, k: int, evidence: RecordedEvidence) -> None:
     """Track a segment with the clock `evidence` of earlier segments, and write its tables."""
     tracker = TrackManager(job.network, job.settings.track, evidence)
-    with SegmentTables(job.recording, {name: folder / f'{name}.parquet' for name in TRACKED},
+    with SegmentTables(job.recording, {name: folder / f'{name}.parquet' for name in SEGMENT_TABLES},
                        N_DIPOLES, job.settings.track) as tables:
         for chunk in read_segment(job.cut / f'segment-{k}.pickle'):
             tables.track(chunk, tracker)
@@ -291,7 +291,7 @@ def join(job: Job) -> dict[str, Any]:
             combined = copy.deepcopy(evidence)
             for rigid_pass in result.evidence.passes:
                 combined.add(*rigid_pass)
-            if k and (combined.was_apart or result.evidence.was_apart):
+            if k and (combined.clocks_differed or result.evidence.clocks_differed):
                 folder = Path(repeat_folder) / f'segment-{k}'
                 folder.mkdir()
                 _track_into(folder, job, k, evidence)
@@ -302,7 +302,7 @@ def join(job: Job) -> dict[str, Any]:
             id_offsets.append(n_tracks)
             n_tracks += result.n_tracks
             n_passes += result.n_passes
-        for table in TRACKED:
+        for table in SEGMENT_TABLES:
             join_tables([folder / f'{table}.parquet' for folder in folders],
                         id_offsets if table != 'passes' else [0] * len(id_offsets), table,
                         job.folder, name)

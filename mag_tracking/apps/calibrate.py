@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting, with_evidence
+from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting, with_pass_mounting
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.network import SensorNetwork
@@ -91,7 +91,7 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
                 np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
                 for s in estimated.orientation_std])
             evidence = fuse_mounting(estimated, prior, tracks)
-            estimated = _with_pass_records(with_evidence(estimated, evidence), estimated, date,
+            estimated = _with_pass_records(with_pass_mounting(estimated, evidence), estimated, date,
                                            evidence.n_tracks)
     without_background = tuple(name for name in network.names if name not in levels)
     return Calibration(estimated, survey, evidence, levels, rejected(calibrated.counts),

@@ -77,7 +77,7 @@ def _knocks(found: Calibration) -> list[Chart]:
         return []
     first, charts = first_knock(shocks), []
     for title, is_corrected in (('First knock, uncorrected clocks', False),
-                          ('First knock, corrected clocks', True)):
+                                ('First knock, corrected clocks', True)):
         traces = []
         for k, (name, (t, acceleration)) in enumerate(shocks.items()):
             offset = found.network.clock_offset[found.network.index(name)] if is_corrected else 0.0

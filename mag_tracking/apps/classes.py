@@ -49,7 +49,7 @@ class Examples:
     """Axes of all signatures."""
     unit: str
     """Unit of all signatures; empty if unknown."""
-    left_out: tuple[str, ...]
+    unusable: tuple[str, ...]
     """Reason for each signature without features."""
 
 

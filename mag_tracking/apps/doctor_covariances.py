@@ -54,7 +54,7 @@ def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator
     ------
     Finding
     """
-    n, declared, measured = calibrate.overruled(name)
+    n, declared, measured = calibrate.overruled_covariances(name)
     if not n:
         return
     advice = (f'the measured noise was used {quantity(n, "time")}; configure the driver to publish '

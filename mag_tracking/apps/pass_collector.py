@@ -147,7 +147,7 @@ class PassCollector:
                 passes.append(self._cut(self._onset_ns, record.stamp_ns))
         if self._onset_ns is not None and frame.stamp_ns - self._onset_ns > MAX_PASS_S * NS:
             passes.append(self._cut(self._onset_ns, frame.stamp_ns, 'the detection lasts for more '
-                                 f'than {MAX_PASS_S:.0f} s; the remainder is not used'))
+                                    f'than {MAX_PASS_S:.0f} s; the remainder is not used'))
         self._last_ns = frame.stamp_ns
         begin = (frame.stamp_ns if self._onset_ns is None else self._onset_ns) - PAD_S * NS
         for buffer in (self._raw, self._calibrated):

@@ -47,7 +47,7 @@ class Selection(NamedTuple):
     """Other topics to record."""
     results: bool = False
     """Whether to record the results of the nodes."""
-    everything: bool = False
+    all_topics: bool = False
     """Whether to record all topics."""
     readings: str = RAW_READINGS
     """Topic with the readings of many sensors."""
@@ -74,7 +74,7 @@ class Selection(NamedTuple):
             results_of=tuple(f'{resolve(name.rstrip("/"))}/' for name in self.results_of),
             result_topics=tuple(map(resolve, self.result_topics)))
 
-    def wants(self, topic: str) -> bool:
+    def includes(self, topic: str) -> bool:
         """Whether to record a topic.
 
         Parameters
@@ -89,7 +89,7 @@ class Selection(NamedTuple):
         if topic == self.readings or topic in self.fields + self.imus + self.topics:
             return True
         # Topics with a name component that begins with an underscore are hidden, as in rosbag2.
-        if self.everything and '/_' not in topic:
+        if self.all_topics and '/_' not in topic:
             return True
         return self.results and (topic.startswith(self.results_of) or topic == '/diagnostics'
                                  or topic in self.result_topics

@@ -275,7 +275,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
             'no_detection_reason': reason,
             'close_network': len(pipeline.network) > 1 and pipeline.network.is_compact,
             'frames_too_long': frame_period_warning(pipeline.settings.align, pipeline.network),
-            'clocks_apart': pipeline.track.clocks_apart,
+            'clocks_apart': pipeline.track.clock_warning,
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks,
             'disturbances': disturbances,
             'unflagged_poses': unflagged_poses(collector.logs.values(), truth.values())

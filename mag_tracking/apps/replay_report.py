@@ -21,7 +21,7 @@ from mag_tracking.report.page_scene import (
     path_entry,
     scene_of,
     strongest_sensors,
-    thinned,
+    thin_poses,
     track_entry,
 )
 from mag_tracking.report.track_log import TrackLog
@@ -95,7 +95,7 @@ def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
     entries = {t['id']: t for t in run.summary['tracks']}
     tracks = []
     for log in logs:
-        rows, facts = thinned(log, max_poses), entries[log.id]
+        rows, facts = thin_poses(log, max_poses), entries[log.id]
         entry = track_entry(log, begin_ns, strongest_sensors(log), rows)
         entry['facts'] = facts_of(facts)
         if log.id in run.smoothed:

@@ -15,7 +15,7 @@ from mag_tracking.recording.sample_reader import SampleReader
 
 
 def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str], date: str,
-           field_size: float | None = None, progress: Callable[[int], object] | None = None,
+           field_magnitude: float | None = None, progress: Callable[[int], object] | None = None,
            stopped: Callable[[], bool] | None = None,
            ) -> tuple[SensorNetwork, dict[str, EllipsoidFit], dict[str, FloatArray], bool]:
     """Estimate the hard and soft iron of sensors that were rotated during a recording.
@@ -28,7 +28,7 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
         Names of the rotated sensors; empty = all.
     date : str
         Date of the calibration, stored in the network.
-    field_size : float, T, optional
+    field_magnitude : float, T, optional
         Magnitude of the ambient field. By default, the gains of the sensors are not changed.
     progress : function, optional
         Called with the number of bytes read since the last call.
@@ -69,7 +69,7 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
         interrupted = True
     readings: dict[str, FloatArray] = {
         name: np.concatenate([np.empty((0, 3)), *r]) for name, r in collected.items()}
-    fits = {name: fit_ellipsoid(r, field_size) for name, r in readings.items()}
+    fits = {name: fit_ellipsoid(r, field_magnitude) for name, r in readings.items()}
     columns = {key: list(getattr(network, key)) for key in (
         'offset', 'correction', 'background', 'noise_std', 'calibrated')}
     for name, fit in fits.items():

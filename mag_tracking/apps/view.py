@@ -100,8 +100,8 @@ def _update_health(scene: LiveScene, pipeline: Pipeline, reader: SampleReader,
     notes = [*notes,
              *(Note(WARNING, f'no messages on {topic}') for topic in reader.missing_topics()),
              *(Note(WARNING, f'{cause}: {n}') for cause, n in rejected.items())]
-    if pipeline.track.clocks_apart:
-        notes.append(Note(WARNING, pipeline.track.clocks_apart))
+    if pipeline.track.clock_warning:
+        notes.append(Note(WARNING, pipeline.track.clock_warning))
     rows: list[list[str | float | None]] = []
     for name, background in pipeline.calibrate.backgrounds().items():
         state = ('stuck' if background.stuck else 'doubtful' if background.doubtful else 'ready'

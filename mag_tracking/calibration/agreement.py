@@ -110,7 +110,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     """
     B0 = np.asarray(earth_field, dtype=float)
     suspects = [j for j in range(len(names))
-           if not _fits(fields[j], R_ws[j], orientation_std[j], B0, bias_std)]
+                if not _fits(fields[j], R_ws[j], orientation_std[j], B0, bias_std)]
     out = []
     for j in suspects:
         size = np.sqrt(np.nansum((fields[j] - R_ws[j].T @ B0)**2))

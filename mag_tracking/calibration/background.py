@@ -90,8 +90,9 @@ class RunningBackground:
         self.n_relearnt = 0
         self.doubtful_times: DoubtfulTimes = ()
         self._provisional = ProvisionalLevel(learn)
-        self._departure = LevelDeparture(learn, relearn, self._state, self._level,
-                                    evaluate_change or partial(SharedChanges().evaluate_change, 0))
+        self._departure = LevelDeparture(
+            learn, relearn, self._state, self._level,
+            evaluate_change or partial(SharedChanges().evaluate_change, 0))
         self.forget()
 
     def forget(self) -> None:
@@ -257,7 +258,7 @@ class RunningBackground:
     def _start_with_frequent(self, frequent: FrequentLevel) -> None:
         """Start with a frequent level; other levels may still replace it."""
         self.start_from(frequent.level.level, frequent.level.covariance)
-        self._seen_s, self.frozen, self._is_contested = frequent.seen_s, False, False
+        self._seen_s, self.frozen, self._is_contested = frequent.observed_s, False, False
         self._learning_window.clear()
         self._departure.end()
 
@@ -302,7 +303,7 @@ class RunningBackground:
         self._is_contested = not departure.has_arrived and (
             self._is_contested
             or duration >= min(self._seen_s, self._relearn) and departure.steady_end() is not None
-            or other_level is not None and other_level.seen_s >= min(self._seen_s, MIN_SEEN_S))
+            or other_level is not None and other_level.observed_s >= min(self._seen_s, MIN_SEEN_S))
         if duration < relearn_time:
             return
         if self._adopt_if_steady(departure.blocks):
@@ -329,13 +330,13 @@ class RunningBackground:
         self.doubtful_times = doubtful_since(self.doubtful_times, since_ns)
         return True
 
-    def _change_to(self, new_blocks: deque[Block], seen_s: float) -> None:
-        """Change the background to the level of `new_blocks`, observed for `seen_s` [s]."""
+    def _change_to(self, new_blocks: deque[Block], observed_s: float) -> None:
+        """Change the background to the level of `new_blocks`, observed for `observed_s` [s]."""
         # The first half may contain the tail of the departing vehicle's field.
         second_half = list(new_blocks)[len(new_blocks) // 2:]
         self._store_former_level(second_half[0].time)
         self._level.set_constant(stacked(second_half))
-        self._is_resumed, self._relearns_soon, self._seen_s = True, False, seen_s
+        self._is_resumed, self._relearns_soon, self._seen_s = True, False, observed_s
         self._quiet.begin(second_half)
         self.n_relearnt += 1
         self.frozen = self._is_contested = self._is_steep = False

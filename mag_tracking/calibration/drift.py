@@ -33,7 +33,7 @@ class FormerLevel:
     """[s] End of the level."""
     level: FloatArray
     """(3,) [T] Field of the level."""
-    seen_s: float
+    observed_s: float
     """[s] Duration for which the level was observed."""
 
     def is_at(self, block: Block, limits: FloatArray) -> bool:

@@ -75,7 +75,7 @@ class EllipsoidFit:
     correction: FloatArray
     """(3, 3) symmetric positive definite, field unit per reading unit: soft iron, scale factors and
     non-orthogonality, up to a rotation."""
-    field_size: float
+    field_magnitude: float
     """Magnitude of B after correction: the given value, or the mean radius for det(correction) = 1,
     in the unit of the readings."""
     residual: float
@@ -87,8 +87,8 @@ class EllipsoidFit:
     """(3,), unit of the readings: standard deviation of `offset`."""
     correction_std: FloatArray
     """(3, 3) Standard deviation of each entry of `correction`."""
-    field_size_std: float
-    """Standard deviation of `field_size`; zero if it was given."""
+    field_magnitude_std: float
+    """Standard deviation of `field_magnitude`; zero if it was given."""
     coverage: float
     """0 to 1: smallest eigenvalue of the weighted mean of f fᵀ over the directions, with the nine
     spherical harmonics f to degree two, which are the effects of the nine parameters on ‖B‖. One
@@ -143,13 +143,13 @@ class _Parameters(TypedDict):
 
     offset: FloatArray
     correction: FloatArray
-    field_size: float
+    field_magnitude: float
     offset_std: FloatArray
     correction_std: FloatArray
-    field_size_std: float
+    field_magnitude_std: float
 
 
-def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> EllipsoidFit:
+def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) -> EllipsoidFit:
     """Fit the offset and the symmetric correction that map all readings to the same magnitude.
 
     A linear quadric fit initialises a robust geometric least-squares fit of ‖C (y - o)‖. Readings
@@ -162,7 +162,7 @@ def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> Elli
     readings : (n, 3) array, any unit, sensor frame
         Chronological readings of a sensor that is rotated in a uniform field. Readings with a NaN
         are excluded.
-    field_size : float, optional
+    field_magnitude : float, optional
         True magnitude of the field, in the requested unit of the corrected field.
 
     Returns
@@ -173,14 +173,14 @@ def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> Elli
     Raises
     ------
     ValueError
-        If `readings` are not (n, 3) or not finite, or `field_size` is not positive.
+        If `readings` are not (n, 3) or not finite, or `field_magnitude` is not positive.
 
     References
     ----------
     [Renaudin10]_ and [KokSchon16]_ section V.A for the conversion of the quadric into offset and
     correction. The measure of coverage and the rejection criteria are additions of this package.
     """
-    readings = _validated(readings, field_size)
+    readings = _validated(readings, field_magnitude)
     present: BoolArray = ~np.any(np.isnan(readings), axis=1)
     is_saturated = np.stack([saturated_readings(axis) for axis in readings.T], axis=1) \
         & present[:, None]
@@ -207,7 +207,7 @@ def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> Elli
                              f'{axes[2]:.2g}, maximum 1 to {MAX_AXIS_RATIO:g}; {POSSIBLE_CAUSES}',
                              counts, notes)
     counts['n_outliers'] += quality['n_outliers']
-    out = _in_units(o, C, P, centre, scale, field_size)
+    out = _in_units(o, C, P, centre, scale, field_magnitude)
     residual = _relative_spread(np.linalg.norm(
         (readings[present] - out['offset']) @ out['correction'], axis=1))
     outlier_fraction = counts['n_outliers'] / (len(valid) + glitches.sum())
@@ -217,7 +217,7 @@ def fit_ellipsoid(readings: FloatArray, field_size: float | None = None) -> Elli
                         warnings=notes + _notes_on_fit(residual, quality, outlier_fraction))
 
 
-def _validated(readings: FloatArray, field_size: float | None) -> FloatArray:
+def _validated(readings: FloatArray, field_magnitude: float | None) -> FloatArray:
     """Convert readings to an array (n, 3); raise ValueError for invalid arguments."""
     readings = np.asarray(readings, dtype=float)
     if readings.ndim != 2 or readings.shape[1] != 3:
@@ -225,8 +225,8 @@ def _validated(readings: FloatArray, field_size: float | None) -> FloatArray:
     infinite = np.isinf(readings).any(axis=1)
     if infinite.any():
         raise ValueError(f'reading {infinite.argmax()} is infinite: {readings[infinite.argmax()]}')
-    if field_size is not None and not 0.0 < field_size < np.inf:
-        raise ValueError(f'field_size is {field_size}, must be positive and finite')
+    if field_magnitude is not None and not 0.0 < field_magnitude < np.inf:
+        raise ValueError(f'field_magnitude is {field_magnitude}, must be positive and finite')
     return readings
 
 
@@ -272,21 +272,21 @@ def _insufficient_data(y: FloatArray) -> str:
 
 
 def _in_units(o: FloatArray, C: FloatArray, P: FloatArray, centre: FloatArray, scale: float,
-              field_size: float | None) -> _Parameters:
+              field_magnitude: float | None) -> _Parameters:
     """Parameters and standard deviations in the readings' units."""
     volume = np.linalg.det(C)**(-1.0 / 3.0)
     t = np.einsum('ij,kji->k', np.linalg.inv(C), BASIS)
-    if field_size is None:
+    if field_magnitude is None:
         k, size = volume, scale * volume
         D = k * (BASIS - C * t[:, None, None] / 3.0)
         size_std = size / 3.0 * np.sqrt(t @ P[3:, 3:] @ t)
     else:
-        k, size, size_std = field_size / scale, float(field_size), 0.0
+        k, size, size_std = field_magnitude / scale, float(field_magnitude), 0.0
         D = k * BASIS
-    return {'offset': centre + scale * o, 'correction': k * C, 'field_size': float(size),
+    return {'offset': centre + scale * o, 'correction': k * C, 'field_magnitude': float(size),
             'offset_std': scale * np.sqrt(np.diagonal(P)[:3]),
             'correction_std': np.sqrt(np.einsum('kij,kl,lij->ij', D, P[3:, 3:], D)),
-            'field_size_std': float(size_std)}
+            'field_magnitude_std': float(size_std)}
 
 
 def _rejection_reason(C: FloatArray, P: FloatArray, quality: Quality, outliers: float) -> str:
@@ -325,7 +325,7 @@ def _rejected_fit(reason: str, counts: _Counts, notes: tuple[str, ...]) -> Ellip
     """Create a rejected fit, with a reason and without results."""
     nan = float('nan')
     return EllipsoidFit(
-        offset=np.full(3, nan), correction=np.full((3, 3), nan), field_size=nan, residual=nan,
-        offset_std=np.full(3, nan), correction_std=np.full((3, 3), nan), field_size_std=nan,
+        offset=np.full(3, nan), correction=np.full((3, 3), nan), field_magnitude=nan, residual=nan,
+        offset_std=np.full(3, nan), correction_std=np.full((3, 3), nan), field_magnitude_std=nan,
         coverage=nan, empty_octants=(), converged=False, reason=reason,
         warnings=notes, **counts)

@@ -108,12 +108,12 @@ class LevelDeparture:
         self.was_steady |= new_blocks is not None
         return new_blocks
 
-    def relearn_time(self, seen_s: float, relearns_soon: bool) -> float:
+    def relearn_time(self, observed_s: float, relearns_soon: bool) -> float:
         """Time on another steady level after which that level becomes the background.
 
         Parameters
         ----------
-        seen_s : float, s
+        observed_s : float, s
             Duration for which the background was observed.
         relearns_soon : bool
             Whether the sensor may have been moved, or its surroundings changed.
@@ -129,7 +129,7 @@ class LevelDeparture:
             return self._relearn
         # A vehicle present from the start may have departed.
         return self._relearn and min(
-            self._relearn, max(self._learn, MIN_RELEARN_S, MIN_DURATION_RATIO * seen_s))
+            self._relearn, max(self._learn, MIN_RELEARN_S, MIN_DURATION_RATIO * observed_s))
 
     def former_seen_s(self) -> float:
         """Duration for which the former level was observed, if the latest block is at that level.
@@ -141,7 +141,7 @@ class LevelDeparture:
         """
         former = self.former
         is_at_it = former is not None and former.is_at(self.blocks[-1], self._level.limits)
-        return former.seen_s if former is not None and is_at_it else 0.0
+        return former.observed_s if former is not None and is_at_it else 0.0
 
     def has_departed(self, new_blocks: deque[Block]) -> bool | None:
         """Determine and store whether a vehicle that was part of the background has departed.

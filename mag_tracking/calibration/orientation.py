@@ -50,7 +50,7 @@ class UpDirection:
     """[rad] Standard deviation of the direction, about each level axis."""
     n: int
     """Number of readings used."""
-    n_left_out: int
+    n_excluded: int
     """Number of readings excluded as knocks or because they are not finite."""
 
 

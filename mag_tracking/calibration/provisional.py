@@ -50,7 +50,7 @@ class FrequentLevel:
     """Whether the level was observed for long enough, and far longer than any other level."""
 
     @property
-    def seen_s(self) -> float:
+    def observed_s(self) -> float:
         """Total duration for which the level was observed [s]."""
         return self.level.n_blocks * self.level.block_s
 

@@ -54,9 +54,9 @@ def add(commands: Commands) -> None:
     add_settings(p)
     executor = p.add_mutually_exclusive_group()
     executor.add_argument('--workers', type=int, metavar='N', default=os.cpu_count() or 1,
-                       help='number of processes on this machine (default: number of processors)')
+                          help='number of processes on this machine (default: all processors)')
     executor.add_argument('--scheduler', metavar='ADDRESS',
-                       help='address of a running Dask scheduler (e.g. tcp://10.0.0.5:8786)')
+                          help='address of a running Dask scheduler (e.g. tcp://10.0.0.5:8786)')
 
 
 def _archive(args: argparse.Namespace) -> int:
@@ -72,8 +72,8 @@ def _archive(args: argparse.Namespace) -> int:
                          bar.update, lambda: bool(signals), tqdm.write)
     print(f'{quantity(len(result.done), "recording")} tracked: {quantity(result.tracks, "track")}, '
           f'{quantity(result.passes, "pass", "passes")}'
-          + (f'; {len(result.already_done)} skipped (already tracked)'
-             if result.already_done else ''))
+          + (f'; {len(result.tracked_earlier)} skipped (already tracked)'
+             if result.tracked_earlier else ''))
     if result.lost_workers:
         print(f'  workers lost: {result.lost_workers}; their tasks were repeated')
     if result.failed:

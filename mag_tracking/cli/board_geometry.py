@@ -213,7 +213,7 @@ def _row(survey: GeometrySurvey, j: int) -> str:
     g = survey.geometry
     shift = 1e3 * np.linalg.norm(survey.network.positions[j] - survey.stated.positions[j])
     shift_std, rotation_std = (np.sqrt(np.square(v[j]).mean())
-                             for v in (1e3 * g.position_std, np.rad2deg(g.rotation_std)))
+                               for v in (1e3 * g.position_std, np.rad2deg(g.rotation_std)))
     bias = ' '.join(f'{1e6 * b:+8.2f}' for b in g.bias[j])
     return (f'{shift:5.2f} ({shift_std:.2f})  {np.rad2deg(survey.rotation_angle[j]):6.2f} '
             f'({rotation_std:.2f})  {g.gain[j]:.4f} ({g.gain_std[j]:.4f}) {bias}  '

@@ -95,7 +95,7 @@ def _examples(args: argparse.Namespace) -> Examples:
     network = None if args.network is None else read_network(args.network)
     examples = examples_of(labelled_signatures(args.labelled, args.labels, network,
                                                args.action != 'predict'))
-    for reason in examples.left_out:
+    for reason in examples.unusable:
         print(f'  warning: not used: {reason}')
     return examples
 
@@ -136,7 +136,8 @@ def _print_evaluation(evaluation: Evaluation) -> None:
         print(f'  {name}: {_mean_fraction(values)}')
     for k, name in enumerate(evaluation.classes):
         print(f'  recall of {name}: {_mean_fraction(evaluation.recall[:, k])}')
-    print(f'  expected calibration error of the probabilities: {evaluation.reliability:.3f}')
+    print('  expected calibration error of the probabilities: '
+          f'{evaluation.expected_calibration_error:.3f}')
 
 
 def _mean_fraction(values: 'np.ndarray[tuple[int, ...], np.dtype[np.float64]]') -> str:

@@ -191,9 +191,9 @@ def _trusted_values(fit: PassFit) -> str:
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     time, time_std, _, _ = fit.closest_approach(centre)
     values = {'speed': f'{speed:.2f}({speed_std:.2f}) m/s',
-             'direction': f'{heading:.1f}({heading_std:.1f}) deg',
-             'time': f'closest to the centre of the sensors {time:+.2f}({time_std:.2f}) s after '
-                     'the strongest field'}
+              'direction': f'{heading:.1f}({heading_std:.1f}) deg',
+              'time': f'closest to the centre of the sensors {time:+.2f}({time_std:.2f}) s after '
+              'the strongest field'}
     return ', '.join(values[name] for name in fit.trusted)
 
 

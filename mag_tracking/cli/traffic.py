@@ -99,7 +99,7 @@ def _traffic(args: argparse.Namespace) -> int:
             if args.enrol is not None and not signals:
                 enrolled.append(pass_of(name, [v.passage for v in result.vehicles]))
             identifications = [None if fleet is None else fleet.identify(v.passage)
-                              for v in result.vehicles]
+                               for v in result.vehicles]
             _print(name, result, recording, identifications)
             tables['passages'] += [
                 passage_row(name, v.passage, result.class_names, _delay(v),

@@ -31,7 +31,7 @@ from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.sensor_network import SensorNetwork
 from mag_tracking.settings import replace
-from mag_tracking.yaml_file import is_text, read_yaml, shown
+from mag_tracking.yaml_file import is_text, read_yaml, short_repr
 
 _HERE = 'mag_tracking.drivers'
 KINDS = {
@@ -77,7 +77,7 @@ def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None
     """
     content = read_yaml(path, SettingsError)
     if not isinstance(content, Mapping) or not content:
-        raise SettingsError(f'{path}: expected a mapping of devices, got {shown(content)}')
+        raise SettingsError(f'{path}: expected a mapping of devices, got {short_repr(content)}')
     try:
         _check_devices(content)
         drivers = [driver_of(name, entry) for name, entry in content.items()]
@@ -110,7 +110,7 @@ def load_class(role: str, name: object) -> Any:
     module, colon, class_name = target.partition(':')
     if not colon:
         raise SettingsError(f'{role}: expected {", ".join(KINDS[role])} or '
-                            f'package.module:Class, got {shown(name)}')
+                            f'package.module:Class, got {short_repr(name)}')
     try:
         cls = getattr(importlib.import_module(module), class_name)
     # A third-party module may raise any error.
@@ -143,9 +143,9 @@ def driver_of(name: object, entry: object) -> Driver:
         If the entry is not valid. The message names the device.
     """
     if not isinstance(name, str) or not isinstance(entry, Mapping):
-        raise SettingsError(f'{name}: expected a mapping of settings, got {shown(entry)}')
+        raise SettingsError(f'{name}: expected a mapping of settings, got {short_repr(entry)}')
     if not is_text(name):
-        raise SettingsError(f'{shown(name)} is not a device name: it is not valid Unicode')
+        raise SettingsError(f'{short_repr(name)} is not a device name: it is not valid Unicode')
     options = dict(entry)
     try:
         kinds = [kind for role in KINDS if isinstance(kind := options.get(role), str)]
@@ -201,7 +201,7 @@ def _pop_group(options: dict[str, Any], name: str) -> Mapping[str, Any]:
     """Remove the group `name` from `options` and return its settings."""
     group = options.pop(name, {})
     if not isinstance(group, Mapping):
-        raise SettingsError(f'{name}: expected a mapping of settings, got {shown(group)}')
+        raise SettingsError(f'{name}: expected a mapping of settings, got {short_repr(group)}')
     return group
 
 
@@ -215,16 +215,16 @@ def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
         sensors = options.pop('sensors', None)
     if not isinstance(sensors, Mapping) or not sensors:
         raise SettingsError('expected `sensor: mag_1`, or `sensors:` with the network name of each '
-                            f'sensor of the device, got {shown(sensors)}')
+                            f'sensor of the device, got {short_repr(sensors)}')
     for key, value in sensors.items():
         if isinstance(key, bool) or not isinstance(key, (str, int)):
-            raise SettingsError(f'sensors: {shown(key)} is not a name; put it in quotes')
+            raise SettingsError(f'sensors: {short_repr(key)} is not a name; put it in quotes')
         if not is_text(str(key)):
-            raise SettingsError(f'sensors: {shown(key)} is not a name: it is not valid '
+            raise SettingsError(f'sensors: {short_repr(key)} is not a name: it is not valid '
                                 'Unicode')
         if not isinstance(value, str) or not (value == IGNORED or _NAME.fullmatch(value)):
             raise SettingsError(f'sensors: {key}: expected a sensor name (letters, digits, _ and '
-                                f'/), or - to ignore the sensor, got {shown(value)}')
+                                f'/), or - to ignore the sensor, got {short_repr(value)}')
     out = {str(key): value for key, value in sensors.items()}
     if len(out) < len(sensors):
         names = [str(key) for key in sensors]

@@ -17,7 +17,7 @@ import math
 from collections import Counter, deque
 from dataclasses import dataclass
 
-from mag_tracking.drivers.lower_line import Point, likely_slopes
+from mag_tracking.drivers.lower_line import Point, slope_range
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
@@ -236,7 +236,7 @@ class DeviceClock:
         if not fits or delay > self._tolerance_ns + self._drift_bound * t:
             if self._candidate is None:
                 self._candidate = _ClockCandidate(ticks, arrival_ns, self._last_ns,
-                                         abs(delay) <= self._tolerance_ns)
+                                                  abs(delay) <= self._tolerance_ns)
             if self._has_stepped(ticks, arrival_ns, fits, self._candidate):
                 self._restart(ticks, arrival_ns, delay, self._candidate)
                 return arrival_ns - self._min_delay_ns
@@ -295,7 +295,7 @@ class DeviceClock:
         """Add a reading to the candidate; return whether the device clock has stepped."""
         wait = arrival_ns - candidate.since_ns
         duration = candidate.add(ticks, arrival_ns, self._tick_ns, self._wrap,
-                             self._tolerance_ns + self._max_drift * wait)
+                                 self._tolerance_ns + self._max_drift * wait)
         # Queued messages arrive all at once, or at intervals unlike the measurement intervals.
         min_duration = self._max_delay_ns if fits else 2.0 * self._tolerance_ns
         return (candidate.agreeing >= _MIN_AGREEING and duration >= min_duration
@@ -331,7 +331,7 @@ class DeviceClock:
         """Update height and slope of the line under the points."""
         self._middle = sum(t for t, _ in points) / len(points)
         if len(points) >= _MIN_POINTS and points[0][0] < points[-1][0]:
-            low, high = likely_slopes(points)
+            low, high = slope_range(points)
             slope = min(max(self._slope, low), high)
             self._slope = min(max(slope, -self._max_drift), self._max_drift)
             self.drift_ppm = self._slope * 1e6

@@ -39,7 +39,7 @@ MAX_SOURCES = 4096
 _AXES = struct.Struct('3d')
 PollResult: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
 """Fields and accelerations received by one poll."""
-NOTHING: PollResult = Readings.joined([]), ()
+EMPTY_RESULT: PollResult = Readings.joined([]), ()
 """Result of a poll without data."""
 MIN_CLOCK_STEP_NS = 10_000_000
 """[ns] Larger changes of wall clock minus monotonic clock are steps of the host clock."""
@@ -69,7 +69,7 @@ class Driver:
     ----------
     name : str
     sensors : dict of str to str
-    own_counts : Counter
+    driver_counts : Counter
         Number of losses and faults detected by the driver itself, by cause.
     fault : str
         Reason why the device is closed or silent; empty if neither is the case.
@@ -87,7 +87,7 @@ class Driver:
                  sleep: Callable[[float], object] = time.sleep) -> None:
         self.name = name
         self.sensors = dict(sensors)
-        self.own_counts: Counter[str] = Counter()
+        self.driver_counts: Counter[str] = Counter()
         self._device, self._settings = device, settings
         self._clock_settings = clock_settings
         self._scale = scale_of(settings.unit, FIELD_UNITS, f'{name}: unit')
@@ -152,7 +152,7 @@ class Driver:
             By cause.
         """
         # Each counter is copied at once, because the polling thread may add a cause meanwhile.
-        total = self.own_counts.copy()
+        total = self.driver_counts.copy()
         total.update({'source changes': n} if (n := self._sole_source.changes) else {})
         total.update(self._device.counts.copy())
         for sensor, check in self._sequences.items():
@@ -180,20 +180,20 @@ class Driver:
         accelerations : sequence of AccelerationSample
         """
         if not self._is_open and not self._try_to_open(timeout_s):
-            return NOTHING
+            return EMPTY_RESULT
         try:
             arrivals = self._read(timeout_s)
         except DeviceError as error:
-            self.own_counts['connections lost'] += 1
+            self.driver_counts['connections lost'] += 1
             self._schedule_retry(error)
-            return NOTHING
+            return EMPTY_RESULT
         now = self._monotonic_ns()
         if not arrivals:
             timeout_s = self._settings.silence_timeout_s
             if timeout_s and now - self._last_receipt_ns > timeout_s * 1e9:
-                self.own_counts['reopened after silence'] += 1
+                self.driver_counts['reopened after silence'] += 1
                 self._schedule_retry(f'open, but no data received for {timeout_s:g} s')
-            return NOTHING
+            return EMPTY_RESULT
         self._last_receipt_ns, self._retry_s, self.fault = now, self._settings.retry_s, ''
         return self._samples(arrivals, self._wall_offset(now))
 
@@ -228,7 +228,7 @@ class Driver:
         ----------
         error : Exception
         """
-        self.own_counts['errors'] += 1
+        self.driver_counts['errors'] += 1
         self._schedule_retry(f'{type(error).__name__}: {error}')
 
     def _try_to_open(self, timeout_s: float) -> bool:
@@ -241,7 +241,7 @@ class Driver:
         try:
             self._device.open()
         except DeviceError as error:
-            self.own_counts['failed attempts to open'] += 1
+            self.driver_counts['failed attempts to open'] += 1
             self._schedule_retry(error)
             return False
         # The previous fault remains until data arrive.
@@ -255,7 +255,7 @@ class Driver:
             self._device.close()
         # A third-party device or a removed port may raise any error; the device is reopened anyway.
         except Exception as error:
-            self.own_counts['failed attempts to close'] += 1
+            self.driver_counts['failed attempts to close'] += 1
             self.fault += f'; closing failed as well: {type(error).__name__}: {error}'
         self._retry_ns = self._monotonic_ns() + round(self._retry_s * 1e9)
         self._retry_s = min(2.0 * self._retry_s, self._settings.max_retry_s)
@@ -264,7 +264,7 @@ class Driver:
         """Return wall clock minus monotonic clock [ns]; count steps of the wall clock."""
         offset = self._wall_ns() - monotonic_ns
         if self._offset_ns is not None and abs(offset - self._offset_ns) > MIN_CLOCK_STEP_NS:
-            self.own_counts['steps of the host clock'] += 1
+            self.driver_counts['steps of the host clock'] += 1
         self._offset_ns = offset
         return offset
 
@@ -293,10 +293,10 @@ class Driver:
         readings = Readings.by_name(sensors, stamps, field)
         infinite: BoolArray = np.any(np.isinf(readings.field), axis=1)
         if infinite.any():
-            self.own_counts['readings that overflow in tesla'] += int(infinite.sum())
+            self.driver_counts['readings that overflow in tesla'] += int(infinite.sum())
             readings = readings.part(~infinite)
-        self.own_counts.update([self._sample_counts[readings.names[j]]
-                                for j in readings.sensor.tolist()])
+        self.driver_counts.update([self._sample_counts[readings.names[j]]
+                                   for j in readings.sensor.tolist()])
         return readings, accelerations
 
     def _resolve(self, reading: Reading, arrival: Arrival) -> tuple[str | None, int | None]:
@@ -322,7 +322,7 @@ class Driver:
             name = (at_device or source)[:80]
             if len(self._unknown_names) < MAX_NAMES:
                 self._unknown_names.add(name)
-            self.own_counts['readings of unknown sensors' + (
+            self.driver_counts['readings of unknown sensors' + (
                 f': {name}' if name in self._unknown_names else ' (and others)')] += 1
         if sensor is None or sensor == IGNORED:
             return None
@@ -337,13 +337,13 @@ class Driver:
         clock = self._clocks.get(arrival.source)
         if clock is None:
             if len(self._clocks) >= MAX_SOURCES:
-                self.own_counts['readings beyond the maximum number of sources'] += 1
+                self.driver_counts['readings beyond the maximum number of sources'] += 1
                 return None
             uses_arrivals = by == 'arrival' or by == 'auto' and ticks is None
             clock = (ArrivalClock if uses_arrivals else DeviceClock)(self._clock_settings)
             self._clocks[arrival.source] = clock
         if ticks is None and isinstance(clock, DeviceClock):
-            self.own_counts['readings without a device time'] += 1
+            self.driver_counts['readings without a device time'] += 1
             return None
         measurement = clock, ticks, arrival.arrival_ns
         if self._measurement != measurement or self._measured_ns is None:
@@ -368,7 +368,7 @@ def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]
     """Poll a driver and pass its samples to a function until `stopping()` is true.
 
     No error is raised, because the function may run in its own thread. Errors of the device are
-    stored in `driver.fault`; errors of `take` are counted in `driver.own_counts`.
+    stored in `driver.fault`; errors of `take` are counted in `driver.driver_counts`.
 
     Parameters
     ----------
@@ -391,7 +391,7 @@ def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]
             # The device is not affected and stays open.
             what = f'errors while processing readings: {type(error).__name__}'
             text = f'{what}: {error}'[:100]
-            known = sum(key.startswith(what) for key in driver.own_counts)
-            driver.own_counts[text if text in driver.own_counts or known < MAX_NAMES
-                              else f'{what} (and others)'] += 1
+            known = sum(key.startswith(what) for key in driver.driver_counts)
+            driver.driver_counts[text if text in driver.driver_counts or known < MAX_NAMES
+                                 else f'{what} (and others)'] += 1
     driver.close()

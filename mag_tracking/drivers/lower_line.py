@@ -37,7 +37,7 @@ def lower_hull(points: Sequence[Point]) -> list[Point]:
     return hull
 
 
-def likely_slopes(points: Sequence[Point]) -> tuple[float, float]:
+def slope_range(points: Sequence[Point]) -> tuple[float, float]:
     """Range of the slopes of lines under the points that are about as likely as the best line.
 
     The best line, according to Moon et al., is the edge of the lower hull over the mean of x.

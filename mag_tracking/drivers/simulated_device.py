@@ -99,7 +99,7 @@ class SimulatedDevice:
         self._table: FloatArray | None = None
         self._start_ns = self._next_index = 0
         self._shift_s: list[float] = (np.arange(len(self._network)) * settings.sequential
-                         / (len(self._network) * settings.rate_hz)).tolist()
+                                      / (len(self._network) * settings.rate_hz)).tolist()
 
     def open(self) -> None:
         """Compute the pass at the first call; skip readings that were due before this call."""

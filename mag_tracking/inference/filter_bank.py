@@ -68,8 +68,8 @@ class FilterBank:
 
     @classmethod
     def from_targets(cls, x: FloatArray, P: FloatArray, label: IntArray, n_sensors: int,
-                   background_std: float, own_covariance: FloatArray | None = None,
-                   kind: IntArray | None = None) -> 'FilterBank':
+                     background_std: float, own_covariance: FloatArray | None = None,
+                     kind: IntArray | None = None) -> 'FilterBank':
         """Create a bank with equal weights from target states.
 
         Each sensor's own states and then three backgrounds per sensor are appended to the target
@@ -245,7 +245,7 @@ class FilterBank:
         """
         return bool(np.exp(np.sort(self.log_w)[-n:]).sum() >= fraction)
 
-    def apart(self, i: int, distance: float = 3.0) -> BoolArray:
+    def is_separated(self, i: int, distance: float = 3.0) -> BoolArray:
         """Whether hypotheses differ significantly in position from a reference hypothesis.
 
         Parameters
@@ -272,8 +272,8 @@ class FilterBank:
             # Directions without variance do not count.
             varies = variance > _SINGULAR_TOLERANCE * variance[:, -1:]
             z = (along**2 / np.where(varies, variance, np.inf)).sum(axis=1)
-        apart: BoolArray = z > distance**2
-        return apart
+        is_separated: BoolArray = z > distance**2
+        return is_separated
 
     def reweight(self, log_likelihood: FloatArray) -> float:
         """Update the weights by Bayes' rule.

@@ -17,7 +17,7 @@ from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quater
 from mag_tracking.network import CalibrationRecord, SensorNetwork
 from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
 from mag_tracking.network.topics import NAME
-from mag_tracking.yaml_file import is_text, read_yaml, shown
+from mag_tracking.yaml_file import is_text, read_yaml, short_repr
 
 _NAME = re.compile(r'[A-Za-z0-9_.-]+')
 _FRAME = re.compile(r'[A-Za-z0-9_./-]+')
@@ -40,24 +40,24 @@ def _parse_vector(label: str, value: object, lengths: tuple[int, ...]) -> FloatA
     """Convert a list of finite numbers, whose length must be in `lengths`, to an array."""
     if not isinstance(value, list) or len(value) not in lengths:
         raise NetworkError(f'{label}: expected {" or ".join(map(str, lengths))} numbers, '
-                           f'got {shown(value)}')
+                           f'got {short_repr(value)}')
     for v in value:
         # YAML 1.1 parses exponents without a point (1e-8) or without a sign (1.0e8) as strings.
         if isinstance(v, str):
-            raise NetworkError(f'{label}: {shown(v)} is a string; write numbers as 1.0e-8 or '
+            raise NetworkError(f'{label}: {short_repr(v)} is a string; write numbers as 1.0e-8 or '
                                '1.0e+8')
         if isinstance(v, bool) or not isinstance(v, (int, float)) or not abs(v) < 1e300:
-            raise NetworkError(f'{label}: {shown(v)} is not a finite number')
+            raise NetworkError(f'{label}: {short_repr(v)} is not a finite number')
     return np.array(value, dtype=float)
 
 
 def _check_keys(label: str, mapping: object, keys: Collection[str]) -> None:
     """Raise NetworkError if `mapping` is not a mapping or has a key that is not in `keys`."""
     if not isinstance(mapping, dict):
-        raise NetworkError(f'{label}: expected a mapping (key: value), got {shown(mapping)}')
+        raise NetworkError(f'{label}: expected a mapping (key: value), got {short_repr(mapping)}')
     for key in mapping:
         if key not in keys:
-            raise NetworkError(f'{label}: unknown key {shown(key)}; expected one of '
+            raise NetworkError(f'{label}: unknown key {short_repr(key)}; expected one of '
                                f'{", ".join(sorted(keys))}')
 
 
@@ -154,7 +154,7 @@ def _parse_calibration(label: str, value: Any) -> CalibrationRecord | None:
     for key in ('date', 'by'):
         if not isinstance(value.get(key), str) or not is_text(value[key]):
             raise NetworkError(f"{label}: {key} must be a string ('...'), "
-                               f'got {shown(value.get(key))}')
+                               f'got {short_repr(value.get(key))}')
     std, orientation = value.get('clock_offset_std'), value.get('stated')
     std = float('nan') if std is None else float(_parse_vector(label, [std], (1,))[0])
     if std < 0.0:
@@ -179,8 +179,8 @@ def _parse_rotation(label: str, q: FloatArray) -> FloatArray:
 def _check_topic(label: str, key: str, topic: object) -> str:
     """Return `topic` if it is a valid topic name; raise NetworkError otherwise."""
     if not isinstance(topic, str) or not NAME.fullmatch(topic):
-        raise NetworkError(f'{label}: {key}: {shown(topic)} is not a valid ROS topic: use letters, '
-                           'digits and _; no part may begin with a digit')
+        raise NetworkError(f'{label}: {key}: {short_repr(topic)} is not a valid ROS topic: use '
+                           'letters, digits and _; no part may begin with a digit')
     return topic
 
 
@@ -217,12 +217,12 @@ def _parse_network(content: Any) -> SensorNetwork:
     frame = content.get('frame', 'map')
     if not isinstance(frame, str) or not _FRAME.fullmatch(frame):
         raise NetworkError('frame: expected a name of letters, digits, _ . / and -, got '
-                           f'{shown(frame)}')
+                           f'{short_repr(frame)}')
     names = tuple(str(name) for name in sensors)
     for name in names:
         if not _NAME.fullmatch(name):
-            raise NetworkError(f'{shown(name)} is not a valid sensor name: use letters, digits, '
-                               '_ . and -')
+            raise NetworkError(f'{short_repr(name)} is not a valid sensor name: use letters, '
+                               'digits, _ . and -')
     entries = [_parse_sensor(n, e) for n, e in zip(names, sensors.values(), strict=True)]
     columns: dict[str, Any] = {key: tuple(e[key] for e in entries) for key in entries[0]}
     for key in ('positions', 'R_ws', 'clock_offset'):
@@ -252,7 +252,8 @@ def _parse_earth_field(content: dict[str, Any]) -> FloatArray | None:
         raise NetworkError(f'site: {missing[0]} is missing')
     date = site['date']
     if not isinstance(date, datetime.date) or isinstance(date, datetime.datetime):
-        raise NetworkError(f'site: date: expected a date such as 2026-05-01, got {shown(date)}')
+        raise NetworkError('site: date: expected a date such as 2026-05-01, got '
+                           f'{short_repr(date)}')
     latitude, longitude, height, azimuth = _parse_vector('site', [
         site[key] for key in ('latitude', 'longitude', 'height', 'x_azimuth_deg')], (4,))
     try:

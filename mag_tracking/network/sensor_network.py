@@ -154,7 +154,7 @@ class SensorNetwork:
         return replace(self, positions=self.positions[rows], R_ws=self.R_ws[rows],
                        clock_offset=self.clock_offset[rows], **per_sensor)
 
-    def with_stated_orientations(self) -> 'SensorNetwork':
+    def with_nominal_orientations(self) -> 'SensorNetwork':
         """Copy the network with the orientations that were entered by hand.
 
         Returns

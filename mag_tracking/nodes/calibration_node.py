@@ -235,7 +235,7 @@ class CalibrationNode(StageNode):
         calibrated = self._stage.feed(raw)
         if self._next_steps is not None:
             detection, tracker = self._next_steps
-            tracker.doubt(self._stage.doubtful_intervals())
+            tracker.set_doubtful_times(self._stage.doubtful_intervals())
             for readings in calibrated:
                 detection.receive_readings(readings)
         return calibrated
@@ -263,7 +263,7 @@ class CalibrationNode(StageNode):
         self._state.publish(message)
 
     def _handle_calibrate(self, request: CalibrateService.Request,
-                   response: CalibrateService.Response) -> CalibrateService.Response:
+                          response: CalibrateService.Response) -> CalibrateService.Response:
         """Handle ~/calibrate: learn backgrounds again."""
         try:
             self._stage.forget(tuple(request.sensors))
@@ -277,7 +277,7 @@ class CalibrationNode(StageNode):
         return response
 
     def _handle_survey(self, request: SurveyMessage.Request,
-               response: SurveyMessage.Response) -> SurveyMessage.Response:
+                       response: SurveyMessage.Response) -> SurveyMessage.Response:
         """Handle ~/survey: update orientations and clock offsets, except for running tracks."""
         network = self._survey_service.solve(self.network, request.save, response)
         if network is None:

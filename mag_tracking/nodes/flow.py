@@ -76,7 +76,7 @@ class Flow:
             self._latencies.append(self._latest_latency_s)
 
     @property
-    def n_ages(self) -> int:
+    def n_latencies(self) -> int:
         """Number of latencies in the next report."""
         return len(self._latencies)
 
@@ -178,7 +178,7 @@ class SubscriberMonitor:
         DiagnosticStatus
         """
         self._known_nodes |= {name for name in set(names) - self._known_nodes
-                       if self._publishes in types_of(name)}
+                              if self._publishes in types_of(name)}
         missing = sorted(self._known_nodes - set(names))
         is_gone = bool(missing) and not self._known_nodes.intersection(names)
         message = 'running' if self._known_nodes else \

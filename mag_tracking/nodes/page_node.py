@@ -33,9 +33,9 @@ from mag_tracking.web.page_server import TICK_S, PageServer
 
 NICENESS = 10
 """Scheduling niceness of the process, which must not delay the nodes."""
-FRAMES_KEPT = 64
+MAX_FRAMES = 64
 """Number of recent serialised frames that are stored for matching with tracks."""
-TRACKS_KEPT = 1000
+MAX_TRACKS = 1000
 """Maximum number of track messages stored for the next tick."""
 TRACKS = 'mag_tracking_msgs/msg/TrackArray'
 STALE_TIMEOUT_S = 5.0
@@ -78,8 +78,8 @@ class PageNode(Node):
         super().__init__('mag_tracking_page', start_parameter_services=False)
         self._scene = scene
         self._layout = NO_SENSORS
-        self._frames: deque[bytes] = deque(maxlen=FRAMES_KEPT)
-        self._tracks: deque[Any] = deque(maxlen=TRACKS_KEPT)
+        self._frames: deque[bytes] = deque(maxlen=MAX_FRAMES)
+        self._tracks: deque[Any] = deque(maxlen=MAX_TRACKS)
         self._statuses: dict[str, tuple[float, DiagnosticStatus]] = {}
         self._tracker_subscriptions: list[Subscription] = []
         self._subscribe_to_tracker(self.resolve_topic_name('tracker_node/tracks'))

@@ -153,7 +153,7 @@ class RecordNode(Node):
     def discover(self) -> None:
         """Subscribe to new selected topics; update the publishers of subscribed topics."""
         for topic, _ in self.get_topic_names_and_types():
-            if topic in self._refused or not self.selection.wants(topic):
+            if topic in self._refused or not self.selection.includes(topic):
                 continue
             infos = self.get_publishers_info_by_topic(topic)
             if not infos:

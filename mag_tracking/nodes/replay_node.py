@@ -231,7 +231,7 @@ class ReplayNode(ManagedNode):
         self._last_tick = now
         self._position_ns += int(elapsed * self._rate * 1e9)
         self._clock_publisher.publish(Clock(clock=Time(sec=self._position_ns // 10**9,
-                                             nanosec=self._position_ns % 10**9)))
+                                                       nanosec=self._position_ns % 10**9)))
         n_remaining = MAX_MESSAGES_PER_TICK
         while self._next_message is not None \
                 and self._next_message.log_time_ns <= self._position_ns:

@@ -13,7 +13,7 @@ from typing import NoReturn
 
 from mag_tracking.interrupts import exit_on_signals
 
-ENDING = (signal.SIGINT, signal.SIGTERM)
+END_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Signals that end a node."""
 
 
@@ -27,13 +27,13 @@ def run_node(name: str) -> NoReturn:
     """
     status = 1
     try:
-        with exit_on_signals(0, *ENDING):
+        with exit_on_signals(0, *END_SIGNALS):
             status = import_module(f'mag_tracking.nodes.{name}').main()
     except KeyboardInterrupt:
         status = 130
     finally:
         # Finalisation of Python also takes time; further signals are ignored.
-        for s in ENDING:
+        for s in END_SIGNALS:
             signal.signal(s, signal.SIG_IGN)
         limit_exit_time(status)
     sys.exit(status)

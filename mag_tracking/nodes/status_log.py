@@ -34,7 +34,7 @@ class StatusLog:
         self._interval_start = 0.0
 
     @property
-    def n_remembered(self) -> int:
+    def n_stored(self) -> int:
         """Number of stored faults and kinds of lines."""
         return len(self._last_logged) + len(self._current_faults) + len(self._similar)
 

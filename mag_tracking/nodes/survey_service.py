@@ -65,7 +65,7 @@ class SurveyService:
             self._end_time = time.monotonic()
 
     def _solve_now(self, network: SensorNetwork, save: bool,
-               response: SurveyMessage.Response) -> SensorNetwork | None:
+                   response: SurveyMessage.Response) -> SensorNetwork | None:
         """Solve a survey; the interval is not checked."""
         # If a target is near a sensor, the background was measured before its arrival.
         fields = {name: self._stage.background(name)

@@ -155,7 +155,7 @@ class TrackerNode(StageNode):
         was_silent, self._is_silent = self._is_silent, \
             silent_s > self.settings.track.end_gap_s + TRANSPORT_MARGIN_S
         if was_silent and self._is_silent:
-            self._publish_all(self._stage.give_up('no frames received'), None)
+            self._publish_all(self._stage.end_tracks('no frames received'), None)
 
     def _receive_calibration(self, message: CalibrationState) -> None:
         """Apply the orientations of a survey and the doubtful intervals of the backgrounds."""
@@ -169,7 +169,7 @@ class TrackerNode(StageNode):
             # The message has only the latest interval of each sensor; frames of earlier intervals
             # may still arrive.
             self._doubtful_times = merged(self._doubtful_times, doubtful_times(message))
-            self._stage.doubt(self._doubtful_times)
+            self._stage.set_doubtful_times(self._doubtful_times)
         if _same_orientations(network, self.network):
             return
         self.network = network
@@ -188,7 +188,7 @@ class TrackerNode(StageNode):
         self._feed(frame)
         self._stage.idle()
 
-    def doubt(self, times: Mapping[str, DoubtfulTimes]) -> None:
+    def set_doubtful_times(self, times: Mapping[str, DoubtfulTimes]) -> None:
         """Set the intervals with doubtful backgrounds, in which tracks are ambiguous.
 
         Parameters
@@ -196,7 +196,7 @@ class TrackerNode(StageNode):
         times : mapping of str to DoubtfulTimes
             Intervals of each sensor.
         """
-        self._stage.doubt(times)
+        self._stage.set_doubtful_times(times)
 
     def idle(self) -> None:
         """Do work that is deferred until the preceding step has published its results."""
@@ -205,8 +205,8 @@ class TrackerNode(StageNode):
     def _feed(self, frame: FieldFrame) -> None:
         """Process a frame and publish the results."""
         self._publish_all(self._stage.feed(frame), frame)
-        if self._stage.clocks_apart:
-            self.get_logger().warning(self._stage.clocks_apart, throttle_duration_sec=60.0)
+        if self._stage.clock_warning:
+            self.get_logger().warning(self._stage.clock_warning, throttle_duration_sec=60.0)
 
     def _publish_all(self, records: list[TrackRecord], frame: FieldFrame | None) -> None:
         """Publish the records of a frame on their topics."""
@@ -306,7 +306,7 @@ def publish_if_any(publisher: Publisher, cls: Any, content: MessageDict | None) 
 def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:
     """Whether two networks have the same orientations within the rounding of quaternions."""
     is_same_std = [a is b if a is None or b is None else np.allclose(a, b)
-             for a, b in zip(one.orientation_std, other.orientation_std, strict=True)]
+                   for a, b in zip(one.orientation_std, other.orientation_std, strict=True)]
     return all(is_same_std) and bool(np.abs(one.R_ws - other.R_ws).max() < 1e-9)
 
 

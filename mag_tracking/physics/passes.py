@@ -198,8 +198,8 @@ class SuperposedPasses:
             Linear parameters.
         """
         converted = [row.forward(path, p[linear])
-                  for row, path, linear in zip(self.rows, self.split(theta), self.moments,
-                                               strict=True)]
+                     for row, path, linear in zip(self.rows, self.split(theta), self.moments,
+                                                  strict=True)]
         return (np.concatenate([path for path, _ in converted]),
                 np.concatenate([moments for _, moments in converted]))
 

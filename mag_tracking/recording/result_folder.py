@@ -16,7 +16,7 @@ from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording import core
 from mag_tracking.recording.track_recording import TrackRecording
-from mag_tracking.recording.writer import refuse_other_recording
+from mag_tracking.recording.writer import check_no_other_recording
 from mag_tracking.records import Detection, FieldFrame, Hypotheses, SmoothedPose, Track
 from mag_tracking.report.json_text import without_nan
 from mag_tracking.report.page import REPORT
@@ -86,7 +86,7 @@ class ResultFolder:
 
     def __init__(self, folder: str | PathLike[str], network: SensorNetwork) -> None:
         self.folder = output_folder(folder)
-        refuse_other_recording(self.folder / _RECORDING)
+        check_no_other_recording(self.folder / _RECORDING)
         self._files = ExitStack()
         try:
             self.replaces_earlier = self._remove_earlier_results()

@@ -124,7 +124,7 @@ def check_no_recording(folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise OutputError(f'{folder} is not a folder')
     existing = sorted(p.name for pattern in ('metadata.yaml', '*.mcap', '*.db3')
-                   for p in folder.glob(pattern))
+                      for p in folder.glob(pattern))
     if existing:
         raise OutputError(f'{folder} already contains a recording ({existing[0]}): choose another '
                           f'folder, or run mag-tracking repair to complete a truncated recording')

@@ -14,7 +14,7 @@ from mag_tracking.messages.shapes import MessageDict
 from mag_tracking.messages.types import definition, encoder
 
 
-def refuse_other_recording(path: Path) -> None:
+def check_no_other_recording(path: Path) -> None:
     """Check that the folder of a new MCAP file does not contain another recording.
 
     Parameters
@@ -64,7 +64,7 @@ class RecordingWriter:
     def __init__(self, path: str | PathLike[str], latched: Collection[str] = ()) -> None:
         self._latched = frozenset(latched)
         self.path = checked_path(path, OutputError)
-        refuse_other_recording(self.path)
+        check_no_other_recording(self.path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._stream = new_binary_file(self.path)

@@ -99,15 +99,15 @@ def geometry_figure(found: _Survey) -> Figure:
     along = np.arange(n)
     moved = found.network.positions - found.stated.positions
     _plot_corrections(rows[0], along, 1e3 * np.linalg.norm(moved, axis=1), 1e3 * g.position_std,
-            'displacement [mm]')
+                      'displacement [mm]')
     _plot_corrections(rows[1], along, np.rad2deg(found.rotation_angle), np.rad2deg(g.rotation_std),
-            'rotation [deg]')
+                      'rotation [deg]')
     rows[2].errorbar(along, g.gain, yerr=SCALE_1D * g.gain_std, fmt='o', ms=4, capsize=2,
                      color='tab:blue')
     rows[2].axhline(1.0, color='k', lw=0.8, ls=':')
     rows[2].set_title('gain (90 %)', fontsize=10, loc='left')
     _plot_residuals(rows[3], along, g.sensor_residual, suspect,
-          'residual in standard deviations (RMS; about 1 if noise and field error are right)')
+                    'residual in standard deviations (RMS; 1 if noise and field error are right)')
     step = -(-n // _MAX_NAMES)
     rows[3].set_xticks(along[::step], [literal(name) for name in names[::step]], rotation=90,
                        fontsize=7)
@@ -179,7 +179,7 @@ def _plot_corrections(axes: Axes, along: IntArray, magnitude: FloatArray, std: F
 
 
 def _plot_residuals(axes: Axes, along: IntArray, residual: FloatArray, suspect: BoolArray,
-          title: str) -> None:
+                    title: str) -> None:
     """Plot residuals as bars, suspect sensors in red."""
     axes.bar(along, np.nan_to_num(residual), width=0.8,
              color=np.where(suspect, _SUSPECT, 'tab:blue').tolist())

@@ -135,7 +135,7 @@ def _pose_size(log: TrackLog) -> int:
     return (4 * (120 + 24 * n_sensors + 32 * n_arrivals)) // 3
 
 
-def thinned(log: TrackLog, most: int) -> list[int]:
+def thin_poses(log: TrackLog, most: int) -> list[int]:
     """Return the indices of evenly spaced poses of a track.
 
     The first, the last and the most certain pose are included.

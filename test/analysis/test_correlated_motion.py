@@ -44,7 +44,7 @@ def test_sensors_may_have_different_orientations():
         np.array([[0.3, 1.0, -0.5], [2.0, 0.1, 0.4]])))
     field = np.einsum('nji,nj->ni', rotations[data.sensor], data.field)
     rotated = dataclasses.replace(data, network=dataclasses.replace(data.network, R_ws=rotations),
-                                 field=field)
+                                  field=field)
     assert correlated_motion(rotated).speed == pytest.approx(7.0, rel=0.01)
 
 
@@ -127,7 +127,7 @@ def test_sensors_above_one_another_have_no_delay(places):
 
 
 @pytest.mark.parametrize('fault', ['first sensor constant', 'all zero', 'one infinite',
-                                    'equal timestamps', 'few', 'no noise'])
+                                   'equal timestamps', 'few', 'no noise'])
 @pytest.mark.filterwarnings('error')
 def test_faulty_readings_result_in_a_reason_or_an_estimate(fault):
     data = simulated_pass(9.0)
@@ -146,7 +146,7 @@ def test_faulty_readings_result_in_a_reason_or_an_estimate(fault):
     if fault == 'few':
         rows = np.flatnonzero(data.t > 2.98)
         faulty = dataclasses.replace(data, t=t[rows], sensor=data.sensor[rows], field=field[rows],
-                                    covariance=data.covariance[rows])
+                                     covariance=data.covariance[rows])
     if fault == 'no noise':
         faulty = dataclasses.replace(data, covariance=0.0 * data.covariance)
     motion = correlated_motion(faulty)

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting, with_evidence
+from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting, with_pass_mounting
 from mag_tracking.geometry import rotation_about_z
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
@@ -93,7 +93,7 @@ def test_a_track_without_information_has_no_effect():
     """Due to linearisation, the covariance of such a track may slightly exceed the prior."""
     prior = np.einsum('jik,jk,jlk->jil', NETWORK.R_sw, PRIOR**2, NETWORK.R_sw)
     uninformative = SimpleNamespace(id=9, mounting=np.zeros((3, 3)),
-                           mounting_covariance=1.02 * prior)
+                                    mounting_covariance=1.02 * prior)
     e = fuse_mounting(NETWORK, PRIOR, [uninformative, uninformative])
     np.testing.assert_allclose(e.covariance, np.array([np.diag(s**2) for s in PRIOR]),
                                rtol=1e-6, atol=1e-15)
@@ -154,7 +154,7 @@ def test_a_track_of_another_network_is_rejected():
 def test_network_is_rotated_about_the_world_axes():
     rotation = np.deg2rad([[0.0, 0.0, 6.0], [2.0, 0.0, 0.0], [1.0, -2.0, 3.0]])
     C = np.tile(np.diag(np.deg2rad([1.0, 2.0, 3.0])**2), (3, 1, 1))
-    found = with_evidence(NETWORK, MountingEvidence(rotation, C, np.full(3, np.nan), 1))
+    found = with_pass_mounting(NETWORK, MountingEvidence(rotation, C, np.full(3, np.nan), 1))
     np.testing.assert_allclose(found.R_ws[0], rotation_about_z(np.deg2rad(6.0)) @ NETWORK.R_ws[0])
     np.testing.assert_allclose(found.R_ws,
                                Rotation.from_rotvec(rotation).as_matrix() @ NETWORK.R_ws)
@@ -189,7 +189,7 @@ def rotated_sensor_passes():
 
 def test_passes_correct_the_orientation_of_a_rotated_sensor(rotated_sensor_passes):
     nominal, truth, evidence = rotated_sensor_passes
-    found = with_evidence(nominal, evidence)
+    found = with_pass_mounting(nominal, evidence)
     before, after = (Rotation.from_matrix(truth @ np.swapaxes(R, 1, 2)).as_rotvec()
                      for R in (nominal.R_ws, found.R_ws))
     print(np.degrees(evidence.rotation).round(2), np.degrees(after).round(2),

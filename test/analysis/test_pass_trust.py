@@ -45,14 +45,14 @@ def test_residuals_near_the_vehicle_are_not_elsewhere():
     position = PATH[:3] + data.t[:, None] * PATH[3:6] - data.positions
     scale = np.minimum(1.0, 0.3 / np.linalg.norm(position, axis=1))[:, None]
     for residual, low, high in ((0.0 * field, 0.0, 0.0), (scale * field, 0.0, 1e-6),
-                            (0.3 * field, 0.001, 0.2)):
+                                (0.3 * field, 0.001, 0.2)):
         fraction = residual_elsewhere(data, [FittedRow(3, PATH, field)],
-                                  np.einsum('nij,nj->ni', W, residual))
+                                      np.einsum('nij,nj->ni', W, residual))
         assert low <= fraction <= high
     # The same residual at another time, as caused by a second vehicle.
     late = np.roll(field, 150, axis=0)
     fraction = residual_elsewhere(data, [FittedRow(3, PATH, field)],
-                           np.einsum('nij,nj->ni', W, 0.2 * late))
+                                  np.einsum('nij,nj->ni', W, 0.2 * late))
     assert fraction > 0.02
 
 

@@ -8,7 +8,7 @@ from mag_tracking.analysis.network_blind import calibrate_geometry_blind
 from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
 from mag_tracking.analysis.network_readings import rotation, tool_rotations
 from support.marks import studied
-from support.real_board import BOX, MOMENT, board_of_41, errors, said, within_limits
+from support.real_board import BOX, MOMENT, board_of_41, errors, print_errors, within_limits
 
 
 @pytest.fixture(scope='module')
@@ -31,7 +31,7 @@ def test_calibration_with_half_of_the_readings_is_accurate_for_the_other_half(re
     position_error, axis_error = errors(g, field[test_rows], positions[test_rows],
                                         axes[test_rows], g.magnet_poses)
     low = positions[test_rows, 2] < 0.1
-    said(f'known poses, rows {first}::2', position_error, axis_error, low)
+    print_errors(f'known poses, rows {first}::2', position_error, axis_error, low)
     within_limits(position_error, axis_error, low)
     if first == 0:
         # With calibrated biases only, the errors are at least three times as large.
@@ -43,7 +43,7 @@ def test_calibration_with_half_of_the_readings_is_accurate_for_the_other_half(re
         few = slice(1, None, 6)
         nominal_error, axis_error = errors(nominal, field[few], positions[few], axes[few],
                                            nominal.magnet_poses)
-        said('as stated', nominal_error, axis_error, positions[few, 2] < 0.1)
+        print_errors('as stated', nominal_error, axis_error, positions[few, 2] < 0.1)
         assert np.median(nominal_error) > 3.0 * np.median(position_error)
 
 
@@ -74,5 +74,5 @@ def test_blind_calibration_is_accurate_for_the_other_readings(recorded):
     poses = fit_registration(*g.poses, positions[::2][g.rows], axes[::2][g.rows])
     place, turn = errors(g, field[1::2], positions[1::2], axes[1::2], poses)
     low = positions[1::2, 2] < 0.1
-    said('unknown poses, rows 0::2', place, turn, low)
+    print_errors('unknown poses, rows 0::2', place, turn, low)
     within_limits(place, turn, low)

@@ -8,7 +8,7 @@ import pytest
 from mag_tracking.analysis.signature_classifier import (
     evaluate,
     evaluate_splits,
-    reliability_error,
+    expected_calibration_error,
     train,
 )
 from mag_tracking.apps.classes import examples_of
@@ -38,7 +38,7 @@ def test_accuracy_exceeds_the_fraction_of_the_largest_class(simulator):
     # A constant prediction has a balanced accuracy of one third.
     assert found.balanced_accuracy.mean() > 0.65
     # The target is 0.05; the limit adds three standard errors of 5 x 42 predictions.
-    assert found.reliability < 0.05 + 3.0 * np.sqrt(0.1 / 210)
+    assert found.expected_calibration_error < 0.05 + 3.0 * np.sqrt(0.1 / 210)
     assert found.unknown.mean() < 0.1
 
 
@@ -85,10 +85,10 @@ def test_labels_unsuitable_for_training_are_rejected(labels, message):
 
 
 def test_expected_calibration_error_follows_its_definition():
-    assert reliability_error(np.array([0.9] * 10), np.array([True] * 9 + [False])) == \
-        pytest.approx(0.0)
-    assert reliability_error(np.array([0.95] * 10), np.array([True] * 5 + [False] * 5)) == \
-        pytest.approx(0.45)
+    error = expected_calibration_error(np.array([0.9] * 10), np.array([True] * 9 + [False]))
+    assert error == pytest.approx(0.0)
+    error = expected_calibration_error(np.array([0.95] * 10), np.array([True] * 5 + [False] * 5))
+    assert error == pytest.approx(0.45)
 
 
 def test_random_labels_are_not_learnt_from_sensors_of_one_pass():

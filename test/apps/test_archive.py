@@ -125,7 +125,7 @@ def test_an_archive_contains_all_valid_recordings(tmp_path, recordings, capsys):
 
     mtimes = {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')}
     second = archive([recordings / '*.mcap', recordings / 'below'], NETWORK_FILE, settings, out)
-    assert sorted(second.already_done) == sorted(run.done) and not second.done
+    assert sorted(second.tracked_earlier) == sorted(run.done) and not second.done
     assert {p: p.stat().st_mtime_ns for p in out.rglob('*-*.parquet')} == mtimes
     assert len(rows(out, 'recordings')) == 4
 
@@ -151,7 +151,7 @@ def test_a_stopped_run_continues(tmp_path, recordings, complete_archive):
     assert first.interrupted and 1 <= len(first.done) < 3
     second = archive([recordings], NETWORK_FILE, settings, out)
     assert not second.interrupted and len(second.done) + len(first.done) == 3
-    assert sorted(second.already_done) == sorted(first.done)
+    assert sorted(second.tracked_earlier) == sorted(first.done)
     assert same_tables(out, complete_archive)
 
 

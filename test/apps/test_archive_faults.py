@@ -85,7 +85,7 @@ def test_a_scheduler_that_does_not_respond_is_an_error(tmp_path, recordings, mon
     monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT_S', 1.0)
     settings = settings_for('vehicle', QUICK)
     for address, error in ((f'tcp://127.0.0.1:{free_port()}', 'no response from a Dask scheduler'),
-                         ('nonsense://x', 'no response from a Dask scheduler')):
+                           ('nonsense://x', 'no response from a Dask scheduler')):
         with pytest.raises(ClusterError, match=error):
             archive([recordings], NETWORK_FILE, settings, tmp_path / 'out', scheduler=address)
 
@@ -162,7 +162,7 @@ def test_a_table_is_complete_or_missing(tmp_path):
 def test_folders_and_patterns_select_recordings(tmp_path, recordings):
     selected = recordings_of([recordings, recordings / 'straight_*.mcap'])
     assert [p.name for p in selected] == ['junction_left_to_right.mcap', 'damaged.mcap',
-                                       'straight_car_right.mcap', 'straight_small_left.mcap']
+                                          'straight_car_right.mcap', 'straight_small_left.mcap']
     (tmp_path / 'bag').mkdir()
     shutil.copy(recordings / 'straight_car_right.mcap', tmp_path / 'bag' / 'a_0.mcap')
     (tmp_path / 'bag' / 'metadata.yaml').write_text('')
@@ -194,7 +194,7 @@ def test_a_recording_that_grows_during_tracking_is_tracked_again(tmp_path):
     archive([path], NETWORK_FILE, settings, out, stopped=grow)
     second = archive([path], NETWORK_FILE, settings, out)
     assert len(second.done) == 1 and second.tracks == 1
-    assert archive([path], NETWORK_FILE, settings, out).already_done == [path]
+    assert archive([path], NETWORK_FILE, settings, out).tracked_earlier == [path]
 
 
 def test_leftovers_of_an_earlier_state_of_a_recording_are_discarded(tmp_path):

@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from bench.figures import Figures
-from mag_tracking.analysis.signature_classifier import reliability_error
+from mag_tracking.analysis.signature_classifier import expected_calibration_error
 from mag_tracking.apps.classes import evaluate_classes, examples_of
 from mag_tracking.event_records import VehiclePassage
 from mag_tracking.network.file import read_network
@@ -33,7 +33,7 @@ N = 120
 """Number of passes per simulator."""
 EXAMPLES = {'motorcycle': 30, 'car': 160, 'truck': 30}
 """Number of signatures of each class."""
-MIN_CORRECT, MAX_RELIABILITY_ERROR = 0.95, 0.05
+MIN_CORRECT, MAX_CALIBRATION_ERROR = 0.95, 0.05
 
 
 def body_of(rng, name, simulator):
@@ -77,9 +77,9 @@ def main():
                         None, True, f' (of {of_kind.sum()})')
         probability = np.array([p.class_probabilities.max() for _, p in counted])
         is_best = np.array([classes[int(np.argmax(p.class_probabilities))] == name
-                         for name, p in counted])
-        figures.add(f'{simulator}: reliability error', reliability_error(probability, is_best), '',
-                    MAX_RELIABILITY_ERROR)
+                            for name, p in counted])
+        figures.add(f'{simulator}: expected calibration error',
+                    expected_calibration_error(probability, is_best), '', MAX_CALIBRATION_ERROR)
     for simulator in SIMULATORS:
         examples = examples_of(signatures(EXAMPLES, simulator))
         found = evaluate_classes(examples, progress=partial(
@@ -88,8 +88,8 @@ def main():
                     True, f' (fraction of the largest class {found.majority:.3f})')
         figures.add(f'{simulator}, one sensor: balanced accuracy',
                     float(found.balanced_accuracy.mean()), '', None, True)
-        figures.add(f'{simulator}, one sensor: reliability error', found.reliability, '',
-                    MAX_RELIABILITY_ERROR)
+        figures.add(f'{simulator}, one sensor: expected calibration error',
+                    found.expected_calibration_error, '', MAX_CALIBRATION_ERROR)
     return figures.save()
 
 

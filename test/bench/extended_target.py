@@ -108,9 +108,9 @@ def simulated(figures, pool, name, kind, changes, flaws, n=40):
     rms = np.array([(e['rms'], s['rms']) for e, s in zip(filtered, smoothed, strict=True)
                     if e['rms'] is not None])
     for label, value, unit in (('RMS within 5 m', np.median(rms[:, 0]), 'm'),
-                              ('RMS within 5 m, smoothed', np.median(rms[:, 1]), 'm'),
-                              ('error at the closest point', np.median(closest), 'm'),
-                              ('ANEES', anees.mean(), '')):
+                               ('RMS within 5 m, smoothed', np.median(rms[:, 1]), 'm'),
+                               ('error at the closest point', np.median(closest), 'm'),
+                               ('ANEES', anees.mean(), '')):
         figures.keep(f'{name}: {label}', value, unit, note=f'{len(sure)} of {n} passes')
     print(f'  {name}: {len(sure)} of {n} tracked and unambiguous; RMS error within 5 m '
           f'{np.median(rms[:, 0]):.2f} m, smoothed {np.median(rms[:, 1]):.2f} m (ratio '

@@ -196,8 +196,8 @@ def report(monitor, rows, figures, aim):
         figures.keep('pose after the last sample of its frame, 99 %', np.quantile(delays, 0.99),
                      'ms')
         print(f'{len(delays)} poses, delay after the sample that completed the frame: median '
-          f'{np.median(delays):.1f} ms, p99 {np.quantile(delays, 0.99):.1f} ms, '
-          f'worst {delays.max():.1f} ms')
+              f'{np.median(delays):.1f} ms, p99 {np.quantile(delays, 0.99):.1f} ms, '
+              f'worst {delays.max():.1f} ms')
         begins = np.array(monitor.begins)
         first, rest = delays[begins], delays[~begins]
         if len(first) and len(rest):

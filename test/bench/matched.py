@@ -21,7 +21,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0, sensor_fields
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.initiation_vehicle import SHARE_FIELD, vehicle_model
+from mag_tracking.stages.track.initiation_vehicle import REFERENCE_FIELD, vehicle_model
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.units import NS
 
@@ -63,7 +63,7 @@ def prior_of(settings, n_t):
     mean = np.full((d, d), 1.0 / d)
     P[6:hard, 6:hard] = np.kron(v.moments[0]**2 / 3.0 / d * mean
                                 + v.difference_stds[0]**2 * (np.eye(d) - mean), np.eye(3))
-    soft_iron_std = v.induced_share_std * v.moments[0] * MU0 / SHARE_FIELD
+    soft_iron_std = v.induced_share_std * v.moments[0] * MU0 / REFERENCE_FIELD
     P[hard:hard + 3, hard:hard + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
     P[hard + 3:n_t, hard + 3:n_t] = v.length_stds[0]**2
     P[n_t:, n_t:] = settings.background_std**2 * np.eye(6)

@@ -51,7 +51,7 @@ def recordings(folder):
     for run in (1, 2):
         table = DATA / 'magnet_16_sensors' / f'lisa_data{run}'
         imported = import_pose_table(table.with_suffix('.csv'), f'{table}_background.csv',
-                                 folder / f'magnet{run}', 1e-6)
+                                     folder / f'magnet{run}', 1e-6)
         found[f'magnet {run}'] = (*imported[:2], 'magnet')
     return found
 

@@ -19,7 +19,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.stages.track.member import Member
 from mag_tracking.stages.track.running_track import RunningTrack
 from support.random_passes import SIMULATORS
-from support.situations import SITUATIONS, made, verdict
+from support.situations import SITUATIONS, simulated_world, verdict
 
 MIN_EVENTS = 0.9
 """Minimum fraction of runs with a disturbance among runs with a detection but no vehicle."""
@@ -90,7 +90,7 @@ def cost():
     for method, (_, call) in originals.items():
         setattr(owner[method], method, call)
     try:
-        a_world = made('a car', 'clouds', 0)
+        a_world = simulated_world('a car', 'clouds', 0)
         for _ in range(2):
             spent.update(dict.fromkeys(spent, 0.0))
             pipeline = Pipeline(a_world.network, settings_for('vehicle'))

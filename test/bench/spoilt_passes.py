@@ -38,7 +38,7 @@ FAULTS = {
 """{fault: (function that returns the fault, its arguments)}."""
 
 
-def spoil_with(what):
+def faults_of(what):
     """List of functions that apply a fault of `FAULTS` to `Readings`; empty for `none`."""
     if not FAULTS[what]:
         return []
@@ -46,9 +46,9 @@ def spoil_with(what):
     return [fault(*arguments)]
 
 
-def spoilt_pass(what, simulator, kind, seed):
+def faulty_pass(what, simulator, kind, seed):
     """Track a random pass with a fault of `FAULTS`; return its `Tracked`."""
-    return one_random_pass(simulator, kind, seed, faults=spoil_with(what))
+    return one_random_pass(simulator, kind, seed, faults=faults_of(what))
 
 
 def summary(figures, what, simulator, kind, found):
@@ -76,7 +76,7 @@ def main():
           f'most {MAX_WRONG:.0%} sure and wrong')
     figures = Figures('spoilt_passes')
     status = count_over([(w, s, k) for w in FAULTS for s in SIMULATORS for k in args.kinds],
-                        spoilt_pass, args.passes, partial(summary, figures))
+                        faulty_pass, args.passes, partial(summary, figures))
     figures.save()
     return status
 

@@ -14,7 +14,14 @@ import numpy as np
 
 from bench.figures import Figures
 from bench.two_simulators import count_over
-from support.standing import SOON_S, STOPS, TRACKED_M, first_after, goes_on, right_after
+from support.standing import (
+    SOON_S,
+    STOPS,
+    TRACKED_M,
+    background_recovery_s,
+    error_after_parked,
+    is_one_track,
+)
 
 RUNS = 20
 
@@ -22,8 +29,8 @@ RUNS = 20
 def one(what, run):
     """Run one case; return the result of its function in `support.standing`."""
     if what == 'stops':
-        return goes_on(STOPS[run % len(STOPS)], run // len(STOPS))
-    return right_after(run) if what == 'leaves' else first_after(run)
+        return is_one_track(STOPS[run % len(STOPS)], run // len(STOPS))
+    return background_recovery_s(run) if what == 'leaves' else error_after_parked(run)
 
 
 def summary(figures, what, found):

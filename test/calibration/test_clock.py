@@ -28,7 +28,7 @@ def smooth(t):
 
 
 def accelerations(t, shape=double_sided, knocks=KNOCKS, rotation=None, direction=(0.3, -0.5, 0.8),
-         rng=None, noise=0.0):
+                  rng=None, noise=0.0):
     """Accelerations (n, 3) [m/s^2] of a rotated sensor at the true times `t`."""
     level = sum(8.0 * shape(t - k) for k in knocks)
     R = Rotation.identity() if rotation is None else rotation

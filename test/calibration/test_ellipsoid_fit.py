@@ -68,7 +68,7 @@ def test_fits_of_recordings_agree_with_another_program(recordings, name, limit, 
     y = recordings[name]
     fit = fit_ellipsoid(y)
     print(f'{name}: {fit.residual_before:.5f} to {fit.residual:.5f}, offset {fit.offset} '
-          f'+- {fit.offset_std}, radius {fit.field_size:.6g}, coverage {fit.coverage:.3f}')
+          f'+- {fit.offset_std}, radius {fit.field_magnitude:.6g}, coverage {fit.coverage:.3f}')
     assert fit.converged and fit.reason == '' and fit.warnings == ()
     assert fit.n_readings == len(y) and fit.n_outliers < 0.001 * len(y)
     assert fit.residual_before == pytest.approx(before, abs=1e-5)
@@ -77,13 +77,13 @@ def test_fits_of_recordings_agree_with_another_program(recordings, name, limit, 
     assert (np.abs(fit.offset - offset) < 3.0 * fit.offset_std + digit).all()
     assert np.linalg.det(fit.correction) == pytest.approx(1.0, rel=1e-9)
     sizes = np.linalg.norm(fit.correct(y), axis=1)
-    assert abs(sizes.mean() / fit.field_size - 1.0) < 0.2 * limit
+    assert abs(sizes.mean() / fit.field_magnitude - 1.0) < 0.2 * limit
 
 
 @pytest.mark.parametrize('name, limit', [(r[0], r[1]) for r in RECORDINGS])
 def test_half_of_a_recording_predicts_the_other(recordings, name, limit):
     y = recordings[name]
-    fits = [fit_ellipsoid(y[k::2], field_size=1.0) for k in (0, 1)]
+    fits = [fit_ellipsoid(y[k::2], field_magnitude=1.0) for k in (0, 1)]
     for fit, rest in zip(fits, (y[1::2], y[::2]), strict=True):
         assert spread(fit.correct(rest)) <= limit
     # Adjacent readings share errors, so the two fits differ by less than their errors.
@@ -107,7 +107,7 @@ def test_exact_readings_give_exact_parameters(seed, decade):
     assert fit.converged and fit.warnings == ()
     np.testing.assert_allclose(fit.offset, unit * offset, atol=1e-9 * unit)
     np.testing.assert_allclose(fit.correction, true, atol=1e-9)
-    assert fit.field_size == pytest.approx(unit, rel=1e-9)
+    assert fit.field_magnitude == pytest.approx(unit, rel=1e-9)
     assert fit.residual < 1e-9 and fit.coverage > 0.5
 
 
@@ -120,8 +120,8 @@ def test_units_only_scale_the_result(unit, size):
     for a, b in [(one.offset * unit, other.offset), (one.offset_std * unit, other.offset_std),
                  (one.correction * scale, other.correction * unit),
                  (one.correction_std * scale, other.correction_std * unit),
-                 (one.field_size * scale, other.field_size),
-                 (one.field_size_std * scale, other.field_size_std),
+                 (one.field_magnitude * scale, other.field_magnitude),
+                 (one.field_magnitude_std * scale, other.field_magnitude_std),
                  (one.residual, other.residual), (one.coverage, other.coverage)]:
         np.testing.assert_allclose(b, a, rtol=1e-5)
 
@@ -129,9 +129,9 @@ def test_units_only_scale_the_result(unit, size):
 def test_corrected_field_has_the_given_size():
     y = readings(tumbling(1000))
     free, fit = fit_ellipsoid(y), fit_ellipsoid(y, 5e-5)
-    assert fit.field_size == 5e-5 and fit.field_size_std == 0.0 and free.field_size_std > 0.0
+    assert fit.field_magnitude == 5e-5 and fit.field_magnitude_std == 0.0 and free.field_magnitude_std > 0.0
     assert np.linalg.norm(fit.correct(y), axis=1).mean() == pytest.approx(5e-5, rel=0.002)
-    np.testing.assert_allclose(fit.correction * free.field_size, 5e-5 * free.correction,
+    np.testing.assert_allclose(fit.correction * free.field_magnitude, 5e-5 * free.correction,
                                rtol=1e-9)
     assert np.array_equal(fit.offset, free.offset)
 
@@ -188,7 +188,7 @@ def test_stated_stds_cover_the_truth(correlation):
         errors.append(np.concatenate([
             (fit.offset - OFFSET) / fit.offset_std,
             ((fit.correction - CORRECTION) / fit.correction_std)[np.triu_indices(3)],
-            [(fit.field_size - 1.0) / fit.field_size_std]]))
+            [(fit.field_magnitude - 1.0) / fit.field_magnitude_std]]))
     inside = np.abs(errors) < t.ppf(0.9, N_BLOCKS - 1)
     rates = inside.mean(axis=0)
     print(f'{correlation}: {rates.round(3)}')
@@ -200,8 +200,8 @@ def test_a_varying_field_size_does_not_affect_the_std_of_the_shape():
     """Each time block covers the sphere with its own field magnitude; det(correction) is one."""
     size = 1.0 + 0.02 * np.random.default_rng(6).standard_normal(N_BLOCKS)
     fit = fit_ellipsoid(readings(tumbling(20000) * np.repeat(size, 20000 // N_BLOCKS)[:, None]))
-    assert fit.field_size_std == pytest.approx(0.02 / np.sqrt(N_BLOCKS), rel=0.4)
-    assert np.diagonal(fit.correction_std).max() < 0.5 * fit.field_size_std
+    assert fit.field_magnitude_std == pytest.approx(0.02 / np.sqrt(N_BLOCKS), rel=0.4)
+    assert np.diagonal(fit.correction_std).max() < 0.5 * fit.field_magnitude_std
 
 
 def test_readings_at_rest_weigh_no_more_than_one_direction():

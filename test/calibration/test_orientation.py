@@ -59,7 +59,7 @@ def test_up_direction_rotates_with_the_sensor(R):
     np.testing.assert_allclose(exact.direction, R.T @ UP, atol=1e-12)
     assert exact.size == pytest.approx(GRAVITY)
     assert exact.std == pytest.approx(0.05 / GRAVITY)
-    assert (exact.n, exact.n_left_out) == (200, 0)
+    assert (exact.n, exact.n_excluded) == (200, 0)
 
 
 def test_knocks_and_readings_that_are_not_finite_are_excluded():
@@ -68,7 +68,7 @@ def test_knocks_and_readings_that_are_not_finite_are_excluded():
     a[50:60] += [30.0, -20.0, 10.0]
     a[70], a[71, 1] = np.nan, np.inf
     up = up_direction(a, 0.0)
-    assert up.n_left_out >= 12 and up.n + up.n_left_out == 200
+    assert up.n_excluded >= 12 and up.n + up.n_excluded == 200
     assert np.arccos(up.direction @ still.direction) < 1e-3
     # An accelerometer with coarse steps has no scatter at rest.
     coarse = np.tile([0.0, 0.0, GRAVITY], (50, 1))

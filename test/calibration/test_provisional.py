@@ -75,7 +75,7 @@ def standing_vehicle(until):
 def test_a_background_with_a_vehicle_at_the_start_is_doubtful_and_replaced():
     """The vehicle stands for four seconds; four seconds later, the background is ambiguous."""
     for seconds, is_doubtful, has_departed in ((4.0, False, False), (9.5, True, False),
-                                           (24.0, False, True)):
+                                               (24.0, False, True)):
         b = run_on(standing_vehicle(4.0), seconds)
         assert b.ready and b.doubtful == is_doubtful
         error = np.abs(b.level(seconds) - EARTH)

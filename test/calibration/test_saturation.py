@@ -58,7 +58,7 @@ def test_a_saturated_segment_is_excluded_from_a_pass_and_reported():
     collector, passes = PassCollector(ROAD, settings_for('vehicle')), []
     for k in np.argsort(data.t, kind='stable'):
         passes += collector.feed(one(MagSample(int(round(1e9 * (20.0 + data.t[k]))),
-                                           ROAD.names[data.sensor[k]], field[k] + 4e-5)))
+                                               ROAD.names[data.sensor[k]], field[k] + 4e-5)))
     passes += collector.flush()
     (cut, notes), = passes
     assert any('mag_1' in n and 'saturated' in n and 'not used' in n for n in notes)

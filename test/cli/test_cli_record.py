@@ -99,7 +99,7 @@ def test_options_select_topics_and_limit_files(tmp_path, monkeypatch):
     assert calls == [(selection.resolved(absolute), tmp_path, size, seconds * NS, [])
                      for selection, size, seconds in (
         (Selection(FIELDS, IMUS), 10**9, 3600),
-        (Selection(FIELDS, IMUS, ('/a', '/b'), everything=True), 500_000, 60),
+        (Selection(FIELDS, IMUS, ('/a', '/b'), all_topics=True), 500_000, 60),
         (Selection(FIELDS, IMUS, results=True), 10**9, 3600))]
 
 

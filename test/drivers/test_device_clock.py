@@ -21,7 +21,7 @@ from mag_tracking.drivers.device_clock import (
     ClockSettings,
     DeviceClock,
 )
-from mag_tracking.drivers.lower_line import likely_slopes, lower_hull
+from mag_tracking.drivers.lower_line import lower_hull, slope_range
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import replace
 
@@ -165,7 +165,7 @@ def test_the_fitted_line_matches_a_linear_programme():
         A = np.column_stack([np.ones(n), x - x.mean()])
         best = linprog([-1.0, 0.0], A, y, bounds=(None, None))
         points = list(zip(x, y, strict=True))
-        low, high = likely_slopes(points)
+        low, high = slope_range(points)
         assert low <= best.x[1] + 1e-9 and best.x[1] <= high + 1e-9
         above = np.sort(y - A @ best.x)[2:]
         room = above[len(above) // 2] / math.log(2.0) / n

@@ -36,7 +36,7 @@ def test_the_example_file_is_valid():
 def test_every_entry_of_the_example_file_is_valid(tmp_path):
     text = (ROOT / 'config' / 'drivers.yaml').read_text()
     blocks = [b for b in text.split('\n\n') if 'sensor' in b and ('transport:' in b
-                                                                 or 'device:' in b)]
+                                                                  or 'device:' in b)]
     assert len(blocks) == 6
     for block in blocks:
         lines = block.splitlines()

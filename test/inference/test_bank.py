@@ -153,7 +153,7 @@ def test_separated_weight_counts_distant_hypotheses_only():
     b = bank(3, spread=1.0)
     b.x[2, 0] = 30.0
     b.log_w = np.log([0.6, 0.3, 0.1])
-    assert b.weight(b.apart(0)) == pytest.approx(0.1)
+    assert b.weight(b.is_separated(0)) == pytest.approx(0.1)
 
 
 def initial_bank(network, earth, offset_std=0.5):
@@ -167,7 +167,7 @@ def initial_bank(network, earth, offset_std=0.5):
                 P.append(np.diag([0.5, offset_std, 0.1, 1.0, 0.3, 0.02,
                                   120.0, 120.0, 120.0, 1.0, 1.0, 1.0]) ** 2)
     bank = FilterBank.from_targets(np.array(x), np.array(P), np.zeros(len(x), dtype=int),
-                                 len(network), 1e-8)
+                                   len(network), 1e-8)
     return bank
 
 
@@ -238,7 +238,7 @@ def test_an_initial_bank_returns_the_rows_of_its_source_bank():
     from_targets = random_bank(5, 4)
     own = np.array([np.diag([1.0, 2.0]), np.diag([3.0, 4.0])])
     bank = FilterBank.from_targets(from_targets.x, from_targets.P, from_targets.label, 2, 1e-8, own,
-                                 from_targets.kind)
+                                   from_targets.kind)
     before, start = bank.copy(), InitialBank.of(bank, 4)
     other = copy(start)
     bank.x[:], bank.P[:] = np.nan, np.nan

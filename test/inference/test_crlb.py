@@ -61,7 +61,7 @@ ROTATION_KERNEL = [*np.cross(UP, R0), *np.cross(UP, V0), 0.0, 0.0, 0.0]
     (ONES, TWO, np.empty((0, 9)), (3.956, 5e-4), (2571, 0.5), ''),
 ])
 def test_observability_of_the_published_example(m, sensors, kernel, smallest, condition,
-                                              unobservable):
+                                                unobservable):
     """Check values of an example of TSP14 Proposition 1, to the published digits."""
     o, k = observability(unitless(m, sensors), NAMES), len(kernel)
     print(f'{len(sensors)} sensors, m = {m}:', o.eigenvalues, o.condition_number)

@@ -81,7 +81,7 @@ def test_density_of_its_own_model_is_near_that_of_the_true_filter(strength):
         ours += bank.log_density(np.zeros(1, dtype=np.int64), np.ones((1, 1)), np.array([value]),
                                  np.ones(1), dt)
         true_filter.predict(F=np.array([[1.0, dt], [0.0, 1.0]]),
-                      Q=Q_continuous_white_noise(2, dt, strength**2))
+                            Q=Q_continuous_white_noise(2, dt, strength**2))
         true_filter.update(value, R=1.0)
         theirs += true_filter.log_likelihood
     # The unknown strength costs its initial weight and at most log(1/stay) per frame.

@@ -171,7 +171,7 @@ def test_nees_of_a_linear_gaussian_case_is_chi_square():
         for p in range(runs):
             h = np.einsum('jic,c->ji', H[p], x[p, :n_t])[None]
             nis.append(plain_kalman.update(x[p:p + 1], P[p:p + 1], y[p], h, H[p:p + 1], C,
-                                     np.zeros((1, n_sensors)))[1][0])
+                                           np.zeros((1, n_sensors)))[1][0])
     e = truth - x
     nees = np.einsum('pi,pij,pj->p', e, np.linalg.inv(P), e)
     low, high = chi2.ppf([0.025, 0.975], runs * n_x) / runs

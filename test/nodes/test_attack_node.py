@@ -116,7 +116,7 @@ def attack_once(call, rng, k):
         response = call(Survey, '/calibration_node/survey', Survey.Request(save=True))
         assert isinstance(response.success, bool)
         response = call(Calibrate, '/calibration_node/calibrate',
-                      Calibrate.Request(sensors=[path]))
+                        Calibrate.Request(sensors=[path]))
         assert not response.success
     else:
         offset = float(rng.choice([-1.0, np.nan, np.inf, 1e300, 2.0]))

@@ -15,7 +15,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.units import NS
 from support.bundled import NETWORK_FILE
 from support.node_processes import start, stop
-from support.situations import made
+from support.situations import simulated_world
 
 pytestmark = pytest.mark.timeout(600)
 NAMES = ('calibration_node', 'detection_node', 'tracker_node')
@@ -23,7 +23,7 @@ NAMES = ('calibration_node', 'detection_node', 'tracker_node')
 
 def test_the_tracker_publishes_the_disturbance_of_a_replay(ros):
     node, spin_until = ros
-    world = made('a temperature step', 'boxes', 0)
+    world = simulated_world('a temperature step', 'boxes', 0)
     readings = world.readings.part(world.readings.stamp_ns < 14 * NS)
     pipeline = Pipeline(world.network, settings_for('vehicle'))
     expected = [r for r in pipeline.feed(readings) if isinstance(r, Disturbance)]

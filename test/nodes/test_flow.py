@@ -124,7 +124,7 @@ def test_the_number_of_stored_latencies_is_bounded(clock):
     flow = Flow('a_node')
     for _ in range(MAX_LATENCIES + 50):
         flow.add(0, 0, clock[0])
-    assert flow.n_ages == MAX_LATENCIES
+    assert flow.n_latencies == MAX_LATENCIES
     assert values(status_of(flow))['messages'] == str(MAX_LATENCIES + 50)
 
 
@@ -152,7 +152,7 @@ class StandIn:
         self._clock, self.is_replayed, self._is_silent = clock, is_replayed, False
         self.flows = {'detection': Flow('detection')}
         self.settings = settings_for('magnet')
-        self._stage = SimpleNamespace(bank=object(), give_up=lambda why: [why])
+        self._stage = SimpleNamespace(bank=object(), end_tracks=lambda why: [why])
         self.published = []
 
     def _publish_all(self, records, frame):

@@ -49,7 +49,7 @@ def seconds_to_first_reading(world, sensor_back_ns):
         m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns
         for _, m in world.since(sensor_back_ns, 'driver_node')))
     delay_s = next(arrival_ns for arrival_ns, m in world.since(sensor_back_ns, 'driver_node')
-                if m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns)
+                   if m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns)
     delay_s = (delay_s - sensor_back_ns) / NS
     assert delay_s <= MAX_RECOVERY_S
     return delay_s

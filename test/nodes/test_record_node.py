@@ -77,7 +77,7 @@ def test_selected_topics_are_recorded(ros, record):
         frozenset({FIELDS[0], FIELDS[0] + '_calibrated', '/tracker_node/pose', imu}): record(
             Selection(FIELDS, IMUS, results=True)),
         frozenset({imu, *names} - {'/_hidden', '/_named'}): record(
-            Selection(FIELDS, IMUS, everything=True))}
+            Selection(FIELDS, IMUS, all_topics=True))}
 
     def publish_all():
         for p in publishers:
@@ -127,7 +127,7 @@ def test_messages_lost_in_the_queue_are_counted(ros, record, monkeypatch):
         session.node.poll()
     assert session.recorder.counts[FIELDS[0]] > n and session.node.lost == before
     lines = list(summary(session.recorder, Selection(FIELDS, topics=('/gone',)), session.node.lost,
-                                     {'/odd': 'odd_msgs/msg/Odd is not installed'}))
+                         {'/odd': 'odd_msgs/msg/Odd is not installed'}))
     assert f'  warning: {FIELDS[0]}: messages lost before recording: ' \
            f'{session.node.lost[FIELDS[0]]}' in lines
     assert [x for x in lines if 'no messages on' in x] == [

@@ -184,4 +184,4 @@ def test_ros_is_shut_down_in_one_module_only(path):
              if isinstance(node, ast.Attribute)}
     shutdown = names & {'rclpy.try_shutdown', 'rclpy.shutdown', 'node.destroy_node'}
     assert shutdown == ({'rclpy.try_shutdown', 'node.destroy_node'} if path.stem == 'shutdown'
-                       else set())
+                        else set())

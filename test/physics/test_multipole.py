@@ -27,7 +27,7 @@ seed = st.integers(0, 10**6)
 
 PARTS = {1: slice(0, 3), 2: slice(3, 8), 3: slice(8, 15)}
 COMPONENTS = {1: ('x', 'y', 'z'), 2: ('xx', 'xy', 'xz', 'yy', 'yz'),
-        3: ('xxx', 'xxy', 'xxz', 'xyy', 'xyz', 'yyy', 'yyz')}
+              3: ('xxx', 'xxy', 'xxz', 'xyy', 'xyz', 'yyy', 'yyz')}
 
 
 def only(order, moments):

@@ -100,7 +100,7 @@ def test_multipoles_describe_a_vehicle_better_with_every_order():
     data = measured(network, path, np.zeros((1, 3)), rng)
     t = data.t[data.sensor == 0]
     B = random_vehicle(rng).field(network.earth_field, np.outer(t, [9.0, 0.0]),
-                   np.zeros(len(t)), network.positions)
+                                  np.zeros(len(t)), network.positions)
     data.field[:] += np.concatenate([B[:, 0], B[:, 1]])
     costs = []
     for order in (1, 2, 3):

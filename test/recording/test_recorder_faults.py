@@ -125,7 +125,7 @@ def test_a_full_disk_is_reported_and_the_recording_continues(tmp_path):
     # One gap: from the first chunk without space to the first retry with space.
     first = found.index(next(b for a, b in zip(found, found[1:], strict=False) if b != a + 1))
     assert found[:first] == list(range(first)) and found[first:] == list(range(first + dropped,
-                                                                              2000))
+                                                                               2000))
     assert len(reports) == 2 and 'No space left' in reports[0] and f': {dropped}' in reports[1]
     assert not recorder.unfinished and not recording.losses
     assert [k for _, k in by_rosbags(tmp_path / 'a')] == found

@@ -120,7 +120,7 @@ def box_truck(rng, length=None, moment=None):
         at = rng.uniform(-front + 1.5, front - 4.0)
         parts += [((at, 0.0, 1.6), (2.0, 1.8, 0.9), 3.0)]
     return magnetised(rng, parts, length,
-                       rng.uniform(1200.0, 2200.0) if moment is None else moment)
+                      rng.uniform(1200.0, 2200.0) if moment is None else moment)
 
 
 @dataclass(frozen=True)

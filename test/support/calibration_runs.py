@@ -19,7 +19,7 @@ EARTH = np.array([2e-6, 1.5e-5, -4.9e-5])
 
 def running(**changes):
     return FedBackground(**{'learn': 3.0, 'memory': 20.0, 'guard': 1.5, 'block': 0.25,
-                                'freeze_std': 2.0, 'relearn': 60.0, **changes})
+                            'freeze_std': 2.0, 'relearn': 60.0, **changes})
 
 
 def feed(background, t, signal=0.0, seed=0, drift=0.0):

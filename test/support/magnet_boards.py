@@ -70,7 +70,7 @@ def estimated(geometry, network):
     """Estimates (10 n + 12,) in the order of the covariance."""
     n = len(network)
     rotations = [_rotation_vector(a.T @ b)
-            for a, b in zip(network.R_ws, geometry.network.R_ws, strict=True)]
+                 for a, b in zip(network.R_ws, geometry.network.R_ws, strict=True)]
     sensor = np.hstack([geometry.bias, geometry.gain[:, None] - 1.0, np.array(rotations),
                         geometry.network.positions - network.positions])
     return np.append(sensor.reshape(10 * n), geometry.shared)

@@ -123,7 +123,7 @@ class World:
     def start(self, name):
         """Start a node as a process with the parameters of this world."""
         parameters = {'driver_node': {'drivers': self.drivers[self.link]},
-                 'tracker_node': POINT, **STEADY}[name]
+                      'tracker_node': POINT, **STEADY}[name]
         if name == 'detection_node':
             parameters = {'align.period_s': FRAME_S, **parameters}
         if name != 'driver_node':

@@ -37,7 +37,7 @@ def random_path(rng, n_dipoles, road):
     if road:
         heading = np.pi * rng.integers(2) + 0.03 * rng.standard_normal()
     along, across = np.array([[1, 0], [0, 1]]) @ [[np.cos(heading), np.sin(heading)],
-                                                 [-np.sin(heading), np.cos(heading)]]
+                                                  [-np.sin(heading), np.cos(heading)]]
     offset = rng.uniform(-2.5, 2.5) if road else rng.uniform(-6.0, 6.0)
     position = np.append(offset * across + rng.uniform(-2.0, 2.0) * along, rng.uniform(0.3, 1.0))
     velocity = np.append(rng.uniform(4.0, 20.0) * along, 0.05 * rng.standard_normal())

@@ -33,7 +33,7 @@ def errors(geometry, field, positions, axes, poses):
     return np.linalg.norm([p.position for p in estimates] - r, axis=1), np.array(angle)
 
 
-def said(what, place, turn, low):
+def print_errors(what, place, turn, low):
     print(f'{what}: {1e3 * np.median(place):.3f} mm, {1e3 * np.median(place[low]):.3f} mm below '
           f'100 mm, {np.median(turn):.2f} deg; 90 % within {1e3 * np.quantile(place, 0.9):.2f} mm')
 

@@ -94,9 +94,9 @@ SITUATIONS = {
     'one overtakes': Situation(lambda r, s: two(r, s, 'overtake'), aim=0.05, group='several'),
     'one follows': Situation(lambda r, s: two(r, s, 'follow'), aim=0.05, group='several'),
     'two that meet, four sensors': Situation(lambda r, s: two(r, s, 'meet', FOUR), aim=0.05,
-                                        group='several'),
+                                             group='several'),
     'one follows, four sensors': Situation(lambda r, s: two(r, s, 'follow', FOUR), aim=0.05,
-                                      group='several'),
+                                           group='several'),
     'hum of 50 Hz at 50 Hz': Situation(lambda r, s: hum(r, s, 50.0, 50.0), group='nothing'),
     'hum of 16.7 Hz at 100 Hz': Situation(lambda r, s: hum(r, s, 16.7, 100.0), group='nothing'),
     'a tram line switched': Situation(tram, group='nothing'),
@@ -111,7 +111,7 @@ SITUATIONS = {
 """{name: situation}."""
 
 
-def made(name, simulator, seed):
+def simulated_world(name, simulator, seed):
     """Simulate a situation; return a `World`."""
     rng = np.random.default_rng([seed, sorted(SITUATIONS).index(name),
                                  SIMULATORS.index(simulator)])
@@ -168,7 +168,7 @@ def mistaken(disturbances, tracks, a_world):
 
 def verdict(name, simulator, seed, changes=None):
     """Simulate and track a situation with the settings `changes`; return its `Verdict`."""
-    a_world = made(name, simulator, seed)
+    a_world = simulated_world(name, simulator, seed)
     pipeline = Pipeline(a_world.network, settings_for('vehicle', changes))
     records = pipeline.feed(a_world.readings) + pipeline.flush()
     tracks = [r for r in records if isinstance(r, Track) and not r.ended]

@@ -6,7 +6,7 @@ from mag_tracking.apps.prescan import prescan
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
 from support.random_passes import SIMULATORS, errors_of
-from support.situations import made, wrong_of
+from support.situations import simulated_world, wrong_of
 
 STOPS = ('stops for 5 s', 'stops for 20 s', 'stops for 60 s')
 STANDING = 0.05
@@ -32,9 +32,9 @@ def stands(a_world, body=0):
     return still.min(), still.max()
 
 
-def goes_on(name, run):
+def is_one_track(name, run):
     """Whether one track covers a vehicle from before its stop until 2 s after it."""
-    a_world = made(name, SIMULATORS[run % 2], run // 2)
+    a_world = simulated_world(name, SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))
     poses = poses_of(pipeline.feed(a_world.readings) + pipeline.flush())
     begin, end = stands(a_world)
@@ -44,11 +44,11 @@ def goes_on(name, run):
     return any(times[0] < begin and times[-1] > end + 2.0 for times in spans.values())
 
 
-def right_after(run):
+def background_recovery_s(run):
     """Time [s] from a vehicle's departure until all backgrounds remain correct; inf if never."""
     # The vehicle has left when no sensor differs from its final level by more than `RIGHT`. The
     # stage runs as in live operation, without a first pass over the readings.
-    a_world = made('there at the start, leaves', SIMULATORS[run % 2], run // 2)
+    a_world = simulated_world('there at the start, leaves', SIMULATORS[run % 2], run // 2)
     stage = Pipeline(a_world.network, settings_for('vehicle')).calibrate
     readings, names = a_world.readings, a_world.network.names
     n = len(names)
@@ -72,15 +72,15 @@ def right_after(run):
         times[wrong.max() + 1] - departure, 0.0)
 
 
-def first_after(run):
+def error_after_parked(run):
     """(median error [m] or inf, n_sure, n_wrong) of the first vehicle after the parked vehicle.
 
     The recording is processed offline, with a first pass.
     """
-    a_world = made('there at the start, then cars', SIMULATORS[run % 2], run // 2)
+    a_world = simulated_world('there at the start, then cars', SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))
     prescan([a_world.readings], a_world.network,
-               pipeline.settings.calibrate).apply(pipeline.calibrate)
+            pipeline.settings.calibrate).apply(pipeline.calibrate)
     poses = poses_of(pipeline.feed(a_world.readings) + pipeline.flush())
     best = np.inf, 0, 0
     for id in {pose.id for pose in poses}:

@@ -84,7 +84,7 @@ def test_the_direction_is_right_despite_coarse_steps(step, directions, request):
     if step > 1e-7:
         request.applymarker(pytest.mark.xfail(strict=True, reason='the largest field of some '
                             'passes is two steps, and zero at one sensor: the direction is not '
-                            'observable'))
+                                              'observable'))
     found = [outcome(name, spoiler.steps(step)) for name in VEHICLES]
     right = sum(o.direction_is_right for o in found)
     nees = np.median([o.nees for o in found if o.tracked])

@@ -211,7 +211,7 @@ def test_the_existence_of_a_target_falls_on_noise():
     for k in range(40):
         y = 1.2e-8 / np.sqrt(8) * rng.standard_normal((2, 3))
         tracks += stage_.feed(FieldFrame(k * 80_000_000, y, C, np.full(2, 8), np.zeros(2),
-                                          True, 6.0, 6))
+                                         True, 6.0, 6))
     assert [t for t in tracks if isinstance(t, Track)][-1].existence < 0.5
 
 

@@ -5,7 +5,14 @@
 
 import pytest
 
-from support.standing import SOON_S, STOPS, TRACKED_M, first_after, goes_on, right_after
+from support.standing import (
+    SOON_S,
+    STOPS,
+    TRACKED_M,
+    background_recovery_s,
+    error_after_parked,
+    is_one_track,
+)
 
 RUNS = 20
 # Twenty consecutive runs, each up to 90 s on a slow machine.
@@ -17,18 +24,18 @@ MIN_RIGHT = 18
 
 @pytest.mark.parametrize('runs', [2, pytest.param(RUNS, marks=pytest.mark.study)])
 def test_the_track_of_a_vehicle_that_stops_continues_and_leaves(runs):
-    found = [goes_on(STOPS[run % len(STOPS)], run // len(STOPS)) for run in range(runs)]
+    found = [is_one_track(STOPS[run % len(STOPS)], run // len(STOPS)) for run in range(runs)]
     assert sum(found) >= 0.9 * runs
 
 
 @pytest.mark.parametrize('runs, min_right', [
     (2, 2), pytest.param(RUNS, MIN_RIGHT, marks=pytest.mark.study)])
 def test_the_background_recovers_soon_after_a_standing_vehicle_leaves(runs, min_right):
-    assert sum(right_after(run) <= SOON_S for run in range(runs)) >= min_right
+    assert sum(background_recovery_s(run) <= SOON_S for run in range(runs)) >= min_right
 
 
 @pytest.mark.parametrize('runs', [1, pytest.param(RUNS, marks=pytest.mark.study)])
 def test_the_first_vehicle_after_a_standing_one_is_tracked_offline(runs):
     for run in range(runs):
-        error, n_sure, n_wrong = first_after(run)
+        error, n_sure, n_wrong = error_after_parked(run)
         assert error < TRACKED_M and n_sure and n_wrong == 0, run

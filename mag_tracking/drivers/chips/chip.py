@@ -85,7 +85,7 @@ class SmBus(Protocol):
         """Close the bus."""
 
 
-class Place(NamedTuple):
+class ChipLocation(NamedTuple):
     """Location of a chip on a bus."""
 
     address: int
@@ -97,7 +97,7 @@ class Place(NamedTuple):
 
     def __str__(self) -> str:
         channel = ('' if self.multiplexer is None else
-                  f', on channel {self.channel} of the multiplexer at {self.multiplexer:#04x}')
+                   f', on channel {self.channel} of the multiplexer at {self.multiplexer:#04x}')
         return f'address {self.address:#04x}{channel}'
 
 
@@ -145,12 +145,12 @@ class Bus:
             raise OSError(errno.ENODEV, 'the bus is not open')
         return self._smbus
 
-    def select(self, place: Place) -> None:
+    def select(self, place: ChipLocation) -> None:
         """Open the multiplexer channel of a chip and close all other channels.
 
         Parameters
         ----------
-        place : Place
+        place : ChipLocation
         """
         selection = (place.multiplexer, place.channel)
         if not self._multiplexers or selection == self._selected:
@@ -176,7 +176,7 @@ class Registers:
     Parameters
     ----------
     bus : Bus
-    place : Place
+    place : ChipLocation
         Location of the chip.
 
     Attributes
@@ -187,7 +187,7 @@ class Registers:
         Function that waits for a time in seconds.
     """
 
-    def __init__(self, bus: Bus, place: Place) -> None:
+    def __init__(self, bus: Bus, place: ChipLocation) -> None:
         self._bus, self._place = bus, place
         self.monotonic_ns, self.sleep = bus.monotonic_ns, bus.sleep
 
@@ -347,7 +347,7 @@ def check_identity(chip: Identified, registers: Registers) -> None:
                               f'{expected:#04x}')
 
 
-def one_of(name: str, value: Value, choices: Mapping[Value, Choice]) -> Choice:
+def look_up_choice(name: str, value: Value, choices: Mapping[Value, Choice]) -> Choice:
     """Look up the value of a setting in the table of its permitted values.
 
     Parameters

@@ -4,7 +4,7 @@ import re
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
-from mag_tracking.drivers.chips.chip import Place
+from mag_tracking.drivers.chips.chip import ChipLocation
 from mag_tracking.errors import SettingsError
 
 ENTRY = re.compile(r'(?P<name>[^:]+):(?P<chip>[^:]+):0x(?P<address>[0-9a-fA-F]{2})'
@@ -16,7 +16,7 @@ class Sensor(NamedTuple):
 
     name: str
     chip: str
-    place: Place
+    place: ChipLocation
 
 
 def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor]:
@@ -52,7 +52,7 @@ def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor
     return sensors
 
 
-def _conflict(one: Place, other: Place) -> bool:
+def _conflict(one: ChipLocation, other: ChipLocation) -> bool:
     """Whether two chips would answer at once; a chip directly on the bus answers on any channel."""
     return one.address == other.address and (
         one == other or None in (one.multiplexer, other.multiplexer))
@@ -86,9 +86,9 @@ def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
                             f'{", ".join(known)} nor a module.Class')
     address = _address(name, 'address', match['address'], 0x08)
     if match['multiplexer'] is None:
-        return Sensor(name, chip, Place(address))
+        return Sensor(name, chip, ChipLocation(address))
     multiplexer = _address(name, 'multiplexer', match['multiplexer'], 0x70)
-    return Sensor(name, chip, Place(address, multiplexer, int(match['channel'])))
+    return Sensor(name, chip, ChipLocation(address, multiplexer, int(match['channel'])))
 
 
 def _address(name: str, role: str, digits: str, lowest: int) -> int:

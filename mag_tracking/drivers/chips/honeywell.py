@@ -27,7 +27,7 @@ from mag_tracking.drivers.chips.chip import (
     Conversion,
     Measurement,
     Registers,
-    one_of,
+    look_up_choice,
 )
 from mag_tracking.settings import param
 
@@ -68,7 +68,7 @@ class Hmc5883l:
     def __init__(self, registers: Registers, settings: Hmc5883lSettings,
                  count: Callable[[str], None]) -> None:
         self._registers = registers
-        self._gain = one_of(f'{self.NAME}.range_ut', settings.range_ut, GAINS)
+        self._gain = look_up_choice(f'{self.NAME}.range_ut', settings.range_ut, GAINS)
         self._gain_bits = list(GAINS).index(settings.range_ut) << 5
 
     def set_up(self) -> None:

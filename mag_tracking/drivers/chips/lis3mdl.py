@@ -22,8 +22,8 @@ from mag_tracking.drivers.chips.chip import (
     Conversion,
     Measurement,
     Registers,
+    look_up_choice,
     mask_overrange,
-    one_of,
 )
 from mag_tracking.settings import param
 
@@ -64,7 +64,8 @@ class Lis3mdl:
     def __init__(self, registers: Registers, settings: Lis3mdlSettings,
                  count: Callable[[str], None]) -> None:
         self._registers, self._count = registers, count
-        self._scale_bits, self._gain = one_of('lis3mdl.range_ut', settings.range_ut, FULL_SCALES)
+        self._scale_bits, self._gain = look_up_choice(
+            'lis3mdl.range_ut', settings.range_ut, FULL_SCALES)
         self._max_field = settings.range_ut * 1e-6
 
     def set_up(self) -> None:

@@ -35,8 +35,8 @@ from mag_tracking.drivers.chips.chip import (
     Conversion,
     Measurement,
     Registers,
+    look_up_choice,
     mask_overrange,
-    one_of,
 )
 from mag_tracking.drivers.reading import Axes
 from mag_tracking.settings import param
@@ -91,8 +91,8 @@ class Mmc5983ma:
     def __init__(self, registers: Registers, settings: Mmc5983maSettings,
                  count: Callable[[str], None]) -> None:
         self._registers = registers
-        self._bandwidth = one_of(f'{self.NAME}.conversion_ms', settings.conversion_ms,
-                                 self.BANDWIDTHS)
+        self._bandwidth = look_up_choice(f'{self.NAME}.conversion_ms', settings.conversion_ms,
+                                         self.BANDWIDTHS)
         self._conversion_ns = round(settings.conversion_ms * 1e6)
         self._set_reset_ns = round(settings.set_reset_s * 1e9)
         self._offset: Axes | None = None

@@ -23,8 +23,8 @@ from mag_tracking.drivers.chips.chip import (
     Conversion,
     Measurement,
     Registers,
+    look_up_choice,
     mask_overrange,
-    one_of,
 )
 from mag_tracking.settings import param
 
@@ -65,7 +65,7 @@ class Rm3100:
     def __init__(self, registers: Registers, settings: Rm3100Settings,
                  count: Callable[[str], None]) -> None:
         self._registers, self._cycles = registers, settings.cycle_count
-        self._gain, rate_hz = one_of('rm3100.cycle_count', settings.cycle_count, CYCLES)
+        self._gain, rate_hz = look_up_choice('rm3100.cycle_count', settings.cycle_count, CYCLES)
         self._delay_ns = round(1e9 / rate_hz)
 
     def set_up(self) -> None:

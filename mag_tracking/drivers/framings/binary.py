@@ -14,7 +14,7 @@ from mag_tracking.drivers.framings.fields import (
     Rejected,
     axis_value,
     chosen,
-    skipped,
+    ignore_value,
     ticks_value,
 )
 from mag_tracking.drivers.reading import Parsed, Reading
@@ -213,7 +213,7 @@ def _wrap(kind: str) -> int:
 def _converter(quantity: str, kind: str, order: _ByteOrder) -> _Converter:
     """Function that converts an unpacked value of a field for `FieldLayout`."""
     if quantity == SKIP:
-        return skipped
+        return ignore_value
     convert: _Converter
     if quantity in AXES or quantity == 'ticks':
         convert = float if kind[0] != 'f' else axis_value if quantity in AXES else ticks_value

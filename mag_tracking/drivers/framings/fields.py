@@ -237,7 +237,7 @@ def sensor_name(text: str) -> str:
     return text
 
 
-def skipped(value: object) -> None:
+def ignore_value(value: object) -> None:
     """Ignore a value.
 
     Parameters
@@ -247,7 +247,7 @@ def skipped(value: object) -> None:
     return None
 
 
-def unescaped(setting: str, text: str) -> bytes:
+def decode_escapes(setting: str, text: str) -> bytes:
     r"""Bytes (UTF-8) of a string with escape sequences.
 
     The sequences \n, \r, \t, \0, \\ and \xhh are recognised, so that both kinds of YAML quotes

@@ -13,11 +13,11 @@ from mag_tracking.drivers.framings.fields import (
     Rejected,
     axis_value,
     chosen,
+    decode_escapes,
+    ignore_value,
     sensor_name,
     sequence_value,
-    skipped,
     ticks_value,
-    unescaped,
 )
 from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
@@ -72,7 +72,7 @@ class Lines:
     """
 
     def __init__(self, end: str, max_length: int) -> None:
-        self.end = unescaped('end', end)
+        self.end = decode_escapes('end', end)
         if not self.end:
             raise SettingsError('end: at least one character is required, such as \\n')
         self.max_length = max_length
@@ -166,10 +166,10 @@ class TextFraming:
     def __init__(self, settings: TextSettings) -> None:
         self._lines = Lines(settings.end, settings.max_length)
         self._layout = FieldLayout(settings.fields, settings.each, settings.count)
-        self._prefix = unescaped('prefix', settings.prefix)
-        self._comment = unescaped('comment', settings.comment)
+        self._prefix = decode_escapes('prefix', settings.prefix)
+        self._comment = decode_escapes('comment', settings.comment)
         self._nmea = chosen('checksum', settings.checksum, ('none', 'nmea')) == 'nmea'
-        separator = unescaped('separator', settings.separator)
+        separator = decode_escapes('separator', settings.separator)
         self._separator = None if separator == b' ' else separator
         self._converters = [_converter(q) for q in self._layout.quantities]
         self._check_settings(separator)
@@ -232,7 +232,7 @@ def _converter(quantity: str) -> Callable[[bytes], object]:
     if quantity in AXES:
         return _axis
     converters: dict[str, Callable[[bytes], object]] = {
-        'ticks': _ticks, 'sequence': _sequence, 'sensor': _sensor, SKIP: skipped}
+        'ticks': _ticks, 'sequence': _sequence, 'sensor': _sensor, SKIP: ignore_value}
     return converters[quantity]
 
 

@@ -33,7 +33,7 @@ _GROUP = 0xFE00
 
 _FLOAT, _FIXED_12_20, _FIXED_16_32 = 0, 1, 2
 _TRIPLE_FORMATS = (struct.Struct('>3f'), struct.Struct('>3i'), struct.Struct('>IhIhIh'),
-          struct.Struct('>3d'))
+                   struct.Struct('>3d'))
 """Formats of three real numbers, indexed by the two precision bits of the identifier."""
 
 _BLOCKS = {

@@ -143,7 +143,7 @@ class MqttTopics:
         self._thread.start()
         with self._changed:
             answered = self._changed.wait_for(lambda: self._is_ready or self._loss,
-                                           self._settings.connect_timeout_s)
+                                              self._settings.connect_timeout_s)
             lost = self._loss
         if not answered or lost:
             self.close()

@@ -31,7 +31,7 @@ from mag_tracking.drivers.transports.polled import Polled
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
 
-AT_ONCE = 1000
+MAX_DATAGRAMS_PER_READ = 1000
 """Maximum number of datagrams per `read`."""
 CLOCK_SET_NS = 1_000_000
 """[ns] A larger change of the clock difference indicates that the wall clock was set."""
@@ -198,7 +198,8 @@ class UdpSocket(Polled[socket.socket]):
         Returns
         -------
         list of Chunk
-            Up to `AT_ONCE` datagrams. Empty if none arrived in time, or if `close` was called.
+            Up to `MAX_DATAGRAMS_PER_READ` datagrams. Empty if none arrived in time, or if `close`
+            was called.
 
         Raises
         ------
@@ -221,7 +222,7 @@ class UdpSocket(Polled[socket.socket]):
         datagrams: list[tuple[bytes, list[Ancillary], int, tuple[str, int]]] = []
         is_empty = False
         ancillary_size = socket.CMSG_SPACE(TIMESPEC.size)
-        while len(datagrams) < AT_ONCE and not is_empty:
+        while len(datagrams) < MAX_DATAGRAMS_PER_READ and not is_empty:
             try:
                 datagrams.append(opened.recvmsg(self._settings.max_length, ancillary_size))
             except BlockingIOError:

@@ -62,7 +62,7 @@ class BackgroundRestoration:
     def __contains__(self, sensor: str) -> bool:
         return sensor in self._stored
 
-    def offer(self, stored: Mapping[str, StoredBackground]) -> None:
+    def set_stored(self, stored: Mapping[str, StoredBackground]) -> None:
         """Replace all stored backgrounds.
 
         Parameters

@@ -312,7 +312,7 @@ class Calibrate:
         stored : mapping of str to StoredBackground
             Background of each sensor.
         """
-        self._restoration.offer(stored)
+        self._restoration.set_stored(stored)
         self._mark_restorable()
 
     def _mark_restorable(self) -> None:
@@ -421,7 +421,7 @@ class Calibrate:
         state = self._state_of(sensor)
         return self._background[sensor].level(int(state['last_ns'] - state['first_ns']) / NS)
 
-    def overruled(self, sensor: str) -> tuple[int, FloatArray, FloatArray]:
+    def overruled_covariances(self, sensor: str) -> tuple[int, FloatArray, FloatArray]:
         """Message covariances of a sensor that contradict its measured noise.
 
         Parameters

@@ -106,7 +106,7 @@ class Survey:
     def __init__(self, network: SensorNetwork, settings: SurveySettings) -> None:
         self.counts: Counter[str] = Counter()
         # The result of an earlier survey is not additional evidence.
-        self._network, self._settings = network.with_stated_orientations(), settings
+        self._network, self._settings = network.with_nominal_orientations(), settings
         self._accelerations: dict[str, deque[tuple[int, FloatArray]]] = {
             name: deque(maxlen=settings.max_accelerations) for name in network.names}
 

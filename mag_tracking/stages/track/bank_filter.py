@@ -204,7 +204,7 @@ class BankFilter:
         """
         n_hyp, n, n_x = paths.shape
         out = PathResult(np.empty(n_hyp), np.empty(n_hyp), np.empty((n_hyp, n), dtype=bool),
-                    np.empty((n_hyp, n, n_x, n_x) if wants_covariances else 0))
+                         np.empty((n_hyp, n, n_x, n_x) if wants_covariances else 0))
         new_x, new_P = np.empty_like(bank.x), np.empty_like(bank.P)
         self._compiled.run_along(
             **self._frames(frames, intervals), first_is_updated=first_is_updated,

@@ -82,7 +82,7 @@ class ClockComparison:
         # [s] Significant offsets between the clocks, else 0; computed once per pass.
         self._offset_s: FloatArray = np.zeros((n_sensors, n_sensors))
 
-    def apart_s(self, rows: IntArray) -> float:
+    def largest_offset_s(self, rows: IntArray) -> float:
         """Largest significant offset between two clocks.
 
         Clocks that were compared in only one pass are ignored, because this pass may contain two
@@ -102,7 +102,7 @@ class ClockComparison:
         return float(self._offset_s[np.ix_(repeated, repeated)].max(initial=0.0))
 
     @property
-    def apart(self) -> ClockOffset | None:
+    def largest_offset(self) -> ClockOffset | None:
         """Clock with the largest significant offset; None if no offset is significant."""
         ahead, behind = map(int, np.unravel_index(np.argmax(self._offset_s), self._offset_s.shape))
         if self._offset_s[ahead, behind] == 0.0:

@@ -178,7 +178,7 @@ class CrossCheck:
         """Whether the latest fit contradicts the track."""
         return bool(self._pass_doubts())
 
-    def conclude(self, clocks: ClockComparison, rows: IntArray) -> None:
+    def finish(self, clocks: ClockComparison, rows: IntArray) -> None:
         """Fit the pass a last time at the end of the track, and update the clock comparison.
 
         Parameters
@@ -229,7 +229,7 @@ class CrossCheck:
             reasons.add(doubts.NO_STEADY_PATH)
         if not latest.is_explained:
             return reasons
-        if latest.needs_clocks_apart:
+        if latest.needs_clock_offsets:
             reasons.add(doubts.CLOCKS_APART)
         if moves_too_far(latest.closest(self._network.positions), latest.velocity,
                          self._period_s, self._network.positions):

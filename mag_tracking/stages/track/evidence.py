@@ -47,7 +47,7 @@ SENSED_LEVEL = 4.0
 noise by this number of standard deviations."""
 
 TRANSIENT_DOUBTS = (doubts.OVERFIT, doubts.DISTURBANCE_MODEL, doubts.INNOVATIONS, doubts.MISFIT,
-                  doubts.HEIGHT, doubts.OFF_THE_ROAD, doubts.NO_STEADY_PATH)
+                    doubts.HEIGHT, doubts.OFF_THE_ROAD, doubts.NO_STEADY_PATH)
 """Doubts about the filter at a single time. Smoothing resolves them only in part."""
 
 TRANSIENT_S = 0.1
@@ -97,7 +97,7 @@ class TrackEvidence:
         self.largest: FloatArray = np.zeros(n_sensors)
 
     @property
-    def doubted(self) -> bool:
+    def is_doubtful(self) -> bool:
         """Whether the whole track is doubtful."""
         return bool(self._doubts)
 
@@ -116,7 +116,7 @@ class TrackEvidence:
         """
         self._log_odds += log_likelihood_ratio
 
-    def doubt(self, reason: str) -> None:
+    def flag(self, reason: str) -> None:
         """Mark the whole track as doubtful.
 
         Parameters
@@ -134,8 +134,8 @@ class TrackEvidence:
         self._n_consecutive_misfits, self._overfit_expiry_ns = 0, -1
         self._last_found_ns.clear()
 
-    def doubt_start(self, approach_unobserved: bool, network: SensorNetwork, starts_anywhere: bool
-                    ) -> None:
+    def flag_start(self, approach_unobserved: bool, network: SensorNetwork, starts_anywhere: bool
+                   ) -> None:
         """Mark the track as doubtful if its start was not observed or its range is not observable.
 
         Parameters
@@ -148,14 +148,14 @@ class TrackEvidence:
         """
         # A target that was not seen approaching may already have passed.
         if approach_unobserved and not starts_anywhere:
-            self.doubt(doubts.NOT_SEEN_APPROACHING)
+            self.flag(doubts.NOT_SEEN_APPROACHING)
         # With a single sensor, the settings determine the range. With a few sensors at one place,
         # errors of the field model determine the range of a vehicle.
         if len(network) == 1 or network.is_compact and not starts_anywhere:
-            self.doubt(doubts.SENSORS_AT_ONE_PLACE)
+            self.flag(doubts.SENSORS_AT_ONE_PLACE)
 
-    def doubt_for(self, reason: str, stamp_ns: int, seconds: float,
-                  since_ns: int | None = None) -> None:
+    def flag_interval(self, reason: str, stamp_ns: int, seconds: float,
+                      since_ns: int | None = None) -> None:
         """Mark the poses of a limited time as doubtful.
 
         Parameters
@@ -182,7 +182,7 @@ class TrackEvidence:
         frame : FieldFrame
         """
         if self._approach.add(frame):
-            self.doubt(doubts.NOT_SEEN_APPROACHING)
+            self.flag(doubts.NOT_SEEN_APPROACHING)
 
     def add_frame(self, frame: FieldFrame, rows: IntArray, nis: FloatArray) -> None:
         """Add the fields and the innovations of a frame.
@@ -255,7 +255,7 @@ class TrackEvidence:
         """
         is_contradiction = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
         if is_contradiction and len(nis) <= 2:
-            self.doubt(doubts.CONTRADICTION)
+            self.flag(doubts.CONTRADICTION)
         return is_contradiction
 
     def vehicle_doubts(self, nis: FloatArray, degrees_of_freedom: int, ratio: float) -> set[str]:
@@ -283,7 +283,7 @@ class TrackEvidence:
         if self.innovations.excess > 1.0:
             reasons.add(doubts.INNOVATIONS)
         if self.innovations.fails:
-            self.doubt(doubts.INNOVATIONS)
+            self.flag(doubts.INNOVATIONS)
         return reasons
 
     def doubts_filter(self, gain: float, stamp_ns: int, window_s: float) -> bool:
@@ -306,7 +306,7 @@ class TrackEvidence:
             self._overfit_expiry_ns = stamp_ns + round(window_s * NS)
         return stamp_ns <= self._overfit_expiry_ns
 
-    def was_filter_doubted(self, stamp_ns: int) -> bool:
+    def was_filter_doubtful(self, stamp_ns: int) -> bool:
         """Whether the filter was doubtful at an earlier time.
 
         Parameters
@@ -334,7 +334,7 @@ class TrackEvidence:
         """
         self._single_sensor_s += dt if by_one_sensor else 0.0
         if self._single_sensor_s > MAX_SINGLE_SENSOR_S:
-            self.doubt(doubts.ONE_SENSOR)
+            self.flag(doubts.ONE_SENSOR)
 
     @property
     def existence(self) -> float:

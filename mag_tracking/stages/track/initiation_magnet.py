@@ -108,7 +108,7 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     if not len(cost):
         return None
     bank = FilterBank.from_targets(state, P, np.zeros(len(cost), dtype=int), len(network),
-                                 background_std, own_covariance)
+                                   background_std, own_covariance)
     bank.reweight(-0.5 * cost)
     return bank
 

@@ -15,7 +15,7 @@ from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.records import FieldFrame
 from mag_tracking.settings import param
 
-SHARE_FIELD = 5e-5
+REFERENCE_FIELD = 5e-5
 """Field for which `VehicleSettings.induced_share` is defined [T]."""
 
 START_TURN_RATIO = 0.5
@@ -163,7 +163,7 @@ def _n_dipoles(settings: VehicleSettings) -> int:
 
 def _soft_iron_per_share(settings: VehicleSettings, kind: int) -> float:
     """Soft iron [m³] of a kind of vehicle for an induced share of one."""
-    return settings.moments[kind] * MU0 / SHARE_FIELD
+    return settings.moments[kind] * MU0 / REFERENCE_FIELD
 
 
 def soft_iron(settings: VehicleSettings, kind: int) -> float:
@@ -246,7 +246,7 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
             labels += [label] * len(states[-1])
             kinds += [kind] * len(states[-1])
     bank = FilterBank.from_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
-                                 len(network), background_std, own_covariance, np.array(kinds))
+                                   len(network), background_std, own_covariance, np.array(kinds))
     return _add_turning_hypotheses(bank, vehicle_model(settings, network), settings.turn_share)
 
 
@@ -259,7 +259,7 @@ def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float
     doubled.origin = np.arange(2 * n)
     doubled.log_w = np.log(np.repeat([1.0 - fraction, fraction], n) / n)
     doubled.P[n:, w, w] = START_TURN_RATIO**2 * model.turn_variance(np.hypot(bank.x[:, 3],
-                                                                        bank.x[:, 4]))
+                                                                             bank.x[:, 4]))
     return doubled
 
 

@@ -33,7 +33,7 @@ unknown."""
 
 
 @dataclass(frozen=True)
-class Joint:
+class JointExplanation:
     """Joint hypotheses of the tracked vehicles and a new vehicle, whose states come last."""
 
     bank: FilterBank
@@ -92,19 +92,19 @@ def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
             slower, faster = sorted((speed[i], speed[k]))
             cosine = velocity[i] @ velocity[k] / max(slower * faster, MIN_MOVING_SPEED**2)
             if slower >= MIN_MOVING_SPEED and (abs(cosine) < CROSSING_COSINE or
-                                       cosine > 0.0 and faster > OVERTAKING_RATIO * slower):
+                                               cosine > 0.0 and faster > OVERTAKING_RATIO * slower):
                 return True
     return False
 
 
-def are_sensed_by_two(joint: Joint) -> bool:
+def are_sensed_by_two(joint: JointExplanation) -> bool:
     """Whether at least two sensors sense each new vehicle.
 
     A field at only one sensor may be a fault of this sensor.
 
     Parameters
     ----------
-    joint : Joint
+    joint : JointExplanation
 
     Returns
     -------

@@ -116,7 +116,7 @@ class TrackManager:
         for track in self._tracks:
             track.configure(settings)
 
-    def doubt(self, times: Mapping[str, DoubtfulTimes]) -> None:
+    def set_doubtful_times(self, times: Mapping[str, DoubtfulTimes]) -> None:
         """Set the times at which the backgrounds of the sensors are doubtful.
 
         Tracks with frames at these times are marked as doubtful.
@@ -136,9 +136,9 @@ class TrackManager:
                 if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
 
     @property
-    def clocks_apart(self) -> str:
+    def clock_warning(self) -> str:
         """Message about a significant clock offset; empty if all clocks agree."""
-        offset = self._clocks.apart if self._settings.cross_check else None
+        offset = self._clocks.largest_offset if self._settings.cross_check else None
         return '' if offset is None else offset.text(self._network.names)
 
     @property
@@ -188,7 +188,7 @@ class TrackManager:
                 self.counts['tracks of new targets' if joint.adds else 'tracks found again'] += 1
                 self._next_id += joint.adds
 
-    def give_up(self, reason: str) -> list[TrackRecord]:
+    def end_tracks(self, reason: str) -> list[TrackRecord]:
         """End all tracks and discard the recent frames, after an interruption of the frames.
 
         Parameters
@@ -219,8 +219,8 @@ class TrackManager:
         dt = (frame.stamp_ns - self._last_ns) / NS
         if dt <= 0.0:
             self.counts['time jumped back'] += 1
-            return self.give_up('time jumped back')
-        return self.give_up('gap in the frames') if dt > self._settings.end_gap_s else []
+            return self.end_tracks('time jumped back')
+        return self.end_tracks('gap in the frames') if dt > self._settings.end_gap_s else []
 
     def _end_all(self, reason: str, stamp_ns: int | None) -> list[TrackRecord]:
         """End every running track and disturbance, at the latest frame."""
@@ -243,7 +243,7 @@ class TrackManager:
         doubtful = self._doubtful_sensors(frame)
         self._max_energy = max(self._max_energy, _energy(frame))
         for track in self._tracks:
-            track.doubt(doubtful)
+            track.flag_doubtful_backgrounds(doubtful)
         out = [record for track in self._tracks for record in track.step(frame, dt)]
         return out + self._delete_ended(frame.stamp_ns)
 
@@ -297,7 +297,7 @@ class TrackManager:
                              self.counts, self._clocks, later_sensors)
         self._next_id += 1
         self._tracks.append(track)
-        track.doubt(self._doubtful_sensors(*recent, frame))
+        track.flag_doubtful_backgrounds(self._doubtful_sensors(*recent, frame))
         out = track.begin(
             frame, recent,
             approach_unobserved=is_in_tail or bool(recent) and _n_sensors(*recent) < 2)

@@ -15,7 +15,7 @@ from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.cross_check import CrossCheck
 from mag_tracking.stages.track.disturbances import UnexplainedField
 from mag_tracking.stages.track.evidence import TrackEvidence
-from mag_tracking.stages.track.joint import Joint
+from mag_tracking.stages.track.joint import JointExplanation
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.plausibility import Plausibility
 from mag_tracking.stages.track.published_pose import ambiguities, published_track, smoothed_pose
@@ -29,7 +29,7 @@ MAX_POSITIONS = 64
 
 
 @dataclass(frozen=True)
-class Update:
+class BankUpdate:
     """Bank of a running track after a frame."""
 
     frame: FieldFrame
@@ -44,7 +44,7 @@ class Update:
 
 
 @dataclass(frozen=True)
-class View:
+class MemberView:
     """Bank of a running track, restricted to one member."""
 
     bank: FilterBank
@@ -142,8 +142,8 @@ class Member:
         ratio : float
             Minimum Bayes factor of a target against a disturbance.
         """
-        self.evidence.doubt_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
-                                  self._sensors.whole, False)
+        self.evidence.flag_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
+                                 self._sensors.whole, False)
         self.evidence.bayes_factor.add(first.evidence.bayes_factor.log_ratio, stamp_ns, ratio)
 
     def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:
@@ -165,13 +165,13 @@ class Member:
                      for stamp_ns, place in self._recent_positions if stamp_ns in position_at]
         return float(np.mean(distances)) if distances else 0.0
 
-    def publish(self, update: Update, view: View) -> Track:
+    def publish(self, update: BankUpdate, view: MemberView) -> Track:
         """Create and store the record of a frame.
 
         Parameters
         ----------
-        update : Update
-        view : View
+        update : BankUpdate
+        view : MemberView
 
         Returns
         -------
@@ -184,7 +184,7 @@ class Member:
         self._counts['poses'] += 1
         return self.last
 
-    def _create_record(self, update: Update, view: View) -> Track:
+    def _create_record(self, update: BankUpdate, view: MemberView) -> Track:
         """Update the evidence with a frame, and return its `Track`."""
         frame, dt, sensors, best = update.frame, update.dt, update.sensors, view.best
         measured: BoolArray = ~np.isnan(frame.field)
@@ -194,7 +194,7 @@ class Member:
         if self._unobserved_length is not None:
             self._unobserved_length.update(
                 view.bank.x[best], view.bank.P[best], sensors.network.positions[measuring],
-                self.last is not None and (self.evidence.doubted or not self.last.ambiguous))
+                self.last is not None and (self.evidence.is_doubtful or not self.last.ambiguous))
         reasons = self.evidence.note(self._doubts(update, view, is_single_sensor), frame.stamp_ns)
         excess = 1.0 if self._target.starts_anywhere else self.evidence.innovations.excess
         return sensors.for_whole_network(published_track(
@@ -209,7 +209,7 @@ class Member:
             mounting_covariance=view.observation.angle_covariances(view.bank.P[best])),
             update.settings)
 
-    def is_doubted(self, settings: TrackSettings) -> bool:
+    def is_doubtful(self, settings: TrackSettings) -> bool:
         """Whether the whole track is currently doubtful.
 
         Parameters
@@ -220,11 +220,11 @@ class Member:
         -------
         bool
         """
-        return self.evidence.doubted or self.cross_check.is_doubtful \
+        return self.evidence.is_doubtful or self.cross_check.is_doubtful \
             or not self.evidence.bayes_factor.is_favoured(settings.min_bayes_factor) \
             or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
 
-    def _doubts(self, update: Update, view: View, is_single_sensor: bool) -> set[str]:
+    def _doubts(self, update: BankUpdate, view: MemberView, is_single_sensor: bool) -> set[str]:
         """Update and return the doubts about a pose."""
         bank, best, evidence, settings = view.bank, view.best, self.evidence, update.settings
         reasons = evidence.doubts | ({doubts.ONE_SENSOR} if is_single_sensor else set())
@@ -240,15 +240,15 @@ class Member:
             settings.min_bayes_factor)
         if self._overfits(update, view):
             reasons.add(doubts.OVERFIT)
-        reasons |= self.cross_check.doubts(self._clocks.apart_s(update.sensors.rows))
+        reasons |= self.cross_check.doubts(self._clocks.largest_offset_s(update.sensors.rows))
         reasons |= self._plausibility.evaluate(
             view.observation, bank, best, settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), update.dt)
         for reason in reasons & doubts.PERMANENT:
-            evidence.doubt(reason)
+            evidence.flag(reason)
         return reasons | evidence.doubts
 
-    def _overfits(self, update: Update, view: View) -> bool:
+    def _overfits(self, update: BankUpdate, view: MemberView) -> bool:
         """Update and return whether the filter fits the frames much better than its path."""
         overfits = self.evidence.doubts_filter(view.gain, update.frame.stamp_ns,
                                                update.settings.relinearise_window_s)
@@ -290,7 +290,7 @@ class Member:
                 or self.evidence.bayes_factor.disfavoured_s(self.last.stamp_ns) <= 0.0:
             return None
         return UnexplainedField(self.id, self.begin_ns, self.evidence.largest, self.evidence.sensed,
-                           uniform)
+                                uniform)
 
     def states_of(self, slot: int, n_one: int, states: Iterable[TrackState],
                   end_ns: float = np.inf) -> list[TrackState]:
@@ -337,18 +337,18 @@ class Member:
         -------
         list of SmoothedPose
         """
-        ambiguous = doubtful or bool(ambiguities(bank, best, bank.apart(best)))
+        ambiguous = doubtful or bool(ambiguities(bank, best, bank.is_separated(best)))
         return [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
             kind=int(bank.kind[best]), kinds=self._target.kinds,
             unobserved_length=self._unobserved_length, complete=complete, difference=difference,
-            ambiguous=ambiguous or self.evidence.was_filter_doubted(stamp_ns))
+            ambiguous=ambiguous or self.evidence.was_filter_doubtful(stamp_ns))
             for (stamp_ns, x, P), difference in zip(states, self.cross_check.differences(states),
                                                     strict=True)]
 
 
-def members_in_order(members: Sequence[Member], new: Member | None, joint: Joint, n_one: int
-             ) -> list[Member]:
+def members_in_order(members: Sequence[Member], new: Member | None, joint: JointExplanation,
+                     n_one: int) -> list[Member]:
     """Return the members and a new target in the order of the states of a joint explanation.
 
     If two vehicles replace one, the old member becomes the vehicle that is nearer to its published
@@ -358,7 +358,7 @@ def members_in_order(members: Sequence[Member], new: Member | None, joint: Joint
     ----------
     members : sequence of Member
     new : Member or None
-    joint : Joint
+    joint : JointExplanation
     n_one : int
         Number of states of each vehicle.
 

@@ -18,7 +18,7 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
-from mag_tracking.stages.track.joint import Joint, are_sensed_by_two
+from mag_tracking.stages.track.joint import JointExplanation, are_sensed_by_two
 from mag_tracking.stages.track.new_target_evidence import IMPROBABLE
 from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, field_energy
 from mag_tracking.stages.track.relinearisation import Window
@@ -98,7 +98,7 @@ class NewTargetSearch:
             len(settings.arrival_names) * len(settings.lateral_offsets) * len(settings.speeds)
             * len(settings.kinds) * len(moment_directions()) * N_DISTANCES))
 
-    def find(self) -> Joint | None:
+    def find(self) -> JointExplanation | None:
         """Return the best explanation with a new target, or with a vehicle at another position.
 
         Returns
@@ -133,8 +133,9 @@ class NewTargetSearch:
                 starts += self._pair_starts(others, i)
         return starts
 
-    def _best_of(self, starts: Sequence[WindowStart], track_evidence: float) -> Joint | None:
-        """`Joint` of one explanation; `track_evidence` is the log-evidence of the current track."""
+    def _best_of(self, starts: Sequence[WindowStart], track_evidence: float
+                 ) -> JointExplanation | None:
+        """Best explanation; `track_evidence` is the log-evidence of the current track."""
         refined = self._add_turning_starts(self._refine_starts(starts))
         prior = LOG_P_ARRIVAL if len(refined[0].kind) > self._n_targets else LOG_P_LOST
         bank, log_likelihood, log_w, paths = self._run_starts(refined)
@@ -192,7 +193,7 @@ class NewTargetSearch:
         return field_energy(
             self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
 
-    def _is_elsewhere(self, joint: Joint) -> bool:
+    def _is_elsewhere(self, joint: JointExplanation) -> bool:
         """Whether the vehicle that was searched for again was found far from its track."""
         n, now = self._n_one, self._bank.x[self._bank.best()]
         assert joint.replaced is not None
@@ -231,7 +232,7 @@ class NewTargetSearch:
         return starts
 
     def _starts_on(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
-                 replaced: int | None) -> list[WindowStart]:
+                   replaced: int | None) -> list[WindowStart]:
         """Starts of known vehicles and new vehicles on `paths` (k, 7) with moments (k, 3, 3)."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
         labels = self._search.prior.nearest_line(paths)[0].tolist()
@@ -315,8 +316,8 @@ class NewTargetSearch:
         return True
 
     def _joint_of(self, starts: Sequence[WindowStart], bank: FilterBank, log_likelihood: FloatArray,
-                  log_w: FloatArray, paths: FloatArray, log_odds: float) -> Joint | None:
-        """`Joint` of the usable starts; None if no start is usable."""
+                  log_w: FloatArray, paths: FloatArray, log_odds: float) -> JointExplanation | None:
+        """`JointExplanation` of the usable starts; None if no start is usable."""
         rows = np.flatnonzero(np.isfinite(log_w))
         if not len(rows):
             return None
@@ -334,5 +335,5 @@ class NewTargetSearch:
                         [each.copy() for _ in range(n_frames)], float(log_sum_exp(log_w[rows])),
                         self._window.max_hypotheses)
         n_targets = len(starts[0].kind)
-        return Joint(now, window, self._filter_of(n_targets), log_odds, starts[0].replaced,
-                     n_targets > self._n_targets)
+        return JointExplanation(now, window, self._filter_of(n_targets), log_odds,
+                                starts[0].replaced, n_targets > self._n_targets)

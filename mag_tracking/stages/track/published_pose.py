@@ -201,15 +201,15 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     Track
     """
     n_t = len(model.state_names)
-    apart = bank.apart(best)
-    P = covariance_about(bank, best, model, apart)
+    is_separated = bank.is_separated(best)
+    P = covariance_about(bank, best, model, is_separated)
     fields, flags = _pose_fields(model, orientation, bank.x[best, :n_t], excess * P,
                                  int(bank.kind[best]), unobserved_length, difference)
-    reasons = doubts.ordered({*found, *ambiguities(bank, best, apart)})
+    reasons = doubts.ordered({*found, *ambiguities(bank, best, is_separated)})
     uncertainty: PoseUncertainty | None = pose_uncertainty(fields)
     if reasons and ambiguous_poses != BEST:
         uncertainty = mixture_uncertainty(
-            bank, best, apart, model, orientation, fields, P, excess) \
+            bank, best, is_separated, model, orientation, fields, P, excess) \
             if ambiguous_poses == MIXTURE else None
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
@@ -231,7 +231,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         topic_uncertainty=uncertainty, **fields)
 
 
-def covariance_about(bank: FilterBank, best: int, model: SourceModel, apart: BoolArray
+def covariance_about(bank: FilterBank, best: int, model: SourceModel, is_separated: BoolArray
                      ) -> FloatArray:
     """Covariance about the state of a hypothesis, from all hypotheses at the same position.
 
@@ -244,14 +244,14 @@ def covariance_about(bank: FilterBank, best: int, model: SourceModel, apart: Boo
     best : int
         Index of the hypothesis.
     model : SourceModel
-    apart : (n_hyp,) bool array
-        `FilterBank.apart` of the hypothesis.
+    is_separated : (n_hyp,) bool array
+        `FilterBank.is_separated` of the hypothesis.
 
     Returns
     -------
     (n_t, n_t) array
     """
-    return _second_moment(bank, best, model, np.where(apart, -np.inf, bank.log_w))
+    return _second_moment(bank, best, model, np.where(is_separated, -np.inf, bank.log_w))
 
 
 def _second_moment(bank: FilterBank, best: int, model: SourceModel,
@@ -269,7 +269,7 @@ def _second_moment(bank: FilterBank, best: int, model: SourceModel,
     return second_moment(weight[rows], difference, bank.P[rows, :n_t, :n_t])
 
 
-def mixture_uncertainty(bank: FilterBank, best: int, apart: BoolArray, model: SourceModel,
+def mixture_uncertainty(bank: FilterBank, best: int, is_separated: BoolArray, model: SourceModel,
                         orientation: Orientation, published: PoseFields, P_unwidened: FloatArray,
                         excess: float = 1.0) -> PoseUncertainty:
     """Uncertainty of a pose if any of the hypotheses may be correct.
@@ -279,8 +279,8 @@ def mixture_uncertainty(bank: FilterBank, best: int, apart: BoolArray, model: So
     bank : FilterBank
     best : int
         Index of the hypothesis.
-    apart : (n_hyp,) bool array
-        `FilterBank.apart` of the hypothesis.
+    is_separated : (n_hyp,) bool array
+        `FilterBank.is_separated` of the hypothesis.
     model : SourceModel
     orientation : Orientation
     published : PoseFields
@@ -298,7 +298,7 @@ def mixture_uncertainty(bank: FilterBank, best: int, apart: BoolArray, model: So
     widening = published['covariance'] - excess * P_unwidened[:6, :6]
     covariance = widening + excess * _second_moment(bank, best, model, bank.log_w)[:6, :6]
     # Headings may be opposite, for which a linearisation is invalid.
-    log_w = np.where(apart, bank.log_w, -np.inf)
+    log_w = np.where(is_separated, bank.log_w, -np.inf)
     rows = np.flatnonzero(log_w >= bank.log_w.max() + np.log(NEGLIGIBLE_WEIGHT))
     if not len(rows):
         return PoseUncertainty(covariance, published['orientation_covariance'],
@@ -329,7 +329,7 @@ def pose_uncertainty(fields: PoseFields) -> PoseUncertainty:
                            fields['position_orientation_covariance'])
 
 
-def ambiguities(bank: FilterBank, best: int, apart: BoolArray) -> set[str]:
+def ambiguities(bank: FilterBank, best: int, is_separated: BoolArray) -> set[str]:
     """Doubts about the position and the arrival direction of the best hypothesis.
 
     Parameters
@@ -337,15 +337,15 @@ def ambiguities(bank: FilterBank, best: int, apart: BoolArray) -> set[str]:
     bank : FilterBank
     best : int
         Index of the hypothesis.
-    apart : (n_hyp,) bool array
-        `FilterBank.apart` of the hypothesis.
+    is_separated : (n_hyp,) bool array
+        `FilterBank.is_separated` of the hypothesis.
 
     Returns
     -------
     set of str
     """
     reasons = set()
-    if bank.weight(apart) > AMBIGUOUS_WEIGHT:
+    if bank.weight(is_separated) > AMBIGUOUS_WEIGHT:
         reasons.add(doubts.ANOTHER_PLACE)
     if 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > AMBIGUOUS_WEIGHT:
         reasons.add(doubts.ANOTHER_ARRIVAL)

@@ -177,7 +177,7 @@ class Relinearisation:
         self._paths = [path[mask] for path in self._paths]
         self._log_likelihoods = [of_frame[mask] for of_frame in self._log_likelihoods]
 
-    def improve(self, bank_filter: BankFilter, bank: FilterBank) -> 'Counter[str]':
+    def relinearise_leading(self, bank_filter: BankFilter, bank: FilterBank) -> 'Counter[str]':
         """Relinearise the leading hypotheses of a bank in place, if the interval has elapsed.
 
         Parameters

@@ -76,7 +76,7 @@ class RigidPass:
     """Cost of a straight path."""
     bent: float
     """Cost of a path with acceleration and turn rate."""
-    apart: float
+    cost_with_offsets: float
     """Cost of a straight path at constant speed with free clock offsets."""
     freedom: int
     """Degrees of freedom of the fit with free clock offsets."""
@@ -108,7 +108,7 @@ class RigidPass:
     @property
     def is_explained(self) -> bool:
         """Whether a straight path explains the pass, if necessary with free clock offsets."""
-        return self.apart <= GOOD_MISFIT * self.freedom
+        return self.cost_with_offsets <= GOOD_MISFIT * self.freedom
 
     def closest(self, positions: FloatArray) -> FloatArray:
         """Closest point of the path to any sensor.
@@ -159,7 +159,7 @@ class RigidPass:
     @property
     def widening(self) -> float:
         """Factor on the variances if the residuals are larger than expected."""
-        return max(self.apart / self.freedom, 1.0)
+        return max(self.cost_with_offsets / self.freedom, 1.0)
 
     def clock_variance(self, sensor: int) -> float:
         """Variance of the clock offset of a sensor, including the model error.
@@ -176,19 +176,19 @@ class RigidPass:
         return float(self.widening * self.offset_std[sensor]**2 + (MIDDLE_STD / self.speed)**2)
 
     @property
-    def needs_clocks_apart(self) -> bool:
+    def needs_clock_offsets(self) -> bool:
         """Whether only a straight path with clock offsets explains the pass."""
         offset = float(np.nanmax(np.abs(self.offset)))
         if not self.is_explained or offset > MAX_OFFSET or offset * self.speed < MIN_DISTANCE:
             return False
-        gains = np.array([self.straight - self.apart, self.bent - self.apart]) / self.widening
+        gains = (np.array([self.straight, self.bent]) - self.cost_with_offsets) / self.widening
         prior_cost = float(np.nansum(np.square(self.offset / OFFSET_STD)))
         return bool((gains - prior_cost > chdtri(self.n_clocks, [P_CLOCKS, P_BEND])).all())
 
     @property
     def is_straight(self) -> bool:
         """Whether the path needs neither a bend nor acceleration."""
-        gain = (min(self.straight, self.apart) - self.bent) / self.widening
+        gain = (min(self.straight, self.cost_with_offsets) - self.bent) / self.widening
         return bool(gain <= chdtri(N_PATH - N_STRAIGHT, P_BEND))
 
 
@@ -234,8 +234,8 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     straight_paths = [f.straight for f in (short, long) if f.needs_no_bend
                       and _is_of_vehicle(f.straight, data.positions)]
     free = np.concatenate([_STRAIGHT, N_PATH + np.arange(n_clocks)])
-    path, apart, P = data.fit(N_SHORT, free, clocks)
-    if not np.isfinite([cost, bent, apart, misfit]).all():
+    path, cost_with_offsets, P = data.fit(N_SHORT, free, clocks)
+    if not np.isfinite([cost, bent, cost_with_offsets, misfit]).all():
         return None
     offset, std = np.full(len(network), np.nan), np.full(len(network), np.nan)
     # An unobservable offset has zero variance in a pseudo-inverse.
@@ -244,8 +244,8 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     offset[data.compared[is_known]] = np.append(0.0, path[N_PATH:])[is_known]
     std[data.compared[is_known]] = np.sqrt(np.append(0.0, variance))[is_known]
     x = _state_at_zero(path)
-    return RigidPass(stamp_ns, cost, bent, apart, data.n_free(N_SHORT) - len(free), misfit,
-                     int(data.compared[0]), offset, std, x[:3], x[3:],
+    return RigidPass(stamp_ns, cost, bent, cost_with_offsets, data.n_free(N_SHORT) - len(free),
+                     misfit, int(data.compared[0]), offset, std, x[:3], x[3:],
                      np.reshape(straight_paths, (-1, 6)))
 
 

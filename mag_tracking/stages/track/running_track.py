@@ -23,8 +23,8 @@ from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.disturbance_model import DisturbanceModel
 from mag_tracking.stages.track.disturbances import UnexplainedField
 from mag_tracking.stages.track.evidence import MIN_OBSERVED_FRACTION, OUT_OF_REACH
-from mag_tracking.stages.track.joint import Joint
-from mag_tracking.stages.track.member import Member, Update, View, members_in_order
+from mag_tracking.stages.track.joint import JointExplanation
+from mag_tracking.stages.track.member import BankUpdate, Member, MemberView, members_in_order
 from mag_tracking.stages.track.new_target_evidence import UNDECIDED_NATS, NewTargetEvidence
 from mag_tracking.stages.track.new_target_search import NewTargetSearch
 from mag_tracking.stages.track.reach import NEGLIGIBLE_ENERGY, WEAK_ENERGY, field_energy
@@ -32,7 +32,7 @@ from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
-from mag_tracking.stages.track.track_bank import Advance, TrackBank
+from mag_tracking.stages.track.track_bank import FrameUpdate, TrackBank
 from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.units import NS
 
@@ -123,7 +123,7 @@ class RunningTrack:
             for member in self.members:
                 member.use(self._bank.sensors)
 
-    def doubt(self, sensors: Sequence[int]) -> None:
+    def flag_doubtful_backgrounds(self, sensors: Sequence[int]) -> None:
         """Mark the track as doubtful if it uses a sensor with a doubtful background.
 
         Parameters
@@ -136,7 +136,7 @@ class RunningTrack:
         for member in self.members:
             if doubts.DOUBTFUL_BACKGROUND not in member.evidence.doubts:
                 self.counts['tracks with a doubtful background'] += 1
-                member.evidence.doubt(doubts.DOUBTFUL_BACKGROUND)
+                member.evidence.flag(doubts.DOUBTFUL_BACKGROUND)
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
@@ -157,7 +157,7 @@ class RunningTrack:
         """
         observed_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
         first = self.members[0]
-        first.evidence.doubt_start(
+        first.evidence.flag_start(
             approach_unobserved
             or observed_ns < MIN_OBSERVED_FRACTION * self._settings.lookback_s * NS,
             self._final_sensors.whole, self._target.starts_anywhere)
@@ -170,7 +170,7 @@ class RunningTrack:
         if self.ended is None:
             before_rows = self._bank.sensors.rows
             if self._bank.widen(dt):
-                first.cross_check.conclude(self._clocks, before_rows)
+                first.cross_check.finish(self._clocks, before_rows)
                 self._use_bank_sensors(True)
         return self.step(frame, dt)
 
@@ -204,29 +204,29 @@ class RunningTrack:
         views = [self._view(i, best) for i in range(len(self.members))]
         lagged = self._bank.lagged(best, advance.frame, dt, publish)
         lagged_poses = [pose for i, view in enumerate(views) for pose in self._smoothed(
-            i, view, False, lagged, self.members[i].is_doubted(self._settings))]
+            i, view, False, lagged, self.members[i].is_doubtful(self._settings))]
         if not publish:
             return []
-        update = Update(advance.frame, dt, self.bank, self._bank.filter, self._bank.sensors,
-                        self._settings)
+        update = BankUpdate(advance.frame, dt, self.bank, self._bank.filter, self._bank.sensors,
+                            self._settings)
         out: list[TrackRecord] = [member.publish(update, view)
                                   for member, view in zip(self.members, views, strict=True)]
         self._handover_due = best if self._bank.sensors.is_part else None
         return [*out, *lagged_poses, *self._end_lost_members(advance.frame)]
 
-    def _view(self, i: int, best: int) -> View:
+    def _view(self, i: int, best: int) -> MemberView:
         """Bank of member `i` alone; `best` is the index of the joint hypothesis."""
         bank = self.bank.extract_target(i, self._bank.single_target.n_target)
         row = best if bank is self.bank else bank.best()
-        return View(bank, row, self._bank.single_target, self._bank.gain(row))
+        return MemberView(bank, row, self._bank.single_target, self._bank.gain(row))
 
-    def _update_evidence(self, advance: Advance) -> bool:
+    def _update_evidence(self, advance: FrameUpdate) -> bool:
         """Update the evidence of the members; return False if no hypothesis explains the frame."""
         frame, dt = advance.frame, advance.dt
         if advance.n_rejected and np.count_nonzero(frame.n_samples) <= advance.n_rejected:
             # Without a majority of sensors, the track itself may be wrong.
             for member in self.members:
-                member.evidence.doubt(doubts.SENSORS_CONTRADICT)
+                member.evidence.flag(doubts.SENSORS_CONTRADICT)
         if not np.isfinite(advance.evidence):
             self.counts['banks lost'] += 1
             return False
@@ -248,7 +248,7 @@ class RunningTrack:
                     own_frame, self.bank.x[best, first:first + self._bank.single_target.n_target])
         return True
 
-    def _update_new_target_evidence(self, advance: Advance, best: int) -> None:
+    def _update_new_target_evidence(self, advance: FrameUpdate, best: int) -> None:
         """Update the evidence for new targets with the fit of hypothesis `best`."""
         bank, frame = self.bank, advance.frame
         self._new_target_evidence.add(
@@ -316,18 +316,18 @@ class RunningTrack:
         member = self.members[i]
         member.ended = reason
         if len(self.members) == 1:
-            member.cross_check.conclude(self._clocks, self._bank.sensors.rows)
+            member.cross_check.finish(self._clocks, self._bank.sensors.rows)
         self.counts[f'tracks ended: {reason}'] += 1
         if member.last is None:
             return []
         best = self.bank.best()
         view = self._view(i, best)
-        doubtful = member.evidence.ends_in_misfit or member.is_doubted(self._settings)
+        doubtful = member.evidence.ends_in_misfit or member.is_doubtful(self._settings)
         return [replace(member.last, ended=True),
                 *self._smoothed(i, view, False, self._bank.remaining_lagged(best), doubtful),
                 *self._smoothed(i, view, True, self._bank.smoothed(best), doubtful)]
 
-    def _smoothed(self, i: int, view: View, complete: bool, states: list[TrackState],
+    def _smoothed(self, i: int, view: MemberView, complete: bool, states: list[TrackState],
                   doubtful: bool) -> list[SmoothedPose]:
         """Smoothed poses of member `i`; if complete, also the poses before it shared its state."""
         member, n = self.members[i], self._bank.single_target.n_target
@@ -341,7 +341,7 @@ class RunningTrack:
         found = [m.unexplained(self._disturbance_model.uniform) for m in self.members if m.ended]
         return [u for u in found if u is not None]
 
-    def new_target(self) -> Joint | None:
+    def new_target(self) -> JointExplanation | None:
         """Search for another explanation of the latest frames, if a search is due.
 
         Returns
@@ -372,16 +372,16 @@ class RunningTrack:
         if joint is not None and joint.log_odds > UNDECIDED_NATS:
             for i, member in enumerate(self.members):
                 if joint.replaced in (None, i):
-                    member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, window.frames[-1].stamp_ns,
-                                              UNDECIDED_S)
+                    member.evidence.flag_interval(
+                        doubts.ANOTHER_VEHICLE, window.frames[-1].stamp_ns, UNDECIDED_S)
         return None
 
-    def admit(self, joint: Joint, id: int) -> None:
+    def admit(self, joint: JointExplanation, id: int) -> None:
         """Continue with another explanation of the latest frames.
 
         Parameters
         ----------
-        joint : Joint
+        joint : JointExplanation
         id : int
             Identifier of the new member, if there is one.
         """
@@ -405,7 +405,7 @@ class RunningTrack:
             member.evidence.add(joint.log_odds)
             member.evidence.bayes_factor.add(joint.log_odds, now_ns, ratio)
             if slot in doubtful:
-                member.evidence.doubt_for(doubts.ANOTHER_VEHICLE, now_ns, DOUBTED_S, begin_ns)
+                member.evidence.flag_interval(doubts.ANOTHER_VEHICLE, now_ns, DOUBTED_S, begin_ns)
 
     def hand_over(self) -> None:
         """Switch to the sensors near the predicted position, if a handover is due."""
@@ -414,5 +414,5 @@ class RunningTrack:
             return
         rows = self._bank.sensors.rows
         if self._bank.hand_over(best):
-            self.members[0].cross_check.conclude(self._clocks, rows)
+            self.members[0].cross_check.finish(self._clocks, rows)
             self._use_bank_sensors(True)

@@ -12,7 +12,7 @@ from mag_tracking.inference.initial_bank import InitialBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.bank_size import MIN_WEIGHT, max_hypotheses, max_sensors
-from mag_tracking.stages.track.joint import Joint
+from mag_tracking.stages.track.joint import JointExplanation
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.reach import first_weak_frame
 from mag_tracking.stages.track.relinearisation import Relinearisation, Window
@@ -25,7 +25,7 @@ from mag_tracking.units import NS
 
 
 @dataclass(frozen=True)
-class Advance:
+class FrameUpdate:
     """Result of the prediction and update of a bank with a frame."""
 
     frame: FieldFrame
@@ -150,7 +150,7 @@ class TrackBank:
         self._whole_track.begin(copy(start), self.filter)
         self._relinearisation.begin(start)
 
-    def advance(self, frame: FieldFrame, dt: float) -> Advance:
+    def advance(self, frame: FieldFrame, dt: float) -> FrameUpdate:
         """Predict and update the bank with a frame, and weight the hypotheses.
 
         Parameters
@@ -162,20 +162,20 @@ class TrackBank:
 
         Returns
         -------
-        Advance
+        FrameUpdate
         """
         predicted, log_likelihood, used, rejected = self._rejection.advance(
             self.filter, self.bank, frame, dt)
         self._counts.update(rejected)
-        return Advance(used, dt, predicted, log_likelihood, self.bank.reweight(log_likelihood),
-                       len(rejected))
+        return FrameUpdate(used, dt, predicted, log_likelihood, self.bank.reweight(log_likelihood),
+                           len(rejected))
 
-    def keep(self, advance: Advance, publish: bool) -> None:
+    def keep(self, advance: FrameUpdate, publish: bool) -> None:
         """Store a frame, drop improbable hypotheses, and relinearise the others.
 
         Parameters
         ----------
-        advance : Advance
+        advance : FrameUpdate
         publish : bool
             Whether a pose is published for the frame.
         """
@@ -185,7 +185,7 @@ class TrackBank:
         self._counts['hypotheses dropped'] += bank.prune(
             -np.log(s.prune_ratio),
             s.max_hypotheses if publish else max(s.max_hypotheses, s.max_initial_hypotheses))
-        self._counts.update(self._relinearisation.improve(self.filter, bank))
+        self._counts.update(self._relinearisation.relinearise_leading(self.filter, bank))
         self._whole_track.add(bank, advance.frame, advance.dt, publish)
 
     def lagged(self, best: int, frame: FieldFrame, dt: float, publish: bool) -> list[TrackState]:
@@ -259,12 +259,12 @@ class TrackBank:
         self._rejection.clear()
         self._clear_lag()
 
-    def resume(self, joint: Joint) -> None:
+    def resume(self, joint: JointExplanation) -> None:
         """Continue with another explanation of the latest frames.
 
         Parameters
         ----------
-        joint : Joint
+        joint : JointExplanation
         """
         self.bank, self.filter = joint.bank, joint.bank_filter
         self._relinearisation.resume(joint.window)

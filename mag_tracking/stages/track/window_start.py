@@ -37,7 +37,7 @@ class WindowStart(PathHypothesis):
     n_new: int
     """Number of new vehicles, which are the last ones."""
     replaced: int | None
-    """As in `Joint`."""
+    """As in `JointExplanation`."""
 
     @property
     def new_indices(self) -> range:

@@ -120,8 +120,8 @@ class Traffic:
         self.counts: Counter[str] = Counter()
         self._settings = settings
         self._lines = counting_lines(settings.line_names, settings.line_headings_deg,
-                               settings.line_offsets, settings.line_half_widths,
-                               network.centre) if counts_vehicles else []
+                                     settings.line_offsets, settings.line_half_widths,
+                                     network.centre) if counts_vehicles else []
         self._direction = FieldDirection(network)
         self._intervals = TrafficIntervals(settings.line_names, settings.interval_s, self.counts)
         self._open: dict[int, _TrackHistory] = {}

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from mag_tracking.drivers.framings.binary import BinaryFraming, BinarySettings
 from mag_tracking.drivers.framings.checksums import CHECKSUMS
-from mag_tracking.drivers.framings.fields import FieldLayout, unescaped
+from mag_tracking.drivers.framings.fields import FieldLayout, decode_escapes
 from mag_tracking.drivers.framings.json_objects import JsonFraming, JsonSettings
 from mag_tracking.drivers.framings.text import TextFraming, TextSettings
 from mag_tracking.drivers.reading import Reading
@@ -94,11 +94,11 @@ def test_a_sensor_name_may_have_64_characters():
 
 
 def test_escapes_are_equal_in_single_and_double_quotes_of_yaml():
-    assert unescaped('end', '\\r\\n') == unescaped('end', '\r\n') == b'\r\n'
-    assert unescaped('end', '\\t\\0\\x1e\\\\n') == b'\t\x00\x1e\\n'
+    assert decode_escapes('end', '\\r\\n') == decode_escapes('end', '\r\n') == b'\r\n'
+    assert decode_escapes('end', '\\t\\0\\x1e\\\\n') == b'\t\x00\x1e\\n'
     for bad in ('\\q', '\\', '\\x80', '\\x1', '\ud800'):
         with pytest.raises(SettingsError, match='end'):
-            unescaped('end', bad)
+            decode_escapes('end', bad)
 
 
 # Binary.

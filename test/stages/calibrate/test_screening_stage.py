@@ -33,8 +33,8 @@ def calibrate(**changes):
 
 
 def feed(stage, y, first=0, rate=100.0):
-    return [c for k, field in enumerate(y) for c in fed(stage,
-        MagSample(round((first + k) * NS / rate), 'mag_1', field))]
+    return [c for k, field in enumerate(y)
+            for c in fed(stage, MagSample(round((first + k) * NS / rate), 'mag_1', field))]
 
 
 def total(stage):

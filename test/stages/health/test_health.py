@@ -256,7 +256,7 @@ def test_without_an_earth_field_sensors_are_compared_with_each_other():
             for j, name in enumerate(network.names):
                 field = network.R_sw[j] @ EARTH * ([1.0, -1.0, 1.0] if j == 1 else np.ones(3))
                 doctor.feed(one(MagSample(k * 20_000_000, name,
-                                      field + SIGMA * rng.standard_normal(3))))
+                                          field + SIGMA * rng.standard_normal(3))))
         findings = [str(f) for f in doctor.findings()]
         assert len(findings) == 1 and findings[0].startswith(message), findings
 

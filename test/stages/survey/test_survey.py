@@ -287,7 +287,7 @@ def test_a_jump_back_in_time_discards_earlier_accelerations():
 def test_calibration_records_are_replaced_for_surveyed_sensors_only():
     before = CalibrationRecord('2025-01-01', 'by hand', np.nan)
     result, _ = surveyed(nominal(calibrated=(before,) * 3),
-                        change=lambda readings: readings.pop('mag_3'))
+                         change=lambda readings: readings.pop('mag_3'))
     assert [c.date for c in result.network.calibrated] == [DATE, DATE, '2025-01-01']
     assert result.network.calibrated[2] is before
 

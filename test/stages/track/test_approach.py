@@ -7,7 +7,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.approach import GROWTH_RATIO, SENSED_LEVEL, Approach
-from support.situations import made
+from support.situations import simulated_world
 
 STD = 1e-8
 
@@ -56,7 +56,7 @@ def test_a_field_that_starts_large_or_stays_small_is_accepted():
 @pytest.mark.parametrize('name, is_expected', [('there at the start, leaves', True),
                                                ('a car', False)])
 def test_a_car_that_leaves_its_place_is_flagged_and_a_passing_car_is_not(name, is_expected):
-    world = made(name, 'clouds', 0)
+    world = simulated_world(name, 'clouds', 0)
     pipeline = Pipeline(world.network, settings_for('vehicle'))
     poses = [r for r in pipeline.feed(world.readings) + pipeline.flush() if isinstance(r, Track)]
     assert poses

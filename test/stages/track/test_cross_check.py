@@ -15,7 +15,7 @@ from support import spoiler
 from support.bundled import LINEARISED_ONCE
 from support.passes import network_of
 from support.situation_worlds import ambient_world
-from support.situations import made
+from support.situations import simulated_world
 from support.steady_frames import ROAD, STRAIGHT, state_at, steady_frames
 
 FAST = np.where(np.arange(10) == 3, 60.0, STRAIGHT)
@@ -67,17 +67,17 @@ def test_the_end_of_a_track_updates_the_clock_comparison():
     clocks, check = ClockComparison(2), CrossCheck(ROAD)
     run_check(check, steady_frames(np.random.default_rng(4), clocks=(0.3,)))
     for _ in range(2):
-        check.conclude(clocks, np.arange(2))
-    assert clocks.apart.sensor == 1
-    assert clocks.apart_s(np.arange(2)) == pytest.approx(0.3, abs=0.05)
+        check.finish(clocks, np.arange(2))
+    assert clocks.largest_offset.sensor == 1
+    assert clocks.largest_offset_s(np.arange(2)) == pytest.approx(0.3, abs=0.05)
 
 
 def test_a_check_without_frames_has_no_doubts():
     check = CrossCheck(ROAD)
     assert check.doubts(1.0) == set()
     clocks = ClockComparison(2)
-    check.conclude(clocks, np.arange(2))
-    assert clocks.apart is None and not check.is_doubtful
+    check.finish(clocks, np.arange(2))
+    assert clocks.largest_offset is None and not check.is_doubtful
 
 
 def test_a_long_track_is_checked_at_its_cpa():
@@ -111,7 +111,7 @@ def tracks_of(readings, network, **changes):
 
 
 def test_the_cross_check_can_be_disabled():
-    world = made('clocks 200 ms apart', 'clouds', 1)
+    world = simulated_world('clocks 200 ms apart', 'clouds', 1)
     for on in (True, False):
         records, pipeline = tracks_of(world.readings, world.network,
                                       **{'track.cross_check': on})
@@ -130,11 +130,11 @@ def test_the_third_car_past_a_wrong_clock_is_flagged_from_its_first_pose():
             and r.id == max(t.id for t in tracks)]
     assert all(doubts.CLOCKS_APART in t.doubts for t in last if isinstance(t, Track))
     assert all(t.ambiguous for t in last)
-    print(pipeline.track.clocks_apart)
-    assert 'the clock of mag_2 is' in pipeline.track.clocks_apart
+    print(pipeline.track.clock_warning)
+    assert 'the clock of mag_2 is' in pipeline.track.clock_warning
     right, pipeline = tracks_of(world.readings, world.network, **LINEARISED_ONCE)
     assert not any(doubts.CLOCKS_APART in t.doubts for t in right if isinstance(t, Track))
-    assert pipeline.track.clocks_apart == ''
+    assert pipeline.track.clock_warning == ''
 
 
 def test_the_difference_of_a_track_is_its_distance_from_the_fitted_path():
@@ -201,7 +201,7 @@ def test_the_difference_is_included_in_published_covariances(monkeypatch):
     """The difference of every path is patched to five metres along x."""
     away = np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     monkeypatch.setattr(RigidPass, 'difference', lambda *_: away)
-    world = made('a car', 'clouds', 0)
+    world = simulated_world('a car', 'clouds', 0)
     records, _ = tracks_of(world.readings, world.network, **LINEARISED_ONCE)
     for kind, share in ((Track, 0.3), (SmoothedPose, 1.0)):
         std = np.array([np.sqrt(r.covariance[0, 0]) for r in records if isinstance(r, kind)])

@@ -12,13 +12,13 @@ from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track.disturbances import Disturbances, UnexplainedField
 from mag_tracking.stages.track.evidence import UNEXPLAINED
 from mag_tracking.stages.track.manager import TrackManager
-from support.situations import made, verdict
+from support.situations import simulated_world, verdict
 from support.track_runs import magnet_frames
 
 
 def outputs(name, simulator='clouds', seed=0, parts=1):
     """(`Pipeline`, its outputs) for a situation whose readings are fed in `parts` batches."""
-    world = made(name, simulator, seed)
+    world = simulated_world(name, simulator, seed)
     pipeline = Pipeline(world.network, settings_for('vehicle'))
     out = []
     for which in np.array_split(np.arange(len(world.readings)), parts):

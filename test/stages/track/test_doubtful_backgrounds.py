@@ -36,9 +36,9 @@ def run_tracker(pass_frames, times, settings=None):
     network, frames = pass_frames
     manager = TrackManager(network, settings_for('vehicle', {**QUICK, **(settings or {})}).track)
     start = frames[0].stamp_ns
-    manager.doubt({name: tuple((start + round(b * 1e9), None if e is None else
-                                start + round(e * 1e9)) for b, e in segments)
-                   for name, segments in times.items()})
+    manager.set_doubtful_times({name: tuple((start + round(b * 1e9), None if e is None else
+                                             start + round(e * 1e9)) for b, e in segments)
+                                for name, segments in times.items()})
     return manager, [r for f in frames for r in manager.feed(f)
                      if isinstance(r, Track) and not r.ended]
 
@@ -123,7 +123,7 @@ def poses_of(records):
 def test_poses_after_dense_traffic_are_unambiguous_without_the_doubt(name):
     """Therefore the ambiguity in the previous test is due to the doubt."""
     pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
-    pipeline.track.doubt = lambda times: None
+    pipeline.track.set_doubtful_times = lambda times: None
     tracks = poses_of(pipeline.feed(after_dense_traffic(name, 7.0)) + pipeline.flush())
     assert sum(not t.ambiguous for t in tracks) > 10
 

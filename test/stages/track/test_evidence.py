@@ -31,42 +31,43 @@ def pose(nis=6.0):
 def test_noise_contradicts_a_track_with_the_nominal_probability():
     rng = np.random.default_rng(0)
     nis = rng.chisquare(6, 3_000_000)
-    doubted = 0
+    is_doubtful = 0
     for value in nis[nis > 25.0]:
         evidence = TrackEvidence(2)
         evidence.contradicts(value * np.array([0.3, 0.7]), 6)
-        doubted += evidence.doubted
+        is_doubtful += evidence.is_doubtful
     # The number has a Poisson distribution with mean 30.
-    assert 10 < doubted < 60 and len(nis) * CONTRADICTION == pytest.approx(30.0)
+    assert 10 < is_doubtful < 60 and len(nis) * CONTRADICTION == pytest.approx(30.0)
 
 
 def test_a_track_that_was_contradicted_once_stays_doubtful():
     evidence = TrackEvidence(2)
     for nis in (6.0, 60.0, 6.0):
         assert evidence.contradicts(np.array([nis, 0.0]), 6) == (nis > 50.0)
-    assert evidence.doubted
+    assert evidence.is_doubtful
 
 
 def test_a_filter_that_overfits_is_flagged_for_the_duration_of_the_window():
     evidence = TrackEvidence(2)
-    doubted = []
+    is_doubtful = []
     for t, loss in ((0.0, -9.0), (1.0, 0.9), (1.1, 1.1), (3.0, 0.0), (3.2, -9.0)):
-        doubted.append(evidence.doubts_filter(-loss * OVERFIT_NATS, round(t * NS), 2.0))
-        evidence.note({doubts.OVERFIT} if doubted[-1] else {doubts.ANOTHER_PLACE}, round(t * NS))
-    assert doubted == [False, False, True, True, False]
+        is_doubtful.append(evidence.doubts_filter(-loss * OVERFIT_NATS, round(t * NS), 2.0))
+        reasons = {doubts.OVERFIT} if is_doubtful[-1] else {doubts.ANOTHER_PLACE}
+        evidence.note(reasons, round(t * NS))
+    assert is_doubtful == [False, False, True, True, False]
     # The doubt applies to single poses, not to the whole track.
-    assert not evidence.doubted
+    assert not evidence.is_doubtful
     # Smoothed poses at the same times are also doubtful.
-    assert [evidence.was_filter_doubted(round(t * NS)) for t in (1.0, 1.1, 3.0, 3.2)] == [
+    assert [evidence.was_filter_doubtful(round(t * NS)) for t in (1.0, 1.1, 3.0, 3.2)] == [
         False, True, True, False]
 
 
 @pytest.mark.parametrize('nis, doubted', [
     ([60.0, 1.0], True), ([60.0, 2.0, 1.0], False), ([60.0, np.nan, 1.0], False)])
-def test_a_contradiction_flags_a_track_of_two_sensors_but_not_of_three(nis, doubted):
+def test_a_contradiction_flags_a_track_of_two_sensors_but_not_of_three(nis, is_doubtful):
     evidence = TrackEvidence(2)
     assert evidence.contradicts(np.array(nis), 3 * np.count_nonzero(~np.isnan(nis)))
-    assert evidence.doubted == doubted
+    assert evidence.is_doubtful == is_doubtful
 
 
 @pytest.mark.parametrize('nis, is_coming, reason', [
@@ -83,7 +84,7 @@ def bank_of(places, weights, std=0.5, lengths=3.0):
     x = np.zeros((n, n_t))
     x[:, 0], x[:, 3], x[:, n_t - 1] = places, 8.0, lengths
     bank = FilterBank.from_targets(x, np.tile(std**2 * np.eye(n_t), (n, 1, 1)), np.zeros(n, int), 2,
-                                 1e-8)
+                                   1e-8)
     bank.log_w = np.log(weights)
     return bank, model
 
@@ -94,20 +95,20 @@ def test_hypotheses_at_one_place_are_merged_in_the_covariance():
     rng = np.random.default_rng(1)
     which = rng.choice(3, 400_000, p=[0.5, 0.3, 0.2])
     samples = bank.x[which, 0] + 0.5 * rng.standard_normal(len(which))
-    assert covariance_about(bank, 0, model, bank.apart(0))[0, 0] == pytest.approx(
+    assert covariance_about(bank, 0, model, bank.is_separated(0))[0, 0] == pytest.approx(
         np.square(samples).mean(), rel=0.01)
 
 
 def test_hypotheses_at_other_places_do_not_widen_the_covariance():
     bank, model = bank_of([0.0, 40.0], [0.9, 0.1])
-    np.testing.assert_allclose(covariance_about(bank, 0, model, bank.apart(0)),
+    np.testing.assert_allclose(covariance_about(bank, 0, model, bank.is_separated(0)),
                                0.25 * np.eye(len(model.state_names)))
-    assert bank.weight(bank.apart(0)) == pytest.approx(0.1)
+    assert bank.weight(bank.is_separated(0)) == pytest.approx(0.1)
 
 
 def test_the_sign_of_the_row_length_does_not_widen_the_covariance():
     bank, model = bank_of([0.0, 0.0], [0.5, 0.5], lengths=np.array([3.0, -3.0]))
-    assert covariance_about(bank, 0, model, bank.apart(0))[-1, -1] == pytest.approx(0.25)
+    assert covariance_about(bank, 0, model, bank.is_separated(0))[-1, -1] == pytest.approx(0.25)
 
 
 def frame(field, noise=1e-8):
@@ -123,7 +124,7 @@ def test_a_field_is_sensed_by_the_sensor_that_measures_it_and_noise_by_none():
         noise = 1e-8 * rng.standard_normal((2, 3))
         # The second sensor of the network is not used.
         evidence.add_frame(frame(noise + [[3e-8, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.array([0, 2]),
-                      np.ones(2))
+                           np.ones(2))
     assert evidence.sensed.tolist() == [True, False, False] and evidence.is_sensed_by_one
     assert evidence.largest[0] > 3e-8 and evidence.largest[1] == 0.0
 
@@ -132,7 +133,7 @@ def test_smoothed_poses_keep_doubts_about_misfits_but_not_about_arrivals():
     evidence = TrackEvidence(2)
     evidence.note({doubts.ANOTHER_ARRIVAL}, 1)
     evidence.note({doubts.DISTURBANCE_MODEL, doubts.ANOTHER_PLACE}, 2)
-    assert [evidence.was_filter_doubted(k) for k in (1, 2)] == [False, True]
+    assert [evidence.was_filter_doubtful(k) for k in (1, 2)] == [False, True]
 
 
 def test_a_track_that_no_target_ever_explained_ends():
@@ -191,19 +192,19 @@ def test_a_transient_doubt_persists_for_a_tenth_of_a_second():
     assert evidence.note(set(), NS + round(0.24 * NS)) == {doubts.OVERFIT}
     assert evidence.note(set(), NS + round(0.32 * NS)) == set()
     # Smoothed poses are doubtful only at the time at which the doubt was found.
-    assert not evidence.was_filter_doubted(NS + round(0.32 * NS))
-    assert evidence.was_filter_doubted(NS + round(0.16 * NS))
+    assert not evidence.was_filter_doubtful(NS + round(0.32 * NS))
+    assert evidence.was_filter_doubtful(NS + round(0.16 * NS))
 
 
 def test_a_doubt_with_a_past_start_flags_earlier_smoothed_poses():
     """A long vehicle that is tracked as two has wrong poses before this is detected."""
     evidence = TrackEvidence(2)
-    evidence.doubt_for(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0, since_ns=3 * NS)
+    evidence.flag_interval(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0, since_ns=3 * NS)
     assert doubts.ANOTHER_VEHICLE in evidence.note(set(), 7 * NS)
     assert doubts.ANOTHER_VEHICLE not in evidence.note(set(), 9 * NS)
-    assert [evidence.was_filter_doubted(t * NS) for t in (2, 3, 5, 7, 9)] == [
+    assert [evidence.was_filter_doubtful(t * NS) for t in (2, 3, 5, 7, 9)] == [
         False, True, True, True, False]
     # Without a past start, no smoothed pose is doubtful.
     evidence = TrackEvidence(2)
-    evidence.doubt_for(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0)
-    assert not any(evidence.was_filter_doubted(t * NS) for t in range(10))
+    evidence.flag_interval(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0)
+    assert not any(evidence.was_filter_doubtful(t * NS) for t in range(10))

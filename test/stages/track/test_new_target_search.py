@@ -9,7 +9,7 @@ import pytest
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
-from mag_tracking.stages.track.joint import CONFIDENT_NATS, Joint
+from mag_tracking.stages.track.joint import CONFIDENT_NATS, JointExplanation
 from mag_tracking.stages.track.member import members_in_order
 from mag_tracking.stages.track.new_target_evidence import (
     ACCEPT_NATS,
@@ -65,14 +65,14 @@ def test_a_less_probable_target_is_accepted_when_it_is_found_twice():
 
 
 def joint_of(velocities, odds, replaced=None, adds=True):
-    """`Joint` of vehicles of seven states with these velocities (n, 2)."""
+    """`JointExplanation` of vehicles of seven states with these velocities (n, 2)."""
     n = len(velocities)
     x = np.zeros((1, n, 7))
     x[0, :, 3:5] = velocities
     bank = FilterBank(x.reshape(1, -1), np.eye(7 * n)[None], np.zeros(1),
                       np.zeros((1, n), dtype=int), np.zeros((1, n), dtype=int), np.arange(1),
                       np.zeros((1, 2)))
-    return Joint(bank, None, None, odds, replaced, adds)
+    return JointExplanation(bank, None, None, odds, replaced, adds)
 
 
 @pytest.mark.parametrize('odds, replaced, flagged', [
@@ -135,7 +135,7 @@ def test_the_best_hypothesis_determines_the_doubts():
     both = FilterBank(np.vstack([bank.x, joint_of([[10.0, 0.0], [11.0, 0.0]], 0.0).bank.x]),
                       np.tile(bank.P, (2, 1, 1)), np.log([0.1, 0.9]), np.tile(bank.label, (2, 1)),
                       np.tile(bank.kind, (2, 1)), np.arange(2), np.zeros((2, 2)))
-    assert Joint(both, None, None, 16.0, None, True).doubtful(7) == ()
+    assert JointExplanation(both, None, None, 16.0, None, True).doubtful(7) == ()
 
 
 def test_overlap_of_vehicles_is_measured_along_a_lane():

@@ -72,7 +72,7 @@ def compare_with_plain(filter_, relinearisation, n=40, restarts_at=(), prune=Tru
     """(bank, bank without relinearisation, Counter) after `n` frames with a gap."""
     rng, counts, stamp_ns = np.random.default_rng(0), Counter(), 0
     bank = FilterBank.from_targets(rng.standard_normal((12, N_T)), np.tile(np.eye(N_T), (12, 1, 1)),
-                                 np.zeros(12, dtype=int), 1, 1.0)
+                                   np.zeros(12, dtype=int), 1, 1.0)
     plain = bank.copy()
     relinearisation.begin(bank.copy())
     for k in range(n):
@@ -96,7 +96,7 @@ def compare_with_plain(filter_, relinearisation, n=40, restarts_at=(), prune=Tru
             plain.keep(mask)
             bank.keep(mask)
         filter_.lengths.append(0)
-        counts.update(relinearisation.improve(filter_, bank))
+        counts.update(relinearisation.relinearise_leading(filter_, bank))
         np.testing.assert_allclose(bank.x, plain.x, rtol=0, atol=1e-9)
         np.testing.assert_allclose(bank.P, plain.P, rtol=0, atol=1e-9)
     np.testing.assert_allclose(bank.log_w, plain.log_w, rtol=0, atol=1e-9)
@@ -164,7 +164,7 @@ def bank_after_one_frame(extra, linear):
 def test_a_converged_path_determines_the_state_and_the_wider_covariance(extra, is_wider):
     filter_, bank, relinearisation = bank_after_one_frame(extra, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
-    assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 0
+    assert relinearisation.relinearise_leading(filter_, bank)[relinearise.FAILED] == 0
     np.testing.assert_allclose(bank.x[0], x[0] + 0.1 * np.eye(6)[1], atol=1e-9)
     np.testing.assert_allclose(
         bank.P[0], P[0] + is_wider * extra * np.eye(6)[0] * np.eye(6)[0][:, None], atol=1e-9)
@@ -177,7 +177,7 @@ def test_an_unconverged_path_only_widens_the_covariance(monkeypatch, extra, line
     monkeypatch.setattr(relinearise, 'CONVERGED', -1.0)
     filter_, bank, relinearisation = bank_after_one_frame(extra, linear)
     x, P = bank.x.copy(), bank.P.copy()
-    assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 1
+    assert relinearisation.relinearise_leading(filter_, bank)[relinearise.FAILED] == 1
     np.testing.assert_array_equal(bank.x, x)
     # The covariance includes the difference between the two states.
     expected = P[0] + is_wider * (extra * np.eye(6)[0] * np.eye(6)[0][:, None]
@@ -190,7 +190,7 @@ def test_the_gain_is_the_log_likelihood_ratio_of_the_path(bonus):
     filter_, bank, relinearisation = bank_after_one_frame(0.0, np.inf)
     filter_.bonus = bonus
     assert relinearisation.gain(0) == 0.0
-    relinearisation.improve(filter_, bank)
+    relinearisation.relinearise_leading(filter_, bank)
     assert relinearisation.gain(0) == pytest.approx(bonus, abs=1e-9)
     assert relinearisation.gain(1) == 0.0
     relinearisation.begin(bank.copy())
@@ -203,7 +203,7 @@ def test_a_path_with_an_invalid_covariance_is_rejected():
     """Rounding errors above a sensor can cause this. State and covariance do not change."""
     filter_, bank, relinearisation = bank_after_one_frame(-3.0, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
-    assert relinearisation.improve(filter_, bank)[relinearise.FAILED] == 1
+    assert relinearisation.relinearise_leading(filter_, bank)[relinearise.FAILED] == 1
     np.testing.assert_array_equal(bank.x, x)
     np.testing.assert_array_equal(bank.P, P)
 
@@ -231,7 +231,7 @@ def test_only_the_heaviest_hypotheses_are_relinearised(monkeypatch, n_max, max_e
     frame = FieldFrame(10**12, np.zeros((1, 3)), np.eye(3)[None], np.full(1, 8), np.zeros(1), True)
     for _ in range(40):
         relinearisation.add(bank, bank.x.copy(), np.zeros(len(bank)), 0.0, frame, 0.1)
-    assert relinearisation.improve(filter_, bank)[relinearise.ATTEMPTED] == 1
+    assert relinearisation.relinearise_leading(filter_, bank)[relinearise.ATTEMPTED] == 1
     assert filter_.origins == {bank.origin[np.argmax(bank.log_w)]}
 
 
@@ -264,7 +264,7 @@ def counts_after(filter_, bank, y, relinearisation):
     for k, frame in enumerate(frames_of(y)):
         dt = PERIOD if k else 0.0
         relinearisation.add(bank, *filter_.advance(bank, frame, dt), 0.0, frame, dt)
-        counts = relinearisation.improve(filter_, bank)
+        counts = relinearisation.relinearise_leading(filter_, bank)
     return counts[relinearise.ATTEMPTED], counts[relinearise.FAILED]
 
 

@@ -28,7 +28,7 @@ def test_the_clock_offset_of_the_other_sensor_is_found(offset):
     # The second sensor has the stronger field, so it is the reference of the clocks.
     assert fit.reference == 1
     assert abs(fit.offset[0] + offset) < 3.0 * fit.offset_std[0] < 0.1
-    assert fit.is_explained and fit.needs_clocks_apart is (offset != 0.0)
+    assert fit.is_explained and fit.needs_clock_offsets is (offset != 0.0)
 
 
 def test_offsets_have_the_sign_of_a_clock_that_is_ahead():
@@ -61,12 +61,12 @@ def test_several_clocks_are_compared_despite_a_dead_axis():
                                change=dead), FOUR)
     offsets = fit.offset - fit.offset[0]
     np.testing.assert_allclose(offsets, [0.0, 0.0, 0.15, 0.0], atol=0.02)
-    assert fit.needs_clocks_apart
+    assert fit.needs_clock_offsets
 
 
 def test_a_turn_is_not_a_clock_offset():
     fit = fit_of(steady_frames(np.random.default_rng(4), path=TURNS), path=TURNS)
-    assert not fit.needs_clocks_apart and not fit.is_straight
+    assert not fit.needs_clock_offsets and not fit.is_straight
     assert fit.misfit < 1.2
 
 
@@ -77,14 +77,14 @@ def test_a_turn_is_not_a_clock_offset():
 def test_no_steady_path_explains_a_faulty_field(change):
     """The fields are: a clipped field, a second vehicle in the other lane, and a flipped axis."""
     fit = fit_of(steady_frames(np.random.default_rng(5), change=change))
-    assert fit.misfit > 1.5 and not fit.needs_clocks_apart
+    assert fit.misfit > 1.5 and not fit.needs_clock_offsets
 
 
 def test_a_model_error_of_the_assumed_magnitude_is_accepted():
     rng = np.random.default_rng(6)
     fit = fit_of(steady_frames(rng, change=lambda B: B * (1.0 + MODEL_ERROR * rng.standard_normal(
         B.shape))))
-    assert fit.misfit < 1.3 and not fit.needs_clocks_apart
+    assert fit.misfit < 1.3 and not fit.needs_clock_offsets
 
 
 @pytest.mark.parametrize('change', [

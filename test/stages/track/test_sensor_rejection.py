@@ -54,7 +54,7 @@ def situation(n=6, seed=0, spread=0.3, n_hyp=5):
                          0.2]) ** 2,
                 (n_hyp, 1, 1))
     bank = FilterBank.from_targets(x, P, np.arange(n_hyp), n, 1e-8,
-                                 bank_filter.observation.own_covariance)
+                                   bank_filter.observation.own_covariance)
     B = dipole_field(network.positions - TARGET, MOMENT)
     field = np.einsum('jik,jk->ji', network.R_sw, B) + SIGMA * rng.standard_normal((n, 3))
     frame = FieldFrame(1000, field, np.tile(SIGMA**2 * np.eye(3), (n, 1, 1)), np.full(n, 8),

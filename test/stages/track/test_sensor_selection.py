@@ -27,8 +27,8 @@ def bank_of(rng, n_hyp, n_t, n_own, n_sensors):
     n_x = n_t + (n_own + 3) * n_sensors
     A = rng.standard_normal((n_hyp, n_x, n_x))
     bank = FilterBank.from_targets(np.zeros((n_hyp, n_t)), np.zeros((n_hyp, n_t, n_t)),
-                                 np.zeros(n_hyp, dtype=int), n_sensors, 1.0,
-                                 np.zeros((n_sensors, n_own, n_own)))
+                                   np.zeros(n_hyp, dtype=int), n_sensors, 1.0,
+                                   np.zeros((n_sensors, n_own, n_own)))
     bank.x, bank.P = rng.standard_normal((n_hyp, n_x)), A @ np.swapaxes(A, 1, 2)
     return bank
 
@@ -157,7 +157,7 @@ def track_frames(frames, changes, doubtful=None, start=slice(None)):
     """(`TrackManager`, live tracks) after the frames have been fed."""
     network, every = frames
     tracker, tracks = manager.TrackManager(network, settings_for('vehicle', changes).track), []
-    tracker.doubt(doubtful or {})
+    tracker.set_doubtful_times(doubtful or {})
     for frame in every[start]:
         tracks += [r for r in tracker.feed(frame) if isinstance(r, Track) and not r.ended]
     return tracker, tracks

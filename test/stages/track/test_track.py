@@ -179,9 +179,9 @@ def test_gaps_and_backward_jumps_end_a_track():
 def test_an_abandoned_track_ends_and_the_next_has_another_id():
     network, frames, _ = magnet_frames(4)
     stage = TrackManager(network, settings_for('magnet').track)
-    assert stage.give_up('no frames received') == []
+    assert stage.end_tracks('no frames received') == []
     stage.feed(frames[0])
-    ended = [t for t in stage.give_up('no frames received') if isinstance(t, Track)]
+    ended = [t for t in stage.end_tracks('no frames received') if isinstance(t, Track)]
     assert [(t.id, t.ended) for t in ended] == [(1, True)] and stage.bank is None
     assert stage.counts['tracks ended: no frames received'] == 1
     assert [(t.id, t.ended) for t in stage.feed(frames[1])] == [(2, False)]
