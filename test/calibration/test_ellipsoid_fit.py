@@ -129,7 +129,8 @@ def test_units_only_scale_the_result(unit, size):
 def test_corrected_field_has_the_given_size():
     y = readings(tumbling(1000))
     free, fit = fit_ellipsoid(y), fit_ellipsoid(y, 5e-5)
-    assert fit.field_magnitude == 5e-5 and fit.field_magnitude_std == 0.0 and free.field_magnitude_std > 0.0
+    assert fit.field_magnitude == 5e-5 and fit.field_magnitude_std == 0.0
+    assert free.field_magnitude_std > 0.0
     assert np.linalg.norm(fit.correct(y), axis=1).mean() == pytest.approx(5e-5, rel=0.002)
     np.testing.assert_allclose(fit.correction * free.field_magnitude, 5e-5 * free.correction,
                                rtol=1e-9)
@@ -355,10 +356,10 @@ def test_coverage_equals_the_known_values():
     (np.zeros((5, 2)), None, r'expected readings \(n, 3\), got \(5, 2\)'),
     (np.zeros(3), None, r'expected readings \(n, 3\), got \(3,\)'),
     (np.where(np.arange(1500)[:, None] == 7, -np.inf, EVEN), None, 'reading 7 is infinite'),
-    (EVEN, 0.0, 'field_size is 0.0, must be positive'),
-    (EVEN, -1.0, 'field_size is -1.0, must be positive'),
-    (EVEN, np.nan, 'field_size is nan, must be positive'),
-    (EVEN, np.inf, 'field_size is inf, must be positive')])
+    (EVEN, 0.0, 'field_magnitude is 0.0, must be positive'),
+    (EVEN, -1.0, 'field_magnitude is -1.0, must be positive'),
+    (EVEN, np.nan, 'field_magnitude is nan, must be positive'),
+    (EVEN, np.inf, 'field_magnitude is inf, must be positive')])
 def test_invalid_arguments_raise_value_error(y, size, message):
     with pytest.raises(ValueError, match=message):
         fit_ellipsoid(y, size)
