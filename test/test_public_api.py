@@ -214,7 +214,7 @@ def test_no_target_gives_empty_arrays(recorded, result, source):
     assert found.tracks == {} and found.rejections == {}
     assert found.sensors_without_background == (() if source == 'noise' else ('mag_1', 'mag_2'))
     assert ('no background of mag_1' in repr(found)) is (source == 'nothing')
-    with pytest.raises(mt.UnknownTrackError, match='not in the result, which has none'):
+    with pytest.raises(mt.UnknownTrackError, match='the result contains no tracks'):
         found.map_figure()
 
 
@@ -324,7 +324,7 @@ def test_a_track_has_a_map_a_weights_and_a_field_figure(result):
     assert len(titles) == 3 and all('Track 1' in title for title in titles)
     labels = [line.get_label() for line in result.map_figure(1).axes[0].lines]
     assert {'truth', 'smoothed', 'magnetometers'} <= set(labels)
-    with pytest.raises(mt.UnknownTrackError, match='track 7: not in the result, which has 1'):
+    with pytest.raises(mt.UnknownTrackError, match='track 7 is not in the result; tracks in the result: 1'):
         result.map_figure(7)
 
 
