@@ -106,7 +106,7 @@ def detection(m, cpa, starts, sensors, scale=AS_PUBLISHED):
 
 
 def at_least_once(m, cpa, sensors=ONE, phase=0.0, scale=AS_PUBLISHED):
-    """Probability (6) of at least one detection in a drive; `phase` shifts the start, in periods."""
+    """Probability (6) of at least one detection in a drive; `phase` shifts the start [periods]."""
     starts = SPEED * PERIOD * (np.arange(-20, 20) + phase)
     return any_detection_probability(detection(m, cpa, starts, sensors, scale))
 

@@ -94,27 +94,27 @@ def _is_from_device(mid: int) -> bool:
     return mid % 2 == 1 or mid in (_MTDATA, _MTDATA2, _WAKE_UP, _ERROR)
 
 
-def _message_at(window: bytes, place: int, longest: int) -> _Message | None:
-    """Message that may begin at the index `place`; None if no message can begin there."""
+def _message_at(window: bytes, index: int, longest: int) -> _Message | None:
+    """Message that may begin at `index`; None if no message can begin there."""
     # While the header is incomplete, MID is -1 and the end is one byte after the window.
-    header = window[place:place + 6]
+    header = window[index:index + 6]
     if not header.startswith(_START[:len(header)]):
         return None
     if len(header) > 2 and not _is_from_device(header[2]):
         return None
     if len(header) < 4 or header[3] == _EXTENDED and len(header) < 6:
         return _Message(-1, len(window), len(window) + 1)
-    length, begin = header[3], place + 4
+    length, begin = header[3], index + 4
     if length == _EXTENDED:
-        length, begin = header[4] << 8 | header[5], place + 6
+        length, begin = header[4] << 8 | header[5], index + 6
     if length > longest:
         return None
     return _Message(header[2], begin, begin + length + 1)
 
 
-def _is_checksum_valid(window: bytes, place: int, message: _Message) -> bool:
+def _is_checksum_valid(window: bytes, index: int, message: _Message) -> bool:
     """Whether the sum of all bytes but the preamble is a multiple of 256."""
-    return sum(window[place + 1:message.end]) % 256 == 0
+    return sum(window[index + 1:message.end]) % 256 == 0
 
 
 class XsensFraming:
@@ -209,14 +209,14 @@ class XsensFraming:
                        more: bool) -> _ParseStep | None:
         """Search `outer` for a data message; return a step to reject `outer` or wait, or None."""
         rejection = _REFUSE._replace(causes=('messages that contain the start of another',))
-        place = 0
+        index = 0
         while True:
             # The checksum of a message may also be the preamble of the next. A data message does
             # not wait for the byte after it; otherwise one in 256 data messages would be delayed.
-            place = self._next_start(window, place + 1, outer.end, outer_is_data)
-            if place < 0:
+            index = self._next_start(window, index + 1, outer.end, outer_is_data)
+            if index < 0:
                 return None
-            inner = _message_at(window, place, self._longest)
+            inner = _message_at(window, index, self._longest)
             if inner is None or inner.mid not in (-1, *_DATA_MESSAGES):
                 continue
             if inner.end > len(window):
@@ -224,15 +224,15 @@ class XsensFraming:
                     return _WAIT
                 if len(window) == self._longest + _MAX_OVERHEAD and not outer_is_data:
                     return rejection
-            elif (_is_checksum_valid(window, place, inner)
+            elif (_is_checksum_valid(window, index, inner)
                   and self._decode(window, inner) is not None):
                 return rejection
 
     @staticmethod
-    def _next_start(window: bytes, place: int, end: int, whole: bool) -> int:
+    def _next_start(window: bytes, index: int, end: int, whole: bool) -> int:
         """Index of the next start before `end`, or -1; `whole` requires both start bytes."""
-        found = window.find(_START, place, end if whole else end + 1)
-        if found < 0 and not whole and end == len(window) and window.endswith(_PREAMBLE, place):
+        found = window.find(_START, index, end if whole else end + 1)
+        if found < 0 and not whole and end == len(window) and window.endswith(_PREAMBLE, index):
             return end - 1
         return found
 

@@ -135,7 +135,7 @@ def test_the_arrival_time_is_that_of_reception_not_of_reading(listen, sender):
         between.append((before, time.monotonic_ns()))
         time.sleep(0.1)
     for chunk, (before, after) in zip(udp.read(0.0), between, strict=True):
-        # The clocks are compared to within a few microseconds.
+        # The comparison of the clocks is accurate to a few microseconds.
         assert before - 50_000 < chunk.arrival_ns < after + 50_000
     assert not udp.counts
 
@@ -235,7 +235,7 @@ def test_a_reader_that_keeps_up_loses_nothing(listen, sender):
     thread.join()
     assert [c.data for c in received] == sent
     arrivals = [c.arrival_ns for c in received]
-    # Each read compares the clocks again, to within a few microseconds.
+    # Each read compares the clocks again, with an accuracy of a few microseconds.
     assert all(b - a > -50_000 for a, b in zip(arrivals, arrivals[1:], strict=False))
     assert not udp.counts
 
