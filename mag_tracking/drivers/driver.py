@@ -184,7 +184,7 @@ class Driver:
         Raises
         ------
         ValueError
-            If a field or an acceleration is not a tuple of three numbers.
+            If a field does not consist of three numbers.
         """
         if not self._is_open and not self._try_to_open(timeout_s):
             return EMPTY_RESULT
@@ -320,7 +320,7 @@ class Driver:
         return sensor, self._stamp(reading, arrival)
 
     def _sensor_of(self, at_device: str, source: str) -> str | None:
-        """Return the network name of a sensor; None if ignored or unknown, which is counted."""
+        """Return the network name of a sensor, or None if ignored or unknown; count the latter."""
         sensor = next((self.sensors[name] for name in (at_device, source)
                        if name and name in self.sensors), None)
         if sensor is None and '' in self.sensors and self._sole_source.accepts(

@@ -48,12 +48,12 @@ _Triple: TypeAlias = tuple[float, float, float]
 
 
 class DecodedMessage(NamedTuple):
-    """Reading of a data message, and causes for which its data were ignored."""
+    """Reading of a data message, and the causes to count for ignored data."""
 
     reading: Reading | None
     """None if the message has neither field nor acceleration."""
     causes: tuple[str, ...]
-    """Causes to count, one for each occurrence of ignored data."""
+    """One cause for each occurrence of ignored data."""
 
 
 def _three_reals(data: bytes, precision: int) -> _Triple | None:

@@ -57,7 +57,7 @@ class UdpSettings:
         '', 'Multicast group to join, such as 239.1.2.3. If set, only datagrams sent to the group '
         'are received.')
     sources: tuple[str, ...] = param(
-        ('',), 'Addresses from which datagrams are accepted; an empty address stands for all.')
+        ('',), 'Addresses from which datagrams are accepted; an empty address accepts all.')
     source_port: bool = param(
         False, 'Whether the source of a datagram is address:port instead of the address.')
     receive_buffer: int = param(
