@@ -3,7 +3,7 @@
     mag-tracking archive recordings/ --network site.yaml --out archive
     python examples/archive_questions.py archive
 
-Without a folder, the bundled recordings are archived first. The queries use DuckDB; pandas and
+If no folder is given, the bundled recordings are archived first. The queries use DuckDB; pandas and
 polars read the same files.
 """
 
@@ -52,7 +52,7 @@ def tables_of(folder):
     connection = duckdb.connect()
     for table in ('tracks', 'poses', 'smoothed', 'passes', 'health'):
         if not any((folder / table).glob('**/*.parquet')):
-            # No recording had a detection.
+            # No recording has rows for this table.
             connection.register(table, schema_of(TABLES[table]).empty_table())
             continue
         connection.sql(f"CREATE VIEW {table} AS SELECT * FROM read_parquet("
@@ -75,7 +75,7 @@ def main():
                       mt.read_network(ROOT / 'config' / 'network.yaml'), settings_for('vehicle'),
                       folder, workers=2, report=print)
         print(f'{len(run.done)} recordings archived in {folder}, {len(run.tracked_earlier)} '
-              'already complete')
+              'were archived earlier')
     connection = tables_of(folder)
     for question, sql in QUESTIONS.items():
         print(f'\n{question}\n{connection.sql(sql)}')

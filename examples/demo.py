@@ -1,4 +1,4 @@
-"""Track a vehicle of a bundled recording over real ROS topics.
+"""Track the vehicle in a bundled recording over real ROS topics.
 
 A car turns at a junction between two magnetometers. The replay node publishes the recording;
 calibration, detection and tracker nodes process it. This program subscribes to their topics, prints
@@ -90,12 +90,12 @@ class Spectator(Node):
             frame = self._frames.get(track.stamp_ns)
             hypotheses = self._hypotheses.get(track.stamp_ns)
             if frame is None or hypotheses is None:
-                continue  # Published before this node was connected: printed, but not drawn.
+                continue  # Frame published before this node connected: the pose is only printed.
             self.logs.setdefault(track.id, TrackLog(track.id)).add(track_of(m, hypotheses), frame)
 
 
 def draw(spectator, out):
-    """Write the figures and the errors of all tracks; return the paths of the figures."""
+    """Write the figures and errors of all tracks, print a summary; return the figure paths."""
     truth = spectator.truth_arrays()
     paths, network = [], spectator.network
     for log in spectator.logs.values():
@@ -154,8 +154,8 @@ def main(argv=None):
         return spectators[-1]
 
     print(f'Replaying {RECORDING.name} at {args.rate:g} times real time through the calibration, '
-          'detection and tracker nodes.\nThe first seconds are quiet: the background is learnt '
-          'from them.\n', flush=True)
+          'detection and tracker nodes.\nNo vehicle is near in the first seconds, in which the '
+          'background is estimated.\n', flush=True)
     status = run(network_file, settings_for('vehicle'), RECORDING, args.rate,
                  observers=[spectator])
     paths = draw(spectators[0], args.out)

@@ -2,9 +2,9 @@
 
 MITRE12 is Slater & Jacyna, Evaluating Detection and Estimation Capabilities of Magnetometer-Based
 Vehicle Sensors, 2012. The figures use the parameters of its tables and its equations, corrected as
-described in `physics.ellipsoid` and `inference.matched_filter`. The paper leaves the following
-points open. The first two choices reproduce the numbers of Figures 2 to 4, unlike the alternatives
-printed by this program:
+described in `physics.ellipsoid` and `inference.matched_filter`. The paper leaves several points
+open; the following list states the choices made here. The first two choices reproduce the numbers
+of Figures 2 to 4; the alternatives that this program prints do not:
 
 - The road leads north. x is along the road and y across it, to the left, as (0, 25) is the closest
 point of approach (CPA) in Figure 6; M1 is the moment along the road.
@@ -70,7 +70,7 @@ FIRST_FOUR = np.diag(np.where(np.arange(6) < 4, PRIOR_STD**-2, 0.0))
 BOUND_CPA = 25.0
 ALONG = -np.pi / 2
 AS_PUBLISHED = SAMPLING_RATE / N_SAMPLES
-"""Deflection with the DFT divided by N, relative to the physical one."""
+"""Deflection with the DFT divided by N, relative to the physical deflection."""
 FROM_WHERE = 'position along the road at the start of the period [m]'
 CHOSEN = 'road to the north, DFT divided by N'
 
@@ -106,7 +106,7 @@ def detection(m, cpa, starts, sensors, scale=AS_PUBLISHED):
 
 
 def at_least_once(m, cpa, sensors=ONE, phase=0.0, scale=AS_PUBLISHED):
-    """Probability (6) of a detection in a whole drive; `phase` shifts the start, in periods."""
+    """Probability (6) of at least one detection in a drive; `phase` shifts the start [periods]."""
     starts = SPEED * PERIOD * (np.arange(-20, 20) + phase)
     return any_detection_probability(detection(m, cpa, starts, sensors, scale))
 
@@ -123,7 +123,7 @@ def cpa_where(probability, target):
 
 
 def noise_std():
-    """Noise standard deviation of a sample [T]: S_n + S_s over the two-sided band.
+    """Noise standard deviation of a sample [T], from S_n + S_s over the two-sided band.
     """
     return np.sqrt(2.0 * quad(lambda f: noise_spectrum(f, BACKGROUND, RESOLUTION, BAND[1]),
                               *BAND, epsabs=0.0)[0])
@@ -143,7 +143,7 @@ def jacobian(z):
 
 
 def measured(x0, v=SPEED, vehicle='car'):
-    """Information matrix (6, 6) of one period about z; (18)."""
+    """Information matrix (6, 6) about z from the samples of one period; (18)."""
     z = [x0, BOUND_CPA, v, ALONG, *moment(vehicle)[:2]]
     return information(jacobian(z), noise_std()**2 * np.eye(2))
 
@@ -201,13 +201,13 @@ def figure_4():
 
 
 def phi_std_bound(C, x0, sign):
-    """Bound on phi [deg] by (19) from the bound `C` on z; `sign` of x/r^2, which is -1 in (20)."""
+    """Bound on phi [deg] by (19) from the bound `C` on z; (20) has x/r^2 with the `sign` -1."""
     row = np.array([-BOUND_CPA, sign * x0]) / (x0**2 + BOUND_CPA**2)
     return np.degrees(np.sqrt(row @ C[:2, :2] @ row))
 
 
 def draw_bounds(axes, at, matrices, prior):
-    """Draw the six bounds against `at`; infinite bounds are drawn dashed, for known y0."""
+    """Draw the six bounds against `at`; dashed for known y0 where a bound is infinite."""
     bounds = np.array([std_bounds(J, prior) for J in matrices])
     bounds_known_y0 = np.array([std_bounds(J, Y0_KNOWN) for J in matrices])
     for i, (name, unit, scale) in enumerate(STATES):
@@ -246,14 +246,14 @@ def figure_5():
 
 def figure_6():
     """Figure 6: bounds against the speed, for a period that starts at the CPA."""
-    mph = np.linspace(-80.0, 80.0, 160)  # Even number: theta is undefined at zero speed.
+    mph = np.linspace(-80.0, 80.0, 160)  # An even number excludes zero speed.
     return bounds_figure([(name, mph, [measured(0.0, v * MPH, name) for v in mph])
                           for name in SEMI_AXES], 'speed [mph], negative = backwards',
                          'MITRE12 Figure 6: bounds of one period starting at (x0, y0) = (0, 25 m)')
 
 
 def compare_detection():
-    """Compute the numbers of Figures 2 to 4, by name."""
+    """Compute the values that are compared with Figures 2 to 4, by name."""
     n = {}
     car, east = moment('car'), moment('car', np.pi / 2)
     for name, m, scale in (('', car, AS_PUBLISHED), (' physical', car, 1.0),
@@ -269,7 +269,7 @@ def compare_detection():
 
 
 def compare_bounds():
-    """Compute the numbers of Figures 5 and 6, by name."""
+    """Compute the values that are compared with Figures 5 and 6, by name."""
     starts = np.linspace(-80.0, 80.0, 161)
     alone, prior, four = (np.array([std_bounds(measured(x), p) for x in starts])
                           for p in (None, PRIOR, FIRST_FOUR))

@@ -11,7 +11,7 @@ three 24-bit values in units of 10 nT, and the sum of all bytes as checksum. In 
       unit: '1e-8'
       sensors: {north: mag_1}
 
-Run as a program, it parses a demonstration stream of packets with garbage between them.
+Run as a program, this file parses a demonstration stream of packets with garbage between them.
 """
 
 import struct
@@ -30,7 +30,7 @@ LONGEST = 2 * 16
 class SlipSettings:
     """Settings, listed under `framing_settings` in the drivers file."""
 
-    sensor: str = param('', 'Name of the sensor, as used in `sensors` of the drivers file.')
+    sensor: str = param('', 'Name of the sensor: its key in `sensors` of the drivers file.')
 
 
 class SlipFraming:
@@ -82,7 +82,7 @@ def packet_of(count, microseconds, field):
 
 
 def main():
-    """Parse three packets separated by garbage."""
+    """Parse three packets separated by garbage, and print the readings and rejections."""
     framing = SlipFraming(SlipSettings(sensor='north'))
     stream = b'half a pack' + END + b''.join(
         packet_of(k, 10_000 * k, (200 + k, 1550, -4900)) + b'garbage' + END for k in range(3))

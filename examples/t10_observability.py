@@ -85,7 +85,10 @@ def condition_maps():
 
 
 def best_place(numbers, same_side=False):
-    """Position (x, y) and value of the minimum, at least 1 m from the line of the path."""
+    """Position (x, y) and value of the minimum, at least 1 m from the line of the path.
+
+    `same_side` excludes positions across the path from the first sensor.
+    """
     y = GRID[:, None]
     masked = np.where((np.abs(y - 1.0) > 0.999) & ((y < 1.0) | (not same_side)), numbers, np.inf)
     i, j = np.unravel_index(masked.argmin(), masked.shape)
@@ -156,7 +159,7 @@ def figure_5_4():
 
 
 def comparison(maps):
-    """Compute the numbers compared with T10, by name; `maps` from `condition_maps`."""
+    """Compute the values that are compared with T10, by name; `maps` is from `condition_maps`."""
     up, h = np.array([0.0, 0.0, 1.0]), energy_threshold(P_FA, 3)
     one, two = seen_by(ONE), seen_by(TWO)
     d = -(R0 + SAMPLE_TIME * np.arange(N_SAMPLES)[:, None] * V0)

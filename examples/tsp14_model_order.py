@@ -22,9 +22,9 @@ ROOT = Path(__file__).resolve().parents[1]
 VEHICLES = ('straight_small_left', 'straight_car_right', 'straight_car_fast_left',
             'straight_truck_right')
 RATES = {'12.5 Hz': 12.5, '100 Hz': 0.0}
-"""`calibrate.decimate_to_hz` for each rate; 0 = as recorded."""
+"""`calibrate.decimate_to_hz` for each rate; 0 keeps the recorded rate."""
 PUBLISHED = {'cars': ((10.0, 51.0), (1.3, 1.6)), 'large': ((142.0, 360.0), (76.7, 302.6))}
-"""TSP14 Tables I and II: lowest and highest normalised cost with one and with three dipoles."""
+"""TSP14 Tables I and II: (lowest, highest) normalised cost for one and for three dipoles."""
 
 
 def passes(rate, orders=(1, 2, 3, 4, 5)):
@@ -42,13 +42,13 @@ def passes(rate, orders=(1, 2, 3, 4, 5)):
 
 
 def costs_of(found, n_dipoles):
-    """(costs of the cars, cost of the truck), normalised, with `n_dipoles` dipoles."""
+    """Normalised costs of fits with `n_dipoles` dipoles: (costs of the cars, cost of the truck)."""
     costs = [f.normalised_cost for one in found for f in one.fits if f.n_dipoles == n_dipoles]
     return costs[:-1], costs[-1]
 
 
 def report(found):
-    """Report that compares the costs with the published costs; `found`: {rate: passes}."""
+    """Report that compares the costs with the published costs; `found` is {rate: passes}."""
     lines = []
     for n_dipoles, (cars, large) in zip((1, 3), zip(*PUBLISHED.values(), strict=True),
                                         strict=True):

@@ -1,6 +1,6 @@
 #!/bin/sh
 # check_program.sh PROGRAM PACKAGE TESTS: check for a program that some tests use.
-# If it is missing, it is installed from apt as root. Other users are told how to install it.
+# If the program is missing, root installs it from apt; other users are told how to install it.
 set -u
 
 program=$1

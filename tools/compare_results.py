@@ -1,4 +1,4 @@
-"""Compare the results of two commits for the bundled recordings, value by value.
+"""Compare the working tree with a commit: results for the bundled recordings, value by value.
 
     .venv/bin/python tools/compare_results.py BASE          # working tree against commit BASE
 
@@ -104,7 +104,7 @@ def main():
     parser.add_argument('--workers', type=int, default=2,
                         help='number of concurrent replays (default: 2)')
     parser.add_argument('--renamed', nargs=2, action='append', default=[], metavar=('OLD', 'NEW'),
-                        help='string of the base and its new name')
+                        help='string in the results of the base, and the string that replaces it')
     args = parser.parse_args()
     build = ROOT / 'build' / 'compare'
     commit = subprocess.run(['git', 'rev-parse', '--short', args.base], cwd=ROOT, check=True,

@@ -1,6 +1,6 @@
 """Generate config/viewers/: layouts for RViz, Foxglove (and Lichtblick) and PlotJuggler.
 
-The layouts are for the sensors of config/network.yaml. For another network file:
+The layouts are for the sensors of config/network.yaml. For another network file, run
 generate_viewers.py FILE FOLDER.
 """
 

@@ -22,7 +22,7 @@ IMAGES = Path(__file__).resolve().parents[1] / 'docs' / 'images'
 RECORDING = vehicle_path('junction_left_turns_to_rear')
 SIZE = {'width': 1280, 'height': 1130}
 SHOWN_S = 2.4
-"""Time of the slider [s], when the car begins to turn."""
+"""Slider time [s] at which the car begins to turn."""
 
 
 def figures():

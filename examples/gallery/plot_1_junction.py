@@ -2,8 +2,8 @@
 A car turns at a junction
 =========================
 
-Two magnetometers stand on either side of a road. A car arrives from the left and turns into the
-side street between them. ``make demo`` replays this recording over ROS topics.
+Two magnetometers stand opposite each other beside a road. A car arrives from the left and turns
+into the side street between them. ``make demo`` replays this recording over ROS topics.
 """
 
 # %%
@@ -19,7 +19,7 @@ result = mt.track(DATA / 'vehicles' / 'junction_left_turns_to_rear.mcap', NETWOR
 print(result)
 
 # %%
-# Map of the track: the published poses with 90 % ellipses (circles are ambiguous poses), the
+# Map of the track: the published poses with 90 % ellipses (circles mark ambiguous poses), the
 # smoothed track, the ground truth, and the best hypothesis of each arrival direction.
 figure = result.map_figure()
 

@@ -2,7 +2,7 @@
 A magnet moves past sixteen sensors
 ===================================
 
-A cylinder magnet of 10 mm is moved past sixteen real three-axis sensors. An optical system
+A cylindrical magnet of Ø10×10 mm is moved past sixteen real three-axis sensors. An optical system
 measures the true poses. The measurements are stored in tables, not in a recording.
 """
 

@@ -33,5 +33,5 @@ figure = pass_figure(chosen, 'truck')
 figure = order_figure(found.passes)
 
 # %%
-# One row per pass and number of dipoles.
+# The table has one row per pass and number of dipoles.
 found.to_dataframe()[['n_dipoles', 'chosen', 'normalised_cost', 'speed', 'sd_speed', 'reason']]

@@ -2,7 +2,7 @@
 Plan a network
 ==============
 
-How accurately can a network locate a vehicle, where does it detect one, and where would one more
+How accurately can a network locate a vehicle, where can it detect one, and where would one more
 sensor help most? Cramér-Rao bounds answer these questions before any sensor is installed.
 """
 

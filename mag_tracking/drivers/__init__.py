@@ -1,1 +1,1 @@
-"""Drivers: samples from sensor hardware. One file per transport, framing or kind of chip."""
+"""Drivers that read samples from sensor hardware over serial lines, UDP, MQTT and I2C."""

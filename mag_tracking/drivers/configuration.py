@@ -1,4 +1,4 @@
-"""Drivers file: devices, their protocols and their sensors.
+"""Reader of the drivers file, which lists devices, their protocols and their sensors.
 
     roadside:
       transport: serial
@@ -9,11 +9,12 @@
       unit: nT
       sensors: {A: mag_1, B: mag_2}
 
-A kind is a name in `KINDS`, or `package.module:Class` for a custom class. Such a class has an
-attribute `SETTINGS` and the methods of `reading.Transport`, `Framing` or `Device`. Its attributes
-`CLOCK` and `DRIVER`, mappings of settings, replace the defaults for every device of that kind. The
-settings of a kind are listed under its own name, and the settings of a custom class under
-`transport_settings`, `framing_settings` or `device_settings`.
+The kind of a transport, framing or device is a name in `KINDS`, or `package.module:Class` for a
+custom class. Such a class has an attribute `SETTINGS` and the methods of `reading.Transport`,
+`Framing` or `Device`. Its optional attributes `CLOCK` and `DRIVER`, mappings of settings, replace
+the defaults for every device of that kind. The settings of a kind in `KINDS` are listed under its
+name, and the settings of a custom class under `transport_settings`, `framing_settings` or
+`device_settings`.
 """
 
 import dataclasses
@@ -104,7 +105,7 @@ def load_class(role: str, name: object) -> Any:
     Raises
     ------
     SettingsError
-        If the class cannot be loaded, or lacks `SETTINGS` or a method.
+        If the class cannot be loaded, or lacks `SETTINGS` or a required method.
     """
     target = KINDS[role].get(name, name) if isinstance(name, str) else ''
     module, colon, class_name = target.partition(':')
@@ -119,7 +120,7 @@ def load_class(role: str, name: object) -> Any:
             f'{role}: {name} cannot be loaded: {type(error).__name__}: {error}') from error
     missing = [member for member in ('SETTINGS', *METHODS[role]) if not hasattr(cls, member)]
     if missing:
-        raise SettingsError(f'{role}: {name} is incomplete, it lacks {", ".join(missing)}')
+        raise SettingsError(f'{role}: {name} is incomplete: it lacks {", ".join(missing)}')
     return cls
 
 
@@ -164,7 +165,7 @@ def driver_of(name: object, entry: object) -> Driver:
 
 
 def _class_defaults(settings: Settings, device: Device, name: str) -> Settings:
-    """`settings` with the defaults of the device's class."""
+    """Return `settings` updated with the attribute `name` of the device, if it exists."""
     return replace(settings, getattr(device, name, {}))
 
 
@@ -172,14 +173,14 @@ def _device(options: dict[str, Any], kinds: Collection[str]) -> Device:
     """Create the device of an entry; remove its settings from `options`."""
     if 'device' in options:
         if 'transport' in options or 'framing' in options:
-            raise SettingsError('device cannot be combined with transport and framing; remove '
-                                'either device or the other two')
+            raise SettingsError('device cannot be combined with transport or framing; remove '
+                                'either device, or transport and framing')
         device: Device = _create_part('device', options, kinds)
         return device
     for role in ('transport', 'framing'):
         if role not in options:
-            raise SettingsError(f'{role} is missing (one of {", ".join(KINDS[role])}), or set '
-                                f'device instead (one of {", ".join(KINDS["device"])})')
+            raise SettingsError(f'{role} is missing; set it to one of {", ".join(KINDS[role])}, or '
+                                f'set device to one of {", ".join(KINDS["device"])} instead')
     return FramedDevice(_create_part('transport', options, kinds),
                         _create_part('framing', options, kinds))
 
@@ -234,7 +235,7 @@ def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
 
 
 def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> None:
-    """Check that each sensor belongs to one device only, and to the network."""
+    """Raise SettingsError if a sensor is assigned twice, or is not in the network."""
     owner: dict[str, str] = {}
     for driver in drivers:
         for key, sensor in driver.sensors.items():
@@ -255,7 +256,7 @@ def _names(settings: Any) -> set[str]:
 
 
 def _groups_of(name: object) -> list[str]:
-    """Groups of a device that have the setting `name`; '' = the top level of the device."""
+    """Groups of a device that have the setting `name`; '' stands for its top level."""
     if name in _ENTRY_KEYS:
         return ['']
     return [group for group, settings in settings_by_kind().items() if name in _names(settings)]
@@ -304,7 +305,8 @@ def settings_by_kind() -> dict[str, Any]:
     Returns
     -------
     dict of str to settings
-        Keys: names of the groups in the drivers file; '' = settings at the top level of a device.
+        The keys are the names of the groups in the drivers file; '' stands for the top level of a
+        device.
     """
     out = {'': DriverSettings(), 'clock': ClockSettings()}
     for role, kinds in KINDS.items():

@@ -1,9 +1,9 @@
-"""Times of measurement from a device's counter and the arrival times of its messages.
+"""Estimation of measurement times from a device's counter and its messages' arrival times.
 
 A message arrives after a fixed minimum delay plus a random, non-negative delay. All points
 (device time, arrival - device time) therefore lie above a line whose slope is the drift of the
-device's oscillator. The estimate is the line under all points of the last minutes that is closest
-to them on average: the edge of their lower convex hull over their mean abscissa.
+device's oscillator. The estimate is the line under all points of the window that is closest to
+them on average: the edge of their lower convex hull over their mean abscissa.
 
 Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network delay
 measurements', IEEE INFOCOM 1999. Departures: only the lowest point of each short block of device
@@ -38,7 +38,7 @@ _MIN_POINTS = 5
 _MIN_AGREEING = 3
 """Number of different device times that must agree on a new clock."""
 _EARLY_NS = 1e6
-"""[ns] Distance below the line at which a message is always accepted."""
+"""[ns] Distance below the line up to which a message is always accepted."""
 
 
 @dataclass(frozen=True)
@@ -46,20 +46,21 @@ class ClockSettings:
     """Settings of a device's clock."""
 
     tick_s: float = param(
-        1e-6, 'Nominal duration of a tick. With `stamp_by: sequence`, 1 / rate.', 's',
-        (1e-10, 60.0))
+        1e-6, 'Nominal duration of a tick. With `stamp_by: sequence`, set it to 1 / sampling rate.',
+        's', (1e-10, 60.0))
     wrap: int = param(
-        2**32, 'Number of ticks at which the counter returns to 0; 0 = never.', '', (0, 2**63 - 1))
+        2**32, 'Number of ticks at which the counter returns to 0; 0 if it never does.', '',
+        (0, 2**63 - 1))
     min_delay_s: float = param(
-        0.0, 'Delay of the fastest message from measurement to arrival (bytes / baud rate, filter '
-        'delay). It is not observable from arrival times.', 's', (0.0, 60.0))
+        0.0, 'Delay of the fastest message from measurement to arrival (transmission time, '
+        'filter delay). It is not observable from arrival times.', 's', (0.0, 60.0))
     max_delay_s: float = param(
         5.0, 'Maximum delay of a message. A message delayed by more indicates a step of the device '
         'clock.', 's', (0.01, 3600.0))
     min_step_s: float = param(
-        0.1, 'Minimum clock step, beyond the spread of the delays. A device time that goes back by '
-        'more, or is late by more for max_delay_s, indicates a step of the device clock.', 's',
-        (1e-3, 60.0))
+        0.1, 'Minimum detectable clock step, in addition to the spread of the delays. A device '
+        'time that goes back by more, or remains late by more for max_delay_s, indicates a step of '
+        'the device clock.', 's', (1e-3, 60.0))
     window_s: float = param(
         120.0, 'Length of the estimation window. The drift is estimated only if at least five '
         'readings are in the window.', 's', (1.0, 86400.0))
@@ -69,7 +70,9 @@ class ClockSettings:
 
 
 class ArrivalClock:
-    """Clock of a device without a counter. Same interface as `DeviceClock`; unknown values are NaN.
+    """Clock of a device without a counter, with the interface of `DeviceClock`.
+
+    `drift_ppm`, `spread_s` and `stamp_std` are always NaN.
 
     Parameters
     ----------
@@ -91,7 +94,7 @@ class ArrivalClock:
         self._min_delay_ns = round(settings.min_delay_s * 1e9)
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int:
-        """Time of arrival minus the minimum delay.
+        """Return the time of arrival minus the minimum delay.
 
         Parameters
         ----------
@@ -108,7 +111,7 @@ class ArrivalClock:
 
 
 class _ClockCandidate:
-    """Readings that may belong to a new clock."""
+    """Readings that deviate from the clock and may belong to a new one."""
 
     def __init__(self, ticks: float, arrival_ns: int, last_fit_ns: int, is_near: bool) -> None:
         self.since_ns, self.last_fit_ns, self._is_near = arrival_ns, last_fit_ns, is_near
@@ -141,9 +144,9 @@ class DeviceClock:
 
     Until a few points are available, the line passes through the lowest point, with the nominal
     tick or with the drift estimated before a restart. A reading that does not fit the clock gets no
-    time. A new clock starts when three consecutive different device times agree on it for longer
-    than an emptying queue could explain, or when no reading has fitted for `window_s`. If readings
-    of two clocks alternate, the older clock is kept.
+    timestamp. A new clock starts when three consecutive different device times agree on it for
+    longer than the delivery of queued messages could explain, or when no reading has fitted the old
+    clock for `window_s`. If readings of two clocks alternate, the older clock is kept.
 
     The rounding error of float64 is below 1 ns for 30 days, and below 0.1 µs for ten years.
 
@@ -154,17 +157,19 @@ class DeviceClock:
     Attributes
     ----------
     counts : Counter
-        Number of readings without a time, by cause.
+        Number of readings without a timestamp, by cause.
     restarts : Counter
         Number of clocks started after the first, by cause.
     drift_ppm : float, ppm
-        Ratio of the true to the nominal tick, minus 1; positive for a slow device. NaN until known.
+        Ratio of the true to the nominal tick, minus 1; positive for a slow device. NaN until
+        estimated.
     spread_s : float, s
-        95th percentile of the delays of recent messages, relative to the fastest. NaN until known.
+        95th percentile of the delays of recent messages, relative to the fastest message. NaN until
+        estimated.
     stamp_std : float, s
         Error of a timestamp due to the delays and to changes of the drift: the 90th percentile of
-        the heights above the line of the lowest points of the blocks. An error of `min_delay_s` is
-        not included. NaN until known, also after a restart.
+        the heights of the blocks' lowest points above the line. An error of `min_delay_s` is not
+        included. NaN until estimated, and again after a restart.
 
     Raises
     ------
@@ -216,8 +221,8 @@ class DeviceClock:
         Returns
         -------
         int or None, ns
-            Not later than `arrival_ns` minus the minimum delay. None if the time is unknown, the
-            cause of which is counted.
+            Not later than `arrival_ns` minus the minimum delay. None if the time is unknown; the
+            cause is counted in `counts`.
         """
         if ticks is None:
             self.counts[NO_TICKS] += 1
@@ -277,7 +282,7 @@ class DeviceClock:
 
     def _restart(self, ticks: float, arrival_ns: int, delay: float,
                  candidate: _ClockCandidate) -> None:
-        """Start a new clock and count its cause; `delay` is relative to the old line [ns]."""
+        """Start a new clock and count the cause; `delay` is relative to the old line [ns]."""
         first, first_ns = candidate.first
         silence = first_ns - candidate.last_fit_ns
         if silence > self._window_ns:

@@ -1,4 +1,4 @@
-"""Driver: keeps one device open and converts its readings to samples.
+"""Driver that keeps one device open and converts its readings to samples.
 
 A driver opens its device and reopens it, with back-off, when the connection is lost. It assigns
 network names to the sensors, converts units to SI, timestamps every reading with its time of
@@ -31,7 +31,7 @@ from mag_tracking.records import AccelerationSample, Readings
 POLL_S = 0.2
 """[s] Interval at which `serve` checks whether to stop."""
 IGNORED = '-'
-"""Name of a sensor whose readings are discarded."""
+"""Network name assigned to a sensor whose readings are discarded."""
 MAX_NAMES = 20
 """Maximum number of unknown sensors, and of errors of one type, that are counted individually."""
 MAX_SOURCES = 4096
@@ -42,11 +42,11 @@ PollResult: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
 EMPTY_RESULT: PollResult = Readings.joined([]), ()
 """Result of a poll without data."""
 MIN_CLOCK_STEP_NS = 10_000_000
-"""[ns] Larger changes of wall clock minus monotonic clock are steps of the host clock."""
+"""[ns] Larger changes of wall clock minus monotonic clock are counted as clock steps."""
 
 
 class Driver:
-    """Opens one device and converts its readings to samples.
+    """Keeps one device open and converts its readings to samples.
 
     Parameters
     ----------
@@ -70,9 +70,11 @@ class Driver:
     name : str
     sensors : dict of str to str
     driver_counts : Counter
-        Number of losses and faults detected by the driver itself, by cause.
+        Number of samples by sensor, and of losses and faults that the driver itself has detected,
+        by cause.
     fault : str
-        Reason why the device is closed or silent; empty if neither is the case.
+        Latest failure, such as a lost connection or silence. Empty before the first failure, and
+        as soon as data arrive.
 
     Raises
     ------
@@ -134,12 +136,12 @@ class Driver:
         return self._is_open
 
     def clocks(self) -> dict[str, ArrivalClock | DeviceClock]:
-        """Clocks of all sources received so far.
+        """Clocks of all sources from which readings have arrived.
 
         Returns
         -------
         dict of str to ArrivalClock or DeviceClock
-            By source.
+            Clock of each source.
         """
         return dict(self._clocks)
 
@@ -149,9 +151,9 @@ class Driver:
         Returns
         -------
         Counter
-            By cause.
+            By sensor or cause, such as 'samples: mag_1' or 'connections lost'.
         """
-        # Each counter is copied at once, because the polling thread may add a cause meanwhile.
+        # Each counter is copied in one step, because the polling thread may add a cause meanwhile.
         total = self.driver_counts.copy()
         total.update({'source changes': n} if (n := self._sole_source.changes) else {})
         total.update(self._device.counts.copy())
@@ -178,6 +180,11 @@ class Driver:
         readings : Readings
             Empty if nothing arrived in time.
         accelerations : sequence of AccelerationSample
+
+        Raises
+        ------
+        ValueError
+            If a field does not consist of three numbers.
         """
         if not self._is_open and not self._try_to_open(timeout_s):
             return EMPTY_RESULT
@@ -198,7 +205,7 @@ class Driver:
         return self._samples(arrivals, self._wall_offset(now))
 
     def _read(self, timeout_s: float) -> list[Arrival]:
-        """Read the available readings, then all further readings within `batch_s`."""
+        """Read the available readings and, if there are any, those that follow within `batch_s`."""
         arrivals = self._device.read(timeout_s)
         if not arrivals or not self._settings.batch_s:
             return arrivals
@@ -249,7 +256,7 @@ class Driver:
         return True
 
     def _schedule_retry(self, why: object) -> None:
-        """Close the device and double the delay before it is reopened."""
+        """Close the device, schedule its reopening, and double the delay for the next failure."""
         self._is_open, self.fault = False, str(why)
         try:
             self._device.close()
@@ -302,7 +309,8 @@ class Driver:
     def _resolve(self, reading: Reading, arrival: Arrival) -> tuple[str | None, int | None]:
         """Identify the sensor of a reading, and timestamp the reading unless it is a duplicate.
 
-        Returns (network name, monotonic time [ns]); None = unknown, or a duplicate.
+        Return (network name, monotonic time [ns]). The name is None if the sensor is unknown or
+        ignored; the time is None for a duplicate, or if no clock provides it.
         """
         sensor = self._known_sensors.get((reading.sensor, arrival.source)) \
             or self._sensor_of(reading.sensor, arrival.source)
@@ -312,7 +320,7 @@ class Driver:
         return sensor, self._stamp(reading, arrival)
 
     def _sensor_of(self, at_device: str, source: str) -> str | None:
-        """Return the network name of a sensor, or None if ignored; count unknown sensors."""
+        """Return the network name of a sensor, or None if ignored or unknown; count the latter."""
         sensor = next((self.sensors[name] for name in (at_device, source)
                        if name and name in self.sensors), None)
         if sensor is None and '' in self.sensors and self._sole_source.accepts(
@@ -365,9 +373,9 @@ def _bytes_of(axes: Axes | None) -> bytes:
 
 def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]], object],
           stopping: Callable[[], bool]) -> None:
-    """Poll a driver and pass its samples to a function until `stopping()` is true.
+    """Poll a driver and pass its samples to `take` until `stopping()` is true; then close it.
 
-    No error is raised, because the function may run in its own thread. Errors of the device are
+    No error is raised, because `serve` may run in its own thread. Errors of the device are
     stored in `driver.fault`; errors of `take` are counted in `driver.driver_counts`.
 
     Parameters

@@ -6,7 +6,7 @@ from mag_tracking.drivers.reading import Arrival, Framing, Transport
 
 
 class FramedDevice:
-    """Extracts readings from the data of a transport with a framing. Implements `reading.Device`.
+    """Device that applies a framing to the data of a transport. Implements `reading.Device`.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class FramedDevice:
     @property
     def counts(self) -> Counter[str]:
         """Number of losses and rejections by cause."""
-        # Each counter is copied at once, because the polling thread may add a cause meanwhile.
+        # Each counter is copied in one step, because the polling thread may add a cause meanwhile.
         total = self._rejected.copy()
         total.update(self._transport.counts.copy())
         return total

@@ -38,14 +38,14 @@ def lower_hull(points: Sequence[Point]) -> list[Point]:
 
 
 def slope_range(points: Sequence[Point]) -> tuple[float, float]:
-    """Range of the slopes of lines under the points that are about as likely as the best line.
+    """Range of slopes that are about as likely as the slope of the best line under the points.
 
     The best line, according to Moon et al., is the edge of the lower hull over the mean of x.
 
     Parameters
     ----------
     points : sequence of Point
-        At least three points in ascending order, with at least two different x.
+        At least three points in ascending order, with at least two different values of x.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Reading of a device, and the protocols `Transport`, `Framing` and `Device`.
+"""Type of a device reading, and the protocols `Transport`, `Framing` and `Device`.
 
 A *transport* receives bytes (serial line, UDP, MQTT). A *framing* extracts readings from bytes and
 is a pure function. A *device* returns readings with their times of arrival: a transport with a
@@ -20,14 +20,14 @@ class Reading(NamedTuple):
     sensor: str = ''
     """Name of the sensor at the device; empty if the device does not send it."""
     field: Axes | None = None
-    """Field in the device's unit, sensor frame. NaN = the axis is not reported or over its range;
-    None = no field."""
+    """Field in the device's unit, sensor frame. NaN for an axis that is not reported or exceeds its
+    range; None if no field is reported."""
     acceleration: Axes | None = None
-    """Acceleration in the device's unit, sensor frame; None = not reported."""
+    """Acceleration in the device's unit, sensor frame; None if not reported."""
     ticks: float | None = None
-    """Device clock at the time of measurement; None = the device has no clock."""
+    """Device clock at the time of measurement; None if the device does not send it."""
     sequence: int | None = None
-    """Sequence number; None = the device does not number its readings."""
+    """Sequence number; None if the device does not number its readings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Parsed:
 
     readings: tuple[Reading, ...] = ()
     consumed: int = 0
-    """Number of bytes at the beginning that are completely parsed."""
+    """Number of leading bytes that are completely parsed and need not be passed again."""
     rejected: Mapping[str, int] = field(default_factory=dict)
     """Number of rejections by cause. A cause is a plural noun phrase, such as 'frames with a wrong
     checksum' or 'bytes between frames'."""
@@ -48,10 +48,10 @@ class Framing(Protocol):
     def parse(self, data: bytes, final: bool = False) -> Parsed:
         """Find all readings in `data`.
 
-        A possible incomplete frame at the end remains unconsumed; it is never longer than the
-        longest frame. With `final`, as for a datagram, all bytes are consumed, and bytes outside
-        frames are counted. The readings and counts of a stream do not depend on its division into
-        chunks if each chunk is preceded by the unconsumed bytes of the previous call.
+        An incomplete frame at the end remains unconsumed; the unconsumed part is never longer than
+        the longest frame. If `final` is set, as for a datagram, all bytes are consumed, and bytes
+        outside frames are counted. The readings and counts of a stream do not depend on its
+        division into chunks if each chunk is preceded by the unconsumed bytes of the previous call.
 
         Parameters
         ----------

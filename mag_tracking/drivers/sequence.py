@@ -3,7 +3,7 @@
 from collections import Counter
 
 MAX_REMEMBERED = 1000
-"""Number of stored sequence numbers. An older number indicates a restarted count."""
+"""Maximum number of stored sequence numbers. An older number indicates a restarted sequence."""
 MAX_GAP = 1_000_000
 """Largest gap counted as loss. A larger gap is counted as a jump of the sequence."""
 
@@ -14,7 +14,7 @@ class SequenceCheck:
     Parameters
     ----------
     wrap : int
-        Number at which the sequence returns to 0; 0 = never.
+        Number at which the sequence returns to 0; 0 if it never does.
 
     Attributes
     ----------
@@ -28,20 +28,20 @@ class SequenceCheck:
         self._begin()
 
     def _begin(self) -> None:
-        """Start a new count."""
+        """Discard the stored numbers; the next reading starts a new sequence."""
         self._newest_number: int | None = None
         self._values: dict[int, bytes] = {}
         self._lost_numbers: dict[int, bool] = {}
 
     def pause(self) -> None:
-        """Start a new count, so that readings during a deliberate pause are not counted as lost."""
+        """Start a new sequence, so that numbers skipped during a pause are not counted as lost."""
         self._begin()
 
     def is_new(self, sequence: int, values: bytes) -> bool:
         """Record a reading; return whether it is new.
 
-        Skipped numbers are counted as lost; the count is corrected if they arrive late. A known
-        number with different values is not a duplicate: it restarts the count.
+        Skipped numbers are counted as lost; the count is corrected if they arrive late. A stored
+        number with different values is not a duplicate: it restarts the sequence.
 
         Parameters
         ----------

@@ -27,9 +27,9 @@ class DriverSettings:
     stamp_by: str = param(
         'auto', 'Source of the timestamps: ticks (device clock), sequence (sample counter of a '
         'device with a steady rate), arrival (time of arrival at the host), or auto (ticks if the '
-        'device has any, otherwise arrival).')
+        'device sends any, otherwise arrival).')
     sequence_wrap: int = param(
-        0, 'Number at which the sequence number returns to 0; 0 = never.', '', (0, 2**64))
+        0, 'Number at which the sequence number returns to 0; 0 if it never does.', '', (0, 2**64))
     retry_s: float = param(
         0.1, 'Delay before a lost device is reopened. It doubles after every failed attempt.', 's',
         (1e-3, 60.0))
@@ -39,7 +39,7 @@ class DriverSettings:
         0.0, 'Interval over which readings are collected before they are passed on; with `batches` '
         'they form one message.', 's', (0.0, 1.0))
     silence_timeout_s: float = param(
-        10.0, 'Interval without data after which a device is closed and reopened; 0 = never.',
+        10.0, 'Interval without data after which a device is closed and reopened; 0 disables this.',
         's', (0.0, 86400.0))
 
 

@@ -1,6 +1,7 @@
-"""Simulated roadside: vehicles pass the sensors of a network in real time.
+"""Device that simulates vehicles passing the sensors of a network in real time.
 
-It serves to try the complete system without hardware, and to measure its computational cost.
+It serves to try the complete system without hardware, and to measure the system's computational
+cost.
 """
 
 import bisect
@@ -23,7 +24,7 @@ from mag_tracking.simulation.scenario import Path, random_vehicle
 TICK_S = 1e-6
 """[s] Resolution of the simulated device clock."""
 MIN_WAIT_S = 1e-3
-"""[s] Minimum waiting time. Several readings arrive together, as from a polled port."""
+"""[s] Minimum waiting time, so that several readings arrive together, as from a polled port."""
 MAX_BACKLOG_S = 5.0
 """[s] Maximum age of a reading. Older readings are dropped, as in the buffer of a real device."""
 
@@ -32,11 +33,12 @@ MAX_BACKLOG_S = 5.0
 class SimulatorSettings:
     """Settings of the simulated roadside."""
 
-    network: str = param('', 'Path of the network.yaml with the sensors to simulate.')
+    network: str = param('', 'Path of the network file that lists the sensors to simulate.')
     rate_hz: float = param(100.0, 'Sampling rate of each sensor.', 'Hz', (0.1, 10_000.0))
     noise: float = param(1.2e-8, 'Standard deviation of the measurement noise.', 'T', (0.0, 1e-3))
     speed: float = param(10.0, 'Speed of the vehicles.', 'm/s', (0.01, 100.0))
-    heading_deg: float = param(0.0, 'Heading of the vehicles; 0 = along x.', 'deg', (-360.0, 360.0))
+    heading_deg: float = param(
+        0.0, 'Heading of the vehicles, anticlockwise from x.', 'deg', (-360.0, 360.0))
     offset: float = param(
         0.0, 'Lateral offset of the vehicles from the centre of the network, positive to the '
         'left.', 'm', (-1e4, 1e4))
@@ -73,7 +75,8 @@ class SimulatedDevice:
     Raises
     ------
     SettingsError
-        If no network is configured, or if the network has no Earth field.
+        If no network is configured, if the network has no Earth field, or if the path past the
+        sensors has length 0.
     NetworkError
         If the network file is not valid.
     """
@@ -178,7 +181,7 @@ class SimulatedDevice:
                                       index.tolist(), j.tolist(), B.tolist(), strict=True)]
 
     def _field_of_pass(self) -> FloatArray:
-        """Field during a pass, (n, n_sensors, 3) T, sensor frames; last row without a vehicle."""
+        """Field during a pass, (n, n_sensors, 3) T, sensor frames; no vehicle in the last row."""
         s, network = self._settings, self._network
         t = np.arange(0.0, self._passing_s, 1.0 / s.rate_hz)
         body = random_vehicle(np.random.default_rng(s.seed), length=s.length, moment=s.moment)
@@ -192,7 +195,7 @@ class SimulatedDevice:
 
 
 def _path_along(network: SensorNetwork, settings: SimulatorSettings) -> tuple[Path, float]:
-    """(straight path past all sensors, duration of a pass [s])."""
+    """Return (straight path past all sensors, duration of a pass [s])."""
     heading = math.radians(settings.heading_deg)
     forward = np.array([math.cos(heading), math.sin(heading)])
     left = np.array([-forward[1], forward[0]])

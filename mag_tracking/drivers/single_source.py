@@ -8,7 +8,7 @@ RELEASE_TIMEOUT_S = 5.0
 """[s] Silence of the selected source after which another source may be selected."""
 
 Source: TypeAlias = tuple[str, str]
-"""(device's name of the sensor, address)."""
+"""(name of the sensor at the device, source of the arrival)."""
 
 
 class SingleSource:

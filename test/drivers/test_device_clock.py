@@ -244,14 +244,14 @@ def test_drift_spread_and_std_match_the_simulated_link():
         clock = clock_of()
         assert math.isnan(clock.drift_ppm + clock.spread_s) and math.isnan(clock.stamp_std)
         e = errors_of(timestamps_of(clock, ticks, arrival), t)
-        # The error has z = 12 at both ends.
+        # The limit assumes errors with z = 12 at both ends of the line.
         assert abs(clock.drift_ppm - ppm) < 2e6 * error_limit(
             2e-3, 100.0, 0.0, 100.0, 100.0, 12.0) / 100.0
         # The 95th percentile of 256 exponential delays is 3 means, within 4 standard deviations.
         p = 0.95 + np.array([-4.0, 4.0]) * math.sqrt(0.05 * 0.95 / 256)
         low, high = -2e-3 * np.log(1.0 - np.minimum(p, 0.999))
         assert low < clock.spread_s < high
-        # Lowest of 188 delays in a block of 1.875 s: 90 % are below 2.3 / 188 of the mean.
+        # In 90 % of the blocks, the lowest of 188 delays is below 2.3 / 188 of the mean.
         assert clock.stamp_std == pytest.approx(2.3 * 2e-3 / 188, rel=0.5)
         assert np.abs(e[3000:]).max() * 1e-9 < clock.stamp_std
 
@@ -293,7 +293,7 @@ def test_losses_over_several_counter_wraps_are_bridged():
 
 
 def max_rejected(rate):
-    """Maximum number of readings lost in a restart: two tolerances (0.1 s + 2 spreads), and 3."""
+    """Maximum number of readings lost in a restart, within two tolerances of 0.1 s + 2 spreads."""
     return 2.0 * (0.1 + 2.0 * 4.0 * 2e-3) * rate + 3
 
 
@@ -331,7 +331,7 @@ def test_a_step_back_during_silence_is_first_treated_as_a_queue(reset, cause):
     # 47.9 s are 7 wraps and 2 s.
     late = (ticks[after][0] - 5) * 1e-4 if reset else 0.3
     ticks[after] = (ticks[after] - round(late * 1e4)) % 2**16
-    # Once the drift is known, the large drift bound does not excuse a step.
+    # Once the drift is estimated, the step is detected despite the large bound on the drift.
     clock = clock_of(max_drift_ppm=5000.0, **SMALL)
     e = errors_of(timestamps_of(clock, ticks, arrival), t)
     assert clock.restarts == {cause: 1} and not clock.counts
@@ -403,7 +403,7 @@ def test_messages_queued_before_opening_are_timestamped():
 @pytest.mark.parametrize('change_ms', [10.8, -10.8])
 @pytest.mark.parametrize('back, restarts', [(0.0, {}), (30.0, {LOST: 1})])
 def test_the_clock_continues_after_an_hour_of_disconnection(change_ms, back, restarts):
-    """In this hour, the drift changes by 3 ppm; in some cases, the clock steps by 30 s."""
+    """While disconnected, the drift changes by 3 ppm; in two cases, the clock steps by 30 s."""
     ticks, arrival, t = simulate(seed=3, seconds=200.0, ppm=40.0)
     hour = 3600 * 10**9 + round(change_ms * 1e6)
     out = t > 100.0
@@ -414,7 +414,7 @@ def test_the_clock_continues_after_an_hour_of_disconnection(change_ms, back, res
     assert clock.restarts == restarts and np.isnan(e).sum() == clock.counts[NO_FIT]
     assert clock.counts[NO_FIT] <= (max_rejected(100.0) if restarts else 0)
     after = e[out][~np.isnan(e[out])]
-    # At first the previous drift is used; one block later, the new messages.
+    # At first the previous drift is used; after one block, the line follows the new messages.
     assert np.abs(after[:20]).max() < 24e6 and np.abs(after[50:]).max() < 2e6
     assert np.abs(after[1000:]).max() * 1e-9 < error_limit(2e-3, 100.0, 0.0, 10.0, 10.0, 12.0)
 
@@ -433,7 +433,7 @@ def test_three_device_times_confirm_a_new_clock_at_any_rate():
     """Three sensors are read every 10 s; the oscillator is 3 % off."""
     clock, out = clock_of(max_drift_ppm=50_000.0, window_s=600.0), []
     for i in range(100):
-        # The first two accepted after the step arrive a second late.
+        # The first two device times accepted after the step arrive a second late.
         d = 10.0 * i
         arrival = START + round((1.03 * d + (i in (62, 63))) * 1e9)
         ticks = round((d + 777.0 * (i >= 60)) * 1e6)
@@ -492,7 +492,7 @@ def test_overtaken_messages_in_blocks_of_one_do_not_bias_the_clock():
 
 
 def test_points_with_one_device_time_have_no_slope():
-    """A set of such points occurs only if arrivals are out of order."""
+    """Such points occur only if messages overtake each other."""
     clock = clock_of(window_s=1.0)
     for i in range(1, 20):
         clock.stamp(2000 * i, START + 60_000_000 + 2_000_000 * i)
@@ -554,7 +554,7 @@ def test_random_device_times_restart_the_clock_once_per_window():
     ticks[random] = np.random.default_rng(0).integers(0, 2**60, random.sum())
     clock = clock_of(wrap=0)
     timestamps_of(clock, ticks, arrival)
-    # In 980 s, the clock restarts whenever no reading has fitted for window_s.
+    # In 980 s, no reading fits the clock for window_s eight times; each time, the clock restarts.
     assert clock.restarts.total() == 8
     assert clock.counts == {NO_FIT: random.sum() - 8}
 

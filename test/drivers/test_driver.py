@@ -122,7 +122,7 @@ def test_a_lost_device_is_reopened_with_back_off():
         if opened == 3:
             assert driver.fault == 'no port'
     waits = np.diff(times)
-    # The interval doubles up to 1 s, and restarts after a reading.
+    # The interval doubles up to 1 s, and is reset by a reading.
     np.testing.assert_allclose(waits[:6], [0.1, 0.2, 0.4, 0.8, 1.0, 1.0], atol=0.011)
     np.testing.assert_allclose(waits[6:], [0.1, 0.2], atol=0.011)
     assert driver.fault == ''
@@ -260,7 +260,7 @@ def test_duplicates_are_distinguished_from_restarts():
     # The same number with the same values is the same reading, NaN or not.
     assert check_sequence([0, 1, 1, 2, 0], values=[5, 6, 6, 7, 5]) == (
         [True, True, False, True, False], {'duplicates': 2})
-    # With different values, the device has restarted, near its first number or far from it.
+    # If the values differ, the device has restarted, at a near or at a distant number.
     for begin in (3, 500, 100_000):
         assert check_sequence([begin, begin + 1, 0, 1, 2]) == (
             [True] * 5, {'sequence restarts': 1})
@@ -281,7 +281,7 @@ def test_the_memory_of_a_sequence_check_is_bounded():
 
 
 def test_duplicate_readings_are_dropped():
-    """A known number with different values is a new reading, not a duplicate."""
+    """A repeated number with different values is a new reading, not a duplicate."""
     def reading(x, sequence, acceleration=None):
         return Reading('', (x, float('nan'), 3.0), acceleration, sequence=sequence)
     driver, *_ = driver_of([
@@ -307,7 +307,7 @@ def test_remembered_readings_do_not_burden_the_garbage_collector():
 @pytest.mark.parametrize('sequence', [None, 1])
 @pytest.mark.parametrize('field', [(1.0, 2.0), (1.0, 2.0, 3.0) * 2, (10**400, 0.0, 0.0)])
 def test_a_field_that_is_not_three_floats_is_an_error_of_the_device(field, sequence):
-    """Three invalid readings are not combined into valid fields."""
+    """The components of invalid readings are not combined into valid fields."""
     driver, *_ = driver_of([[Reading('', field, sequence=sequence)] * 3])
     with pytest.raises((ValueError, OverflowError)):
         driver.poll(0.1)
@@ -416,7 +416,7 @@ def test_frames_are_assembled_from_a_stream():
     device.open()
     assert [(a.arrival_ns, a.reading.field[0]) for a in device.read(0.0)] == [(1, 1.0)]
     assert [(a.arrival_ns, a.reading.field[0]) for a in device.read(0.0)] == [(2, 2.0)]
-    # The connection is lost within a frame, whose start is not joined with later bytes.
+    # The connection is lost within a frame. The start of this frame is not joined with later bytes.
     device.open()
     assert [a.reading.field[0] for a in device.read(0.0)] == [4.0]
     assert device.counts == {'dropped': 2, 'bytes of truncated frames': 1}

@@ -61,9 +61,9 @@ def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
 
 
 @pytest.mark.parametrize('content, message', [
-    (without('framing'), 'board: framing is missing (one of text, json, binary, xsens)'),
-    (without('transport'), 'board: transport is missing (one of serial, udp, mqtt)'),
-    (without(device='i2c'), 'device cannot be combined with transport and framing'),
+    (without('framing'), 'board: framing is missing; set it to one of text, json, binary, xsens'),
+    (without('transport'), 'board: transport is missing; set it to one of serial, udp, mqtt'),
+    (without(device='i2c'), 'device cannot be combined with transport or framing'),
     (without(transport='carrier pigeon'), "transport: expected serial, udp, mqtt or package.mod"),
     (without(framing=['text']), 'framing: expected text'),
     (without(transport='no_such_module:Port'),
@@ -88,7 +88,7 @@ def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
     (without('sensor', sensors={None: 'a'}), 'sensors: None is not a name; put it in quotes'),
     (without(sensor='mag 1'), 'expected a sensor name (letters, digits'),
     (without(framing='collections:OrderedDict'),
-     'OrderedDict is incomplete, it lacks SETTINGS, parse'),
+     'OrderedDict is incomplete: it lacks SETTINGS, parse'),
     (without(framing='.x:Y'), 'framing: .x:Y cannot be loaded: TypeError'),
     (without('sensor', sensors={'A': 'a', 'B': 'a'}), 'sensor a is already assigned to board (A)'),
     ({**without(), 'other': BOARD}, 'other: sensor mag_1 is already assigned to board'),

@@ -32,14 +32,14 @@ def test_every_vehicle_of_a_recording_is_tracked(name):
     assert got.is_found.sum() >= found, str(got)
     assert np.nanmedian(got.rms) <= rms and np.nanmedian(got.nees) <= nees, str(got)
     assert got.n_extra == 0, str(got)
-    # No track has two poses at one time, and every track is counted.
+    # No track has two poses with the same timestamp, and every track is counted.
     assert len({(p.id, p.stamp_ns) for p in poses}) == len(poses)
     assert pipeline.track.counts['tracks'] == len({p.id for p in poses})
 
 
 @pytest.mark.parametrize('name', studied(AIMS, kept=IN_EVERY_TEST))
 def test_every_vehicle_of_a_recording_is_counted(name):
-    """Each vehicle is counted in its direction, and no other passage is counted."""
+    """Each vehicle is counted in the right direction, and no other passage is counted."""
     passages = tracked_recording(name).passages
     right = busy_recordings.rightly_counted(name, passages)
     assert len(right) >= AIMS[name][0] and len(right) == len(passages)

@@ -1,6 +1,7 @@
 """Bundled recordings, degraded as if by poor sensors: tracks, flags and findings.
 
-All recordings are a study; `make test` runs one or two of each kind. Limits are aims.
+The tests of all recordings are studies; `make test` runs one or two recordings of each kind. The
+limits are the aims of the project.
 """
 
 import dataclasses

@@ -149,7 +149,7 @@ def test_detection_probabilities_are_near_the_published_ones(mitre12, detected):
 
 
 def test_bounds_of_one_sensor_without_a_prior_are_infinite(mitre12, bounded):
-    """The scale is unobservable with one sensor, so there are no bounds without a prior."""
+    """The scale is unobservable with one sensor, so only theta has a bound without a prior."""
     n = bounded
     assert n['lost'] == ('x0', 'y0', 'v', 'M1', 'M2')
     m = mitre12.moment('car')
@@ -236,7 +236,7 @@ def test_the_cost_of_simulated_passes_falls_with_the_model_order(tmp_path, capsy
     found = {rate: script.passes(rate, (1, 3)) for rate in script.RATES}
     (cars, truck), (cars_3, truck_3) = (script.costs_of(found['12.5 Hz'], d) for d in (1, 3))
     assert len(cars) == 3 and (np.array(cars_3) < cars).all() and truck_3 < truck
-    # Point models are below and above the published ranges at that rate, as the report states.
+    # With one dipole at 12.5 Hz, the cars are below and the truck is above the published range.
     (lowest, _), _ = script.PUBLISHED['cars']
     (_, highest), _ = script.PUBLISHED['large']
     assert max(cars) < lowest and truck > highest and max(cars_3) < 3.0 < 20.0 < truck_3

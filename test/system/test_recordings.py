@@ -1,7 +1,7 @@
 """Replays of the bundled recordings: errors against ground truth, covariances, repeatability.
 
 The limits are the aims of the project. A test whose aim is not reached is a strict expected
-failure, so it reports when the aim is reached.
+failure, so that the test run fails as soon as the aim is reached.
 """
 
 import csv
@@ -183,7 +183,7 @@ def test_a_car_is_tracked_along_a_corridor(tmp_path):
         assert np.ptp(true[along, 0]) > 41.0
         assert rms <= 0.6
         assert step_of(poses.covariance) < MAX_STEP
-        # Limits of the other cars; 1 is consistent.
+        # The limits for the other cars; the ANEES of a consistent covariance is 1.
         assert anees <= {'filtered': 3.0, 'smoothed': 4.0}[name]
 
 

@@ -38,7 +38,7 @@ def poses_of(name, network):
 
 
 def fuse(poses, noise):
-    """Fuse poses with an EKF of x, y, vx, vy; positions (n, 2). `noise` (4,) is per second."""
+    """Fuse poses with an EKF (x, y, vx, vy; `noise` (4,) per second); return positions (n, 2)."""
     ekf, out, last_ns = KalmanFilter(dim_x=4, dim_z=2), [], None
     ekf.H = np.eye(2, 4)
     for stamp_ns, position, R in poses:
@@ -82,7 +82,7 @@ def test_an_ekf_that_fuses_the_published_pose_is_not_less_accurate(names, road_n
 
 
 def test_the_configuration_is_complete():
-    """Lengths, frames and states that robot_localization would refuse or silently ignore."""
+    """robot_localization would refuse or silently ignore wrong lengths, frames and states."""
     parameters = settings()
     assert len(parameters['pose0_config']) == 15 and parameters['pose0_config'][:2] == [True, True]
     assert len(parameters['process_noise_covariance']) == 225

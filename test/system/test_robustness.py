@@ -91,7 +91,7 @@ def test_a_stuck_sensor_is_not_learnt_and_a_coarse_one_is_not_noiseless(step):
     for t in np.arange(0, 10, 0.01):
         value = EARTH + SIGMA * rng.standard_normal(3)
         b.add(t, np.round(value / step) * step if step else EARTH)
-    # A coarse sensor is as accurate as its steps; one that never changes may be stuck.
+    # A coarse sensor is as accurate as its steps; a sensor that never changes may be stuck.
     assert b.ready == (step > 0.0) and b.stuck == (step == 0.0)
     assert not step or (np.sqrt(b.covariance.diagonal()) > step / 4.0).all()
 

@@ -39,7 +39,7 @@ wrong poses."""
 
 MISSED_EVENT_AIMS = {
     'a car that turns': '226 of 241: the other 15 are or were flagged for their height',
-    'a tram line switched': 'five of six; the cause is unknown, the same without new_targets',
+    'a tram line switched': 'five of six; the cause is unknown and persists without new_targets',
 }
 """{situation: cause of the missed aim for events}."""
 

@@ -61,7 +61,7 @@ def run(value, more_is_better=False, name='a frame, mean'):
     (True, [50.0, 40.0], 44.0, False), (True, [50.0, 40.0], 43.0, True),
     # The best value is older than five runs.
     (False, [1.0, 5.0, 5.0, 5.0, 5.0, 5.0], 5.5, False), (False, [], 9.0, False),
-    # NaN is worse than any number, and is not compared with.
+    # NaN is worse than any number, and no later value is compared with it.
     (False, [5.0], np.nan, True), (False, [np.nan, 5.0], 45.0, True),
     (False, [np.nan], 9.0, False)])
 def test_a_figure_is_compared_with_the_best_of_recent_runs(more_is_better, values, now, is_worse):

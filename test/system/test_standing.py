@@ -19,7 +19,7 @@ RUNS = 20
 pytestmark = pytest.mark.timeout(1800)
 
 MIN_RIGHT = 18
-"""The aim is 20. In two runs, the recovery takes 3.0 and 3.3 s."""
+"""Minimum number of runs with a fast recovery. The aim is 20; two runs take 3.0 and 3.3 s."""
 
 
 @pytest.mark.parametrize('runs', [2, pytest.param(RUNS, marks=pytest.mark.study)])

@@ -1,1 +1,1 @@
-"""Magnetometer chips on I2C, one file for each manufacturer or chip."""
+"""Support for magnetometer chips on I2C, with one module per chip or manufacturer."""

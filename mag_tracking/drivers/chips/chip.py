@@ -1,7 +1,7 @@
-"""Protocol of a magnetometer chip, and access to its registers.
+"""Interface of a magnetometer chip, and access to its registers.
 
-A new chip is one file with a frozen dataclass of settings and a class with the methods of `Chip`,
-plus one line each in `CHIPS` and `I2cSettings` of `transports/i2c.py`.
+To add a chip, write one file with a frozen dataclass of its settings and a class that implements
+`Chip`, and add one line each to `_CLASSES` and `I2cSettings` in `transports/i2c.py`.
 """
 
 import errno
@@ -17,7 +17,7 @@ from mag_tracking.errors import DeviceError, SettingsError
 CONVERSION_MARGIN = 1.1
 """Ratio of the waiting time to the typical conversion time of the data sheet."""
 Identity: TypeAlias = tuple[tuple[int, int], ...]
-"""((register, value), ...) that identify a chip."""
+"""((register, expected value), ...) by which a chip is identified."""
 Value = TypeVar('Value', int, float)
 Choice = TypeVar('Choice')
 
@@ -91,9 +91,9 @@ class ChipLocation(NamedTuple):
     address: int
     """Address of the chip."""
     multiplexer: int | None = None
-    """Address of a TCA9548A; None = the chip is directly on the bus."""
+    """Address of the TCA9548A multiplexer; None if the chip is directly on the bus."""
     channel: int | None = None
-    """Channel of the multiplexer."""
+    """Channel of the multiplexer, 0 to 7; None if there is no multiplexer."""
 
     def __str__(self) -> str:
         channel = ('' if self.multiplexer is None else
@@ -110,14 +110,14 @@ class Bus:
     Parameters
     ----------
     smbus : smbus2.SMBus or None
-        None if no transfers are made.
+        None for a bus that is not open; transfers then raise OSError.
     monotonic_ns : callable
         Monotonic clock, such as `time.monotonic_ns`.
     sleep : callable
         Function that waits for a time in seconds, such as `time.sleep`.
     multiplexers : collection of int, optional
-        Addresses of all TCA9548A multiplexers. At most one channel of all multiplexers is open, and
-        no channel during transfers to a chip directly on the bus.
+        Addresses of all TCA9548A multiplexers. Of all their channels, at most one is open at any
+        time, and none is open during transfers to a chip directly on the bus.
 
     Attributes
     ----------
@@ -166,7 +166,7 @@ class Bus:
         self._selected = selection
 
     def forget(self) -> None:
-        """Discard the stored state of the multiplexers, which a failure may have changed."""
+        """Discard the stored state of the multiplexers, because a failure may have changed it."""
         self._selected = None
 
 
@@ -253,32 +253,32 @@ class Registers:
 
 
 class Conversion(NamedTuple):
-    """Field and time of a conversion."""
+    """Measured field and time of one conversion."""
 
     middle_ns: int
     """Estimated `time.monotonic_ns()` at the middle of the conversion."""
     field: Axes
-    """[T] Field in the right-handed axes described by the chip's module; NaN for an axis over
-    its range."""
+    """[T] Field in the right-handed axes described by the chip's module; NaN for an axis that
+    exceeds its range."""
 
 
 Measurement: TypeAlias = Generator[float, None, Conversion | None]
-"""Return type of `Chip.measure`."""
+"""Return type of `Chip.measure`: yields waiting times [s], returns a `Conversion` or None."""
 
 
 class Identified(Protocol):
-    """Chip, or class of a chip, with registers that identify it."""
+    """Interface of a chip, or of a chip class, that declares its identity registers."""
 
     @property
     def IDENTITY(self) -> Identity:
-        """Registers and values that identify the chip."""
+        """Registers and values that identify the chip; empty if the chip is not identified."""
 
 
 class Chip(Identified, Protocol):
-    """Magnetometer chip."""
+    """Interface of a magnetometer chip."""
 
     def set_up(self) -> None:
-        """Configure the chip from any state.
+        """Configure the chip, regardless of its previous state.
 
         Raises
         ------
@@ -312,9 +312,10 @@ class Chip(Identified, Protocol):
 
 
 class ChipClass(Identified, Protocol):
-    """Class of a `Chip`. Creating an instance must not access the bus.
+    """Interface of a chip class, which creates instances of `Chip`.
 
-    `count` is called with the cause of each loss, as a plural noun phrase.
+    Creating an instance must not access the bus. The instance calls `count` with the cause of each
+    loss, which is a plural noun phrase.
     """
 
     NAME: str
@@ -375,14 +376,14 @@ def look_up_choice(name: str, value: Value, choices: Mapping[Value, Choice]) -> 
 
 
 def mask_overrange(values: Iterable[float], largest: float) -> Axes:
-    """Replace values beyond the range by NaN.
+    """Replace values whose magnitude exceeds the range by NaN.
 
     Parameters
     ----------
     values : iterable of float
         Three values.
     largest : float
-        Largest permitted magnitude.
+        Largest permitted magnitude, in the unit of `values`.
 
     Returns
     -------

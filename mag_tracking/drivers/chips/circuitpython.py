@@ -26,14 +26,14 @@ from mag_tracking.drivers.chips.chip import Conversion, Measurement, Registers
 from mag_tracking.errors import DeviceError
 
 TIMEOUT_NS = 250_000_000
-"""[ns] Timeout of a driver that waits for its chip."""
+"""[ns] Timeout of one measurement. Creating the driver instance may take ten times as long."""
 
 
 class BusioI2c:
     """Subset of the interface of `busio.I2C` that CircuitPython drivers use.
 
-    After the deadline every transaction raises OSError, because drivers wait for their chip in
-    unbounded loops.
+    After the deadline, `try_lock` and every transaction raise OSError, because drivers wait for
+    their chip in unbounded loops.
 
     Parameters
     ----------
@@ -210,7 +210,8 @@ def load(name: str) -> Any:
     Raises
     ------
     DeviceError
-        If the class cannot be imported. The message names the package to install.
+        If the class cannot be loaded. If the import fails, the message names the package to
+        install.
     """
     module_name, _, class_name = name.rpartition('.')
     try:

@@ -1,4 +1,4 @@
-"""Sensors of an I2C bus as listed in the settings: name:chip:address@multiplexer.channel."""
+"""Parser of the I2C sensors in the settings: name:chip:address[@multiplexer.channel]."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -20,7 +20,7 @@ class Sensor(NamedTuple):
 
 
 def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor]:
-    """Parse all entries.
+    """Parse the entries of all sensors of a bus, and check them for conflicts.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def _conflict(one: ChipLocation, other: ChipLocation) -> bool:
 
 
 def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
-    """Parse one entry.
+    """Parse the entry of one sensor.
 
     Parameters
     ----------

@@ -63,7 +63,8 @@ class Hmc5883l:
     IDENTITY = ((0x0A, ord('H')), (0x0B, ord('4')), (0x0C, ord('3')))
     NAME = 'hmc5883l'
     CONFIGURATION = 0x10
-    """One sample per measurement, no bias. The rate, 15 Hz, does not affect single measurements."""
+    """Configuration register A: one sample per measurement, no bias. The rate of 15 Hz does not
+    affect single measurements."""
 
     def __init__(self, registers: Registers, settings: Hmc5883lSettings,
                  count: Callable[[str], None]) -> None:

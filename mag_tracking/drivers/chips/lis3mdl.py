@@ -29,7 +29,7 @@ from mag_tracking.settings import param
 
 CONTROL_1, STATUS, OUT = 0x20, 0x27, 0x28
 AUTO_INCREMENT = 0x80
-"""Bit of a register number: increment it with every byte read."""
+"""Bit of a register number that makes the chip increment it with every byte read."""
 SOFT_RESET, ULTRA_155_HZ, CONTINUOUS, ULTRA_Z, BLOCK_DATA_UPDATE = 0x04, 0x62, 0x00, 0x0C, 0x40
 NEW_DATA, OVERRUN = 0x08, 0x80
 SOFT_RESET_S = 0.01

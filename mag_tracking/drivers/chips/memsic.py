@@ -9,12 +9,13 @@ is above 0, a pair is measured only at that interval, and its offset is subtract
 measurements until the next pair. Single measurements are faster but have 1.4 times the noise. If
 the field changes during a pair, half the change remains in the offset until the next pair.
 
-A reading starts its conversions, and its timestamp is the middle of them. The uncertainty due to
-the chip's oscillator is below 0.5 ms. A pair lasts twice `1 ms + 1.1 conversion`, plus about 1 ms
-on a bus of 400 kHz.
+Each reading starts its own conversions. Its timestamp is the middle of the conversion, or the mean
+of the two middles in a pair. The uncertainty due to the chip's oscillator is below 0.5 ms. A pair
+lasts twice `1 ms + 1.1 conversion`, plus about 1 ms on a bus of 400 kHz.
 
-Axes: the sensing directions after RESET are positive, because they form a right-handed frame. After
-SET they are reversed, although the data sheet of the MMC5983MA calls the value after SET positive.
+Axes: the sensing directions after RESET are taken as positive, because they form a right-handed
+frame. After SET they are reversed, although the data sheet of the MMC5983MA calls the value after
+SET positive.
 Linux describes the MMC5603 and its relatives as "naturally aligned after RESET" (mmc5633.c). Rotate
 the board once in the Earth's field to verify the signs.
 
@@ -55,7 +56,7 @@ class Mmc5983maSettings:
         4.0, 'Duration of a conversion: 8, 4, 2 or 0.5. Longer conversions have less noise.', 'ms',
         (0.5, 8.0))
     set_reset_s: float = param(
-        0.0, 'Interval between measurements of the offset; 0 = with every reading.', 's',
+        0.0, 'Interval between measurements of the offset; 0 measures it with every reading.', 's',
         (0.0, 3600.0))
 
 
@@ -85,7 +86,7 @@ class Mmc5983ma:
     BANDWIDTHS = {8.0: 0, 4.0: 1, 2.0: 2, 0.5: 3}
     SOFT_RESET_S = 0.015
     FULL_SCALE = 131070
-    """Maximum valid count; higher counts are at the limit of the converter's range."""
+    """Maximum valid magnitude of a count; at larger magnitudes, the converter is saturated."""
     N_BYTES = 7
 
     def __init__(self, registers: Registers, settings: Mmc5983maSettings,
@@ -105,7 +106,7 @@ class Mmc5983ma:
         self._registers.write(self.CONTROL_1, self._bandwidth)
 
     def measure(self) -> Measurement:
-        """Measure a pair, or once with the stored offset.
+        """Measure a SET/RESET pair, or once if the stored offset is recent enough.
 
         Returns
         -------
@@ -128,7 +129,7 @@ class Mmc5983ma:
         return _conversion(middle_ns, (x, y, z))
 
     def _measure_pair(self) -> Measurement:
-        """Measure after SET and after RESET; store the offset."""
+        """Measure after SET and RESET; store the offset, and return the field without it."""
         halves = []
         for pulse in (SET, RESET):
             self._registers.write(self.CONTROL_0, pulse)
@@ -146,7 +147,7 @@ class Mmc5983ma:
         return _conversion((set_ns + reset_ns) // 2, (x, y, z))
 
     def _convert(self) -> Generator[float, None, tuple[int, Axes] | None]:
-        """Make one conversion; return (middle [ns], counts of the axes), or None if it is late."""
+        """Make one conversion; return (middle [ns], counts), or None if it is not finished."""
         self._registers.write(self.CONTROL_0, TAKE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()
         yield self._conversion_ns * 1e-9 * CONVERSION_MARGIN
@@ -157,7 +158,7 @@ class Mmc5983ma:
 
     @staticmethod
     def _counts(block: bytes) -> list[int]:
-        """Signed counts: 16 bits of each axis, then the last two bits of all axes in one byte."""
+        """Signed counts from a block: 16 bits per axis, then one byte with 2 low bits per axis."""
         return [(block[2 * i] << 10 | block[2 * i + 1] << 2 | block[6] >> (6 - 2 * i) & 3)
                 - (1 << 17) for i in range(3)]
 
@@ -175,7 +176,7 @@ class Mmc5603(Mmc5983ma):
 
     @staticmethod
     def _counts(block: bytes) -> list[int]:
-        """Signed counts: 16 bits of each axis, then a byte with the last four bits of each axis."""
+        """Signed counts from a block: 16 bits per axis, then one byte per axis with 4 low bits."""
         return [(block[2 * i] << 12 | block[2 * i + 1] << 4 | block[6 + i] >> 4) - (1 << 19)
                 for i in range(3)]
 

@@ -1,1 +1,1 @@
-"""Framings: extraction of readings from bytes, one file per format. All are pure functions."""
+"""Framings that extract readings from bytes, with one module per format."""

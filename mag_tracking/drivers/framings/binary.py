@@ -1,4 +1,4 @@
-"""Framing of binary frames of fixed length: sync, payload, checksum, tail."""
+"""Framing of fixed-length binary frames, which consist of sync, payload, checksum and tail."""
 
 import struct
 from collections import Counter
@@ -33,19 +33,20 @@ class BinarySettings:
 
     sync: str = param('', 'Bytes at the beginning of a frame, hexadecimal, such as A5 5A.')
     fields: tuple[str, ...] = param(
-        (), 'Values of the payload in order, each with its type, such as x:i16: sensor, ticks, '
-        'sequence, x, y, z, ax, ay, az, or - to skip one. x.A:i16 is an axis of sensor A, for '
-        'frames with several sensors. Types: ' + ' '.join(_CODES) + '.')
+        (), 'Values of the payload in order, each as name:type, such as x:i16. Names: sensor, '
+        'ticks, sequence, x, y, z, ax, ay, az, or - to skip a value. x.A:i16 is an axis of sensor '
+        'A, for frames with several sensors. Types: ' + ' '.join(_CODES) + '.')
     each: tuple[str, ...] = param(
-        (), 'Axes of one sensor with their types, repeated count times after the fields.')
-    count: int = param(0, 'Number of sensors described by each.', '', (0, 4096))
+        (), 'Axes and types of one sensor, for frames with several identical sensors. They are '
+        'repeated `count` times after `fields`.')
+    count: int = param(0, 'Number of identical sensors described by `each`.', '', (0, 4096))
     byte_order: str = param(
         'little', 'Byte order of all numbers and of the checksum: little or big.')
     checksum: str = param(
         'none', 'Checksum after the payload: none, ' + ', '.join(CHECKSUMS) + '.')
     checksum_from: str = param(
         'payload', 'First part of the frame that the checksum covers: sync or payload.')
-    tail: str = param('', 'Bytes at the end of a frame, hexadecimal; empty = none.')
+    tail: str = param('', 'Bytes at the end of a frame, hexadecimal; empty if there is no tail.')
 
 
 class BinaryFraming:
@@ -77,7 +78,7 @@ class BinaryFraming:
     Raises
     ------
     SettingsError
-        If the settings do not describe a frame.
+        If the settings do not describe a valid frame.
     """
 
     SETTINGS = BinarySettings
@@ -159,7 +160,7 @@ class BinaryFraming:
         return 0
 
     def _rejection_cause(self, data: bytes, start: int) -> str:
-        """Cause by which the frame at `start` is rejected; empty for a valid frame."""
+        """Cause for which the frame at `start` is rejected; empty for a valid frame."""
         # An exception would be too slow, as this is called for every byte that looks like a sync.
         if not data.startswith(self._tail, start + self._checksum_end):
             return 'with a wrong tail'

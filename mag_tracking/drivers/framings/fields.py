@@ -29,7 +29,7 @@ _Choice = TypeVar('_Choice', bound=str)
 
 
 class Rejected(ValueError):
-    """Rejection of a line or frame. The message is the cause, without 'lines' or 'frames'."""
+    """Rejection of a line or frame. The message is the cause, such as 'with a wrong checksum'."""
 
 
 class FieldLayout:
@@ -89,8 +89,8 @@ class FieldLayout:
         Parameters
         ----------
         values : sequence
-            One value for each of `quantities`: float for an axis (NaN = missing), str for `sensor`,
-            float for `ticks`, int for `sequence`, anything for a skipped value.
+            One value for each of `quantities`: float for an axis (NaN if missing), str for
+            `sensor`, float for `ticks`, int for `sequence`, anything for a skipped value.
 
         Returns
         -------
@@ -153,7 +153,7 @@ def axis_value(value: float | bytes) -> float:
     Parameters
     ----------
     value : float or bytes
-        NaN = missing.
+        NaN if the axis is missing.
 
     Returns
     -------
@@ -238,7 +238,7 @@ def sensor_name(text: str) -> str:
 
 
 def ignore_value(value: object) -> None:
-    """Ignore a value.
+    """Discard a skipped value.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ def ignore_value(value: object) -> None:
 
 
 def decode_escapes(setting: str, text: str) -> bytes:
-    r"""Bytes (UTF-8) of a string with escape sequences.
+    r"""Encode a string with escape sequences as UTF-8 bytes.
 
     The sequences \n, \r, \t, \0, \\ and \xhh are recognised, so that both kinds of YAML quotes
     have the same effect.

@@ -26,15 +26,20 @@ _Converter: TypeAlias = Callable[[object, str], object]
 
 @dataclass(frozen=True)
 class JsonSettings:
-    """Settings of the framing of JSON objects. A path is a series of keys, such as `a.b.0`."""
+    """Settings of the framing of JSON objects.
 
-    sensor: str = param('', "Path of the sensor's name (a string or an integer); empty = none.")
-    ticks: str = param('', 'Path of the device clock; empty = none.')
-    sequence: str = param('', 'Path of the sequence number; empty = none.')
+    A path consists of keys and list indices joined by dots, such as `a.b.0`.
+    """
+
+    sensor: str = param(
+        '', "Path of the sensor's name (a string or an integer); empty if it is not sent.")
+    ticks: str = param('', 'Path of the device time; empty if it is not sent.')
+    sequence: str = param('', 'Path of the sequence number; empty if it is not sent.')
     field: tuple[str, ...] = param(
-        (), 'Paths of the three axes of the field (empty = the axis is missing), or the path of a '
-        'list of the three values.')
-    acceleration: tuple[str, ...] = param((), 'Paths of the acceleration, in the form of `field`.')
+        (), 'Paths of the three axes of the field (an empty path if an axis is not sent), or the '
+        'path of a list of the three values.')
+    acceleration: tuple[str, ...] = param(
+        (), 'Paths of the acceleration, in the same form as `field`.')
     end: str = param('\\n', 'Line terminator. A carriage return before it is removed.')
     max_length: int = param(
         4096, 'Maximum length of a line or message without its terminator.', 'bytes', (2, 1 << 20))
@@ -185,7 +190,7 @@ def _axis(value: object, path: str) -> float:
 
 
 def _ticks(value: object, path: str) -> float:
-    """Convert a device time; raises Rejected if it is missing."""
+    """Convert a device time; raises Rejected if it is not a finite number."""
     return ticks_value(_number(value, path))
 
 

@@ -1,4 +1,4 @@
-"""Framing of lines of text: separated numbers, with or without a checksum."""
+"""Framing of text lines that contain separated values, with or without a checksum."""
 
 import re
 from collections import Counter
@@ -32,17 +32,20 @@ _INTEGER = re.compile(rb'[+-]?[0-9]{1,20}').fullmatch
 
 @dataclass(frozen=True)
 class TextSettings:
-    """Settings of the framing of lines of text."""
+    """Settings of the framing of text lines."""
 
     fields: tuple[str, ...] = param(
         (), 'Values of a line in order: sensor, ticks, sequence, x, y, z, ax, ay, az, or - to skip '
-        'one. x.A is an axis of sensor A, for lines with several sensors.')
-    each: tuple[str, ...] = param((), 'Axes of one sensor, repeated count times after the fields.')
-    count: int = param(0, 'Number of sensors described by each.', '', (0, 4096))
+        'a value. x.A is an axis of sensor A, for lines with several sensors.')
+    each: tuple[str, ...] = param(
+        (), 'Axes of one sensor, for lines with several identical sensors. They are repeated '
+        '`count` times after `fields`.')
+    count: int = param(0, 'Number of identical sensors described by `each`.', '', (0, 4096))
     separator: str = param(',', 'Separator between values; a blank stands for any white space.')
     end: str = param('\\n', 'Line terminator. A carriage return before it is removed.')
     prefix: str = param('', 'Prefix of every line with readings; lines without it are rejected.')
-    comment: str = param('', 'Prefix of comment lines, which are ignored; empty = no comments.')
+    comment: str = param(
+        '', 'Prefix of comment lines, which are skipped and counted; empty if there are none.')
     checksum: str = param(
         'none', 'Checksum: none, or nmea (a line ends in * and two hexadecimal digits, the '
         'exclusive or of the preceding characters without a leading $).')
@@ -97,7 +100,7 @@ class Lines:
         if final:
             lines += [rest] if rest else []
             return self.read(lines, len(data), read)
-        # An overlong line remains unconsumed up to a length that the next call rejects again.
+        # The last bytes of an overlong line remain, enough for the next call to reject the line.
         n_unconsumed = min(len(rest), self.max_length + len(self.end))
         return self.read(lines, len(data) - n_unconsumed, read)
 
@@ -146,8 +149,8 @@ class TextFraming:
 
     An axis is missing if it is `nan` or empty; all other numbers are decimal. A line that does not
     match the settings is rejected as a whole. Without a prefix or a checksum, part of a line may be
-    mistaken for a complete line: '12.5,3,4' is also the end of '-12.5,3,4'. If `final` is set for
-    a truncated line, '1,2,3' is also the beginning of '1,2,34'.
+    mistaken for a complete line: '12.5,3,4' is also the end of '-12.5,3,4'. If the data end within
+    a line and `final` is set, '1,2,3' may be the beginning of '1,2,34'.
 
     Source: NMEA 0183, section "Checksum field".
 
@@ -158,7 +161,7 @@ class TextFraming:
     Raises
     ------
     SettingsError
-        If the settings do not describe a line.
+        If the settings do not describe a valid line.
     """
 
     SETTINGS = TextSettings
@@ -248,12 +251,12 @@ def _axis(text: bytes) -> float:
 
 
 def _ticks(text: bytes) -> float:
-    """Parse a device time; raises Rejected if it is missing."""
+    """Parse a device time; raises Rejected if it is missing or not a finite number."""
     return ticks_value(_axis(text))
 
 
 def _sequence(text: bytes) -> int:
-    """Parse a sequence number; raises Rejected if it is missing."""
+    """Parse a sequence number; raises Rejected if it is not an integer of at most 64 bits."""
     text = text.strip(b' \t')
     if not _INTEGER(text):
         raise Rejected('with a sequence that is not an integer')

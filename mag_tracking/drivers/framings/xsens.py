@@ -2,8 +2,8 @@
 
 A message consists of the preamble 0xFA, the address 0xFF, its type (MID), the length of DATA (one
 byte, or 0xFF and two bytes), DATA, and a checksum byte, which makes the sum of all bytes but the
-preamble a multiple of 256. One in 256 false messages has a valid checksum. Further checks are
-therefore applied:
+preamble a multiple of 256. Of the byte sequences that only look like a message (false messages),
+one in 256 has a valid checksum. Further checks are therefore applied:
 
 - The message type must be one that devices send: MTData2, MTData, WakeUp, Error, or a reply. The
   MID of a reply is the MID of the request plus one, and therefore odd.
@@ -59,7 +59,8 @@ class XsensSettings:
     mtdata: tuple[str, ...] = param(
         ('none',), 'Blocks in the MTData messages of a first-generation MTi or MTx, according to '
         'its output mode and output settings, in this order: temp, acc, gyr, mag, quaternion or '
-        'euler or matrix, analog_1, analog_2, status, counter. none = the device sends no MTData.')
+        'euler or matrix, analog_1, analog_2, status, counter. Set it to none if the device sends '
+        'no MTData.')
     mtdata_format: str = param('float', 'Format of the numbers in MTData: float or fp12.20.')
 
 
@@ -77,7 +78,7 @@ class _ParseStep(NamedTuple):
     """Result of parsing the message that may begin at a position."""
 
     length: int
-    """Number of bytes consumed; 0 = more bytes are needed."""
+    """Number of bytes consumed; 0 if more bytes are needed."""
     is_accepted: bool
     """Whether the message is accepted."""
     causes: tuple[str, ...] = ()
@@ -93,33 +94,33 @@ def _is_from_device(mid: int) -> bool:
     return mid % 2 == 1 or mid in (_MTDATA, _MTDATA2, _WAKE_UP, _ERROR)
 
 
-def _message_at(window: bytes, place: int, longest: int) -> _Message | None:
-    """Message that may begin at the index `place`; None if no message can begin there."""
+def _message_at(window: bytes, index: int, longest: int) -> _Message | None:
+    """Message that may begin at `index`; None if no message can begin there."""
     # While the header is incomplete, MID is -1 and the end is one byte after the window.
-    header = window[place:place + 6]
+    header = window[index:index + 6]
     if not header.startswith(_START[:len(header)]):
         return None
     if len(header) > 2 and not _is_from_device(header[2]):
         return None
     if len(header) < 4 or header[3] == _EXTENDED and len(header) < 6:
         return _Message(-1, len(window), len(window) + 1)
-    length, begin = header[3], place + 4
+    length, begin = header[3], index + 4
     if length == _EXTENDED:
-        length, begin = header[4] << 8 | header[5], place + 6
+        length, begin = header[4] << 8 | header[5], index + 6
     if length > longest:
         return None
     return _Message(header[2], begin, begin + length + 1)
 
 
-def _is_checksum_valid(window: bytes, place: int, message: _Message) -> bool:
+def _is_checksum_valid(window: bytes, index: int, message: _Message) -> bool:
     """Whether the sum of all bytes but the preamble is a multiple of 256."""
-    return sum(window[place + 1:message.end]) % 256 == 0
+    return sum(window[index + 1:message.end]) % 256 == 0
 
 
 class XsensFraming:
     """Extracts readings from the messages of an MTi or MTx. Implements `Framing`.
 
-    A reading has the field in arbitrary units (1 = the magnitude of the field where Xsens
+    A reading has the field in arbitrary units (1 is the magnitude of the field where Xsens
     calibrated the sensor), the acceleration in m/s², the packet counter as sequence (modulo 2^16),
     and SampleTimeFine as ticks (10 kHz). Quantities that the device does not send are None. A
     message with neither field nor acceleration gives no reading. Such a message is counted, and its
@@ -186,7 +187,7 @@ class XsensFraming:
         return Parsed(tuple(readings), position, {c: n for c, n in rejected.items() if n})
 
     def _parse_step(self, window: bytes, more: bool) -> _ParseStep:
-        """Parse the message at the beginning of `window`; `more` = more bytes may follow."""
+        """Parse the message at the beginning of `window`; `more` is true if bytes may follow."""
         message = _message_at(window, 0, self._longest)
         if message is None:
             return _REFUSE
@@ -206,16 +207,16 @@ class XsensFraming:
 
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:
-        """Search `outer` for another message; return a step that rejects or delays it, or None."""
+        """Search `outer` for a data message; return a step to reject `outer` or wait, or None."""
         rejection = _REFUSE._replace(causes=('messages that contain the start of another',))
-        place = 0
+        index = 0
         while True:
-            # The checksum of a message may be the preamble of the next. A data message does not
-            # wait for the byte after it; otherwise one in 256 data messages would be delayed.
-            place = self._next_start(window, place + 1, outer.end, outer_is_data)
-            if place < 0:
+            # The checksum of a message may also be the preamble of the next. A data message does
+            # not wait for the byte after it; otherwise one in 256 data messages would be delayed.
+            index = self._next_start(window, index + 1, outer.end, outer_is_data)
+            if index < 0:
                 return None
-            inner = _message_at(window, place, self._longest)
+            inner = _message_at(window, index, self._longest)
             if inner is None or inner.mid not in (-1, *_DATA_MESSAGES):
                 continue
             if inner.end > len(window):
@@ -223,15 +224,15 @@ class XsensFraming:
                     return _WAIT
                 if len(window) == self._longest + _MAX_OVERHEAD and not outer_is_data:
                     return rejection
-            elif (_is_checksum_valid(window, place, inner)
+            elif (_is_checksum_valid(window, index, inner)
                   and self._decode(window, inner) is not None):
                 return rejection
 
     @staticmethod
-    def _next_start(window: bytes, place: int, end: int, whole: bool) -> int:
-        """Index of the next start before `end`, or -1; `whole` = with both start bytes."""
-        found = window.find(_START, place, end if whole else end + 1)
-        if found < 0 and not whole and end == len(window) and window.endswith(_PREAMBLE, place):
+    def _next_start(window: bytes, index: int, end: int, whole: bool) -> int:
+        """Index of the next start before `end`, or -1; `whole` requires both start bytes."""
+        found = window.find(_START, index, end if whole else end + 1)
+        if found < 0 and not whole and end == len(window) and window.endswith(_PREAMBLE, index):
             return end - 1
         return found
 
@@ -245,7 +246,7 @@ class XsensFraming:
         return None
 
     def _cause(self, window: bytes, message: _Message) -> str:
-        """Cause by which a message that cannot be decoded is counted."""
+        """Cause under which a message that cannot be decoded is counted."""
         if message.mid == _MTDATA:
             if self._layout is None:
                 return 'MTData messages, although mtdata is none'

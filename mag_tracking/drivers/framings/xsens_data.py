@@ -1,6 +1,6 @@
 """Decoding of the Xsens data messages MTData2 and MTData.
 
-The magnetic field is in arbitrary units (1 = the magnitude of the field where Xsens calibrated the
+The magnetic field is in arbitrary units (1 is the magnitude of the field where Xsens calibrated the
 sensor), the acceleration in m/s². Both are in the sensor frame: the coordinate bits of a data
 identifier (0x4 NED, 0x8 NWU) apply to the orientation only (MT0101P, note to revision W) and are
 ignored.
@@ -18,8 +18,8 @@ from mag_tracking.drivers.reading import Reading
 from mag_tracking.errors import SettingsError
 
 TICK_S = 1e-4
-"""[s] Tick of SampleTimeFine. It wraps at 2^32 (MTi 1 and 600 series), or at 864 000 000 ticks,
-which is one day (MTi 10 and 100 series)."""
+"""[s] Tick of SampleTimeFine. The counter wraps at 2^32 (MTi 1 and 600 series), or at 864 000 000
+ticks, which is one day (MTi 10 and 100 series)."""
 
 _PACKET_COUNTER = 0x1020
 _SAMPLE_TIME_FINE = 0x1060
@@ -48,12 +48,12 @@ _Triple: TypeAlias = tuple[float, float, float]
 
 
 class DecodedMessage(NamedTuple):
-    """Reading and counted causes of a data message."""
+    """Reading of a data message, and the causes to count for ignored data."""
 
     reading: Reading | None
-    """None = the message has neither field nor acceleration."""
+    """None if the message has neither field nor acceleration."""
     causes: tuple[str, ...]
-    """Causes by which ignored data are counted, one for each occurrence."""
+    """One cause for each occurrence of ignored data."""
 
 
 def _three_reals(data: bytes, precision: int) -> _Triple | None:
@@ -129,7 +129,7 @@ def read_mtdata2(data: bytes) -> DecodedMessage | None:
 
 
 def _message_of(values: Mapping[str, Any], causes: Sequence[str]) -> DecodedMessage:
-    """Message with a reading if it has a field or an acceleration."""
+    """Create the message; its reading is None if `values` has no field and no acceleration."""
     if 'field' in values or 'acceleration' in values:
         return DecodedMessage(Reading(**values), tuple(causes))
     return DecodedMessage(None, (*causes, 'messages without field or acceleration'))

@@ -1,1 +1,1 @@
-"""Transports: reception of bytes, and polled chips, one file per protocol."""
+"""Transports that receive bytes, and the polled I2C bus, with one module per protocol."""

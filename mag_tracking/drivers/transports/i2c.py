@@ -6,7 +6,7 @@ arrival time of a reading is the estimated middle of the chip's conversion; the 
 give the accuracy. The field is in tesla.
 
 If the bus hangs, `read` blocks for the timeout of the bus adapter's driver, usually one second. A
-cycle ends at the first such failure.
+cycle is aborted at the first such failure.
 
 Sources: i2c-dev of Linux (Documentation/i2c/dev-interface.rst) and its error codes
 (Documentation/i2c/fault-codes.rst).
@@ -67,8 +67,8 @@ class I2cSettings:
     rate_hz: float = param(
         50.0, 'Polling rate. Each sensor is read once per polling cycle.', 'Hz', (0.01, 1000.0))
     max_failures: int = param(
-        10, 'Number of consecutive polling cycles in which a chip cannot be read before the device '
-        'is reopened.', '', (1, 1_000_000))
+        10, 'Number of consecutive polling cycles with a failed reading of the same chip after '
+        'which the device is reopened.', '', (1, 1_000_000))
     silence_timeout_s: float = param(
         2.0, 'Interval without a new conversion of a chip, at least three polling cycles, after '
         'which the device is reopened. A chip whose supply was interrupted does not measure until '
@@ -161,7 +161,7 @@ class I2cDevice(Closable):
         return f'/dev/i2c-{self._settings.bus}'
 
     def _create_chips(self, bus: Bus) -> dict[str, Chip]:
-        """Create {name of the sensor: chip}, without access to the bus."""
+        """Create the chip of each sensor, by sensor name, without access to the bus."""
         chips: dict[str, Chip] = {}
         for name, sensor in self._sensors.items():
             registers = Registers(bus, sensor.place)
@@ -173,7 +173,7 @@ class I2cDevice(Closable):
         return chips
 
     def _count(self, cause: str, name: str) -> None:
-        """Count a loss of a sensor."""
+        """Count a loss by cause and sensor."""
         self.counts[f'{cause}: {name}'] += 1
 
     def _set_up(self, name: str, chip: Chip, bus: Bus) -> None:
@@ -263,7 +263,7 @@ class I2cDevice(Closable):
         return False
 
     def _run_cycle(self, bus: Bus) -> list[Arrival]:
-        """Measure once with all chips at the same time."""
+        """Measure once with all chips concurrently; return the arrivals."""
         arrivals: list[Arrival] = []
         running = {name: chip.measure() for name, chip in self._chips.items()}
         wake_ns = dict.fromkeys(running, self._monotonic_ns())
@@ -289,7 +289,7 @@ class I2cDevice(Closable):
         return arrivals
 
     def _arrivals(self, name: str, conversion: Conversion | None) -> list[Arrival]:
-        """Convert a conversion to an arrival; count a missing conversion."""
+        """Return a conversion as arrivals; count a missing conversion, and detect a silent chip."""
         self._n_failed[name] = 0
         if conversion is None:
             self._count('polling cycles without a new conversion', name)

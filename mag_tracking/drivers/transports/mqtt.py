@@ -1,4 +1,4 @@
-"""MQTT: subscriptions at a broker. Each message is a chunk whose source is its topic.
+"""Transport over MQTT. Each message is a chunk, whose source is the topic.
 
 The session is clean: messages published while the connection was lost are not delivered later,
 because their arrival would not indicate when they were measured. For the same reason, retained
@@ -43,15 +43,17 @@ class MqttSettings:
     topics: tuple[str, ...] = param(
         ('',), 'Topic filters to subscribe to, such as sensors/+/mag; required.')
     qos: int = param(0, 'Quality of service of the subscriptions.', '', (0, 2))
-    username: str = param('', 'User name; empty = none.')
-    password_file: str = param('', 'File whose first line is the password; empty = none.')
+    username: str = param('', 'User name; empty if the broker requires none.')
+    password_file: str = param(
+        '', 'File whose first line is the password; empty if the broker requires none.')
     tls: bool = param(
         False, "Whether to encrypt the connection and verify the broker's certificate.")
     ca_file: str = param(
-        '', 'File with the certificates (PEM) of trusted authorities; empty = certificates of the '
-        'system.')
+        '', 'File with the certificates (PEM) of trusted authorities; empty selects the '
+        'certificates of the system.')
     client_id: str = param(
-        '', 'Client identifier, unique for each connection to the broker; empty = a random one.')
+        '', 'Client identifier, unique for each connection to the broker; empty selects a random '
+        'identifier.')
     keepalive_s: int = param(
         10, 'Keep-alive interval. The connection is closed if the broker does not answer for twice '
         'this interval.', 's', (1, 65535))
@@ -59,16 +61,16 @@ class MqttSettings:
         5.0, "Timeout for connecting, and again for the broker's acknowledgements.", 's',
         (0.1, 600.0))
     queue: int = param(
-        10000, 'Maximum number of messages in the queue. If full, the oldest message is dropped.',
-        '', (1, 10_000_000))
+        10000, 'Maximum number of messages in the queue. If the queue is full, its oldest message '
+        'is dropped.', '', (1, 10_000_000))
     max_length: int = param(
-        65536, 'Maximum length of a message; longer ones are dropped.', 'bytes', (1, 1 << 28))
+        65536, 'Maximum length of a message; longer messages are dropped.', 'bytes', (1, 1 << 28))
     retained: bool = param(
         False, 'Whether to accept retained messages, whose time of publication is unknown.')
 
 
 class _Certificates(ssl.SSLContext):
-    """TLS context with an immediate handshake, whose failure closes the socket, unlike in paho."""
+    """TLS context with an immediate handshake; unlike in paho, its failure closes the socket."""
 
     def wrap_socket(self, sock: socket.socket, *args: Any, **kwargs: Any) -> ssl.SSLSocket:
         """Wrap a socket with an immediate handshake."""
@@ -102,7 +104,7 @@ class MqttTopics:
         if '' in s.topics:
             raise SettingsError('topics: set at least one topic filter, such as sensors/+/mag')
         if s.password_file and not s.username:
-            raise SettingsError('password_file: a password requires username')
+            raise SettingsError('password_file: a password requires a username')
         if s.ca_file and not s.tls:
             raise SettingsError('ca_file: certificates have no effect while tls is false')
         self.counts: Counter[str] = Counter()
@@ -136,7 +138,7 @@ class MqttTopics:
             self._is_ready = self._closing = False
         self._connect(client)
         with self._changed:
-            # A `close` during the connection has priority.
+            # A `close` during the connection attempt has priority.
             self._loss = self._loss if self._closing else ''
         self._thread = threading.Thread(target=self._run, args=(client,), daemon=True,
                                         name=f'mqtt {self._settings.host}')
@@ -224,7 +226,7 @@ class MqttTopics:
                        f'{str(self._settings.tls).lower()}')
 
     def _set_lost(self, reason: str) -> None:
-        """Mark the connection as lost and store the first reason."""
+        """Mark the connection as lost and wake the reader; only the first reason is stored."""
         with self._changed:
             self._loss = self._loss or f'{self._name}: {reason}'
             self._changed.notify_all()

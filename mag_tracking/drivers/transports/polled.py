@@ -1,4 +1,4 @@
-"""Common parts of transports with a file descriptor: waiting for data, and closing."""
+"""Base classes of transports that wait for data and may be closed by another thread."""
 
 import select
 import threading
@@ -38,7 +38,7 @@ class Closable:
         self._lock, self._closing = threading.Lock(), False
 
     def close(self) -> None:
-        """Close the resource; a `read` in another thread returns."""
+        """Close the resource, and make a `read` in another thread return."""
         self._closing = True
         with self._lock:
             self._release()

@@ -1,4 +1,4 @@
-"""Serial line: USB adapters, USB boards, RS-232 and RS-485 ports.
+"""Transport over a serial line: USB adapters, USB boards, RS-232 and RS-485 ports.
 
 The transport returns a stream of bytes, in which the framing finds the readings. Data received
 before `open` are discarded, so the first bytes may belong to an incomplete frame.
@@ -43,7 +43,7 @@ class SerialSettings:
         '', 'Path of the port, such as /dev/ttyUSB0. The links in /dev/serial/by-id keep their '
         'names when an adapter is plugged into another USB port.')
     baud: int = param(115200, 'Baud rate.', 'bit/s', (50, 20_000_000))
-    parity: str = param('N', 'Parity: N = none, E = even, O = odd.')
+    parity: str = param('N', 'Parity: N (none), E (even) or O (odd).')
     stop_bits: int = param(1, 'Number of stop bits.', '', (1, 2))
     exclusive: bool = param(True, 'Whether to open the port for exclusive use.')
 
@@ -156,7 +156,7 @@ class SerialPort(Polled[serial.Serial]):
         return [Chunk(arrival_ns, data)] if data else []
 
     def _count_line_errors(self, before: tuple[int, ...], now: tuple[int, ...]) -> None:
-        """Add the errors between two readings of the kernel's counters."""
+        """Count the errors that occurred between two readings of the kernel's counters."""
         for i, cause in LINE_ERRORS.items():
             if now[i] != before[i]:
                 self.counts[cause] += (now[i] - before[i]) % 2**32

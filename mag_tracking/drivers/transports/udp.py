@@ -1,12 +1,12 @@
-"""UDP over IPv4; each datagram is a message.
+"""Transport over UDP (IPv4), in which each datagram is a message.
 
 The kernel measures the arrival time of a datagram (SO_TIMESTAMPNS), so the arrival time does not
 depend on when this process runs. The wall-clock time of the kernel is converted to the monotonic
 clock by the difference of the clocks. The difference is constant unless the wall clock is set,
 because fine adjustments by the system change the rate of both clocks. If the difference has changed
-since the queue was last empty, the wake-up time of the thread is used instead, and counted. When
-the first socket of the machine has requested timestamps, the kernel returns the time of the read
-access instead of the arrival time for a few milliseconds.
+since the queue was last empty, the wake-up time of the thread is used instead, and counted. For a
+few milliseconds after the first socket of the machine has requested timestamps, the kernel returns
+the time of the read access instead of the arrival time.
 
 The number of datagrams dropped by the kernel because of a full buffer is read from the counter of
 the socket (SO_MEMINFO). SO_RXQ_OVFL is not used, because it is delivered with the next datagram and
@@ -49,21 +49,22 @@ class UdpSettings:
     """Settings of a UDP socket."""
 
     address: str = param(
-        '0.0.0.0', 'Local address to listen on; 0.0.0.0 = all. With a group: address of the '
-        'interface on which to join it; 0.0.0.0 = according to the routing table.')
+        '0.0.0.0', 'Local address to listen on; 0.0.0.0 selects all interfaces. If `group` is set, '
+        'this address selects the interface that joins the group, and 0.0.0.0 leaves the choice to '
+        'the routing table.')
     port: int = param(0, 'Local port to listen on; required.', '', (1, 65535))
     group: str = param(
         '', 'Multicast group to join, such as 239.1.2.3. If set, only datagrams sent to the group '
         'are received.')
     sources: tuple[str, ...] = param(
-        ('',), 'Addresses from which datagrams are accepted; an empty address stands for all.')
+        ('',), 'Addresses from which datagrams are accepted; an empty address accepts all.')
     source_port: bool = param(
         False, 'Whether the source of a datagram is address:port instead of the address.')
     receive_buffer: int = param(
         212992, "Size of the kernel's receive buffer, including an overhead of about 0.5 KiB per "
         'datagram. The kernel limits it to net.core.rmem_max.', 'bytes', (2048, 1 << 30))
     max_length: int = param(
-        65507, 'Maximum length of a datagram; longer ones are dropped.', 'bytes', (1, 65507))
+        65507, 'Maximum length of a datagram; longer datagrams are dropped.', 'bytes', (1, 65507))
 
 
 def clock_difference() -> int | None:
@@ -85,7 +86,7 @@ def clock_difference() -> int | None:
 class UdpSocket(Polled[socket.socket]):
     """Transport over UDP with one chunk per datagram. Implements `reading.Transport`.
 
-    The source of a chunk is the address of its sender.
+    The source of a chunk is the address of its sender, with the port if `source_port` is set.
 
     Parameters
     ----------
@@ -131,7 +132,7 @@ class UdpSocket(Polled[socket.socket]):
         return self._settings
 
     def open(self) -> None:
-        """Bind the socket, and join the group.
+        """Bind the socket, and join the group if one is configured.
 
         Raises
         ------
@@ -179,12 +180,12 @@ class UdpSocket(Polled[socket.socket]):
         if error.errno == errno.EADDRINUSE:
             return 'the port is in use by another program; choose another port'
         if error.errno == errno.EACCES:
-            return 'no permission; ports below 1024 are reserved, choose another one'
+            return 'no permission; ports below 1024 are reserved; choose another port'
         if s.group and not ipaddress.IPv4Address(s.group).is_multicast:
             return f'{s.group} is not a multicast group (224.0.0.0 to 239.255.255.255)'
         if error.errno in (errno.EADDRNOTAVAIL, errno.ENODEV):
-            return (f'no interface has the address {s.address}, or none has a route to the group; '
-                    f'check with `ip address`')
+            return (f'no interface has the address {s.address}, or there is no route to the group; '
+                    f'check with `ip address` and `ip route`')
         return f'cannot be opened: {error.strerror}'
 
     def read(self, timeout_s: float) -> list[Chunk]:
@@ -251,7 +252,7 @@ class UdpSocket(Polled[socket.socket]):
         return False
 
     def _arrival(self, ancillary: list[Ancillary], difference: int | None, woken_ns: int) -> int:
-        """Return the monotonic arrival time of a datagram [ns]; count wake-up times."""
+        """Return the monotonic arrival time of a datagram [ns]; count the use of `woken_ns`."""
         if difference is not None:
             for level, kind, data in ancillary:
                 if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):

@@ -79,7 +79,7 @@ def test_the_arrival_time_is_that_of_the_conversion(chip):
 
 
 def read_for(device, clock, seconds):
-    """Read all arrivals within `seconds`."""
+    """Read for `seconds`; return all arrivals."""
     end_ns, out = clock.ns + round(seconds * 1e9), []
     while clock.ns < end_ns:
         out += device.read((end_ns - clock.ns) * 1e-9)
@@ -197,7 +197,7 @@ def test_the_bridge_offset_is_measured_periodically(chip):
     assert len(fake.pulses) == 4
     for arrival in arrivals + after[1:]:
         np.testing.assert_allclose(arrival.reading.field, B, atol=0.76 / 16384e4)
-    # Until then, the drift of the offset remains in the field.
+    # Until the next pair, the drift of the offset remains in the field.
     assert between[0].reading.field[0] == pytest.approx(B[0] + 100 / 16384e4, abs=1e-8)
 
 
@@ -242,7 +242,7 @@ def test_a_chip_that_keeps_failing_is_lost_and_can_be_reopened(chip):
     fake.power_up()
     device.open()
     fake.answers = False
-    # The count of failures restarts.
+    # The count of consecutive failures restarts at zero.
     assert device.read(0.001) == device.read(0.001) == []
     fake.answers = True
     np.testing.assert_allclose(device.read(1.0)[0].reading.field, B, atol=1e-7)
@@ -289,7 +289,7 @@ def test_a_chip_that_lost_its_settings_gives_no_reading(chip):
     fake.power_up()
     with pytest.raises(DeviceError, match='the chip lost its settings'):
         device.read(10.0)
-    # The gain is unchanged, but another register is not.
+    # The gain is unchanged, but another register has changed.
     fake.memory[:] = bytes([0x70, 7 << 5]) + fake.memory[2:]
     device.open()
     fake.memory[0] = 0x70

@@ -201,7 +201,7 @@ def test_close_ends_a_read_in_another_thread():
 
 
 def multiplexed_rig():
-    """(clock, bus, device): three chips of one address on channels, and two without a channel."""
+    """(clock, bus, device): three chips with one address on channels, two directly on the bus."""
     clock = Clock()
     at = {name: FakeLis3mdl(clock, (i * 1e-5, 0.0, 0.0))
           for i, name in enumerate('ABC', start=1)}
@@ -243,7 +243,7 @@ def test_chips_on_different_channels_measure_simultaneously():
 def test_channels_are_closed_for_chips_on_the_bus_itself():
     _, bus, device = multiplexed_rig()
     device.open()
-    # The last chip addressed is E, which is on the bus itself.
+    # The last chip addressed is E, which is directly on the bus.
     assert bus.chips[0x70].mask == bus.chips[0x71].mask == 0
     assert set(bus.chips[0x70].written) == {0, 1, 1 << 5}
     assert set(bus.chips[0x71].written) == {0, 1}

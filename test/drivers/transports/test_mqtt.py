@@ -343,7 +343,7 @@ def test_a_silent_server_is_reported(topics, tls):
 
 
 @pytest.mark.parametrize('code, text', [
-    # paho reports another version of the protocol as a protocol error.
+    # paho reports the refusal of the protocol version as a protocol error.
     (1, 'A network protocol error occurred when communicating with the broker. Check that it is '
      'an MQTT broker'),
     *((code, f'connection refused: {text}') for code, text in (

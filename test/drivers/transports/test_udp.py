@@ -107,7 +107,7 @@ def test_read_returns_as_soon_as_a_datagram_arrives(listen, sender):
 
 
 def test_one_read_returns_a_limited_number_of_datagrams(listen, sender, monkeypatch):
-    monkeypatch.setattr(udp_socket, 'AT_ONCE', 10)
+    monkeypatch.setattr(udp_socket, 'MAX_DATAGRAMS_PER_READ', 10)
     udp = listen()
     sender(udp, *(bytes([i]) for i in range(25)))
     assert [len(udp.read(0.0)) for _ in range(4)] == [10, 10, 5, 0]
@@ -135,7 +135,7 @@ def test_the_arrival_time_is_that_of_reception_not_of_reading(listen, sender):
         between.append((before, time.monotonic_ns()))
         time.sleep(0.1)
     for chunk, (before, after) in zip(udp.read(0.0), between, strict=True):
-        # The clocks are compared to within a few microseconds.
+        # The comparison of the clocks is accurate to a few microseconds.
         assert before - 50_000 < chunk.arrival_ns < after + 50_000
     assert not udp.counts
 
@@ -149,7 +149,7 @@ def test_a_step_of_the_wall_clock_does_not_shift_arrival_times(listen, sender, m
     sender(udp, b'before')
     real = udp_socket.clock_difference
     monkeypatch.setattr(udp_socket, 'clock_difference', lambda: real() + int(step_s * 1e9))
-    monkeypatch.setattr(udp_socket, 'AT_ONCE', 1)
+    monkeypatch.setattr(udp_socket, 'MAX_DATAGRAMS_PER_READ', 1)
     sender(udp, b'behind')
     for count in (1, 2):
         # The datagram was queued before the step, although another was read since then.
@@ -158,7 +158,7 @@ def test_a_step_of_the_wall_clock_does_not_shift_arrival_times(listen, sender, m
         assert 0 <= chunk.arrival_ns - woken < 50e6
         assert udp.counts == {WAKE_UP_TIMES: count}
     # The queue was never empty so far. Once it is, the timestamps of the kernel are used again.
-    monkeypatch.setattr(udp_socket, 'AT_ONCE', 10)
+    monkeypatch.setattr(udp_socket, 'MAX_DATAGRAMS_PER_READ', 10)
     sender(udp, b'last')
     udp.read(1.0)
     assert udp.counts == {WAKE_UP_TIMES: 3}
@@ -235,7 +235,7 @@ def test_a_reader_that_keeps_up_loses_nothing(listen, sender):
     thread.join()
     assert [c.data for c in received] == sent
     arrivals = [c.arrival_ns for c in received]
-    # Each read compares the clocks again, to within a few microseconds.
+    # Each read compares the clocks again, with an accuracy of a few microseconds.
     assert all(b - a > -50_000 for a, b in zip(arrivals, arrivals[1:], strict=False))
     assert not udp.counts
 
