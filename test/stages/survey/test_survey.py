@@ -26,7 +26,7 @@ CLOCK = np.array([0.0, 0.0213, -0.0087])
 
 
 def nominal(n=3, earth=EARTH, **changes):
-    """Network file before the survey: all sensors are upright, with x to the east."""
+    """Create the network before the survey: all sensors are upright, with x to the east."""
     names = tuple(f'mag_{i + 1}' for i in range(n))
     return SensorNetwork(names, np.arange(3.0 * n).reshape(n, 3), np.tile(np.eye(3), (n, 1, 1)),
                          tuple(f'/{name}/imu/mag' for name in names), earth_field=earth, **changes)
@@ -149,7 +149,7 @@ def test_a_survey_without_data_keeps_the_network():
 
 
 def changed(name, function):
-    """Create a `change` that applies a function to the accelerations of one sensor."""
+    """Create a `change` for `surveyed` that applies a function to one sensor's accelerations."""
     def change(readings):
         readings[name] = [(stamp, function(a)) for stamp, a in readings[name]]
     return change
