@@ -159,7 +159,7 @@ class Calibrate:
         return [name for name, b in self._background.items() if not b.ready]
 
     def doubtful_intervals(self) -> dict[str, DoubtfulTimes]:
-        """Intervals in which the background of a sensor was doubtful.
+        """Intervals in which a background was provisional or may have contained a target's field.
 
         Returns
         -------
