@@ -1,4 +1,4 @@
-"""Tracks and poses of magnetic targets from a network of stationary magnetometers.
+"""Track magnetic targets and estimate their poses with a network of stationary magnetometers.
 
 The names in `__all__` are the public Python interface (the gallery has more examples):
 

@@ -1,8 +1,11 @@
-"""Exceptions that a caller can act on. Each message names the object, the value and the bound."""
+"""Exceptions of the package.
+
+A message names the affected object and, where applicable, the invalid value and its bound.
+"""
 
 
 class MagTrackingError(Exception):
-    """Base class of all exceptions that this package raises deliberately."""
+    """Base class of the exceptions that this package defines."""
 
 
 class SettingsError(MagTrackingError):
@@ -26,7 +29,7 @@ class DeviceError(MagTrackingError):
 
 
 class ReadingsError(MagTrackingError, ValueError):
-    """Arrays of readings have a wrong shape, type or order."""
+    """Readings have a wrong shape, type, order or range, or belong to no sensor of the network."""
 
 
 class UnknownTrackError(MagTrackingError, LookupError):

@@ -5,54 +5,61 @@ from dataclasses import dataclass
 from mag_tracking.arrays import FloatArray
 
 SIGNATURE_SPAN = 4.0
-"""Half the length of a signature, which is centred on the closest point of approach [time
-scales]."""
+"""Half the duration of a signature, in units of `PassEvent.time_scale`. A signature is centred on
+the closest point of approach."""
 
 
 @dataclass(frozen=True, slots=True)
 class PassEvent:
-    """A pass described by a single sensor, for which the spatial scale is unobservable."""
+    """Pass of a target, estimated from the readings of a single sensor.
+
+    The record contains no lengths, because a single sensor does not observe the spatial scale.
+    """
 
     sensor: str
     """Name of the sensor."""
     number: int
-    """Number of the event of this sensor, from 1."""
+    """Consecutive number of the event, counted from 1 for each sensor."""
     ended: bool
-    """True if the target left. False if the readings ended first."""
+    """True if the target has left the range of the sensor. False if the readings ended before."""
     onset_ns: int
     """Time of the onset, ns since 1970."""
     release_ns: int
-    """Last time at which the target was detected, without the hold time, ns since 1970."""
+    """End of the detection, ns since 1970: the release minus the hold time, or the last reading if
+    `ended` is false."""
     peak_ns: int
     """Time of `peak`, ns since 1970."""
     peak: FloatArray
-    """Largest field, (3,) T, sensor frame. NaN = missing axis."""
+    """Reading with the largest field magnitude, (3,) T, sensor frame. NaN for a missing axis."""
     energy: float
     """Energy of the field from onset to release, summed over all axes, T² s."""
     axes: str
     """Measured axes, such as 'xy'."""
     noise_std: FloatArray
-    """Standard deviation of one reading, (3,) T, sensor frame."""
+    """Median noise standard deviation of the readings, (3,) T, sensor frame. NaN for a missing
+    axis."""
     closest_ns: int
-    """Time of the closest point of approach, ns since 1970, for a dipole on a straight line."""
+    """Time of the closest point of approach of a dipole on a straight line, ns since 1970. If this
+    time is unobservable: time of the largest field, or mean time of fewer than 8 readings."""
     closest_std: float
     """Standard deviation of `closest_ns`, s. inf if unobservable."""
     time_scale: float
     """Range at the closest point divided by the speed, s. NaN if unobservable."""
     left_to_right: float
-    """Probability of motion from left to right, seen from the sensor towards the target. 0.5 if
-    unknown, for example without two horizontal axes."""
+    """Probability that the target moved from left to right, as seen from the sensor. 0.5 if
+    unobservable, for example because only one horizontal axis is measured."""
     signature: FloatArray
-    """Field at equal steps from -4 to 4 time scales about the closest point, (33, 3) T, sensor
-    frame. NaN where there are no readings."""
+    """Field at 33 equidistant times from -4 to 4 time scales about the closest point, (33, 3) T,
+    sensor frame. NaN outside the readings, or if `time_scale` is NaN."""
 
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """A change of the field that is better explained by something other than a target."""
+    """A change of the field that started a track, but that no target explains."""
 
     stamp_ns: int
-    """Latest known time of the disturbance, ns since 1970."""
+    """Time at which the disturbance was identified or, if `ended`, at which it ended, ns since
+    1970."""
     id: int
     """Number of the disturbance, from 1."""
     ended: bool
@@ -61,14 +68,14 @@ class Disturbance:
     begin_ns: int
     """Start time of the disturbance, ns since 1970."""
     largest: float
-    """Magnitude of the largest field at any sensor, T."""
+    """Largest magnitude of the field at any sensor, T."""
     sensors: tuple[str, ...]
-    """Names of the affected sensors, the strongest first."""
+    """Names of the affected sensors, in descending order of the field magnitude."""
     uniform: float
     """Probability of one common field across the network, as opposed to an independent field at
     each sensor."""
     track_id: int
-    """Number of the latest track that is ambiguous because of the disturbance."""
+    """Number of the latest track that the disturbance has made ambiguous."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,9 +97,10 @@ class VehiclePassage:
     the path, independently of the track. NaN if the rotation is inconclusive or another vehicle was
     nearby."""
     position: FloatArray
-    """Position on the line, (3,) m, world frame."""
+    """Position of the crossing, (3,) m, world frame."""
     lateral: float
-    """Distance from the middle of the line, m. Positive to the left of the forward direction."""
+    """Distance of `position` from the middle of the line, m. Positive to the left of the forward
+    direction."""
     velocity: FloatArray
     """Velocity, (3,) m/s, world frame."""
     speed: float
@@ -110,11 +118,12 @@ class VehiclePassage:
     moment_covariance: FloatArray
     """Covariance of `moment`, (3, 3) (A m²)², world frame."""
     vehicle_class: str
-    """Most probable class, or `unknown`."""
+    """Most probable class. `unknown` if the vehicle is improbable under every class."""
     class_probabilities: FloatArray
     """Probability of each class, (n_classes,), in the order of `traffic.class_names`."""
     headway: float
-    """Time since the previous passage in the same direction, s. NaN for the first passage."""
+    """Time since the previous passage across this line in this direction, s. NaN for the first
+    passage, or if the passages are not in chronological order."""
     ambiguous: bool
     """Whether the passage is ambiguous: `doubts` is not empty."""
     doubts: tuple[str, ...]
@@ -123,7 +132,7 @@ class VehiclePassage:
 
 @dataclass(frozen=True, slots=True)
 class TrafficCount:
-    """Number of vehicles of one direction and class in an interval, and their mean speed."""
+    """Number, mean speed and mean headway of vehicles of one direction and class in an interval."""
 
     forward: bool
     """Whether the vehicles moved in the forward direction of the line."""
@@ -136,7 +145,7 @@ class TrafficCount:
     mean_speed: float
     """Mean horizontal speed, m/s."""
     mean_headway: float
-    """Mean headway, s. NaN if unknown."""
+    """Mean headway, s. NaN if no headway is known."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ def checked_path(path: str | PathLike[str], error: type[MagTrackingError]) -> Pa
     ----------
     path : path_like
     error : type of MagTrackingError
-        Exception to raise if the path is invalid.
+        Exception to raise if the path contains a NUL character.
 
     Returns
     -------
@@ -55,7 +55,8 @@ def new_text_file(path: str | PathLike[str], newline: str | None = None) -> Text
     """Create an empty UTF-8 file and open it for writing.
 
     An existing file or link with this name is removed first; the target of a link is not modified.
-    Unpaired surrogates, for example from file names that are not UTF-8, are escaped as `\\udcff`.
+    Unpaired surrogates, for example from file names that are not UTF-8, are written
+    as escape sequences such as `\\udcff`.
 
     Parameters
     ----------

@@ -102,7 +102,7 @@ def cross_matrix(a: ArrayLike) -> FloatArray:
 
 
 def left_jacobian(v: ArrayLike) -> FloatArray:
-    """Left Jacobian of SO(3): change of a rotation by a change of its rotation vector.
+    """Left Jacobian of SO(3), which maps a change of a rotation vector to a small rotation.
 
     To first order R(v + d) = R(J d) R(v).
 
@@ -185,7 +185,7 @@ def yaw_between(R: FloatArray, other: FloatArray) -> float:
 
 
 def quaternion_from_rotation(R: FloatArray) -> FloatArray:
-    """Unit quaternion of a rotation matrix, computed from its largest component.
+    """Unit quaternion of a rotation matrix, numerically stable for every rotation.
 
     Parameters
     ----------
@@ -282,14 +282,14 @@ def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, flo
 
 
 def propagated_path(path: FloatArray, seconds: float) -> FloatArray:
-    """Straight paths with a later time origin.
+    """Straight paths after a shift of the time origin.
 
     Parameters
     ----------
     path : (..., n) array
         Position [m], velocity [m/s] and n - 6 constant states.
     seconds : float, s
-        Shift of the time origin.
+        New time origin relative to the previous one.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Handling of termination signals without exceptions: recording, or immediate exit.
+"""Handling of termination signals: record them for a later check, or exit immediately.
 
 Programs import this module first, so it has no slow imports.
 """
@@ -15,10 +15,10 @@ from types import FrameType
 def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
     """Record termination signals, so that a program can check for them where it is safe to stop.
 
-    An exception could interrupt an update or a table row halfway, and a library could suppress or
-    convert the exception. Only the third signal raises KeyboardInterrupt. Ignored signals (SIGINT
-    in a background job) remain ignored. Outside the main thread, no handler can be installed, and
-    the list stays empty.
+    If a signal raised an exception, it could interrupt an update or the writing of a table row, and
+    a library could suppress or convert it. Only the third signal raises KeyboardInterrupt.
+    Ignored signals (SIGINT in a background job) remain ignored. Outside the main thread, no handler
+    can be installed, and the list stays empty.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
     Yields
     ------
     list of int
-        Numbers of the signals received so far.
+        Numbers of the signals received so far; the list grows when a signal arrives.
     """
     received: list[int] = []
 

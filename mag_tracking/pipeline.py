@@ -99,7 +99,9 @@ Output: TypeAlias = (FieldFrame | Detection | Track | SmoothedPose | Disturbance
 
 
 class Pipeline:
-    """Chain of stages from raw readings to frames, detections and tracks, without ROS or a clock.
+    """Chain of stages that converts raw readings to frames, detections, tracks and passages.
+
+    The chain depends neither on ROS nor on a clock.
 
     Parameters
     ----------
@@ -135,12 +137,12 @@ class Pipeline:
         Parameters
         ----------
         readings : Readings
-            Raw readings. The outputs do not depend on how they are split into batches.
+            Raw readings. The outputs do not depend on how the readings are split into batches.
 
         Returns
         -------
         list of Output
-            Frames, detections, tracks and further records, in order of processing.
+            Resulting records, in order of processing.
         """
         calibrated = self._calibrate.feed(readings)
         self.track.set_doubtful_times(self.calibrate.doubtful_intervals())
@@ -175,7 +177,7 @@ class Pipeline:
         return self._process_detected([r for f in frames for r in self._detect.feed(f)])
 
     def _process_detected(self, records: Iterable[FieldFrame | Detection]) -> list[Output]:
-        """Track targets in frames with a detection flag; a record precedes those that it causes."""
+        """Track targets in the frames; return each record, followed by the records it causes."""
         out: list[Output] = []
         for record in records:
             out.append(record)
@@ -195,7 +197,7 @@ class Pipeline:
         return {name: dict(sorted(stage.counts.items())) for name, stage in self._stages().items()}
 
     def rejections(self) -> dict[str, int]:
-        """Number of rejections in all stages together.
+        """Number of rejections, summed over all stages.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Numbers of things in messages."""
+"""Formatting of numbers and their nouns in messages."""
 
 
 def quantity(n: int, singular: str, plural: str = '') -> str:
@@ -10,7 +10,7 @@ def quantity(n: int, singular: str, plural: str = '') -> str:
     singular : str
         Noun for `n` = 1.
     plural : str
-        Noun for other numbers; default: `singular` with an s.
+        Noun for any other number. By default, an s is appended to `singular`.
 
     Returns
     -------

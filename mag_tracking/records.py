@@ -1,6 +1,6 @@
 """Immutable records passed between stages: SI units, time as integer nanoseconds since 1970.
 
-A missing axis or sensor is NaN. The arrays of a record must not be modified.
+The values of a missing axis or sensor are NaN. The arrays of a record must not be modified.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -63,8 +63,8 @@ class Readings:
     """Flux density, (n, 3) T, sensor frame. NaN where an axis is missing. Calibrated readings
     exclude the background."""
     covariance: FloatArray | None = None
-    """Noise covariance, (n, 3, 3) T², sensor frame. A matrix of NaN is unknown. None means that all
-    are unknown."""
+    """Noise covariance, (n, 3, 3) T², sensor frame. An unknown covariance is a matrix of NaN. None
+    means that all covariances are unknown."""
 
     def __post_init__(self) -> None:
         """Check the shapes, because compiled code does not."""
@@ -220,20 +220,24 @@ class FieldFrame:
     stamp_ns: int
     """Mean time of the samples, ns since 1970."""
     field: FloatArray
-    """Mean flux density without the background, (n_sensors, 3) T, sensor frames. NaN = missing."""
+    """Mean flux density without the background, (n_sensors, 3) T, sensor frames. NaN for a
+    missing axis."""
     covariance: FloatArray
     """Covariance of `field`, (n_sensors, 3, 3) T², sensor frames. NaN for a missing sensor."""
     n_samples: IntArray
-    """Number of averaged samples per sensor, (n_sensors,). 0 = missing."""
+    """Number of averaged samples per sensor, (n_sensors,). 0 for a missing sensor."""
     time_offset: FloatArray
     """Mean time of each sensor's samples relative to `stamp_ns`, (n_sensors,) s. 0 for a missing
     sensor."""
     target_present: bool = False
-    """Whether the detector reports a target, including its hold time. False before detection."""
+    """Whether the detection stage reports a target, including the hold time. False before that
+    stage."""
     statistic: float = float('nan')
-    """Whitened energy of the frame, chi-square distributed under noise. NaN before detection."""
+    """Whitened energy of the frame, chi-square distributed under noise. NaN before the detection
+    stage."""
     degrees_of_freedom: int = 0
-    """Degrees of freedom of `statistic`: the number of measured axes. 0 before detection."""
+    """Degrees of freedom of `statistic`: the number of measured axes. 0 before the detection
+    stage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,12 +259,13 @@ class Detection:
     false_alarm_probability: float
     """Probability that noise alone exceeds `threshold` in a single frame."""
     strongest_sensor: str
-    """Name of the sensor with the largest whitened energy per axis."""
+    """Name of the sensor with the largest whitened energy per axis. Empty if no axis was
+    measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """One hypothesis of a track's bank, as published."""
+    """One hypothesis of the filter bank of a track, as published."""
 
     arrival: str
     """Name of the assumed arrival direction. Empty for a magnet."""
@@ -282,7 +287,8 @@ class Hypothesis:
 class Hypotheses(Sequence[Hypothesis]):
     """Sequence of the hypotheses of a bank, stored as arrays.
 
-    A frame may have hundreds of hypotheses, so a `Hypothesis` object is created only on access.
+    A track may have hundreds of hypotheses in each frame, so a `Hypothesis` object is created
+    only on access.
     """
 
     arrivals: tuple[str, ...]
@@ -324,7 +330,8 @@ def best_of_arrivals(members: Sequence[Hypothesis]) -> list[Hypothesis]:
     Returns
     -------
     list of Hypothesis
-        In descending order of weight. `weight` is the total weight of the arrival direction.
+        Copies, in descending order of `weight`, which is the total weight of all hypotheses with
+        the same arrival direction.
     """
     if isinstance(members, Hypotheses):
         arrivals, weights = members.arrivals, members.weights.tolist()
@@ -390,7 +397,7 @@ class SmoothedPose:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """State of a track at one time: its best hypothesis, and a summary of all hypotheses."""
+    """State of a track in one frame: the published hypothesis, and a summary of all hypotheses."""
 
     stamp_ns: int
     """Time of the frame, ns since 1970."""
@@ -404,9 +411,10 @@ class Track:
     """Velocity, (3,) m/s, world frame."""
     covariance: FloatArray
     """Covariance of [position, velocity] about this pose, (6, 6) m and m/s, world frame. It covers
-    all hypotheses near this position. For a vehicle, it also covers the length that has not been
-    observed yet, and an alternative straight path that explains the whole pass. The covariances of
-    `hypotheses` include neither."""
+    all hypotheses near this position. For a vehicle, it also covers the error of the middle due to
+    the part of the vehicle that no sensor has observed yet, and an alternative straight path that
+    explains the whole pass. The covariances in `hypotheses` do not include these two
+    contributions."""
     orientation: FloatArray
     """Orientation, (4,) quaternion xyzw, body to world frame."""
     orientation_covariance: FloatArray
@@ -445,8 +453,8 @@ class Track:
     """Whether x, y, z, and the rotations about the body's x, y and z axes are unobservable, (6,).
     An unobservable rotation has variance π² and is not an estimate."""
     predicted: FloatArray
-    """Field of the frame as predicted by the published hypothesis, without its estimated model
-    errors, (n_sensors, 3) T, sensor frames."""
+    """Field that the published hypothesis predicts, without the estimated model errors,
+    (n_sensors, 3) T, sensor frames."""
     mounting: FloatArray
     """Estimated mounting error of each sensor, (n_sensors, 3) rad: small angles as in
     `physics.mounting`. (0, 3) if not estimated."""

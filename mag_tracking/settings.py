@@ -1,6 +1,6 @@
-"""Settings, declared once with default, description, unit and range.
+"""Declaration and validation of settings, each with default, description, unit and range.
 
-ROS parameters, the YAML file of defaults and the parameter reference are generated from these
+ROS parameters, the YAML file of defaults and the parameter reference are generated from the
 declarations.
 """
 
@@ -24,7 +24,7 @@ Value: TypeAlias = Scalar | tuple[Scalar, ...]
 
 REPLACED_SETTINGS = {'track.vehicle.soft_iron': 'track.vehicle.induced_share',
                      'track.vehicle.soft_iron_std': 'track.vehicle.induced_share_std'}
-"""Former settings, and their replacements in another unit."""
+"""Former settings, and the current settings that replace them in another unit."""
 
 RENAMED_SETTINGS = {
     'jump_ahead_s': 'max_forward_jump_s', 'jump_back_s': 'max_backward_jump_s',
@@ -156,7 +156,7 @@ def _scalar(name: str, value: object, kind: _Class) -> Scalar:
 
 
 def _validated(p: Parameter, value: object) -> Value:
-    """Convert `value` to the declared type of `p` and check its range and length."""
+    """Convert `value` to the declared type of `p`; check its length, range and choices."""
     if p.element is not None:
         if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
             raise SettingsError(f'{p.name}: expected a list of {p.element.__name__}, '
@@ -304,7 +304,8 @@ def read_parameter_file(path: str | PathLike[str]) -> dict[str, Any]:
     Raises
     ------
     SettingsError
-        If the file cannot be read, is not a mapping, or contains two values of a setting.
+        If the file cannot be read, is not a mapping of settings, or contains different values for
+        one setting.
     """
     content = read_yaml(path, SettingsError)
     if content is None:
@@ -332,7 +333,7 @@ def as_ros_parameters(path: str | PathLike[str]) -> str | None:
     Raises
     ------
     SettingsError
-        If the file cannot be read.
+        If the file cannot be read, or contains different values for one setting.
     """
     content = read_yaml(path, SettingsError)
     if not isinstance(content, Mapping) or any(

@@ -19,7 +19,7 @@ from support.ros_domain import RosDomain
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 DOMAIN = RosDomain()
 os.environ['ROS_DOMAIN_ID'] = str(DOMAIN.number)
-# A background job of a shell ignores SIGINT, and its child processes would inherit that.
+# A background job of a shell ignores SIGINT, and its child processes inherit this setting.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 # Nodes must not write to the home folder of the user who runs the tests.
 _HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')

@@ -1,4 +1,4 @@
-"""Output files: each is newly created and replaces an existing link or pipe with its name."""
+"""Output files are newly created; an existing link or pipe of the same name is replaced."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""Summary of a track log: the verdict on ambiguity."""
+"""Track log: whether its summary reports a track as ambiguous."""
 
 import numpy as np
 import pytest

@@ -88,7 +88,7 @@ def copy(tmp_path):
     """Copy the tracked files of the working tree to a folder; return the folder."""
     folder = tmp_path / 'tree'
     for name in tracked_files():
-        # The build needs no tests. Git still lists deleted files.
+        # The build does not need the tests. Git may list files that have been deleted.
         if (ROOT / name).is_file() and not name.startswith('test/'):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)
@@ -183,7 +183,7 @@ def install_wheel(version, tmp_path, copy):
     bin_folder = tmp_path / 'venv' / 'bin'
     pip = bin_folder / 'python', '-m', 'pip', '--quiet', '--disable-pip-version-check', '--no-input'
     run(*pip, 'install', '-c', pins, '--upgrade', 'pip', 'setuptools', 'pybind11', cwd=tmp_path)
-    # As with `python -m build`, a wheel contains only files of the source distribution.
+    # Building from the source distribution, as `python -m build` does, must add or omit no file.
     run(bin_folder / 'python', '-c', 'import sys, setuptools.build_meta as b; b.build_sdist('
         'sys.argv[1])', tmp_path / 'sdist', cwd=copy)
     source, = (tmp_path / 'sdist').glob('*.tar.gz')

@@ -1,7 +1,7 @@
 // Alignment of individual samples into frames.
 //
-// All rules for a sample are implemented here. An event that Python must handle (a rejection that
-// is counted by name, a clock step, a complete frame, ...) is returned as a reason code.
+// All rules of the alignment are implemented here. An event that Python must handle (a rejection
+// that is counted by name, a clock step, a complete frame, ...) is returned as a reason code.
 
 #pragma once
 
@@ -15,9 +15,9 @@
 namespace mag_tracking {
 
 enum Reason {
-    // The batch is finished, or the sample has been rejected.
+    // DONE: the batch is finished. The other codes: the sample has been rejected.
     DONE, UNKNOWN_SENSOR, NO_FIELD, NO_COVARIANCE, DUPLICATE, OUT_OF_ORDER, LATE,
-    // Must be handled before the same sample is processed again.
+    // Time has restarted; must be handled before the same sample is processed again.
     JUMPED_BACK,
     // CLOCK_STEP: the clock may have stepped, and the sample was not added. TOO_MANY: the sensor
     // has more pending samples than allowed. COMPLETE: the next frame is complete.
@@ -72,7 +72,8 @@ class Queue {
     int64_t count_ = 0;
 };
 
-// Samples of a batch: sensor indices (negative = unknown), timestamps, fields and covariances.
+// Samples of a batch: sensor indices (negative for an unknown sensor), timestamps, fields and
+// covariances.
 struct Samples {
     int64_t n;
     const int64_t *rows, *stamps;
@@ -108,7 +109,8 @@ class Alignment {
     }
 
     // Index of the next sample of the batch; index of the sensor that the latest reason refers to;
-    // newest timestamp that passed the clock step filter; whether no clock step is suspected.
+    // newest timestamp that passed the clock step filter; whether no clock step is suspected,
+    // so that samples within the jump limit bypass the filter.
     int64_t next = 0, row = 0, passed = NEVER;
     bool is_calm = true;
 
@@ -126,8 +128,8 @@ class Alignment {
         look_ahead();
     }
 
-    // Add samples to the pending ones, starting at `next`, until Python must handle an event. With
-    // `is_checked`, the samples have passed the clock step filter. `passed_latest` (n) [ns] is the
+    // Queue samples, starting at `next`, until Python must handle an event. If `is_checked`, the
+    // samples have already passed the clock step filter. `passed_latest` (n) [ns] is the
     // latest timestamp of each sensor that passed the filter.
     Reason hold(bool is_checked, int64_t* passed_latest, const Samples& in) {
         while (next < in.n) {
@@ -156,8 +158,8 @@ class Alignment {
     // Whether the next frame must wait for a sensor.
     bool waits() {
         const bool is_young = newest_ - first_ < settings_.wait;
-        // A sensor without any sample is treated as complete up to time -1, so frames that end
-        // before this time do not wait for the sensor.
+        // At the start of the input, a frame that ends at a negative time does not wait if any
+        // sensor has not delivered a sample yet.
         if (due_ < 0 && is_young && std::find(latest_.begin(), latest_.end(), NEVER) != latest_.end())
             return false;
         return is_one_behind() && (!settings_.is_burst || is_one_missing(is_young));
@@ -245,7 +247,8 @@ class Alignment {
         return newest_ - settings_.wait <= latest && latest < due_;
     }
 
-    // Whether any sensor is behind. The sensor found is watched: it is checked first next time.
+    // Whether any sensor is behind. The first such sensor is watched: the next call
+    // checks it first.
     bool is_one_behind() {
         if (watch_ >= 0 && is_behind(latest_[watch_])) return true;
         for (std::size_t j = 0; j < latest_.size(); ++j)

@@ -14,7 +14,7 @@ from mag_tracking.units import NEVER
 
 
 class HeldSample(NamedTuple):
-    """A sample that is held until the clocks of the other sensors confirm its timestamp."""
+    """A sample that the clock step filter checks, and holds if its timestamp has jumped ahead."""
 
     stamp_ns: int
     field: FloatArray
@@ -36,8 +36,8 @@ class ClockStepFilter:
     ----------
     n_sensors : int
     max_jump : int, ns
-        Largest forward jump that is not checked. It is also the maximum time for which a sample is
-        held, by the timestamps of the other sensors or of its own sensor.
+        Largest forward jump that passes unchecked. A held sample is rejected if it is not confirmed
+        before the timestamps of its own sensor, or of the other sensors, advance by more than this.
     max_held : int
         Maximum number of held samples per sensor.
 
@@ -71,7 +71,7 @@ class ClockStepFilter:
 
     @property
     def is_calm(self) -> bool:
-        """Whether no sensor is ahead, so that any jump within the limit passes."""
+        """Whether no clock step is suspected. Samples within the limit then bypass the filter."""
         if not self._held and not self._ahead_since:
             return True
         # The entry of a sensor without held samples expires when a newer timestamp is accepted.
@@ -107,8 +107,8 @@ class ClockStepFilter:
             passed = self._pass(self._release(
                 lambda _, s, __: s.stamp_ns <= stamp + self._max_jump))
         # The sensor agrees with the other sensors again, so its held samples had wrong timestamps.
-        # Samples that were not confirmed in time also had wrong timestamps. The oldest sample is
-        # the first one.
+        # Samples that were not confirmed in time also had wrong timestamps. The first held
+        # sample is the oldest one.
         if i in self._ahead_since or self._held and self.newest - self._held[0][2] > self._max_jump:
             self._ahead_since.pop(i, None)
             return passed, self._release(
@@ -116,7 +116,7 @@ class ClockStepFilter:
         return passed, []
 
     def flush(self) -> SensorSamples:
-        """Release all held samples at the end of the input.
+        """Accept and return all held samples at the end of the input.
 
         Returns
         -------
@@ -125,10 +125,10 @@ class ClockStepFilter:
         return self._pass(self._release(lambda *_: True))
 
     def _jumps(self, i: int, stamp: int) -> bool:
-        """Whether a timestamp exceeds the newest accepted one by more than the limit."""
+        """Whether a timestamp is so far beyond the newest accepted one that it must be checked."""
         if self.newest == NEVER or stamp <= self.newest + self._max_jump:
             return False
-        # With two sensors, a sensor that reports for the first time is as credible as the other.
+        # With two sensors, the first sample of one is as credible as the samples of the other.
         return self.latest[i] != NEVER or bool(self._held) or len(self._active()) > 1
 
     def _pass(self, samples: SensorSamples) -> SensorSamples:
@@ -139,17 +139,17 @@ class ClockStepFilter:
         return samples
 
     def _active(self) -> set[int]:
-        """Indices of the sensors whose samples were accepted recently."""
+        """Indices of the sensors whose latest sample is within the jump limit of the newest."""
         return {j for j, latest in enumerate(self.latest.tolist())
                 if latest != NEVER and latest >= self.newest - self._max_jump}
 
     def _majority_follows(self, stamp: int) -> bool:
-        """Whether most active sensors have jumped to about this timestamp."""
+        """Whether most active sensors have jumped to within the jump limit of a timestamp."""
         agree = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._max_jump}
         return 2 * len(agree) > len(agree | self._active())
 
     def _is_alone(self, i: int, stamp: int) -> bool:
-        """Whether sensor `i` was ahead for longer than the limit while no other sensor reported."""
+        """Whether sensor `i` has been ahead for the jump limit while no sample was accepted."""
         return stamp - self._ahead_since[i][1] >= self._max_jump
 
     def _release_expired(self, i: int, stamp: int) -> SensorSamples:

@@ -1,4 +1,4 @@
-"""Compiled alignment of individual samples; `alignment.hpp` has the rules."""
+"""Compiled alignment of individual samples, by the rules in `alignment.hpp`."""
 
 from mag_tracking.arrays import FloatArray, IntArray
 
@@ -15,7 +15,7 @@ TOO_MANY: int
 COMPLETE: int
 
 class Alignment:
-    """Pending samples of a network, and the frames that they complete.
+    """Queues the pending samples of a network and combines them into frames.
 
     Parameters
     ----------
@@ -25,9 +25,9 @@ class Alignment:
     wait : int, ns
         Maximum time for which frames wait for a silent sensor.
     limit : int, ns
-        Maximum forward jump of a timestamp.
+        A larger forward jump of a timestamp is reported as CLOCK_STEP.
     jump_back : int, ns
-        A larger backward jump of a timestamp is a restart.
+        A larger backward jump of a timestamp is reported as JUMPED_BACK.
     most : int
         Maximum number of pending samples per sensor.
     is_burst : bool
@@ -42,7 +42,8 @@ class Alignment:
     passed : int, ns
         Newest timestamp that passed the clock step filter, or NEVER.
     is_calm : bool
-        Whether no clock step is suspected.
+        Whether no clock step is suspected, so that samples within `limit` bypass the clock step
+        filter.
     n_pending : int
         Number of pending samples.
     """
@@ -58,7 +59,7 @@ class Alignment:
                  most: int, is_burst: bool) -> None: ...
     def hold(self, is_checked: bool, passed: IntArray, rows: IntArray, stamps: IntArray,
              fields: FloatArray, covariances: FloatArray) -> int:
-        """Add samples to the pending ones, starting at `next`, until an event must be handled.
+        """Queue samples, starting at `next`, until an event must be handled.
 
         Parameters
         ----------
@@ -67,7 +68,7 @@ class Alignment:
         passed : (n_sensors,) int array, ns
             Latest timestamp of each sensor that passed the clock step filter; updated in place.
         rows : (n,) int array
-            Index of the sensor of each sample; negative = unknown.
+            Index of the sensor of each sample; negative for an unknown sensor.
         stamps : (n,) int array, ns
         fields : (n, 3) array, T
         covariances : (n, 3, 3) array, T^2
@@ -80,18 +81,18 @@ class Alignment:
 
     def frame(self, is_final: bool) -> tuple[int, FloatArray, FloatArray, IntArray,
                                              FloatArray] | None:
-        """Return the next frame if it is complete, or if all pending samples are final.
+        """Remove the samples of the next frame from the queue and return the frame.
 
         Parameters
         ----------
         is_final : bool
-            Whether the pending samples are final.
+            Whether the input has ended, so that incomplete frames are returned too.
 
         Returns
         -------
         tuple or None
             Timestamp [ns], field, covariance, number of samples and time offset, as in
-            `records.FieldFrame`.
+            `records.FieldFrame`. None if there is no such frame.
         """
 
     def drop(self, i: int) -> None:

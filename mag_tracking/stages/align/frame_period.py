@@ -45,9 +45,9 @@ def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
     """Frame period: the setting, or a period derived from the geometry if the setting is 0.
 
     A frame that is longer than the delay between two sensors mixes their signals, so in a compact
-    network the period is half the shortest delay. A larger network does not use the delay, and
-    short frames need more computing time. In burst mode, the period is the maximum duration of a
-    round.
+    network the period is half the shortest delay. A larger network is tracked without this
+    delay, so it has the default period, which saves computing time. In burst mode, the period is
+    the maximum duration of a round.
 
     Parameters
     ----------
@@ -94,5 +94,5 @@ def frame_period_warning(settings: AlignSettings, network: SensorNetwork) -> str
     delay, one, other = shortest
     return (f'align.period_s: a frame of {1e3 * period:.0f} ms is longer than the '
             f'{1e3 * delay:.0f} ms that a target at {MAX_TARGET_SPEED:.0f} m/s takes from {one} to '
-            f'{other}, which makes speed and direction less accurate; set it to 0 for an automatic '
-            'period')
+            f'{other}, which makes speed and direction less accurate; set align.period_s to 0 for '
+            'an automatic period')

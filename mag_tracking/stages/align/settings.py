@@ -10,9 +10,10 @@ class AlignSettings:
     """Settings of the alignment of samples into frames."""
 
     period_s: float = param(
-        0.0, 'Frame period. The samples of each sensor within a frame are averaged. 0 = '
-        'automatic: 0.08 s; in a network within two metres, half the time that a target at 20 m/s '
-        'takes between the two closest sensors, but not less than 0.02 s.', 's', (0.0, 60.0))
+        0.0, 'Frame period. The samples of each sensor within a frame are averaged. 0 '
+        'selects the period automatically: 0.08 s, or in a network that spans less than two metres '
+        'half the time that a target at 20 m/s takes between the two closest sensors (0.02 to '
+        '0.08 s).', 's', (0.0, 60.0))
     burst: bool = param(
         False, 'Set to true if the sensors are read one after the other, one sample each. A frame '
         'is then complete as soon as every sensor has delivered a sample, and period_s is the '
@@ -21,9 +22,9 @@ class AlignSettings:
         0.5, 'Maximum time that frames wait for a sensor. A sensor that is silent for longer is '
         'treated as inactive and no longer delays frames.', 's', (1e-3, 3600.0))
     max_clock_jump_s: float = param(
-        0.5, 'Maximum forward jump of the timestamps of one sensor. A larger jump that the other '
-        'sensors do not share is treated as a clock step: the samples are held back until the '
-        'other sensors follow. 0 disables the check.', 's', (0.0, 3600.0))
+        0.5, 'Maximum forward jump of the timestamps of one sensor. The samples after a '
+        'larger jump are held back until the other sensors follow; otherwise they are rejected '
+        'because of a clock step. 0 disables the check.', 's', (0.0, 3600.0))
     max_backward_jump_s: float = param(
         1.0, 'Maximum backward jump of a timestamp. A larger jump is treated as a restart (a '
         'looped recording).', 's', (0.0, 3600.0))

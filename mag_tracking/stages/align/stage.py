@@ -1,8 +1,8 @@
 """Align: combine the asynchronous samples of many sensors into frames of the whole network.
 
-Samples are sorted by timestamp. A frame contains only final samples, which are older than the
-latest sample of every active sensor. Therefore the frames do not depend on the order in which the
-messages of different sensors arrive.
+Samples are sorted by timestamp. A frame is completed only when every active sensor has
+delivered a newer sample or, in burst mode, its sample of the round. Therefore the frames do not
+depend on the order in which the messages of different sensors arrive.
 """
 
 from collections import Counter
@@ -36,8 +36,8 @@ CAUSES = {
 class Align:
     """Combines calibrated readings into frames; memory is bounded by `max_buffered`.
 
-    The cost of a sample between two frames does not depend on the number of sensors: as long as
-    one sensor is known to be missing, a sample cannot complete a frame. The rules are in
+    The cost of a sample between two frames does not depend on the number of sensors: while one
+    sensor is known to delay the frame, the other sensors are not checked. The rules are in
     `alignment.hpp`; this class handles the events that the compiled code reports.
 
     Parameters
@@ -108,7 +108,7 @@ class Align:
 
     def _hold(self, rows: IntArray, stamps: IntArray, fields: FloatArray, covariances: FloatArray,
               readings: Readings | None = None) -> list[FieldFrame]:
-        """Add samples to the pending ones and return the completed frames.
+        """Queue samples, and return the completed frames.
 
         `readings` is None if the samples have already passed the clock step filter.
         """
@@ -143,14 +143,14 @@ class Align:
                 self._reject(CAUSES[reason])
 
     def _handle_clock_step(self, i: int, sample: HeldSample) -> list[FieldFrame]:
-        """Pass a sample of sensor `i`, whose clock may have stepped, to the clock step filter."""
+        """Check a sample of sensor `i` for a clock step; return the frames that are completed."""
         passed, rejected = self._clock_steps.feed(i, sample)
         for j, _ in rejected:
             self._reject(f'ahead of all other sensors: {self._names[j]}')
         return self._hold_passed(passed)
 
     def _hold_passed(self, passed: list[tuple[int, HeldSample]]) -> list[FieldFrame]:
-        """Add samples that have passed the clock step filter to the pending ones."""
+        """Queue samples that have passed the clock step filter, and return the completed frames."""
         out: list[FieldFrame] = []
         for i, s in passed:
             out += self._hold(np.array([i]), np.array([s.stamp_ns]), s.field[None],
@@ -165,7 +165,7 @@ class Align:
         return out
 
     def flush(self) -> list[FieldFrame]:
-        """Return all frames of the pending samples.
+        """Return all frames of the held and pending samples at the end of the input.
 
         Returns
         -------
@@ -182,7 +182,7 @@ class Align:
         self.counts[f'rejected: {cause}'] += 1
 
     def _frames(self, final: bool = False) -> list[FieldFrame]:
-        """Return the complete frames, or all frames if the pending samples are final."""
+        """Return the complete frames or, if the input has ended (`final`), all frames."""
         out: list[FieldFrame] = []
         while (arrays := self._alignment.frame(final)) is not None:
             frame = FieldFrame(*arrays)

@@ -16,7 +16,7 @@ class StoredBackground:
 
     stamp_ns: int
     background: FloatArray
-    """Background, (3,) T, sensor frame. NaN = axis not reported."""
+    """Background, (3,) T, sensor frame. NaN for an axis that is not reported."""
     covariance: FloatArray
     """Noise covariance of one sample, (3, 3) T², sensor frame."""
 
@@ -28,7 +28,7 @@ def stored_background(background: RunningBackground, stamp_ns: int,
     Parameters
     ----------
     background : RunningBackground
-        Background estimator; must be ready.
+        Background estimator, which must have a background.
     stamp_ns : int, ns
         Timestamp of the latest reading of the sensor.
     level : (3,) array, T
@@ -82,7 +82,7 @@ class BackgroundRestoration:
         self._stored.pop(sensor, None)
 
     def restore(self, sensor: str, stamp_ns: int, background: RunningBackground) -> str:
-        """Restore the background of a sensor at its first reading, unless it is outdated.
+        """Restore the stored background of a sensor at its first reading, unless it is outdated.
 
         Parameters
         ----------
@@ -90,12 +90,12 @@ class BackgroundRestoration:
         stamp_ns : int, ns
             Timestamp of the first reading.
         background : RunningBackground
-            Receives the stored background.
+            Background estimator of the sensor, which receives the stored background.
 
         Returns
         -------
         str
-            Name of the event to count.
+            Key of the counter that records the outcome.
         """
         stored = self._stored.pop(sensor)
         if 0 < stamp_ns - stored.stamp_ns <= self._max_gap_ns:

@@ -10,12 +10,12 @@ class CalibrateSettings:
     """Settings of backgrounds, noise, rejection of readings and decimation."""
 
     learn_s: float = param(
-        3.0, 'Duration of the quiet interval from which a background is learnt, unless it is '
-        'configured. If there is no quiet interval within twice this time, the most frequent level '
-        'becomes a provisional background.', 's', (0.1, 3600.0))
+        3.0, 'Duration of the quiet interval from which a background is learnt, unless the '
+        'network file contains one. If there is no quiet interval within twice this time, the most '
+        'frequent level becomes a provisional background.', 's', (0.1, 3600.0))
     look_ahead_s: float = param(
-        300.0, 'Offline only: duration of the recording that is searched for the most frequent '
-        'level of a sensor that is not quiet at the start. 0 disables the search.',
+        300.0, 'Offline only: duration, from the start of the recording, that is searched for the '
+        'most frequent level of a sensor that is not quiet at the start. 0 disables the search.',
         's', (0.0, 86400.0))
     memory_s: float = param(
         20.0, 'Duration of the quiet interval to which level, drift and noise are fitted.',
@@ -27,11 +27,11 @@ class CalibrateSettings:
         0.25, 'Duration of a block. The quietness of a sensor is evaluated block by block.',
         's', (0.01, 60.0))
     freeze_std: float = param(
-        2.0, 'Threshold for freezing the background: deviation of the mean of a block, in standard '
-        'deviations of the noise.', '', (0.5, 1000.0))
+        2.0, 'The background is frozen if the mean of a block deviates from it by more than this '
+        'number of standard deviations of the noise.', '', (0.5, 1000.0))
     relearn_s: float = param(
-        120.0, 'Time after which a steady new level becomes the background (a parked car). Unless '
-        'a target was observed approaching, the time is reduced to four times the duration for '
+        120.0, 'Time after which a steady new level becomes the background (a parked car). If no '
+        'target was observed approaching, the time is reduced to four times the duration for '
         'which the background was observed, but not below 10 s. If a parked vehicle was observed '
         'leaving, the time is 2 s for sensors of at least 20 Hz. 0 disables relearning.',
         's', (0.0, 86400.0))
@@ -54,16 +54,17 @@ class CalibrateSettings:
     trust_covariances: bool = param(
         False, 'Use the covariances of the messages unchanged. By default, if a standard deviation '
         'in a message differs by more than a factor of five from the noise measured in quiet '
-        'intervals, the measured noise is used, because many drivers publish a placeholder or '
-        'another unit.')
+        'intervals, the measured noise is used, because many drivers publish a placeholder, or '
+        'a value in another unit.')
     decimate_to_hz: float = param(
         0.0, 'Approximate rate to which faster sensors are low-pass filtered and decimated: an '
         'integer fraction of the rate of the sensor, with 60 dB of alias rejection and a delay of '
         'four output intervals. 0 disables decimation; frames average the samples in any case.',
         'Hz', (0.0, 10000.0))
     max_resume_gap_s: float = param(
-        60.0, 'Maximum interruption, by the timestamps, after which a restarted node restores its '
-        'learnt background. 0 disables restoration.', 's', (0.0, 86400.0))
+        60.0, 'Maximum gap between the timestamps before and after a restart of a node for which '
+        'the learnt background of a sensor is restored. 0 disables restoration.',
+        's', (0.0, 86400.0))
     max_backward_jump_s: float = param(
         1.0, 'Maximum backward jump of a timestamp. A larger jump is treated as a restart (a '
         'looped recording), and the learnt background is discarded.', 's', (0.0, 3600.0))

@@ -49,11 +49,12 @@ CAUSES = {
 
 
 class Calibrate:
-    """Converts raw readings to calibrated readings without background and with a known covariance.
+    """Subtracts the background from raw readings, and attaches a noise covariance.
 
     The clock offset and the corrections of hard and soft iron in the network file are applied
     first. The field remains in the sensor frame. The covariance is taken from the reading if
-    available, otherwise from the network file; otherwise it is estimated.
+    available (unless the measured noise contradicts it), otherwise from the network file; otherwise
+    it is estimated.
 
     The rules are in `calibration/readings.hpp`; this class handles the events that the compiled
     code reports.
@@ -82,7 +83,7 @@ class Calibrate:
             settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
             settings.trust_covariances)], core.LIMITS)
         self._causes = {**CAUSES, core.TOO_LARGE: f'above {settings.max_field:g} T (gauss or '
-                        'microtesla as tesla?)'}
+                        'microtesla published as tesla?)'}
         self._network, self._background_type = network, background_type
         self._index = {name: i for i, name in enumerate(network.names)}
         self._background: dict[str, RunningBackground] = {}
@@ -93,8 +94,8 @@ class Calibrate:
     def update_network(self, network: SensorNetwork) -> None:
         """Apply a new calibration of the same sensors.
 
-        If the offset or the correction of a sensor has changed, its background is learnt again.
-        Otherwise the background is retained, even while it is frozen.
+        If the offset or the correction of a sensor has changed, the background of this sensor is
+        learnt again. Otherwise it is retained, even while it is frozen.
 
         Parameters
         ----------
@@ -125,7 +126,7 @@ class Calibrate:
         self._mark_restorable()
 
     def _configure(self, i: int, shift: int) -> None:
-        """Apply the network file to sensor `i`, and shift its previous timestamps [ns]."""
+        """Apply the network file to sensor `i`; shift stored timestamps of the sensor [ns]."""
         s, network = self._sensors[i], self._network
         for name in ('first_ns', 'last_ns', 'unconfirmed_ns'):
             if s[name] != NEVER:
@@ -158,7 +159,7 @@ class Calibrate:
         return [name for name, b in self._background.items() if not b.ready]
 
     def doubtful_intervals(self) -> dict[str, DoubtfulTimes]:
-        """Intervals in which the background of a sensor was doubtful.
+        """Intervals in which a background was provisional or may have contained a target's field.
 
         Returns
         -------
@@ -194,7 +195,8 @@ class Calibrate:
         Returns
         -------
         list of Readings
-            One batch of the calibrated readings that are complete; empty if there are none.
+            One batch of the calibrated readings that are no longer held; an empty list if there
+            are none.
         """
         rows = readings.rows(self._index)
         own, covariances = _own_covariances(readings)
@@ -305,7 +307,7 @@ class Calibrate:
             self._background[name].start_from(quiet.level, quiet.covariance)
 
     def resume(self, stored: Mapping[str, StoredBackground]) -> None:
-        """Provide backgrounds to be restored at the first readings of their sensors.
+        """Provide stored backgrounds, which are restored at the first reading of each sensor.
 
         Parameters
         ----------
@@ -316,11 +318,11 @@ class Calibrate:
         self._mark_restorable()
 
     def _mark_restorable(self) -> None:
-        """Mark sensors with a stored background, whose first reading compiled code will report."""
+        """Mark the sensors with a stored background; compiled code reports their first reading."""
         self._sensors['is_restorable'] = [name in self._restoration for name in self._index]
 
     def stored(self, sensor: str) -> StoredBackground | None:
-        """Background of a sensor that can be passed to `resume`.
+        """Return the background of a sensor in the form that `resume` accepts.
 
         Parameters
         ----------
@@ -337,16 +339,16 @@ class Calibrate:
         return stored_background(background, last, self.background(sensor))
 
     def idle(self) -> None:
-        """Evaluate complete blocks, which the next reading of their sensor would otherwise trigger.
+        """Evaluate the completed blocks now, instead of at the next reading of their sensors.
 
         The result is the same, because in a large network the reading that completes a block is
-        calibrated with the background before that block.
+        calibrated with the background from before that block.
         """
         for i in np.flatnonzero(self._sensors['is_full']):
             self._background[self._network.names[i]].evaluate_block()
 
     def flush(self) -> list[Readings]:
-        """Return the readings that are still held.
+        """Calibrate and return the readings that are still held.
 
         Returns
         -------
@@ -374,7 +376,7 @@ class Calibrate:
         Parameters
         ----------
         sensors : collection of str, optional
-            Names of the sensors; empty = all sensors.
+            Names of the sensors; an empty collection selects all sensors.
 
         Raises
         ------
@@ -403,7 +405,7 @@ class Calibrate:
         return None if last == NEVER else last
 
     def background(self, sensor: str) -> FloatArray:
-        """Background of a sensor at its latest reading.
+        """Background of a sensor at the time of its latest reading.
 
         Parameters
         ----------
@@ -433,9 +435,9 @@ class Calibrate:
         n : int
             Number of overruled covariances.
         stated : (3,) array, T
-            Standard deviation in the latest message; NaN = unknown.
+            Standard deviation in the latest message; NaN if unknown.
         measured : (3,) array, T
-            Measured standard deviation of the readings; NaN = unknown.
+            Measured standard deviation of the readings; NaN if unknown.
         """
         s = self._state_of(sensor)
         return int(s['n_overruled']), s['stated_std'].copy(), s['noise_std'].copy()

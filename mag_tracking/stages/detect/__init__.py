@@ -1,1 +1,1 @@
-"""Detect: energy test on frames."""
+"""Detect: decide for each frame whether a target is present."""

@@ -18,10 +18,10 @@ def learn(field: FloatArray, memory: float, n: FloatArray, square: FloatArray) -
 
 def scaled(covariance: FloatArray, n: FloatArray, square: FloatArray, least: float, factor: float,
            most: float, allowance: float) -> FloatArray:
-    """Covariance with smaller variances for axes at rest.
+    """Covariance with reduced variances of axes at rest, and with an allowance on all variances.
 
-    An axis is at rest if it has at least `least` values and its `square` is smaller than its
-    variance by `factor`.
+    An axis is at rest if it has at least `least` values and its mean square times `factor` is
+    smaller than its variance.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def scaled(covariance: FloatArray, n: FloatArray, square: FloatArray, least: flo
     most : float
         Factor by which the variance of an axis at rest is reduced.
     allowance : float, T^2
-        Added to all variances.
+        Variance that is added to each axis.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Reduced variance of axes with coarse resolution while there is no target.
+"""Reduction of the variance of axes with coarse resolution while no target is present.
 
 The covariance of such an axis includes the quantisation error of one step. Without a target the
 readings of the axis do not change, so simultaneous steps of two axes are not noise.
@@ -15,11 +15,10 @@ MEMORY_FRAMES = 100
 averaged."""
 
 RESTING_RATIO = 25.0
-"""An axis is at rest if its measured variance is smaller than its nominal variance by this
-factor."""
+"""Minimum ratio of the nominal to the measured variance of an axis at rest."""
 
 VARIANCE_REDUCTION = 20.0
-"""Factor by which the variance of a resting axis is reduced. In a network of two sensors, a single
+"""Factor by which the variance of an axis at rest is reduced. In a network of two sensors, a single
 step of one axis, which background drift can cause, remains below the threshold."""
 
 
@@ -36,24 +35,24 @@ class RestingAxes:
         self._square: FloatArray = np.zeros((n_sensors, 3))
 
     def learn(self, field: FloatArray) -> None:
-        """Add a frame without a target.
+        """Update the averages with a frame that contains no target.
 
         Parameters
         ----------
         field : (n_sensors, 3) array, T
-            NaN = missing axis.
+            NaN for a missing axis.
         """
         core.learn(plain(field), MEMORY_FRAMES, self._n, self._square)
 
     def covariance(self, covariance: FloatArray, allowance: float) -> FloatArray:
-        """Covariance of a frame, reduced for axes at rest.
+        """Covariance of a frame and its background, with reduced variances of axes at rest.
 
         Parameters
         ----------
         covariance : (n_sensors, 3, 3) array, T^2
             Covariance of the frame.
         allowance : float, T^2
-            Variance of the background error.
+            Variance of the background error, which is added to each axis.
 
         Returns
         -------

@@ -22,11 +22,12 @@ class DetectSettings:
         1.0, 'Duration for which all frames have to be quiet before a detection ends.',
         's', (0.0, 3600.0))
     background_drift: float = param(
-        1e-9, 'Growth of the background uncertainty while a target prevents the background from '
-        'being learnt. It is reset a few seconds after the target has left.', 'T/s', (0.0, 1e-3))
+        1e-9, 'Growth rate of the standard deviation of the background while a target prevents the '
+        'background from being learnt. The growth is reset a few seconds after the target has '
+        'left.', 'T/s', (0.0, 1e-3))
     background_std: float = param(
-        4e-9, 'Standard deviation of the background (drift while frozen). Its variance is added to '
-        'the noise variance, which lowers the false alarm probability where the background is '
-        'exact. With the defaults and two sensors with 12 nT of noise per sample, that probability '
-        'is 3.5e-4 per frame of one sample (12.5 Hz) and 1.5e-7 per frame of eight (100 Hz). 0 = '
-        'exactly false_alarm_probability.', 'T', (0.0, 1e-3))
+        4e-9, 'Standard deviation of the background (drift while frozen). Its square is added to '
+        'the noise variance, so the actual false alarm probability is lower if the background is '
+        'exact: with the defaults and two sensors with 12 nT of noise per sample, 3.5e-4 per '
+        'frame of one sample (12.5 Hz) and 1.5e-7 per frame of eight samples (100 Hz). With 0, it '
+        'equals false_alarm_probability.', 'T', (0.0, 1e-3))

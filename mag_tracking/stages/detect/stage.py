@@ -67,7 +67,7 @@ class Detect:
         self._reset()
 
     def _reset(self) -> None:
-        """Reset to the state without a target."""
+        """Reset to the state without a detection."""
         self._present = False
         self._above = 0
         self._last_ns: int | None = None
@@ -133,7 +133,7 @@ class Detect:
 
     def _record_excursions(self, energy: FloatArray, axes: IntArray, statistic: float,
                            n: int) -> None:
-        """Update the largest excursions in frames without a target."""
+        """Update the largest ratios of energy to threshold with a frame without a detection."""
         if not self._present:
             ratio = statistic / self.threshold(self._settings.false_alarm_probability, n)
             self._max_ratio = max(self._max_ratio, ratio)
@@ -141,11 +141,11 @@ class Detect:
 
     @property
     def largest_excursion(self) -> float:
-        """Largest excursion of the whole network, relative to the threshold."""
+        """Square root of the largest ratio of energy to threshold in frames without a detection."""
         return float(np.sqrt(self._max_ratio))
 
     def largest_excursions(self) -> FloatArray:
-        """Largest excursion of each sensor, relative to the threshold of that sensor alone.
+        """As `largest_excursion`, but of each sensor relative to a threshold for this sensor alone.
 
         Returns
         -------

@@ -1,1 +1,1 @@
-"""Events: passes described by individual sensors."""
+"""Events: detect and describe the passes of targets at individual sensors."""

@@ -1,4 +1,4 @@
-"""Closest point of approach of a pass, estimated from one sensor without a length scale."""
+"""Closest point of approach of a pass, estimated from the readings of one sensor."""
 
 from typing import NamedTuple
 
@@ -10,11 +10,11 @@ from mag_tracking.physics.anderson import anderson_residual
 from mag_tracking.records import plain
 
 MAX_SAMPLES = 200
-"""Maximum number of samples to which a pass is averaged before the search."""
+"""Maximum number of samples in the search. If a pass has more, blocks of samples are averaged."""
 
 MAX_STARTS = 5
-"""Number of grid points from which the search starts; the cost of a single axis has several
-minima."""
+"""Maximum number of grid points from which the search starts; the cost of a single axis has
+several minima."""
 
 CORRELATION_TIME = 2.0
 """[time scales] Correlation time of the residual when a dipole is fitted to a vehicle."""
@@ -27,7 +27,8 @@ class ClosestPoint(NamedTuple):
     """Closest point of approach of a pass, estimated from one sensor."""
 
     time: float
-    """[s] Time of the largest field if the closest point is not observable."""
+    """[s] Time of the largest field if the closest point is not observable; mean time if there are
+    fewer than 8 samples."""
     time_std: float
     """[s] Standard deviation; inf if the closest point is not observable."""
     time_scale: float
@@ -45,9 +46,9 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
     t : (n,) array, s
         Times of the readings, ascending.
     field : (n, 3) array, T
-        NaN = missing axis.
+        NaN for a missing axis.
     noise_std : (3,) array, T
-        Noise of one reading, per axis.
+        Noise standard deviation of one reading, per axis.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Events: passes described by individual sensors, from their calibrated readings."""
+"""Events: detect and describe the passes of targets at individual sensors."""
 
 from collections import Counter, deque
 
@@ -31,10 +31,10 @@ SIGNATURE_POINTS = 33
 
 
 class Events:
-    """Converts calibrated readings to events, one for each detection by each sensor.
+    """Converts calibrated readings to pass events, one for each detection at each sensor.
 
     The events that one batch completes are returned sensor by sensor. An event contains no lengths,
-    because a single sensor cannot observe the scale.
+    because a single sensor does not observe the spatial scale.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class _SensorEvents:
         return self._event(detection.stamp_ns - self._hold_ns, True)
 
     def _event(self, release_ns: int, ended: bool) -> list[PassEvent]:
-        """Create the event from the onset until `release_ns`; empty if there are no readings."""
+        """Return a list with the event until `release_ns`; empty if there are no readings."""
         onset_ns, self._onset_ns = self._onset_ns, None
         assert onset_ns is not None
         readings = Readings.joined(self._buffer)
@@ -190,7 +190,7 @@ class _SensorEvents:
 
 
 def _left_to_right(horizontal: FloatArray, noise_std: float, n_quiet: int) -> float:
-    """Probability that the target moves from left to right; 0.5 if it is not observable."""
+    """Probability that the target moves from left to right; 0.5 if unobservable."""
     rotation = rotation_of_pass(horizontal, noise_std, n_quiet)
     if rotation is None:
         return 0.5
@@ -213,7 +213,7 @@ def _median_interval(stamp: IntArray) -> float:
 
 
 def _signature(t: FloatArray, field: FloatArray, time: float, scale: float) -> FloatArray:
-    """Field (`SIGNATURE_POINTS`, 3) [T] at equal steps of the time scale; NaN without readings."""
+    """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times; NaN outside the readings."""
     if not np.isfinite(scale):
         return np.full((SIGNATURE_POINTS, 3), np.nan)
     times = time + scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN, SIGNATURE_POINTS)

@@ -1,1 +1,1 @@
-"""Health: faults in the readings of a sensor."""
+"""Health: detect faults in the readings of a sensor."""

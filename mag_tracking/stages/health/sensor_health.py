@@ -1,4 +1,4 @@
-"""Health: faults in the readings of a sensor, and advice on how to fix them.
+"""Health: detect faults in the readings of a sensor, and advise how to fix them.
 
 Readings are monitored without being changed or delayed. Memory is bounded by a window of readings.
 """
@@ -21,7 +21,7 @@ WINDOW = 512
 UPDATE_INTERVAL = 64
 """Number of new readings after which the statistics are updated."""
 CLOCK_STEP_S = 0.25
-"""[s] Minimum timestamp error of a clock step; the time of receipt must be regular."""
+"""[s] Minimum jump of a timestamp that counts as a clock step if the time of receipt is regular."""
 MAX_LIVE_DELAY_S = 86400.0
 """[s] Maximum age of live timestamps. Older timestamps come from a replay or an unsynchronised
 clock; `apps.doctor` compares the clocks of the sensors."""
@@ -32,15 +32,15 @@ MAX_JITTER = 0.3
 STUCK_S = 1.0
 """[s] A sensor is stuck if its readings are identical for longer than this."""
 MIN_MOVED_STEPS = 10.0
-"""A target that changes one axis by this number of quantisation steps changes every other axis by
-at least one step."""
+"""A target that changes one axis by more than this number of quantisation steps is assumed to
+change every other axis by at least one step."""
 SPIKE_STD = 30.0
 """Minimum difference of a spike from both neighbouring readings, in the same direction, in standard
 deviations of the noise."""
 
 
 def _times(n: int) -> str:
-    """Number of occurrences in words."""
+    """Format a number of occurrences, such as 'once' or '2 times'."""
     return 'once' if n == 1 else f'{n} times'
 
 
@@ -220,7 +220,11 @@ class SensorHealth:
         self._n_since_stuck = n - 1 - int(stuck[-1]) if len(stuck) else self._n_since_stuck + n
 
     def _count_runs(self, same: BoolArray, since: IntArray, stamps: IntArray) -> None:
-        """Count repeated readings: `same` (n,) marks them, and their runs start at `since` [ns]."""
+        """Count repeated and changed readings.
+
+        `same` (n,) marks the readings that equal the previous reading; `since` (n,) [ns] is the
+        start of the run of identical readings to which each reading belongs.
+        """
         changed = np.flatnonzero(~same)
         if not len(changed):
             self._run += len(same)
@@ -306,11 +310,11 @@ class SensorHealth:
         name : str
             Name of the sensor.
         noise_std : (3,) array, T, optional
-            Noise standard deviation at the calibration.
+            Noise standard deviation when the sensor was calibrated, for comparison.
         max_field : float, T, optional
             Limit above which readings are rejected.
         is_live : bool, optional
-            False for a replay, whose timestamps may lag or loop.
+            False for a replay, whose timestamps may be old or repeat; clocks are then not checked.
 
         Returns
         -------
@@ -359,14 +363,14 @@ class SensorHealth:
                           'arrive', 'use timestamps of the sensor instead of the time of receipt')
         elif abs(middle) > 1.0:
             yield Finding(False, name, f'the delay from timestamp to receipt is {middle:.1f} s',
-                          'the clocks of sensor and host disagree: calibrate them with knocks')
+                          'synchronise the clocks of sensor and host (chrony, PTP)')
 
     def _value_findings(self, name: str, n: int, max_field: float) -> Iterator[Finding]:
         """Yield findings about the values and the axes of the readings."""
         c = self.counts
         magnitude = float(np.sqrt(np.nansum(self.field**2)))
         if magnitude > max_field:
-            yield Finding(True, name, f'a field of {magnitude:.3g} T is rejected, the limit is '
+            yield Finding(True, name, f'the field of {magnitude:.3g} T exceeds the limit of '
                           f'{max_field:g} T', 'check the unit (gauss or microtesla published as '
                           'tesla?), or near a magnet raise calibrate.max_field')
         if c['without any axis'] > 0.01 * n:
@@ -385,7 +389,8 @@ class SensorHealth:
                           'the sensor or its driver is stuck: restart it')
         if c['saturated'] > 0.001 * n:
             yield Finding(True, name, f'{c["saturated"]} of {n} readings are at the end of the '
-                          'range', 'set a larger range, or move the sensor further away')
+                          'range of the sensor', 'set a larger range, or move the sensor further '
+                          'away')
         if c['spikes'] > 0.001 * n:
             yield Finding(False, name, f'{c["spikes"]} of {n} readings are spikes', 'check '
                           'connectors, power supply and checksums')

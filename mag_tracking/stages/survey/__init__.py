@@ -1,1 +1,1 @@
-"""Survey: orientations and clock offsets of a network."""
+"""Survey: estimate the orientations and clock offsets of the sensors of a network."""

@@ -1,4 +1,4 @@
-"""Survey: orientation and clock offset of each sensor of a network.
+"""Survey: estimate the orientation and clock offset of each sensor of a network.
 
 It follows T10 section 6.3: knocks that all sensors measure give the clock offsets; accelerometers
 and the field of the Earth give the orientations.
@@ -32,7 +32,7 @@ from mag_tracking.units import NS
 
 MAX_GAP_S = 3600.0
 """[s] Maximum gap between accelerations. After a longer gap or a backward jump, earlier readings
-belong to another recording."""
+belong to another recording and are discarded."""
 
 MIN_STATED_STD = 1e-3
 """[rad] Minimum standard deviation of an orientation in the network file."""
@@ -48,7 +48,8 @@ class SensorSurvey:
     by: str
     """Source of the orientation."""
     lag: Lag | None
-    """Offset of the sensor clock; None for the sensor with the reference clock."""
+    """Offset of the sensor clock. None for the sensor with the reference clock, and for sensors
+    without accelerations."""
     warnings: tuple[str, ...]
 
 
@@ -152,12 +153,13 @@ class Survey:
         return []
 
     def solve(self, fields: Mapping[str, FloatArray], date: str) -> NetworkSurvey:
-        """Compute the survey from the fields of the sensors and the accelerations added so far.
+        """Compute orientations and clock offsets from fields and the accelerations added so far.
 
         Parameters
         ----------
         fields : mapping of str to (3,) array, T, sensor frame
-            Field of each sensor without a target. NaN = axis not reported; a sensor may be missing.
+            Field at each sensor while no target is present. NaN for an axis that is not reported;
+            sensors may be missing.
         date : str
             Date of the survey, for the calibration records.
 
@@ -185,10 +187,10 @@ class Survey:
         reference, lags = self._lags(shocks)
         sensors = []
         for j, name in enumerate(names):
-            orientation, by = oriented.get(j, (level[j], 'accelerometer, heading as stated'))
+            orientation, by = oriented.get(j, (level[j], 'accelerometer, nominal heading'))
             sensors.append(SensorSurvey(
-                name, orientation, 'as stated' if orientation is None else by, lags.get(name),
-                tuple(warnings[name])))
+                name, orientation, 'nominal orientation' if orientation is None else by,
+                lags.get(name), tuple(warnings[name])))
         return NetworkSurvey(self._updated_network(sensors, reference, date), tuple(sensors),
                              tuple(disagreeing), bias_std, reference, shocks)
 
@@ -207,7 +209,7 @@ class Survey:
     def _disagreements(self, field: FloatArray, level: Sequence[Orientation | None],
                        stated_std: FloatArray, warnings: Mapping[str, list[str]]
                        ) -> list[Disagreement]:
-        """Sensors that disagree with the field of the Earth; none if this field is unknown."""
+        """Find sensors that disagree with the Earth's field; an empty list if it is unknown."""
         network = self._network
         R = np.array([R if o is None else o.R_ws for o, R in zip(level, network.R_ws, strict=True)])
         std = np.array([s if o is None else o.std for o, s in zip(level, stated_std, strict=True)])
@@ -221,7 +223,7 @@ class Survey:
     def _compass(self, ups: Mapping[int, UpDirection], field: FloatArray, stated_std: FloatArray,
                  warnings: Mapping[str, list[str]]
                  ) -> tuple[float, dict[int, tuple[Orientation, str]]]:
-        """Estimate the compass bias [T] and {sensor index: (orientation, source)}."""
+        """Estimate the compass bias std [T] and {sensor index: (orientation, source)}."""
         network, bias_std = self._network, self._settings.compass_bias_std
         usable = {j: up for j, up in ups.items() if not np.isnan(field[j]).all()}
         if network.earth_field is None or not usable:
@@ -252,7 +254,7 @@ class Survey:
                 warnings[name].append('the compass allows another heading, which differs by '
                                       f'{np.degrees(orientation.rival):+.0f} degrees')
             if fused is not None:
-                out[j] = fused, 'accelerometer, compass and stated heading'
+                out[j] = fused, 'accelerometer, compass and nominal heading'
         return bias_std, out
 
     def _shocks(self) -> dict[str, tuple[FloatArray, FloatArray]]:
@@ -283,7 +285,8 @@ class Survey:
         """Create a network with the surveyed orientations and clock offsets."""
         network = self._network
         R_ws, clock = network.R_ws.copy(), network.clock_offset.copy()
-        # The reference clock keeps its offset, so that clocks without a comparison remain valid.
+        # The reference clock keeps its offset, so that the offsets of clocks that were not compared
+        # remain valid.
         zero = clock[network.index(reference)] if reference else 0.0
         std, calibrated = list(network.orientation_std), list(network.calibrated)
         for j, s in enumerate(sensors):
@@ -300,7 +303,7 @@ class Survey:
 
 
 class NoiseSource(Protocol):
-    """Interface of a `Calibrate` stage that `with_measured_noise` uses."""
+    """Part of the interface of `Calibrate` that `with_measured_noise` uses."""
 
     def backgrounds(self) -> Mapping[str, RunningBackground]:
         """Background of each sensor of the network, in order.
@@ -322,12 +325,12 @@ def with_measured_noise(network: SensorNetwork, calibrate: NoiseSource) -> Senso
     Returns
     -------
     SensorNetwork
-        Sensors without a complete measurement retain their previous noise.
+        Sensors for which the noise of any axis is not known retain their previous noise.
     """
     noise = list(network.noise_std)
     for j, background in enumerate(calibrate.backgrounds().values()):
         std = None if background.covariance is None else np.sqrt(np.diagonal(background.covariance))
-        # The network file needs three numbers, but an axis that is not reported has no noise.
+        # The network file requires all three axes, but an axis that is not reported has no noise.
         if std is not None and not np.isnan(std).any():
             noise[j] = std
     return replace(network, noise_std=tuple(noise))

@@ -1,1 +1,1 @@
-"""Traffic: passages of vehicles across counting lines, vehicle classes, and interval summaries."""
+"""Traffic: count and classify the vehicles that cross counting lines, and summarise intervals."""

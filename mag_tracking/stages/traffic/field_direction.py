@@ -38,7 +38,7 @@ MAX_LOG_ODDS = float(np.log(MAX_CONFIDENCE / (1.0 - MAX_CONFIDENCE)))
 
 
 class FieldDirection:
-    """Estimates the probability that a direction is wrong, from the latest frames.
+    """Estimates the probability that the direction of a crossing is wrong, from the latest frames.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class FieldDirection:
         ----------
         frame : FieldFrame
         since_ns : int, ns
-            Earliest time of crossings that may still be found.
+            Earliest time of a crossing that may still be found.
         """
         if self._frames and frame.stamp_ns <= self._frames[-1].stamp_ns:
             self._frames.clear()
@@ -104,7 +104,7 @@ class FieldDirection:
         return float(1.0 / (1.0 + np.exp(fused)))
 
     def _log_odds(self, j: int, middle_ns: int, half_ns: int) -> float | None:
-        """Log odds of motion from left to right, from sensor `j`; None if not observable."""
+        """Log odds of motion from left to right as seen from sensor `j`; None if unobservable."""
         frames = [f for f in self._frames if abs(f.stamp_ns - middle_ns) <= half_ns]
         field = horizontal_field(np.array([f.field[j] for f in frames]).reshape(-1, 3),
                                  self._network.R_ws[j])

@@ -11,10 +11,10 @@ class TrafficSettings:
 
     line_names: tuple[str, ...] = param(
         ('road',), 'Names of the counting lines. A vehicle is counted once on each line that it '
-        'crosses.')
+        'crosses. The other line_* settings have one value per line, in the same order.')
     line_headings_deg: tuple[float, ...] = param(
-        (0.0,), 'Forward direction of travel across each line, anticlockwise from x. The line is '
-        'perpendicular to this direction.', 'deg', (-360.0, 360.0))
+        (0.0,), 'Forward direction of travel across each line, measured anticlockwise from x. The '
+        'line is perpendicular to this direction.', 'deg', (-360.0, 360.0))
     line_offsets: tuple[float, ...] = param(
         (0.0,), 'Distance of each line from the centre of the network, along its heading.',
         'm', (-10000.0, 10000.0))
@@ -24,8 +24,8 @@ class TrafficSettings:
     interval_s: float = param(
         60.0, 'Length of the summary intervals, which are aligned to UTC.', 's', (1.0, 86400.0))
     class_names: tuple[str, ...] = param(
-        ('motorcycle', 'car', 'truck'), 'Names of the vehicle classes. The settings below have '
-        'one value per class.')
+        ('motorcycle', 'car', 'truck'), 'Names of the vehicle classes. The other class_* '
+        'settings have one value per class, in the same order.')
     class_shares: tuple[float, ...] = param(
         (0.05, 0.8, 0.15), 'Prior proportion of each class in the traffic.', '', (1e-9, 1.0))
     class_moments: tuple[float, ...] = param(

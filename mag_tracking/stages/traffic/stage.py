@@ -1,4 +1,4 @@
-"""Traffic: passages of tracked vehicles across counting lines, and interval summaries."""
+"""Traffic: count tracked vehicles that cross counting lines, and summarise intervals."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -35,10 +35,10 @@ AMBIGUOUS, CONTRADICTED, EXTRAPOLATED = 'ambiguous', 'direction_contradicted', '
 contradicts its direction; the track does not reach the line."""
 
 MAX_DIRECTION_ERROR = 0.9
-"""Error probability from the fields above which they contradict a direction."""
+"""Error probability above which the fields contradict the direction of a crossing."""
 
 INTERFERENCE_S = 2.0
-"""[s] Another vehicle tracked within this time of a crossing contributes to the fields."""
+"""[s] A direction is not checked if another vehicle is tracked within this time of the crossing."""
 
 REACQUIRED_S, REACQUIRED_M = 1.0, 3.0
 """[s], [m] Maximum separation in time and along the line of two crossings that belong to one
@@ -184,7 +184,7 @@ class Traffic:
         return min([now_ns, *begins]) - round(SMOOTHED_LEAD_S * NS)
 
     def _add_records(self, records: Iterable[Track | SmoothedPose | Disturbance]) -> None:
-        """Add the poses and the ends of tracks."""
+        """Add track records and smoothed poses to the histories of their tracks."""
         for record in records:
             if isinstance(record, Track):
                 self._add_pose(record)
@@ -210,7 +210,7 @@ class Traffic:
             path.add(track)
 
     def _count_ended(self, now_ns: int | None) -> list[VehiclePassage]:
-        """Return the passages of ended tracks that none can precede; all if `now_ns` is None."""
+        """Return passages once no earlier one can follow, or all if `now_ns` is None."""
         ended = {id: track for id, track in self._open.items() if track.ended}
         self._ended += ended.values()
         for id, track in ended.items():
@@ -241,7 +241,7 @@ class Traffic:
         return self._direction.error_probability(crossing)
 
     def _passage(self, pending: _PendingCrossing) -> VehiclePassage | None:
-        """Create the passage of a crossing; None if the vehicle has already been counted."""
+        """Create and count the passage of a crossing; None if the vehicle was already counted."""
         crossing, pose, line = pending.crossing, pending.crossing.pose, pending.line
         direction = line.name, crossing.forward
         latest = self._latest.get(direction)
@@ -303,7 +303,7 @@ def _is_running(record: Track | SmoothedPose | Disturbance) -> bool:
 
 
 def _class_of(pose: Pose, settings: TrafficSettings) -> ClassPosterior:
-    """Classify a vehicle by the magnitude of its moment, and by its length if that is known."""
+    """Classify a vehicle by the magnitude of its moment, and by its length if available."""
     magnitude = float(np.linalg.norm(pose.moment))
     if not magnitude > 0.0:
         prior = np.array(settings.class_shares)

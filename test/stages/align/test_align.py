@@ -167,7 +167,7 @@ def test_burst_mode_does_not_mix_rounds_after_a_lost_sample():
 
 
 def test_burst_mode_compares_silent_sensors_with_the_newest_used_sample():
-    """The sample at 10 ms forms a separate frame, after a frame that includes 150 ms."""
+    """The sample at 10 ms forms a separate frame, after a frame with the sample at 150 ms."""
     align = stage(2, burst=True, period_s=1.0, max_wait_s=0.05)
     arrivals = [(0, 0), (10, 0), (150, 1), (155, 1)]
     assert [len(align.feed(one(sample(ms, j)))) for ms, j in arrivals] == [0, 0, 2, 1]

@@ -43,7 +43,7 @@ def test_batches_give_the_same_frames_as_single_samples(seed):
 
 
 def steady(n, n_readings, start=0, without=()):
-    """Batches every 10 ms, each with one sample from all sensors except the indices `without`."""
+    """Batches at 10 ms intervals, each with a sample of every sensor except those in `without`."""
     names = tuple(f'mag_{j + 1}' for j in range(n))
     present = np.array([j for j in range(n) if j not in without])
     return [Readings(names, present, np.full(len(present), 10**18 + k * 10**7),

@@ -1,4 +1,4 @@
-"""Clock step filter: distinction between a forward clock step and a gap of all sensors."""
+"""Clock step filter: distinguish a forward clock step from a gap in the samples of all sensors."""
 
 from math import inf
 
@@ -62,7 +62,8 @@ def test_samples_of_a_clock_that_steps_ahead_and_back_are_rejected(n, step):
     passed, rejected = run(clock_filter, arrivals)
     wrong = [a for a, b in zip(arrivals, stream(n, 0, 20_000, step), strict=True) if a != b]
     if n == 2 and step == 1000:
-        # Between two samples of the other sensor, the sensor is alone for longer than the limit.
+        # Between two samples of the correct sensor, only the stepped sensor reports for longer
+        # than the limit, so some of its samples pass.
         assert set(rejected) <= set(wrong)
         return
     assert rejected == wrong and len(wrong) == 7000 / step
@@ -102,7 +103,7 @@ def test_sensors_that_have_just_stopped_delay_a_jump_by_the_limit_only():
 
 @pytest.mark.parametrize('max_held', [20, 10_000])
 def test_sensors_that_stop_during_a_clock_step_delay_it_by_the_limit_only(max_held):
-    """Regression: the sensor that is ahead was rejected forever, although no other was active."""
+    """Regression: samples of the sensor ahead were rejected forever with no other sensor active."""
     clock_filter = filter_after(6, max_held=max_held)
     run(clock_filter, stepped(stream(6, 1000, 3000), {2}, 1500, 9999, by=1000))
     alone = [(2, t) for t in range(4000, 6000, 10)]
@@ -137,7 +138,7 @@ def test_a_clock_ahead_of_all_stays_held_when_the_others_jump():
 
 
 def test_a_clock_that_is_ahead_in_its_first_sample_is_rejected_by_majority():
-    """With two sensors, the correct clock is unknown and both pass; else the majority decides."""
+    """With two sensors, either clock may be correct and both pass; otherwise, the majority wins."""
     two = ClockStepFilter(2, LIMIT, 10)
     assert run(two, [(0, 0), (1, 5000)]) == ([(0, 0), (1, 5000)], [])
     three = ClockStepFilter(3, LIMIT, 10)

@@ -20,7 +20,7 @@ def test_level_noise_and_drift_are_learnt():
     drift = np.array([5e-9, -3e-9, 0.0])
     feed(b, np.arange(0, 30, 0.01), drift=drift)
     error = (b.level(30.0) - EARTH - 30.0 * drift) / SIGMA
-    # A line through 2000 samples, extrapolated by 1.5 s.
+    # Bound on the error of a line that is fitted to 2000 samples and extrapolated by 1.5 s.
     assert np.abs(error).max() < 4.5 * np.sqrt(1 / 2000 * (1 + 3 * (1 + 2 * 1.75 / 20) ** 2))
     std = np.sqrt(np.diagonal(b.covariance))
     np.testing.assert_allclose(std, SIGMA, rtol=5 / np.sqrt(2 * 2000))
@@ -155,7 +155,7 @@ def test_implausible_message_covariances_are_overruled_unless_trusted():
     own = np.diag([1e-16, 2e-16, 3e-16])
     s = stage()
     np.testing.assert_array_equal(fed(s, sample(1.0, covariance=own))[0].covariance, own)
-    # A missing covariance is replaced by the configured one.
+    # A missing covariance is replaced by the covariance from the network file.
     np.testing.assert_allclose(fed(s, sample(2.0))[0].covariance, 1.44e-16 * np.eye(3))
     # Rounding errors make all eigenvalues of half of the rank-one products positive.
     bad = [-own, np.zeros((3, 3)), np.diag([1e-16, 2e-16, np.nan]),
@@ -310,7 +310,7 @@ def test_blocks_of_many_sensors_end_at_staggered_times():
     for j in range(n):
         ends, background = ends_of_blocks(j / n, times)
         assert background.ready
-        # Rounding errors amount to one reading.
+        # Rounding errors move an end by at most one reading.
         np.testing.assert_allclose(np.diff(ends), 25, atol=1.1)
         assert ends[0] == pytest.approx(25 * (1.0 + j / n), abs=1.1)
         ends_of_all += ends

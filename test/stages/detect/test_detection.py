@@ -62,7 +62,7 @@ def test_the_false_alarm_rate_is_as_configured(p):
 
 @pytest.mark.parametrize('per_frame, documented, tested', [
     (1, '3.5e-4 per frame of one sample (12.5 Hz)', 1e-3),
-    (8, '1.5e-7 per frame of eight (100 Hz)', 0.05)])
+    (8, '1.5e-7 per frame of eight samples (100 Hz)', 0.05)])
 def test_the_default_false_alarm_probability_is_as_documented(per_frame, documented, tested):
     """The noise is 12 nT per sample, with `per_frame` samples per frame and `background_std`."""
     settings, variance = DetectSettings(), SIGMA**2 / per_frame
@@ -72,7 +72,7 @@ def test_the_default_false_alarm_probability_is_as_documented(per_frame, documen
     text, = (f.metadata['doc'] for f in fields(DetectSettings)
              if f.name == 'background_std')
     assert documented in text
-    # Test of the stage. With eight samples, a higher probability gives enough alarms to count.
+    # The stage itself is tested with a probability that causes enough alarms to count.
     network, rng, n = line_network(2), np.random.default_rng(12), 60_000
     stage = Detect(network, replace(settings, {'false_alarm_probability': tested,
                                                'release_probability': 0.05}))
@@ -188,7 +188,8 @@ def test_onset_needs_consecutive_frames_and_the_hold_bridges_gaps():
                 events.append((k, r.onset, r.id))
             else:
                 present.append(r.target_present)
-    # Three loud frames are an onset, two are not; the hold bridges a short quiet interval.
+    # Three consecutive frames above the threshold are an onset, two are not; the hold time
+    # bridges a short quiet interval.
     assert events == [(8, True, 1), (19, False, 1)]
     assert present == [8 <= k < 19 for k in range(len(pattern))]
 

@@ -118,7 +118,7 @@ def events_of(readings, network=NETWORK, batch=None):
 
 
 def truth_of(name, sensor):
-    """True (time of the CPA [ns], whether the vehicle passed from left to right)."""
+    """Ground truth: (time of the CPA [ns], whether the vehicle passed from left to right)."""
     ((stamps, position, _),) = recorded(name).truth.values()
     r = position - NETWORK.positions[NETWORK.index(sensor)]
     k = int(np.linalg.norm(r, axis=1).argmin())

@@ -113,7 +113,7 @@ def faulty(fault):
     ('dead', True, 'x does not change'),
     ('axis', False, 'z is missing in 300 of 3000 readings'),
     ('nothing', True, '300 of 3000 readings have no valid axis'),
-    ('gauss', True, 'a field of 0.514 T is rejected, the limit is 0.001 T'),
+    ('gauss', True, 'the field of 0.514 T exceeds the limit of 0.001 T'),
     ('noisy', False, 'y is 10 times as noisy as at its calibration'),
 ])
 def test_each_fault_is_named(fault, serious, message):
@@ -276,7 +276,7 @@ def test_clocks_far_apart_are_named_and_the_age_of_a_replay_is_not():
         findings = [str(f) for f in doctor.findings()]
         assert len(findings) == n, findings
         assert not n or findings[0].startswith(
-            'mag_2: its timestamps differ by -120 s from those of other')
+            'mag_2: its timestamps differ by -120 s from the timestamps of other sensors')
 
 
 def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
@@ -285,7 +285,7 @@ def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
     assert len(steps) == 2 and 'its background has been frozen for 5' in steps[1]
     assert 'its background is doubtful' in steps[0]
     parked = doctor_findings(lambda k, field: field + 1e-6 * (k > 1000), seconds=155.0)
-    assert len(parked) == 1 and 'became its background 1 times' in parked[0]
+    assert len(parked) == 1 and 'became its background 1 time;' in parked[0]
     early = doctor_findings(seconds=2.0)
     assert len(early) == 3 and all('no background was learnt' in text for text in early)
 

@@ -26,7 +26,7 @@ CLOCK = np.array([0.0, 0.0213, -0.0087])
 
 
 def nominal(n=3, earth=EARTH, **changes):
-    """Network file before the survey: all sensors are upright, with x to the east."""
+    """Create the network before the survey: all sensors are upright, with x to the east."""
     names = tuple(f'mag_{i + 1}' for i in range(n))
     return SensorNetwork(names, np.arange(3.0 * n).reshape(n, 3), np.tile(np.eye(3), (n, 1, 1)),
                          tuple(f'/{name}/imu/mag' for name in names), earth_field=earth, **changes)
@@ -84,7 +84,7 @@ def test_orientations_and_clock_offsets_are_found():
         np.testing.assert_allclose(std[:2], 0.05 / 9.81, rtol=0.01)
         assert result.network.clock_offset[j] == pytest.approx(CLOCK[j], abs=1e-3)
         record = result.network.calibrated[j]
-        assert (record.date, record.by) == (DATE, 'accelerometer, compass and stated heading')
+        assert (record.date, record.by) == (DATE, 'accelerometer, compass and nominal heading')
         assert record.clock_offset_std < 1e-3
     assert result.bias_std < 6e-7
     t, s = result.shocks['mag_2']
@@ -121,7 +121,7 @@ def test_tilt_and_clock_offset_are_found_without_an_earth_field():
     result, _ = surveyed(nominal(earth=None))
     assert warnings(result) == {}
     for s, R in zip(result.sensors, ROTATIONS, strict=True):
-        assert s.by == 'accelerometer, heading as stated'
+        assert s.by == 'accelerometer, nominal heading'
         np.testing.assert_allclose(s.orientation.R_ws.T[:, 2], R.as_matrix()[2], atol=1e-3)
         assert np.degrees(s.orientation.std[2]) == pytest.approx(5.0)
     assert result.network.clock_offset[1] == pytest.approx(CLOCK[1], abs=1e-3)
@@ -135,7 +135,7 @@ def test_a_sensor_without_accelerations_keeps_its_stated_orientation():
     assert warnings(result) == {
         'mag_2': ('no accelerations; the orientation is not surveyed',)}
     s = result.sensors[1]
-    assert (s.orientation, s.by, s.lag) == (None, 'as stated', None)
+    assert (s.orientation, s.by, s.lag) == (None, 'nominal orientation', None)
     np.testing.assert_array_equal(result.network.R_ws[1], np.eye(3))
     assert result.network.orientation_std[1] is result.network.calibrated[1] is None
     assert 'mag_2' not in result.shocks and result.network.clock_offset[1] == 0.0
@@ -149,7 +149,7 @@ def test_a_survey_without_data_keeps_the_network():
 
 
 def changed(name, function):
-    """Create a `change` that applies a function to the accelerations of one sensor."""
+    """Create a `change` for `surveyed` that applies a function to one sensor's accelerations."""
     def change(readings):
         readings[name] = [(stamp, function(a)) for stamp, a in readings[name]]
     return change
@@ -201,7 +201,7 @@ def test_a_tilted_sensor_is_named_and_levelled():
     np.testing.assert_allclose(result.network.R_ws[1], rotations[1].as_matrix(), atol=0.04)
     # The Earth field is compared in the surveyed orientation, not in the nominal orientation.
     assert result.disagreements == ()
-    assert result.sensors[1].by == 'accelerometer, compass and stated heading'
+    assert result.sensors[1].by == 'accelerometer, compass and nominal heading'
 
 
 def test_a_compass_heading_far_from_the_stated_heading_is_named():
@@ -212,7 +212,7 @@ def test_a_compass_heading_far_from_the_stated_heading_is_named():
         'retained',)}
     np.testing.assert_allclose(result.network.R_ws[1], np.eye(3), atol=2e-3)
     assert np.degrees(result.network.orientation_std[1][2]) == pytest.approx(5.0)
-    assert result.sensors[1].by == 'accelerometer, heading as stated'
+    assert result.sensors[1].by == 'accelerometer, nominal heading'
 
 
 def test_a_sensor_with_a_flipped_axis_keeps_its_stated_heading():
@@ -226,8 +226,8 @@ def test_a_sensor_with_a_flipped_axis_keeps_its_stated_heading():
     assert abs(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])) < 2e-3
     # The tilt is taken from the accelerometer, which is valid.
     np.testing.assert_allclose(R[2], ROTATIONS[2].as_matrix()[2], atol=1e-3)
-    assert result.sensors[2].by == 'accelerometer, heading as stated'
-    assert result.sensors[1].by == 'accelerometer, compass and stated heading'
+    assert result.sensors[2].by == 'accelerometer, nominal heading'
+    assert result.sensors[1].by == 'accelerometer, compass and nominal heading'
     assert result.bias_std < 6e-7
 
 
@@ -236,7 +236,7 @@ def test_a_vertical_field_gives_one_warning_per_sensor():
           zip(('mag_1', 'mag_2', 'mag_3'), ROTATIONS, strict=True)}
     result, _ = surveyed(nominal(earth=np.array([0.0, 0.0, -5e-5])), fields=up)
     for s in result.sensors:
-        assert s.by == 'accelerometer, heading as stated'
+        assert s.by == 'accelerometer, nominal heading'
         assert len(s.warnings) == 1 and 'heading is not observable' in s.warnings[0]
 
 
@@ -251,7 +251,7 @@ def test_the_stated_heading_decides_between_two_headings_that_fit(stated_yaw, of
     fields = {name: R.inv().apply(EARTH) for name, R in zip(network.names, rotations, strict=True)}
     fields['mag_2'] = fields['mag_2'] * [1.0, np.nan, np.nan]
     result, _ = surveyed(network, rotations, fields=fields)
-    assert result.sensors[1].by == 'accelerometer, compass and stated heading'
+    assert result.sensors[1].by == 'accelerometer, compass and nominal heading'
     error = np.degrees(Rotation.from_matrix(
         result.network.R_ws[1] @ rotations[1].as_matrix().T).as_rotvec())
     assert np.abs(error).max() < 2.0

@@ -1,4 +1,4 @@
-"""Traffic counting: passages of counting lines, their order, and the check of the direction."""
+"""Traffic counting: line crossings, their order, and direction checks."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ STEP = 0.1
 
 
 def drive(begin_s, end_s, at_s, v=10.0, y=-1.5, **changes):
-    """Records {step: [Track]} of a vehicle that crosses the line at `at_s`, including the end."""
+    """Track records {step: [Track]}, including the end, of a vehicle on the line at `at_s`."""
     steps = range(round(begin_s / STEP), round(end_s / STEP) + 1)
     out = {k: [track_pose(k * STEP, v * (k * STEP - at_s), y, v, **changes)] for k in steps}
     out[steps[-1]].append(replace(out[steps[-1]][0], ended=True))
@@ -104,7 +104,7 @@ def test_two_vehicles_that_meet_are_both_counted(ends):
     records, _ = counted(drive(2.0, ends[0], 4.0), drive(2.0, ends[1], 4.2, -12.0, 1.5, id=2),
                          field_at=field_of(1.0))
     assert [(p.track_id, p.forward) for p in passages(records)] == [(1, True), (2, False)]
-    # The fields contain both vehicles, so they confirm no direction.
+    # The fields of the two vehicles overlap, so the directions are not checked.
     assert all(np.isnan(p.direction_error) for p in passages(records))
 
 
