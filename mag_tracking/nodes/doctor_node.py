@@ -92,7 +92,7 @@ class DoctorResult:
     findings: list[Finding]
     """Result of `DoctorNode.findings`."""
     status: int = 1
-    """Exit status if the middleware does not shut down; to be set after the report is written."""
+    """Exit status of the process if the middleware hangs. The caller sets it after the report."""
 
 
 @contextmanager

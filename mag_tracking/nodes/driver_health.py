@@ -59,7 +59,7 @@ class DriverDiagnostics:
         if not active:
             message = 'not active'
         elif not served:
-            level, message = DiagnosticStatus.ERROR, 'driver thread has ended: restart the node'
+            level, message = DiagnosticStatus.ERROR, 'the driver thread has ended: restart the node'
         elif driver.fault:
             level, message = DiagnosticStatus.ERROR, driver.fault
         elif not driver.is_open:

@@ -34,7 +34,7 @@ from mag_tracking.web.page_server import TICK_S, PageServer
 NICENESS = 10
 """Scheduling niceness of the process, which must not delay the nodes."""
 MAX_FRAMES = 64
-"""Number of recent serialised frames that are stored for matching with tracks."""
+"""Maximum number of serialised frames stored for the next tick."""
 MAX_TRACKS = 1000
 """Maximum number of track messages stored for the next tick."""
 TRACKS = 'mag_tracking_msgs/msg/TrackArray'
@@ -103,7 +103,7 @@ class PageNode(Node):
                                      RESULTS)]
 
     def _find_tracker(self) -> list[str]:
-        """Subscribe to the only tracker of the namespace; return the track topics of all."""
+        """Return all track topics in the namespace; if there is only one, follow its tracker."""
         namespace = self.get_namespace().rstrip('/')
         topics = [name for name, kinds in self.get_topic_names_and_types()
                   if TRACKS in kinds and name.startswith(f'{namespace}/')

@@ -1,4 +1,4 @@
-"""Run all nodes in one process; a replacement for the launch file without `ros2 launch`."""
+"""Run all nodes in one process; replaces the launch file where `ros2 launch` is missing."""
 
 import signal
 import sys

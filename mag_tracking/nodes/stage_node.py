@@ -38,8 +38,8 @@ from mag_tracking.stages.stage import Stage
 RESULTS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of results for users."""
 STREAM = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of subscriptions between the nodes, and of a replay, which may be fast. The queue is long
-enough for the time that the tracker needs to initiate a track."""
+"""QoS of subscriptions between the nodes, and of the topics of a replay, which may be fast. The
+queue does not overflow while the tracker initiates a track."""
 STREAM_OUTPUT = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of publishers between the nodes. A restarted node can skip at most 256 older messages with a
 single request (RTPS 2.3, 8.3.5.5). With a longer history, a second request would follow seconds
@@ -147,7 +147,7 @@ class StageNode(Node):
         return tuple(map(self.resolve_topic_name, self.network.topics))
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """Stages whose counts are published.
+        """Stages whose counts are published in diagnostics, by name.
 
         Returns
         -------
@@ -171,7 +171,7 @@ class StageNode(Node):
         Parameters
         ----------
         role : str
-            Role of the next step, for messages.
+            Role of the next step, such as `tracker`; used in messages.
         topic : str
         publishes : str
             Message type that identifies the node of the next step among the subscribers.
@@ -298,7 +298,7 @@ class StageNode(Node):
             return None
 
     def _publish_diagnostics(self) -> None:
-        """Publish the counts of the stages; warn of new rejections."""
+        """Publish the counts of the stages and the state of the connections; log a new state."""
         statuses, queues = [], self.queues()
         for name, stage in self.stages().items():
             rejections = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')}
@@ -332,7 +332,7 @@ class StageNode(Node):
                           f'one process, -r {self.get_name()}:__node:=NAME)')
         if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
             faults.append('use_sim_time is set, but no message was received on /clock: start a '
-                          'replay, or unset it')
+                          'replay, or unset use_sim_time')
         return [DiagnosticStatus(
             level=DiagnosticStatus.ERROR if faults else DiagnosticStatus.OK,
             name=f'{self.title}: start', hardware_id='magnetometer network',

@@ -79,7 +79,8 @@ def test_a_silent_input_is_reported_until_it_returns(clock):
     assert silent.message == 'no message from a_node for 3 s'
     gone = status_of(flow, sender_exists=False)
     assert gone.level == DiagnosticStatus.ERROR
-    assert gone.message == silent.message + ', and its publisher is gone: check that it is running'
+    assert gone.message == silent.message + ', and its topics have no publisher: ' \
+        'check that it is running'
     flow.add(0, 0, clock[0])
     assert status_of(flow).message == 'running'
 
