@@ -71,7 +71,8 @@ def add_page(parser: argparse.ArgumentParser, port: bool = True) -> None:
     """
     if port:
         parser.add_argument('--port', type=int, default=DEFAULT_PORT, metavar='PORT',
-                            help=f'port of the page (default: {DEFAULT_PORT}; 0: any free port)')
+                            help=f'port of the page (default: {DEFAULT_PORT}; 0 selects a free '
+                            'port)')
     parser.add_argument('--host', default=LOOPBACK, metavar='ADDRESS', help='local address of '
                         f'the page (default: {LOOPBACK})')
 
