@@ -129,7 +129,7 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _print_evaluation(evaluation: Evaluation) -> None:
-    """Print the scores of an evaluation."""
+    """Print the accuracy, recall and calibration error of an evaluation."""
     print(f'  largest class: {evaluation.majority:.1%} (accuracy of a constant prediction)')
     for name, values in (('accuracy', evaluation.accuracy),
                          ('balanced accuracy', evaluation.balanced_accuracy),

@@ -147,7 +147,7 @@ def page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator
         If the port cannot be opened.
     """
     check_port(host, port)
-    # The process ends when its stdin is closed, even if this process is killed.
+    # The page process ends when its stdin is closed, even if this process is killed.
     process = subprocess.Popen([
         sys.executable, '-m', 'mag_tracking.cli', 'watch', '--host', host, '--port', str(port),
         '--until-eof', *ros_arguments], stdin=subprocess.PIPE)

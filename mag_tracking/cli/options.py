@@ -15,7 +15,7 @@ from mag_tracking.network.topics import checked_namespace
 
 # Quoted because the class is not generic at run time.
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
-"""Subparsers of the main parser, to which each module adds its commands."""
+"""Subparsers of the main parser, to which each command is added."""
 
 FIGURES = ('.png', '.pdf', '.svg')
 """File name extensions accepted for figures."""

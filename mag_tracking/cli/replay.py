@@ -149,7 +149,7 @@ def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None
 
 
 def _overview(path: Path, summary: dict[str, Any]) -> str:
-    """Format the name of the recording and the number of its tracks by verdict."""
+    """Format the name of the recording and the number of tracks with each verdict."""
     verdicts = Counter(t['verdict'] for t in summary['tracks'])
     counts = ', '.join(f'{n} {verdict}' for verdict, n in verdicts.most_common())
     return (f'{path.name}: {quantity(len(summary["tracks"]), "track")}'

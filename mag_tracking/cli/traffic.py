@@ -159,7 +159,7 @@ def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetP
 
 
 def _vehicle(identification: Identification | None) -> dict[str, Any]:
-    """Table columns of the identified vehicle; empty without a fleet."""
+    """Table columns of the identified vehicle; an empty dict without a fleet file."""
     return {} if identification is None else {
         'vehicle': identification.name,
         'p_vehicle': identification.probabilities.get(identification.name, np.nan)}

@@ -42,7 +42,9 @@ class BackgroundStore:
         self._next_write = 0.0
 
     def restore(self, network: SensorNetwork) -> None:
-        """Pass the stored backgrounds to the stage, which checks them against the first readings.
+        """Pass the stored backgrounds to the stage, which restores each at the first reading.
+
+        Outdated backgrounds are not restored; invalid backgrounds are logged.
 
         Parameters
         ----------

@@ -196,12 +196,12 @@ class CalibrationNode(StageNode):
         return ', '.join(parts)
 
     def queues(self) -> dict[str, int]:
-        """Number of queued readings.
+        """Number of queued readings of each stage.
 
         Returns
         -------
         dict of str to int
-            Number by name of the stage.
+            {name of the stage: number}.
         """
         return {'calibrate': self._stage.n_held}
 
@@ -210,7 +210,7 @@ class CalibrationNode(StageNode):
         return self.flows['sensors'].is_live
 
     def _receive(self, sensor: str, message: MagneticField) -> None:
-        """Calibrate a raw reading and publish the result."""
+        """Calibrate a raw reading; publish the readings that are no longer held."""
         raw = reading_of(message, sensor)
         publisher = self._publishers_by_sensor[sensor]
         for calibrated in self._calibrate_readings(raw):
@@ -221,7 +221,7 @@ class CalibrationNode(StageNode):
         self._do_deferred_work()
 
     def _receive_batch(self, message: FieldReadings) -> None:
-        """Calibrate raw readings of many sensors and publish them as one message."""
+        """Calibrate a batch of raw readings and publish the result as one message."""
         raw = self.readings_of(message, self._stage)
         if raw is None:
             return

@@ -96,12 +96,12 @@ class DetectionNode(StageNode):
         return {'align': self._align, 'detect': self._detect, **events}
 
     def queues(self) -> dict[str, int]:
-        """Number of queued readings.
+        """Number of queued readings of each stage.
 
         Returns
         -------
         dict of str to int
-            Number by name of the stage.
+            {name of the stage: number}.
         """
         events = {} if self._events is None else {'events': sum(map(len, self._event_backlog))}
         return {'align': self._align.n_held, **events}

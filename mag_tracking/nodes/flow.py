@@ -162,7 +162,7 @@ class SubscriberMonitor:
 
     def status(self, node: str, names: Collection[str],
                types_of: Callable[[str], Collection[str]]) -> DiagnosticStatus:
-        """Diagnostics of the next step.
+        """Diagnostics of the connection to the next step.
 
         Parameters
         ----------

@@ -176,7 +176,7 @@ class PageNode(Node):
                 self._scene.add_track(track_of(message))
 
     def _update_health(self) -> None:
-        """Update the notes on faults and the table of all statuses."""
+        """Update the notes on faults and the table of all diagnostics on the page."""
         now = time.monotonic()
         notes, rows = [], []
         for name, (received, status) in sorted(self._statuses.items()):
@@ -190,7 +190,7 @@ class PageNode(Node):
                                [Table('Health', ['node', 'level', 'message'], rows)])
 
     def _missing_topics(self) -> Iterator[Note]:
-        """Notes on topics without a publisher."""
+        """Yield notes on missing topics or sensor positions, and on several trackers."""
         topics = self._find_tracker()
         if len(topics) > 1 and self._tracks_topic not in topics:
             yield Note(WARNING, f'several trackers: {", ".join(topics)}; select one (--ros-args -r '

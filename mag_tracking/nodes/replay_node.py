@@ -36,7 +36,7 @@ from mag_tracking.recording.reader import Recording
 TICK_S = 0.005
 """[s] Interval of the checks for due messages."""
 MAX_STEP_S = 0.02
-"""[s] Maximum elapsed time of one tick; playback does not catch up after a longer stall."""
+"""[s] Maximum advance of one tick (at rate 1); playback does not catch up after a longer stall."""
 MAX_MESSAGES_PER_TICK = 200
 """Maximum number of messages published per tick; at most the queue length of the nodes."""
 

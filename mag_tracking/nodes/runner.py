@@ -45,7 +45,7 @@ class TrackPrinter(Node):
     topic : str
         Topic of the tracks.
     every : int
-        Print only every n-th pose.
+        Print only every `every`-th pose of a track.
     out : text stream
         Output stream.
     """
@@ -173,7 +173,7 @@ def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike |
 
 
 def all_connected(stages: list[StageNode], replay: ReplayNode) -> bool:
-    """Whether each played topic of a sensor has a subscriber.
+    """Whether each sensor topic that is replayed has a subscriber.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
     loop : bool
         Restart the recording at its end.
     observers : sequence of functions, optional
-        Functions that create further nodes; called after `rclpy.init`. By default, one function
+        Functions that create additional nodes; called after `rclpy.init`. By default, one function
         that creates a `TrackPrinter`.
     drivers : path, optional
         Drivers file; if given, a driver node is also run.

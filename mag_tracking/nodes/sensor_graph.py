@@ -69,7 +69,7 @@ def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, s
     topic : str
         Absolute topic name.
     known : mapping of str to str
-        Topics of all sensors of the network, which are not suggested.
+        Topic of each sensor of the network; these topics are not suggested.
 
     Returns
     -------

@@ -44,7 +44,7 @@ class HealthDiagnostics:
     network : SensorNetwork
     settings : Settings
     node : Node, optional
-        Provides the remapped topics of the sensors and their publishers.
+        Node that resolves the sensor topics and whose graph is examined for their publishers.
     is_replayed : bool
         Whether the readings come from a recording, so that old timestamps are not a fault.
     """

@@ -54,7 +54,7 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of /tf, as in tf2."""
 READY = 'ready'
-"""State of a node that receives input and works normally."""
+"""State of a node that has received input and operates normally."""
 
 _Record = TypeVar('_Record')
 
@@ -156,12 +156,12 @@ class StageNode(Node):
         raise NotImplementedError
 
     def queues(self) -> dict[str, int]:
-        """Number of queued records.
+        """Number of queued records of each stage.
 
         Returns
         -------
         dict of str to int
-            Number by name of the stage.
+            {name of the stage: number}.
         """
         return {}
 

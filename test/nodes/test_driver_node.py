@@ -33,7 +33,7 @@ board:
 
 
 def line_of(sensor, k, tick):
-    """Line with sequence number `k` at a tick of 10 ms, from a level sensor; x [nT] encodes `tick`."""
+    """Line number `k` of a level sensor at a tick of 10 ms; x [nT] encodes the tick."""
     body = f'{sensor},{k},{10_000 * tick},{2000 + tick},15500,-49000,0,0,1'
     checksum = 0
     for c in body.encode():
