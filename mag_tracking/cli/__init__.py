@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parse(words: Sequence[str]) -> argparse.Namespace:
-    """Parse the command line; the parser is imported here, because this takes most of a second."""
+    """Parse the command line. The parser is imported here, because it takes most of a second."""
     from mag_tracking.cli.commands import parse
 
     return parse(words)

@@ -88,6 +88,6 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _module_of(word: str) -> str | None:
-    """Module of the command whose name or alias is `word`; None if there is none."""
+    """Module of the command whose name or alias is `word`; None if no command matches."""
     return next((command.module for name, command in COMMANDS.items()
                  if word in (name, *command.aliases)), None)

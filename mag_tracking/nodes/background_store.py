@@ -17,7 +17,7 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 
 WRITE_EVERY_S = 5.0
-"""[s] Interval between writes, or a quarter of `calibrate.max_resume_gap_s` if that is shorter."""
+"""[s] Interval between writes, unless a quarter of `calibrate.max_resume_gap_s` is shorter."""
 
 
 class BackgroundStore:

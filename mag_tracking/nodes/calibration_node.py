@@ -164,7 +164,7 @@ class CalibrationNode(StageNode):
     def _survey_path(self) -> Path:
         """Path to which a survey is saved; never the network file, which is edited by hand."""
         save_as = fixed_parameter(self, 'save_as', '', 'Network file to which a survey is saved. '
-                                  'If empty, it is named <network>_calibrated.yaml.')
+                                  'If empty, <network>_calibrated.yaml is used.')
         path = self.network_path
         return self._output_path('save_as', save_as or f'{path.stem}_calibrated.yaml')
 
@@ -210,7 +210,7 @@ class CalibrationNode(StageNode):
         return self.flows['sensors'].is_live
 
     def _receive(self, sensor: str, message: MagneticField) -> None:
-        """Calibrate a raw reading; publish the readings that are no longer held."""
+        """Calibrate a raw reading and publish the resulting readings, if any."""
         raw = reading_of(message, sensor)
         publisher = self._publishers_by_sensor[sensor]
         for calibrated in self._calibrate_readings(raw):

@@ -42,7 +42,7 @@ takes several seconds."""
 
 
 class DriverNode(ManagedNode):
-    """Runs one thread per device, which publishes its readings.
+    """Runs one thread per device, which publishes the readings of the device.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Inspection and control of a ROS graph; a substitute for `ros2`, which PyPI lacks."""
+"""Inspection and control of a ROS graph; a substitute for `ros2`, which is not on PyPI."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -139,7 +139,7 @@ class PageNode(Node):
         self._tracks.extend(message.tracks)
 
     def _receive_smoothed(self, message: SmoothedTrack) -> None:
-        """Add the smoothed path of an ended track."""
+        """Add the smoothed path of an ended track to the scene."""
         self._tick()
         points = [p.pose.pose.position for p in message.poses]
         self._scene.add_smoothed(message.track_id, np.array([[p.x, p.y, p.z] for p in points]))
@@ -156,7 +156,7 @@ class PageNode(Node):
         return namespace == self.get_namespace().strip('/')
 
     def _tick(self) -> None:
-        """Add received messages to the scene: all frames during a track, otherwise the latest."""
+        """Add received tracks and frames to the scene; without tracks, only the latest frame."""
         if not len(self._layout):
             return
         raw = list(self._frames)

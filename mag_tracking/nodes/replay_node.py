@@ -34,7 +34,7 @@ from mag_tracking.nodes.stage_node import STREAM
 from mag_tracking.recording.reader import Recording
 
 TICK_S = 0.005
-"""[s] Interval of the checks for due messages."""
+"""[s] Interval between checks for due messages."""
 MAX_STEP_S = 0.02
 """[s] Maximum advance of one tick (at rate 1); playback does not catch up after a longer stall."""
 MAX_MESSAGES_PER_TICK = 200

@@ -45,7 +45,7 @@ class TrackPrinter(Node):
     topic : str
         Topic of the tracks.
     every : int
-        Print only every `every`-th pose of a track.
+        Print only every `every`-th pose.
     out : text stream
         Output stream.
     """
@@ -58,7 +58,7 @@ class TrackPrinter(Node):
         self.create_subscription(TrackArray, topic, self._receive, STREAM)
 
     def _receive(self, message: TrackArray) -> None:
-        """Print one line per pose."""
+        """Print every `every`-th pose, and the end of each track."""
         for track in map(track_of, message.tracks):
             if track.ended:
                 print(f'track {track.id} has ended', file=self._out, flush=True)

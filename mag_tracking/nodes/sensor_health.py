@@ -33,7 +33,7 @@ MIN_READINGS = 64
 STARTUP_S = 3.0
 """[s] Time after the start during which a silent sensor is not a fault."""
 LEARNING_TIMEOUT_FACTOR = 3.0
-"""A background that is still unknown after this multiple of the learning time is a fault."""
+"""A background that is unknown after this multiple of the learning time, plus 5 s, is a fault."""
 
 
 class HealthDiagnostics:

@@ -247,7 +247,7 @@ class StageNode(Node):
 
     def direct_input(self, source: str, topics: Sequence[str], callback: Callable[[_Record], None],
                      stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
-        """Create a function that receives records of the preceding step, instead of subscriptions.
+        """Create a function that receives the records of the preceding step in place of a topic.
 
         Parameters
         ----------
@@ -322,7 +322,7 @@ class StageNode(Node):
         self.report_state()
 
     def _start_statuses(self) -> list[DiagnosticStatus]:
-        """Status of the start of the node: duplicate name, missing clock."""
+        """Status that reports faults of the start: a duplicate node name or a missing clock."""
         faults = []
         full_name = self.get_name(), self.get_namespace()
         n_same = self.get_node_names_and_namespaces().count(full_name)
