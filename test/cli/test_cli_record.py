@@ -132,6 +132,6 @@ def test_repair_writes_the_index(tmp_path, capsys):
     file.write_bytes(file.read_bytes()[:-20])
     args = arguments_of('repair', tmp_path / 'a')
     assert args.run_command(args) == 0
-    assert capsys.readouterr().out == (f'a_0.mcap: 1 messages, index written\n{tmp_path / "a"}: '
+    assert capsys.readouterr().out == (f'a_0.mcap: index written; messages: 1\n{tmp_path / "a"}: '
                                        'files repaired: 1\n')
     assert Recording(tmp_path / 'a').message_counts == {'/x': 1}
