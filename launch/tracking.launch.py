@@ -14,7 +14,7 @@ from launch import LaunchDescription
 
 
 def config(name):
-    """Path of a file in config/.
+    """Path of a file in the installed folder config/.
 
     Parameters
     ----------
@@ -44,14 +44,16 @@ def launch_arguments():
         DeclareLaunchArgument('params', default_value=config('empty.yaml'),
                               description='Parameter file of the nodes.'),
         DeclareLaunchArgument('drivers', default_value='',
-                              description='Drivers file; starts driver_node.'),
+                              description='Path of a drivers file. If set, driver_node is '
+                              'started.'),
         DeclareLaunchArgument('batches', default_value='false',
                               description='Publish the readings of many sensors in one '
                               'message.'),
         DeclareLaunchArgument('recording', default_value='',
-                              description='Recording; starts replay_node.'),
+                              description='Path of a recording. If set, replay_node is '
+                              'started.'),
         DeclareLaunchArgument('rate', default_value='1.0',
-                              description='Playback rate; 1 = as recorded.'),
+                              description='Playback rate relative to the recorded rate.'),
     ]
 
 

@@ -1,4 +1,4 @@
-"""The command `mag-tracking`; each module registers one or several related commands."""
+"""The command `mag-tracking`: entry point, signals and exit status."""
 
 import argparse
 import io
@@ -17,7 +17,7 @@ INTERRUPTED_MESSAGE = 'mag-tracking: interrupted'
 """Message printed after Ctrl-C."""
 
 BROKEN_PIPE_STATUS = 128 + signal.SIGPIPE
-"""Exit status if the reader of stdout has closed the pipe, as usual for commands."""
+"""Exit status if the reader of stdout has closed the pipe, as for other Unix commands."""
 
 
 def command() -> NoReturn:
@@ -42,15 +42,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     int
         Exit status: 0 for success, 1 for an error that has been printed, 130 after Ctrl-C.
-        Further values depend on the command and are described in its help text.
+        Some commands return other values, which their help texts describe.
     """
     words = sys.argv[1:] if argv is None else argv
     for word in words:
-        # Paths cannot contain NUL, but each function with a path reports this differently.
+        # Paths cannot contain NUL, but functions that take a path report this in different ways.
         if '\0' in word:
             print(f'mag-tracking: {word!r} contains a NUL character', file=sys.stderr)
             return 1
-    # A file name may not be valid UTF-8; by default stderr escapes it and stdout fails.
+    # A file name may be invalid UTF-8. By default, stderr escapes it, but stdout raises an error.
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == 'strict':
         sys.stdout.reconfigure(errors='backslashreplace')
     if words[:1] == ['run']:
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parse(words: Sequence[str]) -> argparse.Namespace:
-    """Parse the command line. The imports are deferred because they take most of a second."""
+    """Parse the command line. The parser is imported here, because it takes most of a second."""
     from mag_tracking.cli.commands import parse
 
     return parse(words)

@@ -15,10 +15,10 @@ from mag_tracking.interrupts import recorded_signals
 from mag_tracking.quantities import quantity
 
 _ARCHIVE = '''
-Tracks many or long recordings on several processors or machines. The results equal those of
-`mag-tracking replay` for each recording; long recordings are divided during quiet intervals. An
+Tracks many or long recordings on several processors or machines. Each recording has the same
+results as with `mag-tracking replay`; long recordings are divided while no target is present. An
 interrupted run continues when the same command is run again; completed recordings are skipped. A
-recording that fails is listed with the reason and does not stop the other recordings.
+recording that fails is listed with the reason and does not stop the run.
 
 Parquet files written to DIR:
   tracks/             one row per track
@@ -54,7 +54,7 @@ def add(commands: Commands) -> None:
     add_settings(p)
     executor = p.add_mutually_exclusive_group()
     executor.add_argument('--workers', type=int, metavar='N', default=os.cpu_count() or 1,
-                          help='number of processes on this machine (default: all processors)')
+                          help='number of processes on this machine (default: one per processor)')
     executor.add_argument('--scheduler', metavar='ADDRESS',
                           help='address of a running Dask scheduler (e.g. tcp://10.0.0.5:8786)')
 

@@ -35,10 +35,12 @@ are estimated. Without a tracker, --unknown-poses also estimates the poses, with
 from --low to --high. The poses should fill the working volume, with the magnet tilted in
 various directions: 162 poses were sufficient for 41 sensors.
 
-TABLE is a CSV file with one row per pose: x0,y0,z0,x1,... [T, sensor frame; empty = not
-measured], mag_x0,mag_y0,mag_z0 [m], mag_mx0,mag_my0,mag_mz0 (unit vector).
+TABLE is a CSV file with one row per pose: the readings x0,y0,z0,x1,... [T, sensor frame; empty
+if not measured], the position mag_x0,mag_y0,mag_z0 of the magnet [m] and the direction of its
+moment mag_mx0,mag_my0,mag_mz0 (unit vector).
 
---params sets the prior knowledge, as standard deviations (0 = exactly known):
+--params overrides these settings, most of which are prior standard deviations (0 fixes the
+quantity):
 {settings}
 
 examples:
@@ -70,11 +72,11 @@ def add(commands: Commands) -> None:
                    help='magnitude of the magnet\'s moment [A m^2]')
     p.add_argument('--out', required=True, type=Path, metavar='FILE',
                    help='network file to write')
-    p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise of one reading, for '
-                   'sensors without noise_std in the network file '
+    p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise standard deviation '
+                   'of one reading, for sensors without noise_std in the network file '
                    f'(default: {ASSUMED_NOISE:g}, not written to the output)')
     p.add_argument('--unknown-poses', action='store_true',
-                   help='estimate the poses of the magnet (no tracker)')
+                   help='estimate the poses of the magnet, if there is no tracker')
     for name, corner in (('--low', 'lower'), ('--high', 'upper')):
         p.add_argument(name, nargs=3, type=float, metavar=('X', 'Y', 'Z'),
                        help=f'{corner} corner of the box that contains the magnet [m]')
@@ -140,7 +142,7 @@ def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[fl
 
 @contextmanager
 def _elapsed_time(task: str) -> Iterator[None]:
-    """Print the task and, on a terminal, the elapsed time; the total time is not predictable."""
+    """Print the task and, on a terminal, the elapsed time of the block."""
     stop = threading.Event()
     bar = tqdm(desc=task, bar_format='{desc}: {elapsed}', disable=None)
     if bar.disable:
@@ -171,9 +173,9 @@ def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
         _print_magnet(g, has_unknown_poses)
     n_unused = survey.n_poses - len(survey.rows)
     print(f'{len(survey.rows)} of {survey.n_poses} poses used, normalised cost '
-          f'{g.normalised_cost:.2f} (1 = consistent with noise and field error)')
+          f'{g.normalised_cost:.2f} (1 if consistent with noise and field error)')
     if n_unused:
-        print('  warning: poses not used (without readings'
+        print('  warning: poses not used (no readings'
               f'{" or outside the box" * has_unknown_poses}): {n_unused}')
     if g.suspect_sensors:
         print('  warning: sensors inconsistent with other sensors or their nominal geometry '
@@ -186,7 +188,8 @@ def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
         if np.isnan(g.bias[j]).all():
             print(f'  warning: {name} has no readings; its nominal geometry is kept')
     for name, axes in survey.silent_axes:
-        print(f'  warning: {name} never reported {axes}: its background is still unknown')
+        print(f'  warning: {name} never reported {axes}: the background on unreported axes '
+              'remains unknown')
     if survey.suspect_rows:
         print('  warning: rows with inconsistent poses (the header is row 1): '
               f'{", ".join(map(str, survey.suspect_rows))}')

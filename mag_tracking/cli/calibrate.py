@@ -24,18 +24,18 @@ from mag_tracking.network.file import write_network
 from mag_tracking.recording.reader import Recording
 
 _CALIBRATE = '''
-Estimates the orientation of each sensor (accelerometer and compass), its clock offset (knock
-twice, at uneven intervals, so that all sensors are shaken) and its noise, from a recording that
-begins without a target. Checks that all sensors measure the same Earth field, and reports flipped
-or swapped axes and wrong units. Passing vehicles improve the headings (disable with --no-passes).
-Headings remain uncertain (a bias of 0.6 uT rotates a compass by two degrees): their standard
-deviations are written to the network file and used by the tracker. Nominal orientations are kept
-in the file, and the next calibration starts from them. Exit status 2 if the field of a sensor
-contradicts the Earth's field.
+Estimates the orientation of each sensor (from its accelerometer and as a compass), its clock
+offset (from two or more knocks, at uneven intervals, that shake all sensors) and its noise. Keep
+targets away during the first seconds of the recording. Checks that all sensors measure the same
+Earth field, and reports flipped or swapped axes and wrong units. Passing vehicles improve the
+headings (disable with --no-passes). Headings remain uncertain (a bias of 0.6 uT rotates a compass
+by two degrees); the tracker uses their standard deviations, which are written to the network file.
+Nominal orientations are kept in the file, and the next calibration starts from them. The exit
+status is 2 if the field of a sensor contradicts the Earth's field.
 
 The network file must contain the Earth's field, as earth_field (tesla) or as site:
   site: {latitude: 58.4, longitude: 15.6, height: 60, date: 2026-05-01, x_azimuth_deg: 90}
-x_azimuth_deg is the bearing of the x axis of the frame (the road) from true north.
+x_azimuth_deg is the bearing of the x axis of the world frame, clockwise from true north.
 
 example:
   mag-tracking calibrate first_day.mcap --network site.yaml --out calibrated.yaml
@@ -112,8 +112,8 @@ def _print(result: Calibration, recording: Recording) -> None:
     for warning in survey.warnings():
         print(f'  warning: {warning}')
     for name in result.without_background:
-        print(f'  warning: {name}: no background was learnt; the recording must begin without a '
-              'target (run mag-tracking doctor for details)')
+        print(f'  warning: {name}: no background was learnt; keep targets away during the first '
+              'seconds of the recording (run mag-tracking doctor for details)')
     if survey.disagreements and result.evidence is None:
         print('  note: passes were not used, because some sensors contradict the Earth\'s field')
     for cause, n in {**result.rejected, **recording.losses}.items():

@@ -25,8 +25,8 @@ from mag_tracking.quantities import quantity
 from mag_tracking.recording.signature_tables import read_model, write_model
 
 _CLASSES = '''
-A single sensor determines neither size nor distance of a target. After training on labelled
-passes, the shape of the field during a pass identifies the class of the target.
+A single sensor determines neither the size nor the distance of a target. A classifier that was
+trained on labelled passes identifies the class of a target by the shape of its field over a pass.
 
 LABELLED is one of:
   - a CSV table with one row per sample (label, signature, time_s, x_nt, y_nt, z_nt) or one row per
@@ -73,7 +73,8 @@ def _add_action(actions: Commands, name: str, run: Callable[[argparse.Namespace]
                    help='table of signatures (.csv) or recording')
     p.add_argument('--labels', type=Path, metavar='FILE',
                    help='table of the labelled intervals of a recording (.csv)')
-    p.add_argument('--network', type=Path, metavar='FILE', help='network file of a recording')
+    p.add_argument('--network', type=Path, metavar='FILE',
+                   help='network file, required for a recording')
     if name == 'train':
         p.add_argument('--out', type=Path, required=True, metavar='FILE',
                        help='model file to write (.json)')
@@ -82,11 +83,11 @@ def _add_action(actions: Commands, name: str, run: Callable[[argparse.Namespace]
                        help='model file written by `classes train`')
     if name == 'evaluate':
         p.add_argument('--splits', type=int, default=20, metavar='N',
-                       help='number of 70/30 splits without --model (default: 20)')
+                       help='number of 70/30 splits, if --model is not given (default: 20)')
 
 
 def _reject_missing_action(args: argparse.Namespace) -> int:
-    """Reject a command without an action; usually argparse does so before."""
+    """Reject a command without an action, if argparse has not rejected it."""
     raise SettingsError('classes: expected train, evaluate or predict')
 
 
@@ -128,7 +129,7 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _print_evaluation(evaluation: Evaluation) -> None:
-    """Print the scores of an evaluation."""
+    """Print the accuracy, recall and calibration error of an evaluation."""
     print(f'  largest class: {evaluation.majority:.1%} (accuracy of a constant prediction)')
     for name, values in (('accuracy', evaluation.accuracy),
                          ('balanced accuracy', evaluation.balanced_accuracy),
@@ -141,7 +142,7 @@ def _print_evaluation(evaluation: Evaluation) -> None:
 
 
 def _mean_fraction(values: 'np.ndarray[tuple[int, ...], np.dtype[np.float64]]') -> str:
-    """Format the mean of a fraction over the test sets, ± its standard deviation if several."""
+    """Format the mean of a fraction over the test sets, and its spread if there are several."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 'no examples'

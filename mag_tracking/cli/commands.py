@@ -34,7 +34,7 @@ COMMANDS = {
         'board_geometry', 'Calibrate the geometry of a board with a magnet.',
         ('geometry',)),
     'doctor': Command('doctor', 'Diagnose sensor faults.'),
-    'fit': Command('fit', 'Fit whole passes at constant velocity, offline.'),
+    'fit': Command('fit', 'Fit each pass as a whole at constant velocity, offline.'),
     'plan': Command('plan', 'Predict accuracy and coverage of a sensor network.'),
     'listen': Command('listen', 'Print the readings of the devices in a drivers file.'),
     'record': Command('record', 'Record the sensors (needs ROS 2).'),
@@ -88,6 +88,6 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _module_of(word: str) -> str | None:
-    """Module of the command with a name or alias; None for an unknown word."""
+    """Module of the command whose name or alias is `word`; None if no command matches."""
     return next((command.module for name, command in COMMANDS.items()
                  if word in (name, *command.aliases)), None)

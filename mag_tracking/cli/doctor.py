@@ -27,7 +27,7 @@ _DOCTOR = '''
 Examines a recording or live topics, and reports the faults of each sensor with a remedy: missing,
 lost or duplicate readings, clock steps, delays, noise above the calibration, stuck or saturated
 sensors, spikes, flipped or swapped axes, wrong units (gauss or microtesla published as tesla),
-backgrounds that are not learnt. Exit status 0 if no serious fault was found, otherwise 2.
+backgrounds that are not learnt. The exit status is 0 if no serious fault was found, otherwise 2.
 
 examples:
   mag-tracking doctor night.mcap --network site.yaml

@@ -79,7 +79,8 @@ def _print(result: EventsResult, names: tuple[str, ...]) -> None:
     for topic in result.missing_topics:
         print(f'  warning: no messages on {topic}')
     for name in result.sensors_without_background:
-        print(f'  warning: no background was learnt for {name}: its quiet intervals are too short')
+        print(f'  warning: no background was learnt for {name}: the intervals without a target are '
+              'too short')
 
 
 def line_of(event: PassEvent) -> str:

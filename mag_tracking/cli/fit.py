@@ -34,21 +34,22 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.settings import read_parameter_file
 
 P_WARNING = 1e-3
-"""Probability of a warning that correct moments of one vehicle contradict each other."""
+"""Probability that correct moments of one vehicle cause a warning of contradictory moments."""
 
 _FIT = '''
-Extracts the passes from a recording (from before each detection until its end) and fits each
-pass as a whole: a row of 1, 2, 3 or 4 dipoles at constant velocity (TSP14). For a vehicle on a
-straight road this is the most accurate estimate. The normalised cost is 1 if the model is right
-and larger otherwise.
+Extracts each pass from a recording (from shortly before a detection until the end of the
+detection) and fits the whole pass with a row of 1, 2, 3 or 4 dipoles at constant velocity (TSP14).
+For a vehicle on a straight road this is the most accurate estimate. The normalised cost is about 1
+if the model is right and larger otherwise.
 
 The tracker runs in parallel and determines the number of vehicles in a pass. Two or three
 simultaneous vehicles are fitted together, on a road at z = 0, and listed separately.
 
 If the model does not describe a pass (a turn, too many vehicles, noise, a single sensor, ...),
 a reason is reported instead of an estimate. Speed, direction and time of the closest point of
-approach are assessed separately and reported if they are determined. If the target passes one
-sensor after another, the delay between them yields an independent speed and direction.
+approach are assessed separately and reported if the data determine them. If the target passes one
+sensor after another, the delay between the sensors yields a second, independent estimate of speed
+and direction.
 
 files written to DIR:
   fits.csv, fits.json   one row per pass, vehicle and number of dipoles
@@ -82,7 +83,8 @@ def add(commands: Commands) -> None:
                    help='range at the closest point of approach and its standard deviation [m], '
                    'for a single sensor, which does not determine the scale')
     p.add_argument('--same-vehicle', action='store_true',
-                   help='estimate hard and soft iron, assuming one vehicle in all passes')
+                   help='assume that all passes are of the same vehicle, and estimate its hard and '
+                   'soft iron')
     p.add_argument('--params', type=Path, metavar='FILE',
                    help='YAML file with the settings to override')
     p.add_argument('--no-figures', action='store_true', help='do not draw figures')
@@ -159,7 +161,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
         if fit.bearing is not None:
             _print_bearing(fit.bearing)
         if fit.reason and fit is fitted_pass.known:
-            print(f'        determined: {_trusted_values(fit)}')
+            print(f'        nevertheless determined: {_trusted_values(fit)}')
         if not fit.reason and fit.is_poor_mixture:
             print('        ambiguous: the joint fit of the vehicles is poor')
         elif not fit.reason and fit.ambiguous:
@@ -185,7 +187,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
 
 
 def _trusted_values(fit: PassFit) -> str:
-    """Format the trusted values (speed, direction, time) of a fit without an estimate."""
+    """Format the values (of speed, direction, time) that are trusted although a fit is rejected."""
     speed, speed_std = fit.speed
     heading, heading_std = np.degrees(fit.heading)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
@@ -227,7 +229,7 @@ def _numbers(fit: PassFit) -> str:
 
 
 def _print_bearing(b: Bearing) -> None:
-    """Print the directions and times that are observable with a single sensor."""
+    """Print the directions, the time and the rate that are observable with a single sensor."""
     def direction_text(k: int, direction: FloatArray) -> str:
         if not np.isfinite(direction).all():
             return 'unknown'

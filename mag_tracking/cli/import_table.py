@@ -49,7 +49,8 @@ def add(commands: Commands) -> None:
                    help='background of each sensor, for a table of magnet poses')
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
     p.add_argument('--noise-std', type=float, default=1e-6, metavar='TESLA',
-                   help='noise of one reading in a table of magnet poses (default: 1e-6)')
+                   help='noise standard deviation of one reading in a table of magnet poses '
+                   '(default: 1e-6)')
 
 
 def _import(args: argparse.Namespace) -> int:

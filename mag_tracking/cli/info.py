@@ -20,7 +20,7 @@ def add(commands: Commands) -> None:
     p = add_command(commands, 'info', _info)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
-    add_network(p, False, 'report which topics of this network are recorded')
+    add_network(p, False, 'network file; report which of its topics are recorded')
 
 
 def _info(args: argparse.Namespace) -> int:

@@ -28,7 +28,8 @@ Sample: TypeAlias = tuple[int, FloatArray | None]
 _LISTEN = '''
 Opens the devices of a drivers file and prints, once per second, the state and error counts of
 each device and the rate and field of each sensor. The command needs no ROS and is suitable as the
-first test of a new connection. Ctrl-C ends it. Exit status 1 if a sensor has sent no readings.
+first test of a new connection. Ctrl-C ends the command. The exit status is 1 if a sensor has sent
+no readings.
 
 examples:
   mag-tracking listen config/drivers.yaml
@@ -48,7 +49,7 @@ def add(commands: Commands) -> None:
     """
     p = add_command(commands, 'listen', _listen, _LISTEN)
     p.add_argument('drivers', type=Path, metavar='DRIVERS', help='drivers file with the devices')
-    add_network(p, False, 'check that its sensors match the drivers file')
+    add_network(p, False, 'network file; check that its sensors match the drivers file')
     p.add_argument('--seconds', type=float, default=math.inf, metavar='N',
                    help='exit after N seconds (default: at Ctrl-C)')
 
@@ -76,7 +77,7 @@ class _ReadingPrinter:
             self._samples[a.sensor].append((a.stamp_ns, None))
 
     def stop(self) -> None:
-        """Close the device."""
+        """Stop the thread, which closes the device."""
         self._stop.set()
         self._thread.join(10.0)
 

@@ -71,7 +71,8 @@ def add_page(parser: argparse.ArgumentParser, port: bool = True) -> None:
     """
     if port:
         parser.add_argument('--port', type=int, default=DEFAULT_PORT, metavar='PORT',
-                            help=f'port of the page (default: {DEFAULT_PORT}; 0: any free port)')
+                            help=f'port of the page (default: {DEFAULT_PORT}; 0 selects a free '
+                            'port)')
     parser.add_argument('--host', default=LOOPBACK, metavar='ADDRESS', help='local address of '
                         f'the page (default: {LOOPBACK})')
 
@@ -146,7 +147,7 @@ def page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator
         If the port cannot be opened.
     """
     check_port(host, port)
-    # The process ends when its stdin is closed, even if this process is killed.
+    # The page process ends when its stdin is closed, even if this process is killed.
     process = subprocess.Popen([
         sys.executable, '-m', 'mag_tracking.cli', 'watch', '--host', host, '--port', str(port),
         '--until-eof', *ros_arguments], stdin=subprocess.PIPE)

@@ -15,7 +15,7 @@ from mag_tracking.network.topics import checked_namespace
 
 # Quoted because the class is not generic at run time.
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
-"""Subparsers of the main parser, to which each module adds its commands."""
+"""Subparsers of the main parser, to which each command is added."""
 
 FIGURES = ('.png', '.pdf', '.svg')
 """File name extensions accepted for figures."""
@@ -145,7 +145,7 @@ def add_report(parser: argparse.ArgumentParser) -> None:
 
 
 def check_writable(path: Path | None) -> None:
-    """Check that the folder of an output file exists.
+    """Check that an output file can be created: its folder exists, and it is not a folder.
 
     Parameters
     ----------
@@ -185,7 +185,8 @@ def check_report(args: argparse.Namespace, *others: Path | None) -> None:
     if path.suffix.lower() not in ('.html', '.htm'):
         raise OutputError(f'--report: expected a file name ending in .html, got {path.name}')
     if any(other is not None and other.resolve() == path.resolve() for other in others):
-        raise OutputError(f'--report: {path} is also used by another option; choose another file')
+        raise OutputError(f'--report: {path} is also an input or output of this command; choose '
+                          'another file')
 
 
 def check_outputs(args: argparse.Namespace) -> None:
@@ -199,7 +200,7 @@ def check_outputs(args: argparse.Namespace) -> None:
     Raises
     ------
     OutputError
-        If the folder of a file is missing.
+        If the folder of a file is missing, or the file is a folder.
     SettingsError
         If the file type of the figure is not supported.
     """

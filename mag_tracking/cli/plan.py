@@ -18,17 +18,18 @@ from mag_tracking.report.json_text import without_nan
 from mag_tracking.settings import read_parameter_file
 
 _PLAN = '''
-Predicts, before installation, the position accuracy, the detection probability, and the best place
-for an additional sensor. The accuracies are Cramer-Rao bounds for a point target at constant
-speed: a good estimator approaches them, and no unbiased estimator is more accurate. Errors beyond
-the noise (clocks, mountings, extended vehicles) are modelled as a relative error of the field
-(--field-error).
+Predicts, before installation, the position accuracy, the detection probability, and the best
+position of an additional sensor. The accuracies are Cramer-Rao bounds for a point target at
+constant speed: a good estimator approaches them, and no unbiased estimator is more accurate.
+Errors other than noise (of clocks, mountings, the point model) are represented by a relative error
+of the field (--field-error).
 
 files written to DIR:
   plan_position.png    map: standard deviation of the position from a whole pass
   plan_detection.png   map: probability that one frame detects the target
-  plan_sensor.png      map: gain of an additional sensor, and its best place
-  plan_lanes.png       along the lanes: bounds of filter and whole pass; probability of a miss
+  plan_sensor.png      map: benefit of an additional sensor, and its best position
+  plan_lanes.png       curves along each lane: bounds of a filter and of the fit of a whole pass,
+                       and the probability that a target is missed
   report.html          interactive report: maps and curves
   plan.json            all values
 
@@ -50,8 +51,9 @@ def add(commands: Commands) -> None:
     p = add_command(commands, 'plan', _plan, _PLAN)
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
-    p.add_argument('--target', metavar='KIND', help='small, car or truck: moment and height of '
-                   'this kind of vehicle in the settings (default: car); or magnet')
+    p.add_argument('--target', metavar='KIND', help='small, car or truck selects the moment and '
+                   'height of this kind of vehicle in the settings (default: car); magnet requires '
+                   '--moment and --height')
     p.add_argument('--moment', type=float, metavar='A_M2',
                    help='magnitude of the moment [A m^2]; requires --height')
     p.add_argument('--height', type=float, metavar='M', help='height of the '
@@ -59,12 +61,13 @@ def add(commands: Commands) -> None:
     p.add_argument('--speed', type=float, default=10.0, metavar='M_S',
                    help='speed [m/s] (default: 10)')
     p.add_argument('--heading', type=float, nargs='+', metavar='DEG',
-                   help='heading of each lane, anticlockwise from x [deg] (default: the arrival '
-                   'directions of the settings)')
+                   help='heading of each lane, measured anticlockwise from x [deg] (default: the '
+                   'arrival directions of the settings)')
     p.add_argument('--offset', type=float, nargs='+', metavar='M', help='lateral offset of each '
                    'lane, to the left of the centre of the sensors [m] (default: 0)')
-    p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise of one sample [T] '
-                   '(default: noise_std of the network file, or 1.2e-8)')
+    p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise standard '
+                   'deviation of one sample [T] (default: noise_std of the network file, or '
+                   '1.2e-8)')
     p.add_argument('--rate', type=float, default=100.0, metavar='HZ',
                    help='sample rate of each sensor (default: 100)')
     p.add_argument('--field-error', type=float, metavar='FRACTION',

@@ -9,7 +9,7 @@ from mag_tracking.recording.repair import repair
 _REPAIR = '''
 A recording that was interrupted (power failure, crash, full disk) has no index.
 `mag-tracking replay` can still read it; rosbag2 and other tools need the index.
-This command writes the index and a new metadata.yaml. The messages are not changed.
+This command writes the index and a new metadata.yaml, and keeps the messages unchanged.
 
 example:
   mag-tracking repair night

@@ -35,11 +35,11 @@ from a quiet interval, detects targets and tracks them with a bank of filters. R
 have to run; the ROS nodes use the same code.
 
 files written to DIR:
-  poses.csv           published pose of each track, one row per frame
-  poses_smoothed.csv  smoothed pose of each track that has ended
-  detections.csv      onsets and releases
+  poses.csv           published poses, one row per track and frame
+  poses_smoothed.csv  smoothed poses of the tracks that have ended
+  detections.csv      onset and release of each detection
   disturbances.csv    fields that no target explains
-  hypotheses.csv      every hypothesis of the bank, one row per frame
+  hypotheses.csv      all hypotheses of the filter bank, one row per hypothesis and frame
   summary.json        counts, rejected samples by cause, tracks
   tracks.mcap         poses and tracks as ROS messages (with metadata.yaml)
   report.html         interactive report: map, time slider, curves, tables
@@ -69,9 +69,9 @@ TRUTH_METRICS = {
     'position_mean': ('mean position error', ' m'),
     'position_max': ('maximum position error', ' m'),
     'axis_median_deg': ('median angular error of the axis', ' deg'),
-    'anees': ('average NEES per axis (1 = consistent)', ''),
+    'anees': ('average NEES per axis (1 if consistent)', ''),
     'error_over_bound': ('ratio of the error to the path bound', '')}
-"""{key of a track's `truth` in summary.json: (description, unit)}."""
+"""Description and unit of each error measure, by its key in a track's `truth` in summary.json."""
 
 
 def add(commands: Commands) -> None:
@@ -149,7 +149,7 @@ def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None
 
 
 def _overview(path: Path, summary: dict[str, Any]) -> str:
-    """Format the name of the recording and the number of its tracks by verdict."""
+    """Format the name of the recording and the number of tracks with each verdict."""
     verdicts = Counter(t['verdict'] for t in summary['tracks'])
     counts = ', '.join(f'{n} {verdict}' for verdict, n in verdicts.most_common())
     return (f'{path.name}: {quantity(len(summary["tracks"]), "track")}'

@@ -14,10 +14,11 @@ from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK
 
 _RUN = '''
 Starts the calibration, detection and tracker nodes in one process, the replay node with
---recording, and the driver node with --drivers. The nodes call each other directly. Messages are
-published after the pose; intermediate results (calibrated fields, frames) are published only if
-they have subscribers. Other drivers publish sensor_msgs/MagneticField on the topics of the
-network file. Ctrl-C ends the nodes. ROS arguments (--ros-args ...) come last.
+--recording, and the driver node with --drivers. The nodes call each other directly. All other
+messages are published after the pose; intermediate results (calibrated fields, frames) are
+published only if they have subscribers. Drivers of other packages must publish
+sensor_msgs/MagneticField on the topics of the network file. Ctrl-C ends the nodes. ROS arguments
+(--ros-args ...) come last.
 
 examples:
   mag-tracking run --network config/network.yaml --drivers config/drivers.yaml
@@ -39,7 +40,7 @@ def add(commands: Commands) -> None:
     add_settings(p)
     p.add_argument('--recording', type=Path, metavar='RECORDING', help='replay this recording')
     p.add_argument('--drivers', type=Path, metavar='DRIVERS',
-                   help='run the devices of this drivers file')
+                   help='run a driver node with the devices of this drivers file')
     p.add_argument('--batches', action='store_true',
                    help='publish the readings of many sensors in one message (recommended for '
                    'dozens of sensors)')

@@ -42,17 +42,18 @@ from mag_tracking.recording.traffic_tables import (
 from mag_tracking.units import NS
 
 _TRAFFIC = '''
-Tracks the vehicles in each recording and counts those that cross a line: time, direction, speed,
-length, class and headway. The default line is perpendicular to the x axis, through the centre of
-the network; the settings traffic.line_* define other lines. A vehicle is counted when its track
-has ended. Ambiguous passages are counted and marked.
+Tracks the vehicles in each recording. Counts each vehicle that crosses a line, and reports its
+time, direction, speed, length, class and headway. The default line is perpendicular to the x axis,
+through the centre of the network; the settings traffic.line_* define other lines. A vehicle is
+counted when its track has ended. Ambiguous passages are counted and marked.
 
 With --out, writes passages.csv (one row per vehicle) and intervals.csv (counts and mean speeds per
 interval, direction and class) to DIR, and the same tables as Parquet if pyarrow is installed.
 
-With --fleet, enrolled vehicles are recognised by the hard and soft iron of their moments.
---enrol NAME adds the only vehicle of each recording to the fleet file. A vehicle enrolled at
-headings 45 degrees apart is recognised at any heading, otherwise only at the enrolled heading.
+With --fleet, enrolled vehicles are recognised by their hard and soft iron. --enrol NAME adds the
+vehicle in each recording, which must be the only one, to the fleet file. A vehicle enrolled at
+headings at least 45 degrees apart is recognised at any heading, otherwise only at the enrolled
+heading.
 
 examples:
   mag-tracking traffic road.mcap --network network.yaml
@@ -120,7 +121,7 @@ def _traffic(args: argparse.Namespace) -> int:
 
 
 def _recordings(args: argparse.Namespace, network: SensorNetwork) -> list[Recording]:
-    """Open all recordings and check the output folder before the run begins."""
+    """Open all recordings; check their topics and the output folder before the run begins."""
     recordings = [Recording(path) for path in args.recordings]
     for recording in recordings:
         SampleReader(recording, network)
@@ -133,7 +134,7 @@ def _recordings(args: argparse.Namespace, network: SensorNetwork) -> list[Record
 
 
 def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
-    """Read the enrolled vehicles to recognise; None without --fleet or with --enrol."""
+    """Check --fleet and --enrol; return the vehicles to recognise, or None if there are none."""
     if args.enrol is not None:
         if args.fleet is None:
             raise SettingsError('--enrol: give the fleet file with --fleet')
@@ -146,7 +147,7 @@ def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
 
 
 def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetPass]) -> None:
-    """Add passes to the fleet file."""
+    """Add passes of the vehicle --enrol to the fleet file."""
     fleet = read_fleet(args.fleet) if args.fleet.exists() else {}
     fleet[args.enrol] = [*fleet.get(args.enrol, []), *passes]
     # Fleet raises an error before a vehicle that cannot be enrolled is written.
@@ -158,7 +159,7 @@ def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetP
 
 
 def _vehicle(identification: Identification | None) -> dict[str, Any]:
-    """Table columns of the identified vehicle; empty without a fleet."""
+    """Table columns of the identified vehicle; an empty dict without a fleet file."""
     return {} if identification is None else {
         'vehicle': identification.name,
         'p_vehicle': identification.probabilities.get(identification.name, np.nan)}
@@ -190,8 +191,8 @@ def _print(name: str, result: TrafficResult, recording: Recording,
     for topic in result.missing_topics:
         print(f'  warning: no messages on {topic}')
     for sensor in result.sensors_without_background:
-        print(f'  warning: no background was learnt for {sensor}: its quiet intervals are too '
-              'short')
+        print(f'  warning: no background was learnt for {sensor}: the intervals without '
+              'a target are too short')
     if result.no_detection_reason:
         print(f'  nothing was detected: {result.no_detection_reason}')
     if result.no_track_reason:

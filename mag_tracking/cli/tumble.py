@@ -26,8 +26,9 @@ _TUMBLE = '''
 For sensors that can be held in the hand: rotate each slowly through all orientations, far from
 iron, while `mag-tracking record` runs. The readings lie on an ellipsoid; the correction to a
 sphere (hard iron, soft iron, scale factors, skewness) is written to the network file and applied
-to all later readings. Run this calibration first: background and noise in the network file refer
-to uncorrected readings and are removed. The calibration is rejected if directions are missing.
+to all later readings. Run this calibration before others, because background and noise in the
+network file refer to uncorrected readings and are removed. The calibration of a sensor is rejected
+if its rotation did not cover enough directions.
 
 example:
   mag-tracking tumble hand.mcap --network site.yaml --sensor mag_3 --out site_tumbled.yaml
@@ -48,7 +49,8 @@ def add(commands: Commands) -> None:
     p.add_argument('--sensor', nargs='+', default=[], metavar='NAME',
                    help='sensors that were rotated (default: all)')
     p.add_argument('--field-size', type=float, metavar='TESLA',
-                   help='magnitude of the ambient field (default: unknown; the gains are kept)')
+                   help='magnitude of the ambient field (default: unknown; the mean gain is not '
+                   'calibrated)')
     p.add_argument('--out', required=True, type=Path, metavar='FILE',
                    help='network file to write')
     p.add_argument('--figure', type=Path, metavar='FILE',

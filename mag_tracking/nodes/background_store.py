@@ -17,7 +17,7 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 
 WRITE_EVERY_S = 5.0
-"""[s] Maximum interval between writes; less if `calibrate.max_resume_gap_s` is short."""
+"""[s] Interval between writes, unless a quarter of `calibrate.max_resume_gap_s` is shorter."""
 
 
 class BackgroundStore:
@@ -42,7 +42,9 @@ class BackgroundStore:
         self._next_write = 0.0
 
     def restore(self, network: SensorNetwork) -> None:
-        """Pass the stored backgrounds to the stage, which checks them against the first readings.
+        """Pass the stored backgrounds to the stage, which restores each at the first reading.
+
+        Outdated backgrounds are not restored; invalid backgrounds are logged.
 
         Parameters
         ----------
@@ -65,7 +67,9 @@ class BackgroundStore:
                 'the backgrounds again')
 
     def update(self, network: SensorNetwork, j: int) -> None:
-        """Update the entry of a sensor; remove the entry if the background is unknown.
+        """Update the entry of a sensor; remove the entry if the background is unknown or doubtful.
+
+        The file is not written until the next `write_if_due`.
 
         Parameters
         ----------
@@ -81,7 +85,7 @@ class BackgroundStore:
             self._entries[name] = background_text(background, network, j, self._settings)
 
     def write_if_due(self, is_live: bool) -> None:
-        """Write the file if the interval has elapsed or a background has become known.
+        """Write the file if the interval has elapsed or a sensor has a new entry; log a failure.
 
         Parameters
         ----------
@@ -101,7 +105,7 @@ class BackgroundStore:
                                  throttle_duration_sec=60.0)
 
     def drop(self, sensors: Iterable[str], is_live: bool) -> None:
-        """Remove the backgrounds of sensors from the file.
+        """Remove the backgrounds of sensors, and write the file immediately.
 
         Parameters
         ----------

@@ -60,8 +60,8 @@ MIN_STEP_S = 0.01
 """[s] Minimum interval between the steps of a round over the sensors. A round takes one second, or
 longer if there are many sensors."""
 DEFERRED_S = 0.0055
-"""[s] Delay of deferred work after a batch of readings has been published. During this time, the
-tracker needs the processor cores: it computes a pose from a hundred sensors."""
+"""[s] Delay of deferred work after a batch of readings has been published. It leaves the processor
+cores to the tracker until the tracker has computed a pose, even with a hundred sensors."""
 
 
 class CalibrationNode(StageNode):
@@ -70,7 +70,8 @@ class CalibrationNode(StageNode):
     Parameters
     ----------
     next_steps : tuple of DetectionNode and TrackerNode, optional
-        Nodes of the same process that receive calibrated readings and doubtful intervals directly.
+        Nodes in the same process. The detection node receives the calibrated readings directly; the
+        tracker node receives the intervals in which backgrounds are doubtful.
     **node_arguments
         Arguments of `StageNode`.
     """
@@ -126,14 +127,14 @@ class CalibrationNode(StageNode):
         self._publish_transforms()
 
     def _publish_transforms(self) -> None:
-        """Publish the transforms of the sensors."""
+        """Publish the transforms of the sensors if `publish_sensor_tf` is set."""
         if self._tf is not None:
             self._tf.publish(self.network)
 
     def _state_path(self) -> Path | None:
-        """File in which backgrounds are stored; None during a replay or if storage is disabled."""
+        """Path of the background file; None during a replay or if storage is disabled."""
         name = fixed_parameter(self, 'state_file', '', 'File in which backgrounds are stored for a '
-                               'restart. Empty: a file below $ROS_HOME or ~/.ros.')
+                               'restart. If empty, a file below $ROS_HOME or ~/.ros is used.')
         if self.is_replayed or not self.settings.calibrate.max_resume_gap_s:
             return None
         if not name:
@@ -145,7 +146,7 @@ class CalibrationNode(StageNode):
         return path
 
     def _output_path(self, parameter: str, name: str) -> Path:
-        """Return the path of an output file; raise SettingsError if its folder is not allowed."""
+        """Return the path of an output file; raise SettingsError if the path is not allowed."""
         prefix = f'calibration_node: parameter {parameter}: '
         network_folder, state_root = self.network_path.parent, state_folder().resolve()
         path = checked_path(network_folder / name, SettingsError)
@@ -161,14 +162,14 @@ class CalibrationNode(StageNode):
         return folder / path.name
 
     def _survey_path(self) -> Path:
-        """File to which a survey is saved; never the network file, which is edited by hand."""
+        """Path to which a survey is saved; never the network file, which is edited by hand."""
         save_as = fixed_parameter(self, 'save_as', '', 'Network file to which a survey is saved. '
-                                  'Empty: <network>_calibrated.yaml.')
+                                  'If empty, <network>_calibrated.yaml is used.')
         path = self.network_path
         return self._output_path('save_as', save_as or f'{path.stem}_calibrated.yaml')
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """Stages whose counts are published.
+        """Stages whose counts are published in diagnostics, by name.
 
         Returns
         -------
@@ -195,12 +196,12 @@ class CalibrationNode(StageNode):
         return ', '.join(parts)
 
     def queues(self) -> dict[str, int]:
-        """Number of queued readings.
+        """Number of queued readings of each stage.
 
         Returns
         -------
         dict of str to int
-            Number by name of the stage.
+            {name of the stage: number}.
         """
         return {'calibrate': self._stage.n_held}
 
@@ -209,7 +210,7 @@ class CalibrationNode(StageNode):
         return self.flows['sensors'].is_live
 
     def _receive(self, sensor: str, message: MagneticField) -> None:
-        """Calibrate a raw reading and publish the result."""
+        """Calibrate a raw reading and publish the resulting readings, if any."""
         raw = reading_of(message, sensor)
         publisher = self._publishers_by_sensor[sensor]
         for calibrated in self._calibrate_readings(raw):
@@ -220,7 +221,7 @@ class CalibrationNode(StageNode):
         self._do_deferred_work()
 
     def _receive_batch(self, message: FieldReadings) -> None:
-        """Calibrate raw readings of many sensors and publish them as one message."""
+        """Calibrate a batch of raw readings and publish the result as one message."""
         raw = self.readings_of(message, self._stage)
         if raw is None:
             return
@@ -231,7 +232,7 @@ class CalibrationNode(StageNode):
         self._deferred.request()
 
     def _calibrate_readings(self, raw: Readings) -> list[Readings]:
-        """Calibrate readings; if the next steps run in this process, pass the result to them."""
+        """Calibrate readings and return them; also pass them to the `next_steps`, if any."""
         calibrated = self._stage.feed(raw)
         if self._next_steps is not None:
             detection, tracker = self._next_steps
@@ -241,7 +242,7 @@ class CalibrationNode(StageNode):
         return calibrated
 
     def _do_deferred_work(self) -> None:
-        """Run the deferred work of the stages, the health checks, and the next step if due."""
+        """Run deferred work, health checks and a due step of the round; report new doubts."""
         self._stage.idle()
         if self._next_steps is not None:
             self._next_steps[1].idle()
@@ -264,7 +265,7 @@ class CalibrationNode(StageNode):
 
     def _handle_calibrate(self, request: CalibrateService.Request,
                           response: CalibrateService.Response) -> CalibrateService.Response:
-        """Handle ~/calibrate: learn backgrounds again."""
+        """Handle ~/calibrate: discard backgrounds and learn them again."""
         try:
             self._stage.forget(tuple(request.sensors))
         except NetworkError as error:
@@ -278,7 +279,7 @@ class CalibrationNode(StageNode):
 
     def _handle_survey(self, request: SurveyMessage.Request,
                        response: SurveyMessage.Response) -> SurveyMessage.Response:
-        """Handle ~/survey: update orientations and clock offsets, except for running tracks."""
+        """Handle ~/survey: update clock offsets now, and orientations from the next track on."""
         network = self._survey_service.solve(self.network, request.save, response)
         if network is None:
             return response

@@ -18,7 +18,7 @@ from mag_tracking.records import Hypothesis, Track
 
 
 def message_class(type_name: str) -> Any:
-    """Class of a message type.
+    """Return the Python class of a message type.
 
     Parameters
     ----------

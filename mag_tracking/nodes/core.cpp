@@ -31,7 +31,7 @@ constexpr std::size_t MAX_MESSAGE = 4096;
 
 double checked(double seconds) {
     if (!(seconds >= 0.0 && seconds <= MAX_S))
-        throw py::value_error("a deadline is between 0 and 1e6 s");
+        throw py::value_error("a deadline must be between 0 and 1e6 s");
     return seconds;
 }
 

@@ -1,7 +1,7 @@
 """Deadline that ends the process even while Python is blocked; compiled."""
 
 class Deadline:
-    """Ends the process unless it is cancelled in time.
+    """Ends the process when the time has elapsed, unless `cancel` is called before.
 
     The deadline runs in a native thread, so code that holds the interpreter lock does not delay it.
     When the process is ended, no buffer is flushed and no `finally` block runs.

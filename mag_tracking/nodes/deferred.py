@@ -1,4 +1,4 @@
-"""Work that is deferred until the subscribers have processed the published messages."""
+"""Work that is deferred so that subscribers can process published messages first."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from mag_tracking.nodes.steady_timer import steady_timer
 
 
 class Deferred:
-    """Calls a function once after a delay.
+    """Calls a function a fixed time after a request; requests in the meantime have no effect.
 
     On a computer with few cores, work immediately after publishing would compete with the processes
     that receive the messages.

@@ -44,7 +44,7 @@ def definition_of(type_name: str) -> str | None:
 def _file_content(type_name: str) -> str | None:
     """Content of the .msg file of a type; None if the file is not installed."""
     package, kind, leaf = type_name.split('/')
-    # The wheels leave AMENT_PREFIX_PATH unset and install below sys.prefix.
+    # ROS from PyPI leaves AMENT_PREFIX_PATH unset and is installed below sys.prefix.
     prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
     for prefix in (*prefixes, sys.prefix):
         file = Path(prefix) / 'share' / package / kind / f'{leaf}.msg'

@@ -31,8 +31,8 @@ from mag_tracking.stages.events.stage import Events
 from mag_tracking.stages.stage import Stage
 
 EVENT_INTERVAL_S = 0.5
-"""[s] Interval of the search for pass events while there are no frames. Otherwise the search runs
-once per frame, because one search takes as long as many readings."""
+"""[s] Interval between searches for pass events. New frames also trigger a search; single readings
+do not, because a search takes as long as the processing of many readings."""
 
 
 class DetectionNode(StageNode):
@@ -85,7 +85,7 @@ class DetectionNode(StageNode):
         self.monitor_subscriber('tracker', NETWORK_FRAME, TRACK_ARRAY)
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """Stages whose counts are published.
+        """Stages whose counts are published in diagnostics, by name.
 
         Returns
         -------
@@ -96,12 +96,12 @@ class DetectionNode(StageNode):
         return {'align': self._align, 'detect': self._detect, **events}
 
     def queues(self) -> dict[str, int]:
-        """Number of queued readings.
+        """Number of queued readings of each stage.
 
         Returns
         -------
         dict of str to int
-            Number by name of the stage.
+            {name of the stage: number}.
         """
         events = {} if self._events is None else {'events': sum(map(len, self._event_backlog))}
         return {'align': self._align.n_held, **events}
@@ -133,7 +133,7 @@ class DetectionNode(StageNode):
             self._event_publisher.publish(to_message(PassEventMessage, pass_event_dict(event)))
 
     def _publish(self, frames: list[FieldFrame]) -> None:
-        """Publish completed frames and their detections."""
+        """Detect targets in completed frames; publish frames and detections."""
         for frame in frames:
             for record in self._detect.feed(frame):
                 if isinstance(record, Detection):
@@ -147,7 +147,7 @@ class DetectionNode(StageNode):
                     self._publish_pending_frame()
 
     def _publish_pending_frame(self) -> None:
-        """Publish the pending frame once, after its pose, if the topic has subscribers."""
+        """Publish the pending frame once, after its pose, if the frame topic has subscribers."""
         frame, self._pending_frame = self._pending_frame, None
         if frame is not None and has_subscribers(self._frames):
             self._publish_frame(frame)

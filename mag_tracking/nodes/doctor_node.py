@@ -1,4 +1,4 @@
-"""Live input of `mag-tracking doctor`: receives readings for a limited time."""
+"""Live input of `mag-tracking doctor`, received for a limited time."""
 
 import time
 from collections import Counter
@@ -90,9 +90,9 @@ class DoctorResult:
     doctor: Doctor
     """Doctor that has received all readings."""
     findings: list[Finding]
-    """Result of `DoctorNode.findings`."""
+    """Faults found by `DoctorNode.findings`; empty until all readings have been received."""
     status: int = 1
-    """Exit status if the middleware does not shut down; to be set after the report is written."""
+    """Exit status of the process if the middleware hangs. The caller sets it after the report."""
 
 
 @contextmanager

@@ -30,7 +30,7 @@ class DriverDiagnostics:
 
     def statuses(self, drivers: Sequence[Driver], served: Collection[str],
                  active: bool) -> list[DiagnosticStatus]:
-        """Diagnostics of all devices.
+        """Return the diagnostics of all devices, and log changes.
 
         Parameters
         ----------
@@ -48,7 +48,7 @@ class DriverDiagnostics:
         return [self._status(driver, driver.name in served, active) for driver in drivers]
 
     def _status(self, driver: Driver, served: bool, active: bool) -> DiagnosticStatus:
-        """Diagnostics of one device."""
+        """Return the diagnostics of one device, and log a change."""
         counts = driver.counts()
         previous = self._reported_counts.get(driver.name, {})
         increases = [f'{count}: {n - previous.get(count, 0)} more'
@@ -59,7 +59,7 @@ class DriverDiagnostics:
         if not active:
             message = 'not active'
         elif not served:
-            level, message = DiagnosticStatus.ERROR, 'driver thread has ended: restart the node'
+            level, message = DiagnosticStatus.ERROR, 'the driver thread has ended: restart the node'
         elif driver.fault:
             level, message = DiagnosticStatus.ERROR, driver.fault
         elif not driver.is_open:

@@ -37,12 +37,12 @@ from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.records import AccelerationSample, Readings
 
 STOP_TIMEOUT_S = 15.0
-"""[s] Maximum time for a driver to stop. Disconnecting from an MQTT broker that does not answer
+"""[s] Maximum time for all drivers to stop. Disconnecting from an MQTT broker that does not answer
 takes several seconds."""
 
 
 class DriverNode(ManagedNode):
-    """Runs one thread per device, which publishes its readings.
+    """Runs one thread per device, which publishes the readings of the device.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class DriverNode(ManagedNode):
         """
         if self._threads:
             self.get_logger().error(f'driver {self._threads[0].name} is still stopping; activate '
-                                    'again later')
+                                    'the node again later')
             return TransitionCallbackReturn.FAILURE
         # A new event for each activation, so that a thread that is still stopping does not resume.
         self._stopping = threading.Event()

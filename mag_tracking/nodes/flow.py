@@ -17,7 +17,7 @@ FIRST_MESSAGE_TIMEOUT_S = 8.0
 MAX_LOAD = 0.95
 """Maximum fraction of the time that a node can spend on messages without falling behind."""
 MAX_LATENCY_S = 1.0
-"""[s] A larger median latency is reported as a fault: the poses are then too old for control."""
+"""[s] A larger median latency causes a warning, because the poses are then too old for control."""
 MAX_LATENCIES = 10_000
 """Maximum number of latencies stored between two reports; enough for a thousand sensors."""
 
@@ -77,7 +77,7 @@ class Flow:
 
     @property
     def n_latencies(self) -> int:
-        """Number of latencies in the next report."""
+        """Number of latencies stored for the next report."""
         return len(self._latencies)
 
     @property
@@ -119,7 +119,7 @@ class Flow:
             message = f'no message from {self.source} for {now - self.last_received:.0f} s'
             if not has_publisher():
                 level = DiagnosticStatus.ERROR
-                message += ', and its publisher is gone: check that it is running'
+                message += ', and its topics have no publisher: check that it is running'
         elif new_losses:
             level = DiagnosticStatus.WARN
             message = f'{new_losses} message{"" if new_losses == 1 else "s"} from {self.source} ' \
@@ -141,7 +141,7 @@ class Flow:
 
 
 class SubscriberMonitor:
-    """Checks that the node of the next step still subscribes to a topic.
+    """Checks that the node of the next processing step still subscribes to a topic.
 
     The node may have any name; it is identified by the message type that it publishes. Other
     subscribers, such as recorders, are ignored.
@@ -149,7 +149,7 @@ class SubscriberMonitor:
     Parameters
     ----------
     role : str
-        Role of the next step, for messages.
+        Role of the next step, such as `tracker`; used in messages.
     topic : str
         Absolute topic name.
     publishes : str
@@ -162,14 +162,14 @@ class SubscriberMonitor:
 
     def status(self, node: str, names: Collection[str],
                types_of: Callable[[str], Collection[str]]) -> DiagnosticStatus:
-        """Diagnostics of the next step.
+        """Diagnostics of the connection to the next step.
 
         Parameters
         ----------
         node : str
             Title of the node that reports.
         names : collection of str
-            Nodes that currently subscribe to the topic.
+            Names of the nodes that currently subscribe to the topic.
         types_of : function
             Returns the types of the messages that a node publishes.
 

@@ -1,4 +1,4 @@
-"""Inspection of a ROS graph: substitutes for the command `ros2`, which ROS from PyPI lacks."""
+"""Inspection and control of a ROS graph; a substitute for `ros2`, which is not on PyPI."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -34,11 +34,11 @@ RESPONSE_TIMEOUT_S = 5.0
 MAX_ATTEMPTS = 3
 """Maximum number of attempts per query."""
 CHANGE_TIMEOUT_S = 60.0
-"""[s] Maximum time for a change of state; some devices open slowly."""
+"""[s] Maximum time for a request that changes a node; some devices open slowly."""
 
 
 class Observer:
-    """Node that examines the graph, calls services and receives messages.
+    """Examines the graph, calls services and receives messages through a node.
 
     Parameters
     ----------
@@ -183,9 +183,9 @@ def topics(graph: Observer) -> list[tuple[str, str, int, int]]:
 
 def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
                      stopped: Callable[[], bool]) -> None:
-    """Receive the messages of a topic until the handler or the caller stops.
+    """Receive the messages of a topic until `handle` or `stopped` requests the end.
 
-    Latched messages are received if all publishers offer them.
+    Messages published earlier are received only if all publishers of the topic are latched.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list
     graph : Observer
     node : str
     name : str, optional
-        Parameter; by default all of them.
+        Name of a parameter; by default, all parameters are listed.
 
     Returns
     -------
@@ -285,7 +285,7 @@ def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list
     Raises
     ------
     GraphError
-        If node or parameter does not exist.
+        If the node or the parameter does not exist.
     """
     names = [name] if name is not None else list(graph.call(
         ListParameters, f'{node}/list_parameters', ListParameters.Request()).result.names)
@@ -310,14 +310,14 @@ def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
     graph : Observer
     node : str
     name : str
-        Parameter.
+        Name of the parameter.
     text : str
         Value as YAML; an integer is accepted for a float.
 
     Raises
     ------
     GraphError
-        If the value is invalid, or the node does not exist or rejects it.
+        If the value is invalid, the node does not exist, or the node rejects the value.
     """
     try:
         value = yaml.safe_load(text)

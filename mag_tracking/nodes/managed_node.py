@@ -54,7 +54,7 @@ class ManagedNode(LifecycleNode):
         """Stop the threads of the node; called before the node is destroyed."""
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
-        """Call `prepare`; log an error and leave the node unconfigured.
+        """Call `prepare`; if it fails, log the error and leave the node unconfigured.
 
         Parameters
         ----------

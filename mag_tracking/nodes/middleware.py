@@ -20,7 +20,7 @@ PROFILE = Path(__file__).with_name('fastdds.xml')
 PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 """Environment variable that selects a profile in Fast DDS 2.14 (Jazzy)."""
 PROFILE_IN_FOLDER = 'DEFAULT_FASTRTPS_PROFILES.xml'
-"""Profile that Fast DDS loads from the working folder by default."""
+"""Name of the profile that Fast DDS loads from the working folder by default."""
 ROS_ARGUMENTS, PARAMETER_FILE = '--ros-args', '--params-file'
 
 
@@ -63,7 +63,7 @@ def _init(arguments: list[str] | None) -> None:
 
 
 def _with_ros_files(arguments: list[str] | None, folder: Path) -> list[str] | None:
-    """Replace plain parameter files in the arguments by converted copies; raise SettingsError.
+    """Replace plain parameter files by converted copies; raise SettingsError for invalid files.
 
     None selects `sys.argv`. The copies are only needed until `rclpy.init` has returned.
     """

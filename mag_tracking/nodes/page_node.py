@@ -34,7 +34,7 @@ from mag_tracking.web.page_server import TICK_S, PageServer
 NICENESS = 10
 """Scheduling niceness of the process, which must not delay the nodes."""
 MAX_FRAMES = 64
-"""Number of recent serialised frames that are stored for matching with tracks."""
+"""Maximum number of serialised frames stored for the next tick."""
 MAX_TRACKS = 1000
 """Maximum number of track messages stored for the next tick."""
 TRACKS = 'mag_tracking_msgs/msg/TrackArray'
@@ -103,7 +103,7 @@ class PageNode(Node):
                                      RESULTS)]
 
     def _find_tracker(self) -> list[str]:
-        """Subscribe to the only tracker of the namespace; return the track topics of all."""
+        """Return all track topics in the namespace; if there is only one, follow its tracker."""
         namespace = self.get_namespace().rstrip('/')
         topics = [name for name, kinds in self.get_topic_names_and_types()
                   if TRACKS in kinds and name.startswith(f'{namespace}/')
@@ -139,7 +139,7 @@ class PageNode(Node):
         self._tracks.extend(message.tracks)
 
     def _receive_smoothed(self, message: SmoothedTrack) -> None:
-        """Add the smoothed path of an ended track."""
+        """Add the smoothed path of an ended track to the scene."""
         self._tick()
         points = [p.pose.pose.position for p in message.poses]
         self._scene.add_smoothed(message.track_id, np.array([[p.x, p.y, p.z] for p in points]))
@@ -156,7 +156,7 @@ class PageNode(Node):
         return namespace == self.get_namespace().strip('/')
 
     def _tick(self) -> None:
-        """Add received messages to the scene: all frames during a track, otherwise the latest."""
+        """Add received tracks and frames to the scene; without tracks, only the latest frame."""
         if not len(self._layout):
             return
         raw = list(self._frames)
@@ -176,7 +176,7 @@ class PageNode(Node):
                 self._scene.add_track(track_of(message))
 
     def _update_health(self) -> None:
-        """Update the notes on faults and the table of all statuses."""
+        """Update the notes on faults and the table of all diagnostics on the page."""
         now = time.monotonic()
         notes, rows = [], []
         for name, (received, status) in sorted(self._statuses.items()):
@@ -190,7 +190,7 @@ class PageNode(Node):
                                [Table('Health', ['node', 'level', 'message'], rows)])
 
     def _missing_topics(self) -> Iterator[Note]:
-        """Notes on topics without a publisher."""
+        """Yield notes on missing topics or sensor positions, and on several trackers."""
         topics = self._find_tracker()
         if len(topics) > 1 and self._tracks_topic not in topics:
             yield Note(WARNING, f'several trackers: {", ".join(topics)}; select one (--ros-args -r '

@@ -1,4 +1,4 @@
-"""Recorder node: writes serialised messages without decoding them; counts lost messages."""
+"""Recorder node that writes messages without decoding them and counts lost messages."""
 
 import signal
 import sys
@@ -58,7 +58,7 @@ class _PolledSubscription:
         self.n_lost = 0
 
     def fetch(self) -> list[tuple[int, int, bytes]]:
-        """Fetch the queued messages: [(received_ns, sent_ns, data)]."""
+        """Remove the queued messages and return them as [(received_ns, sent_ns, data)]."""
         out: list[tuple[int, int, bytes]] = []
         handle = self.subscription.handle
         with handle:
@@ -73,7 +73,7 @@ class _PolledSubscription:
         return out
 
     def _count_lost(self, number: int | None) -> None:
-        """Count the messages missing before sequence number `number`; needs a single publisher."""
+        """Count messages missing before sequence number `number`, if there is one publisher."""
         if number is None or len(self.publishers) > 1:
             self.last_number = None
             return
@@ -82,7 +82,7 @@ class _PolledSubscription:
         self.last_number = number
 
     def set_publishers(self, infos: list[TopicEndpointInfo]) -> None:
-        """Update the publishers; if one has disappeared, restart the count at the next message."""
+        """Update the publishers; if one is gone, ignore the jump of the next sequence number."""
         publishers = tuple(sorted(tuple(i.endpoint_gid) for i in infos))
         if set(self.publishers) - set(publishers):
             self.last_number = None
@@ -164,7 +164,7 @@ class RecordNode(Node):
                 self._subscribe(topic, infos[0].topic_type, infos)
 
     def _subscribe(self, topic: str, type_name: str, infos: list[TopicEndpointInfo]) -> None:
-        """Start recording a topic."""
+        """Subscribe to a topic, or report that its message type is not installed."""
         if message_class(type_name) is None:
             self._refuse(topic, f'message type {type_name} is not installed')
             return
@@ -173,7 +173,7 @@ class RecordNode(Node):
         self._sources[topic].set_publishers(infos)
 
     def _describe(self, topic: str, source: _PolledSubscription) -> None:
-        """Add a topic to the recorder; its publishers are known once a message has arrived."""
+        """Add a topic to the recorder at its first message, when its publishers are known."""
         definition = definition_of(source.type)
         if definition is None:
             self._report(f'{topic}: no definition of {source.type} found: the recording of this '
@@ -191,7 +191,7 @@ class RecordNode(Node):
         self._report(f'{topic} is not recorded: {why}')
 
     def _update_publishers(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
-        """Update the publishers of a topic."""
+        """Update the publishers of a topic; resubscribe if they are no longer all latched."""
         source = self._sources[topic]
         other_types = sorted({i.topic_type for i in infos} - {source.type})
         if other_types and f'{topic} as {other_types[0]}' not in self._refused:

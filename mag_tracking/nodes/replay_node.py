@@ -34,9 +34,9 @@ from mag_tracking.nodes.stage_node import STREAM
 from mag_tracking.recording.reader import Recording
 
 TICK_S = 0.005
-"""[s] Interval of the checks for due messages."""
+"""[s] Interval between checks for due messages."""
 MAX_STEP_S = 0.02
-"""[s] Maximum elapsed time of one tick; playback does not catch up after a longer stall."""
+"""[s] Maximum advance of one tick (at rate 1); playback does not catch up after a longer stall."""
 MAX_MESSAGES_PER_TICK = 200
 """Maximum number of messages published per tick; at most the queue length of the nodes."""
 
@@ -69,12 +69,13 @@ class ReplayNode(ManagedNode):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__('replay_node', **node_arguments)
         self._path = fixed_parameter(self, 'recording', '', 'Path of the recording.')
-        self._rate = fixed_parameter(self, 'rate', 1.0, 'Playback rate; 1 = as recorded.')
-        self._loop = fixed_parameter(self, 'loop', False, 'Restart at the end of the recording.')
+        self._rate = fixed_parameter(self, 'rate', 1.0,
+                                     'Playback rate relative to the recorded rate.')
+        self._loop = fixed_parameter(self, 'loop', False, 'Restart playback at the end.')
         self._offset = fixed_parameter(self, 'start_offset', 0.0,
-                                       'Start position, from the first message [s].')
-        self._topics = fixed_parameter(self, 'topics', [''], 'Recorded topics to play; empty = '
-                                       'all.')
+                                       'Start position after the first message [s].')
+        self._topics = fixed_parameter(self, 'topics', [''], 'Recorded topics to play. If empty, '
+                                       'all topics are played.')
         self._delay = fixed_parameter(self, 'start_delay', 2.0, 'Delay of playback after '
                                       'activation, for discovery of the subscribers [s].')
         self._paused = fixed_parameter(self, 'paused', False, 'Start paused.')
@@ -102,7 +103,7 @@ class ReplayNode(ManagedNode):
         SettingsError
             If a parameter is invalid.
         RecordingError
-            If the recording cannot be read, is empty, or lacks a topic.
+            If the recording cannot be read, is empty, or lacks a selected topic.
         """
         if not self._path:
             raise SettingsError('replay_node: parameter recording is empty; set it to the path of '
@@ -195,7 +196,7 @@ class ReplayNode(ManagedNode):
         self._not_installed.clear()
 
     def _publisher_for(self, topic: str, kind: str) -> Publisher | None:
-        """Publisher of a topic; None if its type is not installed."""
+        """Return the publisher of a topic, created if necessary; None if its type is missing."""
         if topic not in self.publishers_by_topic and topic not in self._not_installed:
             cls = message_class(kind)
             if cls is None:
@@ -252,7 +253,7 @@ class ReplayNode(ManagedNode):
             self._end()
 
     def _has_subscribers(self, now: float) -> bool:
-        """Whether every magnetic field has a subscriber, or the wait for them has timed out."""
+        """Whether every magnetic field has a subscriber, or the wait for subscribers has ended."""
         recording = self._recording
         if recording is not None and now < self._start_time + self._subscriber_timeout_s:
             return all(p.get_subscription_count() for topic, p in self.publishers_by_topic.items()

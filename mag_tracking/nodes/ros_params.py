@@ -102,7 +102,7 @@ def _without_array(value: Any) -> Any:
 
 
 def follow_changes(node: Node, settings: Settings, apply: Callable[[Settings], None]) -> None:
-    """Check live changes of parameters; apply valid changes.
+    """Register callbacks that reject invalid changes of parameters and apply valid changes.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def follow_changes(node: Node, settings: Settings, apply: Callable[[Settings], N
     settings : Settings
         Initial settings.
     apply : function
-        Called with the new settings.
+        Called with the new settings after each valid change.
     """
     state = {'settings': settings}
 

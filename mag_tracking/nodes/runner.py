@@ -1,4 +1,4 @@
-"""Run all nodes in one process; a replacement for the launch file without `ros2 launch`."""
+"""Run all nodes in one process; replaces the launch file where `ros2 launch` is missing."""
 
 import signal
 import sys
@@ -45,7 +45,7 @@ class TrackPrinter(Node):
     topic : str
         Topic of the tracks.
     every : int
-        Print only every n-th pose.
+        Print only every `every`-th pose.
     out : text stream
         Output stream.
     """
@@ -58,7 +58,7 @@ class TrackPrinter(Node):
         self.create_subscription(TrackArray, topic, self._receive, STREAM)
 
     def _receive(self, message: TrackArray) -> None:
-        """Print one line per pose."""
+        """Print every `every`-th pose, and the end of each track."""
         for track in map(track_of, message.tracks):
             if track.ended:
                 print(f'track {track.id} has ended', file=self._out, flush=True)
@@ -173,7 +173,7 @@ def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike |
 
 
 def all_connected(stages: list[StageNode], replay: ReplayNode) -> bool:
-    """Whether each played topic of a sensor has a subscriber.
+    """Whether each sensor topic that is replayed has a subscriber.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
     loop : bool
         Restart the recording at its end.
     observers : sequence of functions, optional
-        Functions that create further nodes; called after `rclpy.init`. By default, one function
+        Functions that create additional nodes; called after `rclpy.init`. By default, one function
         that creates a `TrackPrinter`.
     drivers : path, optional
         Drivers file; if given, a driver node is also run.

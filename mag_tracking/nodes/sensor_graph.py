@@ -10,7 +10,7 @@ from mag_tracking.network.topics import absolute
 from mag_tracking.stages.health.sensor_health import Finding
 
 MAX_NAMED = 4
-"""Maximum number of names in a message; further names are only counted."""
+"""Maximum number of names in a message; the remaining names are only counted."""
 
 
 def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
@@ -69,7 +69,7 @@ def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, s
     topic : str
         Absolute topic name.
     known : mapping of str to str
-        Topics of all sensors of the network, which are not suggested.
+        Topic of each sensor of the network; these topics are not suggested.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, s
 
 
 def shortened(names: list[str]) -> str:
-    """Join names; a long list is cut after the first names and ends with the number of others.
+    """Join names with commas; after `MAX_NAMED` names, only count the remaining names.
 
     Parameters
     ----------

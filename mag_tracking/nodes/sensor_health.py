@@ -26,13 +26,14 @@ from mag_tracking.stages.health.sensor_health import (
 )
 
 WINDOW_S = 60.0
-"""[s] Length of an evaluation window. A fault is reported for one to two windows after its end."""
+"""[s] Length of an evaluation window. A fault is reported for one to two windows after
+the fault has ended."""
 MIN_READINGS = 64
 """Number of readings in the current window below which the previous window is reported."""
 STARTUP_S = 3.0
 """[s] Time after the start during which a silent sensor is not a fault."""
 LEARNING_TIMEOUT_FACTOR = 3.0
-"""A background that is still unknown after this multiple of the learning time is a fault."""
+"""A background that is unknown after this multiple of the learning time, plus 5 s, is a fault."""
 
 
 class HealthDiagnostics:
@@ -43,7 +44,7 @@ class HealthDiagnostics:
     network : SensorNetwork
     settings : Settings
     node : Node, optional
-        Provides the remapped topics of the sensors and their publishers.
+        Node that resolves the sensor topics and whose graph is examined for their publishers.
     is_replayed : bool
         Whether the readings come from a recording, so that old timestamps are not a fault.
     """
@@ -56,10 +57,10 @@ class HealthDiagnostics:
             network.names, network.topics, strict=True)}
         self._settings = settings
         self._index = {name: j for j, name in enumerate(network.names)}
-        # Time of the latest reading by the monotonic clock [s]; NaN = never.
+        # Time of the latest reading by the monotonic clock [s]; NaN before the first reading.
         self._last_received = np.full(len(network), np.nan)
         self._frozen_ns: dict[str, int] = {}
-        # Start of learning by the monotonic clock [s].
+        # Time since which each background has been unknown, by the monotonic clock [s].
         self._unready_since: dict[str, float] = {}
         self._network_findings: dict[str, list[Finding]] = {}
         # Number of relearnt backgrounds at the start of the previous and the current window.
@@ -82,7 +83,7 @@ class HealthDiagnostics:
         return {name: SensorHealth() for name in self._network.names}
 
     def use_network(self, network: SensorNetwork) -> None:
-        """Replace the network by another calibration of the same sensors.
+        """Replace the network by another calibration of the same sensors; restart the windows.
 
         Parameters
         ----------
@@ -117,7 +118,7 @@ class HealthDiagnostics:
         self._current[self._network.names[j]].add_batch(*self._buffer.pop(j))
 
     def statuses(self, node: str, calibrate: Calibrate) -> list[DiagnosticStatus]:
-        """Diagnostics of all sensors.
+        """Evaluate all buffered readings and return the diagnostics of all sensors.
 
         Parameters
         ----------
@@ -167,7 +168,7 @@ class HealthDiagnostics:
                 self._network_findings[finding.subject].append(finding)
 
     def _reported_window(self, name: str) -> SensorHealth:
-        """Current window of a sensor, or its previous window if the current has few readings."""
+        """Current window of a sensor; the previous window if the current one has few readings."""
         previous, current = self._previous[name], self._current[name]
         return previous if previous is not None and current.counts['readings'] < MIN_READINGS \
             else current
@@ -200,7 +201,7 @@ class HealthDiagnostics:
         return sorted(findings.values(), key=lambda f: not f.serious)
 
     def _silence_findings(self, name: str, silent_s: float) -> list[Finding]:
-        """Fault of a sensor that has been silent for `silent_s`; NaN: since the start."""
+        """Fault of a silent sensor; `silent_s` is NaN if the sensor has sent no reading so far."""
         topic = self._topics[name]
         if not math.isnan(silent_s):
             return [Finding(True, name, f'silent for {silent_s:.0f} s', 'check its cable, its '

@@ -59,7 +59,7 @@ class SensorRounds:
         self._states = [self._state(j) for j in range(len(network))]
 
     def tick(self) -> None:
-        """Mark a step as due; the step follows the next readings, or the next tick."""
+        """Mark a step as due; it runs after the next readings, or else at the next tick."""
         if self._is_due:
             self._step()
         self._is_due = True
@@ -70,9 +70,9 @@ class SensorRounds:
             self._step()
 
     def report_doubts(self) -> None:
-        """Publish the calibration immediately if a background has become doubtful or certain.
+        """Publish the calibration immediately if the doubt about a background begins or ends.
 
-        The tracker cannot flag tracks until it receives the message.
+        The tracker flags tracks as ambiguous only after it has received this message.
         """
         backgrounds = self._stage.backgrounds()
         latest = {(j, times[-1]) for j, name in enumerate(self._network.names)

@@ -10,10 +10,10 @@ from mag_tracking.nodes.stage_node import LATCHED
 
 
 class SensorTransforms:
-    """Publishes a frame for each sensor on /tf_static, named after the sensor.
+    """Publishes a static transform for each sensor; the child frame has the name of the sensor.
 
-    The `frame_id` of the sensor messages is not used. This frame may be a robot link that another
-    node publishes, and a frame with two parents would break the tree.
+    The `frame_id` of the sensor messages is not used: it may name a robot link that another node
+    publishes, and a frame with two parents would break the transform tree.
 
     Parameters
     ----------

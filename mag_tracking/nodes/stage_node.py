@@ -38,8 +38,8 @@ from mag_tracking.stages.stage import Stage
 RESULTS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of results for users."""
 STREAM = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of subscriptions between the nodes, and of a replay, which may be fast. The queue is long
-enough for the time that the tracker needs to initiate a track."""
+"""QoS of subscriptions between the nodes, and of the topics of a replay, which may be fast. The
+queue does not overflow while the tracker initiates a track."""
 STREAM_OUTPUT = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of publishers between the nodes. A restarted node can skip at most 256 older messages with a
 single request (RTPS 2.3, 8.3.5.5). With a longer history, a second request would follow seconds
@@ -54,7 +54,7 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of /tf, as in tf2."""
 READY = 'ready'
-"""State of a node that receives input and works normally."""
+"""State of a node that has received input and operates normally."""
 
 _Record = TypeVar('_Record')
 
@@ -147,7 +147,7 @@ class StageNode(Node):
         return tuple(map(self.resolve_topic_name, self.network.topics))
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """Stages whose counts are published.
+        """Stages whose counts are published in diagnostics, by name.
 
         Returns
         -------
@@ -156,12 +156,12 @@ class StageNode(Node):
         raise NotImplementedError
 
     def queues(self) -> dict[str, int]:
-        """Number of queued records.
+        """Number of queued records of each stage.
 
         Returns
         -------
         dict of str to int
-            Number by name of the stage.
+            {name of the stage: number}.
         """
         return {}
 
@@ -171,7 +171,7 @@ class StageNode(Node):
         Parameters
         ----------
         role : str
-            Role of the next step, for messages.
+            Role of the next step, such as `tracker`; used in messages.
         topic : str
         publishes : str
             Message type that identifies the node of the next step among the subscribers.
@@ -247,7 +247,7 @@ class StageNode(Node):
 
     def direct_input(self, source: str, topics: Sequence[str], callback: Callable[[_Record], None],
                      stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
-        """Create a function that receives records of the preceding step, instead of subscriptions.
+        """Create a function that receives the records of the preceding step in place of a topic.
 
         Parameters
         ----------
@@ -298,7 +298,7 @@ class StageNode(Node):
             return None
 
     def _publish_diagnostics(self) -> None:
-        """Publish the counts of the stages; warn of new rejections."""
+        """Publish the counts of the stages and the state of the connections; log a new state."""
         statuses, queues = [], self.queues()
         for name, stage in self.stages().items():
             rejections = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')}
@@ -322,7 +322,7 @@ class StageNode(Node):
         self.report_state()
 
     def _start_statuses(self) -> list[DiagnosticStatus]:
-        """Status of the start of the node: duplicate name, missing clock."""
+        """Status that reports faults of the start: a duplicate node name or a missing clock."""
         faults = []
         full_name = self.get_name(), self.get_namespace()
         n_same = self.get_node_names_and_namespaces().count(full_name)
@@ -332,7 +332,7 @@ class StageNode(Node):
                           f'one process, -r {self.get_name()}:__node:=NAME)')
         if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
             faults.append('use_sim_time is set, but no message was received on /clock: start a '
-                          'replay, or unset it')
+                          'replay, or unset use_sim_time')
         return [DiagnosticStatus(
             level=DiagnosticStatus.ERROR if faults else DiagnosticStatus.OK,
             name=f'{self.title}: start', hardware_id='magnetometer network',

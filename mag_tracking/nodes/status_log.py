@@ -1,4 +1,4 @@
-"""Log of diagnostics: each fault when it appears; errors also once a minute while they last."""
+"""Log of diagnostics: faults are logged when they begin and end; errors are repeated meanwhile."""
 
 import re
 import time
@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 REPEAT_INTERVAL_S = 60.0
-"""[s] Interval at which a persistent error is logged again; minimum interval for other faults."""
+"""[s] Minimum interval between log lines of one fault; a persistent error is repeated after it."""
 MAX_SIMILAR_LINES = 4
 """Maximum number of lines per interval that differ only in numbers, such as sensor numbers."""
 MAX_FAULTS = 1000
@@ -35,11 +35,11 @@ class StatusLog:
 
     @property
     def n_stored(self) -> int:
-        """Number of stored faults and kinds of lines."""
+        """Number of stored faults and line patterns."""
         return len(self._last_logged) + len(self._current_faults) + len(self._similar)
 
     def add(self, status: DiagnosticStatus) -> None:
-        """Log a status if its fault is new or has ended.
+        """Log a status if its fault is new or has ended, or if an error is due to be repeated.
 
         Parameters
         ----------
@@ -77,7 +77,7 @@ class StatusLog:
         self._log(DiagnosticStatus.OK, text)
 
     def _log(self, level: bytes, text: str) -> None:
-        """Log a line unless `MAX_SIMILAR_LINES` similar lines have been logged."""
+        """Log a line unless `MAX_SIMILAR_LINES` similar lines were logged in this interval."""
         now, pattern = time.monotonic(), _NUMBER.sub('#', text)
         if now - self._interval_start > REPEAT_INTERVAL_S or len(self._similar) >= MAX_FAULTS:
             self._similar.clear()

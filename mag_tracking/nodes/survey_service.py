@@ -14,7 +14,7 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.survey.stage import Survey, with_measured_noise
 
 MIN_INTERVAL_S = 0.5
-"""[s] Minimum interval between calls, because each survey delays the readings."""
+"""[s] Minimum interval between surveys, each of which delays the readings."""
 
 
 class SurveyService:
@@ -40,7 +40,7 @@ class SurveyService:
 
     def solve(self, network: SensorNetwork, save: bool,
               response: SurveyMessage.Response) -> SensorNetwork | None:
-        """Solve a survey unless the previous survey has just ended.
+        """Solve a survey, and save the result if requested, unless a survey has just ended.
 
         Parameters
         ----------
@@ -66,13 +66,13 @@ class SurveyService:
 
     def _solve_now(self, network: SensorNetwork, save: bool,
                    response: SurveyMessage.Response) -> SensorNetwork | None:
-        """Solve a survey; the interval is not checked."""
+        """Solve a survey without checking the interval; see `solve`."""
         # If a target is near a sensor, the background was measured before its arrival.
         fields = {name: self._stage.background(name)
                   for name, background in self._stage.backgrounds().items()
                   if background.certain and self._stage.last_stamp_ns(name) is not None}
         if not fields or not self._survey.counts['accelerations']:
-            response.message = 'no background has been learnt yet; wait for a quiet interval' \
+            response.message = 'no background has been learnt yet; keep targets away for a while' \
                 if not fields else 'no acceleration received on ' \
                 f'{", ".join(filter(None, self._imu_topics))}'
             return None

@@ -69,7 +69,7 @@ from mag_tracking.stages.track.settings import BEST
 from mag_tracking.stages.traffic.stage import TrackedFrame
 
 TRANSPORT_MARGIN_S = 1.0
-"""[s] Margin for the transport of a frame, in addition to the maximum gap."""
+"""[s] Margin for the transport of a frame, in addition to `track.end_gap_s`."""
 MAX_PATH = 2000
 """Maximum number of poses in `~/path`."""
 
@@ -99,7 +99,7 @@ class TrackerNode(StageNode):
         follow_changes(self, self.settings, lambda s: self._stage.configure(s.track))
         self._child_frame = fixed_parameter(
             self, 'child_frame', '', 'Frame of the target in odometry and transforms, for example '
-            'for robot_localization. Empty: track_<id>.')
+            'for robot_localization. If empty, the frame is track_<id>.')
         self._tf = self.publisher(TFMessage, '/tf', TRANSFORMS) if fixed_parameter(
             self, 'publish_tf', False, 'Publish the transform from the world frame to the frame '
             'of the target.') else None
@@ -132,7 +132,7 @@ class TrackerNode(StageNode):
         self.report_state()
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """Stages whose counts are published.
+        """Stages whose counts are published in diagnostics, by name.
 
         Returns
         -------
@@ -231,13 +231,13 @@ class TrackerNode(StageNode):
         self._traffic.add(TrackedFrame(frame, records))
 
     def _path_of(self, poses: list[SmoothedPose]) -> Path:
-        """nav_msgs/Path of smoothed poses, with the header of the latest."""
+        """nav_msgs/Path of smoothed poses, with the header of the latest pose."""
         steps = [to_message(PoseStamped, pose_dict(p.stamp_ns, self.network.frame, p.position,
                                                    p.orientation)) for p in poses]
         return Path(header=steps[-1].header, poses=steps)
 
     def _publish(self, track: Track) -> None:
-        """Publish the state of a track at one time."""
+        """Publish one record of a track, or the end of the track, on all topics."""
         frame = self.network.frame
         if not track.ended:
             # The pose comes first, because it may be used for control.
@@ -304,7 +304,7 @@ def publish_if_any(publisher: Publisher, cls: Any, content: MessageDict | None) 
 
 
 def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:
-    """Whether two networks have the same orientations within the rounding of quaternions."""
+    """Whether two networks have the same orientations and uncertainties, except for rounding."""
     is_same_std = [a is b if a is None or b is None else np.allclose(a, b)
                    for a, b in zip(one.orientation_std, other.orientation_std, strict=True)]
     return all(is_same_std) and bool(np.abs(one.R_ws - other.R_ws).max() < 1e-9)

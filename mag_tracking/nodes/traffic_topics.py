@@ -33,7 +33,7 @@ class TrafficTopics:
         self._summaries = node.publisher(TrafficSummaryMessage, '~/traffic', RESULTS)
 
     def add(self, item: TrackedFrame) -> None:
-        """Process the records of a frame and publish the results.
+        """Process the records of a frame; publish completed passages and summaries.
 
         Parameters
         ----------

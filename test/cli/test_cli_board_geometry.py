@@ -94,7 +94,7 @@ def test_sensor_positions_alone_are_sufficient(tmp_path, capsys):
 
 
 def test_inconsistent_sensors_and_poses_are_named(tmp_path, capsys, monkeypatch):
-    """Swapped axes are reported by sensor; an inconsistent pose by its row in the file."""
+    """Swapped axes are reported with the sensor, an inconsistent pose with its row in the file."""
     nominal, field, positions, axes, _ = simulated(5)
     field[:, 2] = field[:, 2][:, [1, 0, 2]]
     field[3] = np.nan

@@ -1,4 +1,4 @@
-"""`replay` reports a clock offset, which corrects the clock in the network file."""
+"""`replay` reports a clock error; the reported offset, set in the network file, corrects it."""
 
 import json
 import re

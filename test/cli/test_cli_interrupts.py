@@ -82,7 +82,7 @@ def test_an_interrupt_does_not_wait_for_the_next_batch(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('step', ['summarise', 'add', 'errors_against_truth', 'write_figures'])
 def test_an_interrupt_while_writing_loses_no_results(tmp_path, monkeypatch, capsys, step):
-    """Interrupt the first two calls of a step of an update or of the final output."""
+    """SIGINT arrives in the first two calls of a step that updates or completes the output."""
     from mag_tracking.apps import replay as app
     from mag_tracking.cli import replay
 
@@ -133,7 +133,7 @@ def test_the_command_works_outside_the_main_thread(tmp_path):
 
 @pytest.mark.parametrize('unbuffered', ['', '1'])
 def test_a_closed_pipe_ends_the_command_silently(unbuffered):
-    """With `| head`, there is no error message, and the exit status is as usual."""
+    """With `| head`, no error is printed, and the exit status is that of SIGPIPE (141)."""
     command = [sys.executable, '-m', 'mag_tracking.cli', 'info', str(vehicle_path(NAME))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                           env={**os.environ, 'PYTHONUNBUFFERED': unbuffered}) as process:

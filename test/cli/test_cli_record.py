@@ -41,7 +41,7 @@ def arguments_of(*arguments):
 def test_record_prints_progress_and_a_summary(tmp_path, monkeypatch, capsys):
     """SIGINT ends the recording; the QoS of a best-effort driver is recorded."""
     monkeypatch.setattr(record_node, 'PROGRESS_INTERVAL_S', 0.2)
-    # Polls are rare, so that the last messages are fetched at the end.
+    # Polls are rare, so that the last messages are fetched by the final poll.
     monkeypatch.setattr(record_node, 'POLL_INTERVAL_S', 0.5)
     stopped, logged = threading.Event(), []
     monkeypatch.setattr(record_node, 'log', lambda text, log=record_node.log: (
@@ -132,6 +132,6 @@ def test_repair_writes_the_index(tmp_path, capsys):
     file.write_bytes(file.read_bytes()[:-20])
     args = arguments_of('repair', tmp_path / 'a')
     assert args.run_command(args) == 0
-    assert capsys.readouterr().out == (f'a_0.mcap: 1 messages, index written\n{tmp_path / "a"}: '
+    assert capsys.readouterr().out == (f'a_0.mcap: index written; messages: 1\n{tmp_path / "a"}: '
                                        'files repaired: 1\n')
     assert Recording(tmp_path / 'a').message_counts == {'/x': 1}

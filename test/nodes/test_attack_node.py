@@ -34,7 +34,7 @@ FIXED = {'calibration_node': ('network', 'save_as', 'state_file', 'target', 'rel
 
 @pytest.fixture
 def folders(tmp_path):
-    """Folder of the network file, with links to a second, protected folder."""
+    """(folder of the network file, protected folder to which the first one has links)."""
     network_folder, protected = tmp_path / 'here', tmp_path / 'outside'
     network_folder.mkdir()
     protected.mkdir()
@@ -53,7 +53,7 @@ def contents(*folders):
 
 
 def start_nodes(network_folder, home):
-    """Start the nodes as processes; a recording is played in a loop."""
+    """Start {node: process}; the replay node plays a recording in a loop."""
     network = ['-p', f'network:={network_folder / "network.yaml"}']
     drivers = network_folder / 'drivers.yaml'
     drivers.write_text(NO_DEVICES)
@@ -76,7 +76,7 @@ unused:
 
 
 class Attacker:
-    """Client of services; each service has one client."""
+    """Calls services; creates one client per service and reuses it."""
 
     def __init__(self, ros):
         self.node, self.spin_until = ros
@@ -105,7 +105,7 @@ def set_parameters(call, node, pairs, atomically=False):
 
 
 def attack_once(call, rng, k):
-    """Run attack `k`: set a parameter or call a service with invalid values."""
+    """Run attack `k`: set a read-only parameter or call services; check the responses."""
     node = NODES[k % len(NODES)]
     path = PATHS[int(rng.integers(len(PATHS)))]
     if k % 4 < 2:
@@ -194,7 +194,7 @@ def test_a_file_outside_the_folder_is_refused_at_start(folders, parameter, name,
 
 
 def create_node(network_folder, parameter, name):
-    """Create a calibration node with a file name in a parameter."""
+    """Create and destroy a calibration node with a file name as the value of a parameter."""
     begin()
     try:
         node = CalibrationNode(parameter_overrides=[

@@ -1,4 +1,4 @@
-"""Deferred work is run once, in time, and is never lost."""
+"""Deferred work: repeated requests cause one call, and the call is neither postponed nor lost."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""Disturbance in the nodes: the tracker publishes the same message as a replay."""
+"""Disturbances in the nodes: the tracker publishes the same message as a replay."""
 
 import numpy as np
 import pytest

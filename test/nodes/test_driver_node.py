@@ -1,4 +1,4 @@
-"""Driver node: from a device to topics and diagnostics; lifecycle."""
+"""Driver node: published readings, diagnostics and lifecycle."""
 
 import time
 
@@ -33,7 +33,7 @@ board:
 
 
 def line_of(sensor, k, tick):
-    """Line `k` of a level sensor at a tick of 10 ms; x [nT] encodes the tick."""
+    """Line number `k` of a level sensor at a tick of 10 ms; x [nT] encodes the tick."""
     body = f'{sensor},{k},{10_000 * tick},{2000 + tick},15500,-49000,0,0,1'
     checksum = 0
     for c in body.encode():
@@ -100,7 +100,7 @@ def test_a_serial_board_is_published_and_reconnected(board):
     diagnostics = listen(node, DiagnosticArray, '/diagnostics', RESULTS)
     process = start('driver_node', '-p', f'drivers:={drivers}', '-p', f'network:={NETWORK_FILE}')
     try:
-        # Lines that were sent before the port was opened arrive together at the beginning.
+        # Lines that were sent before the port was opened arrive together when it is opened.
         assert spin_until(lambda: len(fields) > 100 and len(accelerations) > 100
                           and fields[-100][0] > fields[0][0] + 200_000_000)
         _, message = fields[-1]
@@ -203,7 +203,7 @@ def test_readings_are_published_in_batches(board):
 
 
 def test_readings_in_batches_reach_the_frames(ros, tmp_path):
-    """Readings of a simulator pass the nodes in batches, and no frame lacks a reading."""
+    """Simulated readings pass through the nodes in batches, and no sensor lacks readings."""
     node, spin_until = ros
     network, drivers = tmp_path / 'network.yaml', tmp_path / 'drivers.yaml'
     rows = ''.join(f'  mag_{k}: {{position: [{9 * k}, 0, 0], noise_std: 1.2e-8, '

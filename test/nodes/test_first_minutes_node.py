@@ -36,7 +36,7 @@ class NewUser:
     delay_ns : int
         Delay of the timestamps.
     sensors : sequence of str
-        Sensors that are published.
+        Sensors whose fields are published.
     use_sim_time : bool
         Parameter of the calibration node.
     """

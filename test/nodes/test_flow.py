@@ -61,7 +61,7 @@ def test_a_silent_input_is_reported_until_it_returns(clock):
     flow.topics.append('/a')
     clock[0] += 5.0
     first = status_of(flow)
-    # No message is normal at first: the calibration learns the background.
+    # At first, it is normal to receive nothing, because the calibration learns the background.
     assert first.level == DiagnosticStatus.OK and first.message == 'waiting for /a'
     clock[0] += module.FIRST_MESSAGE_TIMEOUT_S
     overdue = status_of(flow, sender_exists=False)
@@ -74,12 +74,13 @@ def test_a_silent_input_is_reported_until_it_returns(clock):
     assert status_of(flow).message == 'running'
     clock[0] += 1.0
     silent = status_of(flow)
-    # The sender may have nothing to publish.
+    # A sender that exists may have nothing to publish, so the level is not ERROR.
     assert silent.level == DiagnosticStatus.WARN
     assert silent.message == 'no message from a_node for 3 s'
     gone = status_of(flow, sender_exists=False)
     assert gone.level == DiagnosticStatus.ERROR
-    assert gone.message == silent.message + ', and its publisher is gone: check that it is running'
+    assert gone.message == silent.message + ', and its topics have no publisher: ' \
+        'check that it is running'
     flow.add(0, 0, clock[0])
     assert status_of(flow).message == 'running'
 
@@ -140,7 +141,7 @@ def test_a_subscriber_that_disappears_is_reported():
     assert gone.level == DiagnosticStatus.ERROR and gone.name == 'me: to tracker'
     assert gone.message == '/other is gone: check that it is running'
     assert status('/other').level == DiagnosticStatus.OK
-    # A replacement under another name is accepted; nodes of another type are not missed.
+    # A tracker with another name may replace the first; other subscribers may disappear.
     assert status('/second').level == DiagnosticStatus.OK
     assert status('/second', '/rviz').message == status('/second').message == 'running'
 

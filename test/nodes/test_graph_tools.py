@@ -1,4 +1,4 @@
-"""Substitutes for `ros2` on a live system: topics, echo, param, lifecycle."""
+"""Commands that substitute for `ros2`, on a live system: topics, echo, param, lifecycle."""
 
 import subprocess
 import sys

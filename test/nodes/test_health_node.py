@@ -156,14 +156,14 @@ def test_each_sensor_has_a_status(publish_until, statuses):
                              silent=('mag_1', 'mag_2'))
         assert status('mag_1').message.startswith(
             'no message received: /mag_1/imu/mag has no publisher; start its driver')
-        # The timeout is long: readings lost in a stall are reported until enough others follow.
+        # The timeout is long: readings lost in a stall are reported until many more have arrived.
         assert publish_until(
             lambda: all(values(name)['background'] == 'ready' and status(name).level
                         == DiagnosticStatus.OK for name in ('mag_1', 'mag_2')), seconds=240.0)
         assert status('mag_2').message == 'running' and status('mag_2').hardware_id == 'mag_2'
         assert float(values('mag_1')['rate [Hz]']) > 20.0
         assert [5.0 < float(v) < 30.0 for v in values('mag_2')['noise [nT]'].split()] == [True] * 3
-        # The difference is the delay of the middleware and of a busy machine.
+        # The two delays differ by the delay of the middleware and of a busy machine.
         delay = float(values('mag_1')['delay [ms]'])
         publish_delay = np.median(publish_until.late_ms)
         print(f'delay {delay:.1f} ms, of which {publish_delay:.1f} ms before publishing')

@@ -81,7 +81,7 @@ def executables(monkeypatch):
 
 
 def of_class(launch_objects, name):
-    """Objects of a class."""
+    """Objects in a list whose class has the given name."""
     return [m for m in launch_objects if m.name == name]
 
 
@@ -112,7 +112,7 @@ def test_the_launch_file_runs():
         ['ros2', 'launch', str(LAUNCH_FILE), f'network:={NETWORK_FILE}', 'namespace:=road',
          f'recording:={vehicle_path("straight_car_right")}', 'rate:=3.0'], text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    # The timer ends the process if the line never arrives.
+    # The timer ends the process if the expected line never arrives.
     watchdog = threading.Timer(MAX_S, process.kill)
     watchdog.start()
     try:

@@ -34,7 +34,7 @@ begin()
 node, received = Node('listener'), Future()
 executor = EventsExecutor()
 executor.add_node(node)
-# The creation of the node is not a delay of the middleware.
+# The creation of the node is not part of the measured delay.
 began = time.monotonic()
 node.create_subscription(MagneticField, '/field', received.set_result, STREAM)
 executor.spin_until_future_complete(received, 60.0)

@@ -31,7 +31,7 @@ NODES = {'calibration_node': 'magnetic_calibration', 'detection_node': 'watchman
 """{node: its name in these tests}."""
 NETWORKS = {'/north': ('straight_car_right', {}),
             '/a/b': ('straight_car_fast_left', {'mag_1/imu/mag': '/yard/first'})}
-"""{namespace: (recording, {topic: remapped})}."""
+"""{namespace: (recording, {topic: topic to which it is remapped})}."""
 
 
 def start_network(namespace, remapped):
@@ -81,7 +81,7 @@ def test_two_networks_on_one_graph_do_not_interfere(ros, tmp_path, road_network)
         processes += [play(ns, *entry) for ns, entry in NETWORKS.items()]
         assert spin_until(lambda: all(any(t.status == t.ENDED for m in messages for t in m.tracks)
                                       for messages in received.values()))
-        # Each node finds its peers under any name.
+        # Each node identifies its peers although they are renamed.
         assert spin_until(lambda: all(
             statuses.get(f'{ns[1:]}/magnetic_calibration: to detection') == 'running'
             and statuses.get(f'{ns[1:]}/watchman: to tracker') == 'running' for ns in NETWORKS))

@@ -28,7 +28,7 @@ MAX_RECOVERY_S = 2.0
 MAX_REPORT_S = 6.0
 """[s] Maximum time to report a dead node on an idle machine: 3 s of lease, reports at 1 Hz."""
 MAX_VEHICLES = 5
-"""Maximum number of vehicles: on a busy machine, one may pass before it is tracked."""
+"""Maximum number of attempts: on a busy machine, a vehicle may pass without being tracked."""
 
 
 @pytest.fixture(scope='module')
@@ -190,7 +190,7 @@ def test_two_boards_of_one_name_are_reported(site):
     assert not site.told(0, 'driver_node: mqtt', 'sequence restarts')
     began = time.time_ns()
     site.roadside.twin = True
-    # The sequence numbers and the clock reveal the second board; unfit readings are rejected.
+    # The sequence numbers and the clock reveal the second board, and its readings are rejected.
     for words in ('sequence restarts: mag_1', 'do not fit the clock'):
         assert site.wait(lambda words=words: site.told(
             began, 'driver_node: mqtt', words)), words
@@ -228,7 +228,7 @@ def restart(pipeline, name):
     # A track that begins close to the sensors may be wrong, but is ambiguous.
     ('detection_node', -8.0, 1.0), ('tracker_node', -4.0, 1.0)])
 def test_no_pose_is_wrong_after_a_gap_during_a_pass(tmp_path, name, x, gap_s):
-    """Same faults without processes, at reproducible times, with the default frame period."""
+    """The faults occur in one process, at reproducible times, with the default frame period."""
     network, speed = read_network(network_file(tmp_path)), 10.0
     settings = settings_for('vehicle', {**POINT, **STEADY['calibration_node'],
                                         **STEADY['detection_node']})

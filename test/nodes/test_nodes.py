@@ -106,7 +106,7 @@ def compare_with_offline(collector, folder):
 
 
 def compare_traffic(collector, offline):
-    """Assert that passages equal the offline passages, except for the last two."""
+    """Assert that passages equal the offline passages, of which the last two may be missing."""
     n = len(collector.passages)
     assert len(offline.vehicles) - 2 <= n <= len(offline.vehicles) and n > 5
     for online, vehicle in zip(collector.passages, offline.vehicles, strict=False):
@@ -264,7 +264,7 @@ def test_nodes_in_four_processes_equal_offline(ros, tmp_path, road_network):
     np.testing.assert_allclose([t.position[:2] for t in live], list(offline.values()), rtol=1e-9)
     assert received[Clock] and len(received[Odometry]) == len(live)
     assert received[Odometry][0].child_frame_id == 'track_1'
-    # Markers are deleted (2) at the end of the track.
+    # Action 2 deletes the markers at the end of the track.
     assert {m.action for m in received[MarkerArray][-1].markers} == {2}
     state = received[CalibrationState]
     assert state and all(s.ready for s in state[-1].sensors)
@@ -297,7 +297,7 @@ def test_replay_services_pause_seek_and_resume(ros):
         assert call(ros, Seek, '/replay_node/seek', Seek.Request(offset=13.5)).success
         assert not call(ros, Seek, '/replay_node/seek', Seek.Request(offset=99.0)).success
         assert call(ros, Trigger, '/replay_node/resume', Trigger.Request()).success
-        # At the end, the loop restarts: timestamps return to the first.
+        # At the end, playback restarts, so the timestamps return to the first one.
         assert spin_until(lambda: stamp_ns(fields[-1].header.stamp) - begin < 1_000_000_000
                           and len(fields) > n)
         assert (stamp_ns(fields[n].header.stamp) - begin) / 1e9 >= 13.4

@@ -24,7 +24,7 @@ from support.node_processes import MAX_S, environment
 COMMAND = [sys.executable, '-m', 'mag_tracking.cli']
 RECORDING = vehicle_path('straight_car_right')
 PATIENT = ('--ros-args', '-p', 'align.max_wait_s:=5.0')
-"""At a higher rate, readings are later in recording time than the default allows."""
+"""At a high playback rate, readings are later (in recording time) than the default allows."""
 
 
 def command(*arguments):

@@ -49,7 +49,7 @@ def recording_process(out, *options):
 
 
 def await_messages(process, n):
-    """Wait until a recording process reports `n` messages, or no more for ten seconds."""
+    """Wait until a recording process reports `n` messages, or no new message for ten seconds."""
     before, lines = None, 0
     for line in process.stdout:
         match = re.search(r' s: (\d+) messages', line)
@@ -61,7 +61,7 @@ def await_messages(process, n):
 
 
 def contents(path, topics):
-    """{topic: [message as a string]}; serialised messages have undefined padding bytes."""
+    """{topic: [decoded message as a string]}, because padding of serialised bytes is undefined."""
     out = {t: [] for t in topics}
     for m in Recording(path).messages(topics):
         out[m.topic].append(repr(decode(m)))
@@ -77,7 +77,7 @@ def poses(folder):
 
 
 def test_a_recorded_replay_equals_the_original(ros, tmp_path, road_network):
-    """Messages and tracks are the same, also for rosbags. SIGTERM ends the recorder cleanly."""
+    """Messages and tracks are equal; rosbags also reads all messages. SIGTERM ends the recorder."""
     before = set(os.listdir('/dev/shm'))
     original, out = vehicle_path('straight_car_right'), tmp_path / 'night'
     process = recording_process(out)
@@ -141,7 +141,7 @@ def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):
         process.kill()
         kill_time = time.time_ns()
         process.communicate()
-        # A killed process leaves its segments; earlier segments belong to this process.
+        # A killed process leaves its shared memory; segments in `before` belong to this process.
         for name in used - before & set(os.listdir('/dev/shm')):
             os.unlink(f'/dev/shm/{name}')
     messages = list(Recording(tmp_path / 'a').messages())

@@ -1,4 +1,4 @@
-"""Doubtful backgrounds are published between the rounds of per-sensor work."""
+"""Changes of doubtful backgrounds are published without waiting for the end of a round."""
 
 from types import SimpleNamespace
 from unittest.mock import Mock

@@ -86,7 +86,7 @@ def test_topics_fields_and_frames_of_the_layouts_exist(demo):
     assert len(entries) > 20 and frames <= demo.frames
     for topic, path in entries:
         if topic is None:
-            # PlotJuggler separates topic and fields in the same way.
+            # PlotJuggler separates the topic from the fields with a slash, as within a topic name.
             topic = max((t for t in demo.types if path.startswith(f'{t}/')), key=len, default=path)
             path = path.removeprefix(f'{topic}/').replace('/', '.')
         assert topic in demo.types, topic
