@@ -26,8 +26,8 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
                       noise_std: float) -> tuple[Path, Path, int]:
     """Import a table of magnet poses and sensor fields as a recording and a network file.
 
-    The sensor positions and orientations were measured again for every pose; their medians are
-    used.
+    The table repeats the measured sensor positions and orientations for every pose; their medians
+    over all poses are used.
 
     Parameters
     ----------

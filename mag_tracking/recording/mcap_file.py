@@ -182,7 +182,7 @@ class McapFile:
 
 
 class _LooseMessages:
-    """Buffer of messages outside of chunks, which are read faster in blocks."""
+    """Buffer that collects messages outside of chunks into blocks, which are faster to process."""
 
     def __init__(self) -> None:
         self._messages: list[Message] = []

@@ -141,7 +141,7 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
 
 
 def target_alone(fit: _Fit) -> FloatArray:
-    """Fitted field without the backgrounds, which are the last parameters of the fit.
+    """Fitted field of the target, without the fitted background of each sensor.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def target_alone(fit: _Fit) -> FloatArray:
 
 
 def order_figure(passes: Sequence[_FittedPass]) -> Figure:
-    """Plot the normalised cost over the number of dipoles, one line per pass.
+    """Plot the normalised cost against the number of dipoles, one line per pass.
 
     A filled symbol marks the chosen order.
 

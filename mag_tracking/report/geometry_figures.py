@@ -12,8 +12,8 @@ from mag_tracking.report.literal_text import literal
 
 _SUSPECT = 'tab:red'
 _MAX_NAMES = 60
-"""Maximum number of sensor names on an axis. For more sensors, only every second, third, ... name
-is drawn."""
+"""Maximum number of sensor names on an axis. In a larger network, only every second, third, ...
+name is drawn."""
 
 
 class _Network(Protocol):
@@ -77,7 +77,7 @@ class _Survey(Protocol):
 
 
 def geometry_figure(found: _Survey) -> Figure:
-    """Plot corrections of positions, orientations and gains of the sensors, and the residuals.
+    """Plot the corrections of the sensor positions, orientations and gains, and the residuals.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def geometry_figure(found: _Survey) -> Figure:
     rows[2].axhline(1.0, color='k', lw=0.8, ls=':')
     rows[2].set_title('gain (90 %)', fontsize=10, loc='left')
     _plot_residuals(rows[3], along, g.sensor_residual, suspect,
-                    'residual in standard deviations (RMS; 1 if noise and field error are right)')
+                    'residual in standard deviations (RMS; 1 for correct noise and field error)')
     step = -(-n // _MAX_NAMES)
     rows[3].set_xticks(along[::step], [literal(name) for name in names[::step]], rotation=90,
                        fontsize=7)
@@ -116,7 +116,7 @@ def geometry_figure(found: _Survey) -> Figure:
 
 
 def _plot_displacements(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) -> None:
-    """Plot the board along its thinnest axis, with magnified arrows for the displacements."""
+    """Plot the board, viewed along its thinnest axis, with magnified arrows for displacements."""
     places = found.stated.positions
     a, b = _widest_axes(places)
     c = 3 - a - b
@@ -180,7 +180,7 @@ def _plot_corrections(axes: Axes, along: IntArray, magnitude: FloatArray, std: F
 
 def _plot_residuals(axes: Axes, along: IntArray, residual: FloatArray, suspect: BoolArray,
                     title: str) -> None:
-    """Plot residuals as bars, suspect sensors in red."""
+    """Plot the residuals of the sensors as bars; bars of suspect sensors are red."""
     axes.bar(along, np.nan_to_num(residual), width=0.8,
              color=np.where(suspect, _SUSPECT, 'tab:blue').tolist())
     axes.axhline(1.0, color='k', lw=0.8, ls=':')
@@ -189,7 +189,7 @@ def _plot_residuals(axes: Axes, along: IntArray, residual: FloatArray, suspect: 
 
 
 def _plot_pose_residuals(axes: Axes, found: _Survey) -> None:
-    """Plot the residual of each pose over the row of the pose in the table."""
+    """Plot the residual of each pose against its row in the table."""
     suspect = np.isin(found.rows, found.suspect_rows)
     residual = found.geometry.pose_residual
     axes.plot(found.rows[~suspect], residual[~suspect], '.', ms=4, color='tab:blue')
