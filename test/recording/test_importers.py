@@ -1,4 +1,4 @@
-"""Import of tables of magnet poses: invalid tables are refused."""
+"""Import of tables of magnet poses, and rejection of invalid tables."""
 
 import pytest
 

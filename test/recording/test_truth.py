@@ -110,7 +110,7 @@ def test_a_topic_without_poses_is_refused_as_truth(tmp_path, topic, message):
 
 
 def test_a_table_gives_the_same_errors_as_the_topic(tmp_path, road_network):
-    """Times are in ns or in s. The errors of the track equal the errors with the topic."""
+    """The track errors are the same, whether the times in the table are in ns or in s."""
     settings = settings_for('vehicle', QUICK)
     run = replay(Recording(vehicle_path(NAME)), road_network, settings, tmp_path / 'a')
     ((stamps, position, _),) = run.truth.values()
