@@ -136,7 +136,7 @@ class McapFile:
         yield pending
 
     def _count_lost_chunk(self, entry: ChunkIndex) -> None:
-        """Count a chunk of the index that cannot be read."""
+        """Count an unreadable chunk as a loss, described by its duration and start time."""
         seconds = (entry.message_end_time - entry.message_start_time) / 1e9
         after = (entry.message_start_time - (self.start_ns or entry.message_start_time)) / 1e9
         self._count_loss(entry.chunk_start_offset, f'damaged segments ({self._path.name}, '

@@ -1,4 +1,4 @@
-"""Extraction of readings and true poses from a recording."""
+"""Extraction of readings, accelerations and true poses from a recording."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -188,7 +188,7 @@ class SampleReader:
 
     def _records_of(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
                     ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """Iterate as `_records` over the given messages, and count unusable messages."""
+        """Iterate as `_records` over messages; collect true poses and count unusable messages."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
             truth = self._truth.accepts(message.topic, message.type)

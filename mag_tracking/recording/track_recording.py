@@ -94,7 +94,7 @@ class TrackRecording:
                 self._writer.write(self._topics[name], MAGNETIC_FIELD, content, frame.stamp_ns)
 
     def add_track(self, track: Track) -> None:
-        """Write one record of a track, or the end of the track, to all topics of tracks.
+        """Write one record of a track, or the end of the track, on all topics.
 
         Parameters
         ----------

@@ -61,7 +61,7 @@ _INTERVAL = (
 
 
 def tables_of(class_names: Sequence[str], with_fleet: bool) -> dict[str, tuple[Column, ...]]:
-    """Columns of each table.
+    """Columns of the tables `passages` and `intervals`.
 
     Parameters
     ----------

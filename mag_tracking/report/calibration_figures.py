@@ -124,7 +124,7 @@ def _plot_knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> N
 
 
 def _plot_headings(axes: Axes, found: _Calibration, stated: _Network) -> None:
-    """Plot the rotation of each sensor from its nominal orientation, by calibration step."""
+    """Plot the yaw of each sensor relative to its nominal orientation, by calibration step."""
     n = len(stated)
     steps = [('compass', found.survey.network, 'tab:orange', 0.12)]
     if found.evidence is not None:

@@ -65,7 +65,7 @@ def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray
 
 def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None,
                smoothed: ArrayLike | None = None) -> Figure:
-    """Plot the trajectories of the hypotheses with 90 % ellipses, the sensors and the truth.
+    """Plot a track with 90 % ellipses, its hypotheses by arrival direction, sensors and truth.
 
     Parameters
     ----------

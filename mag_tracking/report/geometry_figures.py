@@ -117,31 +117,31 @@ def geometry_figure(found: _Survey) -> Figure:
 
 def _plot_displacements(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) -> None:
     """Plot the board, viewed along its thinnest axis, with magnified arrows for displacements."""
-    places = found.stated.positions
-    a, b = _widest_axes(places)
+    positions = found.stated.positions
+    a, b = _widest_axes(positions)
     c = 3 - a - b
-    shift = 1e3 * (found.network.positions - places)
-    extent = np.ptp(places, axis=0).max() or 1.0
+    shift = 1e3 * (found.network.positions - positions)
+    extent = np.ptp(positions, axis=0).max() or 1.0
     longest = np.linalg.norm(shift[:, [a, b]], axis=1).max()
     key = _round_down(longest) or 1.0
     r, _ = found.geometry.poses
     axes.plot(r[:, a], r[:, b], '.', ms=3, color='0.85', zorder=0, label='poses of the magnet')
     most = np.abs(shift[:, c]).max() or 1.0
     arrows = axes.quiver(
-        places[:, a], places[:, b], shift[:, a], shift[:, b], shift[:, c], cmap='coolwarm',
+        positions[:, a], positions[:, b], shift[:, a], shift[:, b], shift[:, c], cmap='coolwarm',
         clim=(-most, most), angles='xy', scale_units='xy', width=0.006, edgecolor='k',
         linewidth=0.4, scale=8.0 * (longest or 1.0) / extent, zorder=2)
     axes.quiverkey(arrows, 0.86, 1.03, key, f'{key:g} mm', labelpos='E')
-    axes.plot(places[:, a], places[:, b], 'k.', ms=3, zorder=3, label='nominal positions')
+    axes.plot(positions[:, a], positions[:, b], 'k.', ms=3, zorder=3, label='nominal positions')
     if suspect.any():
-        axes.plot(places[suspect, a], places[suspect, b], 'o', ms=12, mfc='none', mew=1.5,
+        axes.plot(positions[suspect, a], positions[suspect, b], 'o', ms=12, mfc='none', mew=1.5,
                   color=_SUSPECT, label='does not fit')
-    if len(places) <= _MAX_NAMES:
-        for name, place in zip(found.network.names, places, strict=True):
-            axes.annotate(literal(name), place[[a, b]], xytext=(3, -8), textcoords='offset points',
-                          fontsize=6, color='0.35')
+    if len(positions) <= _MAX_NAMES:
+        for name, position in zip(found.network.names, positions, strict=True):
+            axes.annotate(literal(name), position[[a, b]], xytext=(3, -8),
+                          textcoords='offset points', fontsize=6, color='0.35')
     # A few distant poses must not extend the axes.
-    low, high = places.min(axis=0) - 0.15 * extent, places.max(axis=0) + 0.15 * extent
+    low, high = positions.min(axis=0) - 0.15 * extent, positions.max(axis=0) + 0.15 * extent
     axes.set_xlim(low[a], high[a])
     axes.set_ylim(low[b], high[b])
     axes.set_aspect('equal')
@@ -153,9 +153,9 @@ def _plot_displacements(figure: SubFigure, axes: Axes, found: _Survey, suspect: 
     figure.colorbar(arrows, ax=axes, shrink=0.7, label=f'displacement along {"xyz"[c]} [mm]')
 
 
-def _widest_axes(places: FloatArray) -> tuple[int, int]:
+def _widest_axes(positions: FloatArray) -> tuple[int, int]:
     """Indices of the two axes along which the board is widest, in ascending order."""
-    a, b = sorted(np.argsort(np.ptp(places, axis=0), kind='stable')[1:])
+    a, b = sorted(np.argsort(np.ptp(positions, axis=0), kind='stable')[1:])
     return int(a), int(b)
 
 

@@ -41,7 +41,7 @@ class MagnetErrors(TypedDict):
     anees: float
     """Mean NEES per axis of the position."""
     n: int
-    """Number of poses."""
+    """Number of evaluated poses."""
 
 
 def interpolate_truth(truth: Truth, stamps_ns: ArrayLike) -> FloatArray:

@@ -114,7 +114,7 @@ def _levels(values: FloatArray, factor: float) -> FloatArray:
 
 
 def position_figure(plan: _Plan) -> Figure:
-    """Plot a map of the position bound that a whole pass through each point attains.
+    """Plot a map of the position bound (standard deviation) from a whole pass through each point.
 
     Parameters
     ----------
@@ -160,7 +160,9 @@ def detection_figure(plan: _Plan) -> Figure:
 
 
 def sensor_figure(plan: _Plan) -> Figure:
-    """Plot a map of the improvement if one sensor is added; white where no sensor is allowed.
+    """Plot a map of how much an additional sensor at each point reduces the median bound.
+
+    The map is white where no sensor is allowed.
 
     Parameters
     ----------
