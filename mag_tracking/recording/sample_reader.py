@@ -73,7 +73,7 @@ class SampleReader:
         if truth is not None and recording.types and not self._truth.accepts(
                 truth, recording.types.get(truth, '')):
             poses = sorted(t for t, kind in recording.types.items() if kind in TRUTH_TYPES)
-            raise RecordingError(f'{recording.path}: the truth topic {truth} is '
+            raise RecordingError(f'{recording.path}: the truth topic {truth} has no poses: it is '
                                  f'{recording.types.get(truth, "not in the recording")}; '
                                  f'topics with poses: {", ".join(poses) or "none found"}')
         self.rejected: Counter[str] = Counter()

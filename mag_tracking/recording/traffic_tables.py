@@ -42,7 +42,8 @@ _PASSAGE = (
     Column('class', 's', '', 'most probable class, or unknown'))
 _VEHICLE = (
     *columns_of('s', '', vehicle='name of the matching enrolled vehicle, or unknown'),
-    *columns_of('f', '', p_vehicle='probability of the vehicle among the comparable vehicles'))
+    *columns_of('f', '', p_vehicle='probability of the vehicle among the enrolled vehicles that '
+                                   'can be compared at this heading'))
 _PASSAGE_END = (
     *columns_of('f', 's', headway='time since the previous vehicle in the same direction'),
     *columns_of('b', '', ambiguous='whether the passage is ambiguous'),
@@ -92,9 +93,9 @@ def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[s
     passage : VehiclePassage
     class_names : sequence of str
     delay : dict
-        Values by column, for the speed from the delay between sensors.
+        Values of the columns for the speed from the delay between sensors.
     vehicle : dict
-        Values by column, for the matching enrolled vehicle.
+        Values of the columns for the matching enrolled vehicle. Empty without a fleet.
 
     Returns
     -------

@@ -191,7 +191,7 @@ def order_figure(passes: Sequence[_FittedPass]) -> Figure:
     axes.axhline(1.0, color='k', lw=0.8, ls='--')
     axes.set_xticks(sorted({f.n_dipoles for one in passes for f in one.fits}))
     axes.set_xlabel('number of dipoles')
-    axes.set_ylabel('normalised cost (1 = residuals match the noise)')
+    axes.set_ylabel('normalised cost (1 if the residuals match the noise)')
     axes.grid(alpha=0.3, which='both')
     legend_beside(axes)
     plain_log_ticks(axes)
