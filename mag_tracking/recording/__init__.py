@@ -1,1 +1,1 @@
-"""Recordings and other files: reading, writing, recording, repair and import."""
+"""Reading, writing, repair and import of recordings and other data files."""

@@ -1,8 +1,8 @@
-"""Folder of an archive: tables as Parquet files, with one file per recording and day.
+"""Folder of an archive: tables of Parquet files, with one file per recording and day.
 
     DIR/archive.json                    schema, network and settings
     DIR/TABLE/date=2026-03-01/NAME.parquet
-    DIR/done/NAME.json                  written last; marks a complete recording
+    DIR/done/NAME.json                  written last; marks a recording as processed
     DIR/unfinished/NAME.STATE/          partial results, from which the next run resumes
 
 NAME is the stem of the recording and a hash of its path; STATE is a hash of the names, sizes and
@@ -39,7 +39,7 @@ _HEAD, _DONE, _WORK, _LOCK = 'archive.json', 'done', 'unfinished', '.lock'
 
 
 def recording_key(recording: Path) -> str:
-    """Name of a recording in the archive, identical in every run.
+    """Name of a recording's files in the archive; the same in every run.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def _hash(text: str) -> str:
 
 
 class ArchiveFolder:
-    """Folder of an archive, locked by the process that coordinates a run; a context manager.
+    """Folder of an archive, locked against other runs until it is closed; a context manager.
 
     Parameters
     ----------
@@ -97,8 +97,8 @@ class ArchiveFolder:
     Raises
     ------
     OutputError
-        If the folder is not an archive, was created with other metadata or another table version,
-        or is locked by another run.
+        If the folder is neither empty nor an archive, was created with other metadata or another
+        table version, is locked by another run, or cannot be written.
     """
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
@@ -143,7 +143,7 @@ class ArchiveFolder:
         self.close()
 
     def _check_head(self, head: dict[str, Any]) -> None:
-        """Check that earlier runs used the same `head`, or write it; raises OutputError."""
+        """Write `head` in the first run, later compare it with the file; raises OutputError."""
         path = self.path / _HEAD
         if not path.exists():
             replace_text(path, json.dumps(head, indent=1, sort_keys=True) + '\n')
@@ -157,11 +157,11 @@ class ArchiveFolder:
                          != json.dumps(before.get(key), sort_keys=True))
         if differs:
             raise OutputError(f'{self.path} was created with other values of '
-                              f'{", ".join(differs)}: rows would not be comparable. '
-                              'Choose another folder')
+                              f'{", ".join(differs)}: the new rows would not be comparable with '
+                              'the existing rows. Choose another folder')
 
     def done(self, recording: Path) -> dict[str, Any] | None:
-        """Summary of a recording that is complete in the archive and has not changed since then.
+        """Return the summary of a recording that was processed and has not changed since then.
 
         Parameters
         ----------
@@ -179,7 +179,7 @@ class ArchiveFolder:
         return known if known.get('state') == recording_state(recording) else None
 
     def begin(self, recording: Path, state: list[list[Any]]) -> Path:
-        """Prepare the folder of a recording's partial results, and remove outdated results.
+        """Create the folder for a recording's partial results, and remove its outdated results.
 
         Parameters
         ----------
@@ -212,7 +212,7 @@ class ArchiveFolder:
 
     def complete(self, recording: Path, work: Path, state: list[list[Any]],
                  known: Mapping[str, Any]) -> None:
-        """Mark a recording as complete after all of its tables have been written.
+        """Mark a recording as processed, after all of its tables have been written.
 
         Parameters
         ----------
@@ -220,8 +220,8 @@ class ArchiveFolder:
         work : Path
             Folder of the partial results, which is removed.
         state : list
-            State of the recording when its processing began. If it has changed since, the next run
-            processes the recording again.
+            State of the recording when its processing began. If the recording has changed since
+            then, the next run processes it again.
         known : mapping
             Summary of the recording.
         """
@@ -242,7 +242,7 @@ class ArchiveFolder:
                 table.add(row)
 
     def known(self) -> list[dict[str, Any]]:
-        """Summaries of all complete recordings, from this run and earlier runs.
+        """Return the summaries of all processed recordings, from this run and earlier runs.
 
         Returns
         -------
@@ -252,7 +252,7 @@ class ArchiveFolder:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder, renamed first so that an interruption leaves no folder of its name."""
+    """Rename a folder, then delete it, so that an interruption leaves no partial folder."""
     renamed = folder.with_name(f'.{secrets.token_hex(8)}.{folder.name}')
     folder.rename(renamed)
     shutil.rmtree(renamed, ignore_errors=True)
@@ -267,7 +267,7 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
     parts : iterable of Path
         Files of the same table, in chronological order.
     shifts : iterable of int
-        Offset that is added to the `track_id` in each part.
+        Offset for each part, which is added to its column `track_id`.
     table : str
         Name of the table.
     folder : Path
@@ -307,7 +307,7 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
 
 
 def common_columns(recording: Path, stamp_ns: int | None) -> dict[str, Any]:
-    """Columns common to the rows of all tables.
+    """Return the columns that the rows of all tables have in common.
 
     Parameters
     ----------

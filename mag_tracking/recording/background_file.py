@@ -158,7 +158,7 @@ def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
     for j, name in enumerate(network.names):
         try:
             if name in entries and entries[name]['made_of'] != _dependencies(network, j, settings):
-                refused[name] = 'it belongs to another network file or other settings'
+                refused[name] = 'it was stored for another network file or other settings'
             elif name in entries:
                 stored[name] = _background_of(entries[name])
         except KeyError as error:
@@ -171,12 +171,13 @@ def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
 
 
 def _background_of(entry: Any) -> StoredBackground:
-    """Background in an entry of the file; raises ValueError if its numbers are invalid."""
+    """Parse an entry of the file; raises KeyError, TypeError or ValueError if it is invalid."""
     background = np.array(entry['background'], dtype=float)
     covariance = np.array(entry['covariance'], dtype=float)
     if background.shape != (3,) or covariance.shape != (3, 3) or np.isinf(background).any() \
             or not isinstance(entry['stamp_ns'], int):
-        raise ValueError(f'invalid background {background.tolist()} at {entry["stamp_ns"]}')
+        raise ValueError(f'the background {background.tolist()}, its covariance or its timestamp '
+                         f'(stamp_ns {entry["stamp_ns"]}) is invalid')
     is_known = ~np.isnan(background)
     C = covariance[np.ix_(is_known, is_known)]
     if not is_known.any() or not np.isfinite(C).all() or np.linalg.eigvalsh(C)[0] <= 0.0:

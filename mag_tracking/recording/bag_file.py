@@ -46,7 +46,7 @@ class BagFile:
     message_counts : Counter
         Number of messages by topic.
     start_ns, end_ns : int, ns, or None
-        Log times of the first and last message. None without messages.
+        Log times of the first and last message. None if the bag has no messages.
 
     Raises
     ------
@@ -117,7 +117,7 @@ class BagFile:
                 reported = position
 
     def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Iterate over (topic, type, log time, bytes); damage ends the iteration and is counted."""
+        """Iterate over (topic, type, log time, bytes); stop at damage, and count it as a loss."""
         n = 0
         with self._open_reader() as reader:
             try:

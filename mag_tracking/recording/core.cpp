@@ -1,5 +1,5 @@
-// Python module of compiled functions for work that is repeated many thousands of times; core.pyi
-// documents the arguments.
+// Python module of compiled functions that locate the records of MCAP chunks and format numbers;
+// core.pyi documents the arguments.
 
 #include <algorithm>
 #include <charconv>
@@ -90,7 +90,7 @@ py::list number_rows(Array values) {
 
 PYBIND11_MODULE(core, m) {
     using namespace mag_tracking;
-    m.doc() = "Compiled functions for work that is repeated many thousands of times.";
+    m.doc() = "Compiled functions that locate the records of MCAP chunks and format numbers.";
     m.def("number_rows", &number_rows, IN(values));
     m.def("records_of", &records_of, py::arg("data"), py::arg("latest_ns"));
 }

@@ -1,4 +1,4 @@
-"""Compiled functions for work that is repeated many thousands of times."""
+"""Compiled functions that locate the records of MCAP chunks and format numbers."""
 
 from mag_tracking.arrays import FloatArray, IntArray
 

@@ -35,7 +35,7 @@ def event_row(event: PassEvent) -> list[object]:
 
 
 def _number(value: float) -> str:
-    """Format a number with six significant digits; empty for an unknown number."""
+    """Format a number with six significant digits; return '' for NaN and infinity."""
     return f'{value:.6g}' if np.isfinite(value) else ''
 
 

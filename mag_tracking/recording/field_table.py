@@ -29,7 +29,7 @@ _Axes: TypeAlias = dict[str, dict[str, str]]
 
 
 def parse_columns(texts: Sequence[str]) -> tuple[str, str | None, _Axes]:
-    """Parse the assignment of table columns.
+    """Parse the assignments of table columns.
 
     Parameters
     ----------
@@ -42,9 +42,9 @@ def parse_columns(texts: Sequence[str]) -> tuple[str, str | None, _Axes]:
     time : str
         Column of the time.
     sensor : str or None
-        Column of the sensor name.
+        Column of the sensor name. None if each sensor has its own columns.
     axes : dict of str to dict of str to str
-        Column by sensor and axis.
+        Column by sensor and axis. If `sensor` is a column, the only key is ''.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def import_field_table(table: _Path, columns: Sequence[str], unit: str, out: _Pa
     recording : Path
         Recording with the readings on `/NAME/imu/mag`.
     counts : dict of str to int
-        Number of readings by sensor. A row without a measured axis of the sensor is not counted.
+        Number of readings by sensor. A row in which no axis was measured is not counted.
 
     Raises
     ------
@@ -164,7 +164,8 @@ def _rows(table: Path, column_names: Sequence[str]) -> list[tuple[int, dict[str,
         if any(row[c] is None for c in column_names):
             raise RecordingError(f'{table}: row {number} has too few columns')
         if None in row:
-            raise RecordingError(f'{table}: row {number} has too many columns (a decimal comma?)')
+            raise RecordingError(f'{table}: row {number} has too many columns; does it contain '
+                                 'decimal commas?')
     return rows
 
 
@@ -182,19 +183,20 @@ def _number(text: str, where: str) -> float:
 
 
 def _stamp(text: str, scale: int, where: str) -> int:
-    """Convert a cell to a time [ns], whole numbers exactly; raises RecordingError."""
+    """Convert a cell to a time [ns]; integers are not rounded; raises RecordingError."""
     text = text.strip()
     is_whole = re.fullmatch(r'[+-]?[0-9]{1,20}', text)
     value = int(text) * scale if is_whole else _number(text, where) * scale
     if not 0 <= value <= LATEST_NS:
-        raise RecordingError(f'{where}: {text[:30] or "an empty cell"} is not a time after 1970')
+        raise RecordingError(f'{where}: {text[:30] or "an empty cell"} is not a valid time since '
+                             '1970')
     return round(value)
 
 
 def _sensor_name(text: str, where: str) -> str:
-    """Sensor name that is valid in topics: a number n becomes `mag_n`; raises RecordingError."""
+    """Convert a string to a sensor name for topics (3 becomes `mag_3`); raises RecordingError."""
     name = f'mag_{text.strip()}' if re.fullmatch('[0-9]+', text.strip()) else text.strip()
     if not re.fullmatch('[A-Za-z_][A-Za-z0-9_]*', name):
         raise RecordingError(f'{where}: {text!r} is not a valid sensor name: use only letters, '
-                             'digits and _, and no digit at the beginning')
+                             'digits and _, and do not begin with a digit')
     return name

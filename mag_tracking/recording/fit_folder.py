@@ -29,10 +29,10 @@ FIT_COLUMNS = (
 """Columns of `fits.csv`. Standard deviations are from `PassFit.robust_covariance`. The closest
 point of approach (CPA) refers to the centre of the sensors; its time is in seconds after
 `stamp_ns`. `rate` is the speed divided by the CPA range, which a single sensor can observe; the
-corresponding directions are in `fits.json`. A fit that is not trusted as a whole has only its
-trusted quantities (speed, heading, time of the CPA), and only if the fit is selected for its pass.
-Jointly fitted vehicles have common unknowns and costs. The columns of the delay are model-free and
-equal for all fits of a pass."""
+corresponding directions are in `fits.json`. For a fit that is not trusted as a whole, only the
+trusted quantities (speed, heading, time of the CPA) are written, and only if the fit is selected
+for its pass. Jointly fitted vehicles share their unknowns and costs. The speed and heading from the
+delays between sensors are model-free and equal for all fits of a pass."""
 
 
 class _FittedPass(Protocol):
@@ -141,7 +141,7 @@ def pass_rows(one: _FittedPass) -> list[dict[str, Any]]:
 class FitFolder:
     """Writes `fits.csv` and `fits.json` to a folder; a context manager.
 
-    Rows are written immediately, `fits.json` on exit, even after an error.
+    Rows are written immediately. `fits.json` is written on exit, even after an error.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ class FitFolder:
     rows : list of dict
         Rows that have been written.
     summary : dict
-        Further content of `fits.json`, to be filled by the caller.
+        Additional entries of `fits.json`, which the caller sets.
 
     Raises
     ------
@@ -198,7 +198,7 @@ class FitFolder:
 
 
 def _bearing(bearing: Bearing | None) -> dict[str, Any] | None:
-    """Convert a `Bearing` to values for JSON."""
+    """Convert a `Bearing` to a dict for JSON; return None if there is no bearing."""
     if bearing is None:
         return None
     return {'to_closest_point': bearing.cpa_direction.tolist(),

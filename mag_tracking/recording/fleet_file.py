@@ -1,4 +1,4 @@
-"""JSON file of enrolled vehicles, with all passes of each vehicle, so that passes can be added."""
+"""JSON file of enrolled vehicles. It contains every pass, so that passes can be added later."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -26,7 +26,7 @@ class FleetPass:
     heading: float
     """Heading, rad, anticlockwise from x."""
     source: str
-    """Recording and number of the passage."""
+    """Name of the recording, and index of the passage in it."""
 
 
 def read_fleet(path: str | PathLike[str]) -> dict[str, list[FleetPass]]:

@@ -26,8 +26,8 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
                       noise_std: float) -> tuple[Path, Path, int]:
     """Import a table of magnet poses and sensor fields as a recording and a network file.
 
-    The sensor positions and orientations were measured again for every pose; their medians are
-    used.
+    The table repeats the measured sensor positions and orientations for every pose; their medians
+    over all poses are used.
 
     Parameters
     ----------
@@ -62,8 +62,8 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
     backgrounds = _read_background(background)
     ids = np.unique(rows['id']).astype(int)
     if len(backgrounds) != len(ids):
-        raise RecordingError(f'the tables have different numbers of sensors: {background} '
-                             f'{len(backgrounds)}, {table} {len(ids)}')
+        raise RecordingError(f'the tables have different numbers of sensors: {background} has '
+                             f'{len(backgrounds)}, {table} has {len(ids)}')
     names = tuple(f'mag_{i}' for i in ids)
     position, vectors = (np.array([np.median(rows[kind][rows['id'] == i], axis=0) for i in ids])
                          for kind in ('sensor', 'sensor_rotation'))

@@ -1,4 +1,4 @@
-"""Reading that reports its progress and can be stopped by the caller."""
+"""Iteration over a recording that reports its progress and can be stopped by the caller."""
 
 from collections.abc import Callable, Iterator
 from typing import TypeAlias, TypeVar
@@ -18,7 +18,7 @@ def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progres
     Parameters
     ----------
     read : callable
-        Returns an iterator. Its argument is a function to be called with the number of bytes read
+        Returns an iterator. Its argument is a function that it calls with the number of bytes read
         since the last call.
     progress : callable, optional
         Called with the number of bytes read since the last call.

@@ -136,7 +136,7 @@ class McapFile:
         yield pending
 
     def _count_lost_chunk(self, entry: ChunkIndex) -> None:
-        """Count a chunk of the index that cannot be read."""
+        """Count an unreadable chunk as a loss, described by its duration and start time."""
         seconds = (entry.message_end_time - entry.message_start_time) / 1e9
         after = (entry.message_start_time - (self.start_ns or entry.message_start_time)) / 1e9
         self._count_loss(entry.chunk_start_offset, f'damaged segments ({self._path.name}, '
@@ -182,7 +182,7 @@ class McapFile:
 
 
 class _LooseMessages:
-    """Buffer of messages outside of chunks, which are read faster in blocks."""
+    """Buffer that collects messages outside of chunks into blocks, which are faster to process."""
 
     def __init__(self) -> None:
         self._messages: list[Message] = []

@@ -109,7 +109,7 @@ class McapFileWriter:
             raise OSError(errno.ENOENT, 'the file was removed')
 
     def _mark_intact(self) -> None:
-        """Record that the bytes in the file form complete chunks."""
+        """Record that all bytes written so far form complete chunks."""
         self._intact_size, self._buffered_size = self._stream.offset, 0
         self.pending.clear()
         if self._times:
@@ -124,7 +124,7 @@ class McapFileWriter:
         self._stream.raw.close()
 
     def abandon(self) -> None:
-        """Close the file after a failure; complete chunks remain, but no index is written."""
+        """Truncate the file to its complete chunks after a failure, and close it without index."""
         self.counts -= self.pending
         with suppress(OSError):
             self._stream.raw.truncate(self._intact_size)

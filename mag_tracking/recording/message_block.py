@@ -1,4 +1,4 @@
-"""Blocks of many messages: their bytes, and arrays with channel, log time and positions."""
+"""Blocks of messages: their bytes, and arrays of their channels, log times and byte positions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -157,7 +157,7 @@ class MessageBlock:
         """
         if not len(self):
             return other
-        # Few messages remain from the previous chunk, so the rest of its bytes is dropped.
+        # Few messages remain from the previous chunk, so only their bytes are kept.
         remaining = [self.data[b:e] for b, e in zip(self.begin, self.end, strict=True)]
         length = np.array([len(m) for m in remaining], dtype=np.int64)
         end = len(other.data) + np.cumsum(length)

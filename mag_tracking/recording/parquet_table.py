@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 2
-"""Version of the tables. Folders of other versions are rejected: rows would not be comparable."""
+"""Version of the tables. Folders of other versions are rejected, because their rows would not be
+comparable."""
 
 MAX_BUFFERED_ROWS = 5000
 """Maximum number of rows that are buffered in memory."""
@@ -27,8 +28,8 @@ class Column(NamedTuple):
     name: str
     """Name of the column."""
     kind: str
-    """Type: t = UTC time, i = integer, f = float, s = string, b = boolean, C = (6, 6) matrix,
-    row-major."""
+    """Type: 't' for UTC time, 'i' for integer, 'f' for float, 's' for string, 'b' for boolean, and
+    'C' for a (6, 6) matrix in row-major order."""
     unit: str
     """Unit; empty for a dimensionless column."""
     meaning: str
@@ -101,7 +102,7 @@ def schema_of(columns: Iterable[Column]) -> 'pa.Schema':
 class TableWriter:
     """Writer of a Parquet file in parts, which replaces an existing file only on success.
 
-    It is a context manager. An error leaves no new file.
+    It is a context manager. After an error, no file is created or replaced.
 
     Parameters
     ----------

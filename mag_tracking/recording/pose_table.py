@@ -15,7 +15,7 @@ def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
     Parameters
     ----------
     path : path_like
-        CSV file with the columns `x0,y0,z0,x1...` [T, sensor frame; empty or nan = not measured],
+        CSV file with the columns `x0,y0,z0,x1...` [T, sensor frame; empty or nan if not measured],
         `mag_x0..z0` [m, tracker frame] and `mag_mx0..mz0` (unit vector, tracker frame).
 
     Returns
@@ -62,7 +62,7 @@ def read_readings(path: CsvPath) -> FloatArray:
 
 
 def read_sensor_positions(path: CsvPath) -> FloatArray:
-    """Read sensor positions from a CSV file of x, y, z with comments after #.
+    """Read sensor positions from a CSV file of x, y, z, in which # begins a comment line.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def read_sensor_positions(path: CsvPath) -> FloatArray:
 
 
 def _values(path: CsvPath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
-    """Read [(line, row)] and, for each row, all readings followed by the columns `pose`."""
+    """Read [(line, cells)], and an array of the readings and the columns `pose` of each row."""
     header, rows = read_csv(path)
     n = sum(name[:1] == 'x' and name[1:].isdigit() for name in header)
     fields = [f'{a}{j}' for j in range(n) for a in 'xyz']

@@ -56,7 +56,8 @@ class Recording:
         self._files = _files(self.path)
         empty = [f for f in self._files if f.stat().st_size == 0]
         if len(empty) < len(self._files):
-            # A crash at a split leaves an empty file. A recording of only empty files is an error.
+            # A crash between two files of a recording leaves an empty file, which is skipped. If
+            # all files are empty, opening them fails.
             self._files = [f for f in self._files if f not in empty]
             self.losses.update(f'empty files ({f.name})' for f in empty)
         self._opened = [(BagFile if f.suffix in BAG_SUFFIXES else McapFile)(f, self.losses)

@@ -1,7 +1,7 @@
 """Recorder of serialised messages in a rosbag2 folder of MCAP files, with limited loss in a crash.
 
 A chunk is completed and passed to the operating system every `FLUSH_INTERVAL_NS`, so less than a
-second is lost if the program is killed. The remaining file has no index. This package can read it
+second is lost if the program is killed. The file then has no index. This package can read it
 directly; other readers require a repair by `recording.repair.repair`.
 """
 
@@ -134,13 +134,13 @@ class Recorder:
         latched : int, optional
             Number of latest messages that are repeated at the start of each later file.
         """
-        # All files use the same profile, because readers match the channels of the files by it.
+        # All files use the same profile, because readers use it to match channels across files.
         self._topics.setdefault(name, Topic(type_name, definition, qos or offered_qos()))
         if latched:
             self._latched[name] = deque(self._latched.get(name, ()), latched)
 
     def write(self, name: str, data: bytes, log_ns: int, publish_ns: int | None = None) -> None:
-        """Record a serialised message of a registered topic.
+        """Record a serialised message of a registered topic, or count it as dropped.
 
         Parameters
         ----------
@@ -186,7 +186,7 @@ class Recorder:
             self._write_metadata()
 
     def close(self) -> None:
-        """Complete all files and `metadata.yaml`; incomplete files remain in `unfinished`."""
+        """Complete all files and `metadata.yaml`; report files that cannot be completed."""
         if self._file:
             self._finish(self._file)
         for path in list(self.unfinished):
@@ -259,13 +259,13 @@ class Recorder:
         return self._file
 
     def _report_recovery(self) -> None:
-        """Report the end of a failure, after the first message has been written."""
+        """Report the end of a failure, once the new file contains a message."""
         if self._is_failing and self._file and self._file.counts:
             self._is_failing = False
             self._report(f'recording resumed; messages dropped so far: {self.dropped.total()}')
 
     def _open_next(self, log_ns: int = 0) -> None:
-        """Create the next file; if that fails, remove it and raise OSError."""
+        """Create the next file with the latched messages, or remove it and raise OSError."""
         self.folder.mkdir(parents=True, exist_ok=True)
         names = (self.folder / f'{self.folder.resolve().name}_{n}.mcap'
                  for n in itertools.count(len(self._summaries)))

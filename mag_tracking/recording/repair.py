@@ -43,8 +43,8 @@ _MAGIC = b'\x89MCAP0\r\n'
 
 
 class _Scan:
-    """Scan of a file up to the first damage: the end of the intact records, and the data for an
-    index."""
+    """Scan of a file up to the first damage. It finds the end of the intact records and collects
+    the data for an index."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self.schemas: dict[int, Schema] = {}
@@ -140,7 +140,7 @@ class _Scan:
         self._rebuilt_index = builder.end()
 
     def index(self) -> bytes:
-        """Serialise the end section of the file, which begins at byte `end`."""
+        """Serialise the indexes and the footer of the file, which are written from byte `end`."""
         builder = RecordBuilder()
         DataEnd(0).write(builder)
         data_end: bytes = self._rebuilt_index + builder.end()
@@ -234,7 +234,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     Parameters
     ----------
     path : path_like
-        MCAP file, or folder of MCAP files, in which `metadata.yaml` is written again.
+        MCAP file, or folder of MCAP files, in which `metadata.yaml` is also rewritten.
     report : callable, optional
         Called with each message to the user.
 

@@ -1,4 +1,4 @@
-"""Results of an offline run: CSV tables and a recording during the run, a summary at its end."""
+"""Results of an offline run: CSV tables and a recording, written continuously, and a summary."""
 
 import csv
 import json
@@ -129,7 +129,7 @@ class ResultFolder:
             self._recording.close()
 
     def add_detection(self, d: Detection) -> None:
-        """Write a row for a detection.
+        """Write a row for the onset or the release of a target.
 
         Parameters
         ----------
@@ -141,7 +141,7 @@ class ResultFolder:
             d.strongest_sensor])
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Write a frame with a target to the recording.
+        """Write the fields of a frame to the recording, not to a table.
 
         Parameters
         ----------
@@ -150,9 +150,9 @@ class ResultFolder:
         self._recording.add_frame(frame)
 
     def add_track(self, track: Track) -> None:
-        """Write a row for a pose and a row for each hypothesis.
+        """Write a track record to the recording; write one row for its pose and one per hypothesis.
 
-        The final record of a track, which has no new pose, adds no rows.
+        The last record of a track has no new pose and adds no rows.
 
         Parameters
         ----------
@@ -183,7 +183,7 @@ class ResultFolder:
             f'{begin}{names[pair]},{row}\r\n' for pair, row in zip(pairs, rows, strict=True)))
 
     def add_disturbance(self, d: Disturbance) -> None:
-        """Write a row for a disturbance, at its detection and again at its end.
+        """Write a disturbance to the recording and the table, at its detection and at its end.
 
         Parameters
         ----------
@@ -195,7 +195,7 @@ class ResultFolder:
             repr(d.uniform), d.track_id])
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Write a row for a smoothed pose of a complete track; fixed-lag poses are ignored.
+        """Write a pose smoothed over the whole track; ignore poses from fixed-lag smoothing.
 
         Parameters
         ----------

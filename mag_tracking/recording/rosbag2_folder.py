@@ -1,4 +1,4 @@
-"""Parts of a rosbag2 folder of MCAP files: new files and `metadata.yaml`."""
+"""Creation of MCAP files and of `metadata.yaml` in a rosbag2 folder."""
 
 import fcntl
 import io
@@ -38,13 +38,13 @@ class FileSummary(NamedTuple):
     counts: Counter[str]
     """Number of messages by topic."""
     first_ns: int | None = None
-    """Log time of the first message, ns. None without messages."""
+    """Log time of the first message, ns. None if the file has no messages."""
     last_ns: int | None = None
-    """Log time of the last message, ns. None without messages."""
+    """Log time of the last message, ns. None if the file has no messages."""
 
 
 def open_new(path: Path) -> io.FileIO:
-    """Create a file and open it without a buffer, which a crash would lose.
+    """Create a file and open it unbuffered, so that a crash loses no written data.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def open_new(path: Path) -> io.FileIO:
 class UnbufferedWriter:
     """Stream that writes all bytes or raises OSError.
 
-    On a full disk, an unbuffered write may write a part of its data without an error.
+    On a full disk, an unbuffered write may write only part of its data without raising an error.
 
     Parameters
     ----------

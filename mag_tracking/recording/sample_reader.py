@@ -1,4 +1,4 @@
-"""Extraction of readings and true poses from a recording."""
+"""Extraction of readings, accelerations and true poses from a recording."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -29,8 +29,8 @@ TRUTH_PREFIX = 'ground_truth/'
 """Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
 never for tracking."""
 BATCH_SIZE = 256
-"""Maximum number of messages per batch of readings. A batch costs as much as a few readings, and
-the caller can stop only between batches."""
+"""Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
+few readings. The caller can stop only between batches."""
 
 
 class SampleReader:
@@ -41,7 +41,7 @@ class SampleReader:
     recording : Recording
     network : SensorNetwork
     truth : str, optional
-        Topic of the true poses. None = all topics below `TRUTH_PREFIX`.
+        Topic of the true poses. None selects all topics below `TRUTH_PREFIX`.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class SampleReader:
         if truth is not None and recording.types and not self._truth.accepts(
                 truth, recording.types.get(truth, '')):
             poses = sorted(t for t, kind in recording.types.items() if kind in TRUTH_TYPES)
-            raise RecordingError(f'{recording.path}: the truth topic {truth} is '
+            raise RecordingError(f'{recording.path}: the truth topic {truth} has no poses: it is '
                                  f'{recording.types.get(truth, "not in the recording")}; '
                                  f'topics with poses: {", ".join(poses) or "none found"}')
         self.rejected: Counter[str] = Counter()
@@ -121,7 +121,7 @@ class SampleReader:
                     yield readings
 
     def _block_readings(self, block: MessageBlock) -> Readings:
-        """Decode the readings of the network's sensors in a block, in order of log time."""
+        """Decode the readings in a block, in order of log time, and collect the true poses."""
         names = {number: self._sensors[kind.topic] for number, kind in block.kinds.items()
                  if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD and kind.is_cdr}
         rows = np.flatnonzero(np.isin(block.channel, list(names)))
@@ -188,7 +188,7 @@ class SampleReader:
 
     def _records_of(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
                     ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """Iterate as `_records` over the given messages, and count unusable messages."""
+        """Iterate as `_records` over messages; collect true poses and count unusable messages."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
             truth = self._truth.accepts(message.topic, message.type)
@@ -223,7 +223,7 @@ class SampleReader:
         return readings.part(is_known)
 
     def truth_arrays(self) -> dict[str, Truth]:
-        """True poses in the messages that have been read.
+        """Return the true poses read so far, and add their rejected messages to `rejected`.
 
         Returns
         -------
@@ -236,7 +236,7 @@ class SampleReader:
 
 
 def _namespace(recording: Recording, network: SensorNetwork) -> str:
-    """Namespace of the network's relative topics in a recording; the root without such topics.
+    """Namespace of the network's relative topics in a recording; '/' if it contains none of them.
 
     Raises RecordingError if several namespaces are possible.
     """

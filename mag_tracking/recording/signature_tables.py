@@ -82,7 +82,7 @@ def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list
 
 
 def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
-    """Read signatures with one row per sample; further columns identify the signature of a row."""
+    """Read signatures with one row per sample; the other columns identify its signature."""
     axes = {name: match for name in header if (match := _AXIS.fullmatch(name.lower()))}
     names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
     if not axes:
@@ -109,7 +109,7 @@ def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> li
 
 
 def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> str:
-    """Value of a column, empty if it is missing; raises LabelsError if it has several values."""
+    """Only value of a column, '' if it is missing; raises LabelsError if there are several."""
     values = sorted({cells.get(column, '').strip() for _, cells in rows})
     if len(values) > 1:
         raise LabelsError(f'{source} has several values of {column}: {", ".join(values)}')
@@ -171,7 +171,7 @@ class _Fields:
 
     def signature(self, t: FloatArray, field: FloatArray, label: str, source: str,
                   group: str) -> Signature:
-        """Create a signature without unmeasured axes and without unmeasured samples at its ends."""
+        """Create a signature; omit unmeasured axes, and incomplete samples at both ends."""
         measured = np.flatnonzero(~np.isnan(field).all(axis=0))
         field = field[:, measured]
         complete = np.flatnonzero(~np.isnan(field).any(axis=1)) if len(measured) else measured
@@ -242,8 +242,8 @@ def _check_overlaps(path: str | PathLike[str], intervals: list[LabelledInterval]
             if second.begin_ns >= first.end_ns:
                 break
             if first.sensor == second.sensor or '' in (first.sensor, second.sensor):
-                raise LabelsError(f'{path}: rows {first.row} and {second.row} overlap: a '
-                                  'signature must contain only one target')
+                raise LabelsError(f'{path}: the intervals in rows {first.row} and {second.row} '
+                                  'overlap: a signature must contain only one target')
 
 
 def write_model(path: str | PathLike[str], model: SignatureModel) -> None:

@@ -1,4 +1,4 @@
-"""Recording `tracks.mcap` with the messages of the nodes, for ROS viewers.
+"""Recording `tracks.mcap` of the messages that the nodes would publish, for ROS viewers.
 
 It contains fields, tracks, poses, odometry, paths, smoothed tracks, markers, transforms and
 disturbances.
@@ -40,7 +40,7 @@ LATCHED = ('/tf_static', '/tracker_node/sensor_markers')
 
 
 class TrackRecording:
-    """Writer of tracks and the corresponding fields and sensors as messages.
+    """Writer of a recording of tracks, calibrated fields and sensor poses.
 
     Parameters
     ----------
@@ -63,12 +63,12 @@ class TrackRecording:
         self._has_sensors = False
 
     def close(self) -> None:
-        """Complete the file."""
+        """Write the buffered poses of a smoothed track, and complete the file."""
         self._write_smoothed()
         self._writer.close()
 
     def _write_sensors(self, stamp_ns: int) -> None:
-        """Write the poses of the sensors before the first message."""
+        """Write the poses and markers of the sensors once, before the first message."""
         if self._has_sensors:
             return
         self._has_sensors = True
@@ -94,7 +94,7 @@ class TrackRecording:
                 self._writer.write(self._topics[name], MAGNETIC_FIELD, content, frame.stamp_ns)
 
     def add_track(self, track: Track) -> None:
-        """Write a pose of a track with its markers and transform, or the end of the track.
+        """Write one record of a track, or the end of the track, on all topics.
 
         Parameters
         ----------
@@ -125,7 +125,7 @@ class TrackRecording:
             self._path.append(pose_dict(stamp_ns, frame, track.position, track.orientation))
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Add a smoothed pose. The poses of a track are written as a single message.
+        """Buffer a smoothed pose; all smoothed poses of a track are written as a single message.
 
         Parameters
         ----------

@@ -17,31 +17,33 @@ DIRECTIONS = {True: 'forward', False: 'backward'}
 
 _PASSAGE = (
     *columns_of('s', '', recording='name of the recording'),
-    *columns_of('i', '', number='number of the passage, chronological'),
+    *columns_of('i', '', number='index of the passage in chronological order, from 1'),
     *columns_of('i', 'ns', stamp_ns='time at which the middle of the vehicle was on the line'),
     *columns_of('s', '', line='name of the counting line'),
-    *columns_of('i', '', track_id='number of the track'),
-    *columns_of('s', '', direction='forward or backward'),
+    *columns_of('i', '', track_id='identifier of the track'),
+    *columns_of('s', '', direction='direction across the line: forward or backward'),
     *columns_of('f', '', direction_error='probability that the direction is wrong'),
     *columns_of('f', 'm', x='position on the line, x', y='position on the line, y',
                 z='position on the line, z',
-                lateral='distance to the left of the middle of the line, in forward direction'),
+                lateral='distance from the middle of the line, positive to the left of the '
+                        'forward direction'),
     *columns_of('f', 'm/s', vx='velocity, x', vy='velocity, y', vz='velocity, z'),
-    *columns_of('f', 'deg', heading_deg='direction of the velocity, from x towards y',
+    *columns_of('f', 'deg', heading_deg='direction of the velocity, anticlockwise from x',
                 sd_heading_deg='standard deviation of the heading'),
     *columns_of('f', 'm/s', speed='horizontal speed', sd_speed='standard deviation of the speed',
                 delay_speed='model-free speed from the delay between sensors',
                 sd_delay_speed='standard deviation of the model-free speed'),
     *columns_of('b', '',
                 speeds_contradict='whether the speeds of track and delay contradict each other'),
-    *columns_of('f', 'm', length='length of the row of dipoles; 0 = point target',
+    *columns_of('f', 'm', length='length of the row of dipoles; 0 for a point target',
                 sd_length='standard deviation of the length'),
     *columns_of('f', 'A m^2', mx='magnetic moment, x', my='magnetic moment, y',
                 mz='magnetic moment, z', moment_size='magnitude of the magnetic moment'),
     Column('class', 's', '', 'most probable class, or unknown'))
 _VEHICLE = (
-    *columns_of('s', '', vehicle='enrolled vehicle, or unknown'),
-    *columns_of('f', '', p_vehicle='probability of the vehicle among the comparable vehicles'))
+    *columns_of('s', '', vehicle='name of the matching enrolled vehicle, or unknown'),
+    *columns_of('f', '', p_vehicle='probability of the vehicle among the enrolled vehicles that '
+                                   'can be compared at this heading'))
 _PASSAGE_END = (
     *columns_of('f', 's', headway='time since the previous vehicle in the same direction'),
     *columns_of('b', '', ambiguous='whether the passage is ambiguous'),
@@ -51,8 +53,8 @@ _INTERVAL = (
     *columns_of('i', 'ns', begin_ns='beginning of the interval',
                 end_ns='end of the interval'),
     *columns_of('s', '', line='name of the counting line'),
-    *columns_of('f', 's', observed_s='part of the interval that is covered by frames'),
-    *columns_of('s', '', direction='forward or backward'),
+    *columns_of('f', 's', observed_s='time within the interval that is covered by frames'),
+    *columns_of('s', '', direction='direction across the line: forward or backward'),
     Column('class', 's', '', 'class of the vehicles'),
     *columns_of('i', '', count='number of vehicles', n_ambiguous='number of ambiguous passages'),
     *columns_of('f', 'm/s', mean_speed='mean speed of the vehicles'),
@@ -60,7 +62,7 @@ _INTERVAL = (
 
 
 def tables_of(class_names: Sequence[str], with_fleet: bool) -> dict[str, tuple[Column, ...]]:
-    """Columns of each table.
+    """Columns of the tables `passages` and `intervals`.
 
     Parameters
     ----------
@@ -82,7 +84,7 @@ def tables_of(class_names: Sequence[str], with_fleet: bool) -> dict[str, tuple[C
 
 def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[str],
                 delay: dict[str, Any], vehicle: dict[str, Any]) -> dict[str, Any]:
-    """Values of a passage by column, in SI units. NaN = unknown.
+    """Values of a passage by column, in the units of the table. Unknown values are NaN.
 
     Parameters
     ----------
@@ -91,9 +93,9 @@ def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[s
     passage : VehiclePassage
     class_names : sequence of str
     delay : dict
-        Values by column, for the speed from the delay between sensors.
+        Values of the columns for the speed from the delay between sensors.
     vehicle : dict
-        Values by column, for the matching enrolled vehicle.
+        Values of the columns for the matching enrolled vehicle. Empty without a fleet.
 
     Returns
     -------
@@ -119,7 +121,7 @@ def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[s
 
 
 def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]]:
-    """Rows of `intervals`: one per direction and class, or one row with count 0.
+    """Rows of `intervals`: one per direction and class, or one row with count 0 for no passages.
 
     Parameters
     ----------

@@ -65,7 +65,7 @@ class TruthTopics:
         return is_truth and kind in TRUTH_TYPES
 
     def add(self, topic: str, content: Any) -> None:
-        """Add a decoded message of a topic with true poses.
+        """Add the pose of a decoded message, or reject it if it is in another frame.
 
         Parameters
         ----------
@@ -84,7 +84,7 @@ class TruthTopics:
              np.array([[p.x, p.y, p.z, q.x, q.y, q.z, q.w]])))
 
     def add_block(self, block: MessageBlock) -> IntArray:
-        """Add the poses of a block that can be read directly from its bytes.
+        """Add the poses in a block that can be decoded directly from its bytes.
 
         Parameters
         ----------

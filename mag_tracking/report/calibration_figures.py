@@ -66,13 +66,13 @@ class _EllipsoidFit(Protocol):
 
 
 def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> Figure:
-    """Plot the knocks before and after clock calibration, and the headings of the sensors.
+    """Plot the knocks before and after clock calibration, and the rotations of the sensors.
 
     Parameters
     ----------
     found : Calibration
     stated : SensorNetwork
-        Nominal network, as installed.
+        Network with the nominal orientations from the network file.
     most : int
         Maximum number of sensors in the plot of the knocks.
 
@@ -88,7 +88,7 @@ def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> 
 
 
 def first_knock(shocks: Mapping[str, tuple[FloatArray, FloatArray]]) -> float:
-    """Start time of the first strong knock.
+    """Time of the first acceleration above 30 % of the maximum of its sensor.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def _plot_knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> N
 
 
 def _plot_headings(axes: Axes, found: _Calibration, stated: _Network) -> None:
-    """Plot the rotation of each sensor from its nominal orientation, by calibration step."""
+    """Plot the yaw of each sensor relative to its nominal orientation, by calibration step."""
     n = len(stated)
     steps = [('compass', found.survey.network, 'tab:orange', 0.12)]
     if found.evidence is not None:

@@ -31,7 +31,7 @@ def dataframe(columns: Mapping[str, Any], units: Mapping[str, str]) -> 'pd.DataF
     ----------
     columns : dict of str to (n,) array
     units : dict of str to str
-        Units by column; units without a column are ignored.
+        Units by column. Units of missing columns are ignored.
 
     Returns
     -------
@@ -71,7 +71,7 @@ def poses_dataframe(poses: StructArray) -> 'pd.DataFrame':
 
 
 def smoothed_dataframe(smoothed: StructArray) -> 'pd.DataFrame':
-    """Convert smoothed poses to the columns of `poses_smoothed.csv`, and `complete`.
+    """Convert smoothed poses to a DataFrame like `poses_smoothed.csv`, with a column `complete`.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def smoothed_dataframe(smoothed: StructArray) -> 'pd.DataFrame':
 
 
 def detections_dataframe(detections: StructArray) -> 'pd.DataFrame':
-    """Convert onsets and releases to the columns of `detections.csv`.
+    """Convert onsets and releases to a DataFrame with the columns of `detections.csv`.
 
     Parameters
     ----------

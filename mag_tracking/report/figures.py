@@ -24,7 +24,7 @@ SCALE_1D = 1.645
 """Half width of a 90 % interval, in standard deviations."""
 
 MIN_DRAWN = 0.01
-"""Minimum weight of a plotted hypothesis. Hypotheses with less weight would extend the map."""
+"""Minimum weight of a plotted hypothesis. Less probable hypotheses are omitted for clarity."""
 
 
 class _Network(Protocol):
@@ -49,13 +49,13 @@ def _ellipse(position: FloatArray, covariance: FloatArray, n: int = 48) -> Float
 
 
 def _colours(log: TrackLog) -> dict[str, str]:
-    """Assign a colour to each arrival, in alphabetical order."""
+    """Assign a colour to each arrival direction, in alphabetical order."""
     names = sorted({name for row in log.arrivals for name in row})
     return {name: SERIES[i % len(SERIES)] for i, name in enumerate(names)}
 
 
 def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Insert NaN into points (n, 2) where the best hypothesis changes and the position jumps."""
+    """Insert NaN into points (n, 2) at jumps, where the best hypothesis has probably changed."""
     uncertainty = 3.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     steps = np.hypot(*np.diff(points, axis=0).T)
     typical_step = 4.0 * np.median(steps) if len(steps) else 0.0
@@ -65,7 +65,7 @@ def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray
 
 def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None,
                smoothed: ArrayLike | None = None) -> Figure:
-    """Plot the trajectories of the hypotheses with 90 % ellipses, the sensors and the truth.
+    """Plot a track with 90 % ellipses, its hypotheses by arrival direction, sensors and truth.
 
     Parameters
     ----------
@@ -117,7 +117,10 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
 
 
 def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
-    """Plot the best hypothesis of each of several arrivals while its weight is significant."""
+    """Plot the best hypothesis of each arrival direction where its weight exceeds `MIN_DRAWN`.
+
+    A track with a single direction has no such curves.
+    """
     colours = _colours(log)
     if len(colours) < 2:
         return
@@ -133,7 +136,7 @@ def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
 
 
 def weights_figure(log: TrackLog) -> Figure:
-    """Plot the weight of each arrival over time, linear and logarithmic.
+    """Plot the weight of each arrival direction over time, on a linear and a logarithmic axis.
 
     Parameters
     ----------
@@ -173,7 +176,7 @@ def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
     network : SensorNetwork
     most : int
         Maximum number of sensors. In a larger network, only the sensors with the strongest fields
-        are plotted. The title contains their number.
+        are plotted, and the title states how many.
 
     Returns
     -------

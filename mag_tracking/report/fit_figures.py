@@ -141,7 +141,7 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
 
 
 def target_alone(fit: _Fit) -> FloatArray:
-    """Fitted field without the backgrounds, which are the last parameters of the fit.
+    """Fitted field of the target, without the fitted background of each sensor.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def target_alone(fit: _Fit) -> FloatArray:
 
 
 def order_figure(passes: Sequence[_FittedPass]) -> Figure:
-    """Plot the normalised cost over the number of dipoles, one line per pass.
+    """Plot the normalised cost against the number of dipoles, one line per pass.
 
     A filled symbol marks the chosen order.
 
@@ -191,7 +191,7 @@ def order_figure(passes: Sequence[_FittedPass]) -> Figure:
     axes.axhline(1.0, color='k', lw=0.8, ls='--')
     axes.set_xticks(sorted({f.n_dipoles for one in passes for f in one.fits}))
     axes.set_xlabel('number of dipoles')
-    axes.set_ylabel('normalised cost (1 = residuals match the noise)')
+    axes.set_ylabel('normalised cost (1 if the residuals match the noise)')
     axes.grid(alpha=0.3, which='both')
     legend_beside(axes)
     plain_log_ticks(axes)

@@ -12,8 +12,8 @@ from mag_tracking.report.literal_text import literal
 
 _SUSPECT = 'tab:red'
 _MAX_NAMES = 60
-"""Maximum number of sensor names on an axis. For more sensors, only every second, third, ... name
-is drawn."""
+"""Maximum number of sensor names on an axis. In a larger network, only every second, third, ...
+name is drawn."""
 
 
 class _Network(Protocol):
@@ -77,7 +77,7 @@ class _Survey(Protocol):
 
 
 def geometry_figure(found: _Survey) -> Figure:
-    """Plot corrections of positions, orientations and gains of the sensors, and the residuals.
+    """Plot the corrections of the sensor positions, orientations and gains, and the residuals.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def geometry_figure(found: _Survey) -> Figure:
     rows[2].axhline(1.0, color='k', lw=0.8, ls=':')
     rows[2].set_title('gain (90 %)', fontsize=10, loc='left')
     _plot_residuals(rows[3], along, g.sensor_residual, suspect,
-                    'residual in standard deviations (RMS; 1 if noise and field error are right)')
+                    'residual in standard deviations (RMS; 1 for correct noise and field error)')
     step = -(-n // _MAX_NAMES)
     rows[3].set_xticks(along[::step], [literal(name) for name in names[::step]], rotation=90,
                        fontsize=7)
@@ -116,32 +116,32 @@ def geometry_figure(found: _Survey) -> Figure:
 
 
 def _plot_displacements(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) -> None:
-    """Plot the board along its thinnest axis, with magnified arrows for the displacements."""
-    places = found.stated.positions
-    a, b = _widest_axes(places)
+    """Plot the board, viewed along its thinnest axis, with magnified arrows for displacements."""
+    positions = found.stated.positions
+    a, b = _widest_axes(positions)
     c = 3 - a - b
-    shift = 1e3 * (found.network.positions - places)
-    extent = np.ptp(places, axis=0).max() or 1.0
+    shift = 1e3 * (found.network.positions - positions)
+    extent = np.ptp(positions, axis=0).max() or 1.0
     longest = np.linalg.norm(shift[:, [a, b]], axis=1).max()
     key = _round_down(longest) or 1.0
     r, _ = found.geometry.poses
     axes.plot(r[:, a], r[:, b], '.', ms=3, color='0.85', zorder=0, label='poses of the magnet')
     most = np.abs(shift[:, c]).max() or 1.0
     arrows = axes.quiver(
-        places[:, a], places[:, b], shift[:, a], shift[:, b], shift[:, c], cmap='coolwarm',
+        positions[:, a], positions[:, b], shift[:, a], shift[:, b], shift[:, c], cmap='coolwarm',
         clim=(-most, most), angles='xy', scale_units='xy', width=0.006, edgecolor='k',
         linewidth=0.4, scale=8.0 * (longest or 1.0) / extent, zorder=2)
     axes.quiverkey(arrows, 0.86, 1.03, key, f'{key:g} mm', labelpos='E')
-    axes.plot(places[:, a], places[:, b], 'k.', ms=3, zorder=3, label='nominal positions')
+    axes.plot(positions[:, a], positions[:, b], 'k.', ms=3, zorder=3, label='nominal positions')
     if suspect.any():
-        axes.plot(places[suspect, a], places[suspect, b], 'o', ms=12, mfc='none', mew=1.5,
+        axes.plot(positions[suspect, a], positions[suspect, b], 'o', ms=12, mfc='none', mew=1.5,
                   color=_SUSPECT, label='does not fit')
-    if len(places) <= _MAX_NAMES:
-        for name, place in zip(found.network.names, places, strict=True):
-            axes.annotate(literal(name), place[[a, b]], xytext=(3, -8), textcoords='offset points',
-                          fontsize=6, color='0.35')
+    if len(positions) <= _MAX_NAMES:
+        for name, position in zip(found.network.names, positions, strict=True):
+            axes.annotate(literal(name), position[[a, b]], xytext=(3, -8),
+                          textcoords='offset points', fontsize=6, color='0.35')
     # A few distant poses must not extend the axes.
-    low, high = places.min(axis=0) - 0.15 * extent, places.max(axis=0) + 0.15 * extent
+    low, high = positions.min(axis=0) - 0.15 * extent, positions.max(axis=0) + 0.15 * extent
     axes.set_xlim(low[a], high[a])
     axes.set_ylim(low[b], high[b])
     axes.set_aspect('equal')
@@ -153,9 +153,9 @@ def _plot_displacements(figure: SubFigure, axes: Axes, found: _Survey, suspect: 
     figure.colorbar(arrows, ax=axes, shrink=0.7, label=f'displacement along {"xyz"[c]} [mm]')
 
 
-def _widest_axes(places: FloatArray) -> tuple[int, int]:
+def _widest_axes(positions: FloatArray) -> tuple[int, int]:
     """Indices of the two axes along which the board is widest, in ascending order."""
-    a, b = sorted(np.argsort(np.ptp(places, axis=0), kind='stable')[1:])
+    a, b = sorted(np.argsort(np.ptp(positions, axis=0), kind='stable')[1:])
     return int(a), int(b)
 
 
@@ -180,7 +180,7 @@ def _plot_corrections(axes: Axes, along: IntArray, magnitude: FloatArray, std: F
 
 def _plot_residuals(axes: Axes, along: IntArray, residual: FloatArray, suspect: BoolArray,
                     title: str) -> None:
-    """Plot residuals as bars, suspect sensors in red."""
+    """Plot the residuals of the sensors as bars; bars of suspect sensors are red."""
     axes.bar(along, np.nan_to_num(residual), width=0.8,
              color=np.where(suspect, _SUSPECT, 'tab:blue').tolist())
     axes.axhline(1.0, color='k', lw=0.8, ls=':')
@@ -189,7 +189,7 @@ def _plot_residuals(axes: Axes, along: IntArray, residual: FloatArray, suspect: 
 
 
 def _plot_pose_residuals(axes: Axes, found: _Survey) -> None:
-    """Plot the residual of each pose over the row of the pose in the table."""
+    """Plot the residual of each pose against its row in the table."""
     suspect = np.isin(found.rows, found.suspect_rows)
     residual = found.geometry.pose_residual
     axes.plot(found.rows[~suspect], residual[~suspect], '.', ms=4, color='tab:blue')

@@ -18,16 +18,15 @@ class PassErrors(TypedDict):
     """Errors of a vehicle's track, as returned by `pass_errors`."""
 
     rms: float | None
-    """Horizontal RMS error within the radius of the centre [m]; None if the target was never within
-    the radius."""
+    """Horizontal RMS error of the poses within the radius [m]; None if there are no such poses."""
     closest: float
-    """Horizontal error at the pose closest to the centre [m]."""
+    """Horizontal error of the pose whose true position is closest to the centre [m]."""
     closest_distance: float
-    """Distance of that pose from the centre [m]."""
+    """Horizontal distance of this true position from the centre [m]."""
     anees: float
     """Mean NEES per axis of the poses within the radius, or of the closest pose."""
     n: int
-    """Number of poses within the radius."""
+    """Number of poses whose true position is within the radius."""
 
 
 class MagnetErrors(TypedDict):
@@ -42,7 +41,7 @@ class MagnetErrors(TypedDict):
     anees: float
     """Mean NEES per axis of the position."""
     n: int
-    """Number of poses."""
+    """Number of evaluated poses."""
 
 
 def interpolate_truth(truth: Truth, stamps_ns: ArrayLike) -> FloatArray:
@@ -81,7 +80,7 @@ def pass_errors(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
     Returns
     -------
     PassErrors or None
-        None if the truth does not cover the track.
+        None if no pose has a true position.
     """
     true = interpolate_truth(truth, log.stamp_ns)[:, :2]
     rows = near_poses(log, truth, centre, radius)
@@ -102,11 +101,11 @@ class UnflaggedPoses(TypedDict):
     """Counts of poses that are not flagged as ambiguous, as returned by `unflagged_poses`."""
 
     n: int
-    """Number of poses with a known truth."""
+    """Number of unflagged poses at times for which a true position is available."""
     wrong: int
-    """Number of wrong poses among the poses with a known truth."""
+    """Number of wrong poses among these poses."""
     without_truth: int
-    """Number of poses without a known truth."""
+    """Number of unflagged poses at times for which no true position is available."""
 
 
 WRONG_M, WRONG_STD = 2.0, 3.0
@@ -121,7 +120,8 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
     ----------
     logs : iterable of TrackLog
     truths : iterable of Truth
-        A pose is wrong if its error is too large for every target present at the time of the pose.
+        A pose is wrong if it is wrong, as defined by `WRONG_M`, for every target whose truth covers
+        the time of the pose.
 
     Returns
     -------
@@ -151,7 +151,7 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
 
 def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
                radius: float = 5.0) -> IntArray:
-    """Return the indices of the poses whose truth is near a point.
+    """Return the indices of the poses whose true position is within a radius of a point.
 
     Parameters
     ----------
@@ -163,8 +163,8 @@ def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
     Returns
     -------
     (k,) int array
-        Index of the closest pose if the target was never within the radius. Empty if no pose has
-        a known truth.
+        Only the closest pose if no true position is within the radius. Empty if no pose has a true
+        position.
     """
     true = interpolate_truth(truth, log.stamp_ns)[:, :2]
     known = np.isfinite(true).all(axis=1)
@@ -190,7 +190,7 @@ def magnet_errors(log: TrackLog | SmoothedLog, truth: Truth, axis: ArrayLike = (
     axis : (3,) array
         Direction of the moment in the frame of the magnet.
     skip : int
-        Number of poses at the start that are not evaluated.
+        Number of poses at the start of the track that are not evaluated.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Exact arrays as base64 in JSON, about a third as large as decimal numbers."""
+"""Binary arrays as base64 in JSON, about a third of the size of decimal numbers."""
 
 import base64
 

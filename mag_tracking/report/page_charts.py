@@ -51,7 +51,7 @@ def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') ->
     ----------
     x, y : (n,) array
     name : str
-        Legend entry; empty for no entry.
+        Legend entry. An empty string omits the entry.
     k : int
         Index of the colour and the dash style.
     mode : str

@@ -13,13 +13,13 @@ from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
 MAX_SENSORS = 8
-"""Maximum number of fields per track. The sensors with the strongest fields are selected."""
+"""Maximum number of sensors per track whose fields are included. The strongest are selected."""
 MAX_BYTES = 4_000_000
 """Approximate size limit of the track data [bytes]. Larger reports show fewer poses per track."""
 MAX_TRACKS = 1_000
 """Maximum number of tracks in a report."""
 MIN_POSES, TRACK_SIZE = 4, 2_500
-"""Minimum number of poses per track, and size of a track without its poses [bytes]."""
+"""Minimum number of poses per track, and approximate size of a track without poses [bytes]."""
 MAX_EXTENT = 6.0
 """Maximum margin of the map around the network, as a multiple of the span of the network."""
 MIN_REACH_M = 10.0
@@ -46,7 +46,7 @@ class Sensors(Protocol):
 
 def scene_of(network: Sensors, begin_ns: int, end_ns: int,
              tracks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the map with a time slider as JSON.
+    """Return the content of the map with a time slider as values for JSON.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
 
 
 def _box(low: FloatArray, high: FloatArray) -> list[float]:
-    """Bounding box [x0, x1, y0, y1] [m] between two corners."""
+    """Bounding box [x0, x1, y0, y1] [m] with the corners `low` and `high`."""
     return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
 
 
@@ -102,7 +102,7 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
 
 
 def max_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
-    """Return the maximum number of poses per track for a limited size of a report.
+    """Return the maximum number of poses per track that keeps a report below a size limit.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def max_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
 
 
 def _pose_size(log: TrackLog) -> int:
-    """Size of a pose in base64 [bytes], with its true and smoothed positions."""
+    """Size [bytes] in base64 of a pose, including its true and its smoothed position."""
     n_sensors = min(MAX_SENSORS, len(log.measured[0]))
     n_arrivals = len({name for row in log.arrivals for name in row})
     # Base64 needs four bytes for three.
@@ -159,7 +159,7 @@ def thin_poses(log: TrackLog, most: int) -> list[int]:
 
 def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
                 rows: Sequence[int] | None = None) -> dict[str, Any]:
-    """Return the poses of a track as JSON.
+    """Return a track as values for JSON.
 
     Parameters
     ----------
@@ -191,16 +191,17 @@ def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
 
 def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance: FloatArray,
                  ambiguous: bool, fields: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a track at constant velocity as JSON.
+    """Return a fitted pass as a track with constant velocity, in values for JSON.
 
     Parameters
     ----------
     track_id : int
     times : (n,) array, s
-        Scene time.
+        Time since the start of the scene.
     state : (n, 6) array, m and m/s, world frame
     covariance : (n, 6, 6) array
     ambiguous : bool
+        Whether all poses are marked as ambiguous.
     fields : sequence of dict
         Fields, as returned by `field_entry`.
 
@@ -218,7 +219,7 @@ def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance
 
 def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
                 times: FloatArray | None = None) -> dict[str, Any]:
-    """Return the measured and the predicted field of one sensor as JSON.
+    """Return the measured and the predicted field of one sensor as values for JSON.
 
     Parameters
     ----------
@@ -226,7 +227,7 @@ def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
         Index of the sensor.
     measured, predicted : (n, 3) array, T, sensor frame
     times : (n,) array, s, optional
-        Scene time; None if the field was measured at the times of the poses.
+        Time since the start of the scene. None if the fields belong to the times of the poses.
 
     Returns
     -------
@@ -238,7 +239,7 @@ def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
 
 
 def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
-    """Return the smoothed or true path of a track as JSON.
+    """Return the smoothed or the true path of a track as values for JSON.
 
     Parameters
     ----------
@@ -253,7 +254,7 @@ def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
 
 
 def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of a track in the table of tracks as JSON.
+    """Return the row of a track in the table of tracks as values for JSON.
 
     Parameters
     ----------
@@ -292,7 +293,7 @@ def _speed_std(velocity: FloatArray, C: FloatArray) -> FloatArray:
 
 def _columns(times: FloatArray, position: FloatArray, velocity: FloatArray, C: FloatArray,
              ambiguous: BoolArray) -> dict[str, Packed]:
-    """Encode the times, states and standard deviations of n poses by column."""
+    """Encode the times, states, covariances and ambiguity flags of n poses by column."""
     return {
         't': packed(times), 'x': packed(position[:, 0]), 'y': packed(position[:, 1]),
         'z': packed(position[:, 2]), 'vx': packed(velocity[:, 0]), 'vy': packed(velocity[:, 1]),
@@ -310,7 +311,7 @@ def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Pa
 
 
 def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]]:
-    """Weight and best hypothesis of each arrival, by column; NaN after the arrival was pruned."""
+    """Weight and best hypothesis of each arrival direction; weight 0 and NaN where it is absent."""
     log_rows = [log.arrivals[k] for k in rows]
     out = {}
     for name in sorted({name for row in log_rows for name in row}):

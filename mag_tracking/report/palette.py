@@ -1,4 +1,4 @@
-"""Colours of figures and pages, distinguishable with colour blindness."""
+"""Colours of figures and pages that people with colour blindness can distinguish."""
 
 BLUE, VERMILLION, GREEN, ORANGE, PINK, SKY = (
     '#0072B2', '#D55E00', '#009E73', '#E69F00', '#CC79A7', '#56B4E9')

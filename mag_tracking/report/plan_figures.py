@@ -1,4 +1,4 @@
-"""Figures of a plan; each function returns one figure."""
+"""Figures of a sensor placement plan; each function returns one figure."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -104,7 +104,8 @@ def _draw_map(plan: _Plan, title: str) -> tuple[Figure, Axes, float, str]:
 
 
 def _levels(values: FloatArray, factor: float) -> FloatArray:
-    """Contour levels of 1, 2 or 5 times a power of ten, within the range of the values."""
+    """Contour levels of 1, 2 or 5 times a power of ten within the range of the values; one
+    intermediate level if there are none."""
     tens = 10.0 ** np.arange(-6, 7)
     levels = np.sort(np.concatenate([tens, 2.0 * tens, 5.0 * tens]))
     low, high = factor * np.nanmin(values), factor * np.nanmax(values)
@@ -113,7 +114,7 @@ def _levels(values: FloatArray, factor: float) -> FloatArray:
 
 
 def position_figure(plan: _Plan) -> Figure:
-    """Plot a map of the position bound of a whole pass through each point.
+    """Plot a map of the position bound (standard deviation) from a whole pass through each point.
 
     Parameters
     ----------
@@ -124,7 +125,7 @@ def position_figure(plan: _Plan) -> Figure:
     Figure
     """
     figure, axes, f, unit = _draw_map(
-        plan, 'Position bound of a whole pass through each point (standard deviation)')
+        plan, 'Position bound from a whole pass through each point (standard deviation)')
     z = f * np.clip(plan.position_std, None, np.ptp(plan.x))
     mesh = axes.pcolormesh(f * plan.x, f * plan.y, z, norm=LogNorm(), cmap='viridis',
                            shading='nearest', rasterized=True)
@@ -159,7 +160,9 @@ def detection_figure(plan: _Plan) -> Figure:
 
 
 def sensor_figure(plan: _Plan) -> Figure:
-    """Plot a map of the improvement by one more sensor; white where no sensor may be placed.
+    """Plot a map of how much an additional sensor at each point reduces the median bound.
+
+    The map is white where no sensor is allowed.
 
     Parameters
     ----------
@@ -172,7 +175,7 @@ def sensor_figure(plan: _Plan) -> Figure:
     gain = 1.0 - plan.with_one_more / plan.without
     possible = np.isfinite(gain).any()
     figure, axes, f, unit = _draw_map(
-        plan, f'Improvement by one more sensor; the median bound near the sensors is now '
+        plan, f'Improvement by one additional sensor; median bound near the sensors without it: '
         f'{length_text(plan.without)}')
     ny, nx = gain.shape
     x, y = np.linspace(plan.x[0], plan.x[-1], nx), np.linspace(plan.y[0], plan.y[-1], ny)
@@ -253,7 +256,7 @@ def lane_figure(plan: _Plan) -> Figure:
     top.set_ylim(top=min(top.get_ylim()[1], f * np.ptp(plan.x)))
     legend_beside(top)
     plain_log_ticks(top)
-    top.set_title('Along the lanes (in the direction of travel, 0 = nearest to the centre)')
+    top.set_title('Along the lanes, in the direction of travel (0 is nearest to the centre)')
     middle.set_ylabel('P(detection by one frame)')
     middle.set_xlabel(f'distance along the lane [{unit}]')
     legend_beside(middle)

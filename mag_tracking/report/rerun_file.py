@@ -21,7 +21,7 @@ RERUN_FILE = 'tracks.rrd'
 TIME = 'stamp'
 """Name of the timeline."""
 MIN_MOMENT = 1e-12
-"""Minimum magnitude of a moment with a defined direction [A m²]."""
+"""Minimum magnitude by which a moment is divided to obtain its direction [A m²]."""
 SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))
 """Radius of a 90 % ellipsoid, in standard deviations."""
 
@@ -41,7 +41,7 @@ def check_rerun() -> None:
 
 def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, TrackLog],
                 smoothed: Mapping[int, SmoothedLog]) -> None:
-    """Write a recording of the sensors, and of poses, 90 % ellipsoids, speeds and fields over time.
+    """Write a Rerun recording of the sensors and of the poses, 90 % regions, speeds and fields.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, 
 
 
 def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> None:
-    """Log the poses of a track, and clear its display after the end of the track."""
+    """Log the poses of a track, and clear the track one period after its last pose."""
     root = f'{network.frame}/track_{log.id}'
     for k, ns in enumerate(log.stamp_ns):
         stream.set_time(TIME, timestamp=np.datetime64(ns, 'ns'))

@@ -21,7 +21,7 @@ _STATE_FIELDS: _Fields = {
     'position_orientation_covariance': ('f8', (3, 3)),
     'moment': ('f8', (3,)), 'moment_covariance': ('f8', (3, 3)),
     'kind': ('U', ()), 'length': ('f8', ()), 'length_std': ('f8', ()), 'ambiguous': ('?', ())}
-"""Common fields of `Track` and `SmoothedPose`, which document the units."""
+"""Fields that `Track` and `SmoothedPose` have in common. These classes document the units."""
 
 _POSE_FIELDS: _Fields = {
     **_STATE_FIELDS, 'doubts': ('U', ()), 'arrival': ('U', ()), 'weight': ('f8', ()),
@@ -83,7 +83,7 @@ def detection_array(detections: Sequence[Detection]) -> StructArray:
 
 
 def _array(records: Sequence[Track | SmoothedPose | Detection], fields: _Fields) -> StructArray:
-    """Structured array (n,) with the attributes of `records` that `fields` names."""
+    """Convert records to a structured array (n,) of the attributes that `fields` names."""
     columns = {name: [_value(r, name) for r in records] for name in fields}
     dtype = [(name, f'U{max(_TEXT_WIDTH, *map(len, columns[name]), 1)}' if kind == 'U' else kind,
               shape) for name, (kind, shape) in fields.items()]

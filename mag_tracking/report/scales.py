@@ -19,7 +19,7 @@ def scale_of(extent: float) -> tuple[float, str]:
 
 
 def field_unit(strongest: float) -> tuple[float, str]:
-    """Select a readable unit for fields up to a given strength.
+    """Select a readable unit for flux densities up to a given magnitude.
 
     Parameters
     ----------

@@ -4,7 +4,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 MINOR_LABEL_DECADES = 1.5
-"""Maximum range of a logarithmic axis that has labels between powers of ten [decades]."""
+"""Range of a logarithmic axis [decades] up to which values between powers of ten are labelled."""
 
 
 def legend_beside(axes: Axes, **named: float) -> None:
@@ -22,6 +22,8 @@ def legend_beside(axes: Axes, **named: float) -> None:
 
 def plain_log_ticks(axes: Axes) -> None:
     """Label a logarithmic y axis with plain numbers such as 0.02 and 3 instead of powers of ten.
+
+    An axis that spans more than six decades is left unchanged.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Record of a run for reports: poses, weights and fields of each track."""
+"""Track histories for reports: poses, weights and fields of each track."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -11,12 +11,12 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.records import FieldFrame, SmoothedPose, Track, best_of_arrivals
 
 Arrival: TypeAlias = tuple[float, FloatArray, FloatArray]
-"""Weight of an arrival, and position and covariance (2, 2) of its best hypothesis."""
+"""Weight of an arrival direction; position (3,) and covariance (2, 2) of its best hypothesis."""
 
 
 @dataclass
 class SmoothedLog:
-    """Record of one smoothed track; all lists have the same length."""
+    """History of one smoothed track. Each list has one element per pose, as in `SmoothedPose`."""
 
     id: int
     stamp_ns: list[int] = field(default_factory=list)
@@ -42,7 +42,8 @@ class SmoothedLog:
         Returns
         -------
         dict of str to float
-            Speed, magnitude of the moment and standard deviation of the position.
+            Horizontal speed, magnitude of the moment and standard deviation of the horizontal
+            position.
         """
         best = int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
         return {'speed': float(np.hypot(*self.velocity[best][:2])),
@@ -52,7 +53,7 @@ class SmoothedLog:
 
 @dataclass
 class TrackLog:
-    """Record of one track, frame by frame; all lists have the same length."""
+    """History of one track. Each list has one element per frame: values of `Track` or the frame."""
 
     id: int
     stamp_ns: list[int] = field(default_factory=list)
@@ -66,14 +67,14 @@ class TrackLog:
     degrees_of_freedom: list[int] = field(default_factory=list)
     ambiguous: list[bool] = field(default_factory=list)
     arrivals: list[dict[str, Arrival]] = field(default_factory=list)
-    """Arrivals of each frame: weight, and position and covariance (2, 2) of the best hypothesis."""
+    """Weight and best hypothesis by arrival direction."""
     doubts: list[tuple[str, ...]] = field(default_factory=list)
     kind: list[str] = field(default_factory=list)
     kind_weight: list[float] = field(default_factory=list)
     length: list[float] = field(default_factory=list)
     measured: list[FloatArray] = field(default_factory=list)
     noise: list[FloatArray] = field(default_factory=list)
-    """Noise covariances of each frame, (n_sensors, 3, 3) T²."""
+    """Noise covariances of the frame, (n_sensors, 3, 3) T²."""
     predicted: list[FloatArray] = field(default_factory=list)
     mounting: list[FloatArray] = field(default_factory=list)
     mounting_std: list[FloatArray] = field(default_factory=list)
@@ -81,7 +82,7 @@ class TrackLog:
     ended: bool = False
 
     def add(self, track: Track, frame: FieldFrame) -> None:
-        """Add a pose and the frame that produced it.
+        """Add a pose and the frame that produced it, or mark the track as ended.
 
         Parameters
         ----------
@@ -127,9 +128,9 @@ class TrackLog:
     def most_certain(self) -> int:
         """Index of the most certain pose, which represents the whole track in summaries.
 
-        The criterion is the horizontal position of a magnet and the horizontal velocity of a
-        vehicle. The position of a vehicle may become more certain later, when its whole length has
-        passed.
+        The criterion is the variance of the horizontal position for a magnet, and of the horizontal
+        velocity for a vehicle. The position of a vehicle may become more certain only later, after
+        its whole length has passed.
 
         Returns
         -------
@@ -150,7 +151,7 @@ class TrackLog:
         Returns
         -------
         dict of str to ((3,) array, deg, and (3,) array, deg)
-            Angles and standard deviations of each sensor; empty if they are not estimated.
+            Angles and standard deviations by sensor. Empty if mounting errors are not estimated.
         """
         k = self.most_certain()
         return {name: (np.degrees(a), np.degrees(sd)) for name, a, sd in

@@ -9,11 +9,11 @@ from mag_tracking.event_records import TrafficCount, TrafficSummary, VehiclePass
 from mag_tracking.units import NS
 
 MAX_GAP_S = 5.0
-"""Maximum interval between two frames that counts as observed time [s]."""
+"""Maximum time between two frames that counts as observed [s]."""
 
 
 class TrafficIntervals:
-    """Counter of passages in equal time intervals, which returns a summary of each interval.
+    """Counter of passages in time intervals of equal length, which summarises each interval.
 
     Parameters
     ----------
@@ -30,14 +30,14 @@ class TrafficIntervals:
         self._names, self._length, self._counts = tuple(line_names), round(interval_s * NS), counts
         # End of the latest interval that has been summarised.
         self._closed_ns: int | None = None
-        # Start of the interval, and passage.
+        # Passages in open intervals, each with the start time of its interval [ns].
         self._passages: list[tuple[int, VehiclePassage]] = []
         # Observed time [ns] of each open interval, by its start.
         self._observed: dict[int, int] = {}
         self._last_ns: int | None = None
 
     def add(self, passage: VehiclePassage) -> None:
-        """Add a passage; a late passage is counted in the earliest open interval.
+        """Add a passage. If its interval is closed, it is counted in the earliest open interval.
 
         Parameters
         ----------
@@ -51,7 +51,7 @@ class TrafficIntervals:
         self._observed.setdefault(begin, 0)
 
     def due(self, before_ns: int, now_ns: int) -> list[TrafficSummary]:
-        """Close the complete intervals, and return their summaries.
+        """Close the intervals that end by `before_ns`, and return their summaries.
 
         Parameters
         ----------
@@ -85,7 +85,7 @@ class TrafficIntervals:
         return stamp_ns // self._length * self._length
 
     def _observe(self, now_ns: int) -> None:
-        """Add the time since the previous frame to its intervals."""
+        """Add the time since the previous frame to the observed time of each interval it covers."""
         self._observed.setdefault(self._begin_of(now_ns), 0)
         last_ns, self._last_ns = self._last_ns, now_ns
         if last_ns is None or now_ns - last_ns > MAX_GAP_S * NS:
@@ -111,7 +111,7 @@ class TrafficIntervals:
 
 
 def counts_of(passages: Sequence[VehiclePassage]) -> tuple[TrafficCount, ...]:
-    """Count passages by direction and class, forward first.
+    """Count passages by direction and class, in the forward direction first.
 
     Parameters
     ----------

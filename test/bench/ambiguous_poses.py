@@ -1,7 +1,7 @@
 """Consistency of ambiguous poses on the pose topics, for each choice of `track.ambiguous_poses`.
 
 Random passes of trucks, cars and turning cars from two simulators are tracked with two sensors at
-100 Hz. The figures are the normalised errors (ANEES per axis) for the covariances on the topics.
+100 Hz. The figures are the normalised errors (ANEES per axis) with the published covariances.
 The aim is an ANEES of at most 2 for ambiguous poses with `mixture`. With `hold`, no ambiguous pose
 may be published.
 """

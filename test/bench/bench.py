@@ -164,7 +164,10 @@ class VectorPeer(Peer):
 
 
 def bank_case(n_sensors, n_hyp, rng, turned):
-    """Create a filter, the sensor poses, a bank of hypotheses and a frame near the truth."""
+    """Create a filter, the sensor poses, a bank of hypotheses near the truth and a frame.
+
+    With `turned`, the state includes the mounting angles of the sensors.
+    """
     positions = np.zeros((n_sensors, 3))
     positions[:, 0] = 9.0 * (np.arange(n_sensors) // 2)
     positions[:, 1] = np.where(np.arange(n_sensors) % 2, 4.5, -4.5)
@@ -196,7 +199,7 @@ def bank_case(n_sensors, n_hyp, rng, turned):
 
 
 def bank_ratio(peer_class, n_sensors, turned, n_hyp=64, rounds=12, repeats=100):
-    """Time an update; return (median, minimum, maximum ratio, [us] of bank, [us] of peer)."""
+    """Time an update; return (median, minimum and maximum ratio, times [us] of bank and peer)."""
     rng = np.random.default_rng(n_sensors)
     bank_filter, positions, R_sw, bank, frame = bank_case(n_sensors, n_hyp, rng, turned)
     x, P = bank.x, bank.P

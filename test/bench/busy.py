@@ -2,10 +2,10 @@
 
 Recordings and simulated worlds with meeting and following vehicles and dense traffic are tracked.
 The figures are the fraction of detected vehicles, the RMS error, the NEES, the number of false
-tracks and the time of a search for another vehicle. At most 1 % of the poses without a flag may be
-wrong, including passes of single vehicles. A frame of two vehicles may take four times as long as a
-frame of one vehicle. With `--data FOLDER`, the recordings of another folder are used (`*.mcap` with
-`*.truth.json`).
+tracks and the time of a search for another vehicle. At most 1 % of the poses that are not flagged
+as ambiguous may be wrong; these include poses of single vehicles. A frame of two vehicles may take
+four times as long as a frame of one vehicle. With `--data FOLDER`, the recordings of another folder
+are used (`*.mcap` with `*.truth.json`).
 """
 
 import argparse
@@ -31,8 +31,8 @@ from support.random_passes import KINDS, are_wrong, one_random_pass
 
 AIMS = {'meeting': (1.0, 4.0, 1.0), 'meeting more': (0.7, 3.0, 1.0),
         'following': (0.9, None, 1.0), 'traffic': (None, None, 11 / 12)}
-"""{kind of recording: (median RMS [m], median NEES of two axes, fraction of vehicles found)};
-None = no aim."""
+"""{kind of recording: (median RMS [m], median NEES of two axes, fraction of vehicles found)}, or
+None for a figure without an aim."""
 MIN_MEETING = 15 / 16
 """With two sensors, one of sixteen vehicles may be missed."""
 MAX_WRONG, MAX_COST = 0.01, 4.0

@@ -1,4 +1,4 @@
-"""Driving directions by single sensors, in a replica of the traffic of PHD15 Paper B.
+"""Driving directions from single sensors, in a replica of the traffic of PHD15 Paper B.
 
 Three replicas of 511 vehicles on a road with two lanes are simulated by each of two simulators,
 with a two-axis sensor on each side of the road. The figures are the fractions of correct directions

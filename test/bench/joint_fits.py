@@ -1,11 +1,11 @@
 """Batch fit of several simultaneous vehicles: accuracy, wrong fits and duration.
 
-Recordings and simulated worlds with two simultaneous vehicles are fitted, and passes of single
-vehicles. The figures are the fraction of vehicles fitted in the correct direction, the fraction of
+Recordings and simulated worlds with two simultaneous vehicles, and passes of single vehicles, are
+fitted. The figures are the fraction of vehicles fitted in the correct direction, the fraction of
 speeds within 10 %, the position error and the time per pass. The aims for the recordings are 90 %
 correct directions and 90 % of the speeds within 10 %. At most 1 % of single vehicles may be fitted
-as several vehicles, and at most 1 % of the fits without a flag may be wrong. With `--data FOLDER`,
-the recordings of another folder are used.
+as several vehicles, and at most 1 % of the fits that are not flagged as ambiguous may be wrong.
+With `--data FOLDER`, the recordings of another folder are used.
 """
 
 import argparse

@@ -7,7 +7,8 @@
 
 Driver, calibration, detection and tracker run as processes; a simulator in the driver replaces the
 hardware. The figures are the delay of a pose after the sample that completed its frame, by the
-clock of this machine, the CPU time of all nodes, their growth of memory, and the kinds of losses.
+clock of this machine, the CPU time of all nodes, their memory growth, and the number of kinds of
+losses.
 The aim is a median delay of 10 ms, or 5 ms with all nodes in one process, without losses. The exit
 status is 1 if a sample or a frame is lost.
 """
@@ -32,14 +33,15 @@ os.environ.setdefault('ROS_DOMAIN_ID', str(101 + os.getpid() % 100))
 ROOT = Path(__file__).resolve().parents[2]
 NODES = ('calibration_node', 'detection_node', 'tracker_node', 'driver_node')
 RATE, PERIOD_S = 100.0, 0.08
-"""[Hz] Rate of each sensor; [s] period of a frame (`align.period_s`)."""
+"""Rate of each sensor [Hz], and period of the frames [s] (`align.period_s`)."""
 WARM_UP_S = 20.0
 BEGINS_AFTER_S = 0.5
-"""[s] Minimum time since the previous pose of a pose that is the first of a track."""
+"""Interval [s] after which a pose counts as the first pose of a new track."""
 MANY, GATHER_S = 16, 0.002
-"""Maximum number of sensors without batches; [s] duration of a batch in sequential measurement."""
+"""Maximum number of sensors without batches; duration of a batch [s] if sensors take turns."""
 LEAN = {'arrival_names': "['left']", 'arrival_headings_deg': '[0.0]'}
-"""One kind, one arrival: all 3 offsets x 14 moments x 3 speeds = 126 hypotheses are kept."""
+"""Settings with one kind of vehicle and one arrival direction, for which all 126 hypotheses
+(3 offsets x 14 moments x 3 speeds) are kept."""
 
 
 def network_yaml(n):
@@ -233,17 +235,17 @@ def main():
     parser.add_argument('--batches', action='store_true',
                         help='send readings in batches, as with many sensors')
     parser.add_argument('--one-process', action='store_true',
-                        help='all nodes in one process, as with `mag-tracking run`')
+                        help='run all nodes in one process, as with `mag-tracking run`')
     parser.add_argument('--lean', action='store_true', help='track with 126 hypotheses')
     parser.add_argument('--sequential', action='store_true',
-                        help='the sensors measure in sequence, not simultaneously')
+                        help='simulate sensors that measure in turn, not simultaneously')
     parser.add_argument('--pages', type=int, default=0, help='number of open live pages')
     found = measure(parser.parse_args())
     return 1 if found is None else int(found[1])
 
 
 def name_of(args):
-    """Name of the benchmark with these options."""
+    """Name under which the figures of a run with these options are recorded."""
     return (f'load, {args.sensors} sensors'
             + (', one process' if args.one_process else ', four processes')
             + (f', {args.pages} pages' if args.pages else ''))

@@ -44,7 +44,7 @@ ERRORS = {'rms': 'RMS [m]', 'closest': 'closest [m]', 'anees': 'ANEES', 'positio
 
 
 def recordings(folder):
-    """Return {name: (recording, network file, preset)}; import tables of readings to `folder`."""
+    """Return {name: (recording, network file, preset)}; import pose tables into `folder`."""
     found = {name: (vehicle_path(name), NETWORK_FILE, 'vehicle') for name in VEHICLES}
     corridor = DATA / 'corridor'
     found['corridor'] = (corridor / 'corridor_8_sensors.mcap', corridor / 'network.yaml', 'vehicle')
@@ -131,7 +131,7 @@ def is_worse(name, figure, now, before):
 
 
 def comparison(name, figure, now, before):
-    """Return a line for a figure, and whether it is worse; None = not measured."""
+    """Return a line for a figure, and whether it is worse; a missing value is None."""
     worse = before is not None and (now is None or is_worse(name, figure, now, before))
     values = [f'{"-" if now is None else f"{now:.4g}":>8s}']
     values += [] if before is None else [f'before {before:8.4g}']

@@ -2,9 +2,9 @@
 
 Each situation is simulated by two simulators and tracked live, by default with two sensors. The
 figure is the fraction of poses without a flag that are more than 2 m and three standard deviations
-from every vehicle. Each situation has an aim; the aim for all situations with
-at most one vehicle is 0.5 %. At least 90 % of the runs with a detection but without a vehicle must
-yield a disturbance. The disturbance model may use at most 10 % of the time of a frame.
+from every vehicle. Each situation has an aim. The aim for all situations with at most one vehicle
+together is 0.5 %. At least 90 % of the runs with a detection but without a vehicle must yield a
+disturbance. The disturbance model may use at most 10 % of the time of a frame.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Random passes with each fault of a poor sensor.
+"""Wrong poses in random passes, for each of several sensor and stream faults.
 
 Each pass is simulated by one of two simulators, modified by one fault and tracked live with two
 sensors at 100 Hz, without a prescan. The figures are the fraction of tracked passes, and the

@@ -52,7 +52,7 @@ def learnt_stage():
 
 
 def write_and_read_back(path):
-    """Write the background of mag_1 to `path`, and read it; return network and backgrounds."""
+    """Write the background of mag_1 and read it back; return the network and the background."""
     network, stage = learnt_stage()
     write_backgrounds(path, {'mag_1': background_text(
         stage.stored('mag_1'), network, 0, SETTINGS)})
@@ -87,7 +87,7 @@ def test_the_first_reading_after_a_restart_is_calibrated(tmp_path):
     for s in readings(1020.0, 10.0, 2):
         out += fed(stage, s)
     assert not stage.backgrounds()['mag_1'].frozen
-    # The end of a line fitted to 10 s of readings has a standard deviation of 2 nT.
+    # At its end, a line fitted to 10 s of readings has a standard deviation of 2 nT.
     np.testing.assert_allclose(stage.background('mag_1'), EARTH, atol=6e-9)
 
 
@@ -126,7 +126,7 @@ def test_a_changed_calibration_discards_stored_backgrounds(tmp_path, change):
 
 
 def test_a_sensor_moved_before_the_restart_is_relearnt_soon(tmp_path):
-    """This applies even with `relearn_s` = 0, which disables the relearning of steady changes."""
+    """It is relearnt even if `relearn_s` is 0, which disables the relearning of steady changes."""
     network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
     stage.resume(stored)
@@ -183,8 +183,8 @@ def test_an_invalid_file_is_refused(tmp_path, change, message):
 
 
 @pytest.mark.parametrize('key, value, reason', [
-    ('background', [1.0, 2.0], 'not valid: invalid background'),
-    ('covariance', [[0.0] * 3] * 3, 'not positive definite'), ('stamp_ns', None, 'at None'),
+    ('background', [1.0, 2.0], 'not valid: the background'),
+    ('covariance', [[0.0] * 3] * 3, 'not positive definite'), ('stamp_ns', None, 'ns None'),
     ('made_of', None, 'another network file'), ('covariance', ..., 'entry has no covariance'),
     ('background', {}, 'the stored entry is not valid')])
 def test_an_invalid_entry_affects_no_other(tmp_path, key, value, reason):

@@ -1,4 +1,4 @@
-"""Import of tables of magnet poses: invalid tables are refused."""
+"""Import of tables of magnet poses, and rejection of invalid tables."""
 
 import pytest
 
@@ -33,7 +33,7 @@ def test_a_pose_table_becomes_a_recording(tmp_path):
     (HEADER + ROW + ROW.replace('50', 'inf'), '1,2,3\n', 'row 3: m_z is not a finite number'),
     (HEADER + '1.5' + ROW[1:], '1,2,3\n', 'numbers that are not integers'),
     (HEADER + ROW, '1,2\n', 'background.csv: expected 3 columns, got 2'),
-    (HEADER + ROW, '1,2,3\n4,5,6\n', r'different numbers of sensors: .*background.csv 2, .* 1$')])
+    (HEADER + ROW, '1,2,3\n4,5,6\n', r'numbers of sensors: .*background.csv has 2, .* has 1$')])
 def test_an_invalid_pose_table_is_refused(tmp_path, table, background, message):
     with pytest.raises(RecordingError, match=message):
         import_tables(tmp_path, table, background)

@@ -135,7 +135,7 @@ def write_mcap(path, encoding, schema, messages):
 
 
 def fields_of(source):
-    """Read the [(topic, time [ns], field (3,))] of a recording."""
+    """Read a recording as a list of (topic, time [ns], field (3,))."""
     read = mt.read_recording(source.path, NETWORK_FILE).readings
     return [(f'/{name}/imu/mag', stamp, field) for name, stamp, field in zip(
         read.sensor_names(), read.stamp_ns.tolist(), read.field, strict=True)]
@@ -250,13 +250,13 @@ def test_a_row_may_contain_several_sensors(tmp_path):
     (['time=t', 'a.x=x'], 'T', 't,y\n1,2\n', 'column x is missing; the columns are t, y'),
     (['time=t', 'a.x=x'], 'T', 't,x\n1,b\n', "row 2: x: expected a number, got 'b'"),
     (['time=t', 'a.x=x'], 'T', 't,x\n1,inf\n', 'row 2: x is infinite'),
-    (['time=t', 'a.x=x'], 'T', 't,x\n-1,2\n', 'row 2: t: -1 is not a time'),
-    (['time=t', 'a.x=x'], 'T', 't,x\n,2\n', 'row 2: t: an empty cell is not a time'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n-1,2\n', 'row 2: t: -1 is not a valid time'),
+    (['time=t', 'a.x=x'], 'T', 't,x\n,2\n', 'row 2: t: an empty cell is not a valid time'),
     (['time=t', 'a.x=x'], 'T', 't,x\n1\n', 'row 2 has too few columns'),
     (['time=t', 'a.x=x'], 'T', 't,x\n0,1,5\n', 'row 2 has too many columns'),
     (['time=t', 'a.x=x'], 'T', 't,x\n--5,1\n', "row 2: t: expected a number, got '--5'"),
     (['time=t', 'a.x=x'], 'T', 't,x\n\u00b2,1\n', 'row 2: t: expected a number'),
-    (['time=t', 'a.x=x'], 'T', f't,x\n{"9" * 5000},1\n', 'is infinite|is not a time'),
+    (['time=t', 'a.x=x'], 'T', f't,x\n{"9" * 5000},1\n', 'is infinite|is not a valid time'),
     (['time=t', 'sensor=s', 'x=x'], 'T', 't,s,x\n1,,2\n', "'' is not a valid sensor name"),
     (['time=t', 'sensor=s', 'x=x'], 'T', 't,s,x\n1,a b,2\n', "'a b' is not a valid sensor name"),
     (['time=t', 'a/b.x=x'], 'T', 't,x\n1,2\n', "'a/b' is not a valid sensor name"),

@@ -68,7 +68,8 @@ for k, d in enumerate(data):
 
 
 def record_until_killed(folder, after_s):
-    """Kill a recording process; return the numbers and times [ns] of the messages it recorded."""
+    """Start a recorder and kill it after `after_s`; return the numbers and times [ns] of the
+    messages passed to it."""
     process = subprocess.Popen([sys.executable, '-c', RECORD_UNTIL_KILLED, folder,
                                 TEST_FOLDER], stdout=subprocess.PIPE)
     with process:
@@ -122,7 +123,7 @@ def test_a_full_disk_is_reported_and_the_recording_continues(tmp_path):
     dropped = recorder.dropped[TOPIC]
     assert recorder.counts[TOPIC] == len(found) == 2000 - dropped
     assert 100 < before < dropped <= before + 100
-    # One gap: from the first chunk without space to the first retry with space.
+    # There is a single gap, from the first chunk without space to the first retry with space.
     first = found.index(next(b for a, b in zip(found, found[1:], strict=False) if b != a + 1))
     assert found[:first] == list(range(first)) and found[first:] == list(range(first + dropped,
                                                                                2000))

@@ -71,7 +71,7 @@ def test_repair_recovers_a_file_truncated_at_any_byte(tmp_path):
 
 
 def stamp_ns_of(message):
-    """Timestamp [ns] of a serialised magnetic field, at the beginning of its bytes."""
+    """Decode the timestamp [ns] at the start of a serialised magnetic field."""
     sec, nanosec = struct.unpack_from('<iI', message.data, 4)
     return sec * S + nanosec
 

@@ -101,16 +101,17 @@ def test_truth_in_another_frame_is_rejected_with_a_reason(tmp_path):
 
 
 @pytest.mark.parametrize('topic, message', [
-    ('/nowhere', 'the truth topic /nowhere is not in the recording; topics with poses: /gnss/pose'),
-    ('nowhere', 'the truth topic /nowhere is not in the recording'),
-    ('/mag_1/imu/mag', 'the truth topic /mag_1/imu/mag is sensor_msgs/msg/MagneticField')])
+    ('/nowhere', 'the truth topic /nowhere has no poses: it is not in the recording; '
+                 'topics with poses: /gnss/pose'),
+    ('nowhere', 'the truth topic /nowhere has no poses: it is not in the recording'),
+    ('/mag_1/imu/mag', 'topic /mag_1/imu/mag has no poses: it is sensor_msgs/msg/MagneticField')])
 def test_a_topic_without_poses_is_refused_as_truth(tmp_path, topic, message):
     with pytest.raises(RecordingError, match=message):
         truth_of(recording_of(tmp_path / 'a.mcap', 'map'), topic)
 
 
 def test_a_table_gives_the_same_errors_as_the_topic(tmp_path, road_network):
-    """Times are in ns or in s. The errors of the track equal the errors with the topic."""
+    """The track errors are the same, whether the times in the table are in ns or in s."""
     settings = settings_for('vehicle', QUICK)
     run = replay(Recording(vehicle_path(NAME)), road_network, settings, tmp_path / 'a')
     ((stamps, position, _),) = run.truth.values()

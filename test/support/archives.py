@@ -27,7 +27,7 @@ def rows(folder, table):
     # DuckDB requires another library for times with a time zone.
     columns = [c.name for c in TABLES[table] if c.kind != 't']
     files = folder / ('recordings.parquet' if table == 'recordings' else f'{table}/**/*.parquet')
-    # Rows with equal names and timestamps are sorted by number.
+    # The number makes the order unique for rows with the same source and timestamp.
     order = [n for n in ('source', 'track_id', 'number', 'stamp_ns', 'sensor') if n in columns]
     return duckdb.sql(f"SELECT {', '.join(columns)} FROM read_parquet('{files}') "
                       f"ORDER BY {', '.join(order)}").fetchall()

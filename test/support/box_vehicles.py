@@ -129,7 +129,7 @@ class Drive:
 
     path: Path
     change: float = 0.0
-    """Relative change of the speed; negative = braking."""
+    """Relative change of the speed, negative for braking."""
     change_at: float = 0.0
     """[s] Middle of the speed change."""
     change_s: float = 2.0

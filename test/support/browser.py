@@ -14,7 +14,7 @@ def chromium():
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
-needs_browser = pytest.mark.skipif(chromium() is None, reason='there is no Chromium here')
+needs_browser = pytest.mark.skipif(chromium() is None, reason='Chromium is not installed')
 
 
 @contextlib.contextmanager
@@ -34,7 +34,7 @@ def browser():
 
 
 class Page:
-    """Open page, with its console errors and its requests."""
+    """Page opened in a browser; records its console errors and its requests."""
 
     def __init__(self, browser, url, **options):
         self.page = browser.new_page(**options)

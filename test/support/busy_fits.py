@@ -22,9 +22,9 @@ class OfVehicle(NamedTuple):
     one: FittedPass
     vehicle: int
     speed: float
-    """[m/s] Speed of the vehicle where its field is strongest."""
+    """[m/s] True speed at the time of the strongest field."""
     error: float
-    """[m] Horizontal error of the fit there, along the centre line of the vehicle."""
+    """[m] Horizontal error of the fitted position at that time."""
 
 
 def fits_of_world(a_world, orders=ORDERS):

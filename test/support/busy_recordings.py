@@ -1,6 +1,6 @@
 """Tracking of recordings with several vehicles at once, and comparison with the true vehicles.
 
-`test/data/busy` contains some of the nine recordings; `folder` selects another folder.
+`test/data/busy` contains some of the nine recordings; the argument `folder` selects another folder.
 """
 
 import json
@@ -61,7 +61,7 @@ def tracked_recording(name, folder=BUSY, changes=None):
 
 
 def rightly_counted(name, passages, folder=BUSY):
-    """Match passages with true vehicles within 1 s in the same direction; [(passage, vehicle)]."""
+    """Match passages and vehicles within 1 s and in the same direction: [(passage, vehicle)]."""
     truth, out = json.loads((folder / f'{name}.truth.json').read_text()), []
     unmatched = list(truth['vehicles'])
     for p in passages:

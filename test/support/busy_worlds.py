@@ -83,7 +83,10 @@ def pair(rng, how, at_s):
 
 
 def busy(how, n_sensors, simulator, seed, n=4, trucks=TRUCKS):
-    """Simulate `n` pairs 'meeting' or 'following', or 3 `n` vehicles in 'traffic'; a `World`."""
+    """Simulate `n` pairs that meet or follow, or up to 3 `n` vehicles in traffic; a `World`.
+
+    `how` is 'meeting', 'following' or 'traffic'.
+    """
     rng = np.random.default_rng([seed, n_sensors, len(how), len(simulator)])
     if how == 'traffic':
         times = LEAD_S + np.cumsum(rng.exponential(3.0, 3 * n))

@@ -10,7 +10,7 @@ C = 1.44e-16 * np.eye(3)
 def disorder(rng, n):
     """Generate samples of `n` sensors with losses, delays, reordering and invalid axes.
 
-    None requests a flush.
+    A yielded None requests a flush.
     """
     arrivals = []
     for j in range(n):

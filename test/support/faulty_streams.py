@@ -30,7 +30,7 @@ def spiky(size):
 
 
 def late_by(seconds):
-    """Set the clock back by `seconds` (negative = ahead)."""
+    """Set the clock back by `seconds`, or ahead if negative."""
     return lambda sample, rng: [replace(sample, stamp_ns=sample.stamp_ns - round(seconds * NS))]
 
 

@@ -1,4 +1,4 @@
-"""Fuzz test of the framings: all frames between garbage must be found, and no false ones.
+"""Fuzz test of the framings: every frame amid garbage must be found, and no false frame.
 
 PYTHONPATH=test python -m support.framing_fuzz --frames 1000000
 
@@ -63,7 +63,7 @@ class Result(NamedTuple):
     """Maximum number of unconsumed bytes."""
 
     def failed(self, chance):
-        """Whether there are more errors than expected if a fraction `chance` of frames is false."""
+        """Whether there are more errors than false frames of probability `chance` would cause."""
         mean = chance * self.suspects
         limit = math.floor(mean + 6.0 * math.sqrt(mean)) if mean > 0.01 else 0
         # A false frame hides at most one true frame, because all frames have the same length.
@@ -133,7 +133,7 @@ def fuzz(case, n_frames, seed=0, share=0.4):
 def _skipped(expected, reading):
     """Remove `reading` and all readings before it from `expected`; return the number before it.
 
-    None if `expected` does not contain `reading`.
+    Return None if the first 200 entries of `expected` do not contain `reading`.
     """
     for i in range(min(200, len(expected))):
         if expected[i] == reading:

@@ -118,7 +118,7 @@ def rig(entries, chips=None, clock=None, **changes):
 
 
 def one(chip, **changes):
-    """Create and open (clock, bus, device, simulated chip) with one sensor A."""
+    """Create and open a device with one sensor A; return (clock, bus, device, simulated chip)."""
     address = FAKES[chip][1]
     clock, bus, device = rig([f'A:{chip}:{address:#04x}'], **changes)
     device.open()

@@ -1,7 +1,7 @@
 """Simulated magnetometer chips that follow their data sheets register by register.
 
-They follow the data sheets and not the drivers: behaviour that a data sheet does not guarantee is
-not simulated.
+They are independent of the drivers. Behaviour that a data sheet does not guarantee is not
+simulated.
 """
 
 import math

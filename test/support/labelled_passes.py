@@ -1,4 +1,4 @@
-"""Labelled signatures of simulated vehicles past one roadside sensor."""
+"""Labelled signatures of simulated vehicles that pass one roadside sensor."""
 
 import csv
 

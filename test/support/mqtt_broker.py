@@ -161,7 +161,7 @@ class ScriptedBroker:
 
 
 def granted(subscribe, *codes):
-    """SUBACK packet for the SUBSCRIBE packet `subscribe`, one code per filter (0x80 = refused)."""
+    """SUBACK packet for the SUBSCRIBE packet `subscribe`, one code per filter (0x80 refuses)."""
     return bytes([0x90, 2 + len(codes or (0,)), *subscribe[2:4], *(codes or (0,))])
 
 

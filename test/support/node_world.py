@@ -39,8 +39,8 @@ FRAME_S = 0.2
 NS = 1_000_000_000
 STEADY = {'calibration_node': {'calibrate.learn_s': 3600.0},
           'detection_node': {'detect.background_drift': 0.0}}
-"""Settings of a constant background, as given in the network file: it is not learnt between
-vehicles, and has no uncertainty."""
+"""Settings for a constant background from the network file, which is not relearnt between vehicles
+and has no uncertainty."""
 
 
 def network_file(folder):
@@ -56,7 +56,7 @@ def network_file(folder):
 def drivers_files(folder, broker, guarded, line):
     """Write the drivers files for `mqtt` and `serial`; return {link: path}.
 
-    The broker refuses one device of `mqtt`.
+    The broker `guarded` refuses the second device of `mqtt`.
     """
     common = {'clock': {'tick_s': 1e-6, 'wrap': 0}, 'unit': 'nT'}
     content = {
@@ -79,7 +79,7 @@ def drivers_files(folder, broker, guarded, line):
 
 
 class World:
-    """The node processes, which may be killed, and all their messages."""
+    """The node processes, which a test may kill, and all messages that they publish."""
 
     def __init__(self, folder, broker, guarded, roadside, line):
         self.broker, self.guarded, self.roadside, self.line = broker, guarded, roadside, line
@@ -110,7 +110,7 @@ class World:
             self._executor.shutdown()
 
     def wait(self, condition, seconds=MAX_S):
-        """Spin until `condition()` is true, at 100 Hz; return its last value."""
+        """Spin at 100 Hz until `condition()` is true or `seconds` have passed; return its value."""
         end = time.monotonic() + seconds
         while not (value := condition()) and time.monotonic() < end:
             self._executor.spin_until_future_complete(Future(), 0.01)
@@ -172,7 +172,7 @@ class World:
         return None
 
     def use(self, link):
-        """Connect the driver to `link`, 'mqtt' or 'serial', and wait for its first output."""
+        """Restart the driver with `link`, 'mqtt' or 'serial', and wait for its first output."""
         if link == self.link:
             return
         if self.link is not None:
@@ -183,11 +183,11 @@ class World:
         assert self.wait(lambda: self.since(began_ns, 'driver_node'))
 
     def since(self, since_ns, name):
-        """Messages of a node after `since_ns`, as [(arrival [ns], message)]."""
+        """Messages of a node that arrived after `since_ns`, as [(arrival [ns], message)]."""
         return [entry for entry in self.heard[name] if entry[0] > since_ns]
 
     def told(self, since_ns, name, *words):
-        """Statuses called `name` after `since_ns` with all `words`: [(arrival [ns], status)]."""
+        """Statuses `name` after `since_ns` whose message has all `words`: [(arrival, status)]."""
         return [(arrival, s) for arrival, s in self.statuses
                 if arrival > since_ns and s.name == name
                 and all(word in s.message for word in words)]
@@ -220,7 +220,7 @@ class World:
 
 
 def is_wrong(track, truth):
-    """Whether an unflagged pose is inconsistent with the truth by its covariance."""
+    """Whether a pose is unflagged and its normalised squared error exceeds `WRONG`."""
     e = track.position[:2] - truth
     return not track.ambiguous and e @ np.linalg.solve(track.covariance[:2, :2], e) > WRONG
 

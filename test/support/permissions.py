@@ -11,7 +11,10 @@ OVERRIDING = 1 << 1 | 1 << 2
 
 @contextmanager
 def as_files_say():
-    """Drop the capabilities by which root overrides file permissions, in this thread."""
+    """Drop the capabilities by which root overrides file permissions; restore them afterwards.
+
+    Only the current thread is affected.
+    """
     libc = ctypes.CDLL(None, use_errno=True)
     # Header: version, thread (0 = this one). Two rows: effective, permitted, inheritable.
     header, rows = (ctypes.c_uint32 * 2)(VERSION, 0), (ctypes.c_uint32 * 6)()

@@ -98,7 +98,7 @@ class Spikes:
 
 
 class PlainCalibration:
-    """Like `Calibrate`, but without restored backgrounds and changes of the calibration."""
+    """Plain `Calibrate` that supports neither stored backgrounds nor a changed calibration."""
 
     def __init__(self, network, settings):
         self.network, self.settings = network, settings

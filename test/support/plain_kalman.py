@@ -58,12 +58,12 @@ def whole_derivative(H, n_own):
 def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
     """Measurement update of every hypothesis, in place.
 
-    `y` (n_sensors, 3) is the measurement; NaN = missing axis. `h` (n_hyp, n_sensors, 3) is its
-    prediction without the backgrounds, with the derivative `H` (n_hyp, n_sensors, 3, n_t + n_own),
-    both at `x_lin` (n_hyp, n_x) or the predicted state. `C` (n_sensors, 3, 3) is the noise, and
-    `inflation` (n_hyp, n_sensors) is added to the variance of each axis. Returns the log-likelihood
-    (n_hyp,), the NIS (n_hyp, n_sensors) of each sensor conditional on the preceding sensors, and
-    the `Gains`.
+    `y` (n_sensors, 3) is the measurement, with NaN for missing axes. `h` (n_hyp, n_sensors, 3) is
+    its prediction without the backgrounds, with the Jacobian `H` (n_hyp, n_sensors, 3, n_t +
+    n_own), both at `x_lin` (n_hyp, n_x) or the predicted state. `C` (n_sensors, 3, 3) is the noise
+    covariance, and `inflation` (n_hyp, n_sensors) is added to the variance of each axis. Returns
+    the log-likelihood (n_hyp,), the NIS (n_hyp, n_sensors) of each sensor conditional on the
+    preceding sensors, and the `Gains`.
     """
     x_lin = x.copy() if x_lin is None else x_lin
     n_hyp, n_sensors, n_x = len(x), len(y), x.shape[1]

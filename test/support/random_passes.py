@@ -79,7 +79,7 @@ class Tracked:
 
 
 def are_wrong(error, deviation):
-    """Whether errors [m] with published standard deviations [m] count as wrong."""
+    """Whether each error [m] exceeds `WRONG_M` and `WRONG_SD` published standard deviations [m]."""
     return (error > WRONG_M) & (error > WRONG_SD * deviation)
 
 
@@ -126,6 +126,9 @@ def tracked(network, body, course, duration, flaws, seed, changes=None, faults=(
 
 
 def one_random_pass(simulator, kind, seed, changes=None, faults=()):
-    """Track a random pass by the bundled network, with {setting: value} and faults."""
+    """Simulate a random pass with `faults`, and track it with the settings `changes`; `Tracked`.
+
+    The network is the bundled network.
+    """
     return tracked(read_network(NETWORK_FILE), *random_pass(simulator, kind, seed), seed, changes,
                    faults)

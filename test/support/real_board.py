@@ -23,7 +23,7 @@ def board_of_41():
 
 
 def errors(geometry, field, positions, axes, poses):
-    """Errors of individual positions [m] and axes [deg]; `poses` converts from tracker to world."""
+    """Errors of the estimated positions [m] and axes [deg]; `poses` maps from tracker to world."""
     r, u = poses(positions, axes)
     estimates = [locate_magnet(geometry.network, B, geometry.moment[0], *BOX, PoseSettings())
                  for B in geometry.signal(field)]

@@ -31,7 +31,7 @@ TWIN_S = 3.0
 
 
 class MqttSender:
-    """Connection of the boards to a broker; after a failure, each round retries it."""
+    """Connection of the boards to a broker. After a failure, each `send` tries to reconnect."""
 
     def __init__(self, port):
         self._port, self._socket = port, None
@@ -118,11 +118,11 @@ class Roadside:
         self._called = round((time.time_ns() - self._start_ns) / 1e9 * RATE_HZ) + 1
 
     def is_gone(self):
-        """Whether there is no vehicle."""
+        """Whether no vehicle is passing."""
         return self._called is None or self._elapsed(time.time_ns()) > PASSING_S
 
     def truth(self, stamp_ns):
-        """Position (2,) [m] of the vehicle, even out of range; NaN before the first vehicle."""
+        """Position (2,) [m] of the latest vehicle, even after its pass; NaN before the first."""
         if self._called is None:
             return np.full(2, np.nan)
         return FIRST + [SPEED * self._elapsed(stamp_ns), 0.0]

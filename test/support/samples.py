@@ -11,7 +11,7 @@ from mag_tracking.simulation import scenario
 
 @dataclass(frozen=True)
 class MagSample:
-    """Reading of one sensor; covariance None = unknown."""
+    """Reading of one sensor; `covariance` is None if unknown."""
 
     stamp_ns: int
     sensor: str

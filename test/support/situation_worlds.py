@@ -207,7 +207,7 @@ def tram(rng, simulator):
 
 
 def storm(rng, simulator, cars=0):
-    """Geomagnetic storm: 500 nT in ten minutes as a sum of slow waves, for two minutes."""
+    """Two minutes of a geomagnetic storm: slow waves and a drift of 500 nT per ten minutes."""
     v = 5e-7 * direction(rng)
     periods, phases = rng.uniform(60.0, 400.0, 6), rng.uniform(0.0, 2.0 * np.pi, 6)
     return ambient_world(rng, simulator, uniform(v, lambda t: sum(

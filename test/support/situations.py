@@ -1,4 +1,4 @@
-"""Situations beyond the assumptions of the tracker's model, and its unflagged wrong poses."""
+"""Situations that violate the assumptions of the tracker's model, and evaluation of its poses."""
 
 from dataclasses import dataclass
 
@@ -133,7 +133,7 @@ class Verdict:
     n_tracks: int
     n_disturbances: int
     n_mistaken: int
-    """Number of reported disturbances that are in fact a body, which their tracks follow."""
+    """Number of disturbances that were reported although their tracks follow a body."""
     doubts: tuple
     """Doubts of each pose."""
 

@@ -59,13 +59,13 @@ class Passing:
         return 0 if self.is_north else 1
 
     def rotations(self):
-        """`FieldRotation` of each sensor; a neutral one if the direction is not observable."""
+        """`FieldRotation` of each sensor, with log odds 0 if the direction is unobservable."""
         pad = int(PAD_S * RATE)
         return [rotation_of_pass(field, NOISE, pad) or FieldRotation(0.0, 1.0)
                 for field in self.field]
 
     def likelihood_ratio_of_north(self):
-        """([log-likelihood ratio of each sensor], their sum) of northbound to southbound."""
+        """Log-likelihood ratios of northbound to southbound: ([ratio of each sensor], sum)."""
         near, far = 5.0 - LANE_M, 5.0 + LANE_M
         one = direction_likelihood_ratio(self.t, self.field[0], NOISE,
                                          LaneHypothesis(SPEED, near), LaneHypothesis(-SPEED, far))
@@ -127,7 +127,7 @@ def field_of(body, arrival, lateral, t):
 
 @dataclass(frozen=True)
 class Shares:
-    """Proportions of correct directions by the near sensor, the far sensor and both."""
+    """Fractions of correct directions from the near sensor, the far sensor and their fusion."""
 
     near: float
     far: float

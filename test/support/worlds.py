@@ -22,7 +22,7 @@ class Ride:
     times: tuple
     """Times of the given speeds, (k,) s."""
     speeds: tuple
-    """Speeds at `times`, (k,) m/s, with linear interpolation; negative = backwards."""
+    """Speeds at `times`, (k,) m/s, interpolated linearly; negative in reverse."""
 
     def at(self, t):
         """Position and heading at times `t`; implements `scenario.Trajectory`."""
@@ -37,7 +37,7 @@ class Ride:
 
 @dataclass(frozen=True)
 class Convoy:
-    """Bodies at fixed distances from each other: a car with a trailer, a train."""
+    """Bodies at fixed distances from each other, such as a car with a trailer."""
 
     bodies: tuple
     behind: tuple
@@ -71,7 +71,7 @@ def box_two_wheeler(rng, length, moment, iron=1.0):
 
 
 def world(network, movers, duration, rng, flaws=None, rate=100.0, ambient=None):
-    """Simulate movers [(body, course)] for `duration` [s] and sensors with `flaws`; a `World`."""
+    """Simulate movers [(body, course)] for `duration` [s] with sensor errors; return a `World`."""
     # `ambient` is a function from times (n,) [s] to fields (n, n_sensors, 3) [T], world frame.
     flaws = flaws or SensorErrorModel()
     t = np.arange(0.0, duration, 1.0 / rate)

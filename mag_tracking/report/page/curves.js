@@ -29,7 +29,8 @@ function largest(axes) {
   return max;
 }
 
-// [{name, t, measured, predicted or null}] of a track, or of the recent frames without a track.
+// [{name, t, measured, predicted}] of a track, or of the latest frames if `track` is null; the
+// predicted field is then null.
 function fieldsOf(scene, track) {
   if (track) {
     return track.fields.map(field => ({name: scene.sensors.names[field.sensor],

@@ -67,7 +67,7 @@ function addRows(message) {
   moveTo(page.follows ? scene.end : page.t);
 }
 
-// Append a frame, and remove those before the time axis.
+// Append a frame, and remove the frames that are older than the time axis.
 function addFrame(recent, frame) {
   recent.t.push(frame.t);
   const old = indexAt(recent.t, frame.t - WINDOW_S) + 1;

@@ -6,7 +6,7 @@ const SERIES = ['#0072B2', '#E69F00', '#009E73', '#CC79A7', '#56B4E9'];
 const DASHES = ['solid', 'dash', 'dot', 'dashdot', 'longdash'];
 const VERMILLION = '#D55E00', BLACK = '#000000';
 const SYMBOLS = ['circle', 'square', 'diamond'];
-// Standard deviations to the edge of a 90 % ellipse and of a 90 % interval.
+// Radius of a 90 % ellipse and half width of a 90 % interval, in standard deviations.
 const SCALE_2D = Math.sqrt(-2 * Math.log(0.1)), SCALE_1D = 1.645;
 // Minimum weight of a hypothesis that is drawn, and maximum number of sensors with labels.
 const MIN_DRAWN = 0.01, MAX_LABELS = 24;

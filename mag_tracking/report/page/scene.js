@@ -81,7 +81,7 @@ function forget(track, n) {
   track.doubts = track.doubts.slice(n);
 }
 
-// Columns of `n` poses without a hypothesis from this direction.
+// Columns of an arrival direction for `n` poses that have no hypothesis from this direction.
 function absent(like, n) {
   return Object.fromEntries(Object.keys(like).map(
     key => [key, new like[key].constructor(n).fill(key === 'weight' ? 0 : NaN)]));
@@ -103,13 +103,13 @@ const endOf = track => track.columns.t[track.columns.t.length - 1];
 // Time for which the last pose of a track remains on the map [s].
 const SHOWN_AFTER_S = 0.6;
 
-// Tracks with a pose at `t`.
+// Tracks shown on the map at `t`.
 function tracksAt(scene, t) {
   return scene.tracks.filter(
     track => beginOf(track) <= t + 1e-9 && t <= endOf(track) + SHOWN_AFTER_S);
 }
 
-// Track shown in the plots at `t`: the newest one, otherwise the nearest in time.
+// Track shown in the plots at `t`: the newest track on the map, otherwise the nearest in time.
 function currentTrack(scene, t) {
   const there = tracksAt(scene, t);
   if (there.length) return there[there.length - 1];
