@@ -41,8 +41,8 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
 def choose_order(fits: Sequence[PassFit]) -> PassFit | None:
     """Return the fit with the smallest criterion, or None if that fit is rejected.
 
-    No other order is returned instead: a poor fit of fewer dipoles does not always show that the
-    target turned.
+    A fit of another order does not replace a rejected fit, because a fit with fewer dipoles does
+    not always reveal that the target turned.
 
     Parameters
     ----------

@@ -165,7 +165,7 @@ def test_a_rejected_joint_fit_has_a_reason():
     data, paths = simulated_pass(rng, MEETING, 1)
     alone, two = [fit_pass(data, 1)], tracked_paths(rng, paths)
     four = np.vstack([two, two + [0.0, 20.0, 0.0, 0.0, 0.0, 0.0]])
-    cases = [('4 targets were tracked, at most 3', data, four),
+    cases = [('4 targets were tracked, but at most 3', data, four),
              ('too few measurements', replace(
                  data, t=data.t[::200], sensor=data.sensor[::200], field=data.field[::200],
                  covariance=data.covariance[::200]), two),
@@ -248,7 +248,8 @@ def test_a_fit_that_differs_from_its_track_has_a_reason():
     # The track is three times as fast as the vehicle.
     wrong_tracks[1, 3] *= 3.0
     found = fit_joint(data, wrong_tracks, GROUND, (1,))
-    assert sorted(fit.reason for fit, in found) == ['', 'the fit is not at the tracked position']
+    assert sorted(fit.reason for fit, in found) == [
+        '', 'the fit differs from the track in position or velocity']
     assert fit_joint(data, wrong_tracks, GROUND, (1,), stopped=lambda: True) == ()
 
 

@@ -133,7 +133,7 @@ def test_one_sensor_adds_almost_no_information():
     free = np.repeat([0.1, 0.5, 0.0], [3, 2, 3])
     g = fitted_geometry(network, scarce, positions[:3], axes[:3], MOMENT, SETTINGS,
                         np.zeros(12), free)
-    assert not g.converged and 'fewer readings than unknowns' in g.reason
+    assert not g.converged and 'too few readings' in g.reason
     assert np.isnan(g.normalised_cost)
 
 

@@ -295,7 +295,7 @@ def test_data_that_cannot_be_fitted_result_in_a_reason():
 
     assert 'no sensor' in reason(replace(data, field=np.full_like(data.field, np.nan)))
     few = np.r_[198:201, 598:601]
-    assert 'fewer measurements (18) than unknowns (22)' in reason(replace(
+    assert 'too few measurements (18) for 22 unknowns' in reason(replace(
         data, t=data.t[few], sensor=data.sensor[few], field=data.field[few]))
     noise = NOISE * rng.standard_normal(data.field.shape)
     assert 'no stronger than noise' in reason(replace(data, field=noise))

@@ -60,7 +60,7 @@ def test_training_is_reproducible_and_a_model_file_is_lossless(tmp_path):
         np.testing.assert_array_equal(found.posterior(other.x), model.posterior(other.x))
         assert found.names(other.x) == model.names(other.x)
     assert evaluate(stored, other.x, other.labels).accuracy[0] > 0.8
-    with pytest.raises(LabelsError, match="not classes of the model: 'tank'"):
+    with pytest.raises(LabelsError, match="no classes for the labels 'tank'"):
         evaluate(stored, other.x, ['tank'] * len(other.labels))
 
 
