@@ -124,7 +124,7 @@ def test_a_written_network_is_read_back(tmp_path, text):
 
 @pytest.mark.parametrize('deg', [1e-5, 0.06, 30.0, 45.0, 180.0])
 def test_any_orientation_std_of_a_survey_is_read_back(tmp_path, deg):
-    """The value of 180 degrees is for an unknown heading; see survey.stated_std_deg."""
+    """A value of 180 degrees marks an unknown heading; see survey.stated_std_deg."""
     n = read(tmp_path, GOOD)
     n = replace(n, orientation_std=(np.deg2rad([0.3, 0.3, deg]), None))
     write_network(tmp_path / 'copy.yaml', n)
