@@ -173,7 +173,7 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
 
 
 def _nearest_pairs(data: PassData) -> list[tuple[int, int]]:
-    """Pairs of sensors to compare, closest first."""
+    """Pairs of sensors to compare, closest first; pairs at almost the same place are excluded."""
     positions = data.network.positions[:, :2]
     pairs = list(combinations(data.sensors.tolist(), 2))
     distance = np.array([np.linalg.norm(positions[i] - positions[j]) for i, j in pairs])
@@ -183,7 +183,7 @@ def _nearest_pairs(data: PassData) -> list[tuple[int, int]]:
 
 def _fit_velocity(data: PassData, pairs: Sequence[PairDelay],
                   similarity: float) -> CorrelatedMotion:
-    """Least-squares fit of a velocity to the delays of the pairs."""
+    """Fit a velocity to the delays of the pairs by least squares."""
     positions = data.network.positions[:, :2]
     d = np.array([positions[p.second] - positions[p.first] for p in pairs])
     tau, std = (np.array([getattr(p, n) for p in pairs]) for n in ('delay', 'delay_std'))

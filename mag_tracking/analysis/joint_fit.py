@@ -293,7 +293,7 @@ def path_from(data: PassData, fit: PassFit) -> FloatArray:
 
 
 def _with_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[FloatArray]:
-    """Copy paths (6 or 7,) with a length only for two or more dipoles."""
+    """Convert paths (6 or 7,) to other orders; the length of a former point is `INITIAL_LENGTH`."""
     return [np.concatenate([path[:6], path[6:] if len(path) > 6 else [INITIAL_LENGTH]])
             if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
 
@@ -315,7 +315,10 @@ def _check_against_track(fits: Sequence[PassFit], best: int, path: FloatArray) -
 
 
 def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
-    """Whether a fit agrees with a `path` (6 or more,) with the same time zero."""
+    """Whether position and velocity of a fit agree with a `path` (6 or more,).
+
+    The fit and the path have the same time zero. They are compared at the strongest field.
+    """
     if not len(fit.x):
         return False
     seconds = _time_of_peak(fit)

@@ -75,7 +75,7 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     network : SensorNetwork
         Every sensor requires a `noise_std`.
     field : (n, 3) array, T, sensor frame
-        Readings corrected for bias and gain (`NetworkGeometry.signal`); NaN = not measured.
+        Readings corrected for bias and gain (`NetworkGeometry.signal`); NaN if not measured.
     moment : float, A m²
     low, high : (3,) array, m, world frame
         Opposite corners of the search box.
@@ -103,7 +103,7 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     if n_values <= N_UNKNOWNS:
         nothing = np.full(3, np.nan)
         return MagnetPose(nothing, nothing, np.full((6, 6), np.nan), nothing, np.nan, False,
-                          f'number of measured axes is {n_values}, more than {N_UNKNOWNS} are '
+                          f'number of measured axes is {n_values}; more than {N_UNKNOWNS} are '
                           'required')
     size2 = np.nansum(np.square(field), axis=1)[:, None]
     std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * size2)
@@ -185,11 +185,11 @@ def _check_input(network: SensorNetwork, field: FloatArray, moment: float, low: 
         raise ValueError(f'expected field ({len(network)}, 3) and corners (3,), got '
                          f'{field.shape}, {low.shape}, {high.shape}')
     if not (np.isfinite(moment) and moment > 0.0):
-        raise ValueError(f'moment is {moment} A m^2, must be finite and above 0')
+        raise ValueError(f'moment is {moment} A m^2; it must be finite and above 0')
     if not (np.isfinite(high - low).all() and (high > low).all()):
         raise ValueError(f'the box from {low.tolist()} to {high.tolist()} m has no volume')
     if np.isinf(field).any():
         raise ValueError('field contains an infinite reading')
     for name, std in zip(network.names, network.noise_std, strict=True):
         if std is None or not (np.asarray(std) > 0.0).all():
-            raise ValueError(f'sensor {name}: noise_std is {std}, must be above 0 T')
+            raise ValueError(f'sensor {name}: noise_std is {std}; it must be above 0 T')

@@ -66,7 +66,7 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
                      field_error=max(COARSE_ERROR, s.field_error))
     for stage in (coarse, s):
         if len(rows) < MIN_POSES:
-            raise ValueError(f'found {len(rows)} of {len(field)} poses in the box, at least '
+            raise ValueError(f'found {len(rows)} of {len(field)} poses in the box; at least '
                              f'{MIN_POSES} are required; check the moment and the box')
         geometry = fitted_geometry(network, field[rows], r, u, moment, stage, shared_unit,
                                    pose_unit)

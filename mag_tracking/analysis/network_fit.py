@@ -222,7 +222,7 @@ class GeometryProblem:
                 np.tile(pose, POSE))
 
     def cost(self, x: Unknowns, f: FloatArray, W: FloatArray, priors: Unknowns) -> float:
-        """Weighted sum of squared residuals and priors.
+        """Weighted sum of the squared residuals and of the squared unknowns (priors).
 
         Parameters
         ----------
@@ -245,7 +245,7 @@ class GeometryProblem:
 
 
 def median_ratio(d2: FloatArray, count: IntArray) -> FloatArray:
-    """Ratio of squared residuals to their median for pure noise.
+    """Ratio of squared residuals to the median expected for pure noise.
 
     Parameters
     ----------

@@ -81,7 +81,7 @@ class NetworkGeometry:
     gain: FloatArray
     """(n,) gain; one is nominal."""
     gain_std: FloatArray
-    """(n,)."""
+    """(n,) standard deviations of `gain`."""
     bias: FloatArray
     """(n, 3) [T], sensor frame; NaN for an axis without readings."""
     bias_std: FloatArray
@@ -93,11 +93,11 @@ class NetworkGeometry:
     shared: FloatArray
     """(12,) shared unknowns; see `TrackedMagnet.poses`."""
     shared_std: FloatArray
-    """(12,)."""
+    """(12,) standard deviations of `shared`."""
     pose: FloatArray
     """(K, 8) unknowns of each pose; see `TrackedMagnet.poses`."""
     pose_covariance: FloatArray
-    """(K, 8, 8)."""
+    """(K, 8, 8) covariance of `pose`."""
     covariance: FloatArray
     """(10 n + 12, 10 n + 12), of the unknowns of all sensors (bias, gain, rotation, position), then
     of the shared unknowns."""
@@ -308,7 +308,7 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
 
 def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
                      trust: FloatArray, priors: Unknowns) -> float:
-    """Weighted sum of squared residuals per degree of freedom; NaN for less than one degree."""
+    """Weighted sum of squared residuals per degree of freedom; NaN if less than one is left."""
     P, P_pose = NormalEquations(problem, x, predicted, W, priors).covariance()
     e2, count, _ = problem.misfit(predicted[0], predicted[1])
     known = np.append(priors[0].ravel(), priors[1]) @ np.diagonal(P)
@@ -354,7 +354,7 @@ def _failure_reason(problem: GeometryProblem, x: Unknowns, converged: bool, cost
     """Reason why the fit is not valid; empty if it is valid."""
     K, max_steps = len(problem.magnet.tool), problem.settings.iterations
     if K < MIN_POSES:
-        reason = (f'number of poses is {K}, at least {MIN_POSES} are required to separate the '
+        reason = (f'number of poses is {K}; at least {MIN_POSES} are required to separate the '
                   'biases from the field of the magnet')
     elif _is_magnet_at_rest(problem, x):
         reason = 'the poses are almost equal: the geometry is not observable; move the magnet'
@@ -381,7 +381,7 @@ def _check_input(network: SensorNetwork, field: FloatArray, positions: FloatArra
         raise ValueError('there are no poses; at least one pose is required')
     for name, std in zip(network.names, network.noise_std, strict=True):
         if std is None or not (np.asarray(std) > 0.0).all():
-            raise ValueError(f'sensor {name}: noise_std is {std}, must be above 0 T')
+            raise ValueError(f'sensor {name}: noise_std is {std}; it must be above 0 T')
     for k in range(K):
         if not (np.isfinite(positions[k]).all()
                 and abs(np.linalg.norm(axes[k]) - 1.0) <= 1e-3):
@@ -394,4 +394,4 @@ def _check_input(network: SensorNetwork, field: FloatArray, positions: FloatArra
     if np.isinf(field).any():
         raise ValueError('field contains an infinite reading')
     if not (np.isfinite(moment) and moment > 0.0):
-        raise ValueError(f'moment is {moment} A m^2, must be finite and above 0')
+        raise ValueError(f'moment is {moment} A m^2; it must be finite and above 0')

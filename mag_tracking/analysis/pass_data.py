@@ -114,7 +114,11 @@ class PassData:
 
     @cached_property
     def whitening(self) -> FloatArray:
-        """Matrices W, (n, 3, 3), with W C Wᵀ = I for the measured axes and zeros elsewhere."""
+        """Whitening matrices W, (n, 3, 3), with W C Wᵀ = I for the covariance C of each sample.
+
+        If a sample is a mean, C is the covariance of the mean. Rows and columns of missing axes are
+        zero.
+        """
         W = np.zeros((len(self.t), 3, 3))
         present = ~np.isnan(self.field)
         for axes in np.unique(present, axis=0):

@@ -126,7 +126,7 @@ def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
         If an order is less than one.
     """
     if min(orders) < 1:
-        raise ValueError(f'number of dipoles is {min(orders)}, must be at least one dipole')
+        raise ValueError(f'number of dipoles is {min(orders)}; at least one dipole is required')
     if not len(data.sensors):
         return 'no sensor has a measurement'
     axes = sum(int((~np.isnan(data.field[data.sensor == j])).any(axis=0).sum())
@@ -138,7 +138,7 @@ def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
 
 
 def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
-    """Create starting paths of the search, in twelve headings past the most exposed sensor.
+    """Create starting paths of the search with various headings, offsets and speeds.
 
     The paths pass the sensor with the strongest field. The duration of the field at this sensor
     determines the ratio of speed to distance.

@@ -22,7 +22,7 @@ Directions with less information are not compared between tracks."""
 
 @dataclass(frozen=True)
 class MountingEvidence:
-    """Sensor orientations fused from tracks."""
+    """Corrections of the sensor orientations, fused from tracks."""
 
     rotation: FloatArray
     """(n_sensors, 3) [rad] small rotations about the world axes, which correct the orientations."""

@@ -126,7 +126,7 @@ class PassFit:
 
     @property
     def determined(self) -> bool:
-        """Whether the measurements determine all unknowns."""
+        """Whether the search converged to a plausible length and all unknowns are observable."""
         if not (len(self.x) and self.converged):
             return False
         variance = np.diagonal(self.robust_covariance)

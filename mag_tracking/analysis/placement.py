@@ -80,7 +80,7 @@ class Sampling:
     """Maximum number of computed frames; an even number is increased by one."""
 
     def times(self) -> tuple[FloatArray, float]:
-        """Times of the computed frames.
+        """Times of the computed frames, and the number of real frames per computed frame.
 
         Returns
         -------

@@ -72,7 +72,7 @@ def features(signature: Signature) -> FloatArray:
     """
     t, field = np.asarray(signature.t, dtype=float), np.asarray(signature.field, dtype=float)
     if len(t) < MIN_SAMPLES:
-        raise ValueError(f'too few samples for a signature: {len(t)}, at least {MIN_SAMPLES} are '
+        raise ValueError(f'too few samples for a signature: {len(t)}; at least {MIN_SAMPLES} are '
                          'required')
     if not (np.isfinite(t).all() and np.isfinite(field).all()):
         raise ValueError('a time or a field value is not finite')
