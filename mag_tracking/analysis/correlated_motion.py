@@ -42,7 +42,7 @@ SMOOTHING = 0.3
 
 MAX_SHIFT = 4.0
 """Maximum shift of a delay during the refinement, in widths of the smoothing kernel. A larger shift
-leads to another maximum."""
+leads to a different correlation maximum."""
 
 MAX_PRIOR_CHI2 = 22.5
 """Maximum joint chi-square of rotation, scale and gains (probability 0.001). At a larger value, the
@@ -217,7 +217,7 @@ class _SensorReadings:
         is_complete = np.isfinite(field[:, axes]).all(axis=1)
         self.t = data.t[of_sensor][is_complete]
         self.field = (field[is_complete] @ R.T if len(axes) == 3 else field[is_complete])[:, axes]
-        # Missing readings have no covariance either.
+        # The covariance of an excluded reading may be NaN.
         variance = np.einsum('nii->ni', data.covariance[of_sensor][is_complete])[:, axes]
         self.noise = float(np.sqrt(variance.min(axis=0).mean())) if is_complete.any() else 0.0
 
@@ -339,7 +339,7 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
         step = np.linalg.solve(information, J.T @ residuals / std**2 - prior @ theta)
         theta = theta + step
         if abs(theta[0] - tau) > pair.t[-1] - pair.t[0]:
-            # Diverged; further steps would overflow.
+            # The fit has diverged; more steps would overflow.
             return tau, np.inf, 0.0
         if abs(step[0]) < 1e-6 * pair.width:
             break

@@ -103,7 +103,7 @@ def _track_scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], rot
         residual = pull - np.einsum('jik,jk->ji', gain, rotation)
         inverse = np.linalg.pinv(gain, rcond=MIN_INFORMATION_FRACTION, hermitian=True)
         squares += np.einsum('ji,jik,jk->j', residual, inverse, residual)
-        # Fewer degrees of freedom, because the fused estimate includes the track.
+        # The fused estimate includes the track, which reduces the degrees of freedom.
         projection = inverse @ gain
         freedom += np.einsum('jii->j', projection - projection @ covariance @ gain)
     scatter: FloatArray = np.divide(squares, freedom, out=np.full(len(rotation), np.nan),

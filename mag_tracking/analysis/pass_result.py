@@ -175,7 +175,7 @@ class PassFit:
         Parameters
         ----------
         seconds : float, s
-            Shift of time zero; positive = later.
+            Shift of time zero; a positive shift makes time zero later.
 
         Returns
         -------

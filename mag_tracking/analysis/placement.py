@@ -70,8 +70,8 @@ class Sampling:
     noise_std: FloatArray | float
     """(n_sensors,) [T] noise standard deviation per axis and frame, or one value for all."""
     field_error: float = 0.0
-    """Error relative to the field due to clocks, mounting and model, treated as white noise. For an
-    error that is constant over n frames, multiply by the square root of n."""
+    """Error relative to the field due to clocks, mounting and model, treated as white noise. An
+    error that is constant over n frames must be multiplied by the square root of n."""
     background_std: float = np.inf
     """Prior standard deviation of the backgrounds [T]; infinite if unknown."""
     half_window: float = 3.0

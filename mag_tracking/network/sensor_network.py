@@ -59,7 +59,7 @@ class SensorNetwork:
     orientation_std: tuple[FloatArray | None, ...] = ()
     """Standard deviation of the mounting error of each sensor about the world axes, (3,) rad. None
     if unknown."""
-    # None only until `__post_init__`.
+    # The value is None only until `__post_init__` has run.
     clock_offset: FloatArray = cast(FloatArray, None)
     """Offset of the clock of each sensor, (n,) s, positive if the clock is ahead. The offset is
     subtracted from the timestamps. None is replaced by zeros."""

@@ -148,7 +148,7 @@ class RowVehicle:
             F = np.eye(n)
             F[:6, :6] = constant_velocity(dt)
             return x @ F.T, F, Q
-        # No decay in backward propagation, which has no process noise: the variance would shrink.
+        # The turn rate does not decay backwards: without process noise, its variance would shrink.
         fading = math.exp(-max(dt, 0.0) / self.turn_time)
         mean = (1.0 - fading) * self.turn_time / dt if dt > 0.0 else 1.0
         predicted, F_turn = fading_turn(x, dt, mean, fading)
