@@ -1,1 +1,1 @@
-"""Analyses of a whole pass or a network: batch fits, bounds, sensor placement."""
+"""Batch analyses of passes and networks: fits, classification, calibration, sensor placement."""

@@ -1,4 +1,4 @@
-"""Observable quantities of a pass at a single sensor: directions, CPA time and rate."""
+"""Observable quantities of a pass at a single sensor: directions, CPA time, speed over range."""
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
     Returns
     -------
     (array, array) or None
-        Path and moments; None if the path passes through the sensor.
+        Scaled path and moments; None if the path passes through the sensor.
 
     References
     ----------
@@ -54,7 +54,7 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
 
 
 def bearing_of(fit: PassFit, place: FloatArray) -> Bearing:
-    """Directions, CPA time and rate of a fit at one sensor, independent of the CPA range.
+    """Compute the quantities of a fit at one sensor that do not depend on the CPA range.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Error of a track relative to the path bound, for recordings with ground truth."""
+"""Error of a track relative to its Cramér-Rao bound, for recordings with ground truth."""
 
 import numpy as np
 
@@ -42,7 +42,7 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
     rows : (k,) int array
         Indices of the evaluated poses in the log.
     axes : int
-        Number of axes: 2 = horizontal error, 3 = error in space.
+        Number of axes: 2 for the horizontal error, 3 for the error in space.
 
     Returns
     -------
@@ -74,7 +74,10 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
 
 def _measurement_model(network: SensorNetwork, log: TrackLog, true: FloatArray, t: FloatArray,
                        known: IntArray, field_error: float) -> tuple[FloatArray, FloatArray]:
-    """Jacobians (k, n_sensors, 3, n_x) by [r, v, m, backgrounds] and noise covariances."""
+    """Jacobians (k, n_sensors, 3, n_x) of the field, and noise covariances (k, n_sensors, 3, 3).
+
+    The states are [r, v, m, backgrounds]. Jacobians of axes without a measurement are NaN.
+    """
     n, n_sensors = len(known), len(network)
     dr_dx, dm_dx = np.zeros((2, n, 1, 3, 9))
     dr_dx[:, 0, range(3), range(3)] = 1.0
@@ -93,7 +96,10 @@ def _measurement_model(network: SensorNetwork, log: TrackLog, true: FloatArray, 
 
 def _motion_model(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: TrackLog,
                   known: IntArray, n_x: int) -> tuple[FloatArray, FloatArray]:
-    """F and Q (k, n_x, n_x) from the previous pose; identity and zero for the first pose."""
+    """Transition matrix and process noise, (k, n_x, n_x) each, from the previous to each pose.
+
+    For the first pose, they are identity and zero.
+    """
     F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
     for k, dt in enumerate(np.diff(t), 1):
         F[k, :6, :6] = constant_velocity(dt)

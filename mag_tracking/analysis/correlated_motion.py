@@ -42,7 +42,7 @@ SMOOTHING = 0.3
 
 MAX_SHIFT = 4.0
 """Maximum shift of a delay during the refinement, in widths of the smoothing kernel. A larger shift
-leads to another maximum."""
+leads to a different correlation maximum."""
 
 MAX_PRIOR_CHI2 = 22.5
 """Maximum joint chi-square of rotation, scale and gains (probability 0.001). At a larger value, the
@@ -57,8 +57,8 @@ MIN_COSINE = 0.3
 the target crosses the line, and its speed is not compared."""
 
 MAX_READINGS = 1_000_000
-"""Maximum number of resampled readings of a pass. A pair with more, due to irregular timestamps, is
-rejected."""
+"""Maximum number of resampled readings of a pair. A pair that requires more, due to irregular
+timestamps, is rejected."""
 
 MAX_PAIRS = 12
 """Maximum number of pairs of sensors; the closest pairs are compared."""
@@ -80,7 +80,7 @@ class PairDelay:
     delay: float
     """Delay of the second sensor after the first [s]."""
     delay_std: float
-    """[s]"""
+    """Standard deviation of `delay` [s]."""
     similarity: float
     """Fraction of the energy of the second field that is explained by the delayed first field."""
 
@@ -92,13 +92,14 @@ class CorrelatedMotion:
     reason: str = 'not evaluated'
     """Empty if there is an estimate."""
     speed: float = np.nan
-    """[m/s]"""
+    """Speed [m/s]."""
     speed_std: float = np.nan
-    """[m/s]"""
+    """Standard deviation of `speed` [m/s]."""
     heading: float = np.nan
-    """[rad] Anticlockwise from x."""
+    """Heading [rad], measured anticlockwise from x."""
     heading_std: float = np.nan
-    """[rad] NaN if the sensors are on one line; the target is assumed to move along that line."""
+    """Standard deviation of `heading` [rad]. NaN if the sensors are on one line, because the target
+    is then assumed to move along that line."""
     similarity: float = np.nan
     """Largest `similarity` of the compared pairs."""
     pairs: tuple[PairDelay, ...] = ()
@@ -122,14 +123,14 @@ def correlated_motion(data: PassData) -> CorrelatedMotion:
     delays = [d for d in (_estimate_delay(data, i, j) for i, j in _nearest_pairs(data))
               if d is not None]
     if not delays:
-        return CorrelatedMotion('no pair of separate sensors has simultaneous readings of a field '
-                                'on a common axis')
+        return CorrelatedMotion('no pair of separate sensors has simultaneous readings of a '
+                                'varying field on a common axis')
     best = max(d.similarity for d in delays)
     similar = tuple(d for d in delays if d.similarity >= MIN_CORRELATION)
     if not similar:
         return CorrelatedMotion(f'the sensors measure different fields (similarity '
-                                f'{max(best, 0.0):.0%}): the target did not pass one after the '
-                                'other at the same distance', similarity=best)
+                                f'{max(best, 0.0):.0%}): the target did not pass them one after '
+                                'the other at the same distance', similarity=best)
     if all(abs(d.delay) < MIN_DELAY * d.delay_std for d in similar):
         return CorrelatedMotion('the sensors measure the same field at the same time',
                                 similarity=best, pairs=similar)
@@ -141,8 +142,8 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
     """Whether a speed and a heading contradict the delays between the sensors.
 
     On a path oblique to the line of the sensors, the delay is shorter than on a path along the
-    line; the speeds are compared accordingly. An unknown value, or a path almost perpendicular
-    to the line, never contradicts the delays.
+    line; the speeds are compared accordingly. A path almost perpendicular to the line, or an
+    unknown value, never contradicts the delays. A significantly opposite heading always does.
 
     Parameters
     ----------
@@ -172,7 +173,7 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
 
 
 def _nearest_pairs(data: PassData) -> list[tuple[int, int]]:
-    """Pairs of sensors to compare, closest first."""
+    """Pairs of sensors to compare, closest first; pairs at almost the same place are excluded."""
     positions = data.network.positions[:, :2]
     pairs = list(combinations(data.sensors.tolist(), 2))
     distance = np.array([np.linalg.norm(positions[i] - positions[j]) for i, j in pairs])
@@ -182,7 +183,7 @@ def _nearest_pairs(data: PassData) -> list[tuple[int, int]]:
 
 def _fit_velocity(data: PassData, pairs: Sequence[PairDelay],
                   similarity: float) -> CorrelatedMotion:
-    """Least-squares fit of a velocity to the delays of the pairs."""
+    """Fit a velocity to the delays of the pairs by least squares."""
     positions = data.network.positions[:, :2]
     d = np.array([positions[p.second] - positions[p.first] for p in pairs])
     tau, std = (np.array([getattr(p, n) for p in pairs]) for n in ('delay', 'delay_std'))
@@ -192,7 +193,7 @@ def _fit_velocity(data: PassData, pairs: Sequence[PairDelay],
     covariance = np.linalg.inv((A / std[:, None] ** 2).T @ A)
     slowness = covariance @ (A.T @ (tau / std**2))
     residuals, freedom = (tau - A @ slowness) / std, len(tau) - A.shape[1]
-    # Inconsistent delays have larger errors than their standard deviations.
+    # If the delays are inconsistent, their standard deviations are too small.
     covariance *= max(1.0, float(residuals @ residuals) / freedom) if freedom else 1.0
     norm = float(np.linalg.norm(slowness))
     along = slowness / norm
@@ -208,7 +209,7 @@ def _fit_velocity(data: PassData, pairs: Sequence[PairDelay],
 
 
 class _SensorReadings:
-    """Readings of one sensor: in the world frame, or in its own frame if axes are missing."""
+    """Readings of one sensor in the world frame, or in the sensor frame if an axis is missing."""
 
     def __init__(self, data: PassData, j: int, R: FloatArray, axes: IntArray) -> None:
         of_sensor = data.sensor == j
@@ -216,7 +217,7 @@ class _SensorReadings:
         is_complete = np.isfinite(field[:, axes]).all(axis=1)
         self.t = data.t[of_sensor][is_complete]
         self.field = (field[is_complete] @ R.T if len(axes) == 3 else field[is_complete])[:, axes]
-        # Missing readings have no covariance either.
+        # The covariance of an excluded reading may be NaN.
         variance = np.einsum('nii->ni', data.covariance[of_sensor][is_complete])[:, axes]
         self.noise = float(np.sqrt(variance.min(axis=0).mean())) if is_complete.any() else 0.0
 
@@ -232,7 +233,7 @@ class _SensorReadings:
 
 @dataclass(frozen=True)
 class _SmoothedPair:
-    """Two smoothed series at common times. Smoothing does not change the delay."""
+    """Smoothed fields of two sensors at common times. Smoothing does not change the delay."""
 
     t: FloatArray
     """(n,) [s]"""
@@ -272,7 +273,7 @@ def _resampled_pair(data: PassData, i: int, j: int) -> _SmoothedPair | None:
     energy = np.square(first.smoothed(t, step) - np.median(first.field, axis=0)).sum(axis=1)
     if not energy.max() > 0.0:
         return None
-    # Exclude the quiet parts of a long window.
+    # Exclude the parts of a long window in which the field is weak.
     energy = np.where(energy > 0.1 * energy.max(), energy, 0.0)
     energy /= energy.sum()
     width = max(step, SMOOTHING * float(np.sqrt(energy @ np.square(t - energy @ t))))
@@ -296,7 +297,7 @@ def _estimate_delay(data: PassData, i: int, j: int) -> PairDelay | None:
 
 
 def _correlation_maxima(pair: _SmoothedPair) -> list[float]:
-    """Delays [s] of the highest maxima of the cross-correlation, at most five."""
+    """Delays [s] of the highest maxima of the cross-correlation, at most five; [0.0] if none."""
     every = max(1, len(pair.t) // N_COARSE)
     step = every * (pair.t[1] - pair.t[0])
     a, b = (y[::every] - np.median(y, axis=0) for y in (pair.first, pair.second))
@@ -309,8 +310,9 @@ def _correlation_maxima(pair: _SmoothedPair) -> list[float]:
 def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]:
     """Refine a delay [s]; return the delay, its standard deviation [s] and the similarity.
 
-    The second field is modelled as the delayed first field with a small rotation, scale and gain
-    error and another background. All parameters are estimated by the Gauss-Newton method.
+    The second field is modelled as the delayed first field with small rotation, scale and gain
+    errors and a different background. All parameters are estimated by the Gauss-Newton method. If
+    the result is not plausible, the standard deviation is infinite and the similarity is zero.
     """
     k = pair.second.shape[1]
     theta = np.concatenate([[tau], np.zeros(2 * k + 3)])
@@ -337,7 +339,7 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
         step = np.linalg.solve(information, J.T @ residuals / std**2 - prior @ theta)
         theta = theta + step
         if abs(theta[0] - tau) > pair.t[-1] - pair.t[0]:
-            # Diverged; further steps would overflow.
+            # The fit has diverged; more steps would overflow.
             return tau, np.inf, 0.0
         if abs(step[0]) < 1e-6 * pair.width:
             break
@@ -359,7 +361,7 @@ def _delay_std(t: FloatArray, J: FloatArray, residuals: FloatArray, prior: Float
 
 def _residuals(pair: _SmoothedPair, t: FloatArray, y: FloatArray,
                theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Residuals (n k,) [T] and derivatives of the model (n k, n_theta) by `theta`."""
+    """Residuals (n k,) [T], and derivatives (n k, n_theta) of the model with respect to theta."""
     k = y.shape[1]
     tau, background, angles, gain = theta[0], theta[1:1 + k], theta[1 + k:4 + k], theta[4 + k:]
     field, slope = pair.at(t - tau)

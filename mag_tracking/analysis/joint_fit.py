@@ -52,7 +52,7 @@ MAX_DETECTION_RANGE = 15.0
 """[m] Maximum distance at which a sensor detects a target."""
 
 MAX_ROUNDS = 3
-"""Maximum number of rounds in which the order of each target is selected, given all others."""
+"""Maximum number of rounds in which the order of each target is selected for given other orders."""
 
 MAX_VELOCITY_DIFFERENCE, MAX_TRACK_DISTANCE = 0.5, 5.0
 """Maximum relative difference of velocity, and maximum distance [m], between two fits of one
@@ -109,18 +109,19 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
     orders : sequence of int
         Candidate numbers of dipoles of each target.
     errors : SensorErrors
-        Sensor errors that the robust covariance includes.
+        Sensor errors included in the robust covariance.
     stopped : function, optional
         Called without arguments; returns whether to abandon the fit.
 
     Returns
     -------
     tuple of tuples of PassFit
-        For each target, one fit per candidate order for which there are enough measurements; the
-        other targets have their selected orders. Targets are sorted by the time at which they pass
-        the centre of the sensors. Time zero is at the strongest field of each target. A fit has a
-        reason if it differs from the tracked path or from the best fit of its target. Empty if
-        there are too few measurements, or if the fit was abandoned.
+        For each target, one fit per candidate order for which there are enough measurements. In
+        each fit, the other targets have their selected orders. Targets are sorted by the time at
+        which they pass the centre of the sensors. Time zero is at the strongest field of each
+        target. `reason` is set if the best fit of a target differs from its track, or if another
+        fit differs from the best fit. Empty if there are too few measurements, or if the fit was
+        abandoned.
     """
     n_targets, begin_ns = len(paths), data.stamp_ns
     orders = [n for n in orders if not unusable_reason(data, n_targets * (n,))]
@@ -148,7 +149,7 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
 
 
 def _initial_paths(rough: PassData, n_targets: int, ground: GroundPrior) -> FloatArray:
-    """Best paths (n, 6 n_targets) of point targets, found by a coarse search in averaged data."""
+    """Search for the best paths (n, 6 n_targets) of point targets in averaged data."""
     paths: FloatArray = np.zeros((1, 0))
     residuals = [rough]
     for n in range(1, n_targets + 1):
@@ -173,21 +174,21 @@ def _initial_paths(rough: PassData, n_targets: int, ground: GroundPrior) -> Floa
 class _JointFits:
     """Cached joint fits of several targets, for any combination of their numbers of dipoles.
 
-    Each fit starts at the point solutions `placed` (n, 6 K) and at an available fit with another
-    number of dipoles.
+    Each fit starts at the point solutions `placed` (n, 6 K), of which the first is the tracked
+    paths, and at any available fit with another number of dipoles of one target.
     """
 
     def __init__(self, data: PassData, rough: PassData, placed: FloatArray, ground: GroundPrior,
                  errors: SensorErrors) -> None:
         self._data, self._rough, self._ground, self._errors = data, rough, ground, errors
-        # Sort the targets of all solutions in the order of the tracks, which are the first one.
+        # Sort the targets of each solution in the order of the tracks.
         split = [np.split(paths, paths.size // 6) for paths in placed]
         self._initial_paths = [[paths[i] for i in assignment(split[0], paths)] for paths in split]
         self._n_free = data.n_independent - background_columns(data, data.whitening).shape[1]
         self._cache: dict[tuple[int, ...], tuple[PassFit, ...]] = {}
 
     def of(self, k: int, orders: Sequence[int], candidates: Sequence[int]) -> tuple[PassFit, ...]:
-        """Fit target `k` with each of the `candidates`; the other targets have their `orders`."""
+        """Fits of target `k` with each of the `candidates`; the other targets have `orders`."""
         previous, fits = self._cache.get(tuple(orders)), []
         for n in candidates:
             combination = (*orders[:k], n, *orders[k + 1:])
@@ -201,8 +202,8 @@ class _JointFits:
                         previous: Sequence[PassFit] | None) -> FloatArray:
         """Starting paths (n, n_theta) for given numbers of dipoles.
 
-        `previous` are the fits with another number of dipoles of target `k`, None if there are no
-        such fits.
+        `previous` contains the fits with another number of dipoles of target `k`; None if there are
+        no such fits.
         """
         starts = [_with_orders(paths, orders) for paths in self._initial_paths]
         if previous is not None and all(len(fit.x) for fit in previous):
@@ -222,7 +223,8 @@ class _JointFits:
         cost = _exclude_solutions(cost, np.array([
             assignment(self._initial_paths[0], split(found)) == in_order
             for found in theta]), np.inf)
-        # If all minima without overlap are much worse, keep the overlap; `fit_targets` rejects it.
+        # If all minima without overlap are much worse, keep those with overlap; `fit_targets`
+        # rejects them.
         cost = _exclude_solutions(cost, np.array([are_separate(self._rough, split(found))
                                                   for found in theta]), MAX_COST_RATIO)
         found = fine_minimum(fine, theta, cost, np.concatenate(
@@ -237,16 +239,16 @@ class _JointFits:
 
 
 def _exclude_solutions(cost: FloatArray, is_allowed: BoolArray, max_ratio: float) -> FloatArray:
-    """Set the costs (n,) of solutions that are not `allowed` to infinity.
+    """Return the costs (n,), with infinity for the solutions that are not allowed.
 
-    The costs are unchanged if no allowed cost is within `max_ratio` times the best cost.
+    Return them unchanged if no allowed cost is within `max_ratio` times the lowest cost.
     """
     has_allowed = (cost[is_allowed] <= max_ratio * cost.min()).any()
     return np.where(is_allowed, cost, np.inf) if has_allowed else cost
 
 
 def are_separate(data: PassData, paths: Sequence[FloatArray], min_gap: float = MIN_GAP) -> bool:
-    """Whether targets do not overlap while they are within range of the sensors.
+    """Whether targets do not overlap while any of them is within range of the sensors.
 
     Parameters
     ----------
@@ -291,26 +293,32 @@ def path_from(data: PassData, fit: PassFit) -> FloatArray:
 
 
 def _with_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[FloatArray]:
-    """Add or remove the length of each path (6 or 7,) according to its number of dipoles."""
+    """Convert paths (6 or 7,) to other orders; the length of a former point is `INITIAL_LENGTH`."""
     return [np.concatenate([path[:6], path[6:] if len(path) > 6 else [INITIAL_LENGTH]])
             if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
 
 
 def _check_against_track(fits: Sequence[PassFit], best: int, path: FloatArray) -> list[PassFit]:
-    """Add a reason to fits that differ from the tracked `path` (6,) or from the best fit."""
+    """Return fits of one target, with a reason if they differ from the track or the best fit.
+
+    The fit `best` is compared with the tracked `path` (6,), the other fits with the best fit.
+    """
     out = []
     for k, fit in enumerate(fits):
-        # Compare the best fit with the track, and the other fits with the best fit.
+        # The other fits cannot be compared if the best fit has no estimate.
         agrees = k != best and not len(fits[best].x) or _agrees_with_path(
             fit, path if k == best else fits[best].x)
-        reason = 'the fit is not at the tracked position' if k == best else \
-            f'not the same target as with {fits[best].n_dipoles} dipoles'
+        reason = 'the fit differs from the track in position or velocity' if k == best else \
+            f'the path differs from the selected fit (number of dipoles: {fits[best].n_dipoles})'
         out.append(fit if agrees or fit.reason else replace(fit, reason=reason, trusted=()))
     return out
 
 
 def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
-    """Whether a fit agrees with a `path` (6 or more,) with the same time zero."""
+    """Whether position and velocity of a fit agree with a `path` (6 or more,).
+
+    The fit and the path have the same time zero. They are compared at the strongest field.
+    """
     if not len(fit.x):
         return False
     seconds = _time_of_peak(fit)
@@ -320,15 +328,16 @@ def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
 
 
 def _time_of_peak(fit: PassFit) -> float:
-    """Time [s] of the strongest fitted field of a target."""
+    """Time [s] at which the fitted field of a target is strongest."""
     field = replace(fit.data, field=fit.predicted).departure
     return float(fit.data.t[np.argmax(np.einsum('ni,ni->n', field, field))])
 
 
 def _shift_to_peak(fits: Sequence[PassFit], best: int) -> tuple[float, tuple[PassFit, ...]]:
-    """Move time zero of the fits of one target to the strongest field of the `best` fit.
+    """Shift time zero of the fits of one target to the strongest field of the `best` fit.
 
-    Also returns the CPA time [s since 1970] of the best fit to the centre of the sensors.
+    Returns the time [s since 1970] at which the best fit is closest to the centre of the sensors,
+    and the shifted fits.
     """
     fit = fits[best]
     if not len(fit.x):

@@ -17,8 +17,8 @@ N_UNKNOWNS = 5
 """Number of unknowns of a pose; the roll of a dipole is not observable."""
 
 EXACT_COST = 1e-9
-"""Maximum sum of squared residuals of exact readings. Rounding prevents a further reduction, so the
-fit counts as converged."""
+"""Maximum sum of squared residuals of readings without noise. Rounding prevents a further
+reduction, so the fit counts as converged."""
 
 MAX_COST = 100.0
 """Maximum normalised cost; a larger cost means that the readings do not fit the dipole."""
@@ -29,7 +29,7 @@ _Problem: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """Settings of the search for a magnet, and error model of the readings."""
+    """Settings of the search for a magnet pose, and error model of the readings."""
 
     field_error: float = param(
         0.01, 'Error of sensors and dipole model relative to the field.', '', (0.0, 1.0))
@@ -37,7 +37,7 @@ class PoseSettings:
         1e-7, 'Standard deviation of the change of the ambient field since the biases were '
         'estimated, per axis; the change is the same at all sensors.', 'T', (1e-15, 1e-3))
     grid_points: int = param(
-        343, 'Number of points of the coarse grid over the box.', '', (8, 1_000_000))
+        343, 'Number of points of the coarse grid in the search box.', '', (8, 1_000_000))
     starts: int = param(8, 'Number of grid points that are refined.', '', (1, 1000))
     iterations: int = param(60, 'Maximum number of steps.', '', (1, 10000))
 
@@ -51,12 +51,12 @@ class MagnetPose:
     axis: FloatArray
     """(3,) unit vector, world: direction of the moment."""
     covariance: FloatArray
-    """(6, 6) of position and axis, singular along the axis. Scaled by the normalised cost if that
-    exceeds one."""
+    """(6, 6) covariance of position and axis, singular along the axis. Scaled by the normalised
+    cost if this cost exceeds one."""
     ambient: FloatArray
     """(3,) [T], world: change of the ambient field since the biases were estimated."""
     normalised_cost: float
-    """About one if moment, noise and field error are correct."""
+    """Cost per degree of freedom; about one if moment, noise and field error are correct."""
     converged: bool
     """Whether the pose is valid."""
     reason: str
@@ -75,7 +75,7 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     network : SensorNetwork
         Every sensor requires a `noise_std`.
     field : (n, 3) array, T, sensor frame
-        Readings corrected for bias and gain (`NetworkGeometry.signal`); NaN = not measured.
+        Readings corrected for bias and gain (`NetworkGeometry.signal`); NaN if not measured.
     moment : float, A m²
     low, high : (3,) array, m, world frame
         Opposite corners of the search box.
@@ -103,7 +103,7 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     if n_values <= N_UNKNOWNS:
         nothing = np.full(3, np.nan)
         return MagnetPose(nothing, nothing, np.full((6, 6), np.nan), nothing, np.nan, False,
-                          f'number of measured axes is {n_values}, more than {N_UNKNOWNS} are '
+                          f'number of measured axes is {n_values}; more than {N_UNKNOWNS} are '
                           'required')
     size2 = np.nansum(np.square(field), axis=1)[:, None]
     std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * size2)
@@ -117,7 +117,7 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
 
 def _problem(network: SensorNetwork, field: FloatArray, std: FloatArray, present: BoolArray,
              moment: float, ambient_std: float) -> _Problem:
-    """Create the residuals of x = [position, unnormalised axis, ambient field over its std]."""
+    """Create the residual function of x = [position, unnormalised axis, ambient field over std]."""
     y = (field / std)[present]
     uniform = (network.R_sw * ambient_std / std[:, :, None])[present]
     prior = np.hstack([np.zeros((3, 6)), np.eye(3)])
@@ -147,7 +147,7 @@ def _starting_states(network: SensorNetwork, field: FloatArray, std: FloatArray,
     per_axis = max(2, int(round(settings.grid_points ** (1.0 / 3.0))))
     axes = [np.linspace(a, b, per_axis + 2)[1:-1] for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
-    # The Jacobian by the moment does not depend on the moment.
+    # The Jacobian with respect to the moment does not depend on the moment.
     dB_dm = dipole_jacobians(network.positions - grid[:, None], np.zeros(3))[1]
     A = (network.R_sw @ dB_dm / std[:, :, None])[:, present]
     usable = np.isfinite(A).all(axis=(1, 2))
@@ -159,7 +159,7 @@ def _starting_states(network: SensorNetwork, field: FloatArray, std: FloatArray,
 
 def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converged: bool,
                      low: FloatArray, high: FloatArray, settings: PoseSettings) -> MagnetPose:
-    """Convert a minimum `x` (9,) to a `MagnetPose`."""
+    """Convert a minimum `x` (9,) to a `MagnetPose`, with a reason if it is not valid."""
     length = np.linalg.norm(x[3:6])
     u = x[3:6] / length
     T = np.zeros((6, 9))
@@ -185,11 +185,11 @@ def _check_input(network: SensorNetwork, field: FloatArray, moment: float, low: 
         raise ValueError(f'expected field ({len(network)}, 3) and corners (3,), got '
                          f'{field.shape}, {low.shape}, {high.shape}')
     if not (np.isfinite(moment) and moment > 0.0):
-        raise ValueError(f'moment is {moment} A m^2, must be finite and above 0')
+        raise ValueError(f'moment is {moment} A m^2; it must be finite and above 0')
     if not (np.isfinite(high - low).all() and (high > low).all()):
         raise ValueError(f'the box from {low.tolist()} to {high.tolist()} m has no volume')
     if np.isinf(field).any():
         raise ValueError('field contains an infinite reading')
     for name, std in zip(network.names, network.noise_std, strict=True):
         if std is None or not (np.asarray(std) > 0.0).all():
-            raise ValueError(f'sensor {name}: noise_std is {std}, must be above 0 T')
+            raise ValueError(f'sensor {name}: noise_std is {std}; it must be above 0 T')

@@ -9,12 +9,12 @@ from mag_tracking.arrays import FloatArray
 
 
 def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
-    """Bayesian information criterion (BIC, Schwarz) of each fit of one pass.
+    """Compare fits of one pass by the Bayesian information criterion (BIC, Schwarz).
 
     The criterion adds a penalty of log(n) for each unknown to the cost, which is -2 times the
     log-likelihood up to a constant. If the normalised cost of the fit with the most dipoles exceeds
     one, all costs are divided by this value: a residual that no order explains is no evidence for a
-    higher order. TSP14 section V.C leaves the criterion open.
+    higher order. TSP14 section V.C does not specify a criterion.
 
     Parameters
     ----------
@@ -41,8 +41,8 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
 def choose_order(fits: Sequence[PassFit]) -> PassFit | None:
     """Return the fit with the smallest criterion, or None if that fit is rejected.
 
-    No other order is returned instead: a poor fit of fewer dipoles does not always show that the
-    target turned.
+    A fit of another order does not replace a rejected fit, because a fit with fewer dipoles does
+    not always reveal that the target turned.
 
     Parameters
     ----------

@@ -28,15 +28,16 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
                              settings: GeometrySettings) -> NetworkGeometry:
     """Estimate the geometry of a network from readings of a magnet at unknown poses.
 
-    The initial poses are estimated with the median reading of each sensor as its bias. Biases and
-    poses are then fitted with an assumed field error of 10 %, and finally all unknowns.
+    The initial poses are estimated with the median reading of each sensor as its bias. Biases,
+    poses and moment are then fitted with an assumed field error of at least 10 %. Finally, all
+    unknowns are fitted with the configured field error.
 
     Parameters
     ----------
     network : SensorNetwork
         As for `calibrate_geometry`.
     field : (K, n, 3) array, T, sensor frame
-        Readings including their constant background; NaN = not measured.
+        Readings including their constant background; NaN if not measured.
     moment : float, A m²
     low, high : (3,) array, m, world frame
         Opposite corners of the box that contains the magnet.
@@ -46,7 +47,8 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
     -------
     NetworkGeometry
         The world frame is defined only by the priors of the sensors and must be registered before
-        a comparison with another frame. `rows` are the indices of the poses inside the box.
+        a comparison with another frame. `rows` are the indices of the fitted poses. Poses that an
+        earlier stage located outside the box are excluded.
 
     Raises
     ------
@@ -64,7 +66,7 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
                      field_error=max(COARSE_ERROR, s.field_error))
     for stage in (coarse, s):
         if len(rows) < MIN_POSES:
-            raise ValueError(f'found {len(rows)} of {len(field)} poses in the box, at least '
+            raise ValueError(f'found {len(rows)} of {len(field)} poses in the box; at least '
                              f'{MIN_POSES} are required; check the moment and the box')
         geometry = fitted_geometry(network, field[rows], r, u, moment, stage, shared_unit,
                                    pose_unit)
@@ -77,7 +79,7 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
 
 def _initial_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
                    high: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Locate the magnet in each reading; return indices (k,), positions and axes (k, 3)."""
+    """Locate the magnet in each reading; return index, position and axis of the k valid poses."""
     if field.ndim != 3 or field.shape[1:] != (len(network), 3):
         raise ValueError(f'expected field (K, {len(network)}, 3), got {field.shape}')
     median = np.zeros(field.shape[1:])

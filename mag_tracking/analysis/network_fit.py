@@ -34,7 +34,7 @@ Unknowns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Unknowns of the sensors (n, 10), shared unknowns (12,) and unknowns of the poses (K, 8)."""
 
 Weights: TypeAlias = tuple[FloatArray, Unknowns, float, FloatArray]
-"""Weights of readings and priors; see `GeometryProblem.weights`."""
+"""Return values of `GeometryProblem.weights`."""
 
 
 class Priors(Protocol):
@@ -77,9 +77,9 @@ class GeometryProblem:
         Nominal moment of the magnet.
     settings : Priors
     shared_unit : (12,) array
-        Prior standard deviations of the shared unknowns; zero = fixed.
+        Prior standard deviations of the shared unknowns; zero fixes an unknown.
     pose_unit : (8,) array
-        Prior standard deviations of the unknowns of a pose; zero = fixed.
+        Prior standard deviations of the unknowns of a pose; zero fixes an unknown.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class GeometryProblem:
                 [s.gain_std, np.deg2rad(s.rotation_std_deg), s.position_std], [1, 3, 3]), (n, 1))])
 
     def predicted(self, x: Unknowns) -> Prediction:
-        """Predicted readings and their derivatives by the unknowns.
+        """Predict readings and their derivatives with respect to the unknowns.
 
         Parameters
         ----------
@@ -146,7 +146,7 @@ class GeometryProblem:
         return sensor * self.sensor_unit, shared * self.shared_unit, pose * self.pose_unit
 
     def start(self) -> Unknowns:
-        """Initial unknowns: no corrections, and biases from the median residuals.
+        """Create the initial unknowns: biases from the median residuals, all other unknowns zero.
 
         Returns
         -------
@@ -199,7 +199,7 @@ class GeometryProblem:
         priors : Unknowns
             Weights of the priors.
         scale : float
-            Factor of the noise variances that fits the median residual, at least one.
+            Factor by which the median squared residual exceeds the expected value; at least one.
         trust : (n, K) array
             Robust weight of each sensor at each pose, 0 to 1.
         """
@@ -222,7 +222,7 @@ class GeometryProblem:
                 np.tile(pose, POSE))
 
     def cost(self, x: Unknowns, f: FloatArray, W: FloatArray, priors: Unknowns) -> float:
-        """Weighted sum of squared residuals and priors.
+        """Weighted sum of the squared residuals and of the squared unknowns (priors).
 
         Parameters
         ----------
@@ -245,7 +245,7 @@ class GeometryProblem:
 
 
 def median_ratio(d2: FloatArray, count: IntArray) -> FloatArray:
-    """Ratio of squared residuals to their median for pure noise.
+    """Ratio of squared residuals to the median expected for pure noise.
 
     Parameters
     ----------
@@ -286,11 +286,11 @@ class NormalEquations:
     A : (N, N) array
         Information of [sensors, shared].
     g : (N,) array
-        Negative gradient of [sensors, shared].
+        Negative gradient with respect to [sensors, shared].
     A_pose : (K, 8, 8) array
-        Information of the poses.
+        Information of each pose.
     g_pose : (K, 8) array
-        Negative gradient of the poses.
+        Negative gradient with respect to each pose.
     C : (K, N, 8) array
         Cross information between [sensors, shared] and each pose.
     """
@@ -371,7 +371,7 @@ class NormalEquations:
         return lost
 
     def _damped(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Information of [sensors, shared] and of the poses with increased diagonals."""
+        """Information of [sensors, shared] and of the poses, with damped (increased) diagonals."""
         return (self.A + damping * np.diag(np.diagonal(self.A)),
                 self.A_pose * (1.0 + damping * np.eye(POSE)))
 
@@ -418,6 +418,6 @@ def solve(problem: GeometryProblem,
 
 
 def _add_step(x: Unknowns, dx: FloatArray, dpose: FloatArray) -> Unknowns:
-    """Add a step to the unknowns."""
+    """Return the unknowns after a step."""
     m = len(dx) - SHARED
     return x[0] + dx[:m].reshape(-1, SENSOR), x[1] + dx[m:], x[2] + dpose

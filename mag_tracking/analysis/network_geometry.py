@@ -1,8 +1,8 @@
 """Calibration of the geometry of a network from readings of a magnet at many poses.
 
 Positions, orientations, gains and biases of fixed sensors are estimated by maximum a posteriori.
-Further unknowns are the alignment between board, tracker and tool or, without a tracker, the poses
-of the magnet. PHD15 Paper A suggests such a calibration as future work.
+Additional unknowns are the alignment between board, tracker and tool or, without a tracker, the
+poses of the magnet. PHD15 Paper A suggests such a calibration as future work.
 """
 
 from dataclasses import dataclass, replace
@@ -32,7 +32,7 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class GeometrySettings:
-    """Prior standard deviations (zero: known exactly) and limits of the fit."""
+    """Prior standard deviations, where zero means exactly known, and limits of the fit."""
 
     gain_std: float = param(0.03, 'Gain of a sensor.', '', (0.0, 1.0))
     rotation_std_deg: float = param(2.0, 'Orientation of a sensor, per axis.', 'deg',
@@ -75,13 +75,13 @@ class NetworkGeometry:
     network: SensorNetwork
     """Network with corrected positions and orientations, and with the biases as background."""
     position_std: FloatArray
-    """(n, 3) [m]."""
+    """(n, 3) [m], world frame."""
     rotation_std: FloatArray
     """(n, 3) [rad], about the axes of the sensor."""
     gain: FloatArray
-    """(n,); 1 = nominal."""
+    """(n,) gain; one is nominal."""
     gain_std: FloatArray
-    """(n,)."""
+    """(n,) standard deviations of `gain`."""
     bias: FloatArray
     """(n, 3) [T], sensor frame; NaN for an axis without readings."""
     bias_std: FloatArray
@@ -89,20 +89,20 @@ class NetworkGeometry:
     magnet: TrackedMagnet
     """Tracked poses of the magnet, and its nominal moment."""
     rows: IntArray
-    """(K,) indices of the used poses."""
+    """(K,) indices of the fitted poses in the input."""
     shared: FloatArray
     """(12,) shared unknowns; see `TrackedMagnet.poses`."""
     shared_std: FloatArray
-    """(12,)."""
+    """(12,) standard deviations of `shared`."""
     pose: FloatArray
     """(K, 8) unknowns of each pose; see `TrackedMagnet.poses`."""
     pose_covariance: FloatArray
-    """(K, 8, 8)."""
+    """(K, 8, 8) covariance of `pose`."""
     covariance: FloatArray
     """(10 n + 12, 10 n + 12), of the unknowns of all sensors (bias, gain, rotation, position), then
     of the shared unknowns."""
     normalised_cost: float
-    """About one if model, noise and field error are correct."""
+    """Cost per degree of freedom; about one if model, noise and field error are correct."""
     sensor_residual: FloatArray
     """(n,) RMS of the normalised residuals; NaN without readings."""
     pose_residual: FloatArray
@@ -184,8 +184,8 @@ MIN_POSES = 3
 """Minimum number of poses that separates the bias of a sensor from the field of the magnet."""
 
 MIN_CHANGE = 0.1
-"""Minimum range of the axis [rad], and of the position relative to the distance. Poses within both
-ranges do not determine the geometry."""
+"""Minimum variation of the axis [rad], and of the position relative to the distance of the nearest
+sensor. If both variations are smaller, the poses do not determine the geometry."""
 
 MAX_CORRECTION = 4.0
 """Maximum correction of a sensor or pose that is not suspect, in prior standard deviations."""
@@ -202,8 +202,8 @@ def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: Flo
                        settings: GeometrySettings) -> NetworkGeometry:
     """Estimate the geometry of a network from readings of a tracked magnet.
 
-    Maximum a posteriori by the Levenberg-Marquardt method with robust weights. A rotation of the
-    board has the same effect as a rotation of all sensors; the priors resolve this gauge freedom.
+    The posterior is maximised by the Levenberg-Marquardt method with robust weights. A rotation of
+    the board has the same effect as a rotation of all sensors. The priors resolve this ambiguity.
     PHD15 Paper A section 8 proposes such a calibration.
 
     Parameters
@@ -211,12 +211,12 @@ def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: Flo
     network : SensorNetwork
         Nominal network. Every sensor requires a `noise_std`.
     field : (K, n, 3) array, T, sensor frame
-        Readings including their constant background; NaN = not measured.
+        Readings including their constant background; NaN if not measured.
     positions : (K, 3) array, m, tracker frame
         Positions of the tracked point. The tracker frame differs from the world frame only by a
         shift and a rotation within the priors of the settings.
     axes : (K, 3) array, unit vectors, tracker frame
-        Directions of the moment, apart from its tilt in the tool.
+        Directions of the moment if the magnet is not tilted in the tool.
     moment : float, A m²
         Nominal moment of the magnet.
     settings : GeometrySettings
@@ -257,9 +257,9 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
         This and the arguments above are as for `calibrate_geometry`.
     shared_unit : (12,) array
         Prior standard deviations of the shared unknowns, in the units of `TrackedMagnet.poses`;
-        zero = fixed.
+        zero fixes an unknown.
     pose_unit : (8,) array
-        Prior standard deviations of the unknowns of a pose; zero = fixed.
+        Prior standard deviations of the unknowns of a pose; zero fixes an unknown.
 
     Returns
     -------
@@ -308,7 +308,7 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
 
 def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
                      trust: FloatArray, priors: Unknowns) -> float:
-    """Weighted sum of squared residuals per degree of freedom; NaN for less than one degree."""
+    """Weighted sum of squared residuals per degree of freedom; NaN if less than one is left."""
     P, P_pose = NormalEquations(problem, x, predicted, W, priors).covariance()
     e2, count, _ = problem.misfit(predicted[0], predicted[1])
     known = np.append(priors[0].ravel(), priors[1]) @ np.diagonal(P)
@@ -343,7 +343,7 @@ def _suspects(problem: GeometryProblem, x: Unknowns, by_sensor: FloatArray,
 
 
 def _is_magnet_at_rest(problem: GeometryProblem, x: Unknowns) -> bool:
-    """Whether the magnet hardly moved, relative to its distance, and hardly rotated."""
+    """Whether the variations of position and axis of the magnet are less than `MIN_CHANGE`."""
     r, u = _positions_and_axes(problem.magnet, *problem.in_si(x)[1:])
     nearest = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
     return bool((np.ptp(r, axis=0) < MIN_CHANGE * nearest).all()
@@ -354,14 +354,14 @@ def _failure_reason(problem: GeometryProblem, x: Unknowns, converged: bool, cost
     """Reason why the fit is not valid; empty if it is valid."""
     K, max_steps = len(problem.magnet.tool), problem.settings.iterations
     if K < MIN_POSES:
-        reason = (f'number of poses is {K}, at least {MIN_POSES} are required to separate the '
+        reason = (f'number of poses is {K}; at least {MIN_POSES} are required to separate the '
                   'biases from the field of the magnet')
     elif _is_magnet_at_rest(problem, x):
-        reason = 'all poses are at one place: the geometry is not observable; move the magnet'
+        reason = 'the poses are almost equal: the geometry is not observable; move the magnet'
     elif not converged:
         reason = f'no minimum found (maximum number of steps: {max_steps})'
     elif np.isnan(cost):
-        reason = 'fewer readings than unknowns'
+        reason = 'too few readings for the number of unknowns'
     elif cost > MAX_COST:
         reason = (f'the readings do not fit the model: the normalised cost is {cost:.0f}; check '
                   'the poses, the moment, the network and noise_std')
@@ -381,7 +381,7 @@ def _check_input(network: SensorNetwork, field: FloatArray, positions: FloatArra
         raise ValueError('there are no poses; at least one pose is required')
     for name, std in zip(network.names, network.noise_std, strict=True):
         if std is None or not (np.asarray(std) > 0.0).all():
-            raise ValueError(f'sensor {name}: noise_std is {std}, must be above 0 T')
+            raise ValueError(f'sensor {name}: noise_std is {std}; it must be above 0 T')
     for k in range(K):
         if not (np.isfinite(positions[k]).all()
                 and abs(np.linalg.norm(axes[k]) - 1.0) <= 1e-3):
@@ -394,4 +394,4 @@ def _check_input(network: SensorNetwork, field: FloatArray, positions: FloatArra
     if np.isinf(field).any():
         raise ValueError('field contains an infinite reading')
     if not (np.isfinite(moment) and moment > 0.0):
-        raise ValueError(f'moment is {moment} A m^2, must be finite and above 0')
+        raise ValueError(f'moment is {moment} A m^2; it must be finite and above 0')

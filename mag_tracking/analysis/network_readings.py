@@ -78,14 +78,14 @@ class TrackedMagnet:
 
     def poses(self, shared: FloatArray, pose: FloatArray) -> tuple[
             FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Positions and moments of the magnet, and their derivatives.
+        """Compute positions and moments of the magnet, and their derivatives.
 
         Parameters
         ----------
         shared : (12,) array
             Shift [m] and rotation vector [rad] from the tracker frame to the board (world) frame;
-            offset [m, tool frame]; tilt [slope, tool frame]; log of the moment over its nominal
-            value.
+            offset [m] and tilt [slope] of the magnet in the tool frame; log of the moment over its
+            nominal value.
         pose : (K, 8) array
             Corrections of the position [m, world frame] and of the tilt [slope, tool frame]; change
             of the ambient field [T, world frame], which does not affect the pose.
@@ -122,7 +122,7 @@ class TrackedMagnet:
 
 def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: FloatArray,
                        shared: FloatArray, pose: FloatArray) -> Prediction:
-    """Predicted reading of each sensor at each pose, and its derivatives.
+    """Predict the reading of each sensor at each pose, and its derivatives.
 
     Parameters
     ----------

@@ -24,13 +24,13 @@ class SensorErrors:
 def robust_covariance(data: PassData, whitened: FloatArray, residuals: FloatArray,
                       target: FloatArray, covariance: FloatArray,
                       errors: SensorErrors) -> FloatArray:
-    """Covariance due to noise, model error and sensor errors.
+    """Compute the covariance due to noise, model error and sensor errors.
 
     Parameters
     ----------
     data : PassData
     whitened : (n, 3, n_x) array
-        Whitened derivatives of the field by the unknowns.
+        Whitened derivatives of the field with respect to the unknowns.
     residuals : (n, 3) array
         Whitened residuals.
     target : (n, 3) array, T, sensor frame
@@ -82,13 +82,14 @@ def velocity_change(data: PassData, whitened: FloatArray, residuals: FloatArray,
     """Estimate the relative change of the velocity while the target is observed.
 
     A constant horizontal acceleration is added to the unknowns, followed by one Gauss-Newton step
-    from the minimum. The derivatives by the acceleration are t²/2 times the derivatives by x and y.
+    from the minimum. The derivatives with respect to the acceleration are t²/2 times the
+    derivatives with respect to x and y.
 
     Parameters
     ----------
     data : PassData
     whitened : (n, 3, n_x) array
-        Whitened derivatives of the field by the unknowns.
+        Whitened derivatives of the field with respect to the unknowns.
     residuals : (n, 3) array
         Whitened residuals.
     first : int
@@ -108,7 +109,7 @@ def velocity_change(data: PassData, whitened: FloatArray, residuals: FloatArray,
     extended = np.concatenate([whitened, by_acceleration], axis=2)
     flat = extended.reshape(residuals.size, -1)
     norm = np.linalg.norm(flat, axis=0)
-    # A zero column has no scale.
+    # A column of zeros cannot be normalised.
     norm[norm == 0.0] = 1.0
     inverse = np.linalg.pinv(flat / norm, rcond=1e-8) / norm[:, None]
     step, covariance = inverse @ residuals.ravel(), inverse @ inverse.T

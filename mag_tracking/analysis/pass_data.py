@@ -29,12 +29,12 @@ class PassData:
     sensor: IntArray
     """(n,) index of the sensor of each sample, ascending."""
     field: FloatArray
-    """(n, 3) [T], sensor frame; NaN = axis not measured."""
+    """(n, 3) [T], sensor frame; NaN for axes that were not measured."""
     covariance: FloatArray
-    """(n, 3, 3) [T²] covariance of each sample. If a sample is a mean, the covariance of a single
-    averaged sample. Ignored for missing axes."""
+    """(n, 3, 3) [T²] covariance of each sample. If a sample is a mean, this is the mean covariance
+    of the averaged samples, not the covariance of their mean. Ignored for missing axes."""
     count: IntArray | None = None
-    """(n,) number of averaged samples; None = 1."""
+    """(n,) number of averaged samples; None if no samples were averaged."""
 
     @classmethod
     def of_frames(cls, network: SensorNetwork, stamps_ns: Sequence[int],
@@ -103,7 +103,7 @@ class PassData:
         Parameters
         ----------
         seconds : float, s
-            Shift of time zero; positive = later.
+            Shift of time zero; a positive shift makes time zero later.
 
         Returns
         -------
@@ -114,7 +114,11 @@ class PassData:
 
     @cached_property
     def whitening(self) -> FloatArray:
-        """Matrices W, (n, 3, 3), with W C Wᵀ = I for the measured axes and zeros elsewhere."""
+        """Whitening matrices W, (n, 3, 3), with W C Wᵀ = I for the covariance C of each sample.
+
+        If a sample is a mean, C is the covariance of the mean. Rows and columns of missing axes are
+        zero.
+        """
         W = np.zeros((len(self.t), 3, 3))
         present = ~np.isnan(self.field)
         for axes in np.unique(present, axis=0):
@@ -146,7 +150,7 @@ class PassData:
                              * max_samples * (1.0 - 1e-9)).astype(int)
             first = np.flatnonzero(np.diff(group, prepend=-1))
             n = np.diff(first, append=len(own))
-            # A missing value makes the mean NaN: the mean of the remaining values has another time.
+            # A missing value makes the mean NaN: the other values have a different mean time.
             rows.append((np.add.reduceat(self.t[own], first) / n, np.full(len(n), j),
                          np.add.reduceat(self.field[own], first) / n[:, None],
                          np.add.reduceat(self.covariance[own], first) / n[:, None, None], n))
@@ -196,7 +200,7 @@ def separable_problem(data: PassData, model_of: ModelOf, relative_error: float =
 
 
 def background_columns(data: PassData, W: FloatArray) -> FloatArray:
-    """Columns of the design matrix for the background of each measured axis, whitened.
+    """Create the whitened columns of the design matrix for the backgrounds of the measured axes.
 
     Parameters
     ----------

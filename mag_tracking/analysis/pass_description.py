@@ -26,7 +26,8 @@ from mag_tracking.inference.separable_fit import Minimum
 from mag_tracking.physics.passes import SuperposedPasses
 
 PATH_TOLERANCE = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2, 0.3])
-"""[m], [m/s], [m] Maximum difference between two paths that count as equal."""
+"""Maximum difference between two paths that count as equal: position [m], velocity [m/s] and length
+[m]."""
 
 CPA_UNIT_STD = 1e-4
 """[m] Standard deviation of an assumed CPA range, which only defines the unit of length."""
@@ -54,7 +55,7 @@ def fits_at_minimum(data: PassData, orders: Sequence[int], found: Minimum, p: Fl
     cpa_range : (float, float), m, optional
         Range at the CPA and its standard deviation; see `fit_pass`.
     path_std : (n_theta,) array, optional
-        Prior standard deviations of the paths; infinite = no prior.
+        Prior standard deviations of the paths; infinite for parameters without a prior.
 
     Returns
     -------
@@ -114,21 +115,21 @@ class _LinearisedFit:
     theta: tuple[FloatArray, ...]
     """Path (6 or 7,) of each target."""
     whitened: FloatArray
-    """(n, 3, n_x) whitened derivatives by paths, combinations of moments and backgrounds."""
+    """(n, 3, n_x) whitened derivatives with respect to paths, moment combinations, backgrounds."""
     H: FloatArray
     """(3 n, n_x) the same derivatives, not whitened, [T] per unit, sensor frame."""
     T: FloatArray
-    """(n_x, n_x) transformation of these parameters into the unknowns."""
+    """(n_x, n_x) transformation of the parameters of `H` into the unknowns `x`."""
     x: FloatArray
     """(n_x,) unknowns."""
     own: tuple[IntArray, ...]
-    """Indices of the unknowns of each target, followed by those of the backgrounds."""
+    """For each target, the indices of its unknowns, followed by the indices of the backgrounds."""
     names: tuple[str, ...]
     """Names of the unknowns."""
     fields: FloatArray
     """(K, n, 3) [T] field of each target, sensor frame."""
     background: FloatArray
-    """(n, 3) [T]"""
+    """(n, 3) [T] fitted background of each sample, sensor frame."""
     residuals: FloatArray
     """(n, 3) whitened residuals."""
 
@@ -175,7 +176,7 @@ def _flatten(A: FloatArray) -> FloatArray:
 
 def _basic_fits(linear: _LinearisedFit, found: Minimum, explained: float, errors: SensorErrors,
                 covariance: FloatArray) -> list[PassFit]:
-    """Create the `PassFit` of each target, except rivals and reason.
+    """Create the `PassFit` of each target, except for `rivals`, `reason` and `trusted`.
 
     `covariance` contains only the effect of the noise.
     """
@@ -205,7 +206,7 @@ def _basic_fits(linear: _LinearisedFit, found: Minimum, explained: float, errors
 
 
 def assignment(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tuple[int, ...]:
-    """Match two sets of paths by their minimum total distance.
+    """Match two sets of paths so that their total distance is minimal.
 
     The order of the targets in a solution of a joint fit is arbitrary.
 
@@ -226,7 +227,10 @@ def assignment(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tup
 
 def _select_rivals(fit: PassFit, minima: Iterable[tuple[FloatArray, float]]) -> tuple[
         tuple[float, FloatArray], ...]:
-    """Select `PassFit.rivals` among the other minima (path, cost), except the reversed row."""
+    """Create `PassFit.rivals` from the minima (path, cost) that differ from the fit.
+
+    A minimum that equals the fit apart from the sign of the length is not a rival.
+    """
     rivals, excess = [], max(1.0, fit.normalised_cost)
     for path, cost in minima:
         path = np.append(path[:6], np.abs(path[6:]))

@@ -37,12 +37,12 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
     ----------
     data : PassData
     n_dipoles : int
-        Model order; 1 = point target without a length.
+        Number of dipoles of the row; 1 models a point target without a length.
     cpa_range : (float, float), m, optional
         Known CPA range and its standard deviation. Only for a single sensor, for which the scale is
         not observable (TSP14 section IV.B).
     errors : SensorErrors
-        Sensor errors that the robust covariance includes.
+        Sensor errors included in the robust covariance.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
 
 
 def centred_on_peak(data: PassData) -> tuple[PassData, PassData]:
-    """Shift time zero of a pass to its strongest field.
+    """Shift time zero of a pass to its strongest field, and average the samples.
 
     Parameters
     ----------
@@ -126,21 +126,22 @@ def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
         If an order is less than one.
     """
     if min(orders) < 1:
-        raise ValueError(f'number of dipoles is {min(orders)}, must be at least one dipole')
+        raise ValueError(f'number of dipoles is {min(orders)}; at least one dipole is required')
     if not len(data.sensors):
         return 'no sensor has a measurement'
     axes = sum(int((~np.isnan(data.field[data.sensor == j])).any(axis=0).sum())
                for j in data.sensors)
     unknowns = sum(6 + (n > 1) + 3 * n for n in orders) + axes
     if data.n_values <= unknowns:
-        return f'fewer measurements ({data.n_values}) than unknowns ({unknowns}) plus one'
+        return f'too few measurements ({data.n_values}) for {unknowns} unknowns'
     return ''
 
 
 def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
-    """Starting paths of the search: all headings, past the sensor with the strongest field.
+    """Create starting paths of the search with various headings, offsets and speeds.
 
-    The duration of the field at that sensor determines the ratio of speed to distance.
+    The paths pass the sensor with the strongest field. The duration of the field at this sensor
+    determines the ratio of speed to distance.
 
     Parameters
     ----------
@@ -174,8 +175,8 @@ def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
 def shorter_rows(path: FloatArray) -> FloatArray:
     """Alternative starting paths of a row, mostly with a shorter length.
 
-    If a dipole at the end of a row has no moment, a shorter row with another centre fits almost as
-    well.
+    If a dipole at the end of a row has no moment, a shorter row with a different centre fits almost
+    as well.
 
     Parameters
     ----------

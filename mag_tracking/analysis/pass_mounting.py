@@ -16,13 +16,13 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Track
 
 MIN_INFORMATION_FRACTION = 0.05
-"""Minimum information about a direction, relative to the best-known direction of the track. Other
-directions are not compared between tracks."""
+"""Minimum information about a direction, relative to the best-known direction of the track.
+Directions with less information are not compared between tracks."""
 
 
 @dataclass(frozen=True)
 class MountingEvidence:
-    """Sensor orientations fused from tracks."""
+    """Corrections of the sensor orientations, fused from tracks."""
 
     rotation: FloatArray
     """(n_sensors, 3) [rad] small rotations about the world axes, which correct the orientations."""
@@ -47,7 +47,7 @@ def fuse_mounting(network: SensorNetwork, prior_std: Iterable[FloatArray],
     prior_std : iterable of n_sensors (3,) array, rad
         Prior standard deviations of the mounting errors of each sensor, about the world axes.
     tracks : sequence of Track
-        The last unambiguous pose of each target, with mounting angles.
+        Last unambiguous pose of each target. Each pose requires mounting angles.
 
     Returns
     -------
@@ -89,7 +89,7 @@ def fuse_mounting(network: SensorNetwork, prior_std: Iterable[FloatArray],
 
 
 def _remove_negative_eigenvalues(information: FloatArray) -> FloatArray:
-    """Set negative eigenvalues of the information (n_sensors, 3, 3) to zero."""
+    """Return the information (n_sensors, 3, 3) with negative eigenvalues set to zero."""
     values, vectors = np.linalg.eigh(information)
     clipped: FloatArray = np.einsum('jik,jk,jlk->jil', vectors, np.maximum(values, 0.0), vectors)
     return clipped
@@ -103,7 +103,7 @@ def _track_scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], rot
         residual = pull - np.einsum('jik,jk->ji', gain, rotation)
         inverse = np.linalg.pinv(gain, rcond=MIN_INFORMATION_FRACTION, hermitian=True)
         squares += np.einsum('ji,jik,jk->j', residual, inverse, residual)
-        # Fewer degrees of freedom, because the fused estimate includes the track.
+        # The fused estimate includes the track, which reduces the degrees of freedom.
         projection = inverse @ gain
         freedom += np.einsum('jii->j', projection - projection @ covariance @ gain)
     scatter: FloatArray = np.divide(squares, freedom, out=np.full(len(rotation), np.nan),
@@ -112,7 +112,7 @@ def _track_scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], rot
 
 
 def with_pass_mounting(network: SensorNetwork, evidence: MountingEvidence) -> SensorNetwork:
-    """Correct the orientations of a network.
+    """Correct the orientations of a network by fused mounting angles.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def with_pass_mounting(network: SensorNetwork, evidence: MountingEvidence) -> Se
     Returns
     -------
     SensorNetwork
-        Network with the orientations and standard deviations of the evidence.
+        Copy of the network with corrected orientations and their standard deviations.
     """
     corrections = rotation_from_quaternion(quaternion_from_rotation_vector(evidence.rotation))
     std = np.sqrt(np.einsum('jii->ji', evidence.covariance))

@@ -39,7 +39,7 @@ class Bearing:
     """(3,) unit vector, world, from the sensor to the target at the CPA. The solution above the
     sensor is used."""
     motion_direction: FloatArray
-    """(3,) unit vector, world."""
+    """(3,) unit vector, world, of the velocity in the solution above the sensor."""
     moment_direction: FloatArray
     """(3,) unit vector, world, of the total moment."""
     direction_std: FloatArray
@@ -47,11 +47,11 @@ class Bearing:
     cpa_time: float
     """[s] relative to time zero."""
     cpa_time_std: float
-    """[s]"""
+    """[s] standard deviation of `cpa_time`."""
     rate: float
     """[1/s] speed over CPA range."""
     rate_std: float
-    """[1/s]"""
+    """[1/s] standard deviation of `rate`."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class PassFit:
     velocity_change: float = np.nan
     """Apparent relative change of the velocity during the pass."""
     velocity_change_std: float = np.nan
-    """Standard deviation due to noise and model errors."""
+    """Standard deviation of `velocity_change` due to noise and model errors."""
     residual_elsewhere: float = np.nan
     """Unexplained fraction of the energy outside the reach of the vehicle; see `pass_trust`."""
     trusted: tuple[str, ...] = ()
@@ -98,9 +98,9 @@ class PassFit:
     bearing: Bearing | None = None
     """Observable quantities of a fit of one sensor; None otherwise."""
     rivals: tuple[tuple[float, FloatArray], ...] = ()
-    """(d, path) of other minima, with a likelihood ratio of exp(-d/2) to this fit. They are not
-    included in the covariance. For example, if a dipole at the end of a row has no moment, a
-    shorter row with another centre is a rival."""
+    """(d, path) of each other minimum of the cost, whose likelihood ratio to this fit is exp(-d/2).
+    The covariance does not cover rivals. For example, if a dipole at the end of a row has no
+    moment, a shorter row with a different centre is a rival."""
     predicted: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) [T] fitted field including the background, sensor frame."""
     predicted_std: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
@@ -126,7 +126,7 @@ class PassFit:
 
     @property
     def determined(self) -> bool:
-        """Whether the measurements determine all unknowns."""
+        """Whether the search converged to a plausible length and all unknowns are observable."""
         if not (len(self.x) and self.converged):
             return False
         variance = np.diagonal(self.robust_covariance)
@@ -141,7 +141,7 @@ class PassFit:
 
     @property
     def is_poor_mixture(self) -> bool:
-        """Whether the residuals of a joint fit exceed the noise."""
+        """Whether this is a joint fit with a cost above `MAX_NORMALISED_COST`."""
         return self.n_other_unknowns > 0 and bool(self.normalised_cost > MAX_NORMALISED_COST)
 
     @property
@@ -175,7 +175,7 @@ class PassFit:
         Parameters
         ----------
         seconds : float, s
-            Shift of time zero; positive = later.
+            Shift of time zero; a positive shift makes time zero later.
 
         Returns
         -------

@@ -24,7 +24,8 @@ MAX_LENGTH = 18.75
 """[m] Maximum length of the iron of one vehicle: a road train (Directive 96/53/EC)."""
 
 MAX_VELOCITY_SPREAD = 0.25
-"""Maximum difference between the velocity of a part of a vehicle and the mean, relative to it."""
+"""Maximum difference between the velocities of parts of a vehicle and their mean, relative to the
+mean."""
 
 
 def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, ground: GroundPrior,
@@ -52,20 +53,20 @@ def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, gro
     Returns
     -------
     tuple of tuples of PassFit
-        For each target, one fit per number of dipoles. The fits as a single target are returned if
-        they explain the field equally well, or if the fitted targets are parts of one vehicle (long
-        vehicles are sometimes tracked as two). They are returned with a reason if neither one
-        target nor the tracked targets explain the field.
+        For each target, one fit per number of dipoles. The fits `alone` are returned if one target
+        explains the field equally well, or if the fitted targets are parts of one vehicle (long
+        vehicles are sometimes tracked as two). If the joint fit is impossible or is rejected, the
+        fits `alone` are returned with a reason.
     """
     n_targets = len(paths)
     if n_targets < 2 or len(data.sensors) < 2:
         return (tuple(alone),)
     if n_targets > MAX_TARGETS:
-        return (_reject(alone, n_targets, f'at most {MAX_TARGETS} can be fitted together'),)
+        return (_reject(alone, n_targets, f'but at most {MAX_TARGETS} can be fitted together'),)
     joint_fits = fit_joint(data, paths, ground, orders, stopped=stopped)
     if not joint_fits:
         return (_reject(alone, n_targets,
-                        'there are too few measurements to fit them together'),)
+                        'but there are too few measurements to fit them together'),)
     best, single = [_best_fit(fits) for fits in joint_fits], _best_fit(alone)
     if not single.reason and single.length[0] <= MAX_LENGTH and all(
             fit.determined for fit in best) and (
@@ -76,12 +77,12 @@ def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, gro
 
 
 def _best_fit(fits: Sequence[PassFit]) -> PassFit:
-    """Fit with the smallest criterion; the first fit if none is determined."""
+    """Return the fit with the smallest criterion, or the first fit if none is determined."""
     return fits[int(np.argmin(order_criteria(fits)))]
 
 
 def _are_parts(data: PassData, fits: Sequence[PassFit]) -> bool:
-    """Whether targets move together and overlap."""
+    """Whether targets overlap and have almost equal velocities."""
     velocity = np.array([fit.velocity for fit in fits])
     mean = velocity.mean(axis=0)
     return bool((np.linalg.norm(velocity - mean, axis=1)
@@ -95,19 +96,20 @@ def _rejection_reason(data: PassData, fits: Sequence[PassFit]) -> str:
         return 'but the joint fit did not converge'
     if not all(has_plausible_residual(fit) for fit in fits):
         return ('but constant velocities leave '
-                f'{1.0 - fits[0].explained:.1%} of the field unexplained (a turn, braking, '
-                'another vehicle)')
+                f'{1.0 - fits[0].explained:.1%} of the field unexplained; possible causes are a '
+                'turn, braking or another vehicle')
     if not are_separate(data, [path_from(data, fit) for fit in fits]):
-        return 'but the fitted vehicles overlap (a turn, braking, another vehicle)'
+        return ('but the fitted vehicles overlap; possible causes are a turn, braking or another '
+                'vehicle')
     for k, fit in enumerate(fits, 1):
         if fit.reason:
-            return f'vehicle {k}: {fit.reason}'
+            return f'but the fit of vehicle {k} is rejected: {fit.reason}'
         if fit.length[0] > MAX_LENGTH:
-            return f'vehicle {k}: a length of {fit.length[0]:.0f} m is too long for a vehicle'
+            return f'but the fitted length of vehicle {k}, {fit.length[0]:.0f} m, is too long'
     return ''
 
 
 def _reject(fits: Sequence[PassFit], n_targets: int, details: str) -> tuple[PassFit, ...]:
-    """Reject fits: add a reason and remove the trusted quantities."""
+    """Return the fits with a reason for rejection and without trusted quantities."""
     reason = f'not one target: {n_targets} targets were tracked, {details}'
     return tuple(replace(fit, reason=reason, trusted=()) for fit in fits)

@@ -1,4 +1,4 @@
-"""Plausibility of a fitted pass and of the quantities that it determines.
+"""Plausibility of a fitted pass and of the speed, direction and time that it determines.
 
 A row of dipoles approximates a vehicle, and part of the near field remains unexplained. This
 residual does not reject a fit if its location and magnitude are typical of real vehicles. Speed,
@@ -76,7 +76,7 @@ def reach(n_dipoles: int, length: float) -> float:
 
 
 class FittedRow(NamedTuple):
-    """A fitted row of dipoles."""
+    """A fitted row of dipoles, and its field at the samples."""
 
     n_dipoles: int
     theta: FloatArray
@@ -102,7 +102,8 @@ def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: Flo
     Returns
     -------
     float
-        Residual in excess of the noise and of ICASSP11 eq. (9), with `reach` in place of lambda.
+        Residual energy in excess of the noise and of the model error of ICASSP11 eq. (9), with
+        `reach` in place of lambda, relative to the energy of all targets.
 
     References
     ----------
@@ -149,8 +150,8 @@ def rejection_reason(fit: PassFit) -> str:
     if reason := _invalid_pass_reason(fit):
         return reason
     if fit.bearing is not None:
-        return ('one sensor: the scale is not observable, only directions and the time of the '
-                'closest approach are (TSP14 Proposition 1)')
+        return ('one sensor: the scale is not observable; only the directions and the time of the '
+                'closest approach are determined (TSP14 Proposition 1)')
     unobservable = [name for name, variance in zip(
         fit.names, np.diagonal(fit.covariance), strict=True) if not np.isfinite(variance)]
     if unobservable:
@@ -201,7 +202,8 @@ def _invalid_pass_reason(fit: PassFit) -> str:
     if not has_plausible_residual(fit):
         return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
                 f'unexplained, {fit.residual_elsewhere:.1%} where a vehicle at that distance '
-                'leaves no residual (another vehicle, a turn, a wrong network file)')
+                'leaves no residual; possible causes are another vehicle, a turn or a wrong '
+                'network file')
     if has_velocity_change(fit):
         return ('not at constant velocity: the velocity changed by '
                 f'{fit.velocity_change:.0%} during the pass (a turn, braking)')
@@ -211,7 +213,7 @@ def _invalid_pass_reason(fit: PassFit) -> str:
 
 
 def has_plausible_residual(fit: PassFit) -> bool:
-    """Whether the location of the residual is plausible for a vehicle.
+    """Whether `residual_elsewhere` of a fit is within the limit for a vehicle.
 
     Parameters
     ----------
@@ -240,7 +242,7 @@ def has_velocity_change(fit: PassFit) -> bool:
 
 
 def contradicts_straight_pass(fit: PassFit) -> bool:
-    """Whether a fit rules out a pass of a single target on a straight line.
+    """Whether a fit rules out a pass of a single target at constant velocity.
 
     A fit of a single dipole rules out nothing, because the target may be extended.
 

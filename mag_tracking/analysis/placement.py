@@ -1,7 +1,7 @@
 """Bounds and detection probabilities of a passing target for the planning of sensor positions.
 
 The target is a point that moves on a straight line at constant speed, with the states [r, v, m].
-The direction of its moment is unknown in advance; all results are computed for all `DIRECTIONS`.
+The direction of its moment is unknown in advance; each result is computed for all `DIRECTIONS`.
 The bounds follow TSP14 section IV and MITRE12 section 4, with unknown backgrounds.
 """
 
@@ -16,7 +16,7 @@ from mag_tracking.physics.dipole import sensor_fields
 
 DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], *(
     np.array(d) / np.sqrt(3.0) for d in ((1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)))])
-"""(7, 3) directions of the moment. Opposite directions provide the same information."""
+"""(7, 3) directions of the moment. Opposite directions result in the same information."""
 
 STATES = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz')
 """Names of the states [r, v, m]."""
@@ -34,11 +34,11 @@ class PlannedTarget:
     height: float
     """Height of the magnetic centre [m]."""
     speed: float
-    """[m/s]"""
+    """Speed [m/s]."""
     height_std: float = np.inf
-    """Prior standard deviation of the height [m]; inf = unknown."""
+    """Prior standard deviation of the height [m]; infinite if unknown."""
     climb_std: float = np.inf
-    """Prior standard deviation of the vertical speed [m/s]; inf = unknown."""
+    """Prior standard deviation of the vertical speed [m/s]; infinite if unknown."""
     moment_known: bool = True
     """Whether the magnitude of the moment has a prior, with a relative standard deviation of one.
     The direction is always unknown."""
@@ -68,19 +68,19 @@ class Sampling:
     period: float
     """Interval between frames [s]."""
     noise_std: FloatArray | float
-    """(n_sensors,) [T] noise standard deviation per axis and frame; or one value for all."""
+    """(n_sensors,) [T] noise standard deviation per axis and frame, or one value for all."""
     field_error: float = 0.0
-    """Error relative to the field due to clocks, mounting and model, treated as white noise. For an
-    error that is constant over n frames, multiply by the square root of n."""
+    """Error relative to the field due to clocks, mounting and model, treated as white noise. An
+    error that is constant over n frames must be multiplied by the square root of n."""
     background_std: float = np.inf
-    """Prior standard deviation of the backgrounds [T]; inf = unknown."""
+    """Prior standard deviation of the backgrounds [T]; infinite if unknown."""
     half_window: float = 3.0
-    """[s] Duration of the track before and after the evaluated point."""
+    """Duration of the track before, and also after, the evaluated point [s]."""
     max_frames: int = 60
-    """Maximum number of computed frames."""
+    """Maximum number of computed frames; an even number is increased by one."""
 
     def times(self) -> tuple[FloatArray, float]:
-        """Times of the computed frames.
+        """Times of the computed frames, and the number of real frames per computed frame.
 
         Returns
         -------
@@ -116,7 +116,7 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
     h : (n_p, 7, k, n_sensors, 3) array, T
         Fields at the k times of `sampling`.
     H : (n_p, 7, k, n_sensors, 3, 9) array
-        Derivatives of `h` by [r, v, m].
+        Derivatives of `h` with respect to [r, v, m].
     """
     t, _ = sampling.times()
     v = target.speed * np.array([np.cos(heading), np.sin(heading), 0.0])
@@ -136,12 +136,12 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
         r = np.broadcast_to(r0[:, None, None] + t[:, None] * v, (n, *shape, 3))
 
         def repeated(a: FloatArray, n: int = n) -> FloatArray:
-            """Repeat an array for each of the points."""
+            """Repeat the array `a` for each of the `n` points."""
             return np.tile(a.reshape(size, 1, *a.shape[2:]), (n, *[1] * (a.ndim - 1)))
 
         h, H, _ = sensor_fields(positions, R_sw, r.reshape(n * size, 1, 3).copy(), repeated(m),
                                 repeated(dr_dx), repeated(dm_dx))
-        # At the position of a sensor, the field is singular. Such a frame is not used.
+        # At the position of a sensor, the field is singular. The sensor is not used in this frame.
         on_it = ~(np.isfinite(h).all(axis=-1) & np.isfinite(H).all(axis=(-2, -1)))
         h[on_it], H[on_it] = 0.0, 0.0
         yield (slice(first, first + n), h.reshape(n, *shape, -1, 3),
@@ -152,7 +152,7 @@ def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTar
                      sampling: Sampling, points: FloatArray, heading: float) -> FloatArray:
     """Fisher information of each sensor about [r, v, m] with the target at a point.
 
-    The backgrounds are eliminated, with their prior.
+    The backgrounds are eliminated; their prior is taken into account.
 
     Parameters
     ----------

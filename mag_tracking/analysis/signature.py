@@ -35,21 +35,21 @@ class Signature:
     t: FloatArray
     """(n,) [s], increasing."""
     field: FloatArray
-    """(n, n_axes) [T], or in an unknown unit."""
+    """(n, n_axes) field, in `unit`."""
     label: str
     """Class; empty if unknown."""
     source: str
-    """Origin of the signature, for messages."""
+    """Origin of the signature, used in messages."""
     axes: tuple[str, ...]
     """Names of the axes."""
     unit: str
-    """T, or empty if unknown."""
+    """Unit of `field`: T, or empty if unknown."""
     group: str
-    """Name common to all signatures of one target; a group is either in training or in test."""
+    """Name common to all signatures of one target. Training and test data share no group."""
 
 
 def features(signature: Signature) -> FloatArray:
-    """Features of the shape and magnitude of a signature.
+    """Compute features of the shape and magnitude of a signature.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def features(signature: Signature) -> FloatArray:
     """
     t, field = np.asarray(signature.t, dtype=float), np.asarray(signature.field, dtype=float)
     if len(t) < MIN_SAMPLES:
-        raise ValueError(f'too few samples for a signature: {len(t)}, at least {MIN_SAMPLES} are '
+        raise ValueError(f'too few samples for a signature: {len(t)}; at least {MIN_SAMPLES} are '
                          'required')
     if not (np.isfinite(t).all() and np.isfinite(field).all()):
         raise ValueError('a time or a field value is not finite')
@@ -101,7 +101,7 @@ def _subtract_baseline(t: FloatArray, field: FloatArray) -> FloatArray:
 
 
 def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
-    """Resample (N_SAMPLES, n_axes) the part of a signature that contains 99 % of the energy."""
+    """Resample the part of a signature with 99 % of the energy to (N_SAMPLES, n_axes)."""
     even = np.linspace(t[0], t[-1], max(4 * N_SAMPLES, len(t)))
     fine = np.stack([np.interp(even, t, axis) for axis in field.T], axis=1)
     energy = np.square(fine).sum(axis=1)

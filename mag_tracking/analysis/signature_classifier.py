@@ -23,8 +23,8 @@ PENALTIES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Candidate values of C, the inverse regularisation strength of the logistic regression."""
 
 KNOWN_QUANTILE = 0.99
-"""Quantile of the distances of held-out training examples to their own class. A signature farther
-from all classes is of an unknown class."""
+"""Quantile of the distances of held-out training examples to their own class. A signature with a
+larger distance to every class is assigned to the class `unknown`."""
 
 TEMPERATURES = np.geomspace(0.3, 10.0, 40)
 """Candidate temperatures of the logits."""
@@ -32,7 +32,7 @@ TEMPERATURES = np.geomspace(0.3, 10.0, 40)
 
 @dataclass(frozen=True)
 class SignatureModel:
-    """Linear classifier with a maximum distance to its classes."""
+    """Linear classifier that rejects signatures far from all classes as unknown."""
 
     classes: tuple[str, ...]
     """Names of the classes."""
@@ -62,7 +62,7 @@ class SignatureModel:
     """{class: number of training examples}."""
 
     def posterior(self, x: FloatArray) -> FloatArray:
-        """Posterior probabilities of the classes.
+        """Compute the posterior probabilities of the classes for each signature.
 
         Parameters
         ----------
@@ -75,7 +75,7 @@ class SignatureModel:
         return _softmax((self._standardise(x) @ self.weights.T + self.offsets) / self.temperature)
 
     def is_known(self, x: FloatArray) -> FloatArray:
-        """Whether each signature is close to a class, compared with the training examples.
+        """Whether the distance of each signature to the nearest class centre is within `limit`.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class SignatureModel:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Accuracy of a classifier on one or several test sets."""
+    """Accuracy of classifiers on one or several test sets."""
 
     classes: tuple[str, ...]
     """Names of the classes."""
@@ -244,10 +244,10 @@ def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]'
     """
     counts = Counter(label for label, _ in set(zip(labels, groups, strict=True)))
     if '' in counts:
-        raise LabelsError(f'labels are missing for {counts[""]} of the targets; label these '
-                          'signatures or remove them')
+        raise LabelsError(f'labels are missing for {counts[""]} of the targets; label or '
+                          'remove their signatures')
     if UNKNOWN in counts:
-        raise LabelsError(f'the label {UNKNOWN!r} is reserved for signatures of no class; rename '
+        raise LabelsError(f'the label {UNKNOWN!r} is reserved for unclassified signatures; rename '
                           'the class')
     if len(counts) < 2:
         raise LabelsError(f'expected at least two classes, got {", ".join(counts) or "none"}')
@@ -277,7 +277,7 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
     test_fraction : float
         Fraction of each class in the test part.
     progress : function
-        Wraps the iterator over the splits.
+        Function that wraps the range of splits, for example to show progress.
 
     Returns
     -------
@@ -320,7 +320,7 @@ def evaluate(model: SignatureModel, x: FloatArray, labels: Sequence[str]) -> Eva
     """
     missing = sorted(set(labels) - set(model.classes))
     if missing:
-        raise LabelsError('labels that are not classes of the model: '
+        raise LabelsError('the model has no classes for the labels '
                           f'{", ".join(map(repr, missing))}; '
                           f'its classes are {", ".join(model.classes)}')
     return _evaluate_parts([(model, x, np.array(labels))])
@@ -400,7 +400,7 @@ def _logits(fitted: Any, z: FloatArray) -> FloatArray:
 
 
 def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
-    """Stratified folds of whole groups: indices of training and test examples."""
+    """Create stratified folds of undivided groups: indices of training and test examples."""
     try:
         from sklearn.model_selection import StratifiedGroupKFold
     except ImportError as error:
@@ -412,23 +412,23 @@ def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
 
 def _random_split(y: Any, groups: Any, test_fraction: float, seed: int
                   ) -> tuple[IntArray, IntArray]:
-    """Stratified random split of whole groups: indices of training and test examples."""
+    """Stratified random split of undivided groups: indices of training and test examples."""
     rng, test_groups = np.random.default_rng(seed), set[str]()
     for name in np.unique(y):
         class_groups = rng.permutation(np.unique(groups[y == name]))
-        # At least the minimum number of examples must remain in the training part.
+        # At least `MIN_SAMPLES` examples must remain in the training part.
         n = min(max(1, round(test_fraction * len(class_groups))),
                 max(len(class_groups) - MIN_SAMPLES, 0))
         test_groups |= set(class_groups[:n].tolist())
     outside = np.isin(groups, list(test_groups))
     if not outside.any():
         raise LabelsError('too few examples for a test set: at least one class requires more than '
-                          f'{MIN_SAMPLES}')
+                          f'{MIN_SAMPLES} examples')
     return np.flatnonzero(~outside), np.flatnonzero(outside)
 
 
 def _class_statistics(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Class centres (n_classes, n_features) and inverse within-class covariance."""
+    """Compute the class centres (n_classes, n_features) and the inverse within-class covariance."""
     from sklearn.covariance import ledoit_wolf
 
     centres = np.array([z[y == k].mean(axis=0) for k in range(int(y.max()) + 1)])
@@ -438,7 +438,7 @@ def _class_statistics(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArra
 
 def _held_out_distances(z: FloatArray, y: IntArray, inside: IntArray,
                         outside: IntArray) -> FloatArray:
-    """Squared distances of held-out examples to their own class."""
+    """Squared distances (n_outside,) of held-out examples to the centres of their own classes."""
     centres, precision = _class_statistics(z[inside], y[inside])
     own: FloatArray = _squared_distances(z[outside], centres, precision)[np.arange(len(outside)),
                                                                          y[outside]]
@@ -453,7 +453,7 @@ def _squared_distances(z: FloatArray, centres: FloatArray, precision: FloatArray
 
 
 def _softmax(logits: FloatArray) -> FloatArray:
-    """Probabilities (n, n_classes) of logits."""
+    """Convert logits to probabilities (n, n_classes)."""
     p = np.exp(logits - logits.max(axis=1, keepdims=True))
     out: FloatArray = p / p.sum(axis=1, keepdims=True)
     return out

@@ -1,4 +1,4 @@
-"""The sensor network, its file, and the counting lines."""
+"""Sensor network: geometry, network file, topic names, Earth's field and counting lines."""
 
 from mag_tracking.network.sensor_network import CalibrationRecord, SensorNetwork
 

@@ -34,7 +34,7 @@ class CountingLine:
     """Half of the length of the line, m."""
 
     def forward(self, position: FloatArray) -> float:
-        """Distance of a position beyond the line, in its forward direction.
+        """Signed distance of a position from the line, along the forward direction of the line.
 
         Parameters
         ----------
@@ -43,7 +43,7 @@ class CountingLine:
         Returns
         -------
         float, m
-            Negative before the line.
+            Positive beyond the line, negative before it.
         """
         return float((position[:2] - self.point) @ self.along)
 
@@ -145,16 +145,19 @@ class CrossingDetector:
         self._last_pose = pose
 
     def _is_beyond(self, pose: Pose) -> bool:
-        """Whether a pose is beyond the line."""
+        """Whether a pose is on or beyond the line."""
         return self.line.forward(pose.position) >= 0.0
 
     def crossing(self) -> Crossing | None:
         """Return the last crossing of the line.
 
+        If the track begins and ends on the same side, a crossing is extrapolated from its first or
+        last pose within `MAX_EXTRAPOLATION_S`.
+
         Returns
         -------
         Crossing or None
-            None if the track begins and ends on the same side, or misses the line.
+            None if there is no such crossing, or if it is beside the line segment.
         """
         if self._first_pose is None or self._last_pose is None:
             return None

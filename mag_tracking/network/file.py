@@ -62,7 +62,7 @@ def _check_keys(label: str, mapping: object, keys: Collection[str]) -> None:
 
 
 def _parse_sensor(name: str, entry: Any) -> dict[str, Any]:
-    """Parse the entry of a sensor to values by the field names of `SensorNetwork`."""
+    """Parse the entry of a sensor; return its values by attribute name of `SensorNetwork`."""
     label = f'sensor {name}'
     _check_keys(label, entry, _SENSOR_KEYS)
     if 'position' not in entry:
@@ -74,7 +74,7 @@ def _parse_sensor(name: str, entry: Any) -> dict[str, Any]:
     q = _parse_vector(f'{label}: orientation', entry.get('orientation', [0, 0, 0, 1]), (4,))
     R_ws = _parse_rotation(f'{label}: orientation', q)
     topic = _check_topic(label, 'topic', entry.get('topic', f'{name}/imu/mag'))
-    # REP-145: the accelerometer topic data_raw and the magnetometer topic mag have one namespace.
+    # REP-145: the accelerometer topic data_raw and the magnetometer topic mag share a namespace.
     default_imu_topic = topic.removesuffix('/mag') + '/data_raw' if topic.endswith('/mag') else None
     imu_topic = entry.get('imu_topic', default_imu_topic)
     return {'positions': position, 'R_ws': R_ws, 'topics': topic,
@@ -96,7 +96,7 @@ def _parse_noise(label: str, noise: object) -> FloatArray | None:
     numbers = noise if isinstance(noise, list) else [noise]
     std = _parse_vector(f'{label}: noise_std', numbers, (1, 3)) * np.ones(3)
     if not ((std >= _MIN_NOISE_STD) & (std < 1e-3)).all():
-        raise NetworkError(f'{label}: noise_std must be above a femtotesla and below a '
+        raise NetworkError(f'{label}: noise_std must be at least a femtotesla and below a '
                            f'millitesla, got {std.tolist()} T')
     return std
 
@@ -208,7 +208,7 @@ def read_network(path: str | PathLike[str]) -> SensorNetwork:
 
 
 def _parse_network(content: Any) -> SensorNetwork:
-    """Create the network from the parsed content of a file."""
+    """Validate the content of a network file and create the network."""
     _check_keys('the file', content, _TOP_KEYS)
     sensors = content.get('sensors')
     if not isinstance(sensors, dict) or not sensors:

@@ -19,7 +19,7 @@ MIN_DELAY_BASELINE = 0.1
 
 @dataclass(frozen=True)
 class CalibrationRecord:
-    """Record of the date and method of a sensor calibration."""
+    """Record of a sensor calibration: date, method, and the orientation entered by hand."""
 
     date: str
     """Date in ISO 8601 format."""
@@ -50,30 +50,30 @@ class SensorNetwork:
     frame: str = 'map'
     """Name of the world frame."""
     earth_field: FloatArray | None = None
-    """Flux density of the Earth, (3,) T, world frame. None = unknown."""
+    """Flux density of the Earth, (3,) T, world frame. None if unknown."""
     noise_std: tuple[FloatArray | None, ...] = ()
-    """Noise standard deviation of the readings of each sensor, (3,) T, sensor frame. None = to be
-    estimated."""
+    """Noise standard deviation of the readings of each sensor, (3,) T, sensor frame. None if it
+    must be estimated."""
     background: tuple[FloatArray | None, ...] = ()
-    """Background of each sensor, (3,) T, sensor frame. None = to be estimated."""
+    """Background of each sensor, (3,) T, sensor frame. None if it must be estimated."""
     orientation_std: tuple[FloatArray | None, ...] = ()
     """Standard deviation of the mounting error of each sensor about the world axes, (3,) rad. None
-    = unknown."""
-    # None only until `__post_init__`.
+    if unknown."""
+    # The value is None only until `__post_init__` has run.
     clock_offset: FloatArray = cast(FloatArray, None)
     """Offset of the clock of each sensor, (n,) s, positive if the clock is ahead. The offset is
-    subtracted from the timestamps. None = zeros."""
+    subtracted from the timestamps. None is replaced by zeros."""
     offset: tuple[FloatArray | None, ...] = ()
     """Hard iron offset of each sensor, (3,) T, sensor frame, from a tumbling calibration."""
     correction: tuple[FloatArray | None, ...] = ()
     """Correction matrix of each sensor, (3, 3): B = correction @ (reading - offset)."""
     imu_topics: tuple[str | None, ...] = ()
-    """Topic of each sensor's accelerometer. None = no accelerometer."""
+    """Topic of each sensor's accelerometer. None if the sensor has no accelerometer."""
     calibrated: tuple[CalibrationRecord | None, ...] = ()
-    """Last calibration of each sensor. None = never calibrated."""
+    """Last calibration of each sensor. None if the sensor was never calibrated."""
     namespace: str | None = None
-    """Namespace of the relative topics in a recording. None = the namespace that contains these
-    topics."""
+    """Namespace of the relative topics in a recording. If None, a reader uses the namespace that
+    contains these topics."""
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -106,7 +106,7 @@ class SensorNetwork:
 
     @property
     def absolute_topics(self) -> tuple[str, ...]:
-        """Absolute topic of each sensor; relative names are resolved in `namespace` or the root."""
+        """Absolute topic of each sensor; relative names are resolved in `namespace`, or in /."""
         return tuple(absolute(topic, self.namespace or '/') for topic in self.topics)
 
     @property
@@ -160,6 +160,7 @@ class SensorNetwork:
         Returns
         -------
         SensorNetwork
+            Sensors without a recorded orientation are unchanged.
         """
         R_ws, std = self.R_ws.copy(), list(self.orientation_std)
         for j, record in enumerate(self.calibrated):
@@ -186,7 +187,8 @@ class SensorNetwork:
         Returns
         -------
         CalibrationRecord
-            Record that includes the orientation that was entered by hand.
+            Record that includes the orientation that was entered by hand, which is the current
+            orientation if no previous record contains one.
         """
         previous, std = self.calibrated[j], self.orientation_std[j]
         if previous is not None and previous.stated is not None:

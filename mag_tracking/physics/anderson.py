@@ -23,8 +23,9 @@ def anderson_functions(tau: ArrayLike) -> FloatArray:
     Returns
     -------
     (..., 3) array
-        The function of n = 1 is odd and orthogonal to the other two functions. Contrary to TSP14,
-        the functions of n = 0 and n = 2 are not orthogonal to each other.
+        Functions in ascending order of n. The function of n = 1 is odd and orthogonal to the other
+        two functions. Contrary to TSP14, the functions of n = 0 and n = 2 are not orthogonal to
+        each other.
 
     Notes
     -----
@@ -93,7 +94,7 @@ def anderson_coefficients(r_cpa: ArrayLike, v0: ArrayLike, m: ArrayLike) -> Floa
     r_cpa : (3,) array, m
         Position of the target relative to the sensor at the closest point of approach.
     v0 : (3,) array, m/s
-        Velocity of the target. Only its direction has an effect.
+        Velocity of the target. Only its direction is used.
     m : (3,) array, A m²
         Dipole moment.
 
@@ -151,8 +152,8 @@ def anderson_field(t: ArrayLike, r0: ArrayLike, v0: ArrayLike, m: ArrayLike) -> 
     Returns
     -------
     (..., 3) array, T
-        Equal to `dipole.dipole_field`. NaN at all times if the path passes through the sensor,
-        because the expansion is then not defined.
+        Equal to the result of `dipole.dipole_field`. NaN at all times if the path passes through
+        the sensor, because the expansion is then not defined.
 
     Raises
     ------

@@ -18,7 +18,7 @@ K_DIPOLE = core.K_DIPOLE
 def sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: FloatArray,
                   dr_dx: FloatArray, dm_dx: FloatArray
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Field of moving dipoles at fixed sensors, and its derivative by the target state.
+    """Field of moving dipoles at fixed sensors, and its derivative with respect to the state.
 
     Parameters
     ----------
@@ -31,22 +31,25 @@ def sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: Flo
     m : (n_hyp, n_dipoles, 3) array, A m², world frame
         Dipole moments.
     dr_dx : (n_hyp, n_dipoles, 3, n_t) array
-        Derivative of `r` by the target state.
+        Derivative of `r` with respect to the target state.
     dm_dx : (n_hyp, n_dipoles, 3, n_t) array
-        Derivative of `m` by the target state.
+        Derivative of `m` with respect to the target state.
 
     Returns
     -------
     h : (n_hyp, n_sensors, 3) array, T, sensor frame
         Sum of the fields of the dipoles.
     H : (n_hyp, n_sensors, 3, n_t) array
-        Derivative of `h` by the target state.
+        Derivative of `h` with respect to the target state.
     gradient : (n_hyp, n_sensors) array, T/m
         Sum of mu0/(4 pi) ‖m‖ / ‖d‖^4 over the dipoles, where d is the vector from dipole to sensor.
         Each term is the magnitude of the first neglected multipole term, per metre of the body that
         is represented by the dipole. Magnitudes are added instead of squares, because the errors of
-        adjacent dipoles of a body are correlated. All outputs are NaN or infinite if a dipole is at
-        the position of a sensor.
+        adjacent dipoles of a body are correlated.
+
+    Notes
+    -----
+    All three outputs are NaN or infinite if a dipole is at the position of a sensor.
 
     References
     ----------
@@ -103,7 +106,7 @@ def dipole_jacobians(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray
     Returns
     -------
     dB_dr : (..., 3, 3) array, T/m
-        Symmetric. The derivative by the source position is its negative. NaN at r = 0.
+        Symmetric. The derivative with respect to the source position is -dB_dr. NaN at r = 0.
     dB_dm : (..., 3, 3) array, T/(A m²)
         Symmetric. NaN at r = 0.
 

@@ -17,15 +17,15 @@ def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
     Parameters
     ----------
     aspect : (...) array
-        Semi-axis of revolution over the transverse semi-axis: above 1 prolate (needle), 1 sphere,
-        below 1 oblate (disk).
+        Semi-axis of revolution over the transverse semi-axis: above 1 for a prolate ellipsoid
+        (needle), 1 for a sphere, below 1 for an oblate ellipsoid (disk).
 
     Returns
     -------
     L1 : (...) array
-        Factor along the axis of revolution: sphere 1/3, needle 0, disk 1.
+        Factor along the axis of revolution: 1/3 for a sphere, 0 for a needle, 1 for a disk.
     L2 : (...) array
-        Factor across the axis, (1 - L1)/2: sphere 1/3, needle 1/2, disk 0.
+        Factor across the axis, (1 - L1)/2: 1/3 for a sphere, 1/2 for a needle, 0 for a disk.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, headi
     mu_r : float
         Relative permeability, 1 + susceptibility; 11 in MITRE12 Table 1.
     heading : (...) array, rad, world frame
-        From x towards y; from east towards north in ENU.
+        Measured from x towards y, which is from east towards north in ENU.
     earth_field : (..., 3) array, T, world frame
         Flux density B0; all axes but the last broadcast against `heading`.
 

@@ -26,8 +26,8 @@ def integrator_noise(dt: float, density: ArrayLike) -> FloatArray:
     Returns
     -------
     (6, 6) array
-        For each axis, density * [[dt^3/3, dt^2/2], [dt^2/2, dt]]. The first three rows are for the
-        integrals, the last three rows for their rates.
+        For each axis, density * [[dt^3/3, dt^2/2], [dt^2/2, dt]]. The first three states are the
+        integrals (positions), the last three states are their rates (velocities).
 
     References
     ----------
@@ -71,7 +71,7 @@ def coordinated_turn(x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
     moved : (n, n_x) array
         States after `dt`.
     F : (n, n_x, n_x) array
-        Derivative of `moved` by `x`.
+        Derivative of `moved` with respect to `x`.
 
     References
     ----------
@@ -82,7 +82,7 @@ def coordinated_turn(x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
 
 def fading_turn(x: FloatArray, dt: float, mean: float, fading: float
                 ) -> tuple[FloatArray, FloatArray]:
-    """Propagate states along an arc with a turn rate that decays.
+    """Propagate states along an arc with a decaying turn rate.
 
     Parameters
     ----------
@@ -99,6 +99,6 @@ def fading_turn(x: FloatArray, dt: float, mean: float, fading: float
     moved : (n, n_x) array
         States after `dt`.
     F : (n, n_x, n_x) array
-        Derivative of `moved` by `x`.
+        Derivative of `moved` with respect to `x`.
     """
     return core.turned(np.ascontiguousarray(x, dtype=float), dt, mean, fading)

@@ -13,9 +13,9 @@ def rotated_fields(h: FloatArray, H: FloatArray, angles: FloatArray
     Parameters
     ----------
     h : (n_hyp, n_sensors, 3) array, T, nominal sensor frame
-        Field.
+        Field that sensors without mounting errors would measure.
     H : (n_hyp, n_sensors, 3, n_t) array
-        Derivative of `h` by the target state.
+        Derivative of `h` with respect to the target state.
     angles : (n_hyp, n_sensors, 3) array, rad, sensor frame
         Vector a in B_actual = B_nominal + a x B_nominal. If a sensor is rotated by +b about one of
         its axes, the measured field is rotated by a = -b.
@@ -23,9 +23,9 @@ def rotated_fields(h: FloatArray, H: FloatArray, angles: FloatArray
     Returns
     -------
     h : (n_hyp, n_sensors, 3) array, T, actual sensor frame
-        Field.
+        Measured field.
     H : (n_hyp, n_sensors, 3, n_t + 3) array
-        Derivative by the target state and by the three angles of the sensor.
+        Derivative with respect to the target state and the three angles of the sensor.
 
     Notes
     -----

@@ -2,7 +2,7 @@
 
 The moment of order l is a symmetric traceless tensor with 2l + 1 independent components. The stored
 components are Cartesian, in alphabetical order. Components with more than one z follow from the
-trace and are not stored::
+zero trace and are not stored::
 
     0..2   x y z                             [A m^2]  dipole
     3..7   xx xy xz yy yz                    [A m^3]  zz = -xx - yy
@@ -27,7 +27,7 @@ from mag_tracking.physics import core
 
 def _field_and_jacobians(r: ArrayLike,
                          moments: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Field and Jacobians by position and moments, after broadcasting of the arguments."""
+    """Broadcast the arguments; return the field and its Jacobians for position and moments."""
     r, moments = np.asarray(r, dtype=float), np.asarray(moments, dtype=float)
     if r.shape[-1:] != (3,):
         raise ValueError(f'r requires a last axis of length 3, got shape {r.shape}')
@@ -87,7 +87,7 @@ def multipole_jacobians(r: ArrayLike, moments: ArrayLike) -> tuple[FloatArray, F
     Returns
     -------
     dB_dr : (..., 3, 3) array, T/m
-        Symmetric. The derivative by the source position is its negative. NaN at r = 0.
+        Symmetric. The derivative with respect to the source position is -dB_dr. NaN at r = 0.
     dB_dm : (..., 3, k) array, T per unit of the component
         The field is dB_dm @ moments. NaN at r = 0.
 
@@ -130,8 +130,8 @@ def multipole_moments(points: ArrayLike, dipoles: ArrayLike, order: int) -> Floa
 
     Notes
     -----
-    Taylor series of the potentials of the dipoles, scaled as in T10. The moment of order l is
-    l (2l-1)!! times the symmetric traceless part of m x x .., with l - 1 factors x.
+    The moments follow from the Taylor series of the dipole potentials, scaled as in T10. The moment
+    of order l is l (2l-1)!! times the symmetric traceless part of m x x .., with l - 1 factors x.
 
     References
     ----------

@@ -1,6 +1,7 @@
 """Expansions of the field of a straight pass: multipoles about one point, or Anderson functions.
 
-The classes have the interface of `passes.RowPass` and are linear in most of their parameters.
+The classes implement `inference.separable_fit.SeparableModel`: the field is linear in all
+parameters but those of the path.
 """
 
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from mag_tracking.physics.anderson import anderson_functions
 from mag_tracking.physics.multipole import multipole_jacobians
 
 _N_MOMENTS = {1: 3, 2: 8, 3: 15}
-"""{highest order: number of moments}"""
+"""Number of moments by the highest order of the expansion."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class MultipolePass:
                 - self.t[:, None] * theta[:, None, 3:])
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened fields of unit moments.
+        """Whitened design matrices of the moments.
 
         Parameters
         ----------
@@ -63,7 +64,7 @@ class MultipolePass:
         return (self.M @ A).reshape(len(theta), 3 * len(self.t), -1)
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of the whitened field by the path parameters.
+        """Derivative of the whitened field with respect to the path parameters.
 
         Parameters
         ----------
@@ -75,7 +76,7 @@ class MultipolePass:
         Returns
         -------
         (n_paths, 3 n, 6) array
-            Derivative of basis(theta) p by theta.
+            Derivative of basis(theta) p with respect to theta.
         """
         gradient, _ = multipole_jacobians(self._relative_positions(theta), p[:, None])
         D = -(self.M @ gradient)
@@ -85,7 +86,7 @@ class MultipolePass:
 
 @dataclass(frozen=True)
 class AndersonPass:
-    """Field of a dipole that passes one sensor on a straight path, in Anderson functions.
+    """Field of a dipole that passes one sensor on a straight path, expanded in Anderson functions.
 
     Path parameters (2): time of the closest point of approach (CPA) [s], speed over range at the
     CPA [1/s]. Linear parameters (9): coefficients of the three functions on each axis of the sensor
@@ -111,7 +112,7 @@ class AndersonPass:
         return columns.reshape(len(f), 3 * len(self.t), 9)
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened fields of unit coefficients.
+        """Whitened design matrices of the coefficients.
 
         Parameters
         ----------
@@ -125,7 +126,7 @@ class AndersonPass:
         return self._design_matrix(anderson_functions(theta[:, 1:] * (self.t - theta[:, :1])))
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of the whitened field by the path parameters.
+        """Derivative of the whitened field with respect to the path parameters.
 
         Parameters
         ----------
@@ -137,7 +138,7 @@ class AndersonPass:
         Returns
         -------
         (n_paths, 3 n, 2) array
-            Derivative of basis(theta) p by theta.
+            Derivative of basis(theta) p with respect to theta.
         """
         tau = theta[:, 1:] * (self.t - theta[:, :1])
         f0, f1, f2 = np.moveaxis(anderson_functions(tau), -1, 0)

@@ -1,7 +1,8 @@
 """Field of rows of dipoles on straight passes at constant velocity.
 
 The field is linear in the moments, but not in the path. A model returns the design matrix of the
-moments and the derivatives by the path. `inference.least_squares` fits such models.
+moments, and the derivatives of the field with respect to the path parameters.
+`inference.separable_fit` fits such models.
 """
 
 from collections.abc import Sequence
@@ -53,17 +54,17 @@ class RowPass:
     @cached_property
     def combinations(self) -> FloatArray:
         """Orthogonal matrix, (3 d, 3 d), that converts linear parameters to moments of the row."""
-        powers = np.vander(self._places, increasing=True)
+        powers = np.vander(self._dipole_offsets, increasing=True)
         return np.kron(np.linalg.qr(powers)[0], np.eye(3))
 
     @cached_property
-    def _places(self) -> FloatArray:
-        """Positions of the dipoles along the row, (d,), in row lengths from the centre."""
+    def _dipole_offsets(self) -> FloatArray:
+        """Offsets of the dipoles from the centre of the row, (d,), relative to its length."""
         d = self.n_dipoles
         return np.linspace(-0.5, 0.5, d, dtype=np.float64) if d > 1 else np.zeros(1)
 
     def forward(self, theta: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Convert to the equivalent parameters with a positive length.
+        """Convert to the equivalent parameters with a non-negative length.
 
         A row of negative length equals a row of positive length with the opposite order of dipoles.
 
@@ -87,7 +88,7 @@ class RowPass:
         return np.append(theta[:6], -theta[6]), self.combinations.T @ moments.ravel()
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened fields of unit linear parameters.
+        """Whitened design matrices of the linear parameters.
 
         Parameters
         ----------
@@ -99,12 +100,12 @@ class RowPass:
         (n_paths, 3 n, 3 n_dipoles) array
             NaN where a dipole is at a sensor.
         """
-        A = core.row_bases(np.ascontiguousarray(theta), self._places, self.t, self.positions,
-                           self.M)
+        A = core.row_bases(np.ascontiguousarray(theta), self._dipole_offsets, self.t,
+                           self.positions, self.M)
         return A @ self.combinations if self.n_dipoles > 1 else A
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of the whitened field by the path parameters.
+        """Derivative of the whitened field with respect to the path parameters.
 
         Parameters
         ----------
@@ -116,11 +117,11 @@ class RowPass:
         Returns
         -------
         (n_paths, 3 n, 6 or 7) array
-            Derivative of basis(theta) p by theta.
+            Derivative of basis(theta) p with respect to theta.
         """
         return core.row_derivatives(
             np.ascontiguousarray(theta), np.ascontiguousarray(p @ self.combinations.T),
-            self._places, self.t, self.positions, self.M)
+            self._dipole_offsets, self.t, self.positions, self.M)
 
 
 @dataclass(frozen=True)
@@ -131,12 +132,12 @@ class SuperposedPasses:
     """
 
     rows: tuple[RowPass, ...]
-    """Passes with common samples."""
+    """Pass of each row. All passes have the same samples."""
 
     @classmethod
     def of(cls, orders: Sequence[int], t: FloatArray, positions: FloatArray,
            M: FloatArray) -> 'SuperposedPasses':
-        """Create rows with common samples.
+        """Create the passes of several rows with the same samples.
 
         Parameters
         ----------
@@ -157,12 +158,12 @@ class SuperposedPasses:
 
     @cached_property
     def paths(self) -> tuple[slice, ...]:
-        """Slice of the path parameters of each row."""
+        """Slice of each row in the concatenated path parameters."""
         return _consecutive_slices([len(row.names) for row in self.rows])
 
     @cached_property
     def moments(self) -> tuple[slice, ...]:
-        """Slice of the linear parameters of each row."""
+        """Slice of each row in the concatenated linear parameters."""
         return _consecutive_slices([3 * row.n_dipoles for row in self.rows])
 
     def split(self, theta: FloatArray) -> list[FloatArray]:
@@ -181,7 +182,7 @@ class SuperposedPasses:
         return [theta[own] for own in self.paths]
 
     def forward(self, theta: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Convert to the equivalent parameters with positive lengths.
+        """Convert to the equivalent parameters with non-negative lengths.
 
         Parameters
         ----------
@@ -193,9 +194,9 @@ class SuperposedPasses:
         Returns
         -------
         theta : (n_theta,) array
-            Path parameters without negative lengths.
+            Path parameters with non-negative lengths.
         p : (k,) array
-            Linear parameters.
+            Linear parameters; the dipoles of rows with a negative length are in reversed order.
         """
         converted = [row.forward(path, p[linear])
                      for row, path, linear in zip(self.rows, self.split(theta), self.moments,
@@ -204,7 +205,7 @@ class SuperposedPasses:
                 np.concatenate([moments for _, moments in converted]))
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened fields of unit linear parameters.
+        """Whitened design matrices of the linear parameters.
 
         Parameters
         ----------
@@ -220,7 +221,7 @@ class SuperposedPasses:
                                for row, own in zip(self.rows, self.paths, strict=True)], axis=2)
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of the whitened field by the path parameters.
+        """Derivative of the whitened field with respect to the path parameters.
 
         Parameters
         ----------
@@ -232,7 +233,7 @@ class SuperposedPasses:
         Returns
         -------
         (n_paths, 3 n, n_theta) array
-            Derivative of basis(theta) p by theta.
+            Derivative of basis(theta) p with respect to theta.
         """
         return np.concatenate([
             row.derivative(theta[:, own], p[:, linear])
@@ -240,6 +241,6 @@ class SuperposedPasses:
 
 
 def _consecutive_slices(lengths: Sequence[int]) -> tuple[slice, ...]:
-    """Consecutive slices of the given lengths."""
+    """Create consecutive slices of the given lengths, from index zero."""
     ends = np.cumsum(lengths).tolist()
     return tuple(slice(end - length, end) for end, length in zip(ends, lengths, strict=True))

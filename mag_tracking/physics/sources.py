@@ -21,16 +21,16 @@ from mag_tracking.physics.motion import constant_velocity, integrator_noise
 
 
 class Dipoles(NamedTuple):
-    """Dipoles of each hypothesis, and their derivatives by the target state."""
+    """Dipoles of each hypothesis, and their derivatives with respect to the target state."""
 
     r: FloatArray
     """Positions, (n_hyp, n_dipoles, 3) m, world frame."""
     m: FloatArray
     """Moments, (n_hyp, n_dipoles, 3) A m², world frame."""
     dr_dx: FloatArray
-    """Derivative of the positions by the state, (n_hyp, n_dipoles, 3, n_t)."""
+    """Derivative of the positions with respect to the state, (n_hyp, n_dipoles, 3, n_t)."""
     dm_dx: FloatArray
-    """Derivative of the moments by the state, (n_hyp, n_dipoles, 3, n_t)."""
+    """Derivative of the moments with respect to the state, (n_hyp, n_dipoles, 3, n_t)."""
 
 
 class SourceModel(Protocol):
@@ -172,7 +172,7 @@ class Magnet:
 
 
 def _second_order_noise(m: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Second moment (n, 3, 3) of the shortening of m along m by a rotation of uncertain angle.
+    """Increase (n, 3, 3) of the second moment of the shortening of m by an uncertain rotation.
 
     A rotation by small angles (a, b) about axes perpendicular to `m` (n, 3) shortens the component
     along m by (a^2 + b^2)/2 |m|, which the Jacobian neglects. With the variances p, q of a, b, the

@@ -1,8 +1,8 @@
-"""Field of a pass with constant acceleration and turn acceleration, and with clock offsets.
+"""Field of a pass with constant acceleration, constant turn acceleration and clock offsets.
 
 Unlike in `passes.RowPass`, the vehicle may accelerate and turn. The row of dipoles rotates with the
 vehicle. The field is linear in the moments, but not in the path and the clock offsets.
-`inference.least_squares` fits such models.
+`inference.separable_fit` fits such models.
 """
 
 from dataclasses import dataclass, field
@@ -14,9 +14,9 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.physics import core
 
 PATH = core.PATH
-"""Names of the path parameters, of the centre of the row at time zero: position x, y, z [m], speed
-[m/s], heading [rad], climb [m/s], length [m], acceleration [m/s^2], turn_rate [rad/s],
-turn_acceleration [rad/s^2]."""
+"""Names of the path parameters: position x, y, z [m] of the centre of the row, speed [m/s], heading
+[rad], climb [m/s] and turn_rate [rad/s] at time zero; length of the row [m]; acceleration [m/s^2];
+turn_acceleration [rad/s^2]. `core` defines the order."""
 
 N_PATH = len(PATH)
 """Number of path parameters."""
@@ -28,9 +28,9 @@ N_STRAIGHT = PATH.index('acceleration')
 class SteadyPass:
     """A row of `n_dipoles` dipoles on a path with constant acceleration and turn acceleration.
 
-    The path parameters `PATH` and the clock offsets are concatenated. The entries in `free` form
-    the non-linear parameters theta; all other entries are constants from `fixed`. Linear parameters
-    (3 n_dipoles): coefficients of orthogonal combinations of the moments.
+    The path parameters `PATH` and the clock offsets are concatenated. The entries with the indices
+    `free` form the non-linear parameters theta; all other entries are constants from `fixed`. The
+    linear parameters (3 n_dipoles) are coefficients of orthogonal combinations of the moments.
 
     The tracker fits this model in compiled code (`stages/track/steady_fit.hpp`). `basis` and
     `derivative` are for searches with a prior and for simulations.
@@ -43,17 +43,17 @@ class SteadyPass:
     M: FloatArray
     """Whitening matrix times world-to-sensor rotation of each sample, (n, 3, 3)."""
     clock: IntArray
-    """Index of the clock of each sample, (n,); -1 = reference clock."""
+    """Index of the clock of each sample, (n,); -1 for the reference clock, which has no offset."""
     free: IntArray
     """Indices of the entries of theta in the concatenated path and clock offsets, ascending."""
     fixed: FloatArray
-    """Path and clock offsets [s], (N_PATH + n_clocks,). Entries in `free` are not used."""
+    """Path and clock offsets [s], (N_PATH + n_clocks,). The entries `free` are ignored."""
     n_dipoles: int
     """Number of dipoles of the row."""
     places: FloatArray = field(init=False)
-    """Positions of the dipoles along the row, (d,), in row lengths from the centre."""
+    """Offsets of the dipoles from the centre of the row, (d,), relative to its length."""
     combinations: FloatArray = field(init=False)
-    """Orthogonal matrix, (d, d), that converts linear parameters to moments, per component."""
+    """Orthogonal matrix, (d, d), that converts the linear parameters of a component to moments."""
 
     def __post_init__(self) -> None:
         """Compute the positions of the dipoles and the combinations of their moments."""
@@ -86,7 +86,7 @@ class SteadyPass:
         return out
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened fields of unit linear parameters.
+        """Whitened design matrices of the linear parameters.
 
         Parameters
         ----------
@@ -103,7 +103,7 @@ class SteadyPass:
         return A @ self._moment_transform
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of the whitened field by the free parameters.
+        """Derivative of the whitened field with respect to the free parameters.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class SteadyPass:
         Returns
         -------
         (n_paths, 3 n, n_free) array
-            Derivative of basis(theta) p by theta.
+            Derivative of basis(theta) p with respect to theta.
         """
         D = core.steady_derivatives(
             self.whole(theta), p @ self._moment_transform.T, self.places, self.t,

@@ -53,11 +53,11 @@ class RowVehicle:
     acceleration_density: FloatArray
     """Power spectral density of the acceleration, per axis, (3,) m²/s³."""
     moment_drift: float = 0.0
-    """Random walk of the total hard iron moment per axis, relative to the magnitude of the iron,
-    1/s^0.5."""
+    """Random walk of the total hard iron moment per axis, 1/s^0.5, relative to the magnitude of the
+    hard and soft iron moments."""
     difference_drift: float = 0.0
-    """Random walk of the difference of each dipole from the mean of the row, with the same
-    normalisation, 1/s^0.5."""
+    """Random walk of the difference of each hard iron moment from the mean of the row, 1/s^0.5,
+    normalised as `moment_drift`."""
     n_dipoles: int = 3
     """Number of dipoles of the row."""
     turn_acceleration: float = 0.0
@@ -77,13 +77,13 @@ class RowVehicle:
 
     @cached_property
     def induction(self) -> FloatArray:
-        """B0/mu0, (3,) A/m, world frame."""
+        """Magnetic field strength B0/mu0 of the earth, (3,) A/m, world frame."""
         return np.asarray(self.earth_field, dtype=float) / MU0
 
     @cached_property
     def _moment_walk(self) -> FloatArray:
-        """Random walk covariance of the hard iron moments over the squared magnitude of the iron,
-        (3 d, 3 d) 1/s.
+        """Random walk covariance of the hard iron moments, (3 d, 3 d) 1/s, over the squared
+        magnitude of the hard and soft iron moments.
         """
         d = self.n_dipoles
         mean = np.full((d, d), 1.0 / d)
@@ -125,8 +125,8 @@ class RowVehicle:
             Prediction interval; negative to propagate backwards, without process noise of the turn
             rate.
         P : (n_hyp, n_t, n_t) array, optional
-            Covariances of `x`. A turn rate of zero variance has no process noise: the path remains
-            straight.
+            Covariances of `x`. A turn rate of zero variance has no process noise, so that straight
+            paths remain straight.
 
         Returns
         -------
@@ -136,8 +136,8 @@ class RowVehicle:
             Jacobian of the prediction. Without a turn rate, it is common to all hypotheses.
         Q : (n_hyp, n_t, n_t) array
             Covariance of the process noise. The drift of the moments is proportional to the
-            magnitude of the iron. The effect of the turn rate noise on position and velocity during
-            `dt` is neglected.
+            magnitude of the hard and soft iron moments. The effect of the turn rate noise on
+            position and velocity during `dt` is neglected.
         """
         n = x.shape[1]
         Q = np.zeros((len(x), n, n))
@@ -148,7 +148,7 @@ class RowVehicle:
             F = np.eye(n)
             F[:6, :6] = constant_velocity(dt)
             return x @ F.T, F, Q
-        # No decay in backward propagation, which has no process noise: the variance would shrink.
+        # The turn rate does not decay backwards: without process noise, its variance would shrink.
         fading = math.exp(-max(dt, 0.0) / self.turn_time)
         mean = (1.0 - fading) * self.turn_time / dt if dt > 0.0 else 1.0
         predicted, F_turn = fading_turn(x, dt, mean, fading)

@@ -1,4 +1,4 @@
-"""Ratio of the error of a track to the path bound, as reported by replays with ground truth."""
+"""Ratio of the track error to its Cramér-Rao bound, as reported by replays with ground truth."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ N = 30
 
 
 def log_with_errors(errors, noise=NOISE, missing=False):
-    """Track log of a straight pass with given position errors (n, 3), and its ground truth."""
+    """Create the log of a straight track with position errors (n, 3), and its ground truth."""
     t = 0.08 * np.arange(N)
     true = np.column_stack([10.0 * t - 12.0, np.full(N, 1.0), np.full(N, 0.5)])
     log = TrackLog(1)
@@ -53,7 +53,7 @@ def test_poses_without_ground_truth_are_ignored():
 
 
 def test_ratio_of_magnet_tracks_is_within_its_limits(magnet_replays):
-    """The target is 1; the limit of 3 is the present result with a margin."""
+    """The design target is a ratio of 1; the limit of 3 is the achieved ratio with a margin."""
     for run, _ in magnet_replays.values():
         ratio_to_bound = run.summary['tracks'][0]['truth']['error_over_bound']
         print(f'magnet: error over path bound {ratio_to_bound:.2f}')

@@ -1,4 +1,4 @@
-"""Speed and direction from the delay between sensors: accuracy, invariances, rejected data."""
+"""Speed and direction from delays between sensors: accuracy, invariances and rejected data."""
 
 import dataclasses
 
@@ -103,7 +103,7 @@ def test_contradictions_depend_on_speed_heading_and_their_stds():
     assert not contradicts_delays((10.4, 0.1), straight, c) \
         and contradicts_delays((14.0, 0.3), straight, c)
     assert contradicts_delays((10.0, 0.1), (np.pi, 0.1), c)
-    # A difference is no contradiction if its std is large or if the difference is small.
+    # Speeds do not contradict each other if their difference is small or its std is large.
     assert not contradicts_delays((14.0, 2.0), straight, c) \
         and not contradicts_delays((10.9, 0.01), straight, c)
     assert not contradicts_delays((10.0, 0.1), (np.radians(100.0), np.radians(40.0)), c)

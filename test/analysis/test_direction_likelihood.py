@@ -1,4 +1,4 @@
-"""Likelihood ratio of two lanes: sign, scale, and directions in simulated traffic of PHD15."""
+"""Likelihood ratio of two lanes: sign, scale, and driving directions in the traffic of PHD15."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def test_sign_of_the_ratio_identifies_the_lane_of_a_dipole(height):
 
 
 def test_ratio_is_proportional_to_the_signal_to_noise_power_ratio():
-    """The correct lane has no residual."""
+    """Without noise, the residual in the correct lane is zero."""
     rng = np.random.default_rng(1)
     h = passing(rng, RIGHT)
     ratios = [direction_likelihood_ratio(T, h, std, RIGHT, LEFT) for std in (2e-8, 1e-8)]
@@ -43,12 +43,12 @@ def test_ratio_is_proportional_to_the_signal_to_noise_power_ratio():
 @pytest.mark.study
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
 def test_directions_in_the_published_traffic(simulator):
-    """PHD15 Paper B, Table 1: 510 of 511 correct at the near sensor, 494 of 511 after fusion."""
+    """Results of PHD15 Paper B, Table 1: 510 of 511 are correct at the near sensor, 494 fused."""
     vehicles = passings(simulator, 1)
     fractions = shares(vehicles, [v.log_odds_of_north() for v in vehicles])
     # The limits are three standard deviations (511 vehicles) below the targets, 99.8 % and 97 %.
-    # With boxes, the result is 99.5 % (`bench.directions`). In six of seven errors, another vehicle
-    # is in the other lane within 0.62 s; in four of these errors, it is a truck.
+    # With the box simulator, the result is 99.5 % (`bench.directions`). In six of seven errors,
+    # another vehicle is in the other lane within 0.62 s; in four of these errors, it is a truck.
     assert fractions.near > 0.998 - 3.0 * np.sqrt(0.998 * 0.002 / 511)
     assert fractions.fused > 0.97 - 3.0 * np.sqrt(0.97 * 0.03 / 511)
     predicted, measured = calibration(vehicles)

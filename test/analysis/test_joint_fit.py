@@ -27,7 +27,7 @@ FOUR = network_of([[-3.0, -4.5, 0.0], [-3.0, 4.5, 0.0], [3.0, -4.5, 0.0], [3.0, 
 
 
 def one_path(rng, at_s, direction, n_dipoles):
-    """Random (path, moments) of a vehicle in its lane, passing the origin at `at_s` [s]."""
+    """Create random (path, moments) of a vehicle that passes the origin in its lane at `at_s`."""
     speed = direction * rng.uniform(8.0, 20.0)
     place = [-speed * at_s, -direction * rng.uniform(1.4, 2.2), rng.uniform(0.4, 1.0)]
     moments = random_moments(rng, n_dipoles)
@@ -36,7 +36,7 @@ def one_path(rng, at_s, direction, n_dipoles):
 
 
 def simulated_pass(rng, plan, n_dipoles, network=ROAD):
-    """Simulate vehicles of a plan [(time [s], direction)]; return (`PassData`, [path])."""
+    """Simulate vehicles that pass the origin at [(time [s], direction)]: (`PassData`, [path])."""
     targets = [one_path(rng, *when, n_dipoles) for when in plan]
     fields = [measured(network, path, moments, rng, seconds=6.0, noise=1.2e-8 if k == 0 else 1e-15)
               for k, (path, moments) in enumerate(targets)]
@@ -72,7 +72,7 @@ def test_two_vehicles_are_fitted_with_consistent_covariances(plan, n_dipoles):
             true[:3] += fit.data.stamp_ns / 1e9 * path[3:6]
             e = fit.x[:6] - true
             z.append(e @ np.linalg.solve(fit.covariance[:6, :6], e))
-    # Six parameters of each vehicle; the prior of height and climb only reduces the errors.
+    # Each vehicle has six path parameters. The prior of height and climb only reduces the errors.
     assert chi2.cdf(np.sum(z), 6 * len(z)) < 0.999, np.round(z, 1)
     assert chi2.cdf(np.sum(z), 4 * len(z)) > 0.001, np.round(z, 1)
 
@@ -89,7 +89,7 @@ def test_three_vehicles_are_fitted():
 
 
 def test_data_of_each_fit_exclude_the_fields_of_the_others():
-    """Only the field of one vehicle and the noise remain."""
+    """The data of a fit contain only the field of its vehicle and the noise."""
     rng = np.random.default_rng(6)
     data, paths = simulated_pass(rng, MEETING, 1)
     (first,), (second,) = fit_joint(data, tracked_paths(rng, paths), GROUND, (1,))
@@ -118,7 +118,7 @@ def test_order_of_each_vehicle_is_chosen_separately():
 
 
 def test_two_following_vehicles_are_not_fitted_as_one_long_row():
-    """Without tracks, the vehicles are fitted as a row with the length of their distance."""
+    """Without tracks, one row is fitted, whose length is the distance between the vehicles."""
     rng = np.random.default_rng(3)
     one, moments = one_path(rng, -0.5, 1, 2)
     other = one.copy()
@@ -165,11 +165,11 @@ def test_a_rejected_joint_fit_has_a_reason():
     data, paths = simulated_pass(rng, MEETING, 1)
     alone, two = [fit_pass(data, 1)], tracked_paths(rng, paths)
     four = np.vstack([two, two + [0.0, 20.0, 0.0, 0.0, 0.0, 0.0]])
-    cases = [('4 targets were tracked, at most 3', data, four),
+    cases = [('4 targets were tracked, but at most 3', data, four),
              ('too few measurements', replace(
                  data, t=data.t[::200], sensor=data.sensor[::200], field=data.field[::200],
                  covariance=data.covariance[::200]), two),
-             # A third, untracked vehicle.
+             # A third vehicle is not tracked.
              ('of the field unexplained', together(data, measured(
                  ROAD, *one_path(rng, 1.5, 1, 1), rng, seconds=6.0, noise=1e-15)), two)]
     for reason, of, tracks in cases:
@@ -191,7 +191,8 @@ def test_vehicles_side_by_side_or_following_are_separate():
     assert are_separate(data, (one, moved(0.0, 3.5)))
     assert are_separate(data, (one, moved(-7.0)))
     assert not are_separate(data, (one, moved(-5.0)))
-    # The first vehicle catches up within range of the sensors, the second vehicle outside.
+    # In the first case, a vehicle catches up within range of the sensors; in the second case,
+    # outside this range.
     assert not are_separate(data, (one, moved(-9.0, 0.0, 0.0, 6.0)))
     assert are_separate(data, (one, moved(-60.0, 0.0, 0.0, 2.0)))
     assert are_separate(data, (one,))
@@ -217,7 +218,7 @@ def test_a_false_track_is_not_fitted_as_a_vehicle():
 
 
 def test_a_velocity_change_of_one_target_rejects_all_fits():
-    """The second vehicle drives at half its speed, then at twice its speed."""
+    """The second vehicle changes from half its nominal speed to twice its nominal speed."""
     rng = np.random.default_rng(11)
     (first, first_moments), (second, second_moments) = (
         one_path(rng, -0.3, 1, 1), one_path(rng, 0.2, -1, 1))
@@ -248,12 +249,13 @@ def test_a_fit_that_differs_from_its_track_has_a_reason():
     # The track is three times as fast as the vehicle.
     wrong_tracks[1, 3] *= 3.0
     found = fit_joint(data, wrong_tracks, GROUND, (1,))
-    assert sorted(fit.reason for fit, in found) == ['', 'the fit is not at the tracked position']
+    assert sorted(fit.reason for fit, in found) == [
+        '', 'the fit differs from the track in position or velocity']
     assert fit_joint(data, wrong_tracks, GROUND, (1,), stopped=lambda: True) == ()
 
 
 def fits_with_minima(*others):
-    """Fit two points, with further minima `others` (functions of theta (12,))."""
+    """Create fits of two points with additional minima, which `others` compute from theta (12,)."""
     rng = np.random.default_rng(15)
     data, paths = simulated_pass(rng, MEETING, 1)
     theta = np.concatenate(paths)
@@ -289,7 +291,7 @@ def test_a_prior_adds_information():
     std = np.full(12, np.inf)
     std[8] = 0.05
     _, known = fits_at_minimum(data, (1, 1), found, p, 1.0, SensorErrors(), path_std=std)
-    # Sherman-Morrison update for one more measurement of one parameter.
+    # Sherman-Morrison update for one additional measurement of one parameter.
     P = second.covariance
     gain = P[:, 2] / (P[2, 2] + 0.05**2)
     np.testing.assert_allclose(known.covariance, P - np.outer(gain, P[2]), rtol=1e-5,

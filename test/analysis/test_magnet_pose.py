@@ -14,7 +14,7 @@ from support.magnet_boards import HIGH, LOW, MOMENT, SETTINGS, board, estimated,
 
 
 def test_single_poses_have_consistent_covariances():
-    """Random poses in the box with one reading per sensor and a random field error."""
+    """The poses in the box are random, with one reading per sensor and a random field error."""
     network = board(4, 0.05)
     rng = np.random.default_rng(5)
     settings = PoseSettings()
@@ -34,7 +34,7 @@ def test_single_poses_have_consistent_covariances():
         assert np.linalg.norm(pose.axis) == pytest.approx(1.0)
         assert np.abs(pose.covariance[3:] @ np.append(np.zeros(3), pose.axis)).max() < 1e-9 * (
             pose.covariance[3:, 3:].max())
-        # The axis error is of first order, perpendicular to the axis, as is the covariance.
+        # The covariance is of first order, so only the axis error perpendicular to the axis counts.
         e = np.append(pose.position - r, pose.axis * (pose.axis @ u) - u)
         C = pose.covariance / max(1.0, pose.normalised_cost)
         scale = np.sqrt(np.diagonal(C))

@@ -133,7 +133,7 @@ def test_one_sensor_adds_almost_no_information():
     free = np.repeat([0.1, 0.5, 0.0], [3, 2, 3])
     g = fitted_geometry(network, scarce, positions[:3], axes[:3], MOMENT, SETTINGS,
                         np.zeros(12), free)
-    assert not g.converged and 'fewer readings than unknowns' in g.reason
+    assert not g.converged and 'too few readings' in g.reason
     assert np.isnan(g.normalised_cost)
 
 
@@ -145,7 +145,7 @@ def test_poses_at_one_place_add_no_information_on_the_geometry():
     field = B + 3e-5 + 1e-7 * rng.standard_normal((30, 9, 3))
     g = calibrate_geometry(network, field, np.tile([0.05, 0.05, 0.08], (30, 1)),
                            np.tile([0.0, 0.0, 1.0], (30, 1)), MOMENT, SETTINGS)
-    assert not g.converged and 'at one place' in g.reason
+    assert not g.converged and 'almost equal' in g.reason
     assert (g.position_std > 0.9 * SETTINGS.position_std).all()
     assert (g.gain_std > 0.9 * SETTINGS.gain_std).all()
 

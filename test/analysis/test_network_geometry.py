@@ -32,7 +32,8 @@ def test_covariance_agrees_with_the_errors(boards):
     print(f'NEES {np.mean(nees):.1f} in {low:.1f} .. {high:.1f}, cost {np.mean(costs):.3f}, '
           f'outside 2 std {np.mean(outside):.3f}')
     assert low <= np.mean(nees) <= high
-    # The errors are correlated by the gauge, so the tolerance exceeds a binomial distribution.
+    # The gauge freedom correlates the errors, so the tolerance is wider than for a binomial
+    # distribution.
     assert np.mean(outside) == pytest.approx(0.0455, abs=0.02)
     assert np.mean(costs) == pytest.approx(1.0, abs=0.03)
 

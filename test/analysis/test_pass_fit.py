@@ -35,7 +35,7 @@ ORDERS = (1, 2, 3)
 
 
 def random_row(n_dipoles, n=6, seed=4):
-    """Random model with `n` samples, and random paths and linear parameters."""
+    """Create a random model with `n` samples, and random paths and linear parameters."""
     rng = np.random.default_rng(seed)
     M = rng.standard_normal((n, 3, 3))
     model = RowPass(rng.uniform(-1.0, 1.0, n), rng.uniform(-5.0, 5.0, (n, 3)), M, n_dipoles)
@@ -61,7 +61,7 @@ def test_a_row_is_the_sum_of_its_dipoles(n_dipoles):
 @pytest.mark.parametrize('road', [True, False], ids=['road', 'any heading'])
 @pytest.mark.parametrize('n_dipoles', ORDERS)
 def test_the_search_finds_the_global_optimum(n_dipoles, road):
-    """The cost does not exceed the minimum near the truth. `bench.pass_search` has 200 passes."""
+    """The cost does not exceed the minimum near the truth; `bench.pass_search` fits 200 passes."""
     failures = []
     for seed in range(10):
         rng = np.random.default_rng([seed, n_dipoles, road])
@@ -98,12 +98,12 @@ def test_errors_agree_with_the_covariance(n_dipoles):
 
 
 def test_stds_of_derived_quantities_agree_with_the_errors():
-    """Squared errors over variances of heading, speed, CPA time and CPA range."""
+    """Normalised errors of heading, speed, CPA time and CPA range have a mean square of about 1."""
     squares, n = [], 30
     for seed in range(n):
         rng = np.random.default_rng([seed, 21])
         path, moments = random_path(rng, 1, False)
-        # With a CPA far from time zero, errors of the derivatives are significant.
+        # With a CPA far from time zero, errors in the derivatives would be significant.
         place = np.array([12.0, -9.0, 0.0])
         fit = fit_pass(measured(ROAD, path, moments, rng), 1)
         fit = replace(fit, robust_covariance=fit.covariance)
@@ -140,7 +140,7 @@ def test_a_misfit_of_all_orders_does_not_favour_a_higher_order():
 
 
 def test_correlated_residuals_increase_the_covariance():
-    """Newey-West covariance of the parameters of a straight line in correlated noise."""
+    """The Newey-West covariance of a straight-line fit accounts for correlated noise."""
     rng, n, keep = np.random.default_rng(3), 3000, np.exp(-0.1)
     H = np.column_stack([np.ones(n), np.linspace(-1.0, 1.0, n)])
     P = np.linalg.inv(H.T @ H)
@@ -271,7 +271,7 @@ def test_one_sensor_with_a_known_range_determines_all_parameters():
 
 
 def test_a_moment_perpendicular_to_the_plane_leaves_directions_unknown():
-    """The kernel has two dimensions (TSP14 section IV.A). Unobservable directions are NaN."""
+    """The null space has two dimensions (TSP14 section IV.A); unobservable directions are NaN."""
     data, _, _ = single_sensor_pass([0.0, 0.0, 300.0], path=(0.5, 0.0, 0.0, 9.0, 0.0, 0.0))
     b = fit_pass(data, 1).bearing
     assert np.isnan(b.cpa_direction).all() and np.isnan(b.motion_direction).all()
@@ -295,7 +295,7 @@ def test_data_that_cannot_be_fitted_result_in_a_reason():
 
     assert 'no sensor' in reason(replace(data, field=np.full_like(data.field, np.nan)))
     few = np.r_[198:201, 598:601]
-    assert 'fewer measurements (18) than unknowns (22)' in reason(replace(
+    assert 'too few measurements (18) for 22 unknowns' in reason(replace(
         data, t=data.t[few], sensor=data.sensor[few], field=data.field[few]))
     noise = NOISE * rng.standard_normal(data.field.shape)
     assert 'no stronger than noise' in reason(replace(data, field=noise))
@@ -351,7 +351,7 @@ STRAIGHT = {'straight_car_right': 8.3, 'straight_small_left': 11.1, 'straight_ca
 
 @pytest.mark.parametrize('name', STRAIGHT)
 def test_order_three_describes_vehicles(recorded_passes, name):
-    """Normalised cost and speed are within the targets of the project."""
+    """Normalised cost and speed are within the accuracy targets of the project."""
     fit = next(f for f in recorded_passes[name].fits if f.n_dipoles == 3)
     assert not fit.reason
     assert fit.normalised_cost < (8.0 if 'truck' in name else 2.0)
@@ -360,7 +360,7 @@ def test_order_three_describes_vehicles(recorded_passes, name):
     # nominal stds.
     std_ratio = np.sqrt(np.diagonal(fit.robust_covariance) / np.diagonal(fit.covariance))[:6]
     assert np.median(std_ratio) > (5.0 if 'truck' in name else 1.0)
-    # The selected order may differ.
+    # The selected order may differ from three.
     assert recorded_passes[name].chosen.speed[0] == pytest.approx(STRAIGHT[name], rel=0.1)
 
 

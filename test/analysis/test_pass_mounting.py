@@ -125,7 +125,7 @@ def test_scatter_of_consistent_tracks_is_about_one():
 
 @pytest.mark.parametrize('n_tracks', [2, 5])
 def test_scatter_of_consistent_weak_tracks_is_not_above_one(n_tracks):
-    """The prior dominates tracks with a tenth of its information, but adds no scatter."""
+    """Each track has a tenth of the information of the prior, which adds no scatter."""
     scatter, _ = scatters(80, n_tracks, noise=0.15)
     freedom = 3 * (n_tracks - 1)
     high = chi2.ppf(0.999, freedom * len(scatter)) / (freedom * len(scatter))
@@ -136,7 +136,8 @@ def test_scatter_of_consistent_weak_tracks_is_not_above_one(n_tracks):
 def test_covariance_of_overconfident_tracks_is_inflated():
     scatter, nees = scatters(60, 5, noise=1e-3, claimed=0.2)
     assert scatter.mean() == pytest.approx(25.0, rel=0.1)
-    # Student's t distribution with 12 degrees of freedom; without inflation, the value is 25.
+    # The normalised errors have Student's t distribution with 12 degrees of freedom; without
+    # inflation, the value would be 25.
     assert 0.6 < nees.mean() / 3 < 1.5
     t = simulated_tracks(5, 3, noise=1e-3, claimed=0.2)
     e = fuse_mounting(NETWORK, PRIOR, t.tracks)

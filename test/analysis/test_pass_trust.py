@@ -21,7 +21,7 @@ PATH = np.array([0.0, -2.0, 0.5, 10.0, 0.0, 0.0, 3.0])
 
 
 def test_reach_covers_the_residuals_of_published_vehicles():
-    """Unexplained energy from costs of TSP14 Tables I and II: (cost - 1) / 87, at 4.5 m."""
+    """At 4.5 m, costs in TSP14 Tables I and II leave (cost - 1) / 87 of the energy unexplained."""
     cars, trucks = (10, 14, 17), ((302.6, 9.09), (76.7, 11.25))
     for cost in cars:
         assert 1.0 < 4.5 * np.sqrt((cost - 1.0) / 87.0) <= reach(1, 0.0)
@@ -88,7 +88,7 @@ def test_a_single_fit_of_two_vehicles_is_not_trusted():
 
 
 def test_a_near_vehicle_is_not_rejected_for_its_residuals():
-    """Correct fits at 0.8 m have residuals of 2.4 to 11.9 %."""
+    """At a distance of 0.8 m, correct fits leave 2.4 to 11.9 % of the energy unexplained."""
     for seed in (2, 9, 20):
         velocity, std = answers(seed).fit
         assert abs(velocity / answers(seed).truth - 1.0) < 0.1 and std < 0.25 * abs(velocity)
@@ -116,7 +116,7 @@ def test_covariance_includes_the_errors_of_the_sensors(errors):
         P = fit.robust_covariance[:6, :6]
         e = fit.x[:6] - true
         z.append(e @ np.linalg.solve(P, e) / 6.0)
-    # 0.1 % and 99.9 % quantiles of chi-square over its mean, for twelve times six values.
+    # The limits are the 0.1 % and 99.9 % quantiles of chi-square over its mean, for 12 x 6 values.
     assert 0.4 < np.mean(z) < 1.7, np.round(z, 2)
 
 

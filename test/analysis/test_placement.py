@@ -35,7 +35,7 @@ def poses_of(network):
 
 @pytest.mark.parametrize('error, background_std', [(0.0, np.inf), (0.04, 1e-8), (0.0, 1e-9)])
 def test_information_equals_the_stacked_measurements(error, background_std):
-    """Oracle: stacked Jacobians with the backgrounds as states."""
+    """The oracle stacks the Jacobians of all frames, with the backgrounds as states."""
     network = line_network(4)
     sampling = Sampling(0.1, 4e-9, error, background_std, 1.0)
     found = pass_information(*poses_of(network), CAR, sampling, POINTS, 0.7)
@@ -107,7 +107,7 @@ def test_fits_reach_the_bound():
     nees = 0.0
     for _ in range(40):
         fit = fit_pass(measured(ROAD, path, 400.0 * DIRECTIONS[4:5], rng), 1)
-        # Convert from the time zero of the fit to that of the path.
+        # Convert from the time zero of the fit to the time zero of the path.
         error = (fit.position - fit.data.stamp_ns / 1e9 * fit.velocity - path[:3])[:2]
         nees += error @ np.linalg.solve(P, error)
     low, high = chi2.ppf([0.0005, 0.9995], 80)
@@ -139,7 +139,7 @@ def road_plan():
 def test_a_plan_is_consistent(road_plan):
     p = road_plan
     lane, = p.lanes
-    # A complete pass contains more information than its part before a frame.
+    # A complete pass contains more information than the part of the pass before a frame.
     assert (lane.pass_std[:, 0] <= 1.05 * lane.filter_std).all()
     assert lane.detection[np.argmin(np.abs(lane.along))] > 0.999
     # The road and the two sensors are symmetric.
@@ -196,7 +196,7 @@ def test_plan_rejects_invalid_options(tmp_path, capsys, options, message):
 
 
 @pytest.mark.parametrize('options', [
-    # Points of the map and of a lane at a sensor; no free position; two lanes with one heading.
+    # Map and lane points at a sensor; no position with the clearance; two lanes with one heading.
     ['--height', '0', '--heading', '0', '--offset', '4.5', '--area', '-10', '-10', '10', '10'],
     ['--height', '0', '--heading', '90', '--area', '-9', '-9', '9', '9', '--clearance', '1e6'],
     ['--heading', '0', '0', '--offset', '2', '-2', '--rate', '1'],

@@ -34,7 +34,7 @@ def test_calibration_with_half_of_the_readings_is_accurate_for_the_other_half(re
     print_errors(f'known poses, rows {first}::2', position_error, axis_error, low)
     within_limits(position_error, axis_error, low)
     if first == 0:
-        # With calibrated biases only, the errors are at least three times as large.
+        # If only the biases are calibrated, the errors are at least three times as large.
         bias_only = GeometrySettings(
             gain_std=0.0, rotation_std_deg=0.0, position_std=0.0, board_shift_std=0.0,
             board_rotation_std_deg=0.0, tool_offset_std=0.0, tool_tilt_std_deg=0.0)

@@ -60,7 +60,7 @@ def test_training_is_reproducible_and_a_model_file_is_lossless(tmp_path):
         np.testing.assert_array_equal(found.posterior(other.x), model.posterior(other.x))
         assert found.names(other.x) == model.names(other.x)
     assert evaluate(stored, other.x, other.labels).accuracy[0] > 0.8
-    with pytest.raises(LabelsError, match="not classes of the model: 'tank'"):
+    with pytest.raises(LabelsError, match="no classes for the labels 'tank'"):
         evaluate(stored, other.x, ['tank'] * len(other.labels))
 
 
@@ -92,13 +92,13 @@ def test_expected_calibration_error_follows_its_definition():
 
 
 def test_random_labels_are_not_learnt_from_sensors_of_one_pass():
-    """Four sensors measure almost equal readings, so a split of a pass would leak labels."""
+    """The signatures of a pass at four sensors are similar; splitting a pass would leak labels."""
     rng = np.random.default_rng(2)
     of_pass = rng.standard_normal((40, 20)).repeat(4, axis=0)
     x = of_pass + 0.01 * rng.standard_normal(of_pass.shape)
     labels = rng.choice(['a', 'b'], 40).repeat(4).tolist()
     groups = list(map(str, np.arange(40).repeat(4)))
     found = evaluate_splits(x, labels, groups, ('x',), 'T', 10)
-    # Chance level within three standard errors of ten overlapping splits of twelve passes.
+    # The limit is three standard errors of ten overlapping splits with twelve test passes each.
     assert abs(found.balanced_accuracy.mean() - 0.5) < 0.25
     assert found.accuracy.mean() < 0.8

@@ -124,7 +124,7 @@ def test_a_written_network_is_read_back(tmp_path, text):
 
 @pytest.mark.parametrize('deg', [1e-5, 0.06, 30.0, 45.0, 180.0])
 def test_any_orientation_std_of_a_survey_is_read_back(tmp_path, deg):
-    """The value of 180 degrees is for an unknown heading; see survey.stated_std_deg."""
+    """A value of 180 degrees marks an unknown heading; see survey.stated_std_deg."""
     n = read(tmp_path, GOOD)
     n = replace(n, orientation_std=(np.deg2rad([0.3, 0.3, deg]), None))
     write_network(tmp_path / 'copy.yaml', n)
@@ -186,9 +186,9 @@ def test_invalid_calibrations_are_rejected(tmp_path, old, new, message):
     ('position: [0, -4.5, 0]', 'positon: [0, -4.5, 0]', "unknown key 'positon'"),
     ('position: [0, -4.5, 0]', 'position: [0, .nan, 0]', 'not a finite number'),
     ('    position: [0, -4.5, 0]\n', '', 'sensor a: position is missing'),
-    ('1.2e-8', '-1.2e-8', 'noise_std must be above a femto'),
+    ('1.2e-8', '-1.2e-8', 'noise_std must be at least a femto'),
     ('1.2e-8', '1e-8', 'write numbers as 1.0e-8'),
-    ('1.2e-8', '1.0e-100', 'above a femtotesla'),
+    ('1.2e-8', '1.0e-100', 'at least a femtotesla'),
     ('position: [0, -4.5, 0]', 'position: [0, 1.0e+200, 0]', 'too far from the origin'),
     ('position: [0, -4.5, 0]', 'position: [0, 1.0e9, 0]', "'1.0e9' is a string"),
     ('position: [0, -4.5, 0]', 'position: [0, 4.5, 0]', 'sensors a and b are both at'),

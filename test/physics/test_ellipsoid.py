@@ -95,9 +95,9 @@ def test_moment_rotates_with_the_scene(a, b, mu_r, heading, turn, B0):
     R = Rotation.from_euler('z', turn).as_matrix()
     m = ellipsoid_moment((a, b), mu_r, heading, B0)
     rotated = ellipsoid_moment((a, b), mu_r, heading + turn, R @ B0)
-    # With the reverse heading it is the same body, and its response is linear.
+    # Reversing the heading does not change the body, and the response is linear in the field.
     back = ellipsoid_moment((a, b), mu_r, heading + math.pi, 2 * B0)
-    # Not the norm: the squares of a tiny induction are zero.
+    # The maximum replaces the norm, because the squares of a tiny induction underflow to zero.
     limit = 1e-12 * 4 / 3 * math.pi * a * b * b * mu_r * np.abs(B0).max() / MU0
     np.testing.assert_allclose(rotated, R @ m, rtol=0, atol=limit)
     np.testing.assert_allclose(back, 2 * m, rtol=0, atol=limit)

@@ -49,7 +49,7 @@ INDEPENDENT_AXES = {
     ('row_bases', 'places', 0), ('steady_bases', 'theta', 0), ('steady_bases', 'theta', 1),
     ('steady_bases', 'places', 0), ('steady_derivatives', 'theta', 1),
     ('anderson_residual', 'y', 1)}
-"""(function, argument, axis) whose length does not depend on the other arguments."""
+"""Axes (function, argument, axis) whose length does not depend on the other arguments."""
 
 ARRAYS = [(name, argument) for name, call in CALLS.items() for argument, value in call.items()
           if isinstance(value, np.ndarray)]

@@ -1,4 +1,4 @@
-"""All source models: Jacobians compared with differences, process noise with exact integrals."""
+"""Source models: Jacobians compared with differences, process noise with exact integrals."""
 
 import inspect
 
@@ -80,7 +80,7 @@ def test_process_noise_is_symmetric_and_positive_semidefinite(name):
 
 
 def test_constant_velocity_noise_is_the_exact_integral():
-    """Oracle: Van Loan's matrix exponential."""
+    """The oracle is Van Loan's matrix exponential."""
     dt, density = 0.37, np.array([1.0, 2.0, 0.5])
     A = np.zeros((6, 6))
     A[:3, 3:] = np.eye(3)
@@ -94,7 +94,7 @@ def test_constant_velocity_noise_is_the_exact_integral():
 
 @pytest.mark.parametrize('rate', [-0.8, -1e-9, 0.0, 1e-5, 0.4])
 def test_a_coordinated_turn_is_a_circular_arc(rate):
-    """Oracle: the matrix exponential. Backward propagation restores the state."""
+    """The oracle is the matrix exponential. Backward propagation restores the state."""
     x, dt = np.array([[1.0, 2.0, 0.5, 6.0, -3.0, 0.2, rate]]), 1.7
     A = np.zeros((6, 6))
     A[:3, 3:] = np.eye(3)
@@ -155,7 +155,7 @@ def test_a_turn_rate_known_to_be_zero_keeps_the_path_straight():
     np.testing.assert_allclose(predicted[:, :-1], expected, atol=1e-12)
     np.testing.assert_allclose(F[0, :-1, :-1], F_straight, atol=1e-12)
     np.testing.assert_allclose(Q[:, :-1, :-1], Q_straight, atol=1e-15)
-    # Exactly zero: this is the criterion for hypotheses that do not turn.
+    # A variance of exactly zero identifies hypotheses that do not turn.
     after = F @ P @ np.swapaxes(F, 1, 2) + Q
     assert not predicted[:, -1].any() and not after[:, -1].any() and not after[:, :, -1].any()
 
@@ -200,7 +200,7 @@ def test_states_of_another_model_are_rejected():
 
 
 def row_state(d, length, heading=0.6):
-    """State of a row of `d` dipoles with the same total moment for any `d`."""
+    """Create the state of a row of `d` dipoles; the total moment does not depend on `d`."""
     x = np.zeros((1, 6 + 3 * d + (4 if d > 1 else 3)))
     x[0, :6] = [3.0, -1.0, 0.5, 8.0 * np.cos(heading), 8.0 * np.sin(heading), 0.2]
     x[0, 6:6 + 3 * d] = np.tile(np.array([250.0, -90.0, 60.0]) / d, d)
@@ -328,7 +328,7 @@ def rotation_noise(std_w, std_m, dt, density=0.0):
 
 @pytest.mark.study
 def test_noise_covers_the_second_order_of_an_uncertain_rotation():
-    """Oracle: difference between exact and linearised rotation of sampled moments."""
+    """The oracle is the difference between exact and linearised rotation of sampled moments."""
     std_w = np.array([0.10, 0.25, 0.15])
     expected, extra = rotation_noise(std_w, np.zeros(3), 0.5)
     assert extra == pytest.approx(expected, rel=0.05)
@@ -337,7 +337,7 @@ def test_noise_covers_the_second_order_of_an_uncertain_rotation():
 
 
 def test_a_known_rotation_adds_no_noise_to_an_uncertain_moment():
-    """Noise for a known rotation would be added repeatedly in many short steps."""
+    """If a known rotation added noise, the noise would accumulate over many short steps."""
     expected, extra = rotation_noise(np.zeros(3), np.full(3, 0.2), 0.5)
     assert expected < 1e-20 and extra < 1e-20
     # The noise of the angular velocity adds an angle variance proportional to dt^3.
