@@ -145,7 +145,7 @@ def test_a_calibration_records_its_date_and_evidence(name):
     passes = '' if name == 'two_way_road' else '; 1 pass'
     assert (found.evidence is None) == (not passes)
     for c in found.network.calibrated:
-        assert (c.date, c.by) == (DATE, f'accelerometer, compass and stated heading{passes}')
+        assert (c.date, c.by) == (DATE, f'accelerometer, compass and nominal heading{passes}')
 
 
 @pytest.mark.parametrize('name', ALL_NAMES)

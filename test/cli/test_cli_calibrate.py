@@ -102,7 +102,7 @@ def test_a_calibration_without_passes_is_less_certain(tmp_path, capsys):
         assert main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--out', str(out),
                      *extra]) == 0
         stds.append([std[2] for std in read_network(out).orientation_std])
-    assert 'compass and stated heading\n' in capsys.readouterr().out.split('network written to')[1]
+    assert 'compass and nominal heading\n' in capsys.readouterr().out.split('network written to')[1]
     assert (np.array(stds[0]) < np.array(stds[1])).all()
 
 

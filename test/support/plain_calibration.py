@@ -154,7 +154,7 @@ class PlainCalibration:
         if np.isinf(values).any():
             return 'infinite value'
         if values.max() > limit:
-            return f'above {limit:g} T (gauss or microtesla as tesla?)'
+            return f'above {limit:g} T (gauss or microtesla published as tesla?)'
         if sample.covariance is not None and self.settings.trust_covariances:
             present = ~np.isnan(sample.field)
             C = sample.covariance[np.ix_(present, present)]

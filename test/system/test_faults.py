@@ -38,14 +38,14 @@ COUNTED_AS = {
     'dies': ('align', 'frames with a sensor missing'),
     'freezes': ('mag_2', 'rejected: stuck sensor (repeated reading)'),
     'spikes of 2000 times full scale':
-        ('mag_2', 'rejected: above 0.001 T (gauss or microtesla as tesla?)'),
+        ('mag_2', 'rejected: above 0.001 T (gauss or microtesla published as tesla?)'),
     'spikes within full scale': ('mag_2', 'rejected: spike'),
     'small spikes': ('mag_2', 'rejected: spike'),
     'swaps axes': ('track', 'frames in which mag_2 was rejected'),
     'jumps 1 s ahead': ('align', 'rejected: ahead of all other sensors: mag_2'),
     'jumps 1 s back': ('mag_2', 'rejected: out of order'),
     'sends duplicates': ('mag_2', 'rejected: duplicate timestamp'),
-    'sends gauss': ('mag_2', 'rejected: above 0.001 T (gauss or microtesla as tesla?)'),
+    'sends gauss': ('mag_2', 'rejected: above 0.001 T (gauss or microtesla published as tesla?)'),
 }
 """{fault: (stage or sensor that counts it, name of the count)}."""
 

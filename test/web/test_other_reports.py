@@ -133,7 +133,7 @@ def test_a_network_named_like_a_page_is_not_replaced(tmp_path, capsys):
     network.write_text(NETWORK_FILE.read_text())
     assert main(['doctor', str(RECORDINGS[0]), '--network', str(network),
                  '--report', str(network)]) == 1
-    assert 'is also used by another option' in capsys.readouterr().err
+    assert 'is also an input or output of this command' in capsys.readouterr().err
     assert network.read_text() == NETWORK_FILE.read_text()
 
 
