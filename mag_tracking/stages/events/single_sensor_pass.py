@@ -28,7 +28,7 @@ class ClosestPoint(NamedTuple):
 
     time: float
     """[s] Time of the largest field if the closest point is not observable; mean time if there are
-    fewer than 8 samples."""
+    fewer than 8 samples with all reported axes; NaN without samples."""
     time_std: float
     """[s] Standard deviation; inf if the closest point is not observable."""
     time_scale: float
@@ -60,13 +60,14 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
     """
     present = ~np.isnan(field).all(axis=0) & ~np.isnan(noise_std)
     complete = ~np.isnan(field[:, present]).any(axis=1)
-    t, y = t[complete], field[complete][:, present] / noise_std[present]
-    if len(t):
-        t, y = _averaged(t, y)
+    if not complete.any():
+        strongest = float(t[np.argmax(np.nansum(field**2, axis=1))]) if len(t) else np.nan
+        return ClosestPoint(strongest, np.inf, np.nan)
+    t, y = _averaged(t[complete], field[complete][:, present] / noise_std[present])
     t, y = plain(t), plain(y)
-    span = float(t[-1] - t[0]) if len(t) else 0.0
+    span = float(t[-1] - t[0])
     if len(t) < 8 or not span > 0.0:
-        return ClosestPoint(float(t.mean()) if len(t) else np.nan, np.inf, np.nan)
+        return ClosestPoint(float(t.mean()), np.inf, np.nan)
     strongest = float(t[np.argmax(np.sum(y**2, axis=1))])
     interval = span / (len(t) - 1)
 

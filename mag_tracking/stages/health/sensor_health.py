@@ -368,9 +368,9 @@ class SensorHealth:
     def _value_findings(self, name: str, n: int, max_field: float) -> Iterator[Finding]:
         """Yield findings about the values and the axes of the readings."""
         c = self.counts
-        magnitude = float(np.sqrt(np.nansum(self.field**2)))
-        if magnitude > max_field:
-            yield Finding(True, name, f'the field of {magnitude:.3g} T exceeds the limit of '
+        largest = float(np.nanmax(np.abs(self.field), initial=0.0))
+        if largest > max_field:
+            yield Finding(True, name, f'a field component of {largest:.3g} T exceeds the limit of '
                           f'{max_field:g} T', 'check the unit (gauss or microtesla published as '
                           'tesla?), or near a magnet raise calibrate.max_field')
         if c['without any axis'] > 0.01 * n:

@@ -103,6 +103,16 @@ def test_too_few_readings_give_no_direction_and_no_cpa():
     assert np.isnan(closest_point(np.zeros(0), np.zeros((0, 3)), np.ones(3)).time)
 
 
+def test_alternately_missing_axes_give_the_time_of_the_largest_field():
+    t, field, _, _ = passing(np.random.default_rng(3))
+    strongest = t[np.argmax(np.square(field[:, 0]) * (np.arange(len(t)) % 2))]
+    field = field.copy()
+    field[::2, 0] = field[1::2, 1:] = np.nan
+    field[::2, 1:] *= 1e-3
+    found = closest_point(t, field, np.ones(3))
+    assert (found.time, found.time_std) == (strongest, np.inf) and np.isnan(found.time_scale)
+
+
 def events_of(readings, network=NETWORK, batch=None):
     """Calibrate raw readings and create the events; return [PassEvent]."""
     settings = settings_for('vehicle')

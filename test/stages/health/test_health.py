@@ -113,7 +113,7 @@ def faulty(fault):
     ('dead', True, 'x does not change'),
     ('axis', False, 'z is missing in 300 of 3000 readings'),
     ('nothing', True, '300 of 3000 readings have no valid axis'),
-    ('gauss', True, 'the field of 0.514 T exceeds the limit of 0.001 T'),
+    ('gauss', True, 'a field component of 0.49 T exceeds the limit of 0.001 T'),
     ('noisy', False, 'y is 10 times as noisy as at its calibration'),
 ])
 def test_each_fault_is_named(fault, serious, message):
