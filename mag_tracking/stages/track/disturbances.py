@@ -72,9 +72,9 @@ class Disturbances:
         return [self._current]
 
     def feed(self, frame: FieldFrame) -> None:
-        """Update the current disturbance with a frame without a track.
+        """Update the current disturbance, if any, with a frame that belongs to no track.
 
-        Its field may increase and reach further sensors.
+        The disturbance may grow stronger and affect additional sensors.
 
         Parameters
         ----------

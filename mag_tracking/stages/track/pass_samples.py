@@ -56,7 +56,7 @@ class PassSamples:
         return len(self.compared) - 1
 
     def n_free(self, n_dipoles: int) -> int:
-        """Degrees of freedom that remain for the path after backgrounds and moments.
+        """Degrees of freedom that remain after the backgrounds and moments have been estimated.
 
         Parameters
         ----------
@@ -69,7 +69,7 @@ class PassSamples:
         return self.n_values - self.backgrounds.shape[1] - 3 * n_dipoles
 
     def with_near_field_error(self, path: FloatArray) -> 'PassSamples':
-        """Samples whose noise includes the model error near the sensors.
+        """Copy of the samples with noise that includes the model error near the sensors.
 
         Parameters
         ----------

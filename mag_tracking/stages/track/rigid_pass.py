@@ -50,10 +50,11 @@ P_CLOCKS, P_BEND = 1e-5, 1e-3
 straight motion, improve the fit by as much."""
 
 MIN_DISTANCE = 1.0
-"""[m] Clock offsets that move the target by less than this are harmless."""
+"""[m] Clock offsets are harmless if the target moves by less than this during the offset."""
 
 MIDDLE_STD = 0.5
-"""[m] Standard deviation of the magnetic centre of a vehicle between sensors."""
+"""[m] Standard deviation with which the apparent magnetic centre of a vehicle varies from sensor to
+sensor."""
 
 MAX_DISTANCE, MAX_SPEED = 30.0, 100.0
 """[m], [m/s] Maximum distance of a tracked vehicle from the nearest sensor, and its maximum
@@ -86,8 +87,8 @@ class RigidPass:
     reference: int
     """Index of the sensor with the strongest field; its clock is the reference."""
     offset: FloatArray
-    """(n_sensors,) [s] Time by which each clock is ahead of the reference; NaN = not compared or
-    not observable."""
+    """(n_sensors,) [s] Time by which each clock is ahead of the reference; NaN if the clock was not
+    compared or its offset is not observable."""
     offset_std: FloatArray
     """(n_sensors,) [s] Standard deviation due to noise and model error alone; 0 for the
     reference."""
@@ -95,7 +96,7 @@ class RigidPass:
     """(3,) [m] Position at the time of the strongest field, on the straight path with free clock
     offsets."""
     velocity: FloatArray
-    """(3,) [m/s] Velocity on this path."""
+    """(3,) [m/s] Velocity on the straight path with free clock offsets."""
     straight_paths: FloatArray
     """(k, 6) [m], [m/s] Positions and velocities at the time of the strongest field, for straight
     paths of a short and of a long row that explain the pass about as well as bent paths."""
@@ -124,12 +125,12 @@ class RigidPass:
         """
         offsets = positions - self.position
         square = max(float(self.velocity @ self.velocity), 1e-12)
-        places = self.position + (offsets @ self.velocity / square)[:, None] * self.velocity
-        nearest: FloatArray = places[np.argmin(np.linalg.norm(places - positions, axis=1))]
+        points = self.position + (offsets @ self.velocity / square)[:, None] * self.velocity
+        nearest: FloatArray = points[np.argmin(np.linalg.norm(points - positions, axis=1))]
         return nearest
 
     def difference(self, stamp_ns: int, state: FloatArray) -> FloatArray:
-        """Horizontal difference between a state and the nearest of the `straight_paths`.
+        """Horizontal difference of a state from the nearest of the `straight_paths`.
 
         Parameters
         ----------
@@ -158,7 +159,7 @@ class RigidPass:
 
     @property
     def widening(self) -> float:
-        """Factor on the variances if the residuals are larger than expected."""
+        """Factor on the variances, above 1 if the residuals are larger than expected."""
         return max(self.cost_with_offsets / self.freedom, 1.0)
 
     def clock_variance(self, sensor: int) -> float:
@@ -187,7 +188,7 @@ class RigidPass:
 
     @property
     def is_straight(self) -> bool:
-        """Whether the path needs neither a bend nor acceleration."""
+        """Whether turn rate and acceleration do not improve the fit significantly."""
         gain = (min(self.straight, self.cost_with_offsets) - self.bent) / self.widening
         return bool(gain <= chdtri(N_PATH - N_STRAIGHT, P_BEND))
 
@@ -266,7 +267,7 @@ class _RowFits(NamedTuple):
 
     @property
     def needs_no_bend(self) -> bool:
-        """Whether the straight path may explain the pass and the bent path is hardly better."""
+        """Whether the straight path explains the pass, and the bent path hardly better."""
         n_more = N_PATH - N_STRAIGHT
         gain = (self.cost - self.cost_bent) / max(self.misfit, 1.0)
         return bool(self.cost <= MAX_MISFIT * (self.freedom + n_more)
@@ -275,7 +276,7 @@ class _RowFits(NamedTuple):
 
 def _fit_long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, adds_starts: bool
               ) -> _RowFits:
-    """Fit a long row, starting from the paths of a short row; `adds_starts` adds starts."""
+    """Fit a long row from the paths of a short row; `adds_starts` adds starts for the bent path."""
     near = data.with_near_field_error(bent)
     starts = np.array([straight, bent, straight, bent])
     starts[2:, PATH.index('length')] = LONG_LENGTH

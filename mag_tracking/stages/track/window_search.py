@@ -21,7 +21,7 @@ their moments."""
 
 
 class WindowSearch:
-    """Samples of a window in which vehicles are searched.
+    """Samples of a relinearisation window, prepared for searches for vehicles.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class WindowSearch:
         return self._vehicles.background_std * self.samples.backgrounds
 
     def _columns(self, H: FloatArray, x: FloatArray, t: FloatArray, n_one: int) -> FloatArray:
-        """Fields (n, n_sensors, 3, q) of errors of known vehicles by one standard deviation.
+        """Fields (n, n_sensors, 3, q) due to errors of known vehicles, at one standard deviation.
 
         `H` (n, n_sensors, 3, n_t) are the derivatives along a path that ends with the state `x`
         (n_x,), at times `t` (n,) [s] before its end.
