@@ -34,7 +34,8 @@ class TrackSettings:
     model_error_time_s: float = param(
         0.3, 'Correlation time of the model error near the target (first-order Gauss-Markov states '
         'of each sensor). With it, the weight of the error does not depend on the frame period. 0 '
-        'selects independent noise in every frame, which is faster with many sensors.', 's', (0.0, 60.0))
+        'selects independent noise in every frame, which is faster with many sensors.', 's',
+        (0.0, 60.0))
     background_std: float = param(
         2e-8, 'Standard deviation of a background at the start of a track.', 'T', (0.0, 1e-3),
         live=True)
