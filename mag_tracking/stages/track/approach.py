@@ -31,7 +31,7 @@ MAX_FRAMES = 1000
 
 
 class Approach:
-    """Approach test on the first frames of a track, until its field has grown by `GROWTH_RATIO`."""
+    """Approach test on the first frames of a track, until the field has grown by `GROWTH_RATIO`."""
 
     def __init__(self) -> None:
         self._times: list[float] = []
@@ -61,7 +61,7 @@ class Approach:
         return not self._is_open and self._is_doubtful()
 
     def _is_doubtful(self) -> bool:
-        """Whether the growth contradicts a target approaching from afar."""
+        """Whether the growth contradicts the field of a target that approaches from afar."""
         time, levels = np.array(self._times), np.array(self._levels)
         growth = growth_of(time, levels, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
         # A field that falls in between belongs to a target that has passed its first sensor.

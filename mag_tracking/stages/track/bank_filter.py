@@ -28,7 +28,7 @@ differences between frames determine velocities better than differences within a
 
 
 class PathResult(NamedTuple):
-    """Result of `BankFilter.run_along` for each hypothesis."""
+    """Result of `BankFilter.run_along`; the first axis of every array is the hypothesis."""
 
     log_likelihood: FloatArray
     """Log-likelihood of the frames used for updates, (n_hyp,); -inf if a dipole is at a sensor or a
@@ -222,7 +222,7 @@ class BankFilter:
 
     def _frames(self, frames: Sequence[FieldFrame], intervals: Sequence[float]
                 ) -> dict[str, FloatArray]:
-        """Frames as consecutive arrays, keyed by the argument names of the compiled filter."""
+        """Arrays that join the frames, keyed by the argument names of the compiled filter."""
         dt = np.array(intervals, dtype=float)
         decay, variance = self.observation.drift(dt, self._settings.background_drift)
         return {'field': np.array([frame.field for frame in frames]),

@@ -84,7 +84,7 @@ class ClockComparison:
         self._offset_s: FloatArray = np.zeros((n_sensors, n_sensors))
 
     def largest_offset_s(self, rows: IntArray) -> float:
-        """Largest significant offset between two clocks.
+        """Largest significant offset between the clocks of two of the given sensors.
 
         Clocks that were compared in only one pass are ignored, because this pass may contain two
         vehicles.

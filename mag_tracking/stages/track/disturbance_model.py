@@ -35,7 +35,7 @@ number."""
 
 
 class DisturbanceModel:
-    """Evidence for smooth fields without a target.
+    """Models of smooth fields without a target, as the alternative explanation of a track.
 
     Parameters
     ----------

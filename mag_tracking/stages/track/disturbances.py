@@ -57,7 +57,7 @@ class Disturbances:
         Returns
         -------
         list of Disturbance
-            Record of the new disturbance; empty if one is in progress.
+            Record of the new disturbance; empty if a disturbance is already in progress.
         """
         if self._current is not None:
             self._largest = np.maximum(self._largest, found.largest)

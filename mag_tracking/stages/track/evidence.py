@@ -288,12 +288,13 @@ class TrackEvidence:
         return reasons
 
     def doubts_filter(self, gain: float, stamp_ns: int, window_s: float) -> bool:
-        """Update and return whether the filter fits the frames much better than its path.
+        """Update and return whether the filter fits the frames much better than the path does.
 
         Parameters
         ----------
         gain : float, nats
-            Log-likelihood gain of the path over the filter, for the latest frames.
+            Log-likelihood along the path of the hypothesis, minus its log-likelihood in the filter,
+            for the latest frames.
         stamp_ns : int, ns
             Timestamp of the latest frame.
         window_s : float, s

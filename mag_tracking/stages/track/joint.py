@@ -51,7 +51,7 @@ class JointExplanation:
     """Whether the explanation has one vehicle more than the track."""
 
     def doubtful(self, n_one: int) -> tuple[int, ...]:
-        """Indices of the vehicles that may be wrong.
+        """Indices of the vehicles whose states may be wrong.
 
         - All vehicles of an explanation below `CONFIDENT_NATS`, or below `IMPLAUSIBLE_NATS` if
           vehicles cross or one is much faster.

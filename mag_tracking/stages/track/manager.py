@@ -27,15 +27,15 @@ from mag_tracking.stages.track.target import target_of
 from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (scale not observable with one sensor)'
-ALONE = 'frames without a start (scale not observable with one sensor)'
+ALONE = 'frames in which no track could start (scale not observable with one sensor)'
 
 DISTURBANCE_TRACKS = 'tracks explained by a disturbance'
 
-STARTED_IN_TAIL = 'tracks started in the tail of a lost track, in a larger field'
+STARTED_IN_TAIL = 'tracks started in a larger field after the target of a detection was lost'
 
 RESTART_ENERGY_RATIO = 4.0
-"""Minimum energy of the first frame after a lost track, relative to the maximum energy of the lost
-track (twice its field). In the tail of a pass the field only decreases."""
+"""Minimum energy of the frame in which a track starts after a lost track, relative to the maximum
+energy of the lost track (twice the field). While a vehicle departs, its field only decreases."""
 
 
 class TrackManager:
@@ -130,7 +130,7 @@ class TrackManager:
             self._doubtful_by_sensor = {self._network.index(name): t for name, t in times.items()}
 
     def _doubtful_sensors(self, *frames: FieldFrame) -> list[int]:
-        """Indices of the sensors whose backgrounds are doubtful in one of the frames."""
+        """Indices of the sensors whose backgrounds are doubtful in any of the frames."""
         return [j for j, times in self._doubtful_by_sensor.items()
                 if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
 
@@ -264,7 +264,7 @@ class TrackManager:
             self._recent.popleft()
 
     def _initiate(self, frame: FieldFrame) -> list[TrackRecord]:
-        """Start a track and run it through the frames before the detection."""
+        """Start a track, if possible, with the frames before the detection; return its records."""
         if len(self._network) == 1 and not self._settings.single_sensor_prior:
             self.counts[NO_SCALE] += 1
             self._restart_energy = np.inf
@@ -285,7 +285,7 @@ class TrackManager:
                                   bank_filter.observation.own_covariance)
         self._recent.clear()
         if bank is None:
-            self.counts['frames without a start'] += 1
+            self.counts['frames in which no track could start'] += 1
             return []
         self.counts['tracks'] += 1
         is_in_tail = self._restart_energy is not None

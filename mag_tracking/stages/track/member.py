@@ -84,7 +84,7 @@ class Member:
     ended : str or None
         Reason for the end; None while the target is tracked.
     is_lost : bool
-        Whether the track ended while the target was still detected.
+        Whether the member ended while the target was still detected.
     early : list of TrackState
         Smoothed states of the time before the target shared its state with other targets.
     slot : int
@@ -250,7 +250,7 @@ class Member:
         return reasons | evidence.doubts
 
     def _overfits(self, update: BankUpdate, view: MemberView) -> bool:
-        """Update and return whether the filter fits the frames much better than its path."""
+        """Update and return whether the filter fits the frames much better than the path does."""
         overfits = self.evidence.doubts_filter(view.gain, update.frame.stamp_ns,
                                                update.settings.relinearise_window_s)
         if overfits:

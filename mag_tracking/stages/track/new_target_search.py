@@ -143,7 +143,7 @@ class NewTargetSearch:
                               float(log_sum_exp(log_w)) + prior - track_evidence)
 
     def _current_track(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-        """Leading hypotheses of the current track, along their paths.
+        """Run the leading hypotheses of the current track along their paths.
 
         Returns their indices in the bank (n,), log-likelihoods (n,), log-weights after these frames
         (n,) and paths (n, n_frames, n_x).
@@ -176,7 +176,7 @@ class NewTargetSearch:
         return chosen
 
     def _known_vehicles(self, row: int, log_w: float, path: FloatArray) -> KnownVehicles:
-        """Vehicles of a hypothesis of the track, with its log-weight at the anchor."""
+        """Vehicles of hypothesis `row` of the track; `log_w` is its log-weight at the anchor."""
         at = np.searchsorted(self._window.anchor.origin, self._bank.origin[[row]])
         before = self._window.anchor.rows(at)
         label, kind = (tuple(np.ravel(of[row]).tolist())

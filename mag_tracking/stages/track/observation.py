@@ -249,6 +249,7 @@ class Observation:
         -------
         h : (n_hyp, n_sensors, 3) array, T, sensor frame
         H : (n_hyp, n_sensors, 3, n_target) array
+            Derivative with respect to the states of the targets.
         variance : (n_hyp, n_sensors) array, T^2
             Variance of the model error near the targets; the errors of different targets are
             independent.
@@ -323,6 +324,7 @@ class Observation:
         -------
         h : (n_hyp, n_sensors, 3) array, T, sensor frame
         H : (n_hyp, n_sensors, 3, n_target + n_own) array
+            Derivative with respect to the states of the targets and the states of the sensor.
         inflation : (n_hyp, n_sensors) array, T^2
             Variance of the model error; 0 if the model errors are states.
 

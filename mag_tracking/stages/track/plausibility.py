@@ -41,7 +41,7 @@ class Plausibility:
 
     def evaluate(self, observation: Observation, bank: FilterBank, best: int,
                  settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
-        """Update the closest points with a frame, and return the doubts about a hypothesis.
+        """Update the closest points of all hypotheses; return the doubts about one of them.
 
         Parameters
         ----------

@@ -84,7 +84,7 @@ class Window:
 
 
 class Relinearisation:
-    """Window of the latest frames of a running track, with the path of each hypothesis.
+    """Relinearisation over a window of the latest frames, with the path of each hypothesis.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class Relinearisation:
     def clear(self) -> None:
         """Discard the window."""
         self._anchor: FilterBank | InitialBank | None = None
-        # {origin: log-likelihood gain of the path over the filter}, at the last relinearisation.
+        # Log-likelihood gain of each path at the last relinearisation, by origin; see `gain`.
         self._gain: dict[int, float] = {}
 
     def begin(self, anchor: FilterBank | InitialBank) -> None:
@@ -174,7 +174,7 @@ class Relinearisation:
             self._last_ns = frame.stamp_ns
 
     def _keep_hypotheses(self, anchor: FilterBank | InitialBank, mask: BoolArray) -> None:
-        """Keep only the hypotheses of the anchor in `mask`."""
+        """Drop all hypotheses of the anchor that are not in `mask`."""
         anchor.keep(mask)
         self._paths = [path[mask] for path in self._paths]
         self._log_likelihoods = [of_frame[mask] for of_frame in self._log_likelihoods]

@@ -251,7 +251,7 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
 
 
 class _RowFits(NamedTuple):
-    """Fits of a row of dipoles, on a straight and on a bent path."""
+    """Fits of one row of dipoles, on a straight path and on a bent path."""
 
     straight: FloatArray
     """(6,) Position and velocity of the straight path at time zero."""
@@ -293,6 +293,6 @@ def _state_at_zero(path: FloatArray) -> FloatArray:
 
 
 def _is_of_vehicle(state: FloatArray, positions: FloatArray) -> bool:
-    """Whether a state (6,) is possible for a vehicle that passes sensors (n, 3)."""
+    """Whether a vehicle near sensors (n, 3) may have a state (6,), by its distance and speed."""
     nearest = np.linalg.norm(state[:3] - positions, axis=1).min()
     return bool(nearest < MAX_DISTANCE and np.linalg.norm(state[3:]) < MAX_SPEED)

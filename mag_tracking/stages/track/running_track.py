@@ -229,7 +229,7 @@ class RunningTrack:
             for member in self.members:
                 member.evidence.flag(doubts.SENSORS_CONTRADICT)
         if not np.isfinite(advance.evidence):
-            self.counts['banks lost'] += 1
+            self.counts['frames that no hypothesis explains'] += 1
             return False
         best = self.bank.best()
         no_target = self._no_target.log_density(frame, dt, self._settings.background_drift)
@@ -258,7 +258,7 @@ class RunningTrack:
             bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
 
     def _member_frame(self, i: int, best: int, frame: FieldFrame, dt: float) -> FieldFrame:
-        """Frame with the field of member `i` only, according to hypothesis `best`."""
+        """Frame without the fields that hypothesis `best` predicts for the other members."""
         if len(self.members) == 1:
             return frame
         others = self._bank.filter.field_of_others(self.bank, best, i, frame, dt)
@@ -286,7 +286,7 @@ class RunningTrack:
         return out
 
     def _end_member(self, member: Member, reason: str) -> list[TrackRecord]:
-        """End one member, and remove its states from the joint state."""
+        """End one member, remove its states from the joint state, and return its records."""
         if len(self.members) == 1:
             self.is_lost = member.is_lost
             return self.end(reason)

@@ -27,7 +27,7 @@ sensors far from the target fit any hypothesis."""
 
 
 class SensorRejection:
-    """Update of a bank without the sensors that contradict the others.
+    """Update of a bank that excludes sensors whose measurements contradict the other sensors.
 
     Parameters
     ----------

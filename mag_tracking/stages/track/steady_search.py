@@ -115,6 +115,7 @@ class PathPrior:
         Returns
         -------
         line : (n,) int array
+            Index in `headings`.
         off : (n,) array, rad
             Heading of the path relative to the line.
         """
@@ -334,7 +335,7 @@ class SteadySearch:
         return path, np.where(are_moving & self._are_detectable(path), cost, np.inf)
 
     def best(self, grid: StartGrid, most: int) -> FloatArray:
-        """Paths that explain the frames best.
+        """Search for the paths of a single vehicle that explain the frames best.
 
         Parameters
         ----------
@@ -352,7 +353,7 @@ class SteadySearch:
         return _best_distinct(path, cost, PATH_TOLERANCE, most)
 
     def moments(self, theta: FloatArray) -> FloatArray:
-        """Moments of the rows of dipoles on given paths.
+        """Estimate the moments of the rows of dipoles on given paths.
 
         Parameters
         ----------
@@ -386,7 +387,7 @@ class SteadySearch:
             self._model.derivative(path[None], p)[0] * KNOWN_STD]))
 
     def pairs(self, grid: StartGrid, most: int, most_second: int) -> list[FloatArray]:
-        """Pairs of paths that explain the frames best.
+        """Search for the pairs of paths that explain the frames best.
 
         Parameters
         ----------

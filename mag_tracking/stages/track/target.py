@@ -47,7 +47,7 @@ class Target:
 
 
 def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
-    """Target selected by the settings.
+    """Create the target that the settings select, and check its settings.
 
     Parameters
     ----------

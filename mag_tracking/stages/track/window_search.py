@@ -32,7 +32,7 @@ class WindowSearch:
     Attributes
     ----------
     times : (n,) array, s
-        Times of the frames, relative to the last one.
+        Times of the frames, relative to the last frame.
     prior : PathPrior
     samples : PassSamples
     """

@@ -188,5 +188,6 @@ def test_twice_the_field_of_a_lost_vehicle_starts_an_ambiguous_track(lookback_s)
         'vehicle', {'track.lookback_s': lookback_s}).track)
     tracks = tracks_with_contradiction(stage, [1e-4] * 19 + [2.1e-4])
     assert stage.counts['tracks'] == 2
-    assert stage.counts['tracks started in the tail of a lost track, in a larger field'] == 1
+    assert stage.counts[
+        'tracks started in a larger field after the target of a detection was lost'] == 1
     assert tracks[-1].id == 2 and tracks[-1].ambiguous

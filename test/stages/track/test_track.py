@@ -205,7 +205,7 @@ def test_too_few_axes_start_no_magnet_track():
     field[0] = frames[0].field[0]
     stage = TrackManager(network, settings_for('magnet').track)
     assert stage.feed(dataclasses.replace(frames[0], field=field)) == []
-    assert stage.counts['frames without a start'] == 1
+    assert stage.counts['frames in which no track could start'] == 1
 
 
 def test_a_hypothesis_at_a_sensor_is_dropped_and_the_others_continue():
