@@ -64,7 +64,8 @@ class Approach:
         """Whether the growth contradicts the field of a target that approaches from afar."""
         time, levels = np.array(self._times), np.array(self._levels)
         growth = growth_of(time, levels, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
-        # A field that falls in between belongs to a target that has passed its first sensor.
+        # If the field falls before it reaches the highest level, the target has passed its first
+        # sensor.
         is_falling = levels < STEADY_FRACTION * np.maximum.accumulate(levels)
         if growth is None or (is_falling & (levels > SENSED_LEVEL)).any():
             return False

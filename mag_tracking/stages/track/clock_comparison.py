@@ -9,10 +9,10 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.stages.track.rigid_pass import MAX_OFFSET, MIN_DISTANCE, RigidPass
 
 SIGNIFICANT_STD = 4.0
-"""An offset is reported if it exceeds this number of standard deviations."""
+"""An offset is significant only if it exceeds this number of standard deviations."""
 
 MEMORY_PASSES = 20
-"""Effective number of passes in the estimate. Older passes are forgotten, because clocks drift and
+"""Effective number of passes in the estimate. Older passes lose weight, because clocks drift and
 are adjusted."""
 
 FORGETTING_FACTOR, CONTRADICTED_FACTOR = 1.0 - 1.0 / MEMORY_PASSES, 0.5

@@ -29,7 +29,7 @@ FIRST_CHECK_S = 0.12
 """Delay of the first fit after the maximum of the field [s]."""
 
 CHECK_INTERVAL_RATIO = 1.7
-"""Ratio of the delays of successive fits."""
+"""Ratio of the delays of successive fits after the maximum of the field."""
 
 BEFORE_S, AFTER_S = 4.0, 3.0
 """Frames from `BEFORE_S` before to `AFTER_S` after the maximum of the field belong to the pass
@@ -53,7 +53,7 @@ class _FrameSummary(NamedTuple):
     magnitude: float
     """Largest field of any sensor [T]."""
     state: FloatArray
-    """Position and velocity (6,) at that time, as published."""
+    """Position and velocity (6,) of the best hypothesis at the time of the frame."""
 
 
 class CrossCheck:

@@ -30,8 +30,8 @@ MIN_GRADIENT_SENSORS = 3
 gradient could explain any readings."""
 
 MAX_COMMON_SENSORS = 8
-"""Maximum number of sensors in the model of a common field; its cost grows with the cube of their
-number."""
+"""Maximum number of sensors in the model of a common field. The cost of the model grows with the
+cube of this number."""
 
 
 class DisturbanceModel:

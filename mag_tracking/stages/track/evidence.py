@@ -88,7 +88,7 @@ class TrackEvidence:
         self._doubtful_times: DoubtfulTimes = ()
         # Latest timestamp of each transient doubt.
         self._last_found_ns: dict[str, int] = {}
-        # Expiry of each other doubt with a limited duration.
+        # Expiry of each doubt that was flagged for a limited time.
         self._expiry_ns: dict[str, int] = {}
         # Time segments in which smoothed poses are also doubtful.
         self._smoothed_segments: list[tuple[int, int]] = []

@@ -23,7 +23,7 @@ NEAR_ERROR_LENGTH = 0.2
 """[m] Near a sensor, the relative error is at least this length divided by the distance."""
 
 MAX_SENSORS = 4
-"""Maximum number of sensors. The sensors with the strongest fields are used."""
+"""Maximum number of sensors in a fit. The sensors with the strongest fields are used."""
 
 N_STEPS, TOLERANCE = 30, 1e-3
 """Maximum number of steps, and the relative improvement of the cost below which the search ends."""
@@ -40,15 +40,15 @@ class PassSamples:
     positions: FloatArray
     """(n, 3) [m] Sensor positions, world frame."""
     M: FloatArray
-    """(n, 3, 3) Rotation from world to sensor, and whitening."""
+    """(n, 3, 3) Whitening matrix times rotation from world to sensor."""
     clock: IntArray
     """(n,) Clock of each sample; see `SteadyPass`."""
     y: FloatArray
     """(3 n,) Whitened fields; 0 for missing axes."""
     backgrounds: FloatArray
-    """(3 n, q) Whitened columns of the backgrounds."""
+    """(3 n, q) Whitened fields of unit backgrounds, one column for each axis of a sensor."""
     n_values: int
-    """Number of measured values."""
+    """Number of measured axes in all samples."""
 
     @property
     def n_clocks(self) -> int:

@@ -42,7 +42,7 @@ PASSES = 3
 result."""
 
 STEP_SIZE = 0.5
-"""Damping of each step. Undamped steps overshoot where the field is strongly nonlinear, and
+"""Damping factor of each step. Undamped steps overshoot where the field is strongly nonlinear, and
 diverge."""
 
 CONVERGED = 0.3

@@ -46,8 +46,8 @@ GOOD_MISFIT, MAX_MISFIT = 1.3, 1.5
 it."""
 
 P_CLOCKS, P_BEND = 1e-5, 1e-3
-"""Significance levels for clock offsets, and for a bent path: probability that correct clocks, or a
-straight motion, improve the fit by as much."""
+"""Significance levels for clock offsets, and for a bent path: probability that noise alone improves
+the fit significantly although the clocks are correct, or although the motion is straight."""
 
 MIN_DISTANCE = 1.0
 """[m] Clock offsets are harmless if the target moves by less than this during the offset."""
@@ -74,9 +74,9 @@ class RigidPass:
     stamp_ns: int
     """Time of the strongest field; time zero of the paths."""
     straight: float
-    """Cost of a straight path."""
+    """Cost of a straight path at constant speed, without clock offsets."""
     bent: float
-    """Cost of a path with acceleration and turn rate."""
+    """Cost of a path with acceleration and turn rate, without clock offsets."""
     cost_with_offsets: float
     """Cost of a straight path at constant speed with free clock offsets."""
     freedom: int

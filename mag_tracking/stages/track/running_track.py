@@ -86,7 +86,7 @@ class RunningTrack:
         self._bank = TrackBank(target, settings, sensors, bank_filter, bank, counts, later_sensors)
         self.members = [Member(id, target, sensors, counts, clocks, 0)]
         self._new_target_evidence = NewTargetEvidence()
-        # Whether the last search could not add a member, because there are too many.
+        # Whether the track had the maximum number of members at the last search.
         self._is_at_limit = False
         self._handover_due: int | None = None
         self._use_bank_sensors(False)

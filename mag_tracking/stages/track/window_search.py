@@ -16,8 +16,8 @@ MAX_SAMPLES = 320
 """Maximum number of samples of a search. Windows with more samples are decimated."""
 
 KNOWN_STD, KNOWN_MOMENT_RATIO = 0.7, 0.3
-"""[m], [m/s] Uncertainty of the paths of tracked vehicles in a search, and relative uncertainty of
-their moments."""
+"""[m], [m/s] Standard deviation of the positions and velocities of tracked vehicles in a search,
+and relative standard deviation of their moments."""
 
 
 class WindowSearch:

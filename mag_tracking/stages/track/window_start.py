@@ -25,7 +25,7 @@ class PathHypothesis:
     path: FloatArray
     """(n, n_x) States at the frames of the window."""
     label: tuple[int, ...]
-    """Arrival of each vehicle."""
+    """Index of the arrival direction of each vehicle."""
     kind: tuple[int, ...]
     log_w: float
 
