@@ -1,4 +1,4 @@
-"""Approach test: check that the field of a track grew as for a target approaching from afar."""
+"""Approach test: whether a field grows like the field of a target that approaches from afar."""
 
 import numpy as np
 
@@ -16,11 +16,12 @@ GROWTH_RATIO = 10.0
 
 MIN_LOG2_RATIO = -0.25
 """Minimum log2 ratio of the durations of the first and the second half of the growth. The
-theoretical value is 0.55 for a uniformly decreasing distance and -0.83 for a target that starts
-from rest next to a sensor. A field that jumps has a smaller value."""
+theoretical value is 0.55 for a target that approaches at constant speed, and -0.83 for a target
+that starts from rest next to a sensor. A sudden jump of the field gives a smaller value."""
 
 STEADY_FRACTION = 0.85
-"""The growth is not steady if the field falls below this fraction of its previous maximum."""
+"""If the field falls below this fraction of its previous maximum while the target is sensed, the
+target has passed its first sensor, and the test passes."""
 
 LEVEL_TIME_STD = 0.5
 """Uncertainty of the time at which the field reached a level, in frame periods."""
@@ -30,7 +31,7 @@ MAX_FRAMES = 1000
 
 
 class Approach:
-    """Approach test on the first frames of a track, until its field has grown by `GROWTH_RATIO`."""
+    """Approach test on the first frames of a track, until the field has grown by `GROWTH_RATIO`."""
 
     def __init__(self) -> None:
         self._times: list[float] = []
@@ -38,7 +39,7 @@ class Approach:
         self._is_open = True
 
     def add(self, frame: FieldFrame) -> bool:
-        """Add a frame to the test.
+        """Add a frame, and return whether the test fails with this frame.
 
         Parameters
         ----------
@@ -60,10 +61,11 @@ class Approach:
         return not self._is_open and self._is_doubtful()
 
     def _is_doubtful(self) -> bool:
-        """Whether the growth contradicts a target approaching from afar."""
+        """Whether the growth contradicts the field of a target that approaches from afar."""
         time, levels = np.array(self._times), np.array(self._levels)
         growth = growth_of(time, levels, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
-        # A field that falls in between belongs to a target that has passed its first sensor.
+        # If the field falls before it reaches the highest level, the target has passed its first
+        # sensor.
         is_falling = levels < STEADY_FRACTION * np.maximum.accumulate(levels)
         if growth is None or (is_falling & (levels > SENSED_LEVEL)).any():
             return False

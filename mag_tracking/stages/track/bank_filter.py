@@ -28,13 +28,14 @@ differences between frames determine velocities better than differences within a
 
 
 class PathResult(NamedTuple):
-    """Result of `BankFilter.run_along` for each hypothesis."""
+    """Result of `BankFilter.run_along`; the first axis of every array is the hypothesis."""
 
     log_likelihood: FloatArray
-    """Log-likelihood of all frames along the path, (n_hyp,); -inf if the path is unusable."""
+    """Log-likelihood of the frames used for updates, (n_hyp,); -inf if a dipole is at a sensor or a
+    variance is negative."""
     unsettled: FloatArray
-    """Largest change of the path in the last pass, (n_hyp,), in standard deviations of its
-    position."""
+    """Largest distance of the smoothed positions from the path in the last pass, (n_hyp,), in
+    standard deviations of the position."""
     used: BoolArray
     """Whether the hypothesis was updated with each frame, (n_hyp, n)."""
     covariances: FloatArray
@@ -81,6 +82,7 @@ class BankFilter:
     Attributes
     ----------
     observation : Observation
+        Measurement model of the targets.
     """
 
     def __init__(self, network: SensorNetwork, model: SourceModel, settings: TrackSettings,
@@ -133,10 +135,10 @@ class BankFilter:
             Updated in place.
         frame : FieldFrame
         dt : float, s
-            Time since the previous frame.
+            Time since the previous frame. Unless it is positive, the prediction is skipped.
         keeps_prior : bool
-            Write the states and covariances to new arrays, which is slower. By default the arrays
-            `bank.x` and `bank.P` are overwritten.
+            Whether to write the states and covariances to new arrays, which is slower. By default,
+            the arrays `bank.x` and `bank.P` are overwritten.
 
         Returns
         -------
@@ -178,25 +180,26 @@ class BankFilter:
         Parameters
         ----------
         bank : FilterBank
-            Bank at the first frame; replaced by the bank at the last frame.
+            Bank at the first frame; updated in place to the last frame.
         frames : list of FieldFrame
             The n frames of the path.
         intervals : list of float, s
             Time since the previous frame, for each frame.
         paths : (n_hyp, n, n_x) array
-            Linearisation points, updated in place. NaN linearises at the prediction and iterates as
-            in `advance`.
+            Linearisation points, updated in place. At NaN, a frame is linearised at its prediction,
+            with the iterations of `advance`.
         passes : int
-            Number of passes; each is linearised along the path of the previous one.
+            Number of passes; each pass is linearised along the path of the previous pass.
         step : float
             Fraction of the difference between smoothed states and path by which each pass moves the
             path.
         first_is_updated : bool
-            The bank has already been updated with the first frame.
+            Whether the bank has already been updated with the first frame.
         rejects_outliers : bool
-            Skip the update with frames whose normalised innovation exceeds `end_nis` per axis.
+            Whether to skip the update with frames whose normalised innovation squared exceeds
+            `end_nis` per axis.
         wants_covariances : bool
-            Also return the smoothed covariances.
+            Whether to return the smoothed covariances.
 
         Returns
         -------
@@ -219,7 +222,7 @@ class BankFilter:
 
     def _frames(self, frames: Sequence[FieldFrame], intervals: Sequence[float]
                 ) -> dict[str, FloatArray]:
-        """Frames as consecutive arrays, keyed by the argument names of the compiled filter."""
+        """Arrays that join the frames, keyed by the argument names of the compiled filter."""
         dt = np.array(intervals, dtype=float)
         decay, variance = self.observation.drift(dt, self._settings.background_drift)
         return {'field': np.array([frame.field for frame in frames]),
@@ -240,7 +243,7 @@ class BankFilter:
         Returns
         -------
         (n_sensors,) array, s
-            Multiples of `SAME_TIME_S`; 0 for a frame that is treated as simultaneous.
+            Multiples of `TIME_RESOLUTION_S`; 0 if the frame is treated as simultaneous.
         """
         offset: FloatArray = frame.time_offset
         if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_FRACTION * dt:
@@ -250,7 +253,7 @@ class BankFilter:
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
         """Variance of the model error in the field of a hypothesis.
 
-        Only the part that is uncorrelated with the previous frame is returned.
+        Only the variance that is uncorrelated with the previous frame is returned.
 
         Parameters
         ----------
@@ -263,6 +266,7 @@ class BankFilter:
         Returns
         -------
         (n_sensors,) array, T²
+            0 where a dipole is at the sensor.
         """
         error = self.observation.model_error(
             bank.x[i], self._lengths(bank.kind[i:i + 1])[0], self._settings.field_error)
@@ -306,6 +310,7 @@ class BankFilter:
         ----------
         x : (n_x,) array
         kind : (1,) or (1, n_targets) int array
+            Kind of each target.
         frame : FieldFrame
         dt : float, s
             Time since the previous frame.
@@ -375,7 +380,7 @@ class BankFilter:
         return LINEAR_FRACTION * self.observation.distance_to_nearest(x)
 
     def is_implausible(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
-        """Whether the normalised innovation of a hypothesis exceeds `end_nis` per axis.
+        """Whether the normalised innovation squared of a hypothesis exceeds `end_nis` per axis.
 
         Parameters
         ----------
@@ -394,7 +399,7 @@ class BankFilter:
 
 
 class NoTarget:
-    """Filter of the hypothesis without a target, in which only the backgrounds drift.
+    """Filter for the hypothesis that there is no target and only the backgrounds drift.
 
     Its log-density is the reference for the evidence of a target.
 
@@ -410,7 +415,7 @@ class NoTarget:
         self._P = np.tile(background_std**2 * np.eye(3), (n_sensors, 1, 1))
 
     def log_density(self, frame: FieldFrame, dt: float, background_drift: float) -> float:
-        """Log-density of a frame given the previous ones.
+        """Update the backgrounds with a frame; return its log-density given the previous frames.
 
         Parameters
         ----------
@@ -442,7 +447,7 @@ class NoTarget:
 
 
 def known_covariance(covariance: FloatArray) -> FloatArray:
-    """Frame covariances with the identity in place of missing axes.
+    """Replace the missing elements of frame covariances by elements of the identity.
 
     Parameters
     ----------
@@ -452,7 +457,7 @@ def known_covariance(covariance: FloatArray) -> FloatArray:
     Returns
     -------
     (..., 3, 3) array, T²
-        NaN replaced by the elements of the identity.
+        Free of NaN.
     """
     missing = np.isnan(covariance)
     return np.where(missing, np.eye(3), covariance) if missing.any() else covariance

@@ -11,11 +11,13 @@ from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.settings import TrackSettings
 
 MAX_BYTES = 4 << 30
-"""Maximum memory of the covariances of all starting hypotheses, and of the grid of a magnet
-[bytes]. The peak memory is 1.5 times as large."""
+"""Memory above which settings are rejected [bytes]. The limit applies to the covariances of all
+starting hypotheses, and separately to the grid of a magnet. The peak memory is 1.5 times as
+large."""
 START_BYTES = 250_000_000
-"""Maximum memory of the covariances of all starting hypotheses of a track [bytes]. If it does not
-suffice for all sensors, the remaining sensors are added after the frames before the detection."""
+"""Memory for the covariances with which a track starts [bytes]. If the covariances with all sensors
+need more, the track starts with fewer sensors. The remaining sensors are added after the frames
+before the detection."""
 MIN_SENSORS_AT_START = 4
 """Minimum number of sensors at the start of a track. The sensors nearest to the strongest field are
 used."""
@@ -24,8 +26,8 @@ WIDER_BYTES = 100_000_000
 MIN_HYPOTHESES = 100
 """Minimum number of retained hypotheses, even if they exceed `WIDER_BYTES`."""
 MIN_WEIGHT = 0.999
-"""Minimum total weight of the retained hypotheses when the remaining sensors are added. With a
-smaller weight, the track would appear more certain than the frames justify."""
+"""Minimum total weight of the hypotheses that are retained when the remaining sensors are added. If
+more weight were dropped, the track would appear more certain than the frames justify."""
 _FLOAT_BYTES = 8
 
 
@@ -96,6 +98,7 @@ def max_sensors(observation: Observation, n_hyp: int) -> int:
     Returns
     -------
     int
+        At least `MIN_SENSORS_AT_START`, even if they exceed `START_BYTES`.
     """
     return _max_affordable_sensors(n_hyp, observation.n_target, observation.n_own + 3)
 
@@ -160,7 +163,7 @@ def _check_bank(group: str, factors: Mapping[str, int], settings: TrackSettings,
         raise SettingsError(
             f'{group}: {n_hyp} starting hypotheses, {product}, with {n_x} states each for {n} '
             f'sensors (track.max_sensors) need {_in_gigabytes(size)} of memory; the limit is '
-            f'{_in_gigabytes(MAX_BYTES)}. Reduce one of these numbers')
+            f'{_in_gigabytes(MAX_BYTES)}. Reduce the number of hypotheses or track.max_sensors')
 
 
 def _n_sensors(settings: TrackSettings, network: SensorNetwork) -> int:
@@ -169,7 +172,7 @@ def _n_sensors(settings: TrackSettings, network: SensorNetwork) -> int:
 
 
 def _states_per_sensor(settings: TrackSettings) -> int:
-    """Number of states of a sensor: background, and mounting angles and model errors if used."""
+    """Number of states of a sensor: background, and mounting angles and model errors if enabled."""
     return 3 * (1 + bool(settings.mounting_std_deg) + bool(settings.model_error_time_s))
 
 

@@ -9,17 +9,18 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.stages.track.rigid_pass import MAX_OFFSET, MIN_DISTANCE, RigidPass
 
 SIGNIFICANT_STD = 4.0
-"""An offset is reported if it exceeds this number of standard deviations."""
+"""An offset is significant only if it exceeds this number of standard deviations."""
 
 MEMORY_PASSES = 20
-"""Effective number of passes in the estimate. Older passes are forgotten, because clocks drift and
+"""Effective number of passes in the estimate. Older passes lose weight, because clocks drift and
 are adjusted."""
 
 FORGETTING_FACTOR, CONTRADICTED_FACTOR = 1.0 - 1.0 / MEMORY_PASSES, 0.5
-"""Factor on the previous information at each pass, and at a pass that contradicts the estimate."""
+"""Factor on the previous information at a pass that agrees with the estimate, and at a pass that
+contradicts it."""
 
 PRIOR_STD_S = 1e3
-"""Standard deviation of an unknown clock [s]."""
+"""Prior standard deviation of the offset of each clock [s]."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class ClockOffset:
     """Number of passes in which the clock was compared."""
 
     def text(self, names: Sequence[str]) -> str:
-        """Message with the offset and the correction of the network file.
+        """Return a message that states the offset and how to correct the network file.
 
         Parameters
         ----------
@@ -62,7 +63,7 @@ class ClockOffset:
 
 
 class ClockComparison:
-    """Clock offsets of several passes, combined by recursive least squares.
+    """Clock offsets estimated from several passes by recursive least squares.
 
     A wrong sensor position has the same effect as a wrong clock if all vehicles pass in the same
     direction at the same speed.
@@ -73,17 +74,17 @@ class ClockComparison:
     """
 
     def __init__(self, n_sensors: int) -> None:
-        # Information matrix of the clock offsets, and its product with them.
+        # Information matrix of the clock offsets, and its product with their estimates.
         self._information = np.zeros((n_sensors, n_sensors))
         self._vector = np.zeros(n_sensors)
         self._n_passes = np.zeros(n_sensors, dtype=np.int64)
-        # Weighted number of passes, and weighted sum of the inverse of their speeds.
+        # Weighted number of passes, and weighted sum of their inverse speeds.
         self._weight, self._slowness = 0.0, 0.0
         # [s] Significant offsets between the clocks, else 0; computed once per pass.
         self._offset_s: FloatArray = np.zeros((n_sensors, n_sensors))
 
     def largest_offset_s(self, rows: IntArray) -> float:
-        """Largest significant offset between two clocks.
+        """Largest significant offset between the clocks of two of the given sensors.
 
         Clocks that were compared in only one pass are ignored, because this pass may contain two
         vehicles.
@@ -103,7 +104,7 @@ class ClockComparison:
 
     @property
     def largest_offset(self) -> ClockOffset | None:
-        """Clock with the largest significant offset; None if no offset is significant."""
+        """Clock that causes the largest significant offset; None if no offset is significant."""
         ahead, behind = map(int, np.unravel_index(np.argmax(self._offset_s), self._offset_s.shape))
         if self._offset_s[ahead, behind] == 0.0:
             return None
@@ -123,8 +124,8 @@ class ClockComparison:
     def add(self, found: RigidPass, rows: IntArray) -> None:
         """Add a pass to the estimate.
 
-        Passes without a straight path that explains them are ignored. Slow passes are ignored, too,
-        because they hardly depend on the clocks.
+        A pass is ignored if no straight path explains it, or if the vehicle is so slow that the
+        fit hardly depends on the clocks.
 
         Parameters
         ----------
@@ -159,14 +160,14 @@ class ClockComparison:
             (offset > SIGNIFICANT_STD * std) & (offset > min_offset), offset, 0.0)
 
     def _contradicts(self, fit: RigidPass, rows: IntArray, is_known: BoolArray) -> bool:
-        """Whether a pass contradicts the previous estimate for a clock in `is_known`."""
+        """Whether a pass contradicts the previous estimate for any clock in the mask `is_known`."""
         offset, std = self._offsets()
         reference = rows[fit.reference]
         return any(abs(fit.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STD * np.sqrt(
             fit.clock_variance(j) + std[rows[j], reference]**2) for j in np.flatnonzero(is_known))
 
     def _offsets(self) -> tuple[FloatArray, FloatArray]:
-        """Offsets (n, n) [s] of each clock (row) ahead of each clock (column), and their stds."""
+        """Time (n, n) [s] by which the row's clock is ahead of the column's, and its std (n, n)."""
         # The common offset of all clocks is not observable; the prior fixes it.
         prior = np.eye(len(self._vector)) / PRIOR_STD_S**2
         covariance: FloatArray = np.linalg.inv(self._information + prior).astype(np.float64)

@@ -10,7 +10,7 @@
 namespace mag_tracking {
 namespace {
 
-// Number of targets that share a state.
+// Number of targets that share the state of a filter.
 template <class Target>
 Size number_of(const Target&) { return 1; }
 Size number_of(const Vehicles& vehicles) { return vehicles.count; }

@@ -46,7 +46,7 @@ def fit_steady_pass(*, theta: FloatArray, cost: FloatArray, covariance: FloatArr
                     positions: FloatArray, M: FloatArray, clock: IntArray, y: FloatArray,
                     nuisance: FloatArray, n_steps: int, tolerance: float, most_damping: float,
                     full_rank: float, linear_rank: float, rank: float) -> None:
-    """Refine a `SteadyPass` like `least_squares.refine`.
+    """Fit a `SteadyPass` from each start by the method of `least_squares.refine`.
 
     The starts `theta` (n, n_free) are replaced by the minima, with their `cost` (n,) and
     `covariance` (n, n_free, n_free). The columns of `nuisance` (n_y, q) are orthonormal, and have

@@ -1,4 +1,4 @@
-"""Cross-check of a running track with a fit of its whole pass; see `rigid_pass`."""
+"""Cross-check of a running track against a fit of the whole pass; see `rigid_pass`."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -29,7 +29,7 @@ FIRST_CHECK_S = 0.12
 """Delay of the first fit after the maximum of the field [s]."""
 
 CHECK_INTERVAL_RATIO = 1.7
-"""Ratio of the delays of successive fits."""
+"""Ratio of the delays of successive fits after the maximum of the field."""
 
 BEFORE_S, AFTER_S = 4.0, 3.0
 """Frames from `BEFORE_S` before to `AFTER_S` after the maximum of the field belong to the pass
@@ -39,11 +39,11 @@ MIN_FRAMES, MAX_FRAMES = 12, 128
 """Minimum and maximum number of frames in a fit. A longer pass is decimated."""
 
 STEADY_S = 1.5
-"""Time after the maximum of the field for which the motion of a vehicle is assumed to stay steady
-[s]."""
+"""Time after the maximum of the field for which acceleration and turn rate of a vehicle are assumed
+to be constant [s]."""
 
 LATE_MISFIT = 8.0
-"""Maximum misfit of later fits, in which the turn rate of a car may have changed."""
+"""Maximum misfit of fits after `STEADY_S`, in which the turn rate of a car may have changed."""
 
 
 class _FrameSummary(NamedTuple):
@@ -53,11 +53,11 @@ class _FrameSummary(NamedTuple):
     magnitude: float
     """Largest field of any sensor [T]."""
     state: FloatArray
-    """Position and velocity (6,) at that time, as published."""
+    """Position and velocity (6,) of the best hypothesis at the time of the frame."""
 
 
 class CrossCheck:
-    """Cross-check of a track with fits of a steady path to its whole pass.
+    """Cross-check of a track against fits of a steady path to the whole pass.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class CrossCheck:
         """
         magnitude = float(field_magnitudes(frame).max(initial=0.0))
         if self._current is not None:
-            # The minimum excludes gaps.
+            # The minimum interval is not affected by gaps.
             self._period_s = min(self._period_s, (frame.stamp_ns - self._current.stamp_ns) / NS)
         self._current = _FrameSummary(frame.stamp_ns, magnitude, state[:6].copy())
         if self._peak is None or magnitude > self._peak.magnitude:
@@ -139,7 +139,8 @@ class CrossCheck:
     def differences(self, states: Sequence[TrackState]) -> list[FloatArray]:
         """Differences of smoothed states from the fitted pass.
 
-        For states before or after the pass, the difference of its first or last state is returned.
+        For states before or after the pass, the difference of the first or last state in the pass
+        is returned.
 
         Parameters
         ----------
@@ -162,8 +163,8 @@ class CrossCheck:
     def _covers(self, stamp_ns: int) -> bool:
         """Whether the latest fit determines the position of the vehicle at a time.
 
-        A track that begins at the maximum of the field contains only part of a pass. Many paths
-        would explain it.
+        A track that begins at the maximum of the field contains only part of a pass, which many
+        paths would explain.
         """
         return self.latest is not None and self._is_whole_pass \
             and -BEFORE_S * NS <= stamp_ns - self.latest.stamp_ns <= AFTER_S * NS

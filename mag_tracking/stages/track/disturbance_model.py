@@ -15,7 +15,8 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 
 GRADIENT_RATIO = 0.3
-"""Relative change of a common field from the centre of the network to its edge."""
+"""Prior standard deviation of the change of a common field from the centre of the network to its
+edge, relative to the standard deviation of the field."""
 
 MIN_STD = 1e-15
 """Minimum standard deviation of the noise of a sensor [T]. Network files with less noise are
@@ -25,16 +26,16 @@ UNKNOWN_FIELD_STD = 1e-4
 """Prior standard deviation of the field after a handover [T]."""
 
 MIN_GRADIENT_SENSORS = 3
-"""Minimum number of sensors for which the common field has a gradient. With fewer sensors, it could
-explain any readings."""
+"""Minimum number of sensors for which the common field has a gradient. With fewer sensors, a
+gradient could explain any readings."""
 
 MAX_COMMON_SENSORS = 8
-"""Maximum number of sensors in the model of a common field; its cost grows with the cube of their
-number."""
+"""Maximum number of sensors in the model of a common field. The cost of the model grows with the
+cube of this number."""
 
 
 class DisturbanceModel:
-    """Evidence for smooth fields without a target.
+    """Models of smooth fields without a target, as the alternative explanation of a track.
 
     Parameters
     ----------
@@ -124,8 +125,9 @@ class DisturbanceModel:
 def _common_field_matrix(network: SensorNetwork) -> FloatArray:
     """Matrix (3 n_sensors, m) from a common field and the backgrounds to the axes of each sensor.
 
-    The field is uniform with a gradient. Without sources inside the network the gradient is
-    symmetric and traceless: five numbers, in units of a field over the radius of the network.
+    The field has a uniform component and, from `MIN_GRADIENT_SENSORS` sensors on, a gradient.
+    Without sources inside the network, the gradient is symmetric and traceless. It has five
+    parameters, in units of a field over the radius of the network.
     """
     n, R_sw = len(network), network.R_sw
     field = np.tile(np.eye(3), (n, 1, 1))

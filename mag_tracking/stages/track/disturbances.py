@@ -57,7 +57,7 @@ class Disturbances:
         Returns
         -------
         list of Disturbance
-            Record of the new disturbance; empty if one is in progress.
+            Record of the new disturbance; empty if a disturbance is already in progress.
         """
         if self._current is not None:
             self._largest = np.maximum(self._largest, found.largest)
@@ -72,9 +72,9 @@ class Disturbances:
         return [self._current]
 
     def feed(self, frame: FieldFrame) -> None:
-        """Update the current disturbance with a frame without a track.
+        """Update the current disturbance, if any, with a frame that belongs to no track.
 
-        Its field may increase and reach further sensors.
+        The disturbance may grow stronger and affect additional sensors.
 
         Parameters
         ----------

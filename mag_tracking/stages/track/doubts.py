@@ -24,27 +24,29 @@ NO_STEADY_PATH = 'no_steady_path'
 ANOTHER_VEHICLE = 'another_vehicle'
 
 PERMANENT = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
-"""Doubts that persist until the end of a track, because its path was distorted. Other implausible
-states may be corrected by later frames."""
+"""Doubts that persist until the end of a track, because they show that its path is distorted. Other
+implausible states may be corrected by later frames."""
 
 MEANINGS = {
     ANOTHER_PLACE: 'another position is still possible',
     ANOTHER_ARRIVAL: 'another arrival direction is still possible',
     NOT_SEEN_APPROACHING: 'the target was not seen approaching: it started near the sensors, or '
-                          'the track began in the tail of a lost track',
+                          'the track began while the target of a lost track was still detected',
     SENSORS_AT_ONE_PLACE: 'the network has one sensor, or all sensors are within two metres: range '
-                          'and size are not observable and follow from the settings',
-    ONE_SENSOR: 'only one of several sensors provides readings, or did for too long',
-    FELT_BY_ONE_SENSOR: 'only one sensor senses the target: range and size are not observable and '
-                        'follow from the settings',
+                          'and moment are not observable and follow from the settings',
+    ONE_SENSOR: 'only one of several sensors provides readings, or too much of the track is based '
+                'on a single sensor',
+    FELT_BY_ONE_SENSOR: 'only one sensor senses the target: range and moment are not observable '
+                        'and follow from the settings',
     DOUBTFUL_BACKGROUND: 'the background of a sensor is doubtful',
-    SENSORS_CONTRADICT: 'the sensors contradict each other without a majority',
+    SENSORS_CONTRADICT: 'the sensors contradict each other, and no majority agrees',
     MISFIT: 'the field does not fit the best hypothesis',
     CONTRADICTION: 'the probability of the field given the best hypothesis is below 1e-5',
     OVERFIT: 'the filter fits the latest frames much better than the path of its hypothesis does',
     DISTURBANCE_MODEL: 'a smooth field without a target explains the frames about as well as '
                        'the target',
-    INNOVATIONS: 'the innovations of the latest frames or of the track exceed their covariance',
+    INNOVATIONS: 'the innovations of the latest frames, or of the whole track, are too large for '
+                 'their covariance',
     SENSORS_ROTATED: 'the track requires larger mounting errors than configured',
     HEIGHT: 'the height of the source is implausible for its kind of vehicle',
     OFF_THE_ROAD: 'the target passes all sensors on one side, outside the configured lanes',

@@ -17,8 +17,8 @@ from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 MAX_SINGLE_SENSOR_S = 0.5
-"""Maximum time for which only one of several sensors may support a track [s]. After this time the
-track stays ambiguous."""
+"""Maximum total time for which only one of several sensors may support a track [s]. After this
+time, the track stays ambiguous."""
 
 LOST = 'target lost'
 OUT_OF_REACH = 'out of reach'
@@ -26,8 +26,8 @@ UNEXPLAINED = 'unexplained'
 """Reasons for the end of a track."""
 
 UNEXPLAINED_S = 3.0
-"""A track ends when a disturbance has explained it better than a target for this time [s], unless a
-target explained it better before."""
+"""A track ends when a disturbance has explained its frames better than a target for this time [s],
+unless a target explained them better at an earlier time."""
 
 CONTRADICTION = 1e-5
 """Probability below which a field contradicts the track of a vehicle. The filter is still updated
@@ -35,7 +35,7 @@ with such a field. It may then follow a wrong path that agrees with all later fr
 
 OVERFIT_NATS = float(np.log(1e4))
 """Maximum excess of the log-likelihood in the filter over the log-likelihood along the path of the
-same hypothesis [nats]. An extended Kalman filter linearises each frame at another state. It may
+same hypothesis [nats]. An extended Kalman filter linearises each frame at a different state. It may
 therefore fit the frames better than any single path can."""
 
 MIN_OBSERVED_FRACTION = 0.5
@@ -48,14 +48,15 @@ noise by this number of standard deviations."""
 
 TRANSIENT_DOUBTS = (doubts.OVERFIT, doubts.DISTURBANCE_MODEL, doubts.INNOVATIONS, doubts.MISFIT,
                     doubts.HEIGHT, doubts.OFF_THE_ROAD, doubts.NO_STEADY_PATH)
-"""Doubts about the filter at a single time. Smoothing resolves them only in part."""
+"""Doubts that concern the filter at individual frames. Smoothing resolves them only in part."""
 
 TRANSIENT_S = 0.1
 """Time for which a transient doubt persists after the frame in which it was found [s]. A doubt that
 is absent from a single frame may reappear in the next."""
 
 MAX_SEGMENTS = 5000
-"""Maximum number of stored segments of doubtful poses. A smoothed track has fewer."""
+"""Maximum number of stored time segments with doubtful poses. A track that is short enough to be
+smoothed has fewer."""
 
 
 class TrackEvidence:
@@ -87,9 +88,9 @@ class TrackEvidence:
         self._doubtful_times: DoubtfulTimes = ()
         # Latest timestamp of each transient doubt.
         self._last_found_ns: dict[str, int] = {}
-        # Expiry of each other doubt with a limited duration.
+        # Expiry of each doubt that was flagged for a limited time.
         self._expiry_ns: dict[str, int] = {}
-        # Segments in which smoothed poses are also doubtful.
+        # Time segments in which smoothed poses are also doubtful.
         self._smoothed_segments: list[tuple[int, int]] = []
         self._min_spread = np.inf
         # Per sensor: whitened energy of its fields in excess of noise, and number of axes.
@@ -127,7 +128,7 @@ class TrackEvidence:
         self._doubts.add(reason)
 
     def drop_explained_doubts(self) -> None:
-        """Drop the doubts that another vehicle explains."""
+        """Drop the doubts that the field of another vehicle explains."""
         self._doubts -= {doubts.CONTRADICTION, doubts.INNOVATIONS, doubts.SENSORS_CONTRADICT,
                          *doubts.PERMANENT}
         self.innovations = InnovationConsistency(len(self.largest))
@@ -156,7 +157,7 @@ class TrackEvidence:
 
     def flag_interval(self, reason: str, stamp_ns: int, seconds: float,
                       since_ns: int | None = None) -> None:
-        """Mark the poses of a limited time as doubtful.
+        """Mark the poses within a limited time as doubtful.
 
         Parameters
         ----------
@@ -167,15 +168,15 @@ class TrackEvidence:
         seconds : float, s
             Duration of the doubt.
         since_ns : int, ns, optional
-            Earlier time from which smoothed poses are also doubtful. By default, no smoothed pose
-            is.
+            Earlier time from which smoothed poses are also doubtful. By default, smoothed poses are
+            not affected.
         """
         self._expiry_ns[reason] = until_ns = stamp_ns + round(seconds * NS)
         if since_ns is not None:
             self._smoothed_segments.append((since_ns, until_ns))
 
     def check_approach(self, frame: FieldFrame) -> None:
-        """Mark the track as doubtful if its field did not grow as for an approaching target.
+        """Mark the track as doubtful if a frame makes the approach test fail.
 
         Parameters
         ----------
@@ -217,7 +218,7 @@ class TrackEvidence:
         return int(np.count_nonzero(self.sensed)) < 2
 
     def note(self, found: set[str], stamp_ns: int) -> set[str]:
-        """Record the doubts about the pose of a frame.
+        """Record the doubts about the pose of a frame, and add the earlier doubts that persist.
 
         Parameters
         ----------
@@ -287,12 +288,13 @@ class TrackEvidence:
         return reasons
 
     def doubts_filter(self, gain: float, stamp_ns: int, window_s: float) -> bool:
-        """Update and return whether the filter fits the frames much better than its path.
+        """Update and return whether the filter fits the frames much better than the path does.
 
         Parameters
         ----------
         gain : float, nats
-            Log-likelihood gain of the path over the filter, for the latest frames.
+            Log-likelihood along the path of the hypothesis, minus its log-likelihood in the filter,
+            for the latest frames.
         stamp_ns : int, ns
             Timestamp of the latest frame.
         window_s : float, s
@@ -320,10 +322,10 @@ class TrackEvidence:
         return are_doubtful((*self._doubtful_times, *self._smoothed_segments), stamp_ns)
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
-        """Add to the time for which only one of several sensors supported the track.
+        """Accumulate the time with only one supporting sensor; flag the track if it is too long.
 
-        A single sensor determines neither the scale nor the mirror image, and the other sensors do
-        not always correct the error when they return.
+        A single sensor determines neither the scale of a track nor which of two mirror images is
+        correct. The other sensors do not always correct the error when they measure again.
 
         Parameters
         ----------
@@ -355,9 +357,9 @@ class TrackEvidence:
         track : Track
             The latest pose.
         spread : float, m
-            Standard deviation of the horizontal position of its hypothesis alone. Differences
-            between hypotheses are excluded, because they do not depend on the distance of the
-            target.
+            Standard deviation of the horizontal position of the published hypothesis alone.
+            Differences between hypotheses are excluded, because they do not depend on the distance
+            of the target.
         is_coming : bool
             Whether the target is approaching the sensors. An approaching target is not out of
             reach, however uncertain its position.

@@ -117,7 +117,7 @@ class Filter {
     // Filters a hypothesis, `x` (wide) and `P` (n_x, wide), through all frames; returns the
     // log-likelihood. The linearisation points are `path` (n, n_x). NaN linearises at the
     // prediction, and repeats the update at its own result, `iterations` times in total. A frame
-    // whose normalised innovation exceeds `strange` per axis is not used for an update.
+    // whose normalised innovation squared exceeds `strange` per axis is not used for an update.
     INLINE double run(const Frames& frames, bool first_is_updated, double strange, int iterations,
                       const double* near_field_length, const double* path, double* x, double* P,
                       Path& out) {
@@ -173,7 +173,7 @@ class Filter {
         return is_valid;
     }
 
-    // Smoothed covariances (n, n_x, n_x): P - P L P.
+    // Smoothed covariances (n, n_x, n_x): P - P L P, with the information L of the later frames.
     INLINE void smooth_covariances(const Frames& frames, Path& path, double* out) {
         const int n_x = n_.n_x;
         Numbers information(n_.square()), once(n_.square()), twice(n_.square()), B(3 * n_.wide);
@@ -232,7 +232,7 @@ class Filter {
     }
 
     // Computes the fields h_, their derivative `H` and inflation_ at the state `x`; returns false
-    // if they are not finite.
+    // if one of them is not finite.
     INLINE bool evaluate(const Frame& frame, const double* x, const double* near_field_length,
                          double* H) {
         double at[MAX_TARGET_STATES], total = 0.0;

@@ -22,8 +22,10 @@ class MagnetSettings:
         0.15, 'Margin around the bounding box of the sensors within which the magnet may first '
         'appear.', 'm', (1e-3, 100.0))
     grid_points: int = param(
-        4000, 'Number of points of the coarse grid over that region.', '', (8, 1_000_000))
-    starts: int = param(24, 'Number of best grid points that are refined.', '', (1, 1000))
+        4000, 'Number of points of the coarse grid over the region in which the magnet may first '
+        'appear.', '', (8, 1_000_000))
+    starts: int = param(24, 'Number of grid points that are refined; the best points are used.',
+                        '', (1, 1000))
     speed_std: float = param(0.05, 'Standard deviation of the initial velocity, per axis.', 'm/s',
                              (1e-9, 100.0))
     spin_std: float = param(0.5, 'Standard deviation of the initial angular velocity, per axis.',
@@ -33,8 +35,8 @@ class MagnetSettings:
     angular_acceleration: float = param(
         0.2, 'Root spectral density of the angular acceleration.', 'rad/s^1.5', (0.0, 1000.0))
     near_field_length: float = param(
-        5e-4, 'Near-field length of the magnet (lambda in ICASSP11 eq. (9)): near it, the model '
-        'error is the first neglected multipole term.', 'm', (0.0, 1000.0), live=True)
+        5e-4, 'Near-field length of the magnet (lambda in ICASSP11 eq. (9)). Near the magnet, the '
+        'model error is the first neglected multipole term.', 'm', (0.0, 1000.0), live=True)
     axis: tuple[float, ...] = param(
         (0.0, 0.0, 1.0), 'Direction of the moment in the frame of the magnet.',
         '', (-1.0, 1.0), length=3)
@@ -57,7 +59,7 @@ def magnet_model(settings: MagnetSettings) -> Magnet:
 def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldFrame,
                  background_std: float, own_covariance: FloatArray, relative_std: float
                  ) -> FilterBank | None:
-    """Return the hypotheses of a magnet at its first frame, at any position.
+    """Return the hypotheses of a magnet at its first frame, for any position near the sensors.
 
     The moment is projected out at each point of a coarse grid. The best grid points are refined.
     Each distinct optimum becomes a hypothesis, weighted by its fit.

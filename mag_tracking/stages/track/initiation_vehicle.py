@@ -30,12 +30,12 @@ class VehicleSettings:
     arrival_names: tuple[str, ...] = param(
         ('left', 'right', 'rear'), 'Names of the arrival directions.')
     arrival_headings_deg: tuple[float, ...] = param(
-        (0.0, 180.0, 90.0), 'Heading on arrival, one per arrival name; 0 = along x, '
-        'anticlockwise. The arrival lines pass through the centre of the network.',
+        (0.0, 180.0, 90.0), 'Heading on arrival, one per arrival name, measured anticlockwise from '
+        'x. The arrival lines pass through the centre of the network.',
         'deg', (-360.0, 360.0))
     lateral_offsets: tuple[float, ...] = param(
-        (-4.0, 0.0, 4.0), 'Lateral offsets of the starting lines from each arrival line; positive '
-        'to the left.', 'm', (-1000.0, 1000.0))
+        (-4.0, 0.0, 4.0), 'Lateral offsets of the starting lines from each arrival line. Positive '
+        'offsets are to the left of the heading.', 'm', (-1000.0, 1000.0))
     lateral_std: float = param(1.5, 'Standard deviation of the lateral distance from a starting '
                                'line.', 'm', (1e-3, 1000.0))
     along_std: float = param(3.0, 'Standard deviation of the starting distance along the line.',
@@ -43,8 +43,8 @@ class VehicleSettings:
     max_start_distance: float = param(
         30.0, 'Maximum starting distance from the outermost sensor.', 'm', (0.1, 10000.0))
     speeds: tuple[float, ...] = param((5.0, 10.0, 20.0), 'Initial speeds.', 'm/s', (0.01, 200.0))
-    speed_std: float = param(0.3, 'Standard deviation of an initial speed, relative to it.', '',
-                             (1e-3, 10.0))
+    speed_std: float = param(0.3, 'Standard deviation of each initial speed, as a fraction of the '
+                             'speed.', '', (1e-3, 10.0))
     cross_speed_std: float = param(
         0.1, 'Standard deviation of the velocity across the heading, relative to the initial '
         'speed.', '', (1e-3, 10.0))
@@ -56,17 +56,17 @@ class VehicleSettings:
         (2, 20))
     kinds: tuple[str, ...] = param(
         ('small', 'car', 'truck'), 'Names of the kinds of vehicle; the evidence selects one per '
-        'track. The settings down to near_field_lengths have one value per kind.')
+        'track. Each setting from lengths to near_field_lengths has one value per kind.')
     lengths: tuple[float, ...] = param(
         (0.0, 3.0, 9.0), 'Initial length of the row of dipoles (TSP14 eq. (10)), which is somewhat '
-        'shorter than the vehicle. 0 = a point target. If all kinds are points, the filter is '
-        'several times faster. For kinds above 4 m, the covariance of the published middle covers '
-        'the part of the vehicle beyond its magnetic row.', 'm', (0.0, 1000.0))
+        'shorter than the vehicle. 0 selects a point target. If all kinds are points, the filter '
+        'is several times faster. For kinds above 4 m, the covariance of the published position '
+        'allows for the part of the vehicle beyond the row.', 'm', (0.0, 1000.0))
     length_stds: tuple[float, ...] = param(
         (0.0, 1.0, 3.0), 'Standard deviation of the length; 0 for points.', 'm', (0.0, 1000.0))
     moments: tuple[float, ...] = param(
         (120.0, 400.0, 1600.0), 'Initial magnitude of the moment. TSP14 gives 300 to 600 for cars '
-        'and about 1800 for trucks, which moment_stds covers.', 'A m^2', (1e-6, 1e6))
+        'and about 1800 for trucks, which the default moment_stds cover.', 'A m^2', (1e-6, 1e6))
     moment_stds: tuple[float, ...] = param(
         (45.0, 150.0, 600.0), 'Standard deviation of the total hard iron moment, per axis.',
         'A m^2', (1e-6, 1e6))
@@ -86,18 +86,20 @@ class VehicleSettings:
         0.4, 'Fraction of the initial moment that a field of 50 uT would induce: soft iron D = '
         'share x moment x mu0 / 50 uT along each axis of the vehicle, m = Rz (m0 + D Rz^T B0/mu0). '
         'TSP14 Tables V and VI give 0.26 for a car (its D times three); T10 Table 6.9, as fitted '
-        'here, gives 0.42. No effect without an earth field.', '', (0.0, 10.0))
+        'here, gives 0.42. The setting has no effect if the network has no earth field.', '',
+        (0.0, 10.0))
     induced_share_std: float = param(
-        0.3, 'Standard deviation of the induced share: once common to the three axes, and once '
-        'more for each axis. The axes of the car in MITRE12 differ by a third of their mean (RMS), '
+        0.3, 'Standard deviation of the induced share. It applies twice: in common to the three '
+        'axes, and again independently to each axis. '
+        'The axes of the car in MITRE12 differ by a third of their mean (RMS), '
         'which is 0.13 here; a larger value compensates for errors of the model.', '',
         (0.0, 10.0))
     acceleration: float = param(
         1.0, 'Root spectral density of the horizontal acceleration.', 'm/s^1.5', (0.0, 1000.0))
     turn_acceleration: float = param(
         3.0, 'Standard deviation of the lateral acceleration of turning hypotheses; each straight '
-        'hypothesis has a turning counterpart. 0 = no turning hypotheses, half the number of '
-        'hypotheses.', 'm/s^2', (0.0, 100.0))
+        'hypothesis has a turning counterpart. 0 disables turning hypotheses, which halves the '
+        'number of hypotheses.', 'm/s^2', (0.0, 100.0))
     turn_time: float = param(1.5, 'Correlation time of the turn rate.', 's', (0.01, 1000.0))
     turn_share: float = param(
         0.5, 'Fraction of vehicles that turn near the sensors.', '', (1e-6, 0.999999))
@@ -117,7 +119,7 @@ PER_KIND = ('lengths', 'length_stds', 'moments', 'moment_stds', 'difference_stds
 
 
 def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehicle:
-    """Return the source model of the settings; it has no soft iron without an earth field.
+    """Return the source model of the settings; soft iron has no effect without an earth field.
 
     Parameters
     ----------
@@ -131,8 +133,8 @@ def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehic
     Raises
     ------
     SettingsError
-        If lists that belong together differ in length, a kind is listed twice, or a point has a
-        spread.
+        If lists that belong together differ in length, if a kind is listed twice, or if the
+        length or moment differences of a point have a standard deviation.
     """
     for names, item, lists in (('arrival_names', 'arrival name', ('arrival_headings_deg',)),
                                ('kinds', 'kind', PER_KIND)):
@@ -204,8 +206,8 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
     """Return the hypotheses of a vehicle at its first frame.
 
     There is one hypothesis for each combination of kind, arrival line, moment direction, lateral
-    offset and speed. Each starts at the first position on its line at which its field has the
-    measured energy.
+    offset and speed, and a turning copy of each if turning is enabled. A hypothesis starts at the
+    first position on its line at which its field has the measured energy.
 
     Parameters
     ----------
@@ -251,7 +253,7 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
 
 
 def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float) -> FilterBank:
-    """Bank with a straight and a turning copy of each hypothesis, if vehicles turn."""
+    """Bank with a straight and a turning copy of each hypothesis, if turning is enabled."""
     if not model.turn_acceleration:
         return bank
     n, w = len(bank), len(model.state_names) - 1
@@ -279,7 +281,7 @@ class _MeasuredEnergy:
 def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
                         measured: _MeasuredEnergy, R: FloatArray, moments: FloatArray,
                         height: float) -> FloatArray:
-    """First position (n_offsets, n_moments, 3) on each line with the measured field energy."""
+    """First position (n_offsets, n_moments, 3) on each line at which the field energy matches."""
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(settings.max_start_distance, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])
@@ -313,7 +315,7 @@ def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
 
 def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: float,
                         moment_std: float) -> FloatArray:
-    """Initial covariance of a hypothesis that arrives along a direction.
+    """Initial covariance of a hypothesis that arrives from a given direction.
 
     Parameters
     ----------

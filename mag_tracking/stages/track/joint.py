@@ -1,4 +1,4 @@
-"""Joint explanation of the latest frames of a track by its vehicles and a new vehicle."""
+"""Joint explanation of the latest frames of a track by several vehicles."""
 
 from dataclasses import dataclass
 
@@ -16,16 +16,16 @@ high, because the evidence treats model errors as independent between frames and
 overconfident."""
 
 IMPLAUSIBLE_NATS = 60.0
-"""The same limit for two vehicles that cross, or that overtake at a speed ratio above
-`OVERTAKING_RATIO` [nats]. Such traffic is rarer than a flipped axis or a train with a similar
-field."""
+"""The limit in place of `CONFIDENT_NATS` if a new vehicle crosses another vehicle, or if one
+overtakes at a speed ratio above `OVERTAKING_RATIO` [nats]. Such traffic is rarer than a flipped
+axis or a train with a similar field."""
 
 CROSSING_COSINE = 0.9
 """Two vehicles cross if the cosine of the angle between their velocities is smaller than this in
 magnitude."""
 
 OVERTAKING_RATIO = 1.8
-"""Maximum usual speed ratio of two vehicles moving in the same direction."""
+"""Maximum plausible speed ratio of two vehicles that move in the same direction."""
 
 MIN_MOVING_SPEED = 1.0
 """Minimum speed of vehicles whose directions are compared [m/s]. The heading of slower vehicles is
@@ -34,7 +34,7 @@ unknown."""
 
 @dataclass(frozen=True)
 class JointExplanation:
-    """Joint hypotheses of the tracked vehicles and a new vehicle, whose states come last."""
+    """Joint hypotheses of all vehicles; the states of new or relocated vehicles come last."""
 
     bank: FilterBank
     """Hypotheses at the latest frame of the window."""
@@ -45,19 +45,19 @@ class JointExplanation:
     log_odds: float
     """Log-odds of this explanation against the current track [nats]."""
     replaced: int | None
-    """Index in the track of the vehicle that the last vehicle, or the last two vehicles, replace.
-    None if no vehicle is replaced."""
+    """Index in the track of the vehicle that is replaced by the last vehicle, or by the last two
+    vehicles. None if no vehicle is replaced."""
     adds: bool
     """Whether the explanation has one vehicle more than the track."""
 
     def doubtful(self, n_one: int) -> tuple[int, ...]:
-        """Indices of the vehicles that may be wrong.
+        """Indices of the vehicles whose states may be wrong.
 
         - All vehicles of an explanation below `CONFIDENT_NATS`, or below `IMPLAUSIBLE_NATS` if
           vehicles cross or one is much faster.
-        - A vehicle that was found at another position.
-        - Two vehicles that replace one and move in the same direction, because a long vehicle with
-          large model errors resembles them.
+        - A vehicle that was found at another position than its track.
+        - Two vehicles that replace one vehicle and move in the same direction, because a long
+          vehicle with large model errors resembles two vehicles.
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
 def are_sensed_by_two(joint: JointExplanation) -> bool:
     """Whether at least two sensors sense each new vehicle.
 
-    A field at only one sensor may be a fault of this sensor.
+    A field that only one sensor measures may be a fault of this sensor.
 
     Parameters
     ----------

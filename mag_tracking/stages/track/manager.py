@@ -27,31 +27,30 @@ from mag_tracking.stages.track.target import target_of
 from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (scale not observable with one sensor)'
-ALONE = 'frames without a start (scale not observable with one sensor)'
+ALONE = 'frames in which no track could start (scale not observable with one sensor)'
 
 DISTURBANCE_TRACKS = 'tracks explained by a disturbance'
 
-STARTED_IN_TAIL = 'tracks started in the tail of a lost track, in a larger field'
+STARTED_IN_TAIL = 'tracks started in a larger field after the target of a detection was lost'
 
 RESTART_ENERGY_RATIO = 4.0
-"""Minimum energy of the first frame after a lost track, relative to the maximum energy of the lost
-track (twice its field). In the tail of a pass the field only decreases."""
+"""Minimum energy of the frame in which a track starts after a lost track, relative to the maximum
+energy of the lost track (twice the field). While a vehicle departs, its field only decreases."""
 
 
 class TrackManager:
     """Track management: turns frames with a detection verdict into tracks.
 
-    While a target is present, there is one `Track` per frame and target. Smoothed poses follow:
-    with a fixed lag during the track, and for the complete track at its end. Vehicles that appear
-    during a track become its members.
+    While a target is present, the manager returns one `Track` per frame and target. Smoothed poses
+    follow with a fixed lag during the track, and for the whole track at its end. Vehicles that
+    appear during a track become members of the track.
 
     Parameters
     ----------
     network : SensorNetwork
     settings : TrackSettings
     clocks : ClockComparison, optional
-        Clock comparison with earlier passes, which is continued. By default, a new comparison
-        starts.
+        Clock comparison from earlier passes, to be continued. By default, a new comparison starts.
 
     Attributes
     ----------
@@ -76,8 +75,8 @@ class TrackManager:
         self._last_ns: int | None = None
         # [T^2] Maximum energy of the field since the start of the latest track.
         self._max_energy = 0.0
-        # [T^2] After a lost target, a track starts only if the energy of the field exceeds this
-        # limit; None if no target was lost in the present detection.
+        # [T^2] After a target was lost, a track starts only if the energy of the field exceeds this
+        # limit; None if no target was lost in the current detection.
         self._restart_energy: float | None = None
         self._next_network: SensorNetwork | None = None
         self._disturbances = Disturbances(network.names)
@@ -131,7 +130,7 @@ class TrackManager:
             self._doubtful_by_sensor = {self._network.index(name): t for name, t in times.items()}
 
     def _doubtful_sensors(self, *frames: FieldFrame) -> list[int]:
-        """Indices of the sensors whose backgrounds are doubtful in one of the frames."""
+        """Indices of the sensors whose backgrounds are doubtful in any of the frames."""
         return [j for j, times in self._doubtful_by_sensor.items()
                 if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
 
@@ -143,11 +142,11 @@ class TrackManager:
 
     @property
     def bank(self) -> FilterBank | None:
-        """Hypotheses of the first running track; None without a track."""
+        """Hypotheses of the first running track; None if no track is running."""
         return self._tracks[0].bank if self._tracks else None
 
     def feed(self, frame: FieldFrame) -> list[TrackRecord]:
-        """Update the tracks with a frame.
+        """Start, update or end tracks with a frame, and return the resulting records.
 
         Parameters
         ----------
@@ -213,7 +212,7 @@ class TrackManager:
         return self._end_all('input ended', self._last_ns)
 
     def _end_at_gap(self, frame: FieldFrame) -> list[TrackRecord]:
-        """End all tracks if time jumped back or the gap before the frame is too long."""
+        """End all tracks after a jump back in time or too long a gap, and return their records."""
         if self._last_ns is None:
             return []
         dt = (frame.stamp_ns - self._last_ns) / NS
@@ -223,7 +222,7 @@ class TrackManager:
         return self.end_tracks('gap in the frames') if dt > self._settings.end_gap_s else []
 
     def _end_all(self, reason: str, stamp_ns: int | None) -> list[TrackRecord]:
-        """End every running track and disturbance, at the latest frame."""
+        """End every running track and the current disturbance, and return their records."""
         tracks, self._tracks = self._tracks, []
         out = [record for track in tracks for record in track.end(reason)]
         if stamp_ns is None:
@@ -239,7 +238,7 @@ class TrackManager:
         return out
 
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
-        """Update every running track with the frame, and delete the tracks that end."""
+        """Update every running track with the frame, and delete the tracks that have ended."""
         doubtful = self._doubtful_sensors(frame)
         self._max_energy = max(self._max_energy, _energy(frame))
         for track in self._tracks:
@@ -251,7 +250,7 @@ class TrackManager:
         """Delete the tracks that ended, and return the records of their disturbances."""
         out = self._unexplained([track for track in self._tracks if track.ended is not None],
                                 stamp_ns)
-        # A vehicle that restarts in the tail of its detection would be placed on the wrong line.
+        # A track that restarts while the vehicle departs would be placed on the wrong line.
         if any(track.is_lost for track in self._tracks) and not self._target.starts_anywhere:
             self._restart_energy = RESTART_ENERGY_RATIO * self._max_energy
         self._tracks = [track for track in self._tracks if track.ended is None]
@@ -265,7 +264,7 @@ class TrackManager:
             self._recent.popleft()
 
     def _initiate(self, frame: FieldFrame) -> list[TrackRecord]:
-        """Start a track and run it through the frames before the detection."""
+        """Start a track, if possible, with the frames before the detection; return its records."""
         if len(self._network) == 1 and not self._settings.single_sensor_prior:
             self.counts[NO_SCALE] += 1
             self._restart_energy = np.inf
@@ -286,7 +285,7 @@ class TrackManager:
                                   bank_filter.observation.own_covariance)
         self._recent.clear()
         if bank is None:
-            self.counts['frames without a start'] += 1
+            self.counts['frames in which no track could start'] += 1
             return []
         self.counts['tracks'] += 1
         is_in_tail = self._restart_energy is not None

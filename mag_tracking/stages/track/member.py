@@ -25,7 +25,8 @@ from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
 
 MAX_POSITIONS = 64
-"""Number of stored recent positions, which distinguish a target from another target."""
+"""Number of stored recent positions. If two vehicles replace one, they show which of the two
+continues the track."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,8 @@ class MemberView:
     """Index of the published hypothesis."""
     observation: Observation
     gain: float
-    """Log-likelihood gain of the path of this hypothesis over the filter, for the latest frames
-    [nats]."""
+    """Log-likelihood along the path of this hypothesis, minus its log-likelihood in the filter, for
+    the latest frames [nats]."""
 
 
 class Member:
@@ -83,7 +84,7 @@ class Member:
     ended : str or None
         Reason for the end; None while the target is tracked.
     is_lost : bool
-        Whether the track ended while the target was still detected.
+        Whether the member ended while the target was still detected.
     early : list of TrackState
         Smoothed states of the time before the target shared its state with other targets.
     slot : int
@@ -249,7 +250,7 @@ class Member:
         return reasons | evidence.doubts
 
     def _overfits(self, update: BankUpdate, view: MemberView) -> bool:
-        """Update and return whether the filter fits the frames much better than its path."""
+        """Update and return whether the filter fits the frames much better than the path does."""
         overfits = self.evidence.doubts_filter(view.gain, update.frame.stamp_ns,
                                                update.settings.relinearise_window_s)
         if overfits:
@@ -274,7 +275,7 @@ class Member:
         return self.evidence.reason_to_end(self.last, self._position_std, is_coming, settings)
 
     def unexplained(self, uniform: float) -> UnexplainedField | None:
-        """Field of the track, if a target never explained it.
+        """Field of the track if no target has ever explained it.
 
         Parameters
         ----------
@@ -284,7 +285,7 @@ class Member:
         Returns
         -------
         UnexplainedField or None
-            None if a target explained it.
+            None if a target has explained the field.
         """
         if self._was_unambiguous or self.last is None \
                 or self.evidence.bayes_factor.disfavoured_s(self.last.stamp_ns) <= 0.0:
@@ -328,7 +329,7 @@ class Member:
         best : int
             Index of the hypothesis.
         complete : bool
-            Whether the states cover the complete track.
+            Whether the states cover the whole track.
         states : list of TrackState
         doubtful : bool
             Whether all poses are marked as ambiguous.
@@ -351,8 +352,8 @@ def members_in_order(members: Sequence[Member], new: Member | None, joint: Joint
                      n_one: int) -> list[Member]:
     """Return the members and a new target in the order of the states of a joint explanation.
 
-    If two vehicles replace one, the old member becomes the vehicle that is nearer to its published
-    positions.
+    If two vehicles replace one member, this member continues as the vehicle whose path is nearer to
+    its published positions.
 
     Parameters
     ----------

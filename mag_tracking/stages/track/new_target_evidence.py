@@ -1,4 +1,4 @@
-"""Triggers for comparing a track with other explanations of its frames, and their acceptance."""
+"""Triggers and acceptance criteria for comparing a track with other explanations of its frames."""
 
 import numpy as np
 from scipy.special import chdtrc
@@ -10,7 +10,8 @@ FALSE_ALARM = 1e-3
 """Significance level of the latest innovations below which a new target is searched for."""
 
 WINDOW_S, MIN_INTERVAL_S = 0.25, 0.15
-"""Duration of the latest frames that are tested, and minimum interval between two searches [s]."""
+"""Duration of the latest frames that are tested, and minimum interval before a comparison that
+improbable innovations trigger [s]."""
 
 LONG_INTERVAL_S, INTERVAL_GROWTH = 0.3, 1.5
 """Interval after which a long vehicle is compared with two vehicles [s], and factor by which this
@@ -25,11 +26,11 @@ IMPROBABLE, LONG_VEHICLE = 'improbable innovations', 'a long vehicle'
 
 
 class NewTargetEvidence:
-    """Decision when to compare a track with an explanation that has one more vehicle.
+    """Decision when to compare a track with other explanations, and whether to accept one.
 
     A comparison is due when the latest innovations are improbable. A model of one long vehicle may
-    explain two short vehicles without improbable innovations. Long vehicles are therefore also
-    compared at intervals.
+    explain two short vehicles without improbable innovations. A track of a long vehicle is
+    therefore also compared at intervals.
     """
 
     def __init__(self) -> None:

@@ -1,9 +1,9 @@
 """Search for a new vehicle in the frames of a running track.
 
-Three other explanations of the relinearisation window are tried: a further vehicle; two vehicles in
-place of one, because two vehicles may have misled the filter of one; and one of the vehicles at
-another position. Each explanation is filtered and smoothed along its path like any hypothesis. Its
-evidence is compared with the evidence of the current track.
+Three other explanations of the frames in the relinearisation window are tried: an additional
+vehicle; two vehicles in place of one, because two vehicles may have misled the filter of a single
+vehicle; and one of the vehicles at another position. Each explanation is filtered and smoothed
+along its path like any hypothesis. Its evidence is compared with the evidence of the current track.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,7 +53,7 @@ MIN_DISPLACEMENT_M = 2.0
 """Minimum distance from the track at which a vehicle counts as found at another position [m]."""
 
 MAX_RATIO = 5.0
-"""Maximum speed and moment of a new vehicle, relative to the largest of the settings."""
+"""Maximum speed and moment of a new vehicle, relative to the largest values in the settings."""
 
 LOG_P_LOST = np.log(0.01)
 """Log-probability that the track of a vehicle was at a wrong position during the whole window."""
@@ -63,7 +63,7 @@ N_DISTANCES = 10
 
 
 class NewTargetSearch:
-    """Search for explanations of a window with a further vehicle or a vehicle elsewhere.
+    """Search for explanations by an additional vehicle, or by a vehicle at another position.
 
     Parameters
     ----------
@@ -76,8 +76,8 @@ class NewTargetSearch:
         Number of vehicles of the track.
     vehicles : VehicleState
     reason : str
-        Reason from `NewTargetEvidence.due`. If the innovations are not improbable, only two
-        vehicles in place of one are searched for.
+        Reason from `NewTargetEvidence.due`. Without improbable innovations, the search is
+        restricted to two vehicles in place of one.
     may_add : bool
         Whether a vehicle may be added.
     """
@@ -103,7 +103,7 @@ class NewTargetSearch:
 
         Returns
         -------
-        Joint or None
+        JointExplanation or None
             None if no such explanation is usable.
         """
         if not len(self._search.samples.t):
@@ -135,7 +135,7 @@ class NewTargetSearch:
 
     def _best_of(self, starts: Sequence[WindowStart], track_evidence: float
                  ) -> JointExplanation | None:
-        """Best explanation; `track_evidence` is the log-evidence of the current track."""
+        """Explanation by refined starts; `track_evidence` is the log-evidence of the track."""
         refined = self._add_turning_starts(self._refine_starts(starts))
         prior = LOG_P_ARRIVAL if len(refined[0].kind) > self._n_targets else LOG_P_LOST
         bank, log_likelihood, log_w, paths = self._run_starts(refined)
@@ -143,7 +143,7 @@ class NewTargetSearch:
                               float(log_sum_exp(log_w)) + prior - track_evidence)
 
     def _current_track(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-        """Leading hypotheses of the current track, along their paths.
+        """Run the leading hypotheses of the current track along their paths.
 
         Returns their indices in the bank (n,), log-likelihoods (n,), log-weights after these frames
         (n,) and paths (n, n_frames, n_x).
@@ -163,7 +163,7 @@ class NewTargetSearch:
         return order, track_log_likelihood, before + track_log_likelihood, paths
 
     def _leading_indices(self, rows: IntArray, log_w: FloatArray) -> list[int]:
-        """Indices into `rows` of the best hypothesis of each arrival and kind, to be tried."""
+        """Indices into `rows` of the hypotheses to be tried: the best of each arrival and kind."""
         tried: set[tuple[int, ...]] = set()
         n_max = MAX_KNOWN if self._n_targets == 1 else 1
         chosen: list[int] = []
@@ -176,7 +176,7 @@ class NewTargetSearch:
         return chosen
 
     def _known_vehicles(self, row: int, log_w: float, path: FloatArray) -> KnownVehicles:
-        """Vehicles of a hypothesis of the track, with its log-weight at the anchor."""
+        """Vehicles of hypothesis `row` of the track; `log_w` is its log-weight at the anchor."""
         at = np.searchsorted(self._window.anchor.origin, self._bank.origin[[row]])
         before = self._window.anchor.rows(at)
         label, kind = (tuple(np.ravel(of[row]).tolist())
@@ -217,7 +217,7 @@ class NewTargetSearch:
 
     def _starts_beside(self, known: KnownVehicles, replaced: int | None = None
                        ) -> list[WindowStart]:
-        """Starts with a further vehicle, which is new or replaces vehicle `replaced`."""
+        """Starts with an additional vehicle, which is new or replaces vehicle `replaced`."""
         search = self._search.beside(known)
         return [start for theta in search.best(self._search.grid, MAX_FIRST)
                 for start in self._starts_on(known, theta[None], search.moments(theta), replaced)]
@@ -233,7 +233,7 @@ class NewTargetSearch:
 
     def _starts_on(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
                    replaced: int | None) -> list[WindowStart]:
-        """Starts of known vehicles and new vehicles on `paths` (k, 7) with moments (k, 3, 3)."""
+        """Starts of known vehicles and of new ones with `paths` (k, 7) and `moments` (k, 3, 3)."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
         labels = self._search.prior.nearest_line(paths)[0].tolist()
         starts = []
@@ -251,7 +251,7 @@ class NewTargetSearch:
         return starts
 
     def _sensors_at_start(self) -> FloatArray:
-        """Covariance of the states of the sensors at the start of a track."""
+        """Covariance of the sensor states at the start of a track."""
         observation, std = self._filter.observation, self._vehicles.background_std
         return block_diag(*observation.own_covariance,
                           std**2 * np.eye(3 * len(observation.positions)))
@@ -264,7 +264,7 @@ class NewTargetSearch:
                 if log_w[k] >= log_w.max() - MAX_LOSS_NATS]
 
     def _add_turning_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Starts in which the new vehicles go straight, and in which one of them turns."""
+        """Each start with straight new vehicles, and its copies in which one new vehicle turns."""
         fraction = self._vehicles.settings.turn_share
         out = []
         for start in starts:
@@ -304,7 +304,7 @@ class NewTargetSearch:
     def _are_plausible(self, start: WindowStart, x: FloatArray) -> bool:
         """Whether speeds and moments of the new vehicles in the state `x` (n_x,) are plausible.
 
-        A stationary vehicle is not new.
+        A stationary vehicle cannot have arrived during the window.
         """
         settings, n = self._vehicles.settings, self._n_one
         for i in start.new_indices:

@@ -11,12 +11,11 @@ from mag_tracking.physics.mounting import rotated_fields
 from mag_tracking.physics.sources import SourceModel
 
 MAX_ROTATION = np.deg2rad(15.0)
-"""[rad] Maximum standard deviation of a mounting angle. Larger values are limited, because the
-rotations are of first order. `TrackManager` counts the affected sensors."""
+"""[rad] Maximum standard deviation of a mounting angle. Larger values are limited to it, because
+rotations are approximated to first order. `TrackManager` counts the affected sensors."""
 
 TIME_RESOLUTION_S = 1e-3
-"""[s] Samples closer than this are treated as simultaneous: at 20 m/s a target moves two
-centimetres."""
+"""[s] Resolution of sampling times. At 20 m/s, a target moves two centimetres in this time."""
 
 
 def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
@@ -42,16 +41,17 @@ def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
 
 
 class Observation:
-    """Predicted fields of a network for hypotheses, and the layout of the states of the sensors.
+    """Predicted fields of a network for hypotheses, and the layout of the sensor states.
 
-    The state begins as described in `inference/hypothesis.hpp`: the states of `n_targets` targets
-    of one model, one after the other; their fields are added. The states of each sensor follow:
-    three mounting angles [rad] if they are estimated, and three model errors in units of their
-    standard deviation if `error_time` is not 0.
+    The state begins with the states of `n_targets` targets of one model, one after the other; the
+    fields of the targets are added. The states of each sensor follow: three mounting angles [rad]
+    if they are estimated, and three model errors in units of their standard deviation if
+    `error_time` is not 0. The backgrounds of all sensors [T] come last, as described in
+    `inference/hypothesis.hpp`.
 
     The model errors represent the field that the target model neglects near a vehicle. They are
     first-order Gauss-Markov processes with the correlation time `error_time`, so that their weight
-    does not depend on the frame period. Without `error_time`, the error is independent noise in
+    does not depend on the frame period. If `error_time` is 0, the error is independent noise in
     every frame.
 
     Parameters
@@ -59,9 +59,10 @@ class Observation:
     network : SensorNetwork
     model : SourceModel
     mounting_std : float, rad
-        Standard deviation of the mounting angles for sensors without `orientation_std`; 0 = the
-        angles are not estimated.
+        Standard deviation of the mounting angles for sensors without `orientation_std`. If it is 0,
+        the mounting angles of no sensor are estimated.
     error_time : float, s
+        Correlation time of the model errors.
     n_targets : int, optional
 
     Attributes
@@ -70,14 +71,14 @@ class Observation:
     R_sw : (n_sensors, 3, 3) array
         World to sensor.
     n_angles : int
-        Number of mounting angles per sensor.
+        Number of estimated mounting angles per sensor: 3 or 0.
     n_targets : int
     n_one : int
         Number of states per target.
     n_target : int
         Number of states of all targets.
     own_covariance : (n_sensors, n_own, n_own) array
-        Covariance of the states of each sensor at the start of a track.
+        Covariance of the mounting angles and model errors of each sensor at the start of a track.
     single_target : Observation
         Measurement model of one target.
     """
@@ -107,7 +108,7 @@ class Observation:
 
     @property
     def n_own(self) -> int:
-        """Number of states per sensor, between those of the targets and the backgrounds."""
+        """Number of mounting angles and model errors per sensor."""
         return self.own_covariance.shape[1]
 
     def n_states(self, n_sensors: int) -> int:
@@ -124,7 +125,7 @@ class Observation:
         return self.n_target + (self.n_own + 3) * n_sensors
 
     def own(self, x: FloatArray) -> FloatArray:
-        """States of each sensor, without the backgrounds.
+        """Mounting angles and model errors of each sensor.
 
         Parameters
         ----------
@@ -214,7 +215,7 @@ class Observation:
         return positions
 
     def drift(self, dt: FloatArray, background_density: float) -> tuple[FloatArray, FloatArray]:
-        """Decay and process noise of the states of the sensors.
+        """Decay and process noise of the sensor states.
 
         Parameters
         ----------
@@ -248,6 +249,7 @@ class Observation:
         -------
         h : (n_hyp, n_sensors, 3) array, T, sensor frame
         H : (n_hyp, n_sensors, 3, n_target) array
+            Derivative with respect to the states of the targets.
         variance : (n_hyp, n_sensors) array, T^2
             Variance of the model error near the targets; the errors of different targets are
             independent.
@@ -280,7 +282,7 @@ class Observation:
 
     def field_of(self, x: FloatArray, targets: Iterable[int], time_offset: FloatArray
                  ) -> FloatArray:
-        """Field of selected targets.
+        """Field of selected targets at the sampling time of each sensor.
 
         Parameters
         ----------
@@ -322,8 +324,9 @@ class Observation:
         -------
         h : (n_hyp, n_sensors, 3) array, T, sensor frame
         H : (n_hyp, n_sensors, 3, n_target + n_own) array
+            Derivative with respect to the states of the targets and the states of the sensor.
         inflation : (n_hyp, n_sensors) array, T^2
-            Variance of a model error that is independent in every frame; else 0.
+            Variance of the model error; 0 if the model errors are states.
 
         References
         ----------

@@ -23,7 +23,7 @@ NEAR_ERROR_LENGTH = 0.2
 """[m] Near a sensor, the relative error is at least this length divided by the distance."""
 
 MAX_SENSORS = 4
-"""Maximum number of sensors. The sensors with the strongest fields are used."""
+"""Maximum number of sensors in a fit. The sensors with the strongest fields are used."""
 
 N_STEPS, TOLERANCE = 30, 1e-3
 """Maximum number of steps, and the relative improvement of the cost below which the search ends."""
@@ -40,15 +40,15 @@ class PassSamples:
     positions: FloatArray
     """(n, 3) [m] Sensor positions, world frame."""
     M: FloatArray
-    """(n, 3, 3) Rotation from world to sensor, and whitening."""
+    """(n, 3, 3) Whitening matrix times rotation from world to sensor."""
     clock: IntArray
     """(n,) Clock of each sample; see `SteadyPass`."""
     y: FloatArray
     """(3 n,) Whitened fields; 0 for missing axes."""
     backgrounds: FloatArray
-    """(3 n, q) Whitened columns of the backgrounds."""
+    """(3 n, q) Whitened fields of unit backgrounds, one column for each axis of a sensor."""
     n_values: int
-    """Number of measured values."""
+    """Number of measured axes in all samples."""
 
     @property
     def n_clocks(self) -> int:
@@ -56,7 +56,7 @@ class PassSamples:
         return len(self.compared) - 1
 
     def n_free(self, n_dipoles: int) -> int:
-        """Degrees of freedom that remain for the path after backgrounds and moments.
+        """Degrees of freedom that remain after the backgrounds and moments have been estimated.
 
         Parameters
         ----------
@@ -69,7 +69,7 @@ class PassSamples:
         return self.n_values - self.backgrounds.shape[1] - 3 * n_dipoles
 
     def with_near_field_error(self, path: FloatArray) -> 'PassSamples':
-        """Samples whose noise includes the model error near the sensors.
+        """Copy of the samples with noise that includes the model error near the sensors.
 
         Parameters
         ----------

@@ -10,7 +10,7 @@ from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 from mag_tracking.stages.track.observation import Observation
 
 P_MOUNTING = 0.05
-"""Probability that correctly mounted sensors need mounting angles as large as the limit."""
+"""Probability that the estimated mounting angles of correctly mounted sensors exceed the limit."""
 
 P_HEIGHT = 1e-3
 """Probability that the height of a vehicle differs from the height of its kind by more than the
@@ -27,21 +27,21 @@ MIN_SPEED = 1.0
 MAX_RELATIVE_MOVE = 0.75
 """Maximum motion of a target within a frame, relative to its distance to the second nearest sensor.
 Fields are averaged over the frame, with a relative error of about half the square of this ratio.
-The error of a single sensor that is passed closely does not mislead a track."""
+The nearest sensor is ignored, because the error of a single sensor does not mislead a track."""
 
 
 class Plausibility:
     """Doubts about the states of a vehicle along its track."""
 
     def __init__(self) -> None:
-        # Per origin of a hypothesis: smallest distance to a sensor so far, and whether the path was
-        # off the road there.
+        # For each origin of hypotheses: smallest distance to a sensor so far, and whether the
+        # hypothesis was off the road at this point.
         self._nearest: FloatArray = np.zeros(0)
         self._was_off_road: BoolArray = np.zeros(0, dtype=bool)
 
     def evaluate(self, observation: Observation, bank: FilterBank, best: int,
                  settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
-        """Update the closest points with a frame, and return the doubts about a hypothesis.
+        """Update the closest points of all hypotheses; return the doubts about one of them.
 
         Parameters
         ----------
@@ -77,7 +77,7 @@ class Plausibility:
 
     def _update_road_check(self, bank: FilterBank, settings: VehicleSettings,
                            positions: FloatArray) -> None:
-        """Update for each hypothesis its closest point, and whether it was off the road there."""
+        """Update the closest point of each hypothesis, and whether it was off the road there."""
         n_added = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
         self._nearest = np.append(self._nearest, np.full(n_added, np.inf))
         self._was_off_road = np.append(self._was_off_road, np.zeros(n_added, dtype=bool))
@@ -121,7 +121,7 @@ def _is_moving(x: FloatArray) -> BoolArray:
 
 def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray
                   ) -> bool:
-    """Whether a target moves too far within a frame.
+    """Whether the motion of a target within a frame exceeds `MAX_RELATIVE_MOVE`.
 
     Parameters
     ----------
@@ -135,6 +135,7 @@ def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positio
     Returns
     -------
     bool
+        False if there is only one sensor.
     """
     distances = np.sort(np.linalg.norm(position - positions, axis=1))
     displacement = float(np.hypot(velocity[0], velocity[1])) * dt

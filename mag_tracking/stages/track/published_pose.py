@@ -30,7 +30,8 @@ NEGLIGIBLE_WEIGHT = 1e-6
 covariances."""
 
 AMBIGUOUS_WEIGHT = 0.05
-"""A track is ambiguous if other positions, or other arrival directions, exceed this weight."""
+"""A track is ambiguous if the total weight of the hypotheses at other positions, or with other
+arrival directions, exceeds this value."""
 
 
 Flags: TypeAlias = tuple[bool, bool, bool]
@@ -42,7 +43,7 @@ OrientationEstimate: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, Flags
 
 
 class Orientation(Protocol):
-    """Interface for the orientation of a target from its state; see `VehicleOrientation`."""
+    """Interface that computes an orientation from a target state; see `VehicleOrientation`."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
         """Return quaternion, derivative, variance of the unobservable part, and flags."""
@@ -61,7 +62,7 @@ class Orientation(Protocol):
 
 
 class PoseFields(TypedDict):
-    """Fields of `Track` and `SmoothedPose` that follow from a target state."""
+    """Entries of `Track` and `SmoothedPose` that are computed from a target state."""
 
     position: FloatArray
     velocity: FloatArray
@@ -179,15 +180,16 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     found : set of str
         Doubts about the pose, without the ambiguities of the bank.
     unobserved_length : UnobservedLength or None
-        Uncertainty of the middle of a vehicle due to its length; None for a small target.
+        Uncertainty of the middle of a vehicle due to its unobserved length; None for a magnet.
     excess : float, optional
-        Ratio of the actual to the expected innovations; it scales the covariance.
+        Ratio of the actual to the expected variance of the innovations, by which the covariance is
+        multiplied.
     ambiguous_poses : str, optional
         Setting `track.ambiguous_poses`.
     difference : (6,) array, m and m/s
-        Difference to another possible position and velocity, which the covariance must cover.
+        Difference from another possible position and velocity, which the covariance must cover.
     stamp_ns : int, ns
-        This and the following parameters are fields of `Track`.
+        This and the following parameters are entries of `Track`.
     id : int
     ended : bool
     existence : float
@@ -235,8 +237,9 @@ def covariance_about(bank: FilterBank, best: int, model: SourceModel, is_separat
                      ) -> FloatArray:
     """Covariance about the state of a hypothesis, from all hypotheses at the same position.
 
-    These hypotheses differ in their linearisation, kind of target and motion. Their differences are
-    part of the error. Hypotheses at other positions make the track ambiguous instead.
+    Hypotheses at the same position differ in linearisation, kind of target and motion; these
+    differences are part of the error. Hypotheses at other positions make the track ambiguous
+    instead.
 
     Parameters
     ----------
@@ -356,7 +359,7 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
                   unobserved_length: UnobservedLength | None, difference: FloatArray,
                   stamp_ns: int, id: int, kind: int, kinds: Sequence[str], ambiguous: bool,
                   complete: bool) -> SmoothedPose:
-    """Record of a smoothed state.
+    """Record of the pose that belongs to a smoothed state.
 
     Parameters
     ----------
@@ -391,7 +394,7 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
 def _pose_fields(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray,
                  kind: int, unobserved_length: UnobservedLength | None, difference: FloatArray
                  ) -> tuple[PoseFields, Flags]:
-    """Fields of a record from a target state, and flags of the unobservable rotations."""
+    """Compute the entries of a record, and the flags of unobservable rotations, from a state."""
     dipoles = model.dipoles(x[None])
     dm_dx = dipoles.dm_dx[0].sum(axis=0)
     length, length_std = 0.0, 0.0

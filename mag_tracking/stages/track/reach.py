@@ -1,4 +1,4 @@
-"""Field energy of a target at the sensors, from the states of its track."""
+"""Energy of the field of a target at the sensors, computed from the states of its track."""
 
 import numpy as np
 
@@ -9,8 +9,9 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.relinearisation import Window
 
 NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
-"""Field energy per frame, in units of the noise, below which a target is not detectable, and below
-which it does not disturb other targets."""
+"""Field energy per frame, in units of the noise, below which a target that moves away is removed
+from a joint track. The larger limit applies if the track has the maximum number of targets. It is
+also the limit up to which the field of a target does not disturb other targets."""
 
 DETECTABLE_ENERGY = 4.0
 """Minimum field energy of a detectable target, in units of the noise. For a tracked vehicle, it
@@ -60,7 +61,7 @@ def field_energy(bank_filter: BankFilter, target: int, state: FloatArray, frame:
 
 def first_weak_frame(bank_filter: BankFilter, target: int, window: Window | None, origin: int
                      ) -> int:
-    """Index of the first frame of a window from which a target is no longer detectable.
+    """Index of the frame after the last one in which the energy of a target exceeds `WEAK_ENERGY`.
 
     Parameters
     ----------
@@ -74,11 +75,11 @@ def first_weak_frame(bank_filter: BankFilter, target: int, window: Window | None
     Returns
     -------
     int
-        0 without a window.
+        0 if there is no window, or if the energy never exceeds `WEAK_ENERGY`.
     """
     if window is None:
         return 0
     row = int(np.searchsorted(window.anchor.origin, origin))
-    felt = [field_energy(bank_filter, target, path[row], frame) > WEAK_ENERGY
-            for path, frame in zip(window.paths, window.frames, strict=True)]
-    return max((k for k, is_felt in enumerate(felt) if is_felt), default=-1) + 1
+    are_strong = [field_energy(bank_filter, target, path[row], frame) > WEAK_ENERGY
+                  for path, frame in zip(window.paths, window.frames, strict=True)]
+    return max((k for k, is_strong in enumerate(are_strong) if is_strong), default=-1) + 1

@@ -1,14 +1,14 @@
 """Relinearisation of the leading hypotheses of a running track along their smoothed paths.
 
 An extended Kalman filter linearises each frame at the state predicted at that time. Far from the
-sensors the prediction is metres off. The filter becomes overconfident there and remains so.
-Therefore the latest frames are filtered and smoothed again, with motion and field linearised along
-the smoothed path of each leading hypothesis. These are damped Gauss-Newton steps on the path. If
-they converge, the state at the end of the path replaces the state of the filter, with the larger of
-both covariances. If they do not converge, the state is retained, but a larger covariance of the
-path is adopted. The filter may be overconfident in this case: a filter that is linearised at
-different states gains information about directions that no single path can observe (Julier and
-Uhlmann 2001 found this for maps).
+sensors, the error of the prediction is several metres. The filter becomes overconfident there and
+remains so. Therefore the latest frames are filtered and smoothed again, with motion and field
+linearised along the smoothed path of each leading hypothesis. Each such pass is a damped
+Gauss-Newton step on the path. If the steps converge, the state at the end of the path replaces the
+state of the filter, with the larger of both covariances. If they do not converge, the state is
+retained, but the covariance of the path is adopted if it is larger. The filter may be overconfident
+in this case: a filter that is linearised at different states gains information about directions
+that no single path can observe (Julier and Uhlmann 2001 found this for maps).
 
 The likelihood of the frames along the path does not measure convergence. The model error and the
 drift of a moment are proportional to the moment, so the steps minimise a different cost. For the
@@ -34,26 +34,28 @@ from mag_tracking.stages.track.bank_filter import BankFilter, PathResult
 from mag_tracking.units import NS
 
 MAX_LOG_RATIO = np.log(1e3)
-"""Maximum difference between the largest log-weight and the log-weight of a leading hypothesis."""
+"""Maximum difference between the largest log-weight and the log-weight of a hypothesis that is
+relinearised."""
 
 PASSES = 3
 """Number of Gauss-Newton steps per relinearisation. The next relinearisation continues from the
 result."""
 
 STEP_SIZE = 0.5
-"""Damping of each step. Undamped steps overshoot where the field is strongly nonlinear, and
+"""Damping factor of each step. Undamped steps overshoot where the field is strongly nonlinear, and
 diverge."""
 
 CONVERGED = 0.3
-"""Maximum movement of a converged path in the last step, in standard deviations of the position."""
+"""Maximum distance of the smoothed positions from a converged path in the last step, in standard
+deviations of the position."""
 
 ATTEMPTED, FAILED = 'paths relinearised', 'paths relinearised without success'
 """Keys of the event counts."""
 
 MAX_FRAMES = 64
-"""Maximum number of frames in a window. When it moves, at most half of them remain. Without this
-limit, a window of several seconds at 100 frames per second would exceed the capacity of one
-core."""
+"""Maximum number of frames in a window. When the window moves, at most half of this number remain.
+Without this limit, a window of several seconds at 100 frames per second would exceed the capacity
+of one core."""
 
 MAX_ELEMENTS = 5_000_000
 """Maximum product of frames, hypotheses and squared number of states. With many sensors, fewer
@@ -82,7 +84,7 @@ class Window:
 
 
 class Relinearisation:
-    """Window of the latest frames of a running track, with the path of each hypothesis.
+    """Relinearisation over a window of the latest frames, with the path of each hypothesis.
 
     Parameters
     ----------
@@ -106,7 +108,7 @@ class Relinearisation:
     def clear(self) -> None:
         """Discard the window."""
         self._anchor: FilterBank | InitialBank | None = None
-        # {origin: log-likelihood gain of the path over the filter}, at the last relinearisation.
+        # Log-likelihood gain of each path at the last relinearisation, by origin; see `gain`.
         self._gain: dict[int, float] = {}
 
     def begin(self, anchor: FilterBank | InitialBank) -> None:
@@ -172,7 +174,7 @@ class Relinearisation:
             self._last_ns = frame.stamp_ns
 
     def _keep_hypotheses(self, anchor: FilterBank | InitialBank, mask: BoolArray) -> None:
-        """Keep only the hypotheses of the anchor in `mask`."""
+        """Drop all hypotheses of the anchor that are not in `mask`."""
         anchor.keep(mask)
         self._paths = [path[mask] for path in self._paths]
         self._log_likelihoods = [of_frame[mask] for of_frame in self._log_likelihoods]
@@ -243,7 +245,8 @@ class Relinearisation:
         i : int
             Index of the target.
         n : int
-            Index of the first frame in which the target is not detectable. The window begins there.
+            Index of the frame from which the field of the target is weak; see `first_weak_frame`.
+            The window is shortened to begin at this frame.
         """
         if self._anchor is None or self._is_stale or n >= len(self._frames):
             self.restart()
@@ -271,7 +274,7 @@ class Relinearisation:
         self._last_ns = window.frames[-1].stamp_ns
 
     def gain(self, origin: int) -> float:
-        """Log-likelihood gain of a path over the filter, for the latest frames.
+        """Log-likelihood along a path minus the log-likelihood in the filter, in the window.
 
         Parameters
         ----------
@@ -316,7 +319,7 @@ class Relinearisation:
 
     def _run_along(self, bank_filter: BankFilter, bank: FilterBank, paths: FloatArray,
                    passes: int) -> PathResult:
-        """Run hypotheses of the anchor along their paths (n_rows, n, n_x); both are modified."""
+        """Run hypotheses of the anchor along `paths` (n_rows, n, n_x); update both in place."""
         n = paths.shape[1]
         return bank_filter.run_along(
             bank, self._frames[:n], self._intervals[:n], paths, passes=passes, step=STEP_SIZE,
@@ -332,9 +335,9 @@ def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArr
 
 def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
                        nearly_linear: Callable[[FloatArray], FloatArray]) -> None:
-    """Adopt larger covariances of paths, in place, widened by the difference of the states.
+    """Adopt the larger covariances of paths, in place, widened by the difference of the states.
 
-    Covariances that are too large for the next linear update are not adopted.
+    A covariance is not adopted if it is too large for the next linear update.
     """
     difference = x - bank.x[rows]
     wide_P = P + difference[:, :, None] * difference[:, None]

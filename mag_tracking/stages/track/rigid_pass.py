@@ -46,14 +46,15 @@ GOOD_MISFIT, MAX_MISFIT = 1.3, 1.5
 it."""
 
 P_CLOCKS, P_BEND = 1e-5, 1e-3
-"""Significance levels for clock offsets, and for a bent path: probability that correct clocks, or a
-straight motion, improve the fit by as much."""
+"""Significance levels for clock offsets, and for a bent path: probability that noise alone improves
+the fit significantly although the clocks are correct, or although the motion is straight."""
 
 MIN_DISTANCE = 1.0
-"""[m] Clock offsets that move the target by less than this are harmless."""
+"""[m] Clock offsets are harmless if the target moves by less than this during the offset."""
 
 MIDDLE_STD = 0.5
-"""[m] Standard deviation of the magnetic centre of a vehicle between sensors."""
+"""[m] Standard deviation with which the apparent magnetic centre of a vehicle varies from sensor to
+sensor."""
 
 MAX_DISTANCE, MAX_SPEED = 30.0, 100.0
 """[m], [m/s] Maximum distance of a tracked vehicle from the nearest sensor, and its maximum
@@ -73,9 +74,9 @@ class RigidPass:
     stamp_ns: int
     """Time of the strongest field; time zero of the paths."""
     straight: float
-    """Cost of a straight path."""
+    """Cost of a straight path at constant speed, without clock offsets."""
     bent: float
-    """Cost of a path with acceleration and turn rate."""
+    """Cost of a path with acceleration and turn rate, without clock offsets."""
     cost_with_offsets: float
     """Cost of a straight path at constant speed with free clock offsets."""
     freedom: int
@@ -86,8 +87,8 @@ class RigidPass:
     reference: int
     """Index of the sensor with the strongest field; its clock is the reference."""
     offset: FloatArray
-    """(n_sensors,) [s] Time by which each clock is ahead of the reference; NaN = not compared or
-    not observable."""
+    """(n_sensors,) [s] Time by which each clock is ahead of the reference; NaN if the clock was not
+    compared or its offset is not observable."""
     offset_std: FloatArray
     """(n_sensors,) [s] Standard deviation due to noise and model error alone; 0 for the
     reference."""
@@ -95,7 +96,7 @@ class RigidPass:
     """(3,) [m] Position at the time of the strongest field, on the straight path with free clock
     offsets."""
     velocity: FloatArray
-    """(3,) [m/s] Velocity on this path."""
+    """(3,) [m/s] Velocity on the straight path with free clock offsets."""
     straight_paths: FloatArray
     """(k, 6) [m], [m/s] Positions and velocities at the time of the strongest field, for straight
     paths of a short and of a long row that explain the pass about as well as bent paths."""
@@ -124,12 +125,12 @@ class RigidPass:
         """
         offsets = positions - self.position
         square = max(float(self.velocity @ self.velocity), 1e-12)
-        places = self.position + (offsets @ self.velocity / square)[:, None] * self.velocity
-        nearest: FloatArray = places[np.argmin(np.linalg.norm(places - positions, axis=1))]
+        points = self.position + (offsets @ self.velocity / square)[:, None] * self.velocity
+        nearest: FloatArray = points[np.argmin(np.linalg.norm(points - positions, axis=1))]
         return nearest
 
     def difference(self, stamp_ns: int, state: FloatArray) -> FloatArray:
-        """Horizontal difference between a state and the nearest of the `straight_paths`.
+        """Horizontal difference of a state from the nearest of the `straight_paths`.
 
         Parameters
         ----------
@@ -158,7 +159,7 @@ class RigidPass:
 
     @property
     def widening(self) -> float:
-        """Factor on the variances if the residuals are larger than expected."""
+        """Factor on the variances, above 1 if the residuals are larger than expected."""
         return max(self.cost_with_offsets / self.freedom, 1.0)
 
     def clock_variance(self, sensor: int) -> float:
@@ -187,7 +188,7 @@ class RigidPass:
 
     @property
     def is_straight(self) -> bool:
-        """Whether the path needs neither a bend nor acceleration."""
+        """Whether turn rate and acceleration do not improve the fit significantly."""
         gain = (min(self.straight, self.cost_with_offsets) - self.bent) / self.widening
         return bool(gain <= chdtri(N_PATH - N_STRAIGHT, P_BEND))
 
@@ -250,7 +251,7 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
 
 
 class _RowFits(NamedTuple):
-    """Fits of a row of dipoles, on a straight and on a bent path."""
+    """Fits of one row of dipoles, on a straight path and on a bent path."""
 
     straight: FloatArray
     """(6,) Position and velocity of the straight path at time zero."""
@@ -266,7 +267,7 @@ class _RowFits(NamedTuple):
 
     @property
     def needs_no_bend(self) -> bool:
-        """Whether the straight path may explain the pass and the bent path is hardly better."""
+        """Whether the straight path explains the pass, and the bent path hardly better."""
         n_more = N_PATH - N_STRAIGHT
         gain = (self.cost - self.cost_bent) / max(self.misfit, 1.0)
         return bool(self.cost <= MAX_MISFIT * (self.freedom + n_more)
@@ -275,7 +276,7 @@ class _RowFits(NamedTuple):
 
 def _fit_long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, adds_starts: bool
               ) -> _RowFits:
-    """Fit a long row, starting from the paths of a short row; `adds_starts` adds starts."""
+    """Fit a long row from the paths of a short row; `adds_starts` adds starts for the bent path."""
     near = data.with_near_field_error(bent)
     starts = np.array([straight, bent, straight, bent])
     starts[2:, PATH.index('length')] = LONG_LENGTH
@@ -292,6 +293,6 @@ def _state_at_zero(path: FloatArray) -> FloatArray:
 
 
 def _is_of_vehicle(state: FloatArray, positions: FloatArray) -> bool:
-    """Whether a state (6,) is possible for a vehicle that passes sensors (n, 3)."""
+    """Whether a vehicle near sensors (n, 3) may have a state (6,), by its distance and speed."""
     nearest = np.linalg.norm(state[:3] - positions, axis=1).min()
     return bool(nearest < MAX_DISTANCE and np.linalg.norm(state[3:]) < MAX_SPEED)

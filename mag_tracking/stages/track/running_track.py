@@ -1,8 +1,8 @@
 """A running track: its members, their published poses, and the evidence for and against them.
 
 A track usually has one target. Targets whose fields overlap at the sensors are members of one track
-and share a state, because a field that is attributed to the wrong target is missing in the correct
-target.
+and share a state. Otherwise, a field could be attributed to the wrong target, and would be missing
+from the evidence for the correct target.
 
 Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 """
@@ -40,7 +40,7 @@ UNDECIDED_S = 1.0
 """[s] Duration of the doubt after another explanation was about as probable as the track."""
 
 DOUBTED_S = 3.0
-"""[s] Duration of the doubt about the vehicles of an uncertain explanation."""
+"""[s] Duration of the doubt about the uncertain vehicles of an accepted explanation."""
 
 TrackRecord = Track | SmoothedPose | Disturbance
 """Output of the tracker."""
@@ -86,13 +86,13 @@ class RunningTrack:
         self._bank = TrackBank(target, settings, sensors, bank_filter, bank, counts, later_sensors)
         self.members = [Member(id, target, sensors, counts, clocks, 0)]
         self._new_target_evidence = NewTargetEvidence()
-        # Whether the last search could not add a member, because there are too many.
+        # Whether the track had the maximum number of members at the last search.
         self._is_at_limit = False
         self._handover_due: int | None = None
         self._use_bank_sensors(False)
 
     def _use_bank_sensors(self, is_handover: bool) -> None:
-        """Switch to the sensors of the bank."""
+        """Restart the reference models and the cross-checks with the sensors of the bank."""
         sensors = self._bank.sensors
         self._no_target = NoTarget(len(sensors.network), self._settings.background_std)
         self._disturbance_model = DisturbanceModel(sensors.network, self._settings.background_std,
@@ -140,14 +140,14 @@ class RunningTrack:
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
-        """Process the frames before the detection, and publish the frame of the detection.
+        """Process the frames before the detection; return the records of the detection's frame.
 
         Parameters
         ----------
         frame : FieldFrame
             Frame of the detection, of the whole network.
         recent : list of FieldFrame
-            Frames before it, oldest first.
+            Frames before the detection, oldest first.
         approach_unobserved : bool, optional
             Whether the recent frames do not show the approach of the target.
 
@@ -175,7 +175,7 @@ class RunningTrack:
         return self.step(frame, dt)
 
     def step(self, frame: FieldFrame, dt: float, publish: bool = True) -> list[TrackRecord]:
-        """Predict, update and weight the bank, and publish the frame if requested.
+        """Predict, update and weight the bank with a frame, and return the records.
 
         Parameters
         ----------
@@ -184,6 +184,7 @@ class RunningTrack:
         dt : float, s
             Time since the previous frame.
         publish : bool, optional
+            Whether to return the records of the frame.
 
         Returns
         -------
@@ -215,7 +216,7 @@ class RunningTrack:
         return [*out, *lagged_poses, *self._end_lost_members(advance.frame)]
 
     def _view(self, i: int, best: int) -> MemberView:
-        """Bank of member `i` alone; `best` is the index of the joint hypothesis."""
+        """View of member `i` alone; `best` is the index of the best joint hypothesis."""
         bank = self.bank.extract_target(i, self._bank.single_target.n_target)
         row = best if bank is self.bank else bank.best()
         return MemberView(bank, row, self._bank.single_target, self._bank.gain(row))
@@ -228,7 +229,7 @@ class RunningTrack:
             for member in self.members:
                 member.evidence.flag(doubts.SENSORS_CONTRADICT)
         if not np.isfinite(advance.evidence):
-            self.counts['banks lost'] += 1
+            self.counts['frames that no hypothesis explains'] += 1
             return False
         best = self.bank.best()
         no_target = self._no_target.log_density(frame, dt, self._settings.background_drift)
@@ -257,14 +258,14 @@ class RunningTrack:
             bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
 
     def _member_frame(self, i: int, best: int, frame: FieldFrame, dt: float) -> FieldFrame:
-        """Frame with the field of member `i` only, according to hypothesis `best`."""
+        """Frame without the fields that hypothesis `best` predicts for the other members."""
         if len(self.members) == 1:
             return frame
         others = self._bank.filter.field_of_others(self.bank, best, i, frame, dt)
         return replace(frame, field=frame.field - others)
 
     def _is_out_of_reach(self, i: int, frame: FieldFrame) -> bool:
-        """Whether member `i` of several moves away and is no longer detectable."""
+        """Whether the field of member `i` is weak and the member does not approach a sensor."""
         last = self.members[i].last
         assert last is not None
         energy = field_energy(self._bank.filter, i, self.bank.x[self.bank.best()], frame)
@@ -285,7 +286,7 @@ class RunningTrack:
         return out
 
     def _end_member(self, member: Member, reason: str) -> list[TrackRecord]:
-        """End one member, and remove its states from the joint state."""
+        """End one member, remove its states from the joint state, and return its records."""
         if len(self.members) == 1:
             self.is_lost = member.is_lost
             return self.end(reason)
@@ -329,7 +330,7 @@ class RunningTrack:
 
     def _smoothed(self, i: int, view: MemberView, complete: bool, states: list[TrackState],
                   doubtful: bool) -> list[SmoothedPose]:
-        """Smoothed poses of member `i`; if complete, also the poses before it shared its state."""
+        """Smoothed poses of member `i`, also from before it shared its state if `complete`."""
         member, n = self.members[i], self._bank.single_target.n_target
         own_states = member.states_of(member.slot if complete else i, n, states)
         return member.smoothed(view.bank, view.best, complete,
@@ -337,7 +338,7 @@ class RunningTrack:
 
     @property
     def unexplained(self) -> list[UnexplainedField]:
-        """Fields of the ended members that a target never explained."""
+        """Fields of the ended members that no target has ever explained."""
         found = [m.unexplained(self._disturbance_model.uniform) for m in self.members if m.ended]
         return [u for u in found if u is not None]
 
@@ -346,8 +347,9 @@ class RunningTrack:
 
         Returns
         -------
-        Joint or None
-            None if no other explanation is sufficiently probable.
+        JointExplanation or None
+            None if no search is due, or if no other explanation is sufficiently probable. If one is
+            nearly as probable as the track, the track is marked as doubtful for a limited time.
         """
         window, n = self._bank.window, len(self.members)
         if self.ended is not None or self._target.starts_anywhere or window is None \

@@ -21,12 +21,13 @@ _States: TypeAlias = tuple[FloatArray, FloatArray]
 """States and covariances of a bank."""
 
 SENSORS_PER_REJECTION = 8
-"""One in this number of sensors may be rejected, but at least one. If more rejections are needed,
-the track itself is wrong. Sensors far from the target fit any hypothesis."""
+"""Number of sensors per rejected sensor. With fewer sensors, one may be rejected. If more
+rejections are needed, the track itself is wrong. The majority is no proof of the track, because
+sensors far from the target fit any hypothesis."""
 
 
 class SensorRejection:
-    """Update of a bank without the sensors that contradict the others.
+    """Update of a bank that excludes sensors whose measurements contradict the other sensors.
 
     Parameters
     ----------
@@ -39,7 +40,7 @@ class SensorRejection:
         self.clear()
 
     def clear(self) -> None:
-        """Forget the sensors that were rejected in the previous frame."""
+        """Clear the memory of the sensors that were rejected in the previous frame."""
         self._rejected: tuple[int, ...] = ()
 
     def advance(self, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame, dt: float
@@ -62,7 +63,7 @@ class SensorRejection:
         frame : FieldFrame
             The frame that was used, in which rejected sensors are missing.
         counts : Counter of str
-            One rejection for each rejected sensor, by description.
+            For each rejected sensor, one count under the description of this rejection.
         """
         # Copying all states takes as long as the update. If the frame fits the hypothesis that
         # leads before the update, it usually also fits the hypothesis that leads afterwards.

@@ -139,7 +139,7 @@ class SensorSubset:
         Returns
         -------
         SensorSubset
-            The same object if it contains the nearer half of these sensors.
+            The same object if it already contains the nearer half of these sensors.
         """
         place = state[:2] + PREDICTION_S * state[3:5]
         is_enough = np.isin(nearest_sensors(self.whole.positions, place, n // 2), self.rows).all()
@@ -160,7 +160,7 @@ class SensorSubset:
         return bool(offset @ track.velocity[:2] < 0.0)
 
     def for_whole_network(self, track: Track, settings: TrackSettings) -> Track:
-        """Extend a track of these sensors to the whole network.
+        """Extend a track record of these sensors to all sensors of the network.
 
         Parameters
         ----------
@@ -219,20 +219,20 @@ def _state_columns(n_t: int, n_own: int, n_sensors: int) -> IntArray:
 
 def for_whole_network(track: Track, rows: IntArray, network: SensorNetwork,
                       settings: TrackSettings) -> Track:
-    """Extend a track from its sensors to the whole network.
+    """Extend a track record from the sensors of the track to all sensors of the network.
 
     Parameters
     ----------
     track : Track
     rows : (n,) int array
-        Indices of its sensors in the network.
+        Indices of the sensors of the track in the network.
     network : SensorNetwork
     settings : TrackSettings
 
     Returns
     -------
     Track
-        Values of the other sensors are NaN, except for the prior of their mounting angles.
+        Entries of the other sensors are NaN; their mounting angles have the prior covariance.
     """
     n_sensors = len(network)
     predicted, nis = np.full((n_sensors, 3), np.nan), np.full(n_sensors, np.nan)

@@ -24,16 +24,18 @@ class TrackSettings:
         'no pose (hold), or the best pose with its own covariance (best).', choices=(
             MIXTURE, HOLD, BEST))
     single_sensor_prior: bool = param(
-        False, 'Track with a single sensor (a network of one, or the only sensor that measures). '
+        False, 'Track even if the network has only one sensor, or only one measures at the start. '
         'The scale is not observable from one sensor: moment and range follow from the configured '
         'moments, heights and offsets alone. Such tracks are always ambiguous.')
     field_error: float = param(
-        0.04, 'Error of the predicted field relative to its magnitude (gains, axes, shape).',
+        0.04, 'Error of the predicted field relative to its magnitude (gains and axes of the '
+        'sensors, shape of the target).',
         '', (0.0, 10.0), live=True)
     model_error_time_s: float = param(
         0.3, 'Correlation time of the model error near the target (first-order Gauss-Markov states '
-        'of each sensor), which makes its weight independent of the frame period. 0 = independent '
-        'noise in every frame, which is faster with many sensors.', 's', (0.0, 60.0))
+        'of each sensor). With it, the weight of the error does not depend on the frame period. 0 '
+        'selects independent noise in every frame, which is faster with many sensors.', 's',
+        (0.0, 60.0))
     background_std: float = param(
         2e-8, 'Standard deviation of a background at the start of a track.', 'T', (0.0, 1e-3),
         live=True)
@@ -42,26 +44,27 @@ class TrackSettings:
     mounting_std_deg: float = param(
         5.0, 'Standard deviation of the orientation of a sensor about each axis, relative to the '
         'network file, for sensors without orientation_std_deg. The angles are estimated with each '
-        'track (to first order: at 15 degrees the field is 3 % too large). 0 = exactly as in the '
-        'file, which is several times faster with dozens of sensors.', 'deg', (0.0, 15.0))
+        'track (to first order: at 15 degrees the field is 3 % too large). 0 disables the '
+        'estimation for all sensors, which is several times faster with dozens of sensors.', 'deg',
+        (0.0, 15.0))
     min_bayes_factor: float = param(
         20.0, 'Minimum Bayes factor of a target against a disturbance: a smooth field at each '
         'sensor (temperature, a knock) or over the network (a storm, a power line). The pose is '
-        'ambiguous if the frames of the track do not reach it, or if the factor decreases by '
+        'ambiguous if the factor over the whole track is smaller, or if the factor decreases by '
         'this ratio within a second.', '', (1.0, 1e12), live=True)
     iterations: int = param(
         1, 'Number of linearisations per update. More than one helps if the field is far more '
-        'informative than the prediction (magnets); for vehicles it converges to the wrong side.',
-        '', (1, 20), live=True)
+        'informative than the prediction (magnets). For vehicles, the iterations converge to the '
+        'wrong side of the sensor.', '', (1, 20), live=True)
     max_sensors: int = param(
-        16, 'Maximum number of sensors of a track. In a larger network a track uses the nearest '
-        'sensors, which change as it moves, and it is not smoothed then. The initial hypotheses of '
-        'a vehicle may leave memory (250 MB) for about ten sensors only; the others are added at '
-        'the detection, where smoothing begins in this case, or as the vehicle moves.',
-        '', (2, 1000))
+        16, 'Maximum number of sensors of a track. In a larger network, a track uses the nearest '
+        'sensors. After they change, the track is not smoothed at its end. For the initial '
+        'hypotheses of a vehicle, the memory limit (250 MB) may allow only about ten sensors. The '
+        'remaining sensors are then added at the detection, where smoothing begins in this case, '
+        'or as the vehicle moves.', '', (2, 1000))
     max_joint_targets: int = param(
         4, 'Maximum number of vehicles with overlapping fields that are tracked jointly. '
-        'Each one adds computing time. 1 = a track always has one vehicle.', '', (1, 4))
+        'Each additional vehicle adds computing time. 1 disables joint tracking.', '', (1, 4))
     prune_ratio: float = param(
         1e-12, 'Weight, relative to the heaviest hypothesis, below which a hypothesis is dropped '
         '(T10 Alg. 3).', '', (1e-300, 0.5), live=True)
@@ -75,8 +78,8 @@ class TrackSettings:
     relinearise_window_s: float = param(
         2.0, 'Duration of the window over which the leading hypotheses of a running track are '
         'relinearised along their smoothed paths. It contains the frames of one to two times this '
-        'duration, and no more than 64. 0 disables relinearisation, which takes a fifth less time.',
-        's', (0.0, 60.0))
+        'duration, and no more than 64. 0 disables relinearisation, which reduces the computing '
+        'time by a fifth.', 's', (0.0, 60.0))
     relinearise_interval_s: float = param(
         0.15, 'Interval between relinearisations. Their cost grows with the number of sensors; at '
         '100 frames per second, 0.5 is recommended.', 's', (0.0, 60.0))
@@ -86,20 +89,21 @@ class TrackSettings:
         True, 'Fit a path of steady acceleration and turn rate to the whole pass once a vehicle '
         'has passed, and about four times after that. The fit reveals clock offsets, clipped '
         'sensors, and two vehicles that are tracked as one. If a straight path explains the pass '
-        'and leads elsewhere, the covariance covers it as well.', live=True)
+        'but leads to another position, the covariance covers this position, too.', live=True)
     lookback_s: float = param(
-        1.0, 'Time by which a track begins before its detection, with stored frames. Fields that '
-        'are too weak for a detection still contain information about the origin of the target.',
-        's', (0.0, 60.0))
+        1.0, 'Time before the detection at which a track begins; it uses stored frames. Fields '
+        'that are too weak for a detection still contain information about the origin of the '
+        'target.', 's', (0.0, 60.0))
     end_std: float = param(
         5.0, 'Standard deviation of the horizontal position of the best hypothesis above which a '
         'track ends as out of reach, unless the target approaches the sensors.',
         'm', (1e-6, 1e6), live=True)
     end_nis: float = param(
         25.0, 'Normalised innovation squared per axis above which a track ends after two '
-        'consecutive frames: it has lost its target. A single such frame makes it ambiguous. A '
-        'vehicle is also ambiguous if its innovation is less probable than 1e-5; with two sensors, '
-        'its whole track is.', '', (1.0, 1e12), live=True)
+        'consecutive frames, because it has lost its target. A single such frame makes the pose '
+        'ambiguous. The pose of a vehicle is also ambiguous if the probability of its innovation '
+        'is below 1e-5. With one or two sensors, the whole track is then ambiguous.', '',
+        (1.0, 1e12), live=True)
     end_gap_s: float = param(
         2.0, 'Maximum gap between frames. A track ends at a longer gap.', 's', (1e-3, 86400.0))
     max_smoothing_s: float = param(
@@ -109,7 +113,8 @@ class TrackSettings:
     smoothing_lag_s: float = param(
         0.0, 'Lag of the fixed-lag smoothing. Each pose of a running track is published again '
         'after this time, with the information of the frames since. Every frame then costs a '
-        'twentieth of a millisecond for each frame of the lag. 0 disables it.', 's', (0.0, 10.0))
+        'twentieth of a millisecond for each frame of the lag. 0 disables fixed-lag smoothing.',
+        's', (0.0, 10.0))
     vehicle: VehicleSettings = field(default_factory=VehicleSettings)
     magnet: MagnetSettings = field(default_factory=MagnetSettings)
 

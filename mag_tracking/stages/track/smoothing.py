@@ -31,8 +31,8 @@ TrackState: TypeAlias = tuple[int, FloatArray, FloatArray]
 
 RELINEARISATIONS = 1
 """Number of relinearisations of the whole track at the previous result. They correct for inaccurate
-predictions far from the sensors. One does not reach convergence. Four improve turning cars and
-trucks, but degrade the car along a corridor."""
+predictions far from the sensors. One relinearisation does not reach convergence. Four improve the
+tracks of turning cars and trucks, but degrade the track of a car along a corridor of sensors."""
 
 MAX_ELEMENTS = 10_000_000
 """Maximum product of frames and squared number of states. It corresponds to 80 MB and less than a
@@ -54,7 +54,7 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     intervals : sequence of float, s
         Time from the previous frame to each frame.
     updated : bool, optional
-        Whether the bank has been updated with the first frame.
+        Whether the bank has already been updated with the first frame.
     relinearisations : int, optional
     path : sequence of (n_x,) array, optional
         Known states at the first frames, at which the first pass is linearised.
@@ -103,7 +103,8 @@ class WholeTrack:
     Attributes
     ----------
     is_too_long : bool
-        Whether the track exceeded a limit and cannot be smoothed.
+        Whether the track exceeded a limit or changed its sensors, and cannot be smoothed as a
+        whole.
     """
 
     def __init__(self, max_duration_s: float) -> None:
@@ -120,12 +121,12 @@ class WholeTrack:
         self._is_updated = False
 
     def begin(self, bank: FilterBank | InitialBank, bank_filter: BankFilter) -> None:
-        """Start with a bank before its first frame, and with a copy of the current filter.
+        """Discard all frames, and start with a bank and a copy of its filter.
 
         Parameters
         ----------
         bank : FilterBank or InitialBank
-            The caller must not modify it afterwards.
+            Bank at the first frame. The caller must not modify it afterwards.
         bank_filter : BankFilter
         """
         self.clear()
@@ -133,7 +134,7 @@ class WholeTrack:
             self._start = _TrackStart(copy(bank_filter), bank)
 
     def resume(self, window: Window, bank_filter: BankFilter) -> None:
-        """Continue from a window of another filter; all of its frames count as published.
+        """Restart with a window of another filter; all of its frames count as published.
 
         Parameters
         ----------
@@ -222,7 +223,7 @@ class _LaggedFrame(NamedTuple):
 
 
 class FixedLag:
-    """Smoothing with a fixed lag: the latest frames of a running track, and the bank at each.
+    """Fixed-lag smoother, with the latest frames of a track and the bank after each frame.
 
     Parameters
     ----------

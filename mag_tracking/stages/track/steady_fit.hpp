@@ -61,7 +61,7 @@ class SteadyModel {
     }
 
   private:
-    // Sets the free parameters.
+    // Copies the free parameters into the whole parameter vector.
     INLINE void set_free(const double* theta) {
         for (int c = 0; c < n_free_; ++c) whole_[free_[c]] = theta[c];
     }

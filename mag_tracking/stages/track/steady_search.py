@@ -1,8 +1,8 @@
 """Search for vehicles on straight paths in the frames of a window, given known vehicles.
 
-All quantities in which the field is linear are Gaussian and are marginalised: the moments of the
-vehicle, the backgrounds, and the uncertainty of known vehicles. The remaining parameters describe
-the path. They are searched from a grid of start values.
+The terms in which the field is linear have Gaussian priors and are marginalised: the moments of the
+vehicle, the backgrounds, and the errors of known vehicles. The remaining parameters describe the
+path. They are searched from a grid of start values.
 
 Source: TSP14 sections III.A and V for the row of dipoles; variable projection with priors.
 """
@@ -29,7 +29,7 @@ N_DIPOLES = 3
 """Number of dipoles of the rows in the search; sufficient for a car near a sensor."""
 
 GRID_STEP, GRID_MARGIN = 3.0, 12.0
-"""[m] Spacing of the positions of the grid, and their range beyond the outermost sensor."""
+"""[m] Spacing of the grid along an arrival line, and its range beyond the last sensor."""
 
 SPEED = PATH.index('speed')
 """Column of the speed in a path."""
@@ -42,16 +42,17 @@ MIN_SPEED_RATIO = 0.2
 """Minimum speed of an arriving vehicle, relative to the lowest starting speed."""
 
 N_STARTS, N_STEPS, TOLERANCE = 10, 12, 1e-3
-"""Number of different starts that are refined, maximum number of steps, and the relative
+"""Maximum number of distinct starts that are refined, maximum number of steps, and the relative
 improvement of the cost below which the refinement ends."""
 
 START_TOLERANCE: FloatArray = np.array([4.0, 2.5, 1.0, 5.0, 0.3, 1.0, 3.0])
 PATH_TOLERANCE: FloatArray = np.array([1.0, 1.0, 1.0, 2.0, 0.3, 1.0, 9.0])
-"""[m], [m/s], [rad] Starts, and paths, that differ by no more than this are treated as
-identical."""
+"""[m], [m/s], [rad] Differences of path parameters up to which two starts, or two refined paths,
+are treated as identical."""
 
 KNOWN_STD: FloatArray = np.array([2.0, 1.5, 0.2, 3.0, 0.1, 0.1, 1.5])
-"""[m], [m/s], [rad] Uncertainty of the path of another vehicle in the search."""
+"""[m], [m/s], [rad] Standard deviations of the path of the first vehicle in the search for a
+second vehicle."""
 
 
 @dataclass(frozen=True)
@@ -61,15 +62,15 @@ class PathPrior:
     headings: FloatArray
     """(n,) [rad] Headings of the arrival lines."""
     centre: FloatArray
-    """(2,) [m] Point that all arrival lines pass."""
+    """(2,) [m] Point through which all arrival lines pass."""
     mean: FloatArray
     """(7,) Mean of a straight path; position and heading are relative to the nearest line."""
     std: FloatArray
-    """(7,) Standard deviations."""
+    """(7,) Standard deviations about `mean`; infinite for the position along the line."""
     moment_std: FloatArray
     """(3 d,) [A m^2] Standard deviations of the combinations of moments."""
     min_speed: float
-    """[m/s] Minimum speed of an arriving vehicle. A slower vehicle was there before."""
+    """[m/s] Minimum speed of an arriving vehicle. A slower vehicle was already near the sensors."""
 
     @classmethod
     def of(cls, vehicle: VehicleSettings, network: SensorNetwork) -> 'PathPrior':
@@ -114,6 +115,7 @@ class PathPrior:
         Returns
         -------
         line : (n,) int array
+            Index in `headings`.
         off : (n,) array, rad
             Heading of the path relative to the line.
         """
@@ -163,13 +165,14 @@ class PathPrior:
         starts = []
         for heading in self.headings:
             along = np.array([np.cos(heading), np.sin(heading)])
-            reach = float(np.abs((network.positions[:, :2] - self.centre) @ along).max())
-            places, y, v = (a.ravel() for a in np.meshgrid(
-                np.arange(-vehicle.max_start_distance - reach, GRID_MARGIN + reach, GRID_STEP),
+            half_length = float(np.abs((network.positions[:, :2] - self.centre) @ along).max())
+            x, y, v = (a.ravel() for a in np.meshgrid(
+                np.arange(-vehicle.max_start_distance - half_length, GRID_MARGIN + half_length,
+                          GRID_STEP),
                 offsets, speeds,
                 indexing='ij'))
-            grid = np.tile(self.mean, (len(places), 1))
-            grid[:, :2] = self.centre + places[:, None] * along \
+            grid = np.tile(self.mean, (len(x), 1))
+            grid[:, :2] = self.centre + x[:, None] * along \
                 + y[:, None] * [-along[1], along[0]]
             grid[:, 3], grid[:, 4] = v, heading
             starts.append(grid)
@@ -177,9 +180,9 @@ class PathPrior:
 
 
 class StartGrid:
-    """Grid of start paths, with the field of a point on each.
+    """Grid of start paths, with the field of a point target on each path.
 
-    Quantities that do not depend on known vehicles are computed once for all searches of a window.
+    Arrays that do not depend on known vehicles are computed once for all searches of a window.
 
     Parameters
     ----------
@@ -198,7 +201,7 @@ class StartGrid:
     gram : (n, 3, 3) array
         A'A of the columns A of each path.
     prior_cost : (n,) array
-        Squared normalised difference of each path from the prior.
+        Squared normalised difference of each path from the mean of the prior.
     """
 
     def __init__(self, samples: PassSamples, prior: PathPrior, theta: FloatArray) -> None:
@@ -214,8 +217,8 @@ class StartGrid:
 class SteadySearch:
     """Search for vehicles in the samples of a window, given the known vehicles.
 
-    In a joint search for m vehicles, a row of 7 m numbers contains their paths, and a row of 9 m
-    numbers their moments. In shapes, n is the number of rows and y the number of whitened
+    In a joint search for m vehicles, a row of 7 m parameters describes their paths, and a row of
+    9 m parameters their moments. In shapes, n is the number of rows and y the number of whitened
     measurements.
     """
 
@@ -224,23 +227,23 @@ class SteadySearch:
     known: FloatArray
     """(y,) Whitened field of the known vehicles."""
     columns: FloatArray
-    """(y, q) Whitened fields of one standard deviation of each unknown quantity: backgrounds, and
-    errors of the known vehicles."""
+    """(y, q) Whitened field of each nuisance term at one standard deviation. The nuisance terms are
+    the backgrounds and the errors of the known vehicles."""
 
     @cached_property
     def _model(self) -> SteadyPass:
-        """Row of dipoles in the search."""
+        """Row of dipoles that models a vehicle in the search."""
         return self.samples.straight_model(N_DIPOLES)
 
     @cached_property
-    def _marginal(self) -> MarginalWhitener:
-        """Projection that marginalises the unknown quantities."""
+    def _marginal_whitener(self) -> MarginalWhitener:
+        """Whitening that marginalises the nuisance terms in `columns`."""
         return MarginalWhitener(self.columns)
 
     @cached_property
     def _y(self) -> FloatArray:
-        """Field (y,) to be explained."""
-        return self._marginal(self.samples.y - self.known)
+        """Field (y,) to be explained: without known vehicles, and with marginal whitening."""
+        return self._marginal_whitener(self.samples.y - self.known)
 
     def _solve(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Basis (n, y, 9 m), information (n, 9 m, 9 m), its inverse, and estimate of moments.
@@ -248,7 +251,7 @@ class SteadySearch:
         The inverse is NaN or meaningless for a path through a sensor.
         """
         basis = self._model.basis(theta.reshape(-1, N_STRAIGHT))
-        A = self._marginal(_joined_columns(basis, _n_vehicles(theta)))
+        A = self._marginal_whitener(_joined_columns(basis, _n_vehicles(theta)))
         At = np.swapaxes(A, 1, 2)
         information = At @ A + np.diag(self._moment_std(theta)**-2.0)
         inverse = pseudo_inverse(information)
@@ -259,7 +262,7 @@ class SteadySearch:
         return np.tile(self.prior.moment_std, _n_vehicles(theta))
 
     def cost(self, grid: StartGrid) -> FloatArray:
-        """Cost of a point on each path of a grid.
+        """Cost of a point target on each path of a grid.
 
         Parameters
         ----------
@@ -272,9 +275,10 @@ class SteadySearch:
         """
         n, std = len(grid.theta), self.prior.moment_std[0] * np.sqrt(N_DIPOLES)
         with ignoring_overflow():
-            factor = self._marginal.correction_factor(grid.bases).reshape(-1, n, 3).swapaxes(0, 1)
+            factor = self._marginal_whitener.correction_factor(grid.bases).reshape(
+                -1, n, 3).swapaxes(0, 1)
             information = grid.gram - factor.swapaxes(1, 2) @ factor + np.eye(3) / std**2
-            b = (self._marginal(self._y) @ grid.bases).reshape(n, 3)
+            b = (self._marginal_whitener(self._y) @ grid.bases).reshape(n, 3)
             p = np.einsum('nij,nj->ni', pseudo_inverse(information), b)
             # Residuals are not computed: this is faster, and accurate enough to rank the starts.
             cost: FloatArray = float(self._y @ self._y) - np.einsum('ni,ni->n', p, b) \
@@ -299,7 +303,7 @@ class SteadySearch:
         paths = theta.reshape(-1, N_STRAIGHT)
         A, _, inverse, p = self._solve(theta)
         derivative = self._model.derivative(paths, p.reshape(len(paths), -1))
-        D = self._marginal(_joined_columns(derivative, m))
+        D = self._marginal_whitener(_joined_columns(derivative, m))
         moved = inverse @ (np.swapaxes(A, 1, 2) @ D)
         off, off_J = self.prior.residual_and_jacobian(paths)
         return (np.hstack([self._y - np.einsum('nyi,ni->ny', A, p), -p / std, off.reshape(n, -1)]),
@@ -309,8 +313,8 @@ class SteadySearch:
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Refine paths by Levenberg-Marquardt steps.
 
-        The prior does not limit the position along a line. A step may therefore move a vehicle that
-        explains no field to any distance.
+        The prior does not limit the position along a line. A vehicle that explains no field may
+        therefore be moved to any distance.
 
         Parameters
         ----------
@@ -331,7 +335,7 @@ class SteadySearch:
         return path, np.where(are_moving & self._are_detectable(path), cost, np.inf)
 
     def best(self, grid: StartGrid, most: int) -> FloatArray:
-        """Paths that explain the frames best.
+        """Search for the paths of a single vehicle that explain the frames best.
 
         Parameters
         ----------
@@ -349,7 +353,7 @@ class SteadySearch:
         return _best_distinct(path, cost, PATH_TOLERANCE, most)
 
     def moments(self, theta: FloatArray) -> FloatArray:
-        """Moments of the rows of dipoles on given paths.
+        """Estimate the moments of the rows of dipoles on given paths.
 
         Parameters
         ----------
@@ -383,7 +387,7 @@ class SteadySearch:
             self._model.derivative(path[None], p)[0] * KNOWN_STD]))
 
     def pairs(self, grid: StartGrid, most: int, most_second: int) -> list[FloatArray]:
-        """Pairs of paths that explain the frames best.
+        """Search for the pairs of paths that explain the frames best.
 
         Parameters
         ----------
@@ -418,7 +422,7 @@ class SteadySearch:
             return _log_determinant(self._information_of_moments(theta))
 
     def _are_detectable(self, theta: FloatArray) -> BoolArray:
-        """Whether the prior of the moments makes all vehicles of each row (n,) detectable."""
+        """Whether all vehicles of each row (n,) are detectable if the moments follow the prior."""
         with ignoring_overflow():
             energy = np.einsum('nii->ni', self._information_of_moments(theta)) - 1.0
         vehicle_energy = energy.reshape(len(theta), -1, 3 * N_DIPOLES).sum(axis=2)

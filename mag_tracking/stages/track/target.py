@@ -26,7 +26,7 @@ from mag_tracking.stages.track.unobserved_length import UnobservedLength
 
 @dataclass(frozen=True)
 class Target:
-    """Kind of target that the tracker can follow."""
+    """Target that the tracker can follow: a vehicle or a magnet."""
 
     model: SourceModel
     orientation: Orientation
@@ -35,18 +35,19 @@ class Target:
     kinds: Sequence[str]
     """Name of each kind of target."""
     unobserved_length: Callable[[], UnobservedLength | None]
-    """Factory of the uncertainty of the middle due to the length, called for each track; returns
-    None for a small target."""
+    """Factory that is called for each track. It returns the uncertainty of the middle of a vehicle
+    due to its unobserved length; None for a magnet."""
     starts_anywhere: bool
     """Whether a track may start anywhere. A lost magnet may be found at any position, but a vehicle
     starts on an arrival line."""
     start: Callable[[TrackSettings, SensorNetwork, FieldFrame, FloatArray], FilterBank | None]
-    """First hypotheses from the settings, a network, a frame and the covariances (n_sensors, n_own,
-    n_own) of the sensor states; None if the frame does not allow a start."""
+    """Function that returns the first hypotheses from the settings, a network, a frame and the
+    covariances (n_sensors, n_own, n_own) of mounting angles and model errors; None if the frame
+    does not allow a start."""
 
 
 def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
-    """Target selected by the settings.
+    """Create the target that the settings select, and check its settings.
 
     Parameters
     ----------

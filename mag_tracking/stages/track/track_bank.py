@@ -97,7 +97,7 @@ class TrackBank:
         return self._fixed_lag is not None
 
     def gain(self, row: int) -> float:
-        """Log-likelihood gain of a path over the filter, for the latest frames.
+        """Log-likelihood along a path minus the log-likelihood in the filter, in the window.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class TrackBank:
         self._relinearisation.restart()
 
     def begin(self, first: FieldFrame, now: FieldFrame) -> None:
-        """Move the bank back to the first frame of the track.
+        """Move the bank back to the first frame of the track, and start to store frames.
 
         Parameters
         ----------
@@ -171,7 +171,7 @@ class TrackBank:
                            len(rejected))
 
     def keep(self, advance: FrameUpdate, publish: bool) -> None:
-        """Store a frame, drop improbable hypotheses, and relinearise the others.
+        """Store a frame, drop improbable hypotheses, and relinearise the leading ones if due.
 
         Parameters
         ----------
@@ -189,7 +189,7 @@ class TrackBank:
         self._whole_track.add(bank, advance.frame, advance.dt, publish)
 
     def lagged(self, best: int, frame: FieldFrame, dt: float, publish: bool) -> list[TrackState]:
-        """Add a frame to the fixed lag, and return the states of the frames older than the lag.
+        """Add a frame to the fixed-lag smoother; return the states of frames older than the lag.
 
         Parameters
         ----------
@@ -209,7 +209,7 @@ class TrackBank:
             self.filter, self.bank, best, frame, dt, publish)
 
     def remaining_lagged(self, best: int) -> list[TrackState]:
-        """States of the remaining frames of the fixed lag at the end of the track.
+        """Smoothed states of the frames that remain in the fixed-lag smoother at the track's end.
 
         Parameters
         ----------
@@ -273,7 +273,7 @@ class TrackBank:
         self._clear_lag()
 
     def _clear_lag(self) -> None:
-        """Drop the frames of the fixed lag, because the layout of the states has changed."""
+        """Drop the frames of the fixed-lag smoother, because the state layout has changed."""
         if self._fixed_lag is not None:
             self._fixed_lag.clear()
 

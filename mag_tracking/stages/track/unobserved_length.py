@@ -21,8 +21,9 @@ class UnobservedLength:
     dipoles explains both, and both models are too inaccurate for a reliable comparison.
 
     The iron of a long vehicle is at its engine, axles and load, so the row of dipoles is shorter
-    than the vehicle. Until the rear has been observed, the remaining part is assumed behind the
-    row. Afterwards it may be at either end, and the middle is uniformly distributed in between.
+    than the vehicle. Until the rear has been observed, the rest of the vehicle is assumed to be
+    behind the row. Afterwards, it may be at either end, and the middle is uniformly distributed
+    between these two cases.
 
     Each track has its own object.
 

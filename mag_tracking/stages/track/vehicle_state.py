@@ -128,7 +128,7 @@ class VehicleState:
         return hard
 
     def turning(self, x: FloatArray, P: FloatArray, target: int) -> FloatArray | None:
-        """Covariance with the initial variance of the turn rate of one target.
+        """Return `P` with the turn-rate variance of one target set to its initial value.
 
         Parameters
         ----------
@@ -141,7 +141,7 @@ class VehicleState:
         Returns
         -------
         (n_x, n_x) array or None
-            None if vehicles do not turn according to the settings.
+            None if turning is disabled in the settings.
         """
         if not self._model.turn_acceleration:
             return None
@@ -154,10 +154,10 @@ class VehicleState:
 
 
 def _resampled(moments: FloatArray, d: int) -> FloatArray:
-    """Moments (d, 3) of a row of `d` dipoles with the total and the middle of `moments` (k, 3)."""
+    """Resample `moments` (k, 3) to `d` dipoles (d, 3); the total and the centroid are preserved."""
     if len(moments) == 1 or d == 1:
         return np.tile(moments.sum(axis=0) / d, (d, 1))
-    places = np.linspace(0.0, d - 1.0, len(moments))
-    weights = np.maximum(1.0 - np.abs(places - np.arange(d)[:, None]), 0.0)
+    coordinates = np.linspace(0.0, d - 1.0, len(moments))
+    weights = np.maximum(1.0 - np.abs(coordinates - np.arange(d)[:, None]), 0.0)
     resampled: FloatArray = weights @ moments
     return resampled

@@ -16,12 +16,12 @@ MAX_SAMPLES = 320
 """Maximum number of samples of a search. Windows with more samples are decimated."""
 
 KNOWN_STD, KNOWN_MOMENT_RATIO = 0.7, 0.3
-"""[m], [m/s] Uncertainty of the paths of tracked vehicles in a search, and relative uncertainty of
-their moments."""
+"""[m], [m/s] Standard deviation of the positions and velocities of tracked vehicles in a search,
+and relative standard deviation of their moments."""
 
 
 class WindowSearch:
-    """Samples of a window in which vehicles are searched.
+    """Samples of a relinearisation window, prepared for searches for vehicles.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class WindowSearch:
     Attributes
     ----------
     times : (n,) array, s
-        Times of the frames, relative to the last one.
+        Times of the frames, relative to the last frame.
     prior : PathPrior
     samples : PassSamples
     """
@@ -87,7 +87,7 @@ class WindowSearch:
         return self._vehicles.background_std * self.samples.backgrounds
 
     def _columns(self, H: FloatArray, x: FloatArray, t: FloatArray, n_one: int) -> FloatArray:
-        """Fields (n, n_sensors, 3, q) of errors of known vehicles by one standard deviation.
+        """Fields (n, n_sensors, 3, q) due to errors of known vehicles, at one standard deviation.
 
         `H` (n, n_sensors, 3, n_t) are the derivatives along a path that ends with the state `x`
         (n_x,), at times `t` (n,) [s] before its end.

@@ -25,14 +25,14 @@ class PathHypothesis:
     path: FloatArray
     """(n, n_x) States at the frames of the window."""
     label: tuple[int, ...]
-    """Arrival of each vehicle."""
+    """Index of the arrival direction of each vehicle."""
     kind: tuple[int, ...]
     log_w: float
 
 
 @dataclass(frozen=True)
 class WindowStart(PathHypothesis):
-    """Hypothesis of known and new vehicles."""
+    """Hypothesis of known and new vehicles, at the start of a window."""
 
     n_new: int
     """Number of new vehicles, which are the last ones."""
@@ -47,14 +47,14 @@ class WindowStart(PathHypothesis):
 
 @dataclass(frozen=True)
 class KnownVehicles(PathHypothesis):
-    """Hypothesis of the known vehicles in a search for others."""
+    """Hypothesis of the known vehicles in a search for new vehicles."""
 
     filter: BankFilter | None
     """Filter for this number of vehicles; None if no vehicle is known."""
 
 
 def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
-    """Covariance with an inserted independent block.
+    """Return a covariance with an independent block inserted.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
 
 
 def in_order_of(first: FloatArray, pair: FloatArray) -> FloatArray:
-    """Pair of paths in the order of another pair, by distance.
+    """Return a pair of paths in the order that matches another pair best, by distance.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length: int | No
         Number of states per vehicle.
     n_targets : int
     length : int or None
-        Column of the length among the states of a vehicle; None = all are points.
+        Column of the length among the states of a vehicle; None if all vehicles are points.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Approach test: fields that grow like the field of a target from afar, and other fields."""
+"""Approach test: which growth of a field is accepted, and which growth is flagged."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def approach_flags(sizes):
 
 
 def test_a_field_that_grows_with_the_inverse_cube_of_distance_is_accepted():
-    """At any speed at which the field takes at least two frames to grow tenfold."""
+    """The speed does not matter if the field takes at least two frames to grow tenfold."""
     for step in (0.02, 0.05, 0.1, 0.2):
         distance = np.arange(2.0, 0.2, -step)
         assert not any(approach_flags(SENSED_LEVEL * GROWTH_RATIO * (0.4 / distance)**3))
@@ -36,8 +36,8 @@ def test_a_field_that_grows_with_the_inverse_cube_of_distance_is_accepted():
     2.0 * GROWTH_RATIO * SENSED_LEVEL * np.linspace(0.0, 1.0, 30)**2,
     np.concatenate([np.full(10, 0.5), np.linspace(0.5, 40.0, 30)])])
 def test_a_field_that_grows_differently_is_flagged_once(sizes):
-    """One field is of a target that starts next to a sensor. The other grows linearly, as with a
-    current or temperature."""
+    """The first field belongs to a target that starts next to a sensor. The second field grows
+    linearly, like the field of a current or the effect of a temperature change."""
     assert sum(approach_flags(sizes)) == 1
 
 

@@ -104,7 +104,7 @@ def rotating_magnet(offset, rate=0.4, n=60, dt=0.27):
 
 
 def errors_of(network, frames, truth):
-    """Position errors [m] and NEES of the tracks, ten frames after the start."""
+    """Position errors [m] and NEES of the tracks, without the first ten frames."""
     stage = TrackManager(network, settings_for('magnet').track)
     tracks = [t for f in frames for t in stage.feed(f)]
     e = (np.array([t.position for t in tracks]) - truth)[10:]
@@ -159,7 +159,8 @@ def test_a_magnet_is_found_again_after_a_long_gap(gap_s):
 
 
 def tracks_with_contradiction(manager, sizes):
-    """`Track`s of a constant field, followed by random fields of these RMS values [T]."""
+    """`Track`s from ten frames with a constant field and frames with random fields of these RMS
+    values [T]."""
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
     rng = np.random.default_rng(1)
     records = []
@@ -181,10 +182,12 @@ def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_restarted():
 
 @pytest.mark.parametrize('lookback_s', [1.0, 0.0])
 def test_twice_the_field_of_a_lost_vehicle_starts_an_ambiguous_track(lookback_s):
-    """In the tail of a pass the field only decreases, so twice the field is another target."""
+    """While a vehicle departs, its field only decreases. A field twice as strong must therefore
+    belong to another target."""
     stage = TrackManager(line_network(2), settings_for(
         'vehicle', {'track.lookback_s': lookback_s}).track)
     tracks = tracks_with_contradiction(stage, [1e-4] * 19 + [2.1e-4])
     assert stage.counts['tracks'] == 2
-    assert stage.counts['tracks started in the tail of a lost track, in a larger field'] == 1
+    assert stage.counts[
+        'tracks started in a larger field after the target of a detection was lost'] == 1
     assert tracks[-1].id == 2 and tracks[-1].ambiguous

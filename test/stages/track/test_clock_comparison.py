@@ -33,7 +33,7 @@ def test_consistent_passes_identify_the_clock_that_is_ahead():
     text = clocks.largest_offset.text(('left', 'right'))
     assert 'right is 100 ms ahead of the clock of left' in text and '4 passes' in text
     assert 'increase clock_offset of right by 0.100 s' in text
-    # With the other sensor as the reference.
+    # The result is the same with the other sensor as the reference.
     assert comparison_of([rigid_pass_of(-0.1, reference=1)] * 4).largest_offset.sensor == 1
 
 
@@ -59,7 +59,7 @@ def test_offsets_within_their_standard_deviations_identify_no_clock():
     named = sum(comparison_of([rigid_pass_of(std * rng.standard_normal(), std=0.05, speed=60.0)
                                for _ in range(4)]).largest_offset is not None for _ in range(300))
     assert named <= 1
-    # Offsets four times as large do name a clock.
+    # Offsets that are four times as large identify a clock.
     assert sum(comparison_of([rigid_pass_of(4.0 * std * rng.standard_normal(), std=0.05, speed=60.0)
                               for _ in range(4)]).largest_offset is not None
                for _ in range(100)) > 10

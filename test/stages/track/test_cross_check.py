@@ -161,7 +161,7 @@ def test_the_difference_of_a_track_is_its_distance_from_the_fitted_path():
     assert all(np.hypot(*d[:2]) < 2.0 for d in check.differences(states))
     of_far = [np.hypot(*d[:2]) for d in check.differences(far)]
     assert len(of_far) == len(states) and of_far[0] > 5.0 and of_far[-1] == of_far[-20] > 15.0
-    # If the fit covers none of the states, the difference of the filter is used.
+    # If the fit covers none of the states, the latest difference of the running track is used.
     assert check.differences(far[-3:]) == [check.difference] * 3
 
 

@@ -68,7 +68,7 @@ def test_the_evidence_falls_with_the_speed_of_a_passing_dipole():
     for speed in (4.0, 8.0, 16.0):
         r = np.stack([speed * t, 0.0 * t - 1.0, 0.0 * t + 0.5], axis=1)
         passing = dipole_field(network.positions - r[:, None], np.array([200.0, 100.0, -300.0]))
-        # The field is zero at the beginning.
+        # The field starts at zero.
         passing -= passing[0]
         explained.append(total_log_density(DisturbanceModel(network, 2e-8),
                                            frames(network, passing)[20:-20]))
@@ -93,8 +93,8 @@ def test_the_first_frame_after_a_handover_is_not_compared():
     sequence = frames(network, field)
     model, none = DisturbanceModel(network, 2e-8, is_handover=True), np.zeros(2)
     assert model.log_density(sequence[0], 0.0, none) is None
-    # Afterwards the evidence is as without the jump, except for the cost of an unknown rate of
-    # change.
+    # Afterwards, the evidence equals the evidence without the jump, except for the cost of an
+    # unknown rate of change.
     rest = sum(model.log_density(f, 0.08, none) for f in sequence[1:])
     before = DisturbanceModel(network, 2e-8)
     smooth = frames(network, field - 1e-6)
@@ -107,7 +107,8 @@ def test_the_first_frame_after_a_handover_is_not_compared():
 def test_the_evidence_stays_finite_over_gaps_with_rotated_sensors(gap_s):
     """Each update mixes all components.
 
-    Unless one half of a covariance is mirrored, rounding errors grow until it is indefinite.
+    Unless one half of each covariance is mirrored, rounding errors grow until the covariance is
+    indefinite.
     """
     network, rng = line_network(4), np.random.default_rng(2)
     R = np.linalg.qr(rng.standard_normal((4, 3, 3)))[0]

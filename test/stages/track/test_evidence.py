@@ -36,7 +36,7 @@ def test_noise_contradicts_a_track_with_the_nominal_probability():
         evidence = TrackEvidence(2)
         evidence.contradicts(value * np.array([0.3, 0.7]), 6)
         is_doubtful += evidence.is_doubtful
-    # The number has a Poisson distribution with mean 30.
+    # The number of doubtful tracks has a Poisson distribution with mean 30.
     assert 10 < is_doubtful < 60 and len(nis) * CONTRADICTION == pytest.approx(30.0)
 
 
@@ -62,7 +62,7 @@ def test_a_filter_that_overfits_is_flagged_for_the_duration_of_the_window():
         False, True, True, False]
 
 
-@pytest.mark.parametrize('nis, doubted', [
+@pytest.mark.parametrize('nis, is_doubtful', [
     ([60.0, 1.0], True), ([60.0, 2.0, 1.0], False), ([60.0, np.nan, 1.0], False)])
 def test_a_contradiction_flags_a_track_of_two_sensors_but_not_of_three(nis, is_doubtful):
     evidence = TrackEvidence(2)
@@ -197,7 +197,7 @@ def test_a_transient_doubt_persists_for_a_tenth_of_a_second():
 
 
 def test_a_doubt_with_a_past_start_flags_earlier_smoothed_poses():
-    """A long vehicle that is tracked as two has wrong poses before this is detected."""
+    """A long vehicle that is tracked as two vehicles has wrong poses before the error is found."""
     evidence = TrackEvidence(2)
     evidence.flag_interval(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0, since_ns=3 * NS)
     assert doubts.ANOTHER_VEHICLE in evidence.note(set(), 7 * NS)

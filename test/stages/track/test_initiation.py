@@ -36,8 +36,8 @@ def test_the_hypothesis_on_the_side_that_fits_better_is_heavier():
     above = np.linalg.norm(bank.x[:, :3] - truth[0, :3], axis=1) < 0.005
     below = np.linalg.norm(bank.x[:, :3] - truth[0, :3] * [1, 1, -1], axis=1) < 0.005
     assert above.sum() == below.sum() == 1
-    # Below the board, z is off by four standard deviations: twice the field divided by half the
-    # field.
+    # For the hypothesis below the board, the z axis differs by twice the field, which is four
+    # standard deviations of half the field.
     gap = float(bank.log_w[above][0] - bank.log_w[below][0])
     assert gap == pytest.approx(0.5 * 4.0**2, rel=0.1)
 
@@ -72,7 +72,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
                                (0.5 * vehicle.turn_acceleration / speed)**2)
     assert np.exp(bank.log_w[turns]).sum() == pytest.approx(vehicle.turn_share)
     assert len(set(bank.origin)) == len(bank)
-    # A point has neither a length nor differences of its dipoles.
+    # The length and the differences between dipoles of a point have no variance.
     points = bank.P[bank.kind == 0]
     assert not points[:, length, length].any()
     np.testing.assert_allclose(points[:, 6, 6], points[:, 6, 9], rtol=1e-12)
@@ -108,8 +108,8 @@ def test_a_vehicle_starts_where_its_field_first_has_the_frame_energy(missing):
     model = vehicle_model(vehicle, network)
 
     def energy(back):
-        """Energy of the fields of the hypotheses at the sensors, `back` [m] before their
-        positions."""
+        """Field energy at the sensors for each hypothesis, moved back along its path by `back`
+        [m]."""
         x = bank.x[:, :model_size].copy()
         x[:, :2] -= back * x[:, 3:5] / np.hypot(*x[:, 3:5].T)[:, None]
         m = model.dipoles(x).m.sum(axis=1)

@@ -1,4 +1,4 @@
-"""Bound on the number of hypotheses in `config/large_network.yaml`: poses with and without it."""
+"""Limit on the number of hypotheses in `config/large_network.yaml`: its effect on the poses."""
 
 import numpy as np
 import pytest
@@ -14,8 +14,8 @@ from support.samples import one, simulate
 
 SETTINGS = read_parameter_file(ROOT / 'config' / 'large_network.yaml')
 LOST = [8, 13, 15, 18, 63, 118]
-"""Seeds of vehicles that are lost if the bound applies from the first frame (the first four), or if
-the bound is 60."""
+"""Seeds of vehicles that are lost if the limit applies from the first frame (the first four), or if
+the limit is 60 (the other two)."""
 
 
 @pytest.fixture(scope='module')

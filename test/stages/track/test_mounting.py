@@ -47,7 +47,7 @@ def test_small_angles_are_a_rotation_to_first_order():
 
 
 def test_derivatives_by_state_and_angle_match_finite_differences():
-    """The field is a linear function of the state here, so H is its derivative."""
+    """The field is a linear function of the state here, so H is the derivative of the field."""
     h, H, angles = case()
 
     def field(v):

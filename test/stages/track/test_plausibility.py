@@ -38,7 +38,8 @@ def doubts_in_state(mounting=MOUNTING, dt=0.08, **of_state):
 @pytest.mark.parametrize('of_state, expected', [
     ({}, set()),
     ({'z': 1.1}, set()), ({'z': 1.2}, {doubts.HEIGHT}), ({'z': -0.3}, {doubts.HEIGHT}),
-    # 1.2 standard deviations in six angles give 8.6; one mounting in twenty exceeds 12.6.
+    # The squares of six angles of 1.2 standard deviations add up to 8.6; one correct mounting in
+    # twenty exceeds 12.6.
     ({'angles_deg': 6.0}, set()), ({'angles_deg': 8.0}, {doubts.SENSORS_ROTATED}),
     ({'angles_deg': -8.0}, {doubts.SENSORS_ROTATED}),
     ({'mounting': 0.0}, set()),
@@ -60,7 +61,7 @@ def observation_of(network=NETWORK):
 @pytest.mark.parametrize('y, after, expected', [
     (0.0, 8.0, set()), (8.0, 0.0, {doubts.OFF_THE_ROAD}), (0.0, 8.6, {doubts.OFF_THE_ROAD})])
 def test_a_path_is_evaluated_where_it_is_nearest_to_a_sensor(y, after, expected):
-    """A vehicle may turn off after the sensors, up to the second limit.
+    """A vehicle may leave the road after it has passed the sensors, up to the second limit.
 
     A vehicle that passed off the road stays doubtful, even after it has stopped.
     """

@@ -200,7 +200,8 @@ def test_the_gain_is_the_log_likelihood_ratio_of_the_path(bonus):
 
 
 def test_a_path_with_an_invalid_covariance_is_rejected():
-    """Rounding errors above a sensor can cause this. State and covariance do not change."""
+    """Rounding errors can cause such a covariance if a hypothesis is just above a sensor. State and
+    covariance of the bank do not change."""
     filter_, bank, relinearisation = bank_after_one_frame(-3.0, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
     assert relinearisation.relinearise_leading(filter_, bank)[relinearise.FAILED] == 1
@@ -221,7 +222,7 @@ def test_relinearisation_covers_twice_the_window_at_most(monkeypatch, window_s, 
 
 @pytest.mark.parametrize('n_max, max_elements', [(1, 10**9), (5, 6**2 * 40)])
 def test_only_the_heaviest_hypotheses_are_relinearised(monkeypatch, n_max, max_elements):
-    """Many states reduce their number: here to one hypothesis over forty frames."""
+    """A large number of states reduces the number of hypotheses: here to one over forty frames."""
     monkeypatch.setattr(relinearise, 'MAX_ELEMENTS', max_elements)
     filter_ = LinearFilter()
     bank, *_ = compare_with_plain(filter_, Relinearisation(60.0, 60.0, n_max), prune=False)
@@ -350,8 +351,8 @@ def test_a_path_through_a_sensor_is_rejected(monkeypatch):
 @pytest.mark.study
 @pytest.mark.parametrize('target', matched.TARGETS)
 def test_the_error_of_matched_targets_is_near_its_bound(target, n=60):
-    """Ratio of RMS error to path bound, without the worst 5 %. Without relinearisation it is 1.4
-    and 1.8."""
+    """Ratio of RMS error to path bound, without the worst 5 % of the runs. Without relinearisation,
+    the ratio is 1.4 and 1.8."""
     with ProcessPoolExecutor(2) as pool:
         error, bound = (np.array(a)[:, matched.STEPS // 2:] for a in zip(
             *pool.map(partial(matched.one_run, target), range(n)), strict=True))

@@ -41,7 +41,7 @@ class CountingFilter(BankFilter):
 
 
 def situation(n=6, seed=0, spread=0.3, n_hyp=5):
-    """(filter, bank of hypotheses near the truth, frame that fits, names)."""
+    """(filter, bank of hypotheses near the truth, frame that fits them, sensor names)."""
     rng = np.random.default_rng(seed)
     network = line_network(n, spacing=4.0, tilt=0.2)
     model = vehicle_model(SETTINGS.vehicle, network)
@@ -272,7 +272,7 @@ def test_a_sensor_that_rules_out_every_hypothesis_is_rejected():
 
 @functools.cache
 def tracked_pass(n_sensors, fault, seed=0, network_at=None, lasting_s=1.0):
-    """(pipeline, live tracks, (begin, end) of the fault) of a pass with a fault of mag_2.
+    """(pipeline, live tracks, (begin, end) of the fault [s]) of a pass with a fault of mag_2.
 
     The network is replaced `network_at` [s] after the fault begins.
     """
@@ -355,7 +355,7 @@ def test_a_track_supported_by_one_sensor_for_too_long_stays_ambiguous(dropout_s,
 
 
 def first_tracks(n_quiet, stage=None, begin_ns=NS, missing=(), n_present=1):
-    """(stage, tracks) of a target that is present after `n_quiet` frames without one."""
+    """(stage, tracks) of a target that is present after `n_quiet` frames without a target."""
     network = line_network(2, tilt=0.0)
     stage = TrackManager(network, SETTINGS) if stage is None else stage
     B = dipole_field(network.positions - [-8.0, -1.2, 0.5], MOMENT)
@@ -384,6 +384,6 @@ def test_a_new_track_does_not_inherit_the_doubts_of_the_previous_one():
 
 @pytest.mark.parametrize('n_quiet', [0, 4])
 def test_a_target_that_was_not_seen_approaching_is_ambiguous(n_quiet):
-    """This happens after a restart in the middle of a pass."""
+    """This happens if the tracker is restarted in the middle of a pass."""
     _, tracks = first_tracks(n_quiet)
     assert tracks and all(t.ambiguous for t in tracks)

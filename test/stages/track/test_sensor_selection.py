@@ -79,7 +79,8 @@ def test_a_part_of_a_network_has_the_properties_of_its_sensors():
 
 
 def drive(network, changes, speed=20.0, seed=1):
-    """(records, pipeline, true position at t) of a point target along the network."""
+    """(records, pipeline, function from time [s] to true position) of a point that passes the
+    network."""
     farthest = float(network.positions[:, 0].max())
     path = Path(np.array([-60.0, -1.5]), 0.0, speed)
     samples, *_ = simulate(network, point_body([200.0, -150.0, 80.0], 5.0, 0.5), path, 50.0,
@@ -90,7 +91,7 @@ def drive(network, changes, speed=20.0, seed=1):
 
 
 def test_a_target_is_tracked_along_forty_sensors():
-    """At any time six of the sensors over 180 m are used. The error stays within its covariance."""
+    """Of forty sensors over 180 m, six are used at any time. The errors match the covariance."""
     network = line_network(40, tilt=0.02)
     records, pipeline, truth = drive(network, {'track.max_sensors': 6})
     live = [r for r in records if isinstance(r, Track) and not r.ended]
@@ -164,7 +165,7 @@ def track_frames(frames, changes, doubtful=None, start=slice(None)):
 
 
 def test_sensors_that_join_without_measurements_change_nothing(monkeypatch, frames):
-    """The states are predicted once to the frame in which they join."""
+    """The states are predicted only once to the frame in which the sensors join."""
     network, every = frames
     first = next(f for f in every if f.target_present)
     near = nearest_sensors(network.positions, network.positions[

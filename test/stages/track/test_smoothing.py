@@ -52,8 +52,8 @@ N_X = N_T + (N_OWN + 3) * N_SENSORS
 
 
 def whole_derivative(H):
-    """Derivative (3 n_sensors, n_x) of all sensors; `plain_kalman.update` processes one at a
-    time."""
+    """Derivative (3 n_sensors, n_x) of the fields of all sensors; `plain_kalman.update` processes
+    one sensor at a time."""
     out = np.zeros((3 * N_SENSORS, N_X))
     for j in range(N_SENSORS):
         rows = slice(3 * j, 3 * j + 3)
@@ -240,8 +240,8 @@ def test_smoothing_at_the_linearisation_of_the_filter_reproduces_its_pose(monkey
     live = [r for r in records if isinstance(r, Track) and not r.ended]
     smoothed = [r for r in records if isinstance(r, SmoothedPose)]
     np.testing.assert_allclose(smoothed[-1].position, live[-1].position, rtol=0, atol=1e-9)
-    # The smoothed covariance is of one hypothesis; the published one includes others at this
-    # position.
+    # The smoothed covariance belongs to one hypothesis; the published covariance includes other
+    # hypotheses at this position.
     own = next(h.covariance for h in live[-1].hypotheses
                if np.array_equal(h.position, live[-1].position))
     np.testing.assert_allclose(smoothed[-1].covariance, own, rtol=1e-7, atol=1e-12)
@@ -337,7 +337,7 @@ def records_with_spike(stage, frames, at, size, n=1):
 
 
 def paths_without_and_with_a_spike(size):
-    """Smoothed poses within 6 m of a pass, without and with a spike of `size` [T] long after it."""
+    """Smoothed poses within 6 m of the sensors, without and with a later spike of `size` [T]."""
     network, samples, t, position = pass_of(
         random_vehicle(np.random.default_rng(1), length=4.0), seed=1)
     pipeline = Pipeline(network, settings_for('vehicle'))
@@ -367,7 +367,7 @@ def test_a_frame_that_contradicts_the_track_does_not_distort_it(size):
 @pytest.mark.xfail(strict=True, reason=(
     '0.50 m, 1.65 standard deviations: a different one of nearly equal hypotheses survives'))
 def test_a_frame_that_contradicts_the_track_does_not_distort_it_by_30_cm():
-    """A row of three dipoles reached this aim."""
+    """A vehicle model with a row of three dipoles achieved this accuracy."""
     plain, with_spike = paths_without_and_with_a_spike(1e-5)
     np.testing.assert_allclose([p.position for p in with_spike], [p.position for p in plain],
                                rtol=0, atol=0.3)

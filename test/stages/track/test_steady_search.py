@@ -78,7 +78,7 @@ def test_the_field_of_a_known_vehicle_is_not_another_vehicle():
     search, grid = search_of(FIRST)
     alone, beside = search.cost(grid), search.beside(FIRST).cost(grid)
     assert np.ptp(alone) > 1000.0
-    # The priors of paths and moments contribute a few dozen.
+    # The priors of paths and moments contribute a few dozen to the difference.
     assert np.ptp(beside) < 100.0
 
 
@@ -99,8 +99,8 @@ def test_the_gradient_of_the_cost_is_exact(truths):
 
 
 def test_the_cost_of_the_grid_matches_the_full_covariance():
-    """Cost differences match the log-density of a point with a Gaussian moment, backgrounds and
-    noise."""
+    """Cost differences match the log-density of the frames for a point target with Gaussian moment,
+    backgrounds and noise."""
     search, grid = search_of(FIRST)
     beside, rows = search.beside(SECOND), np.arange(0, len(grid.theta), 97)
     std = search.prior.moment_std[0] * np.sqrt(3.0)

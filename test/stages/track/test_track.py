@@ -62,7 +62,8 @@ def test_the_evidence_identifies_the_kind_of_a_vehicle(kind, body):
 
 @pytest.mark.study
 def test_most_trucks_are_identified_and_the_others_are_uncertain():
-    """With other noise, 35 of 40 trucks (seeds 0 to 39) were identified. The limit is binomial."""
+    """With other noise, 35 of 40 trucks (seeds 0 to 39) were identified. The limit is the 1 %
+    quantile of a binomial distribution with this rate."""
     n, ends = 16, []
     for seed in range(n):
         body = random_vehicle(np.random.default_rng(seed), **TRUCK)
@@ -204,7 +205,7 @@ def test_too_few_axes_start_no_magnet_track():
     field[0] = frames[0].field[0]
     stage = TrackManager(network, settings_for('magnet').track)
     assert stage.feed(dataclasses.replace(frames[0], field=field)) == []
-    assert stage.counts['frames without a start'] == 1
+    assert stage.counts['frames in which no track could start'] == 1
 
 
 def test_a_hypothesis_at_a_sensor_is_dropped_and_the_others_continue():

@@ -66,7 +66,7 @@ def test_a_row_longer_than_its_kind_hides_only_the_spread_of_lengths():
 
 
 def test_an_approaching_car_may_be_the_front_of_a_truck():
-    """The variance is of a mixture in which one vehicle in three is a truck, with its middle 3 m
+    """The variance matches a mixture in which one vehicle in three is a truck with its middle 3 m
     further back."""
     added = length_of_vehicles().covariance(at([-20.0, 0.0]), P, 3.0, CAR)
     rng = np.random.default_rng(0)
@@ -125,8 +125,8 @@ def test_no_vehicle_is_longer_than_the_longest_kind():
 
 
 def test_the_difference_to_another_path_widens_the_joint_covariance():
-    """It widens position, velocity and heading of a smoothed pose. The joint covariance stays
-    valid."""
+    """The difference widens position, velocity and heading of a smoothed pose. The joint covariance
+    stays positive semidefinite."""
     model, x = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi)
     found = {}
     for name, difference in (('here', np.zeros(6)), ('apart', np.array([6.0, 0, 0, 2.0, 0, 0]))):
