@@ -1,1 +1,1 @@
-"""Applications, callable from Python without ROS. Each command has a module of the same name."""
+"""Applications that can be called from Python without ROS. The module of a command has its name."""

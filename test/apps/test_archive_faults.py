@@ -229,7 +229,7 @@ def test_a_recording_that_kills_its_workers_is_the_only_failure(tmp_path, record
     run = archive([folder], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out',
                   report=lines.append)
     assert [p.name for p in run.done] == ['good.mcap'] and run.lost_workers >= 1
-    assert 'its worker was lost several times' in run.failed[folder / 'deadly.mcap']
+    assert 'the worker of a task was lost several times' in run.failed[folder / 'deadly.mcap']
     assert len(rows(tmp_path / 'out', 'recordings')) == 2
 
 
