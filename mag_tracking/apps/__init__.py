@@ -1,1 +1,4 @@
-"""Applications that can be called from Python without ROS. The module of a command has its name."""
+"""Applications that can be called from Python without ROS.
+
+A command that tracks, calibrates or plans has a module of the same name.
+"""

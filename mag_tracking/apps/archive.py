@@ -221,7 +221,7 @@ class _Scheduler:
         self._states: dict[Path, list[list[Any]]] = {}
 
     def run(self, recordings: Sequence[Path], stopped: Callable[[], bool]) -> None:
-        """Track recordings, a few at a time to limit intermediate files; end if `stopped()` is true."""
+        """Track recordings, a few at a time to limit intermediate files; end when stopped."""
         queued = list(reversed(recordings))
         while queued or self._cluster.n_running:
             while queued and self._n_active_recordings() < 2 * self._cluster.n_workers + 1:
