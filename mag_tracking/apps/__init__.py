@@ -1,4 +1,4 @@
 """Applications that can be called from Python without ROS.
 
-A command that tracks, calibrates or plans has a module of the same name.
+Most commands that process recordings have a module of the same name.
 """

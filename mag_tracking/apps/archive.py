@@ -51,8 +51,8 @@ class ArchiveRun:
 def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
     """Resolve paths, folders and glob patterns to recordings.
 
-    Folders are searched recursively, except names that begin with a dot. A folder that contains
-    metadata.yaml is a recording.
+    Folders are searched recursively; entries whose name begins with a dot are skipped. A folder
+    that contains metadata.yaml is a recording.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
 
 
 def _recordings_at(path: Path, visited: set[Path]) -> list[Path]:
-    """Find the recordings at or below a path; skip folders in `visited`, and add searched folders.
+    """Find the recordings at or below a path; skip the `visited` folders, and extend this set.
 
     An unreadable folder is returned like a recording, so that it is reported as failed.
     """
@@ -248,7 +248,7 @@ class _Scheduler:
         self._cluster.submit(('cut', job), 0, cut, job)
 
     def _on_finished(self, kind: str, job: Job, result: Any) -> None:
-        """Process the result of a task and submit dependent tasks; raises archive-wide errors."""
+        """Process a task's result and submit dependent tasks; raises OutputError and ClusterError."""
         path = job.recording
         if isinstance(result, OutputError | ClusterError):
             raise result

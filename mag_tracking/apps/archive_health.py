@@ -31,7 +31,7 @@ class HealthRows:
         self._next_ns: int | None = None
 
     def due(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
-        """Create one row per sensor if `ROW_INTERVAL_S` has passed since the previous rows.
+        """Create one row per sensor if `ROW_INTERVAL_S` has passed since the last rows or the first frame.
 
         Parameters
         ----------

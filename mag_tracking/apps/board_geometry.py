@@ -51,7 +51,7 @@ class GeometrySurvey:
     n_poses: int
     """Number of poses in the table."""
     silent_axes: tuple[tuple[str, str], ...]
-    """(sensor, axes without readings) of each sensor that has readings of other axes."""
+    """(sensor, its axes without readings) for each sensor that reports some axes but not all."""
 
     @property
     def rotation_angle(self) -> FloatArray:
@@ -234,7 +234,7 @@ def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
 
 
 def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:
-    """Return `network` with the noise [T] of sensors without a noise set; unchanged if None."""
+    """Return `network` with `noise_std` [T] for sensors that have no noise; unchanged if None."""
     if noise_std is None:
         return network
     return replace(network, noise_std=tuple(
@@ -242,7 +242,7 @@ def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwor
 
 
 def _silent_axes(network: SensorNetwork, field: FloatArray) -> Iterator[tuple[str, str]]:
-    """Yield (sensor, axes without readings) of each sensor that has readings of other axes."""
+    """Yield (sensor, its axes without readings) for sensors that report some axes but not all."""
     silent: BoolArray = np.all(np.isnan(field), axis=0)
     for name, axes in zip(network.names, silent, strict=True):
         if axes.any() and not axes.all():

@@ -32,7 +32,7 @@ class Calibration:
     survey: NetworkSurvey
     """Results from accelerometers, compasses and knocks."""
     evidence: MountingEvidence | None
-    """Orientations from passing targets; None if no pass was evaluated and usable."""
+    """Orientations from passing targets; None if no pass was used."""
     levels: dict[str, FloatArray]
     """{sensor: (3,) field without a target, T, sensor frame}."""
     rejected: dict[str, int]

@@ -121,7 +121,7 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
     frozen_since_ns : int, ns, or None
         Timestamp from which the background has been frozen; None if it is not frozen.
     n_reported : int
-        Number of relearnt backgrounds that earlier findings included.
+        Number of relearnt backgrounds that were reported earlier.
 
     Yields
     ------
@@ -147,7 +147,7 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
     if last is not None and frozen_since_ns is not None \
             and (last - frozen_since_ns) / NS > MAX_FROZEN_S:
         yield Finding(False, name, 'its background has been frozen for '
-                      f'{(last - frozen_since_ns) / NS:.0f} s', 'remove a target near it; if the '
+                      f'{(last - frozen_since_ns) / NS:.0f} s', 'remove any target near it; if the '
                       'field has changed permanently, call the service calibrate')
 
 

@@ -60,8 +60,8 @@ class FittedPass:
     def known(self) -> PassFit | None:
         """Fit whose trusted values are reported: the chosen fit, or else the fit of lowest cost.
 
-        Without a chosen fit, None if no fit has trusted values, or if any fit shows that the target
-        turned or was not a single target.
+        Without a chosen fit, the result is None if no fit has trusted values, or if any fit shows
+        that the target turned or was not a single target.
         """
         if self.chosen is not None:
             return self.chosen
@@ -72,7 +72,7 @@ class FittedPass:
 
     @property
     def disagreement(self) -> tuple[float, float]:
-        """Largest position [m] and velocity [m/s] differences from fits with a similar cost.
+        """Largest differences in position [m] and velocity [m/s] from fits with a similar cost.
 
         The differences from the chosen fit indicate the error of the model. They are NaN if there
         is no chosen fit, or no other fit with a similar cost. They are also NaN if the residuals of

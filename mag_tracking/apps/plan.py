@@ -195,7 +195,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
 def _closest_point_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                           lane: Lane, distance_scale: float,
                           ) -> tuple[Observability, dict[str, FloatArray]]:
-    """Compute `Plan.observability`, with positions scaled by a distance, and `Plan.blocks`."""
+    """Compute `Plan.observability`, scaled with a distance [m], and `Plan.blocks`."""
     closest = lane.points[np.argmin(np.abs(lane.along))][None]
     J = pass_information(network.positions, network.R_sw, target, sampling, closest,
                          lane.heading)[0].sum(axis=1)

@@ -16,10 +16,10 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.units import NS
 
 LEARNING_TOLERANCE_S = 1.0
-"""Time by which learning may exceed its minimum duration at the start without a target [s]."""
+"""Excess of the initial learning time above which a target is considered present [s]."""
 
 MIN_BLOCKS = 6.0
-"""Learning time [blocks] that is always allowed, for slow sensors with long blocks."""
+"""Minimum learning time [blocks], which applies to slow sensors with long blocks."""
 
 MIN_LEVEL_FRACTION = 1.0 / 3.0
 """Minimum total duration of a background level, as a fraction of the learning time."""
@@ -33,8 +33,8 @@ class Prescan:
     """Backgrounds and resolutions found by a first pass over a recording."""
 
     levels: dict[str, QuietLevel]
-    """{sensor: most frequent level}; empty if no target is present at the
-    start."""
+    """{sensor: most frequent level}; empty if no target is present at the start of the
+    recording."""
     steps: dict[str, FloatArray]
     """{sensor: (3,) smallest change of each axis, T}."""
 

@@ -218,7 +218,7 @@ def check_order(readings: Readings, tolerance: float = MAX_DELAY_S) -> None:
     ----------
     readings : Readings
     tolerance : float, s
-        Maximum time by which a reading may be older than a reading before it.
+        Maximum time by which a reading may be older than a preceding reading.
 
     Raises
     ------

@@ -134,7 +134,7 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
 
 
 class Results(Protocol):
-    """Receiver of frames, detections and poses, such as a `ResultFolder`."""
+    """Receiver of the outputs of a pipeline, such as a `ResultFolder`."""
 
     def add_detection(self, detection: Detection, /) -> None:
         """Add the onset or release of a detection.

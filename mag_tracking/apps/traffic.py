@@ -30,7 +30,7 @@ from mag_tracking.records import FieldFrame, Track
 from mag_tracking.units import NS
 
 RETENTION_S = 300.0
-"""Time for which frames are stored after a track has ended, until its passage is reported [s]."""
+"""Time for which the frames of an ended track are stored until its passage is reported [s]."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class TrafficResult:
     summaries: tuple[TrafficSummary, ...]
     """One summary per line and interval."""
     counts: dict[str, int]
-    """Number of passages, and of tracks or crossings that were not counted, by cause."""
+    """Events such as passages, and tracks that crossed no line: {event: number}."""
     rejections: dict[str, int]
     """Readings that were not used: {cause: number}."""
     missing_topics: tuple[str, ...]

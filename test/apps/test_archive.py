@@ -39,7 +39,7 @@ def road_network_file(tmp_path_factory):
 
 
 def archive_without_cluster(folder, recording, network, settings, in_order=True):
-    """Archive a recording without a cluster; return (columns of the recording, number of segments)."""
+    """Archive a recording without a cluster; return (columns of its row, number of segments)."""
     work = folder / 'unfinished'
     work.mkdir(parents=True)
     job = Job(recording, work, folder, network, settings)
