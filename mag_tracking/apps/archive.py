@@ -248,7 +248,7 @@ class _Scheduler:
         self._cluster.submit(('cut', job), 0, cut, job)
 
     def _on_finished(self, kind: str, job: Job, result: Any) -> None:
-        """Process a task's result and submit dependent tasks; raises OutputError and ClusterError."""
+        """Process a task's result, submit dependent tasks; raises OutputError and ClusterError."""
         path = job.recording
         if isinstance(result, OutputError | ClusterError):
             raise result

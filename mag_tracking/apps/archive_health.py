@@ -31,7 +31,10 @@ class HealthRows:
         self._next_ns: int | None = None
 
     def due(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
-        """Create one row per sensor if `ROW_INTERVAL_S` has passed since the last rows or the first frame.
+        """Create one row per sensor if `ROW_INTERVAL_S` has passed since the previous rows.
+
+        The first interval begins with the first frame, or with the first frame after the time
+        jumped back.
 
         Parameters
         ----------

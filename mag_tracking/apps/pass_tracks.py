@@ -88,7 +88,7 @@ class PassTracks:
         return np.array(paths).reshape(-1, 6)
 
     def _poses_of_smallest_variance(self, end_ns: int) -> list[_Pose]:
-        """Return each track's pose of smallest variance up to `end_ns`; drop its other poses by then.
+        """Return each track's pose of smallest variance up to `end_ns`; drop its other old poses.
 
         Vehicles that are still approaching are omitted: their latest pose has the smallest
         variance.
