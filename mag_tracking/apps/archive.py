@@ -233,7 +233,7 @@ class _Scheduler:
                 self._on_finished(kind, job, result)
 
     def _n_active_recordings(self) -> int:
-        """Number of recordings with running tasks."""
+        """Number of recordings whose tasks are running."""
         return len({job.recording for _, job in self._cluster.keys()})
 
     def _start(self, path: Path) -> None:

@@ -94,7 +94,7 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
                     settings: GeometrySettings, date: str,
                     box: tuple[Sequence[float], Sequence[float]] | None = None,
                     noise_std: float | None = None) -> GeometrySurvey:
-    """Estimate the geometry of a network from readings of a magnet in many poses.
+    """Estimate the geometry of a network from its readings for many poses of a magnet.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
 
 def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: str,
                        by: str) -> SensorNetwork:
-    """Apply estimated positions, orientations, gains and biases to a network.
+    """Return a network with the estimated positions, orientations, gains and biases.
 
     A reading is gain * field + bias. The stage Calibrate applies the correction before it removes
     the background. The stored background and noise therefore refer to corrected readings. A sensor

@@ -103,7 +103,7 @@ def _survey_recording(recording: Recording, network: SensorNetwork, settings: Se
                       progress: Callable[[int], object] | None,
                       stopped: Callable[[], bool] | None,
                       ) -> tuple[dict[str, FloatArray], NetworkSurvey, Calibrate, bool]:
-    """Read the recording for the first time; return (levels, survey, stage, interrupted)."""
+    """Survey the sensors in a recording; return (levels, survey, stage, interrupted)."""
     reader = SampleReader(recording, network)
     # Backgrounds and noise in the network file may be outdated; they are learnt again.
     unlearnt = replace(network, background=(), noise_std=())
@@ -130,7 +130,7 @@ def _survey_recording(recording: Recording, network: SensorNetwork, settings: Se
 def _track_passes(recording: Recording, network: SensorNetwork, settings: Settings,
                   progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
                   ) -> tuple[list[Track], bool]:
-    """Read the recording again; return (last unambiguous pose of each used track, interrupted)."""
+    """Track the targets; return (last unambiguous pose of each used track, interrupted)."""
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
     poses: dict[int, tuple[int, Track]] = {}
     interrupted = False

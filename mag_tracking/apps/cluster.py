@@ -35,7 +35,7 @@ _TIMEOUT_ERRORS = (TimeoutError, asyncio.TimeoutError)
 
 
 class LostWorkersError(MagTrackingError):
-    """A task lost its worker several times."""
+    """A task failed because its worker was lost several times."""
 
 
 class _Task(NamedTuple):

@@ -65,7 +65,7 @@ class RecordingFit:
 
     def passes(self, progress: Callable[[int], object] | None = None,
                stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """Read the recording and yield each pass after its fit.
+        """Read the recording, fit each pass, and yield the results.
 
         Parameters
         ----------

@@ -214,7 +214,7 @@ def _lane_distances(lane: Lane, places: FloatArray) -> FloatArray:
 
 
 def n_parts(lanes: Sequence[tuple[str, float, float]]) -> int:
-    """Return the number of times that `compute_plan` calls its `progress`.
+    """Return the number of times that `compute_plan` calls `progress`.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ class PlanInputs:
 
     @property
     def n_parts(self) -> int:
-        """Number of times that `run` calls its `progress`."""
+        """Number of times that `run` calls `progress`."""
         return n_parts(self.lanes)
 
     def run(self, network: SensorNetwork, settings: Settings,

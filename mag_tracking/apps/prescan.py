@@ -145,7 +145,10 @@ def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
 
 def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: QuietLevel,
                     recorder: BlockRecorder, settings: CalibrateSettings) -> bool:
-    """Whether the background of a sensor was learnt early and equals the most frequent level."""
+    """Whether the initial background was learnt early and equals the most frequent level.
+
+    If relearning is disabled, any initial background that was learnt early is accepted.
+    """
     max_time = LEARNING_TOLERANCE_S + max(settings.learn_s, MIN_BLOCKS * level.block_s)
     if learnt is None or learnt[0] > max_time:
         return False

@@ -20,7 +20,7 @@ RESULTS = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
 
 
 class RecorderState(Protocol):
-    """State of a recorder that the reports describe."""
+    """State of a recorder, as described by `progress_line` and `summary`."""
 
     counts: Counter[str]
     """Number of messages written per topic."""

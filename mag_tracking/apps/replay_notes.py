@@ -27,7 +27,7 @@ def notes_of(summary: Mapping[str, Any]) -> list[Note]:
 
 
 def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Notes on topics, readings and sensors."""
+    """Notes on missing topics and detections, rejected readings, and missing backgrounds."""
     sensors = summary['sensors']
     for topic in summary['missing_topics']:
         yield Note(WARNING, f'no messages on {topic}')

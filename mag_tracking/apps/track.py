@@ -334,7 +334,7 @@ class _Results:
 
 def _tracking_result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
                      recording: RecordedReadings) -> TrackingResult:
-    """Convert the results to arrays; the readings of `recording` are not used."""
+    """Create a `TrackingResult`; the readings of `recording` are not used."""
     rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
     reason = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
                                  pipeline.detect, recording.missing_topics, rejections)

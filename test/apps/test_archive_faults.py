@@ -182,7 +182,7 @@ def test_invalid_arguments_are_reported(tmp_path, recordings, capsys):
 
 
 def test_a_recording_that_grows_during_tracking_is_tracked_again(tmp_path):
-    """Such a recording may still be in progress."""
+    """A recording may still be in progress while it is archived."""
     path, out, settings = tmp_path / 'a.mcap', tmp_path / 'out', settings_for('vehicle', QUICK)
     data = vehicle_path('straight_car_right').read_bytes()
     path.write_bytes(data[:len(data) // 2])
