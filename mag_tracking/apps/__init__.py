@@ -1,1 +1,4 @@
-"""Applications, callable from Python without ROS. Each command has a module of the same name."""
+"""Applications that can be called from Python without ROS.
+
+Most commands that process recordings have a module of the same name.
+"""

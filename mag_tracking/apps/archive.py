@@ -1,4 +1,4 @@
-"""Tracking of many or long recordings on a cluster, with all results in one dataset."""
+"""Tracking of many or long recordings on several processors or machines, into one dataset."""
 
 import dataclasses
 import glob
@@ -41,7 +41,7 @@ class ArchiveRun:
     tracks: int = 0
     """Number of tracks in the recordings tracked in this run."""
     passes: int = 0
-    """Number of fitted passes in the recordings tracked in this run."""
+    """Number of fitted passes, one per vehicle, in the recordings tracked in this run."""
     lost_workers: int = 0
     """Number of lost workers, whose tasks were repeated."""
     interrupted: bool = False
@@ -49,9 +49,10 @@ class ArchiveRun:
 
 
 def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
-    """Find the recordings given by folders, patterns and paths.
+    """Resolve paths, folders and glob patterns to recordings.
 
-    Folders are searched recursively. A folder with a metadata.yaml is itself a recording.
+    Folders are searched recursively; entries whose name begins with a dot are skipped. A folder
+    that contains metadata.yaml is a recording.
 
     Parameters
     ----------
@@ -78,14 +79,14 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
             raise RecordingError(f'{path}: no recording found; recordings end in '
                                  f'{", ".join(SUFFIXES)}')
         selected.update(dict.fromkeys(recordings))
-    # A pattern may match a recording and the files in it.
+    # A pattern may match both a recording and the files inside it.
     return [path for path in selected if path.parent not in selected]
 
 
 def _recordings_at(path: Path, visited: set[Path]) -> list[Path]:
-    """Find the recordings at or below a path; skip `visited` folders and add new ones to them.
+    """Find the recordings at or below a path; skip the `visited` folders, and extend this set.
 
-    An unreadable folder is included, so that it is reported as a failed recording.
+    An unreadable folder is returned like a recording, so that it is reported as failed.
     """
     path = path.resolve()
     if not path.is_dir():
@@ -128,8 +129,8 @@ def archive(recordings: Iterable[str | PathLike[str]],
             report: Callable[[str], object] | None = None) -> ArchiveRun:
     """Track recordings and write the results to a dataset.
 
-    Recordings tracked by an earlier run are skipped. The tables contain the same rows as a separate
-    replay of each recording.
+    Recordings tracked by an earlier run are skipped unless they have changed. The tables contain
+    the same rows as a separate replay of each recording.
 
     Parameters
     ----------
@@ -138,19 +139,20 @@ def archive(recordings: Iterable[str | PathLike[str]],
     network : SensorNetwork or path of a network file
     settings : Settings
     out : path
-        Folder of the dataset, described in `recording.archive_folder`.
+        Folder of the dataset; `recording.archive_folder` describes its layout.
     workers : int
         Number of processes on this machine.
     scheduler : str, optional
-        Address of a Dask scheduler, such as tcp://10.0.0.5:8786, used instead of `workers`. Its
-        workers need this package and access to the recordings and `out` under the same paths.
+        Address of a Dask scheduler, such as tcp://10.0.0.5:8786, used instead of `workers`. The
+        workers of the scheduler need this package, and access to the recordings and `out` under the
+        same paths.
     progress : function, optional
-        Called with the size of each completed recording in bytes.
+        Called with the size in bytes of each completed recording, including skipped recordings.
     stopped : function, optional
         Called several times per second; the run ends when it returns true. The next run into
         `out` continues with the remaining recordings.
     report : function, optional
-        Called with a line for the user for each recording that fails.
+        Called with a message to the user for each recording that fails.
 
     Returns
     -------
@@ -159,10 +161,12 @@ def archive(recordings: Iterable[str | PathLike[str]],
     Raises
     ------
     RecordingError
-        If there is no recording.
+        If an element of `recordings` matches no recording.
+    NetworkError
+        If the network file is invalid.
     OutputError
-        If the dataset cannot be written, or was created with other settings or by another
-        version.
+        If the dataset cannot be written, is in use by another run, or was created with another
+        network, other settings or another version.
     ClusterError
         If the scheduler does not respond or has no workers.
     MissingDependencyError
@@ -217,7 +221,7 @@ class _Scheduler:
         self._states: dict[Path, list[list[Any]]] = {}
 
     def run(self, recordings: Sequence[Path], stopped: Callable[[], bool]) -> None:
-        """Track recordings, only a few concurrently to bound the number of intermediate files."""
+        """Track recordings, a few at a time to limit intermediate files; end when stopped."""
         queued = list(reversed(recordings))
         while queued or self._cluster.n_running:
             while queued and self._n_active_recordings() < 2 * self._cluster.n_workers + 1:
@@ -229,11 +233,11 @@ class _Scheduler:
                 self._on_finished(kind, job, result)
 
     def _n_active_recordings(self) -> int:
-        """Number of recordings with running tasks."""
+        """Number of recordings whose tasks are running."""
         return len({job.recording for _, job in self._cluster.keys()})
 
     def _start(self, path: Path) -> None:
-        """Submit the first task of a recording."""
+        """Submit the first task of a recording, or report the recording as unreadable."""
         try:
             self._states[path] = recording_state(path)
         except OSError as error:
@@ -244,7 +248,7 @@ class _Scheduler:
         self._cluster.submit(('cut', job), 0, cut, job)
 
     def _on_finished(self, kind: str, job: Job, result: Any) -> None:
-        """Process the result of a task and submit the dependent tasks."""
+        """Process a task's result, submit dependent tasks; raises OutputError and ClusterError."""
         path = job.recording
         if isinstance(result, OutputError | ClusterError):
             raise result

@@ -17,7 +17,7 @@ ROW_INTERVAL_S = 600.0
 
 
 class HealthRows:
-    """Creates one row per sensor every ten minutes and at the end of the recording.
+    """Creates rows of the table `health`: one per sensor every ten minutes, and on request.
 
     Parameters
     ----------
@@ -31,7 +31,10 @@ class HealthRows:
         self._next_ns: int | None = None
 
     def due(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
-        """Create the rows that are due at the time of a frame.
+        """Create one row per sensor if `ROW_INTERVAL_S` has passed since the previous rows.
+
+        The first interval begins with the first frame, or with the first frame after the time
+        jumped back.
 
         Parameters
         ----------
@@ -51,7 +54,7 @@ class HealthRows:
             yield from self.rows(stamp_ns, calibrate)
 
     def rows(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
-        """Create one row per sensor.
+        """Create one row per sensor, with the number of readings since the previous row.
 
         Parameters
         ----------
@@ -82,6 +85,6 @@ class HealthRows:
 
 
 def _axis_columns(name: str, values: FloatArray) -> dict[str, float | None]:
-    """Columns of the three axes of a vector; None where the value is unknown."""
+    """Columns for the three axes of a vector; None replaces NaN."""
     return {f'{name}_{axis}': None if np.isnan(v) else float(v)
             for axis, v in zip('xyz', values, strict=True)}

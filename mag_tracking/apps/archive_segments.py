@@ -1,9 +1,10 @@
-"""Segments of a long recording in which a target is near, written to files for the tracker.
+"""Segments of a recording in which a target is detected, stored as files for the tracker.
 
 The stages before the tracker process the recording once, from beginning to end, and keep their
-backgrounds across segments. The tracker starts each segment without memory, but finds the same
-tracks as in the whole recording. To this end, a segment begins with all earlier frames that a new
-track may use, and ends only when a quiet interval is longer than their time span.
+backgrounds across segments. The tracker is restarted for each segment, but finds the same tracks
+as in the whole recording. To this end, a segment begins with all earlier frames that a new track
+may use, and ends only after an interval without a target that is longer than the time span of these
+frames.
 """
 
 import dataclasses
@@ -24,14 +25,14 @@ from mag_tracking.units import NS
 MIN_SEGMENT_FRAMES = 300
 """Minimum number of frames in a segment. Shorter segments have too much overhead."""
 CHUNK_FRAMES = 2000
-"""Maximum number of frames kept in memory."""
+"""Number of frames in memory at which a chunk is written to the file."""
 MIN_QUIET_S = 1.0
-"""Minimum duration of the quiet interval at the end of a segment [s]."""
+"""Minimum duration without a target that ends a segment [s]."""
 
 Doubts = Mapping[str, DoubtfulTimes]
 """{sensor: times at which its background is doubtful}."""
 NumberedPass = tuple[int, PassData, tuple[str, ...]]
-"""Index of a pass in its recording from 1, its measurements, and notes for the user."""
+"""Index of a pass in its recording (from 1), measurements of the pass, and notes for the user."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,13 +40,13 @@ class FrameChunk:
     """Consecutive frames as arrays, and the passes that ended during these frames."""
 
     stamp_ns: IntArray
-    """(n,) ns."""
+    """(n,) ns, timestamps of the frames."""
     field: FloatArray
     """(n, n_sensors, 3) T, sensor frame, background removed."""
     covariance: FloatArray
     """(n, n_sensors, 3, 3) T², sensor frame."""
     n_samples: IntArray
-    """(n, n_sensors) number of samples averaged; 0 = missing."""
+    """(n, n_sensors) number of averaged samples; 0 if the sensor is missing."""
     time_offset: FloatArray
     """(n, n_sensors) s, mean time of the samples of a sensor relative to `stamp_ns`."""
     target_present: BoolArray
@@ -82,6 +83,7 @@ def read_segment(path: Path) -> Iterator[FrameChunk]:
     Parameters
     ----------
     path : Path
+        File of the segment.
 
     Yields
     ------
@@ -114,7 +116,8 @@ class SegmentWriter:
         self._folder = folder
         self._quiet_ns = int(max(lookback_s, MIN_QUIET_S) * NS)
         self.n_segments = self.n_frames = 0
-        # (frame, doubts): quiet frames that a new track may use, and frames of the open segment.
+        # Pairs (frame, doubts): frames without a target that a new track may use, and frames of the
+        # open segment.
         self._lookback: deque[tuple[FieldFrame, Doubts]] = deque()
         self._unwritten: list[tuple[FieldFrame, Doubts]] = []
         self._passes: list[NumberedPass] = []
@@ -123,7 +126,7 @@ class SegmentWriter:
         self._last_frame: FieldFrame | None = None
 
     def add_frame(self, frame: FieldFrame, doubts: Doubts) -> None:
-        """Add the next frame.
+        """Add the next frame; write a chunk or end the segment if due.
 
         Parameters
         ----------
@@ -131,12 +134,17 @@ class SegmentWriter:
             Frame with its detection result.
         doubts : Doubts
             Doubtful times known so far.
+
+        Raises
+        ------
+        OutputError
+            If the segment file cannot be written.
         """
         last, self._last_frame = self._last_frame, frame
         self.n_frames += 1
         if last is not None and frame.stamp_ns <= last.stamp_ns:
-            # The time jumped back: a new track does not use earlier frames. If quiet frames were
-            # omitted, the tracker of the segment could not detect the jump.
+            # The time jumped back: a new track does not use earlier frames. After frames without a
+            # target, which are not stored, the tracker could not detect the jump. The segment ends.
             if not last.target_present:
                 self.close()
             self._lookback.clear()
@@ -173,7 +181,13 @@ class SegmentWriter:
         self._passes.append((number, data, notes))
 
     def close(self) -> None:
-        """End the current segment, if there is one."""
+        """End the current segment, if there is one.
+
+        Raises
+        ------
+        OutputError
+            If the segment file cannot be written.
+        """
         if self._unwritten or self._passes:
             self._write()
         self.n_segments += self._is_open

@@ -1,4 +1,4 @@
-"""Tracks and passes of one segment of a recording, as rows of the tables of an archive."""
+"""Tracks and passes of one segment of a recording, as rows of archive tables."""
 
 import math
 from contextlib import ExitStack
@@ -36,13 +36,14 @@ class SegmentTables:
     paths : dict of str to Path
         File of each table in `SEGMENT_TABLES`.
     n_dipoles : int
-        Number of dipoles in the row that is fitted to a pass.
+        Number of dipoles in the row that models a vehicle. A joint fit of several vehicles also
+        tries one dipole fewer.
     settings : TrackSettings
 
     Attributes
     ----------
     n_tracks, n_passes : int
-        Number of tracks and fitted passes written.
+        Number of written tracks, and number of written passes, one per vehicle.
     """
 
     def __init__(self, recording: Path, paths: dict[str, Path], n_dipoles: int,
@@ -62,7 +63,7 @@ class SegmentTables:
         self._files.__exit__(*error)
 
     def track(self, chunk: FrameChunk, tracker: TrackManager) -> None:
-        """Track the targets in a chunk of the segment and fit its passes.
+        """Track the targets in a chunk of the segment, fit its passes, and write the rows.
 
         Parameters
         ----------
@@ -92,7 +93,7 @@ class SegmentTables:
             self._add_track_row(log)
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Do nothing: frames have no table.
+        """Ignore a frame, because frames have no table.
 
         Parameters
         ----------
@@ -100,7 +101,7 @@ class SegmentTables:
         """
 
     def add_detection(self, detection: Detection) -> None:
-        """Do nothing: detections have no table.
+        """Ignore a detection, because detections have no table.
 
         Parameters
         ----------
@@ -108,7 +109,7 @@ class SegmentTables:
         """
 
     def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Do nothing: disturbances have no table.
+        """Ignore a disturbance, because disturbances have no table.
 
         Parameters
         ----------

@@ -1,7 +1,7 @@
 """Tasks of an archive: cut a recording into segments, track each segment, join the tables.
 
-Each task writes one folder below the folder of its recording. If this folder exists, the task does
-nothing. Every task can therefore be repeated.
+The tasks `cut` and `track_segment` each write a folder, and do nothing if the folder exists. Every
+task can therefore be repeated.
 """
 
 import copy
@@ -39,10 +39,10 @@ from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.rigid_pass import RigidPass
 
 N_DIPOLES = 3
-"""Number of dipoles in the row that is fitted to a pass."""
+"""Number of dipoles in the row that models a vehicle."""
 
 CUT_FILE, TRACKED_FILE = 'columns.json', 'tracked.pickle'
-"""Files that pass the result of a task to the next task, stored in the folder of its tables."""
+"""Files with the result of a task for later tasks, stored in the folder that the task writes."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class RecordedEvidence(ClockComparison):
     passes : list of (RigidPass, (n,) int array)
         Passes, each with the indices of its sensors in the network.
     clocks_differed : bool
-        Whether clocks were ever found to differ. Tracks then depend on earlier passes.
+        Whether a clock offset was ever significant. Tracks then depend on earlier passes.
     """
 
     def __init__(self, n_sensors: int) -> None:
@@ -107,7 +107,7 @@ class RecordedEvidence(ClockComparison):
         ----------
         found : RigidPass
         rows : (n,) int array
-            Indices of its sensors in the network.
+            Indices, in the network, of the sensors of the pass.
         """
         super().add(found, rows)
         self.passes.append((found, rows))
@@ -153,7 +153,7 @@ def cut(job: Job) -> dict[str, Any]:
 def _atomic_folder(final: Path) -> Iterator[Path]:
     """Yield a folder to write to and rename it to `final` at the end; raises OutputError.
 
-    The same task may also run on a worker that was considered lost, or for a run that was killed.
+    Another process may run the same task: a worker considered lost, or a worker of a killed run.
     The first result is kept; all results are equal.
     """
     draft = final.with_name(f'.{secrets.token_hex(8)}.{final.name}')
@@ -170,7 +170,7 @@ def _atomic_folder(final: Path) -> Iterator[Path]:
 
 @contextmanager
 def _output_errors(path: Path) -> Iterator[None]:
-    """Convert an OSError to an OutputError that names `path`; ignore it if `path` exists."""
+    """Convert an OSError to an OutputError that names `path`; suppress it if `path` exists."""
     try:
         yield
     except OSError as error:
@@ -211,14 +211,14 @@ class _Segmenter:
             'no_detection_reason': self._passes.no_detection_reason(missing) or ''}
 
     def _add_frame(self, frame: FieldFrame) -> None:
-        """Write a frame with its detection result."""
+        """Write a frame with its detection result, and the health rows that are due."""
         self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
         self._last_ns = frame.stamp_ns
         self._writer.add_frame(frame, self._passes.calibrate.doubtful_intervals())
         self._add_health(self._health.due(frame.stamp_ns, self._passes.calibrate))
 
     def _add_passes(self, passes: Iterable[tuple[PassData, tuple[str, ...]]]) -> None:
-        """Write completed passes."""
+        """Number completed passes and write them."""
         for data, notes in passes:
             self._n_passes += 1
             self._writer.add_pass(self._n_passes, data, notes)

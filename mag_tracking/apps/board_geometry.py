@@ -24,10 +24,11 @@ from mag_tracking.recording.pose_table import (
 )
 
 ASSUMED_NOISE = 1e-7
-"""Noise of sensors without a configured noise [T]. Near a magnet, the field error is larger."""
+"""Noise assumed for sensors without a configured noise [T]. Near a magnet, the field error is
+larger."""
 
 MIN_ROTATION_STD = 1e-7
-"""Standard deviation below which an orientation counts as fixed in the estimation [rad]."""
+"""Standard deviation below which an orientation is considered fixed, not estimated [rad]."""
 
 FIRST_ROW = 2
 """Row number of the first pose in the table; the header is row 1."""
@@ -50,7 +51,7 @@ class GeometrySurvey:
     n_poses: int
     """Number of poses in the table."""
     silent_axes: tuple[tuple[str, str], ...]
-    """(sensor, axes without readings) of each sensor with readings of only some axes."""
+    """(sensor, its axes without readings) for each sensor that reports some axes but not all."""
 
     @property
     def rotation_angle(self) -> FloatArray:
@@ -67,7 +68,7 @@ def board_of(path: str | PathLike[str]) -> SensorNetwork:
     Parameters
     ----------
     path : path
-        CSV file with x, y, z [m].
+        CSV file with the position x, y, z [m] of each sensor.
 
     Returns
     -------
@@ -93,7 +94,7 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
                     settings: GeometrySettings, date: str,
                     box: tuple[Sequence[float], Sequence[float]] | None = None,
                     noise_std: float | None = None) -> GeometrySurvey:
-    """Estimate the geometry of a network from readings of a magnet in many poses.
+    """Estimate the geometry of a network from its readings for many poses of a magnet.
 
     Parameters
     ----------
@@ -108,7 +109,8 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
     date : str
         Date of the calibration, stored in the network.
     box : (low, high), optional
-        Corners (3,) [m] of the box that contains the magnet. With a box, the table needs no poses.
+        Corners (3,) [m] of the box that contains the magnet. If given, the poses are estimated, and
+        the table needs only readings.
     noise_std : float, T, optional
         Noise of sensors without a configured noise. By default, `ASSUMED_NOISE` is used, but not
         stored in the network.
@@ -120,7 +122,8 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
     Raises
     ------
     RecordingError
-        If the table cannot be read or used.
+        If the table cannot be read, does not match the network, or is not sufficient for the
+        estimation.
     """
     if box is None:
         readings, positions, axes = read_pose_table(table)
@@ -179,7 +182,7 @@ def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
 
 def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: str,
                        by: str) -> SensorNetwork:
-    """Apply estimated positions, orientations, gains and biases to a network.
+    """Return a network with the estimated positions, orientations, gains and biases.
 
     A reading is gain * field + bias. The stage Calibrate applies the correction before it removes
     the background. The stored background and noise therefore refer to corrected readings. A sensor
@@ -231,7 +234,7 @@ def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
 
 
 def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:
-    """Set the noise [T] of sensors without a configured noise; None changes nothing."""
+    """Return `network` with `noise_std` [T] for sensors that have no noise; unchanged if None."""
     if noise_std is None:
         return network
     return replace(network, noise_std=tuple(
@@ -239,7 +242,7 @@ def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwor
 
 
 def _silent_axes(network: SensorNetwork, field: FloatArray) -> Iterator[tuple[str, str]]:
-    """Yield (sensor, axes without readings) of each sensor with readings of only some axes."""
+    """Yield (sensor, its axes without readings) for sensors that report some axes but not all."""
     silent: BoolArray = np.all(np.isnan(field), axis=0)
     for name, axes in zip(network.names, silent, strict=True):
         if axes.any() and not axes.all():

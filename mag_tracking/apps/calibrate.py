@@ -20,7 +20,7 @@ from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.survey.stage import NetworkSurvey, Survey, with_measured_noise
 
 MIN_POSES = 8
-"""Minimum number of unambiguous poses of a track that the calibration uses."""
+"""Minimum number of unambiguous poses of a track; shorter tracks are not used."""
 
 
 @dataclass
@@ -32,7 +32,7 @@ class Calibration:
     survey: NetworkSurvey
     """Results from accelerometers, compasses and knocks."""
     evidence: MountingEvidence | None
-    """Results from the passes; None without usable passes."""
+    """Orientations from passing targets; None if no pass was used."""
     levels: dict[str, FloatArray]
     """{sensor: (3,) field without a target, T, sensor frame}."""
     rejected: dict[str, int]
@@ -48,22 +48,23 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
               stopped: Callable[[], bool] | None = None) -> Calibration:
     """Estimate orientations, clock offsets and noise of a network from a recording.
 
-    The recording must begin without a target; clock offsets require knocks.
+    The recording must start without a target near the sensors. Clock offsets are estimated from
+    knocks.
 
     Parameters
     ----------
     recording : Recording
     network : SensorNetwork
-        Network as installed.
+        Network before the calibration, with nominal orientations.
     settings : Settings
     date : str
         Date of the calibration, stored in the network.
     passes : bool
-        Whether to refine the orientations with passing targets; ignored if
-        `track.mounting_std_deg` is zero.
+        Whether to refine the orientations with passing targets. This step is omitted if
+        `track.mounting_std_deg` is zero, or if a sensor contradicts the Earth's field.
     progress : function, optional
-        Called with the number of bytes read since the last call. With `passes`, the recording is
-        read twice.
+        Called with the number of bytes read since the last call. If the orientations are refined
+        with passing targets, the recording is read twice.
     stopped : function, optional
         Called after every batch of readings; reading ends when it returns true.
 
@@ -79,7 +80,7 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
     levels, survey, calibrated, interrupted = _survey_recording(
         recording, network, settings, date, progress, stopped)
     if not calibrated.counts.total():
-        raise RecordingError(f'{recording.path}: no samples of the sensors of the network')
+        raise RecordingError(f'{recording.path}: no samples from the sensors of the network')
     estimated = with_measured_noise(survey.network, calibrated)
     evidence = None
     # A faulty sensor would bias the orientations of the other sensors.
@@ -102,7 +103,7 @@ def _survey_recording(recording: Recording, network: SensorNetwork, settings: Se
                       progress: Callable[[int], object] | None,
                       stopped: Callable[[], bool] | None,
                       ) -> tuple[dict[str, FloatArray], NetworkSurvey, Calibrate, bool]:
-    """Read the recording for the first time; return (levels, survey, stage, interrupted)."""
+    """Survey the sensors in a recording; return (levels, survey, stage, interrupted)."""
     reader = SampleReader(recording, network)
     # Backgrounds and noise in the network file may be outdated; they are learnt again.
     unlearnt = replace(network, background=(), noise_std=())
@@ -115,7 +116,8 @@ def _survey_recording(recording: Recording, network: SensorNetwork, settings: Se
                 survey.feed(record)
                 continue
             stage.feed(record)
-            # The first known background is used: later, a target may be standing near the sensor.
+            # The first background that is not doubtful is used, because a target may stop near the
+            # sensor later.
             levels.update({name: stage.background(name) for name in record.names
                            if name not in levels and stage.backgrounds()[name].certain})
     except ReadingStopped:
@@ -128,7 +130,7 @@ def _survey_recording(recording: Recording, network: SensorNetwork, settings: Se
 def _track_passes(recording: Recording, network: SensorNetwork, settings: Settings,
                   progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
                   ) -> tuple[list[Track], bool]:
-    """Read the recording again; return (last unambiguous pose of each track, interrupted)."""
+    """Track the targets; return (last unambiguous pose of each used track, interrupted)."""
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
     poses: dict[int, tuple[int, Track]] = {}
     interrupted = False
@@ -150,7 +152,7 @@ def _track_passes(recording: Recording, network: SensorNetwork, settings: Settin
 
 def _with_pass_records(network: SensorNetwork, surveyed: SensorNetwork, date: str,
                        n_tracks: int) -> SensorNetwork:
-    """Add the number of passes to the calibration records of `surveyed`; set them in `network`."""
+    """Return `network` with the calibration records of `surveyed` and the number of passes."""
     passes = quantity(n_tracks, 'pass', 'passes')
     return replace(network, calibrated=tuple(
         surveyed.calibration_record(j, date, f'as stated; {passes}') if record is None

@@ -1,4 +1,4 @@
-"""Report of a calibration: clock offsets, headings, noise, warnings."""
+"""Report of a calibration: clock offsets, headings, noise and warnings."""
 
 from pathlib import Path
 
@@ -84,7 +84,8 @@ def _knocks(found: Calibration) -> list[Chart]:
             near = np.abs(t - offset - first) < KNOCK_MARGIN_S
             traces.append(curve(t[near] - offset - first, acceleration[near], name, k,
                                 'lines+markers'))
-        charts.append(Chart(title, traces, axes('time [s]', 'acceleration from rest [m/s²]')))
+        charts.append(Chart(title, traces, axes('time [s]',
+                                                'acceleration relative to rest [m/s²]')))
     return charts
 
 
@@ -104,12 +105,12 @@ def _headings(found: Calibration, stated: SensorNetwork) -> Chart:
             'y': [plain(name) for name in stated.names],
             'error_x': {'type': 'data', 'array': half_width, 'color': SERIES[k]},
             'marker': {'color': SERIES[k], 'size': 8, 'symbol': ('circle', 'square')[k]}})
-    return Chart('Rotation about the vertical relative to the network file (90%)', traces,
+    return Chart('Rotation about the vertical relative to the network file, 90% intervals', traces,
                  axes('[degrees]', ''))
 
 
 def _table(found: Calibration) -> Table:
-    """Table of the orientation, clock and noise of each sensor."""
+    """Table of the orientation, clock offset and noise of each sensor."""
     network, rows = found.network, list[list[str | float | None]]()
     for j, name in enumerate(network.names):
         R, std, noise = network.R_ws[j], network.orientation_std[j], network.noise_std[j]

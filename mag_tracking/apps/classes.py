@@ -38,7 +38,7 @@ class Examples:
     """Feature vectors of signatures, with labels and origins."""
 
     x: FloatArray
-    """(n, n_features)."""
+    """(n, n_features) feature vectors."""
     labels: tuple[str, ...]
     """(n,) classes; empty strings if unlabelled."""
     sources: tuple[str, ...]
@@ -50,7 +50,7 @@ class Examples:
     unit: str
     """Unit of all signatures; empty if unknown."""
     unusable: tuple[str, ...]
-    """Reason for each signature without features."""
+    """One message per signature for which no features could be computed."""
 
 
 def examples_of(signatures: list[Signature]) -> Examples:
@@ -82,7 +82,7 @@ def examples_of(signatures: list[Signature]) -> Examples:
 def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] | None = None,
                         network: SensorNetwork | None = None, is_labelled: bool = True
                         ) -> list[Signature]:
-    """Read the signatures in a table, or extract the labelled intervals of a recording.
+    """Read the signatures in a table, or extract them from labelled intervals of a recording.
 
     Parameters
     ----------
@@ -102,7 +102,8 @@ def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] |
     Raises
     ------
     LabelsError
-        If labels are missing, overlap or are empty, or an interval contains no readings.
+        If labels or the network are missing, a label is empty, intervals overlap, or an interval
+        contains no readings.
     RecordingError
         If a file cannot be read.
     """
@@ -192,7 +193,7 @@ def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_
     model : SignatureModel, optional
         Model to evaluate; by default, a model is trained for each split.
     n_splits : int
-        Number of splits without `model`.
+        Number of splits; ignored if `model` is given.
     progress : function
         Wraps the iterable of splits, as `tqdm` does.
 

@@ -35,7 +35,7 @@ _TIMEOUT_ERRORS = (TimeoutError, asyncio.TimeoutError)
 
 
 class LostWorkersError(MagTrackingError):
-    """A task lost its worker several times."""
+    """A task failed because its worker was lost several times."""
 
 
 class _Task(NamedTuple):
@@ -123,12 +123,12 @@ class Cluster(Generic[_Key]):
         return [task.key for task in self._running.values()]
 
     def submit(self, key: _Key, priority: int, task: Callable[..., Any], *arguments: Any) -> None:
-        """Run `task(*arguments)` on a worker.
+        """Submit the call `task(*arguments)` to the workers.
 
         Parameters
         ----------
         key : hashable
-            Returned with the result.
+            Identifies the task; `finished` yields it with the result.
         priority : int
             Tasks with a higher priority are started first.
         task : function
@@ -155,7 +155,7 @@ class Cluster(Generic[_Key]):
         Raises
         ------
         ClusterError
-            If the connection to the scheduler is lost.
+            If the connection to the scheduler is lost, or there have been no workers for too long.
         """
         from distributed import wait
 
@@ -179,9 +179,10 @@ class Cluster(Generic[_Key]):
             return future.result()
         error = future.exception() if future.status == 'error' else None
         if isinstance(error, KilledWorker):
-            return LostWorkersError('its worker was lost several times (killed or out of memory)')
-        return error or ClusterError('the scheduler abandoned a task or has ended; run the command '
-                                     'again')
+            return LostWorkersError('the worker of a task was lost several times (killed or out of '
+                                    'memory)')
+        return error or ClusterError('the scheduler has stopped or has cancelled a task; run the '
+                                     'command again')
 
     def _count_lost(self) -> None:
         """Count lost workers; raises ClusterError if there have been no workers for too long."""
@@ -237,7 +238,7 @@ def _event_loop() -> 'IOLoop':
 
 
 def _local(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
-    """Start worker processes on this machine and return their client."""
+    """Start worker processes on this machine and return a client that submits tasks to them."""
     # Starting Python's resource tracker unblocks SIGINT in the calling thread, which must not be
     # the thread of the event loop.
     resource_tracker.ensure_running()
@@ -253,7 +254,7 @@ def _local(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
 
 
 async def _reach(address: str) -> None:
-    """Connect to a scheduler once; raises OSError or ValueError if it does not respond."""
+    """Check that a scheduler responds; raises OSError or ValueError."""
     from distributed.comm.core import connect
 
     await (await connect(address, timeout=CONNECT_TIMEOUT_S)).close()

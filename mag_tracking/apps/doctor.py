@@ -27,17 +27,17 @@ MAX_FROZEN_S = 30.0
 """Time for which a background may be frozen before it is reported [s]."""
 
 MAX_CLOCK_DIFFERENCE_S = 60.0
-"""Maximum difference between the clocks of sensors [s]."""
+"""Difference from the clocks of other sensors above which a clock is reported [s]."""
 
 MIN_MISSED_TARGETS = 3
 """Number of consecutive missed targets at which a sensor is reported."""
 
 LEVEL_STEP = 1e-8
-"""Step to which levels are rounded for comparison; a fiftieth of the field of nearby iron [T]."""
+"""Step to which levels are rounded for comparison [T]: a fiftieth of the field of nearby iron."""
 
 
 def level_of(calibrate: Calibrate, name: str, health: SensorHealth) -> FloatArray:
-    """Return the field of a sensor without a target.
+    """Return the field that a sensor measures while no target is present.
 
     Parameters
     ----------
@@ -105,8 +105,8 @@ def _clock_findings(network: SensorNetwork,
     for name, delay in delays.items():
         if abs(delay - reference) > MAX_CLOCK_DIFFERENCE_S:
             yield Finding(True, name, f'its timestamps differ by {reference - delay:+.4g} s from '
-                          'the timestamps of other sensors', 'set its clock (chrony, PTP); knocks '
-                          'correct only offsets below survey.max_clock_offset_s')
+                          'the timestamps of other sensors', 'synchronise its clock (chrony, PTP); '
+                          'knocks correct only offsets below survey.max_clock_offset_s')
 
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
@@ -119,9 +119,9 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
         Sensor.
     calibrate : Calibrate
     frozen_since_ns : int, ns, or None
-        Timestamp since which the background has been frozen.
+        Timestamp from which the background has been frozen; None if it is not frozen.
     n_reported : int
-        Number of relearnt backgrounds that were already reported.
+        Number of relearnt backgrounds that were reported earlier.
 
     Yields
     ------
@@ -133,12 +133,12 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       'iron near it to check whether it is stuck or too coarse; to use it, set '
                       'background and noise_std in the network file')
     elif last is not None and not background.ready:
-        yield Finding(True, name, 'no background was learnt', 'begin without a target for a few '
-                      'seconds, or set background and noise_std in the network file')
+        yield Finding(True, name, 'no background was learnt', 'keep targets away during the '
+                      'first seconds, or set background and noise_std in the network file')
     if background.doubtful:
-        yield Finding(False, name, 'its background is doubtful, and its tracks are ambiguous',
-                      'begin without a target for a few seconds, or set background and noise_std '
-                      'in the network file')
+        yield Finding(False, name, 'its background is doubtful, which makes tracks ambiguous',
+                      'keep targets away during the first seconds, or set background and '
+                      'noise_std in the network file')
     if background.n_relearnt > n_reported:
         times = quantity(background.n_relearnt - n_reported, 'time')
         yield Finding(False, name, f'a lasting change of the field became its background {times}',
@@ -147,8 +147,8 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
     if last is not None and frozen_since_ns is not None \
             and (last - frozen_since_ns) / NS > MAX_FROZEN_S:
         yield Finding(False, name, 'its background has been frozen for '
-                      f'{(last - frozen_since_ns) / NS:.0f} s', 'a target stays near it, or the '
-                      'field has changed permanently: call the service calibrate')
+                      f'{(last - frozen_since_ns) / NS:.0f} s', 'remove any target near it; if the '
+                      'field has changed permanently, call the service calibrate')
 
 
 class MissedTargets:
@@ -265,7 +265,7 @@ class Doctor:
                 rejection_advice(cause)))
         warning = frame_period_warning(self._settings.align, self.network)
         if warning:
-            found.append(Finding(True, 'align', warning, 'set align.period_s to 0 (auto)'))
+            found.append(Finding(True, 'align', warning, 'set align.period_s to 0 (automatic)'))
         return sorted(found, key=lambda f: not f.serious)
 
 
@@ -289,7 +289,7 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
     doctor : Doctor
         Doctor after reading the recording.
     findings : list of Finding
-        Damage to the recording, which the findings of `doctor` do not include.
+        Damage to the recording, which `doctor.findings` does not include.
 
     Raises
     ------
@@ -304,6 +304,6 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
             break
     damage = [Finding(True, recording.path.name, f'{cause}: {n}', 'the recording is damaged: run '
                       'mag-tracking repair') for cause, n in recording.losses.items()]
-    damage += [Finding(False, 'recording', f'{cause}: {n}', 'the recording is damaged, or its '
-                       'message type differs') for cause, n in reader.rejected.items()]
+    damage += [Finding(False, 'recording', f'{cause}: {n}', 'the recording is damaged, or '
+                       'a message type is unsupported') for cause, n in reader.rejected.items()]
     return doctor, damage

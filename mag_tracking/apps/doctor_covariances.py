@@ -27,7 +27,7 @@ def likely_cause(stated: float, measured: float) -> str:
     Returns
     -------
     str
-        Content of the covariance field, such as 'a placeholder'.
+        Probable meaning of the declared covariance, such as 'a placeholder'.
     """
     if abs(np.log(stated**2 / measured)) < np.log(MAX_MISMATCH):
         return 'the standard deviation instead of the variance'
@@ -40,7 +40,7 @@ def likely_cause(stated: float, measured: float) -> str:
 
 
 def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator[Finding]:
-    """Report a sensor whose messages declare a different noise than its readings have.
+    """Report a sensor whose messages declare a noise that contradicts its readings.
 
     Parameters
     ----------

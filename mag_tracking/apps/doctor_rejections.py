@@ -28,14 +28,13 @@ ADVICE = {
     RejectionCause.INFINITE: 'check the driver',
     RejectionCause.TOO_LARGE: 'check for gauss or microtesla published as tesla; near a magnet, '
                               'raise calibrate.max_field',
-    RejectionCause.BAD_COVARIANCE: 'publish zeros if the noise is unknown',
+    RejectionCause.BAD_COVARIANCE: 'publish a covariance of zeros if the noise is unknown',
     RejectionCause.AXIS_MISSING: 'check the sensor and its driver, or remove the correction from '
                                  'the network file',
     RejectionCause.TOO_FAR_AHEAD: 'check for a clock step or corrupt messages',
-    RejectionCause.DUPLICATE: 'the driver publishes readings twice, or its timestamps are too '
-                              'coarse',
-    RejectionCause.OUT_OF_ORDER: 'check for two publishers on one topic, and for a clock that was '
-                                 'set',
+    RejectionCause.DUPLICATE: 'check whether the driver publishes readings twice, or with '
+                              'timestamps that are too coarse',
+    RejectionCause.OUT_OF_ORDER: 'check for two publishers on one topic, and for a clock step',
     RejectionCause.STUCK: 'the sensor or its driver is stuck: restart it; for simulated sensors '
                           'without noise, set calibrate.reject_stuck to false',
     RejectionCause.SPIKES: 'check connectors, power supply and checksums; if the targets are fast, '
@@ -49,7 +48,7 @@ _CAUSE_OF_PREFIX = {
     'above ': RejectionCause.TOO_LARGE,
     'spike': RejectionCause.SPIKES,
     'possible spike when ': RejectionCause.SPIKES}
-"""Causes whose description contains a value or a circumstance: {beginning: cause}."""
+"""Causes whose description contains a variable part: {start of the description: cause}."""
 
 
 def rejection_cause(description: str) -> RejectionCause | None:
@@ -58,7 +57,7 @@ def rejection_cause(description: str) -> RejectionCause | None:
     Parameters
     ----------
     description : str
-        Key of `stages.stage.rejected`.
+        Key of the result of `stages.stage.rejected`.
 
     Returns
     -------
@@ -77,7 +76,7 @@ def rejection_advice(description: str) -> str:
     Parameters
     ----------
     description : str
-        Key of `stages.stage.rejected`.
+        Key of the result of `stages.stage.rejected`.
 
     Returns
     -------

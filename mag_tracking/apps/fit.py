@@ -65,7 +65,7 @@ class RecordingFit:
 
     def passes(self, progress: Callable[[int], object] | None = None,
                stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """Read the recording and yield each pass after its fit.
+        """Read the recording, fit each pass, and yield the results.
 
         Parameters
         ----------
@@ -88,7 +88,7 @@ class RecordingFit:
         yield from self._fitter.flush(stopped)
 
     def warnings(self) -> list[str]:
-        """Describe missing topics, missing backgrounds, and lost or rejected readings.
+        """Describe missing topics, backgrounds and detections, and lost or rejected readings.
 
         Returns
         -------
@@ -114,7 +114,7 @@ class FitResult:
     passes: tuple[FittedPass, ...]
     """One entry per pass and vehicle."""
     warnings: tuple[str, ...]
-    """Warnings about lost or rejected readings and unused sensors."""
+    """Warnings about missing topics, backgrounds or detections, and lost or rejected readings."""
 
     def __repr__(self) -> str:
         return (f'FitResult({quantity(len(self.passes), "pass", "passes")}'
@@ -213,12 +213,12 @@ def check_cpa_range(name: str, cpa_range: Sequence[float] | None, network: Senso
     Raises
     ------
     SettingsError
-        If the values are not positive, or the network has several sensors.
+        If `cpa_range` is not a pair of positive values, or the network has several sensors.
     """
     if cpa_range is None:
         return
     if len(network) > 1:
         raise SettingsError(f'{name}: only for a single sensor; the {len(network)} sensors of the '
-                            'network determine the scale')
+                            'network already determine the scale')
     if len(cpa_range) != 2 or not (np.isfinite(cpa_range).all() and min(cpa_range) > 0.0):
         raise SettingsError(f'{name}: expected two positive numbers, got {list(cpa_range)}')

@@ -55,7 +55,7 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
              warnings: Sequence[str]) -> Page:
     """Create the page of fitted passes.
 
-    A pass without an estimate appears only in the table.
+    A pass without an estimate is not shown on the map.
 
     Parameters
     ----------
@@ -72,14 +72,14 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
     if not passes:
         notes.append(Note(NOTE, 'no passes: nothing was detected'))
     if any(fitted.n_vehicles > 1 for fitted in passes):
-        notes.append(Note(NOTE, 'for vehicles fitted together, the measured field is shown without '
-                          'the field of the other vehicles'))
-    begins = [ns / NS for ns in _begins_ns(passes)]
+        notes.append(Note(NOTE, 'for vehicles that were fitted together, the fitted field of the '
+                          'other vehicles is subtracted from the measured field'))
+    peaks = [ns / NS for ns in _peaks_ns(passes)]
     if len({fitted.recording for fitted in passes}) > 1:
         notes.append(Note(NOTE, 'the time axis shows the recordings one after another'))
-    tracks = [_pass_entry(k + 1, fitted, fitted.chosen, begins[k])
+    tracks = [_pass_entry(k + 1, fitted, fitted.chosen, peaks[k])
               for k, fitted in enumerate(passes) if fitted.chosen is not None]
-    ends = [begins[k] + float(fitted.fits[0].data.t.max()) for k, fitted in enumerate(passes)]
+    ends = [peaks[k] + float(fitted.fits[0].data.t.max()) for k, fitted in enumerate(passes)]
     scene = scene_of(network, 0, int(max(ends) * NS), tracks) if tracks else None
     n_estimates = len(tracks)
     n_passes = len({(fitted.recording, fitted.number) for fitted in passes})
@@ -90,16 +90,16 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
 
 
 def _poor_fits(passes: Sequence[FittedPass]) -> list[str]:
-    """Warning about chosen fits with a high cost, in at most one line."""
+    """Return one warning if chosen fits have a high cost, otherwise an empty list."""
     costs = [fitted.chosen.normalised_cost for fitted in passes if fitted.chosen is not None]
     n_poor = sum(cost > MAX_NORMALISED_COST for cost in costs)
     if not n_poor:
         return []
     return [f'poor fits (normalised cost above {MAX_NORMALISED_COST:g}): {n_poor} of {len(costs)}; '
-            'their errors of speed and position may be several standard deviations']
+            'errors of their speed and position may exceed several standard deviations']
 
 
-def _begins_ns(passes: Sequence[FittedPass]) -> list[int]:
+def _peaks_ns(passes: Sequence[FittedPass]) -> list[int]:
     """Return the time of the strongest field of each pass on the time axis of the page [ns]."""
     out: list[int] = []
     recording, shift, end = '', 0, 0
@@ -114,8 +114,8 @@ def _begins_ns(passes: Sequence[FittedPass]) -> list[int]:
     return out
 
 
-def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, begin: float) -> dict[str, Any]:
-    """Create the scene entry of the chosen fit of a pass, as JSON-compatible values."""
+def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak: float) -> dict[str, Any]:
+    """Create the scene entry of a chosen fit, whose field is strongest at the time `peak` [s]."""
     data = fit.data
     t = np.linspace(data.t.min(), data.t.max(), N_POSES)
     F = np.tile(np.eye(6), (N_POSES, 1, 1))
@@ -125,9 +125,9 @@ def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, begin: float) -> 
     target_field = target_alone(fit)
     other_field = fit.predicted - target_field
     fields = [field_entry(int(j), (data.field - other_field)[data.sensor == j],
-                          target_field[data.sensor == j], begin + data.t[data.sensor == j])
+                          target_field[data.sensor == j], peak + data.t[data.sensor == j])
               for j in data.sensors]
-    entry = fitted_entry(number, begin + t, state, C, fit.ambiguous, fields)
+    entry = fitted_entry(number, peak + t, state, C, fit.ambiguous, fields)
     entry['facts'] = {
         'label': f'{fitted.recording}, {fitted.label}', 'kind': quantity(fit.n_dipoles, 'dipole'),
         'speed': float(fit.speed[0]), 'moment': float(np.linalg.norm(fit.moment[0])),
@@ -149,7 +149,7 @@ def _order_chart(passes: Sequence[FittedPass]) -> Chart:
 
 
 def _table(passes: Sequence[FittedPass]) -> Table:
-    """Table of the fits of all passes with all numbers of dipoles."""
+    """Table with one row per fitted vehicle and number of dipoles."""
     rows: list[list[str | float | None]] = []
     for fitted in passes:
         for fit in fitted.fits:

@@ -41,7 +41,7 @@ def induction_of(network: SensorNetwork) -> FloatArray:
 
 
 def pass_of(recording: str, passages: Sequence[VehiclePassage]) -> FleetPass:
-    """Convert the only passage in a recording to a pass of an enrolled vehicle.
+    """Convert the only passage in a recording to a pass for the enrolment of a vehicle.
 
     Parameters
     ----------

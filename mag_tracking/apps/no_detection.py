@@ -63,7 +63,7 @@ def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: C
 
 def _likely_cause(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
                   detect: Detect) -> str:
-    """Describe the setting or network-file entry that probably prevented a detection."""
+    """Describe the probable cause of the missing detection."""
     unready = calibrate.unready()
     if unready:
         return f'{", ".join(unready)} had no background and could not be used'
@@ -78,7 +78,7 @@ def _likely_cause(network: SensorNetwork, settings: Settings, calibrate: Calibra
         return (f'it lasted for {frames}, but detect.onset_frames is '
                 f'{settings.detect.onset_frames}')
     if settings.calibrate.trust_covariances:
-        return ('the covariances of the messages are used unchecked '
+        return ('the covariances in the messages, which may be too large, are used unchecked '
                 '(calibrate.trust_covariances)')
     scatters = np.concatenate([b.scatter_std for b in calibrate.backgrounds().values()])
     quietest = float(np.min(scatters, where=~np.isnan(scatters), initial=np.inf))

@@ -41,7 +41,8 @@ class PassCollector:
         self._max_field = settings.calibrate.max_field
         self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
                         Detect(network, settings.detect))
-        # Raw and calibrated readings, in network time, from `PAD_S` before the latest onset.
+        # Raw and calibrated readings, in network time, from `PAD_S` before the onset or, without a
+        # detection, before the latest frame.
         self._raw: deque[Readings] = deque()
         self._calibrated: deque[Readings] = deque()
         self._onset_ns: int | None = None
@@ -157,7 +158,7 @@ class PassCollector:
 
     def _cut(self, onset_ns: int, end_ns: int,
              *remarks: str) -> tuple[PassData, tuple[str, ...]]:
-        """End the pass that began with an onset; return (PassData, notes) until `end_ns`."""
+        """End the current pass; return (PassData up to `end_ns`, notes including `remarks`)."""
         begin = onset_ns - int(PAD_S * NS)
         readings = Readings.joined(self._calibrated)
         readings = readings.part((begin <= readings.stamp_ns) & (readings.stamp_ns <= end_ns))

@@ -53,14 +53,15 @@ class FittedPass:
 
     @property
     def chosen(self) -> PassFit | None:
-        """Fit with the number of dipoles that the measurements support, or None."""
+        """Fit with the number of dipoles that the measurements support; None if it was rejected."""
         return choose_order(self.fits)
 
     @property
     def known(self) -> PassFit | None:
         """Fit whose trusted values are reported: the chosen fit, or else the fit of lowest cost.
 
-        None if any fit shows that the target turned or was not a single target.
+        Without a chosen fit, the result is None if no fit has trusted values, or if any fit shows
+        that the target turned or was not a single target.
         """
         if self.chosen is not None:
             return self.chosen
@@ -71,11 +72,12 @@ class FittedPass:
 
     @property
     def disagreement(self) -> tuple[float, float]:
-        """Largest differences [m], [m/s] between the chosen fit and fits with a similar cost.
+        """Largest differences in position [m] and velocity [m/s] from fits with a similar cost.
 
-        The differences indicate the error of the model. They are NaN without a fit of similar
-        cost. They are also NaN if the residuals of the chosen fit are consistent with the noise,
-        because additional dipoles then fit only noise.
+        The differences from the chosen fit indicate the error of the model. They are NaN if there
+        is no chosen fit, or no other fit with a similar cost. They are also NaN if the residuals of
+        the chosen fit are consistent with the noise, because additional dipoles then fit only
+        noise.
         """
         chosen = self.chosen
         if chosen is None or not chosen.cost > energy_threshold(1e-3, chosen.degrees_of_freedom):
@@ -131,6 +133,7 @@ class PassFitter:
         Returns
         -------
         iterator of FittedPass
+            The passes are fitted during the iteration.
         """
         return self._fit_passes(self.collector.feed(readings), stopped)
 
@@ -145,6 +148,7 @@ class PassFitter:
         Returns
         -------
         iterator of FittedPass
+            The passes are fitted during the iteration.
         """
         return self._fit_passes(self.collector.flush(), stopped)
 
@@ -205,8 +209,8 @@ def fitted_vehicles(recording: str, number: int, data: PassData, single: Sequenc
     if len(vehicles) == 1:
         return [FittedPass(recording, number, vehicles[0], notes, correlated_motion(data))]
     chosen = [fit for fit in map(choose_order, vehicles) if fit is not None]
-    notes = (*notes, f'{len(vehicles)} vehicles were fitted together; the measurements do not '
-                     'include the field of the other vehicles')
+    notes = (*notes, f'{len(vehicles)} vehicles were fitted together; the fitted field of the '
+                     'other vehicles was subtracted from the measurements')
     if not are_separate(data, [path_from(data, fit) for fit in chosen], MAX_TRAILER_DISTANCE):
         notes = (*notes, f'the vehicles are less than {MAX_TRAILER_DISTANCE:.0f} m apart: they may '
                          'be parts of one vehicle')

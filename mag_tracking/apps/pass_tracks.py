@@ -41,7 +41,7 @@ class PassTracks:
         self._last_stamp_ns = 0
 
     def add(self, records: Iterable[object]) -> None:
-        """Store the poses among the records of a tracker.
+        """Store the poses and ends of tracks among the records of a tracker.
 
         Parameters
         ----------
@@ -88,7 +88,7 @@ class PassTracks:
         return np.array(paths).reshape(-1, 6)
 
     def _poses_of_smallest_variance(self, end_ns: int) -> list[_Pose]:
-        """Return the pose of smallest variance of each track until a time; drop older poses.
+        """Return each track's pose of smallest variance up to `end_ns`; drop its other old poses.
 
         Vehicles that are still approaching are omitted: their latest pose has the smallest
         variance.

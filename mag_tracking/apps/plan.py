@@ -25,8 +25,8 @@ from mag_tracking.pipeline import Settings
 from mag_tracking.stages.track.settings import acceleration_density
 
 MAX_FRAMES = 1000
-"""Maximum number of frames of a pass in the calculation of the probability of a miss. More frames,
-from slower passes, hardly change the probability."""
+"""Maximum number of frames of a pass in the calculation of the probability of a miss. The
+additional frames of slower passes hardly change this probability."""
 
 Area: TypeAlias = tuple[float, float, float, float]
 """Rectangle (x0, y0, x1, y1) [m]."""
@@ -37,7 +37,7 @@ GOOD_PD = 0.9
 
 @dataclass(frozen=True)
 class Lane:
-    """Straight lane through the network, with bounds and detection along it."""
+    """Straight lane through the network, with bounds and detection probabilities along the lane."""
 
     name: str
     """Name in messages and figures."""
@@ -51,7 +51,7 @@ class Lane:
     """(n, 3) m, m/s, A m²: bounds of position, velocity and moment from the whole pass; median over
     the directions of the moment."""
     filter_std: FloatArray
-    """(n,) m, bound of the position for a filter that has received the measurements so far."""
+    """(n,) m, position bound of a filter that has processed the measurements up to the point."""
     detection: FloatArray
     """(n,) probability that a frame detects the target; mean over the directions of the moment."""
 
@@ -78,18 +78,19 @@ class Plan:
     lanes: tuple[Lane, ...]
     """Lanes through the network."""
     with_one_more: FloatArray
-    """Coarser map: median bound [m] over the lanes near the network, with an additional sensor at
-    the point; NaN where no sensor is allowed."""
+    """Coarser map of the median position bound [m] on the lanes near the network if a sensor is
+    added at the point; NaN where no sensor is allowed."""
     without: float
-    """Median bound over the lanes near the network, without an additional sensor [m]."""
+    """Median position bound on the lanes near the network without an additional sensor [m]; NaN if
+    no additional sensor is allowed."""
     best_place: tuple[float, float]
-    """Best position of the additional sensor (x, y) [m]."""
+    """Best position of the additional sensor (x, y) [m]; not valid if no sensor is allowed."""
     observability: Observability
     """Observability at the closest point of the first lane, for one direction of the moment,
     without priors."""
     blocks: dict[str, FloatArray]
     """{'with prior' or 'without prior': (3,) bounds of position, velocity and moment} at the
-    closest point of the first lane."""
+    closest point of the first lane; medians over the directions of the moment."""
     missed: FloatArray
     """(n, 2) lateral distance [m] of a pass with the heading of the first lane, and probability
     that the pass is missed."""
@@ -135,8 +136,9 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     target : PlannedTarget
     sampling : Sampling
     lanes : sequence of (name, heading [rad], lateral offset [m])
-        The offset is to the left of the line through the centre of the sensors.
+        The offset is measured from the centre of the sensors, positive to the left of the heading.
     area : (x0, y0, x1, y1), m
+        Area of the maps.
     settings : Settings
         Settings of detection and tracking.
     clearance : float, m
@@ -167,8 +169,9 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     planned = tuple(_lane(network, target, sampling, *lane, area, settings) for lane in lanes)
     step(1)
     # The effect of the additional sensor is evaluated where the lanes are near the network.
-    reach = 0.5 * max(np.ptp(network.positions[:, :2], axis=0).max(), 8.0 * target.height)
-    near = [(lane.heading, lane.points[np.abs(lane.along) <= reach][::4]) for lane in planned]
+    half_length = 0.5 * max(np.ptp(network.positions[:, :2], axis=0).max(), 8.0 * target.height)
+    near = [(lane.heading, lane.points[np.abs(lane.along) <= half_length][::4])
+            for lane in planned]
     coarse_x, coarse_y = _grid(area, max(11, n_grid // 2))
     places = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
     allowed = np.all([_lane_distances(lane, places) >= clearance for lane in planned], axis=0)
@@ -177,7 +180,8 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     median_bound[allowed] = with_sensor
     step(1)
     best = int(np.nanargmin(median_bound)) if allowed.any() else 0
-    observable, blocks = _closest_point_bounds(network, target, sampling, planned[0], reach)
+    observable, blocks = _closest_point_bounds(network, target, sampling, planned[0],
+                                               half_length)
     shape = len(coarse_y), len(coarse_x)
     return Plan(
         network, target, sampling, x, y,
@@ -189,19 +193,20 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
 
 
 def _closest_point_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
-                          lane: Lane, reach: float) -> tuple[Observability, dict[str, FloatArray]]:
-    """Compute `Plan.observability` and `Plan.blocks`, scaled with a distance `reach` [m]."""
+                          lane: Lane, distance_scale: float,
+                          ) -> tuple[Observability, dict[str, FloatArray]]:
+    """Compute `Plan.observability`, scaled with a distance [m], and `Plan.blocks`."""
     closest = lane.points[np.argmin(np.abs(lane.along))][None]
     J = pass_information(network.positions, network.R_sw, target, sampling, closest,
                          lane.heading)[0].sum(axis=1)
-    scale = np.repeat([max(reach, 1e-3), target.speed, target.moment], 3)
+    scale = np.repeat([max(distance_scale, 1e-3), target.speed, target.moment], 3)
     return (observability(J[3], STATES, scale),
             {'with prior': np.median(bounds_of(J, target.prior()), axis=0),
              'without prior': np.median(bounds_of(J, np.zeros((9, 9))), axis=0)})
 
 
 def _lane_distances(lane: Lane, places: FloatArray) -> FloatArray:
-    """Distances (n,) [m] of places (n, 2) from the line of a lane."""
+    """Distances (n,) [m] of `places` (n, 2) from the centre line of a lane."""
     u = lane.points[-1] - lane.points[0]
     r = places - lane.points[0]
     distance: FloatArray = np.abs(u[0] * r[:, 1] - u[1] * r[:, 0]) / np.hypot(*u)
@@ -209,7 +214,7 @@ def _lane_distances(lane: Lane, places: FloatArray) -> FloatArray:
 
 
 def n_parts(lanes: Sequence[tuple[str, float, float]]) -> int:
-    """Return the number of times that `compute_plan` calls its `progress`.
+    """Return the number of times that `compute_plan` calls `progress`.
 
     Parameters
     ----------
@@ -223,7 +228,7 @@ def n_parts(lanes: Sequence[tuple[str, float, float]]) -> int:
 
 
 def _grid(area: Area, n: int) -> tuple[FloatArray, FloatArray]:
-    """Coordinates of a map with square cells."""
+    """Coordinates (x, y) of a map with square cells and `n` points along the longer side."""
     x0, y0, x1, y1 = area
     cell = max(x1 - x0, y1 - y0) / (n - 1)
     return (np.linspace(x0, x1, max(2, int(round((x1 - x0) / cell)) + 1), dtype=float),
@@ -232,7 +237,7 @@ def _grid(area: Area, n: int) -> tuple[FloatArray, FloatArray]:
 
 def _lane(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, name: str,
           heading: float, offset: float, area: Area, settings: Settings) -> Lane:
-    """Compute bounds and detection along one lane."""
+    """Compute bounds and detection probabilities along one lane."""
     u = np.array([np.cos(heading), np.sin(heading)])
     half = 0.5 * np.hypot(area[2] - area[0], area[3] - area[1])
     n = int(np.clip(half / (target.speed * sampling.period), 10, 60))

@@ -44,7 +44,7 @@ class PlanInputs:
 
     @property
     def n_parts(self) -> int:
-        """Number of times that `run` calls its `progress`."""
+        """Number of times that `run` calls `progress`."""
         return n_parts(self.lanes)
 
     def run(self, network: SensorNetwork, settings: Settings,
@@ -125,18 +125,20 @@ def plan(network: SensorNetwork | str | PathLike[str], target: str | None = None
     ----------
     network : SensorNetwork or path of a network file
     target : str, optional
-        'small', 'car' or 'truck' (default: 'car'): moment and height of this kind of vehicle in
+        Kind of vehicle ('small', 'car' or 'truck'; default: 'car'), whose moment and height are in
         the settings; or 'magnet', which requires `moment` and `height`.
     moment : float, A m², optional
         Magnitude of the moment; requires `height`.
     height : float, m, optional
         Height of the magnetic centre, z in the frame of the network.
     speed : float, m/s
+        Speed of the target.
     heading : sequence of float, deg, optional
-        Heading of each lane, anticlockwise from x; default: the arrival directions of the
+        Heading of each lane, measured anticlockwise from x; default: the arrival directions in the
         settings.
     offset : sequence of float, m, optional
-        Lateral offset of each lane, to the left of the centre of the sensors; default: 0.
+        Lateral offset of each lane from the centre of the sensors, positive to the left of the
+        heading; default: 0.
     noise_std : float, T, optional
         Noise of one sample; default: the noise in the network file, or 12 nT.
     rate : float, Hz
@@ -144,10 +146,11 @@ def plan(network: SensorNetwork | str | PathLike[str], target: str | None = None
     field_error : float, optional
         Relative error of the field; default: `track.field_error`.
     area : (x0, y0, x1, y1), m, optional
-        Area of the maps; default: where at least half of the targets are detected.
+        Area of the maps; default: the bounding box of the sensors, extended by the range at which a
+        sensor detects half of the targets.
     clearance : float, m, optional
-        Minimum distance of an additional sensor from a lane; default: 2 for vehicles, 0 with
-        `moment`.
+        Minimum distance of an additional sensor from a lane; default: 2, or 0 if
+        `moment` is given.
     grid : int
         Number of points along the longer side of the maps.
     settings : {name: value}, optional
@@ -194,7 +197,7 @@ def _target(track: TrackSettings, target: str | None, moment: float | None,
         _in_range('height', height, -1e3, 1e3)
     if moment is not None:
         if target not in (None, 'magnet'):
-            raise SettingsError('target: give either target or moment')
+            raise SettingsError('target: give either target or moment, not both')
         if height is None:
             raise SettingsError('height: required together with moment')
         return PlannedTarget(_in_range('moment', moment, 1e-6, 1e6), height, speed)
@@ -235,7 +238,7 @@ def _lanes(vehicle: VehicleSettings, heading: Sequence[float] | None,
 
 def _sampling(network: SensorNetwork, settings: Settings, noise_std: float | None, rate: float,
               field_error: float | None) -> Sampling:
-    """Create the sampling of the sensors, without the duration of a pass.
+    """Create the sampling of the sensors; the caller sets `half_window`.
 
     A field error that persists over many frames is not averaged out. It is represented here by
     additional noise in each frame, whereas the tracker estimates it as a state.
@@ -253,7 +256,7 @@ def _sampling(network: SensorNetwork, settings: Settings, noise_std: float | Non
 
 
 def _area(network: SensorNetwork, reach: float, area: Sequence[float] | None) -> Area:
-    """Area of the maps (x0, y0, x1, y1) [m]."""
+    """Return the checked `area`; default: the box of the sensors extended by `reach` [m]."""
     low, high = network.positions[:, :2].min(axis=0), network.positions[:, :2].max(axis=0)
     if area is not None and len(area) != 4:
         raise SettingsError(f'area: expected X0, Y0, X1, Y1, got {area}')

@@ -25,7 +25,7 @@ def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
     ----------
     plan : Plan
     lines : list of str
-        Lines of `summary_lines`.
+        Lines returned by `summary_lines`.
     out : Path
         Output folder.
 
@@ -101,7 +101,7 @@ def plan_page(plan: Plan, lines: list[str]) -> Page:
     ----------
     plan : Plan
     lines : list of str
-        Lines of `summary_lines`.
+        Lines returned by `summary_lines`.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def _log_bar(low: float, high: float, title: str) -> dict[str, Any]:
 
 
 def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
-    """Traces of the lanes and sensors on a map."""
+    """Traces of the lanes and sensors on a map whose coordinates are multiplied by `f`."""
     low, high = (plan.x[0], plan.y[0]), (plan.x[-1], plan.y[-1])
     traces = []
     for lane in plan.lanes:
@@ -175,7 +175,7 @@ def _lanes(plan: Plan) -> list[Chart]:
                    curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]
         detection.append(curve(along, lane.detection, name, k))
     missed = plan.missed[plan.missed[:, 1] >= MIN_MISSED]
-    label = f'distance along the lane, 0 = nearest to the centre [{unit}]'
+    label = f'distance along the lane from the point nearest to the centre [{unit}]'
     return [Chart('Position bound along the lanes', bounds,
                   axes(label, f'standard deviation [{unit}]', log_y=True)),
             Chart('Detection along the lanes', detection, axes(label, 'probability per frame')),

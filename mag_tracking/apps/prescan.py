@@ -1,4 +1,4 @@
-"""First pass over a recording: backgrounds of sensors whose recording begins with a target."""
+"""First pass over a recording, to find backgrounds if a target is present at the start."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.units import NS
 
 LEARNING_TOLERANCE_S = 1.0
-"""Maximum excess of the learning time of a quiet beginning over the minimum [s]."""
+"""Excess of the initial learning time above which a target is considered present [s]."""
 
 MIN_BLOCKS = 6.0
-"""Minimum learning time in blocks, for slow sensors with long blocks."""
+"""Minimum learning time [blocks], which applies to slow sensors with long blocks."""
 
 MIN_LEVEL_FRACTION = 1.0 / 3.0
 """Minimum total duration of a background level, as a fraction of the learning time."""
 
 N_READINGS_AT_ONCE = 8
-"""Number of readings per batch while the background at the beginning is learnt."""
+"""Number of readings per batch while the initial background is learnt."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ class Prescan:
     """Backgrounds and resolutions found by a first pass over a recording."""
 
     levels: dict[str, QuietLevel]
-    """{sensor: most frequent level}; empty if the recording begins quietly."""
+    """{sensor: most frequent level}; empty if no target is present at the start of the
+    recording."""
     steps: dict[str, FloatArray]
     """{sensor: (3,) smallest change of each axis, T}."""
 
@@ -47,7 +48,7 @@ class Prescan:
         Returns
         -------
         [begin, end], s, or None
-            Relative to the first reading of the sensor.
+            Relative to the first reading of the sensor; None if no level was found.
         """
         level = self.levels.get(sensor)
         return None if level is None else [level.begin, level.end]
@@ -64,12 +65,12 @@ class Prescan:
 
 def prescan(batches: Iterable[Readings], network: SensorNetwork,
             settings: CalibrateSettings) -> Prescan:
-    """Find the backgrounds of sensors whose recording begins with a target.
+    """Find the backgrounds of sensors if a target is present at the start of the readings.
 
     Parameters
     ----------
     batches : iterable of Readings
-        Raw readings from the beginning of the recording; consumed up to `look_ahead_s`.
+        Raw readings from the start of the recording; consumed up to `look_ahead_s`.
     network : SensorNetwork
     settings : CalibrateSettings
 
@@ -102,15 +103,17 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
             levels[name] = level
             is_quiet &= not had_target \
                 and _begins_quietly(learnt.get(name), level, background, settings)
-    # A target sensed by one sensor at the beginning may be in the backgrounds of all sensors.
+    # The field of a target that one sensor detects at the start may be part of the backgrounds of
+    # all sensors.
     return Prescan({} if is_quiet else levels, steps)
 
 
 def _level_of(recorder: BlockRecorder, departed_at: float | None,
               learnt: tuple[float, FloatArray] | None) -> tuple[QuietLevel | None, bool]:
-    """Most frequent level of a sensor, and whether a target stood near it until `departed_at` [s].
+    """Return (most frequent level, whether a target was present until `departed_at` [s]).
 
-    If the level `learnt` at the beginning returns, no target stood there.
+    If so, only later readings determine the level. If the field later returns to the level `learnt`
+    at the start, no target was present.
     """
     level = recorder.quiet_level()
     if level is None or departed_at is None or learnt is None \
@@ -142,7 +145,10 @@ def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
 
 def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: QuietLevel,
                     recorder: BlockRecorder, settings: CalibrateSettings) -> bool:
-    """Whether the background of a sensor was learnt early and equals the most frequent level."""
+    """Whether the initial background was learnt early and equals the most frequent level.
+
+    If relearning is disabled, any initial background that was learnt early is accepted.
+    """
     max_time = LEARNING_TOLERANCE_S + max(settings.learn_s, MIN_BLOCKS * level.block_s)
     if learnt is None or learnt[0] > max_time:
         return False
@@ -152,7 +158,7 @@ def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: QuietLevel,
 
 def prescan_of(recording: Recording, network: SensorNetwork, settings: CalibrateSettings,
                stopped: Callable[[], bool] | None = None) -> Prescan:
-    """Find the backgrounds of sensors in a recording that begins with a target.
+    """Find the backgrounds of sensors if a target is present at the start of a recording.
 
     Parameters
     ----------

@@ -121,11 +121,11 @@ def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: Arra
     sensor : (n,) sequence of str
         Name of the sensor of each reading, as in the network file.
     stamp_ns : (n,) int array, ns
-        Timestamps, sorted; sensors may have equal timestamps.
+        Timestamps in ascending order; sensors may have equal timestamps.
     field : (n, 3) array, T, sensor frame
-        NaN = axis not measured.
+        Flux density; NaN marks an axis that was not measured.
     covariance : (n, 3, 3) array, T², sensor frame, optional
-        NaN = unknown.
+        Noise covariance; NaN if unknown.
 
     Returns
     -------
@@ -137,7 +137,7 @@ def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: Arra
         If shapes or types are wrong, or the timestamps are not sorted.
     """
     if isinstance(sensor, str):
-        raise ReadingsError(f'sensor: expected one name per reading, got the text {sensor!r}')
+        raise ReadingsError(f'sensor: expected one name per reading, got the string {sensor!r}')
     names = tuple(dict.fromkeys(str(name) for name in sensor))
     index_of = {name: i for i, name in enumerate(names)}
     fields, C = _with_nan(field), None if covariance is None else _with_nan(covariance)
@@ -174,7 +174,7 @@ def checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
     """
     readings = _to_standard_types(readings)
     if len(readings) and not set(readings.names) & set(network.names):
-        raise ReadingsError(f'no readings of the network: the readings are from '
+        raise ReadingsError(f'no reading is from a sensor of the network: the readings are from '
                             f'{", ".join(readings.names)}, the sensors of the network are '
                             f'{", ".join(network.names)}')
     return readings
@@ -218,7 +218,7 @@ def check_order(readings: Readings, tolerance: float = MAX_DELAY_S) -> None:
     ----------
     readings : Readings
     tolerance : float, s
-        Maximum delay of a reading relative to an earlier one.
+        Maximum time by which a reading may be older than a preceding reading.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Selection of topics and reports for the command `mag-tracking record`."""
+"""Topic selection, progress and summary of the command `mag-tracking record`."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -16,11 +16,11 @@ from mag_tracking.quantities import quantity
 RESULTS_OF = ('calibration_node/', 'detection_node/', 'tracker_node/')
 """Prefixes of result topics, relative to the namespace of the recorder."""
 RESULTS = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
-"""Result topics that do not begin with these prefixes."""
+"""Result topics that do not begin with a prefix in `RESULTS_OF`."""
 
 
 class RecorderState(Protocol):
-    """State of a recorder that the reports describe."""
+    """State of a recorder, as described by `progress_line` and `summary`."""
 
     counts: Counter[str]
     """Number of messages written per topic."""
@@ -54,7 +54,7 @@ class Selection(NamedTuple):
     results_of: tuple[str, ...] = RESULTS_OF
     """Prefixes of result topics."""
     result_topics: tuple[str, ...] = RESULTS
-    """Result topics that do not begin with these prefixes."""
+    """Result topics that do not begin with a prefix in `results_of`."""
 
     def resolved(self, resolve: Callable[[str], str]) -> 'Selection':
         """Return the selection with absolute names.

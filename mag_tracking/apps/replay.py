@@ -1,4 +1,4 @@
-"""Offline replay of a recording through all stages: tables, summary, recording and figures."""
+"""Offline replay of a recording through all stages, with tables, a summary and figures."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -44,7 +44,7 @@ SUSPECT_MOUNTING_RATIO = 2.0
 
 
 class Configured(Protocol):
-    """Sensor network with its settings, such as a `Pipeline`."""
+    """Object with a sensor network and settings, such as a `Pipeline`."""
 
     @property
     def network(self) -> SensorNetwork:
@@ -85,14 +85,14 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     progress : function, optional
         Called with the number of bytes read since the last call.
     stopped : function, optional
-        Called after every batch of readings and every progress call. When it returns true,
+        Called after every batch of readings and every progress report. When it returns true,
         reading ends, partial results are written, and the summary is marked as interrupted.
     report : function, optional
-        Called with a line for the user if the results of an earlier run are replaced.
+        Called with a message to the user if the results of an earlier run are replaced.
     truth : str, optional
-        Ground truth: a CSV file (see `recording.truth`), or a topic of the recording with
-        PoseStamped, PoseWithCovarianceStamped or Odometry. Default: all topics below
-        /ground_truth.
+        Source of the ground truth: a CSV file (see `recording.truth`), or a topic of the recording
+        with messages of type PoseStamped, PoseWithCovarianceStamped or Odometry. By default, all
+        topics below /ground_truth are used.
 
     Returns
     -------
@@ -134,10 +134,10 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
 
 
 class Results(Protocol):
-    """Receives detections and poses, such as a `ResultFolder`."""
+    """Receiver of the outputs of a pipeline, such as a `ResultFolder`."""
 
     def add_detection(self, detection: Detection, /) -> None:
-        """Add an onset or a release.
+        """Add the onset or release of a detection.
 
         Parameters
         ----------
@@ -326,12 +326,13 @@ def _mounting(log: TrackLog, pipeline: Pipeline) -> dict[str, dict[str, Any]]:
 
 def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
                          truth: Mapping[str, Truth]) -> dict[str, Any] | None:
-    """Compute the errors of a track against the ground truth that fits best.
+    """Compute the errors of a track relative to the best-matching target of the ground truth.
 
     Parameters
     ----------
     log : TrackLog or SmoothedLog
     pipeline : Configured
+        Provides the network and the settings.
     truth : {target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}
 
     Returns
@@ -349,7 +350,7 @@ def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
 
 def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,
                truth: Truth) -> tuple[float, dict[str, Any]] | None:
-    """Compute (error [m] for the choice of a ground truth, all errors) of a track, or None."""
+    """Compute (error [m] by which targets are compared, all errors); None without overlap."""
     if pipeline.settings.track.target == 'magnet':
         magnet = magnet_errors(log, truth, pipeline.settings.track.magnet.axis)
         return (magnet['position_mean'], {**magnet}) if magnet else None
@@ -358,7 +359,7 @@ def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,
 
 
 def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: Truth) -> float | None:
-    """Ratio of the error of a track to its path bound, or None."""
+    """Ratio of the error of a track to its path bound; None if the ratio cannot be computed."""
     track = pipeline.settings.track
     if track.target == 'magnet':
         # Between two poses, the magnet may have rotated arbitrarily.
@@ -400,7 +401,7 @@ def write_trajectories(run: Run, out: Path) -> list[Path]:
 
 def write_figures(run: Run, network: SensorNetwork, out: Path, max_tracks: int = 6,
                   stopped: Callable[[], bool] | None = None) -> list[Path]:
-    """Draw the figures of the first tracks.
+    """Draw and save the figures of the first tracks.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Notes on a replay: warnings, limits and disturbances."""
+"""Notes on a replay: warnings, limitations and disturbances."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -27,7 +27,7 @@ def notes_of(summary: Mapping[str, Any]) -> list[Note]:
 
 
 def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Notes on topics, readings and sensors."""
+    """Notes on missing topics and detections, rejected readings, and missing backgrounds."""
     sensors = summary['sensors']
     for topic in summary['missing_topics']:
         yield Note(WARNING, f'no messages on {topic}')
@@ -46,7 +46,7 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     for name, s in sensors.items():
         if s['quiet_stretch_s'] is not None:
             begin, end = s['quiet_stretch_s']
-            yield Note(NOTE, f'the recording begins with a target: the most frequent level of '
+            yield Note(NOTE, f'a target is present at the start: the most frequent level of '
                        f'{name}, from {begin:.1f} to {end:.1f} s, is used as its background')
 
 
@@ -61,7 +61,7 @@ def no_track_reason(counts: Mapping[str, int]) -> str | None:
     Returns
     -------
     str or None
-        One sentence; None if vehicles were tracked, or several sensors measured the target.
+        Explanation; None if vehicles were tracked, or several sensors measured the target.
     """
     if counts.get(NO_SCALE, 0) or counts.get(ALONE, 0) and not counts.get('tracks', 0):
         return ('no track: the scale is not observable with a single sensor. Use `mag-tracking '
@@ -71,17 +71,18 @@ def no_track_reason(counts: Mapping[str, int]) -> str | None:
 
 
 def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Notes on limitations of the tracks and their causes."""
+    """Notes on the limitations of the tracks, with causes."""
     counts = summary['counts']['track']
     reason = no_track_reason(counts)
     if reason:
         yield Note(NOTE, reason)
     elif len(summary['sensors']) == 1 and summary['tracks']:
-        yield Note(NOTE, 'range and size are based on the settings (track.single_sensor_prior): '
+        yield Note(NOTE, 'range and moment are based on the settings (track.single_sensor_prior): '
                    'the scale is not observable with a single sensor')
     if summary['close_network'] and summary['target'] == 'vehicle' and summary['tracks']:
-        yield Note(NOTE, 'all sensors are within two metres: range and size are poorly observable '
-                   'and all tracks are ambiguous; use the speed and direction from the delay')
+        yield Note(NOTE, 'all sensors are within two metres: range and moment are poorly '
+                   'observable, and all tracks are ambiguous; use the speed and direction from the '
+                   'delays between the sensors')
     if summary['frames_too_long']:
         yield Note(WARNING, summary['frames_too_long'])
     if summary['clocks_apart']:
@@ -89,8 +90,8 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     n_lost = counts.get(f'tracks ended: {LOST}', 0)
     if n_lost:
         yield Note(WARNING, quantity(n_lost, 'track lost its target', 'tracks lost their target')
-                   + ': check the orientations in the network file; other causes are several '
-                   'targets at once, or a kind of target that is not in the settings')
+                   + ': check the orientations in the network file; other possible causes are '
+                   'simultaneous targets, or a kind of target that the settings do not include')
     uncertain = counts.get('sensors whose orientation is hardly known', 0)
     if uncertain:
         yield Note(WARNING, quantity(uncertain, 'sensor has', 'sensors have')

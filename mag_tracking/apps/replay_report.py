@@ -81,7 +81,7 @@ def replay_page(run: Run, network: SensorNetwork) -> Page:
 
 def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
            notes: list[Note]) -> dict[str, Any]:
-    """Create the map of the tracks; add a note for each omission."""
+    """Create the map of the tracks; append a note to `notes` for each omission."""
     if len(logs) < len(run.logs):
         notes.append(Note(NOTE, f'the page shows the first {len(logs)} of {len(run.logs)} tracks'))
     max_poses = max_poses_of(logs)

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 _BATCH = 4096
-"""Number of readings from arrays processed at once, to bound the memory for outputs."""
+"""Number of readings per batch when arrays are processed, to bound the memory for outputs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class TrackingResult:
     """
 
     network: SensorNetwork
-    """Sensors."""
+    """Sensor network."""
     settings: Settings
     """Settings of all stages."""
     poses: StructArray
@@ -80,7 +80,7 @@ class TrackingResult:
     """Sensors that were not used because their background was not learnt. To use them, record a
     quiet interval, or set `background` and `noise_std` in the network file."""
     disturbances: tuple[Disturbance, ...]
-    """Fields that a disturbance explains better than a target."""
+    """Field changes that a disturbance explains better than a target does."""
 
     def __repr__(self) -> str:
         unused = {**self.rejections, **self.lost}
@@ -142,7 +142,7 @@ class TrackingResult:
         return detections_dataframe(self.detections)
 
     def errors(self, track_id: int | None = None) -> dict[str, Any] | None:
-        """Compute the errors of a track against the ground truth that fits best.
+        """Compute the errors of a track relative to the best-matching target of the ground truth.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class TrackingResult:
         Returns
         -------
         dict or None
-            Entry `truth` of a track in `summary.json`; None without ground truth.
+            Entry `truth` of a track in `summary.json`; None if no ground truth covers the track.
 
         Raises
         ------
@@ -304,7 +304,7 @@ def _batches(readings: Readings) -> Iterator[Readings]:
 
 
 class _Results:
-    """Collects detections and poses in lists."""
+    """Collects detections, poses and disturbances."""
 
     def __init__(self) -> None:
         self.poses: list[Track] = []
@@ -313,7 +313,7 @@ class _Results:
         self.disturbances: dict[int, Disturbance] = {}
 
     def add_detection(self, detection: Detection) -> None:
-        """Add an onset or a release."""
+        """Add the onset or release of a detection."""
         self.detections.append(detection)
 
     def add_disturbance(self, disturbance: Disturbance) -> None:
@@ -321,7 +321,7 @@ class _Results:
         self.disturbances[disturbance.id] = disturbance
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Do nothing: frames with a target are in the history of its track."""
+        """Ignore a frame, because the history of each track contains its frames."""
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """Add a smoothed pose."""
@@ -334,7 +334,7 @@ class _Results:
 
 def _tracking_result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
                      recording: RecordedReadings) -> TrackingResult:
-    """Convert the results to arrays; the readings of `recording` are not used."""
+    """Create a `TrackingResult`; the readings of `recording` are not used."""
     rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
     reason = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
                                  pipeline.detect, recording.missing_topics, rejections)

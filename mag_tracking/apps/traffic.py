@@ -30,17 +30,17 @@ from mag_tracking.records import FieldFrame, Track
 from mag_tracking.units import NS
 
 RETENTION_S = 300.0
-"""Time for which the fields of an ended track are kept for its passage [s]."""
+"""Time for which the frames of an ended track are stored until its passage is reported [s]."""
 
 
 @dataclass(frozen=True)
 class CountedVehicle:
-    """Passage of a vehicle, with its velocity from the delay between sensors."""
+    """Passage of a vehicle, with the velocity estimated from the delays between the sensors."""
 
     passage: VehiclePassage
     """Passage across a line."""
     delay: CorrelatedMotion
-    """Velocity independent of the model of the track; `reason` explains a missing value."""
+    """Velocity from the delays, independent of the tracker; `reason` explains a missing value."""
 
     @property
     def speeds_contradict(self) -> bool:
@@ -61,7 +61,7 @@ class TrafficResult:
     summaries: tuple[TrafficSummary, ...]
     """One summary per line and interval."""
     counts: dict[str, int]
-    """Tracks that were not counted, such as tracks that crossed no line: {cause: number}."""
+    """Events such as passages, and tracks that crossed no line: {event: number}."""
     rejections: dict[str, int]
     """Readings that were not used: {cause: number}."""
     missing_topics: tuple[str, ...]
@@ -71,7 +71,7 @@ class TrafficResult:
     no_detection_reason: str | None
     """One sentence if nothing was detected; otherwise None."""
     no_track_reason: str | None
-    """One sentence if nothing was tracked because only one sensor measured; otherwise None."""
+    """Explanation if nothing was tracked because only one sensor measured; otherwise None."""
 
     def __repr__(self) -> str:
         lines = dict(Counter(v.passage.line for v in self.vehicles))
@@ -111,7 +111,7 @@ def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathL
 def count_traffic(recording: Recording, network: SensorNetwork, settings: Settings,
                   progress: Callable[[int], object] | None = None,
                   stopped: Callable[[], bool] | None = None) -> TrafficResult:
-    """Count the traffic in an open recording.
+    """Count the vehicles in an open recording.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def count_traffic(recording: Recording, network: SensorNetwork, settings: Settin
 
 
 class _Counter:
-    """Collects passages and summaries, and the fields of active tracks for the delays."""
+    """Collects passages and summaries; stores the frames of tracks to compute the delays."""
 
     def __init__(self, network: SensorNetwork) -> None:
         self._network = network
@@ -182,7 +182,7 @@ class _Counter:
                 self.summaries.append(record)
 
     def _drop_old(self, now_ns: int) -> None:
-        """Drop the fields of tracks that ended long ago, or before the time jumped back."""
+        """Drop the frames of tracks that ended long ago, or before the time jumped back."""
         old = self._tracks_before_jump or {track_id for track_id, frames in self._frames.items()
                                            if now_ns - frames[-1].stamp_ns > RETENTION_S * NS}
         for track_id in old:

@@ -25,11 +25,11 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
     recording : Recording
     network : SensorNetwork
     sensors : collection of str
-        Names of the rotated sensors; empty = all.
+        Names of the rotated sensors; an empty collection selects all sensors.
     date : str
         Date of the calibration, stored in the network.
     field_magnitude : float, T, optional
-        Magnitude of the ambient field. By default, the gains of the sensors are not changed.
+        Magnitude of the ambient field. By default, the mean gain of a sensor is not calibrated.
     progress : function, optional
         Called with the number of bytes read since the last call.
     stopped : function, optional
@@ -38,8 +38,8 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
     Returns
     -------
     network : SensorNetwork
-        Network with the corrections that converged. Background and noise of these sensors are
-        removed because they refer to uncorrected readings.
+        Network with the corrections of the sensors whose fit converged. The background and noise
+        of these sensors are removed, because these values refer to uncorrected readings.
     fits : dict of str to EllipsoidFit
         Result of each sensor.
     readings : dict of str to (n, 3) array, T, sensor frame

@@ -34,11 +34,11 @@ def view(recording: Recording, network: SensorNetwork, settings: Settings, scene
     network : SensorNetwork
     settings : Settings
     scene : LiveScene
-        Receives frames and tracks.
+        Receives frames, tracks and the state of the sensors.
     rate : float
         Playback speed; 1 is real time.
     stopped : function
-        Called several times per second.
+        Called several times per second; tracking ends when it returns true.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Simulated scenarios with ground truth: bodies that move past a sensor network.
 
-A simulated vehicle is a cloud of magnetised parts rather than one dipole, so a point target model
-has a realistic model error. A matched point target is a cloud of one part.
+A simulated vehicle is a cloud of magnetised parts rather than one dipole, so that a point-target
+model has a realistic model error. A single part is a point target that matches this model.
 """
 
 from collections.abc import Sequence
@@ -117,7 +117,7 @@ class MagneticBody:
         Returns
         -------
         (n, n_sensors, 3) array, T, world frame
-            NaN where a part is at a point.
+            NaN at a point that coincides with a part.
         """
         R, origin = body_poses(position, heading)
         r = origin[:, None] + np.einsum('nij,pj->npi', R, self.parts)
@@ -130,7 +130,7 @@ class MagneticBody:
 
 def point_body(hard_iron: Sequence[float] | FloatArray, soft_iron: float,
                height: float) -> MagneticBody:
-    """Point target that matches the model of the tracker.
+    """Create a point target that matches the model of the tracker.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def point_body(hard_iron: Sequence[float] | FloatArray, soft_iron: float,
 
 def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float = 1.7,
                    height: float = 1.3, n_parts: int = 60, moment: float = 400.0) -> MagneticBody:
-    """Random vehicle: magnetised parts in a box, with most of the iron low and at the ends.
+    """Create a random vehicle of magnetised parts in a box, most of them low and at the ends.
 
     Parameters
     ----------
@@ -162,8 +162,8 @@ def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float =
     n_parts : int
         Number of parts.
     moment : float, A m²
-        Typical total moment. Permanent and induced moment are each about `moment` / 1.4 in an earth
-        field of 50 microtesla.
+        Typical total moment. The permanent and the induced moment are each about `moment` / 1.4 if
+        the Earth's field is 50 microtesla.
 
     Returns
     -------
@@ -199,7 +199,7 @@ class Path:
     straight: float = float('inf')
     """Length of the straight segment before the arc, m."""
     turn: float = 0.0
-    """Angle of the arc, rad, anticlockwise positive; 0 = straight path."""
+    """Angle of the arc, rad, positive for a left turn; 0 selects a straight path."""
     radius: float = 1.0
     """Radius of the arc, m."""
 
@@ -236,7 +236,7 @@ class Path:
 
 @dataclass(frozen=True)
 class SensorErrorModel:
-    """Standard deviations of random sensor errors; zeros = perfect sensors."""
+    """Standard deviations of random sensor errors; zero disables an error."""
 
     noise_std: float = 1.2e-8
     """White noise, T."""
@@ -260,7 +260,7 @@ def simulate(network: SensorNetwork, body: Body, path: Trajectory, rate: float, 
     Parameters
     ----------
     network : SensorNetwork
-        Sensors; must have an earth field.
+        Sensor network; the Earth's field must be set.
     body : Body
     path : Trajectory
     rate : float, Hz
@@ -268,14 +268,14 @@ def simulate(network: SensorNetwork, body: Body, path: Trajectory, rate: float, 
     duration : float, s
     rng : numpy.random.Generator
     sensor_errors : SensorErrorModel, optional
-        Default: white noise only.
+        By default, only white noise is simulated.
     start_s : float, s
         Timestamp of the first sample.
 
     Returns
     -------
     readings : Readings
-        Chronological.
+        Raw readings in chronological order.
     t : (n,) array, s
         Time of each sample since the start.
     position : (n, 2) array, m, world frame
@@ -286,7 +286,7 @@ def simulate(network: SensorNetwork, body: Body, path: Trajectory, rate: float, 
     Raises
     ------
     ValueError
-        If the network has no earth field.
+        If the Earth's field of the network is not set.
     """
     errors, earth_field = sensor_errors or SensorErrorModel(), network.earth_field
     if earth_field is None:

@@ -1,4 +1,4 @@
-"""Archives: rows equal to a replay, continued runs, and invalid recordings."""
+"""Archives: agreement with a replay, resumed runs, and invalid recordings."""
 
 import contextlib
 import os
@@ -39,7 +39,7 @@ def road_network_file(tmp_path_factory):
 
 
 def archive_without_cluster(folder, recording, network, settings, in_order=True):
-    """Archive a recording without a cluster; return (its columns, number of segments)."""
+    """Archive a recording without a cluster; return (columns of its row, number of segments)."""
     work = folder / 'unfinished'
     work.mkdir(parents=True)
     job = Job(recording, work, folder, network, settings)
@@ -86,7 +86,7 @@ def test_a_recording_in_segments_gives_the_rows_of_a_replay(
 @pytest.mark.parametrize('ahead_s', [0.0, 0.2])
 def test_clock_differences_carry_over_between_segments(
         tmp_path, monkeypatch, road_network_file, ahead_s):
-    """With clock differences, passes in earlier segments mark later tracks as doubtful."""
+    """If clocks differ, tracks are doubtful because of passes in earlier segments."""
     monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 60)
     path = tmp_path / 'network.yaml'
     text = road_network_file.read_text()
@@ -104,7 +104,7 @@ def test_clock_differences_carry_over_between_segments(
 
 
 def test_an_archive_contains_all_valid_recordings(tmp_path, recordings, capsys):
-    """Two workers skip and report the invalid recording. A second run changes nothing."""
+    """Two workers report and skip the invalid recording. A second run changes nothing."""
     out, lines = tmp_path / 'out', []
     settings = settings_for('vehicle', QUICK)
     run = archive([recordings], NETWORK_FILE, settings, out, workers=2, report=lines.append)
@@ -184,7 +184,7 @@ def test_ctrl_c_ends_the_command_with_a_hint_to_continue(tmp_path, recordings):
 
 
 def frames(*segments):
-    """Frames at 10 Hz of consecutive segments, each given as (duration [s], target present)."""
+    """Frames at 10 Hz in consecutive intervals (duration [s], whether a target is present)."""
     out = []
     for seconds, present in segments:
         for _ in range(round(10 * seconds)):
@@ -207,7 +207,7 @@ def test_segments_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quiet
         stored = [frame for chunk in read_segment(tmp_path / f'segment-{k}.pickle')
                   for frame, _ in chunk.frames()]
         first = next(i for i, frame in enumerate(stored) if frame.target_present)
-        # All frames that a track may look back to, and the frame that ends the track.
+        # The segment contains all frames that a new track may use, and the frame that ends it.
         assert stored[first].stamp_ns - stored[0].stamp_ns in (3_000_000_000, 3_100_000_000)
         assert not stored[-1].target_present
     assert max(len(chunk.stamp_ns) for k in range(n) for chunk in read_segment(
@@ -226,7 +226,7 @@ def test_a_backward_time_jump_between_segments_loses_no_frames(tmp_path):
 
 
 def test_doubts_are_stored_with_the_frames_of_a_segment(tmp_path):
-    """Doubts are stored at the beginning of each segment and whenever they change."""
+    """Doubts are stored at the start of each segment and whenever they change."""
     writer = SegmentWriter(tmp_path, 3.0)
     first, second = {'mag_1': ((1, None),)}, {'mag_1': ((1, 5),)}
     for k, frame in enumerate(frames((5.0, False), (2.0, True), (9.0, False))):

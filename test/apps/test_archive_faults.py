@@ -31,7 +31,7 @@ def test_the_tasks_of_a_lost_worker_are_repeated(tmp_path, recordings, complete_
         [recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)))
     thread.start()
     wait_for(lambda: list(out.glob('unfinished/*/cut')))
-    # Processes without children are the workers; the others supervise them.
+    # Processes without children are workers; the other processes supervise the workers.
     workers = [p for p in psutil.Process().children(recursive=True) if p not in before
                and not p.children()]
     for worker in workers:
@@ -182,7 +182,7 @@ def test_invalid_arguments_are_reported(tmp_path, recordings, capsys):
 
 
 def test_a_recording_that_grows_during_tracking_is_tracked_again(tmp_path):
-    """A recording in progress, for example, grows while it is tracked."""
+    """A recording may still be in progress while it is archived."""
     path, out, settings = tmp_path / 'a.mcap', tmp_path / 'out', settings_for('vehicle', QUICK)
     data = vehicle_path('straight_car_right').read_bytes()
     path.write_bytes(data[:len(data) // 2])
@@ -229,7 +229,7 @@ def test_a_recording_that_kills_its_workers_is_the_only_failure(tmp_path, record
     run = archive([folder], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out',
                   report=lines.append)
     assert [p.name for p in run.done] == ['good.mcap'] and run.lost_workers >= 1
-    assert 'its worker was lost several times' in run.failed[folder / 'deadly.mcap']
+    assert 'the worker of a task was lost several times' in run.failed[folder / 'deadly.mcap']
     assert len(rows(tmp_path / 'out', 'recordings')) == 2
 
 

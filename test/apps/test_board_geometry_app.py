@@ -15,7 +15,7 @@ from support.magnet_boards import HIGH, LOW, MOMENT, simulated
 
 
 def with_earlier_calibration(network):
-    """Add the results of an earlier calibration to a network: tumbling and clock offsets."""
+    """Return a network with an earlier calibration, including tumbling and clock offsets."""
     n = len(network)
     rng = np.random.default_rng(8)
     C = np.eye(3) + 0.1 * rng.standard_normal((n, 3, 3))

@@ -1,4 +1,4 @@
-"""Calibration of the bundled recordings from installation data, compared with the truth."""
+"""Calibration of the bundled recordings from nominal orientations, compared with the truth."""
 
 import json
 from functools import cache
@@ -27,7 +27,7 @@ def truth_of(name):
 
 
 def as_installed(truth):
-    """Network with true positions and field of the Earth; sensors upright, x to the east."""
+    """Nominal network: true positions and Earth's field; sensors upright, with x to the east."""
     n = len(truth['sensors_m'])
     names = tuple(f'mag_{i + 1}' for i in range(n))
     return SensorNetwork(names, np.array(truth['sensors_m'], dtype=float),
@@ -141,7 +141,7 @@ def test_valid_recordings_give_no_warning(name):
     if name == 'straight_truck_right' else []))
 def test_a_calibration_records_its_date_and_evidence(name):
     found = calibration_of(name)
-    # The start of the two-way road ends before the first vehicle passes.
+    # The recording `two_way_road_start` ends before the first vehicle passes.
     passes = '' if name == 'two_way_road' else '; 1 pass'
     assert (found.evidence is None) == (not passes)
     for c in found.network.calibrated:
@@ -152,7 +152,7 @@ def test_a_calibration_records_its_date_and_evidence(name):
 def test_the_noise_is_estimated(name):
     truth = np.array(truth_of(name)['sensor_truth']['noise_std_T'])
     for noise, expected in zip(calibration_of(name).network.noise_std, truth, strict=True):
-        # Sensors with two axes get no noise estimate.
+        # The noise of sensors with two axes is not estimated.
         assert (noise is None) == (name == 'two_way_road')
         if noise is not None:
             np.testing.assert_allclose(noise, expected, rtol=0.35)

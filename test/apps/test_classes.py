@@ -1,4 +1,4 @@
-"""`mag-tracking classes`: tables, labelled intervals of recordings, and invalid labels."""
+"""`mag-tracking classes`: tables, labelled intervals of recordings, and invalid inputs."""
 
 import csv
 import json
@@ -19,7 +19,7 @@ ROAD = DATA / 'two_way_road'
 
 @pytest.fixture(scope='module')
 def tables(tmp_path_factory):
-    """Folder with two tables of the same signatures: one row per sample or per signature."""
+    """Folder with two tables of the same signatures: a row per sample, and a row per signature."""
     folder, found = tmp_path_factory.mktemp('classes'), signatures(COUNTS, 'boxes')
     write_by_sample(folder / 'by_sample.csv', found)
     write_by_row(folder / 'by_row.csv', found)
@@ -65,7 +65,7 @@ def test_labelled_intervals_give_a_signature_of_each_sensor(tmp_path):
     network = read_network(NETWORK_FILE)
     found = labelled_signatures(ROAD / 'two_way_road.mcap', write_intervals(
         tmp_path / 'a.csv', rows), network)
-    # Two sensors with two axes each.
+    # The network has two sensors, each with two axes.
     assert len(found) == 2 * len(rows) and all(s.field.shape[1] == 2 for s in found)
     epoch = truth['epoch_s']
     absolute = [(label, round((epoch + a) * 1e9), round((epoch + b) * 1e9), 'mag_2')
@@ -105,7 +105,7 @@ def test_invalid_intervals_are_reported(tmp_path, rows, error):
     ('label,x0,x1\ncar,1,two\n', "row 2: x1 is 'two', not a number"),
     ('label,x0\n', 'a.csv has no rows')])
 def test_an_invalid_table_is_rejected_with_its_error(tmp_path, capsys, text, message):
-    """The message is compared because such a table could not be trained even without the check."""
+    """The message is compared, because training with such a table fails even without the check."""
     path = tmp_path / 'a.csv'
     path.write_text(text)
     assert main(['classes', 'train', str(path), '--out', str(tmp_path / 'm.json')]) == 1

@@ -38,7 +38,7 @@ def test_a_description_identifies_its_cause(reason):
 
 
 def quiet(n, network):
-    """Quiet samples of sensor `mag_1` at 100 Hz."""
+    """Samples of sensor `mag_1` at 100 Hz without a target."""
     rng = np.random.default_rng(0)
     field = network.R_sw[0] @ network.earth_field
     return [MagSample(10**18 + k * STEP_NS, 'mag_1', field + 1.2e-8 * rng.standard_normal(3))
@@ -51,7 +51,7 @@ def changed(samples, k, **values):
 
 
 def rejections(samples, network):
-    """Rejections {description: number} of samples by the stage."""
+    """Feed samples to the stage; return its rejections {description: number}."""
     stage = Calibrate(network, SETTINGS)
     for sample in samples:
         stage.feed(one(sample))
@@ -69,7 +69,7 @@ FAULTS = {
     RejectionCause.DUPLICATE: {'stamp_ns': 10**18 + 498 * STEP_NS},
     RejectionCause.OUT_OF_ORDER: {'stamp_ns': 10**18 + 498 * STEP_NS - STEP_NS // 2},
     RejectionCause.SPIKES: {'field': np.full(3, 2e-4)}}
-"""Changes of one reading that the stage rejects for each cause."""
+"""{cause: change that makes the stage reject a reading for this cause}."""
 
 
 @pytest.mark.parametrize('cause', FAULTS, ids=lambda cause: cause.name)
@@ -116,5 +116,5 @@ def test_the_doctor_gives_the_advice():
     doctor = Doctor(network, settings_for('vehicle'))
     for sample in changed(quiet(510, network), 499, field=np.full(3, 2e-4)):
         doctor.feed(one(sample))
-    assert any('readings rejected: spike' in f.what
+    assert any('1 reading rejected: spike' in f.what
                and f.advice == ADVICE[RejectionCause.SPIKES] for f in doctor.findings())

@@ -1,4 +1,4 @@
-"""Targets that other sensors detect distinguish stuck sensors from quiet sensors."""
+"""Detection of stuck sensors by means of the targets that other sensors detect."""
 
 import numpy as np
 import pytest

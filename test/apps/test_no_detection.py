@@ -1,4 +1,4 @@
-"""One-sentence explanation why nothing was detected."""
+"""Explanation, in one sentence, of why nothing was detected."""
 
 import dataclasses
 

@@ -19,7 +19,7 @@ def test_an_empty_batch_may_arrive_while_a_reading_is_delayed():
             for name in ROAD.names]))
 
     for k in range(1000):
-        # The reading before the empty batch is an outlier, whose output waits for the next reading.
+        # The reading before the empty batch is an outlier, which is held until the next reading.
         passes += feed(k, 5e-6 * (k == 600))
         if k == 600:
             passes += collector.feed(batch([]))

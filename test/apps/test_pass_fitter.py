@@ -32,7 +32,7 @@ def test_two_vehicles_are_fitted_together(how, simulator):
     assert sorted(match.vehicle for match in right) == [0, 1]
     for match in right:
         assert '2 vehicles were fitted together' in match.one.notes[-1]
-        # Within 10 %, or three standard deviations: a driver may brake.
+        # Three standard deviations are allowed, because a driver may brake.
         found, std = match.one.chosen.speed
         assert abs(found - match.speed) < max(0.1 * match.speed, 3.0 * std)
 
@@ -75,13 +75,13 @@ def in_order(*tracks):
 
 def test_vehicles_of_a_pass_have_their_smallest_covariance_in_it():
     tracks = PassTracks(settings_for('vehicle').track)
-    # The third vehicle belongs to the next pass, which begins before this one ends.
+    # The third vehicle belongs to the next pass, which begins before the first pass ends.
     tracks.add([object(), *in_order(crossing(1, 3.0, -1.7, 10.0), crossing(2, 4.0, 1.7, -12.0),
                                     crossing(3, 8.0, -1.7, 14.0, n=20))])
     paths = tracks.paths(pass_of(0.0, 6.0))
     np.testing.assert_allclose(sorted(paths[:, 3]), [-12.0, 10.0])
     for path in paths:
-        # The position refers to the beginning of the pass.
+        # The position is the position at the start of the pass.
         at = 3.0 if path[3] > 0.0 else 4.0
         np.testing.assert_allclose(path[:2], [-at * path[3], -np.sign(path[3]) * 1.7])
     np.testing.assert_allclose(tracks.paths(pass_of(5.0, 12.0))[:, 3], [14.0])

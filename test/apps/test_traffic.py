@@ -1,4 +1,4 @@
-"""`mag-tracking traffic`: counts, directions, speeds, classes and tables of roads with truth."""
+"""`mag-tracking traffic`: counts, directions, speeds, classes and tables, against the truth."""
 
 import csv
 import dataclasses
@@ -39,7 +39,7 @@ def test_thirty_vehicles_are_counted_with_direction_class_and_speed():
     assert np.count_nonzero(kinds) == 30 and np.count_nonzero(cars) >= 22
     speeds = np.array([[p.speed, p.speed_std, v['speed_mps']] for p, v in right])
     errors = np.abs(speeds[:, 0] - speeds[:, 2])
-    # The target is 30. The speeds of three small cars, tracked as point targets, are 12 to 24 % too
+    # The goal is 30. The speeds of three small cars, tracked as point targets, are 12 to 24 % too
     # low: two of them within two standard deviations, the third ambiguous.
     assert np.count_nonzero(errors < 0.1 * speeds[:, 2]) >= 27
     assert np.count_nonzero(errors < 3.0 * speeds[:, 1]) >= 29

@@ -42,7 +42,7 @@ class StoringScene(LiveScene):
 
 
 def view_recording(path, network, rate):
-    """View a recording at a rate; return (scene, duration [s])."""
+    """View a recording at `rate` times real time; return (scene, duration [s])."""
     scene = StoringScene(network)
     began = time.monotonic()
     view(Recording(path), network, settings_for('vehicle', QUICK), scene, rate, lambda: False)
@@ -70,7 +70,7 @@ def test_an_hour_without_messages_is_skipped(road_network, tmp_path):
 
 
 def rewrite(path, network, log_time_of, stamp_of):
-    """Copy the recording with other times: functions of (index of a message, time [ns])."""
+    """Copy the recording; the functions map (index of a message, time [ns]) to a new time."""
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
     with RecordingWriter(path) as writer:
         for k, (readings, log_ns) in enumerate(reader.readings_as_received()):
