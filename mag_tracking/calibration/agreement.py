@@ -1,4 +1,4 @@
-"""Comparison of the sensors of a network with the Earth's field, and explanation of differences.
+"""Comparison of measured fields with the Earth's field, and explanations of differences.
 
 Without a target, all sensors measure the same field in different frames. Flipped axes, swapped
 axes, a wrong unit or two exchanged sensors are therefore detected and named.
@@ -29,8 +29,8 @@ MAX_REMAINING_FRACTION = 0.3
 difference."""
 
 MAX_RATIO_TO_NEXT = 0.5
-"""Maximum difference that remains after a partial explanation, relative to the next best change of
-axes of the same complexity."""
+"""Maximum difference that remains after a partial explanation, relative to the difference that
+remains after the next best change of axes of the same complexity."""
 
 UNITS = (('gauss', 1e4), ('millitesla', 1e3), ('microtesla', 1e6), ('nanotesla', 1e9))
 _AXES = 'xyz'
@@ -41,7 +41,7 @@ _AxisChange: TypeAlias = tuple[str, tuple[int, ...], FloatArray]
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A sensor whose field differs from the Earth's field."""
+    """A sensor whose measured field is inconsistent with the Earth's field."""
 
     sensor: str
     size: float
@@ -51,8 +51,8 @@ class Disagreement:
 
     def __str__(self) -> str:
         cause = ' or '.join(self.explanations) or (
-            'no change of axes, other unit or exchange of sensors explains it; check for iron or '
-            'magnets nearby, and check the configured orientation')
+            'not explained by swapped or flipped axes, a wrong unit or exchanged sensors; check '
+            'for iron or magnets nearby, and check the configured orientation')
         return (f'{self.sensor} differs from the Earth\'s field by {self.size * 1e6:.3g} uT: '
                 f'{cause}')
 
@@ -63,7 +63,7 @@ def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
     Parameters
     ----------
     fields : (n, 3) array, T, sensor frames
-        NaN = not reported.
+        NaN if not reported.
     R_ws : (n, 3, 3) array
         Sensor to world.
 
@@ -74,12 +74,13 @@ def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
     Raises
     ------
     ValueError
-        If fewer than three sensors report all axes: two sensors do not reveal the faulty sensor.
+        If fewer than three sensors report all axes. With two sensors, the faulty sensor cannot
+        be identified.
     """
     is_complete = ~np.isnan(fields).any(axis=1)
     if np.count_nonzero(is_complete) < 3:
-        raise ValueError('a comparison without earth_field requires three sensors that report '
-                         f'all axes, but there are {np.count_nonzero(is_complete)}')
+        raise ValueError('if earth_field is unknown, at least three sensors must report all axes, '
+                         f'but only {np.count_nonzero(is_complete)} do')
     field: FloatArray = np.median(
         np.einsum('jik,jk->ji', R_ws[is_complete], fields[is_complete]), axis=0)
     return field
@@ -94,7 +95,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     ----------
     names : sequence of n str
     fields : (n, 3) array, T, sensor frames
-        Measured without a target; NaN = axis not reported.
+        Measured without a target; NaN for an unreported axis.
     R_ws : (n, 3, 3) array
         Sensor to world.
     orientation_std : (n, 3) array, rad
@@ -121,7 +122,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
 
 def _fits(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray,
           bias_std: float) -> bool:
-    """Whether a field is consistent with the Earth's field at the best heading."""
+    """Whether a measured field is consistent with the Earth's field at the best heading."""
     return _fits_cached(_cache_key(y), _cache_key(R_ws), _cache_key(std), _cache_key(B0), bias_std)
 
 
@@ -152,7 +153,7 @@ def _fits_cached(field: tuple[float, ...], orientation: tuple[float, ...],
 def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields: FloatArray,
                   R_ws: FloatArray, orientation_std: FloatArray, B0: FloatArray,
                   bias_std: float) -> tuple[str, ...]:
-    """Simplest explanations of the field of sensor `j`."""
+    """Simplest faults that explain the field of sensor `j`; empty if none does."""
     def fits(y: FloatArray, R: FloatArray = R_ws[j],
              std: FloatArray = orientation_std[j]) -> bool:
         return _fits(y, R, std, B0, bias_std)
@@ -184,8 +185,8 @@ def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
         # If two changes explain the difference equally well, neither is reported.
         if remainders[0][0] < MAX_REMAINING_FRACTION * original and not (
                 len(remainders) > 1 and remainders[1][0] < remainders[0][0] / MAX_RATIO_TO_NEXT):
-            return (f'{remainders[0][1]}, and {remainders[0][0] * 1e6:.2g} uT remain (iron nearby, '
-                    'or the bias of the sensor)',)
+            return (f'{remainders[0][1]}, and {remainders[0][0] * 1e6:.2g} uT remain (due to '
+                    'nearby iron or the bias of the sensor)',)
     return ()
 
 
@@ -198,7 +199,7 @@ def _remaining_difference(y: FloatArray, R_ws: FloatArray, std: FloatArray,
 
 
 def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Possible heading errors (n,) [rad] of a sensor, and the Earth's field (n, 3) for each."""
+    """Tested heading errors (n,) [rad] of a sensor, and the Earth's field (n, 3) [T] for each."""
     max_error = min(np.pi, MAX_HEADING_STDS * std[2])
     yaw = np.linspace(-max_error, max_error, 1 + 2 * max(1, round(max_error / YAW_STEP)))
     return yaw, np.stack([B0[0] * np.cos(yaw) + B0[1] * np.sin(yaw),

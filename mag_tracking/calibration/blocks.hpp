@@ -86,7 +86,7 @@ inline void moments(const Sensor& s, int64_t k, double* mean, double* scatter) {
 }
 
 // Pooled covariance within k blocks, from their sums of squared deviations `scatter` (k, 3, 3) and
-// numbers of samples `n` (k, 3), into `out` (3, 3); NaN = axis not reported. Returns false if there
+// numbers of samples `n` (k, 3), into `out` (3, 3); NaN for an unreported axis. Returns false if there
 // are too few samples.
 inline bool pool(int64_t k, const double* scatter, const double* n, double* out) {
     double freedom[3] = {0.0, 0.0, 0.0}, sum[9] = {};

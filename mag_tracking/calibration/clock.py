@@ -17,7 +17,7 @@ MIN_CORRELATION = 0.7
 """Minimum correlation of two sensors that measured the same knocks."""
 
 MIN_RIVAL_RATIO = 0.9
-"""Correlation of a second lag, relative to the best lag, above which the lag is ambiguous."""
+"""Correlation at a second lag, relative to the best lag, above which the lag is ambiguous."""
 
 CONTEXT_S = 5.0
 """[s] Interval before the first and after the last knock that is compared in a long recording, so
@@ -39,7 +39,7 @@ class Lag:
     std: float
     """[s] Standard deviation of the offset."""
     correlation: float
-    """Correlation at this offset, 0 to 1; NaN if a sensor measured no knock."""
+    """Correlation at the offset, even if it was rejected, 0 to 1; NaN if it was not computed."""
     reason: str
     """Why the offset is unknown; empty if it is known."""
 
@@ -164,7 +164,7 @@ def _separation(a: _Series, b: _Series, max_lag: float) -> float | None:
 
 
 def _around_knocks(a: _Series, b: _Series, max_lag: float) -> _Series:
-    """Part of series `a` around the knocks of `b`."""
+    """Part of series `a` around the knocks of `b`; all of `a` if `b` has no knock."""
     if len(b[1]) < 8 or not _is_knock(b[1]).any():
         return a
     first, last = _knock_times(*b)

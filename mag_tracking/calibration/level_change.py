@@ -25,7 +25,7 @@ DETECTION_STDS = 3.0
 """Detection limit of a change in standard deviations of the mean of a block, per axis."""
 
 MIN_ASYMMETRY = 0.8
-"""Minimum asymmetry of a change (a binary logarithm) for a decision; 0 = equal ends."""
+"""Minimum asymmetry of a change for a decision, as a binary logarithm; 0 for equal ends."""
 
 MIN_GROWTH = 3.5
 """Minimum ratio of the largest evaluated magnitude to the detection limit."""
@@ -79,7 +79,7 @@ def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: F
     n_steady : int
         Number of blocks at the end that are at the later level.
     before : (k, 3) array, T
-        Earlier level at the times of the blocks; NaN = axis not reported.
+        Earlier level at the times of the blocks; NaN for an unreported axis.
     noise_std : (3,) array, T
         Standard deviation of one reading.
     origin : float, s
@@ -136,7 +136,7 @@ def _asymmetry(time: FloatArray, off_before: FloatArray, off_after: FloatArray, 
 
 
 NO_CHANGE = LevelChange(np.nan, 0.0, None)
-"""Value that replaces an earlier change of a sensor after the end of that change."""
+"""Placeholder for a sensor whose level does not change."""
 
 
 class SharedChanges:
@@ -146,7 +146,7 @@ class SharedChanges:
         self._latest_changes: dict[int, LevelChange] = {}
 
     def evaluate_change(self, sensor: int, change: LevelChange) -> bool | None:
-        """Evaluate a change of a sensor together with the changes of the other sensors.
+        """Store a change of a sensor, and classify it together with changes at other sensors.
 
         A change that is not clear is classified by the largest simultaneous change.
 

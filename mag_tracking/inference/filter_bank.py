@@ -230,7 +230,7 @@ class FilterBank:
         return float(np.exp(log_sum_exp(self.log_w[rows]))) if rows.any() else 0.0
 
     def is_concentrated_in(self, n: int, fraction: float) -> bool:
-        """Whether the heaviest hypotheses have at least a given fraction of the weight.
+        """Whether the `n` heaviest hypotheses have at least a given fraction of the weight.
 
         Parameters
         ----------

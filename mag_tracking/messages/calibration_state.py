@@ -99,7 +99,7 @@ def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
 
 
 def with_orientations(network: SensorNetwork, message: CalibrationState) -> SensorNetwork:
-    """Copy a network with the sensor orientations of a CalibrationState.
+    """Return a copy of a network that has the sensor orientations of a CalibrationState.
 
     Parameters
     ----------
@@ -113,8 +113,8 @@ def with_orientations(network: SensorNetwork, message: CalibrationState) -> Sens
     Raises
     ------
     RecordingError
-        If sensors or frame differ from those of `network`, or an orientation or its standard
-        deviation is invalid.
+        If the sensors or the frame of `message` differ from `network`, or an orientation or its
+        standard deviation is invalid.
     """
     names = tuple(s.sensor for s in message.sensors)
     if names != network.names:

@@ -23,7 +23,7 @@ LIFETIME_S = 2
 _ARROW, _CUBE, _SPHERE, _TEXT = 0, 1, 2, 9
 _ADD, _DELETE = 0, 2
 _SCALE_3D = 2.5003
-"""Standard deviations to the surface of the 90 % region (chi-square, 3 degrees of freedom)."""
+"""Radius of the 90 % region in standard deviations (chi-square, 3 degrees of freedom)."""
 SENSOR_SIZE_M = 0.3
 """[m] Maximum length of a sensor marker; the length is at most half the smallest sensor
 distance."""
@@ -70,7 +70,7 @@ def delete_markers(track: Track, frame: str) -> dict[str, Any]:
 
 
 def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
-    """Markers of the sensors and their names.
+    """Markers that show the sensors and their names.
 
     Parameters
     ----------

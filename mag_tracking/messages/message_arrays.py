@@ -25,8 +25,9 @@ class FieldArrays(NamedTuple):
     """Contents of sensor_msgs/MagneticField messages as arrays."""
 
     is_decoded: BoolArray
-    """(n,) False for an unusual or damaged message, which must be decoded individually. The
-    corresponding elements of the other arrays are meaningless."""
+    """(n,) False for a message that is damaged, not little-endian CDR or in a frame with a
+    non-ASCII name, and which must be decoded individually. The corresponding elements of the other
+    arrays are meaningless."""
     stamp_ns: IntArray
     """(n,) Timestamps."""
     field: FloatArray
@@ -39,8 +40,9 @@ class PoseArrays(NamedTuple):
     """Contents of geometry_msgs/PoseStamped messages as arrays."""
 
     is_decoded: BoolArray
-    """(n,) False for a message in another frame and for an unusual or damaged message, which must
-    be decoded individually. The corresponding elements of the other arrays are meaningless."""
+    """(n,) False for a message that is in another frame, damaged or not little-endian CDR, and
+    which must be decoded individually. The corresponding elements of the other arrays are
+    meaningless."""
     stamp_ns: IntArray
     """(n,) Timestamps."""
     pose: FloatArray

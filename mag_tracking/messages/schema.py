@@ -79,7 +79,7 @@ def reading_of(message: MagneticField, sensor: str) -> Readings:
 
 
 def known_covariances(C: FloatArray) -> FloatArray | None:
-    """Convert the covariances of messages to those of `Readings`.
+    """Convert covariances of messages to the convention of `Readings`.
 
     A NaN covariance means "unknown" in `Readings` only. In a message, NaN is a fault: it is
     replaced by zero, which the calibration stage rejects.
@@ -114,7 +114,7 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
     Returns
     -------
     AccelerationSample
-        NaN if the message contains no acceleration (its covariance begins with -1).
+        NaN if the message contains no acceleration (its first covariance element is -1).
     """
     a = message.linear_acceleration
     is_present = message.linear_acceleration_covariance[0] != -1.0
@@ -125,7 +125,7 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
 def float64_array(values: ArrayLike) -> 'array[float]':
     """Convert numbers to the array type that a float64[] field accepts without conversion.
 
-    The elements of a list would be checked one by one.
+    The elements of a list would be checked individually.
 
     Parameters
     ----------

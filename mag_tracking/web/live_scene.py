@@ -76,7 +76,7 @@ class LiveScene:
         self._is_new = True
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Add a frame; call it before `add_track` with the same timestamp.
+        """Add a frame; it must be added before the tracks with the same timestamp.
 
         Parameters
         ----------
@@ -147,7 +147,7 @@ class LiveScene:
                 self._notes, self._tables, self._is_health_new = notes, tables, True
 
     def whole(self) -> list[str]:
-        """Messages with the complete state that has been sent, for a new viewer.
+        """Messages that give a new viewer the state that all other viewers have received.
 
         Returns
         -------
@@ -191,7 +191,7 @@ class LiveScene:
             return out
 
     def _scene_messages(self, tracks: list[dict[str, Any]]) -> list[str]:
-        """List of the message that replaces the scene; empty while the sensors are unknown."""
+        """The message that replaces the scene, as a list; empty while the sensors are unknown."""
         if not len(self._network):
             return []
         begin_ns = self._begin_ns or 0

@@ -8,8 +8,8 @@ from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
 MAX_TRACK_POSES, N_REMOVED = 8_000, 1_000
-"""Maximum number of poses of one track, and number of poses removed beyond it. `scene.js` uses the
-same numbers."""
+"""Maximum number of poses of one track, and number of poses that are removed if it is exceeded.
+`scene.js` uses the same numbers."""
 MAX_GAP_S = 60.0
 """[s] A pose after a longer gap belongs to another track with the same id."""
 N_RECENT = 100
