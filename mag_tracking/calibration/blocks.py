@@ -1,4 +1,4 @@
-"""Blocks: summaries of short intervals of readings, to which a background is fitted."""
+"""Summaries of short intervals of readings (blocks), to which the background line is fitted."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

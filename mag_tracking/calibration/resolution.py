@@ -75,7 +75,7 @@ def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
 
 
 def smallest_steps(fields: FloatArray) -> FloatArray:
-    """Smallest change between consecutive readings of each axis.
+    """Smallest non-zero change between consecutive readings of each axis.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ class Iron:
     covariance: FloatArray
     """Covariance of [m0, D], (4, 4)."""
     residuals: FloatArray
-    """Moments minus their prediction, (n, 3) A m², world frame."""
+    """Measured minus predicted moments, (n, 3) A m², world frame."""
     normalised_cost: float
     """Weighted sum of squared residuals over the degrees of freedom; about 1 if the model and the
     covariances are correct. NaN without covariances."""
@@ -99,4 +99,4 @@ def _whitening(covariances: ArrayLike | None, n: int) -> FloatArray:
     try:
         return np.linalg.inv(np.linalg.cholesky(covariances))
     except np.linalg.LinAlgError:
-        raise ValueError('covariances: not positive definite') from None
+        raise ValueError('a covariance is not positive definite') from None

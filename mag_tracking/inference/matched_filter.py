@@ -16,7 +16,7 @@ from scipy.special import ndtr, ndtri
 from mag_tracking.arrays import BoolArray, FloatArray
 
 _BAND_EDGE_TOLERANCE = 1e-9
-"""Relative tolerance with which a frequency on the edge of a band belongs to it."""
+"""Relative tolerance by which a band is extended, so that it includes its edges."""
 
 
 def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,

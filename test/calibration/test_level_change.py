@@ -95,7 +95,7 @@ def time_reversed(blocks):
 
 @pytest.mark.parametrize('stops', [True, False])
 def test_a_stopping_vehicle_has_arrived_and_a_starting_one_has_departed(stops):
-    """Eighty vehicles of each kind are simulated; a reversed change has the opposite or no result."""
+    """Eighty vehicles of each kind are simulated; reversed changes never have the same result."""
     verdicts = []
     for seed in range(80):
         begin, end = (0.0, 16.0) if stops else (8.0, 30.0)
