@@ -111,7 +111,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     """
     B0 = np.asarray(earth_field, dtype=float)
     suspects = [j for j in range(len(names))
-                if not _fits(fields[j], R_ws[j], orientation_std[j], B0, bias_std)]
+                if not _is_consistent(fields[j], R_ws[j], orientation_std[j], B0, bias_std)]
     out = []
     for j in suspects:
         size = np.sqrt(np.nansum((fields[j] - R_ws[j].T @ B0)**2))
@@ -120,10 +120,11 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     return out
 
 
-def _fits(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray,
-          bias_std: float) -> bool:
+def _is_consistent(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray,
+                   bias_std: float) -> bool:
     """Whether a measured field is consistent with the Earth's field at the best heading."""
-    return _fits_cached(_cache_key(y), _cache_key(R_ws), _cache_key(std), _cache_key(B0), bias_std)
+    return _is_consistent_cached(
+        _cache_key(y), _cache_key(R_ws), _cache_key(std), _cache_key(B0), bias_std)
 
 
 def _cache_key(a: FloatArray) -> tuple[float, ...]:
@@ -132,10 +133,10 @@ def _cache_key(a: FloatArray) -> tuple[float, ...]:
 
 
 @functools.lru_cache(maxsize=4096)
-def _fits_cached(field: tuple[float, ...], orientation: tuple[float, ...],
-                 orientation_std: tuple[float, ...], B0: tuple[float, ...],
-                 bias_std: float) -> bool:
-    """Cached version of `_fits`, with tuples as arguments."""
+def _is_consistent_cached(field: tuple[float, ...], orientation: tuple[float, ...],
+                          orientation_std: tuple[float, ...], B0: tuple[float, ...],
+                          bias_std: float) -> bool:
+    """Cached version of `_is_consistent`, with tuples as arguments."""
     y, R_ws, std = (np.array(field), np.array(orientation).reshape(3, 3),
                     np.array(orientation_std))
     reported = ~np.isnan(y)
@@ -156,7 +157,7 @@ def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields:
     """Simplest faults that explain the field of sensor `j`; empty if none does."""
     def fits(y: FloatArray, R: FloatArray = R_ws[j],
              std: FloatArray = orientation_std[j]) -> bool:
-        return _fits(y, R, std, B0, bias_std)
+        return _is_consistent(y, R, std, B0, bias_std)
 
     y = fields[j]
     # Exchanged sensors: both must be suspect, and both must fit after the exchange.

@@ -30,7 +30,7 @@ from mag_tracking.units import NS
 
 
 class RunningBackground:
-    """Running estimate of one sensor's background; times in seconds since its first reading.
+    """Running estimate of a sensor's background; times are in seconds since the first reading.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class RunningBackground:
                  freeze_std: float, relearn: float, background: FloatArray | None = None,
                  noise_std: FloatArray | None = None, phase: float | None = None, *,
                  sensors: StructArray, evaluate_change: ChangeEvaluator | None = None) -> None:
-        self._learn, self._length, self._relearn = learn, block, relearn
+        self._learn, self._block_length, self._relearn = learn, block, relearn
         self._sensors, self._state = sensors, sensors[0]
         self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
         self._max_blocks = max(3, int(round(memory / block)))
@@ -176,7 +176,7 @@ class RunningBackground:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Noise covariance of one sample, (3, 3) T², or None; NaN for an unreported axis.
+        """Noise covariance of one sample, (3, 3) T²; None if unknown, NaN for an unreported axis.
 
         The variance due to the sensor's steps is included.
         """
@@ -372,7 +372,7 @@ class RunningBackground:
             self._store_former_level(float(blocks.time[0]))
         # The required length was checked by the caller; the initial length does not apply.
         self._is_resumed = False
-        self._seen_s = float(blocks.time[-1] - blocks.time[0]) + self._length
+        self._seen_s = float(blocks.time[-1] - blocks.time[0]) + self._block_length
         self._seen_until = float(blocks.time[-1])
         self._level.set_uncertainty()
         self._quiet.begin(collected)

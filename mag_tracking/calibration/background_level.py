@@ -123,7 +123,7 @@ class BackgroundLevel:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Noise covariance of one sample, (3, 3) T², or None; NaN for an unreported axis.
+        """Noise covariance of one sample, (3, 3) T²; None if unknown, NaN for an unreported axis.
 
         The variance due to the sensor's steps is included.
         """

@@ -72,7 +72,7 @@ class Decimator:
         """Discard the stored samples and retain the measured rate."""
         self._window: deque[tuple[int, FloatArray]] = deque(
             maxlen=None if self._taps is None else len(self._taps))
-        self._until_next = 0
+        self._n_until_output = 0
 
     def feed(self, stamp_ns: int, field: FloatArray) -> list[tuple[int, FloatArray]]:
         """Add a sample, and return the outputs that become available; usually an empty list.
@@ -141,10 +141,10 @@ class Decimator:
         """Return the output of the filter if one is due."""
         if len(self._window) < len(taps):
             return []
-        if self._until_next:
-            self._until_next -= 1
+        if self._n_until_output:
+            self._n_until_output -= 1
             return []
-        self._until_next = factor - 1
+        self._n_until_output = factor - 1
         # The filter is symmetric, so its output belongs to the centre sample.
         middle = self._window[len(taps) // 2][0]
         return [(middle, taps @ np.array([f for _, f in self._window]))]

@@ -1,4 +1,4 @@
-"""Directions of the readings of a tumbled sensor: their coverage and weights."""
+"""Coverage of the sphere by the readings of a tumbled sensor, and weights by direction."""
 
 from itertools import product
 

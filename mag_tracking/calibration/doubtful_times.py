@@ -1,4 +1,4 @@
-"""Intervals in which the background of a sensor was doubtful, by the timestamps of its readings."""
+"""Intervals in which the background of a sensor was doubtful, as timestamps of its readings."""
 
 from collections.abc import Mapping
 from typing import TypeAlias
@@ -56,7 +56,7 @@ def doubtful_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
 
 def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTimes]
            ) -> dict[str, DoubtfulTimes]:
-    """Merge two records of the same sensors.
+    """Merge earlier and latest doubtful intervals of sensors.
 
     An interval in `latest` replaces an earlier interval that begins at the same time or within it.
     If the end of an earlier interval is missing, the interval ends where the next one begins. If

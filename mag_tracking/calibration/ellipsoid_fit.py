@@ -249,7 +249,7 @@ def _notes_on_input(counts: _Counts, is_saturated: BoolArray) -> tuple[str, ...]
 
 
 def _glitches(y: FloatArray) -> BoolArray:
-    """Whether each reading (n,) is far from the median, while few readings are."""
+    """Flag readings (n,) far from the median, unless they are too many to be glitches."""
     distance = np.linalg.norm(y - np.median(y, axis=0), axis=1) if len(y) else np.zeros(0)
     is_far = distance > MIN_GLITCH_DISTANCE * np.median(distance) if len(y) \
         else np.zeros(0, dtype=bool)

@@ -75,7 +75,7 @@ class LevelDeparture:
         self.has_arrived = self.was_steady = False
 
     def add(self, block: Block, before: Iterable[Block]) -> None:
-        """Add a block.
+        """Add a block to the departure.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Provisional background before a quiet interval is long enough: the most frequent level so far.
+"""Most frequent level so far: a provisional background until a quiet interval is long enough.
 
 In dense traffic no interval is quiet for several seconds, and a sensor without a background cannot
 contribute to tracking.

@@ -32,7 +32,7 @@ class BlockRecorder(RunningBackground):
     """Background estimator that only collects blocks, for a first pass over a recording."""
 
     def evaluate_block(self) -> None:
-        """Store the current block if it is complete."""
+        """Store the latest complete block, unless it has been stored already."""
         if self._state['is_full']:
             self._blocks.append(block_of(self._sensors))
             self._state['is_full'] = False

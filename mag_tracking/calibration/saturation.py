@@ -23,7 +23,7 @@ differences between and next to these neighbours."""
 
 
 def isolated_readings(values: FloatArray) -> IntArray:
-    """Find single readings of one axis that differ from both neighbours, which agree.
+    """Find single readings of one axis that differ from both neighbours while these two agree.
 
     Parameters
     ----------

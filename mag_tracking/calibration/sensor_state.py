@@ -1,4 +1,4 @@
-"""State of the sensors that is updated with every reading, in one structured array.
+"""Sensor state that is updated with every reading, in one structured array for all sensors.
 
 Compiled code accesses it for each reading, Python for each block.
 """

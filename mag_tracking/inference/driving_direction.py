@@ -89,7 +89,7 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
     if lag < 1 or n < 1:
         raise ValueError(f'lag: expected 1 to {(len(field) - 1) // 2} samples, got {lag}')
     floor = 2.0 * n / lag**2 * noise_std**4
-    estimate = noise_std**2 / lag**2 * _spread(field, lag) - floor
+    estimate = noise_std**2 / lag**2 * _squared_lag_differences(field, lag) - floor
     return FieldRotation(_correlation(field, lag), max(estimate, floor))
 
 
@@ -114,8 +114,9 @@ def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRo
     [PHD15]_ Paper B eq. (12), (14).
     """
     padded = np.pad(signal, ((lag, lag), (0, 0)))
-    return FieldRotation(_correlation(padded, lag), noise_std**2 / lag**2 * _spread(padded, lag)
-                         + 2.0 * len(signal) / lag**2 * noise_std**4)
+    return FieldRotation(
+        _correlation(padded, lag), noise_std**2 / lag**2 * _squared_lag_differences(padded, lag)
+        + 2.0 * len(signal) / lag**2 * noise_std**4)
 
 
 def _correlation(field: FloatArray, lag: int) -> float:
@@ -124,13 +125,13 @@ def _correlation(field: FloatArray, lag: int) -> float:
     return float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
 
 
-def _spread(field: FloatArray, lag: int) -> float:
+def _squared_lag_differences(field: FloatArray, lag: int) -> float:
     """Sum of the squared differences of samples two lags apart."""
     return float(np.sum(np.square(field[2 * lag:] - field[:-2 * lag])))
 
 
 def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
-    """Lag matched to the width of a pass.
+    """Lag, in samples, that matches the width of a pass.
 
     Parameters
     ----------

@@ -129,7 +129,7 @@ def with_orientations(network: SensorNetwork, message: CalibrationState) -> Sens
     for name, v in zip(names, std, strict=True):
         if not (np.isnan(v).all() or (np.isfinite(v) & (v > 0.0)).all()):
             raise RecordingError(f'CalibrationState of {name}: orientation_std is {v.tolist()} '
-                                 'rad; expected positive values, or NaN for unknown')
+                                 'rad; expected positive values, or NaN if unknown')
     try:
         R_ws = rotation_from_quaternion(q)
     except ValueError as error:

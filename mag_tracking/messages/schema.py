@@ -216,8 +216,8 @@ def readings_dict(readings: Readings) -> MessageDict:
     """
     C = readings.covariance
     if not len(readings) or C is not None and np.isnan(C).all(axis=(1, 2)).any():
-        raise RecordingError('FieldReadings requires at least one reading, and covariances of all '
-                             'readings or of none')
+        raise RecordingError('FieldReadings requires at least one reading, and covariances for '
+                             'all readings or for none')
     return {'header': header_dict(int(readings.stamp_ns.max()), ''),
             'sensors': list(readings.names),
             'sensor': array('H', readings.sensor.astype(np.uint16).tobytes()),

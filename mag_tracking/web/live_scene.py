@@ -73,7 +73,7 @@ class LiveScene:
         self._tracks: dict[int, LiveTrack] = {}
         # {track id: latest track with this id}
         self._latest_by_id: dict[int, LiveTrack] = {}
-        self._is_new = True
+        self._is_scene_new = True
 
     def add_frame(self, frame: FieldFrame) -> None:
         """Add a frame; it must be added before the tracks with the same timestamp.
@@ -169,8 +169,8 @@ class LiveScene:
             JSON messages.
         """
         with self._lock:
-            if self._is_new:
-                self._is_new = False
+            if self._is_scene_new:
+                self._is_scene_new = False
                 return self._scene_messages([])
             out = [self._health_message()] if self._is_health_new else []
             self._is_health_new = False
@@ -209,7 +209,7 @@ class LiveScene:
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
             # An empty scene that may have been sent earlier had no start time.
-            self._is_new = True
+            self._is_scene_new = True
         self._end_ns = max(self._end_ns, stamp_ns)
 
     def _remove_old_tracks(self) -> None:

@@ -312,7 +312,7 @@ def _open_socket(host: str, port: int) -> socket.socket:
     except (OSError, UnicodeError) as error:
         reason = getattr(error, 'strerror', None) or str(error)
         raise DeviceError(f'the live page cannot be served on {host} port {port}: {reason}; '
-                          'choose another port') from error
+                          'check the address or choose another port') from error
 
 
 def _response(status: HTTPStatus, body: bytes, kind: str, encoding: str = '') -> Response:
