@@ -63,7 +63,7 @@ def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
     Parameters
     ----------
     fields : (n, 3) array, T, sensor frames
-        NaN if not reported.
+        Measured fields; NaN for an unreported axis.
     R_ws : (n, 3, 3) array
         Sensor to world.
 
@@ -95,7 +95,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     ----------
     names : sequence of n str
     fields : (n, 3) array, T, sensor frames
-        Measured without a target; NaN for an unreported axis.
+        Fields measured without a target; NaN for an unreported axis.
     R_ws : (n, 3, 3) array
         Sensor to world.
     orientation_std : (n, 3) array, rad

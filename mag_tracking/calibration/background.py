@@ -1,11 +1,11 @@
 """Running estimate of the background and noise of one sensor from intervals without a target.
 
-The background is a line in time (level and drift) through the means of short quiet blocks; the
-noise is pooled from the scatter within the blocks. A block that departs from the line freezes the
-estimate and discards the blocks shortly before it, because a target approaches gradually. If there
-is no quiet interval, the most frequent level serves as a provisional background. TSP14 section VI
-and T10 section 6.3 use the mean and covariance of a target-free interval; the line and the freezing
-are additions of this package.
+The background is a line in time (level and drift) through the means of short blocks of readings;
+the noise is pooled from the scatter within the blocks. A block is quiet if its mean is within the
+noise limits of the line. Any other block freezes the estimate and discards the blocks shortly
+before it, because a target approaches gradually. If there is no quiet interval, the most frequent
+level serves as a provisional background. TSP14 section VI and T10 section 6.3 use the mean and
+covariance of a target-free interval; the line and the freezing are additions of this package.
 """
 
 from collections import deque
@@ -49,7 +49,7 @@ class RunningBackground:
     relearn : float, s
         Duration of another steady level after which that level becomes the background. The
         duration is shorter if the background was observed only briefly, or contains a target that
-        has left. 0 disables the adoption of other levels.
+        has left. 0 disables the replacement, except of a background set by `resume`.
     background : (3,) array, T, optional
         Background, if it is known in advance.
     noise_std : (3,) array, T, optional
@@ -125,7 +125,7 @@ class RunningBackground:
         Parameters
         ----------
         background : (3,) array, T
-            NaN for an unreported axis.
+            Stored background; NaN for an unreported axis.
         covariance : (3, 3) array, T²
             Noise of one reading.
         """
@@ -145,7 +145,7 @@ class RunningBackground:
         Parameters
         ----------
         level : (3,) array, T
-            NaN for an unreported axis.
+            Initial background; NaN for an unreported axis.
         covariance : (3, 3) array, T²
             Noise of one reading.
         """

@@ -86,7 +86,7 @@ def coverage(u: FloatArray, w: FloatArray) -> float:
     ----------
     u : (n, 3) array, unit vectors
     w : (n,) array
-        Weights.
+        Weights of the directions.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def empty_octants(u: FloatArray, w: FloatArray) -> tuple[str, ...]:
     ----------
     u : (n, 3) array, unit vectors
     w : (n,) array
-        Weights.
+        Weights of the directions.
 
     Returns
     -------

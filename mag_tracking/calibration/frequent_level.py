@@ -9,8 +9,8 @@ from mag_tracking.calibration.blocks import Blocks, line_through, pooled_covaria
 from mag_tracking.calibration.resolution import TOGGLE
 
 MAX_CALM_RATIO = 3.0
-"""Maximum standard deviation of a calm block relative to the quietest fifth of the blocks.
-A passing target changes the field within a block."""
+"""Maximum standard deviation within a block, relative to the 20 % quantile of all blocks. Blocks
+above this limit are excluded, because a passing target changes the field within a block."""
 
 LEVEL_WIDTH = 4.0
 """Maximum difference between the mean of a block and its level, in standard deviations of a mean,
@@ -20,7 +20,7 @@ MIN_WIDTH = 5e-9
 """[T] Minimum tolerance of a level, which allows for drift."""
 
 MIN_REPORTED_FRACTION = 0.5
-"""Minimum fraction of the blocks in which a used axis is reported."""
+"""An axis is evaluated if more than this fraction of the blocks contain it."""
 
 MIN_BLOCKS = 4
 """Minimum number of blocks of a level."""
@@ -79,7 +79,7 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int) -> Q
     Parameters
     ----------
     blocks : Blocks
-        Chronological.
+        Blocks in chronological order.
     steps : (3,) array, T
         Smallest change of each axis; 0 if unknown.
     max_blocks : int

@@ -52,7 +52,7 @@ def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Gr
     Parameters
     ----------
     time : (k,) array, s
-        Increasing.
+        Times of the blocks, increasing.
     size : (k,) array
         Magnitude of the change.
     low, high : float

@@ -47,7 +47,7 @@ CLEAR_SIZE = 60.0
 classified alone; a smaller change may be classified by a larger change at another sensor."""
 
 MAX_TIME_DIFFERENCE_S = 3.0
-"""[s] Maximum time between the new levels of sensors that are changed by the same target."""
+"""[s] Maximum time between the starts of the new levels at sensors near the same target."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: F
     Parameters
     ----------
     blocks : Blocks
-        Chronological, from the earlier level on.
+        Blocks in chronological order, beginning at the earlier level.
     n_steady : int
         Number of blocks at the end that are at the later level.
     before : (k, 3) array, T

@@ -17,8 +17,8 @@ MIN_RELEARN_S = 10.0
 background."""
 
 SHORTENED_FRACTION = 2.0 / 3.0
-"""Required duration of a level after a departure, and of a former level, relative to the usual
-duration."""
+"""Required duration of the level after a vehicle has departed, and of a former level, as a fraction
+of the usual duration."""
 
 MAX_EVALUATED_BLOCKS = 240
 """Maximum number of blocks (a minute of the usual length) for which arrivals and departures are

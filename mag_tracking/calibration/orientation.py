@@ -62,7 +62,7 @@ def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
     Parameters
     ----------
     acceleration : (n, 3) array, m/s², sensor frame
-        May contain knocks.
+        Accelerations, which may contain knocks.
     bias : float, m/s²
         Standard deviation of the bias of the accelerometer, per axis.
 
@@ -121,7 +121,7 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
     ----------
     up : UpDirection
     field : (3,) array, T, sensor frame
-        Measured without a target; NaN for an unreported axis.
+        Field measured without a target; NaN for an unreported axis.
     earth_field : (3,) array, T, world frame
     bias_std : float, T
         Standard deviation of the bias of the sensor, including nearby iron, per axis. A bias is

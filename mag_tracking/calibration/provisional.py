@@ -27,7 +27,7 @@ MAX_BLOCKS = 240
 """Maximum number of stored blocks: a minute of blocks of the usual length."""
 
 SEARCH_GROWTH = 1.1
-"""Growth of the number of blocks after which the level is determined again."""
+"""Factor by which the number of blocks must grow before the level is determined again."""
 
 MIN_SEEN_S = 10.0
 """[s] Minimum total duration of a certain level, which must also last far longer than any other

@@ -80,7 +80,7 @@ def smallest_steps(fields: FloatArray) -> FloatArray:
     Parameters
     ----------
     fields : (n, 3) array, T
-        Chronological; NaN if missing.
+        Readings in chronological order; NaN for a missing axis.
 
     Returns
     -------

@@ -28,7 +28,7 @@ def isolated_readings(values: FloatArray) -> IntArray:
     Parameters
     ----------
     values : (n,) array
-        Chronological, without NaN.
+        Readings in chronological order, without NaN.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def saturated_readings(values: FloatArray) -> BoolArray:
     Parameters
     ----------
     values : (n,) array
-        Chronological raw readings; NaN if missing.
+        Raw readings in chronological order; NaN for a missing axis.
 
     Returns
     -------

@@ -64,7 +64,7 @@ class TargetBayesFactor:
         log_ratio : float, nats
             Improvement of the log-likelihood of the whole track.
         ratio : float
-            Bayes factor required.
+            Required Bayes factor.
 
         Returns
         -------
@@ -80,7 +80,7 @@ class TargetBayesFactor:
         Parameters
         ----------
         ratio : float
-            Bayes factor required.
+            Required Bayes factor.
 
         Returns
         -------
@@ -94,7 +94,7 @@ class TargetBayesFactor:
         Parameters
         ----------
         ratio : float
-            Bayes factor required.
+            Required Bayes factor.
 
         Returns
         -------

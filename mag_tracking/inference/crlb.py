@@ -345,7 +345,7 @@ def snr_at_distance(moment: float | FloatArray, noise_std: float | FloatArray,
     Parameters
     ----------
     moment : float or array, A m²
-        Magnitude: 300-600 for a car, 1800 for a truck (TSP14).
+        Magnitude of the moment: 300-600 for a car, 1800 for a truck (TSP14).
     noise_std : float or array, T
         Noise standard deviation of one axis, equal on all axes; 1.1e-8 in TSP14.
     distance : float or array, m

@@ -65,7 +65,7 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
     ----------
     field : (n, 2) array, T
         Horizontal field x, y in a frame with z up, without the background. The first and the last
-        `lag` samples are free of the target.
+        `lag` samples must not contain the field of the target.
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     lag : int
@@ -140,7 +140,7 @@ def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     max_lag : int
-        Maximum lag, the number of samples at each end that are free of the target.
+        Maximum lag, which is the number of samples before and after the pass.
 
     Returns
     -------
@@ -167,7 +167,7 @@ def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     lags : sequence of int
-        Candidates.
+        Candidate lags.
 
     Returns
     -------
@@ -213,7 +213,7 @@ def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
     Parameters
     ----------
     field : (n, 3) array, T, sensor frame
-        NaN for a missing axis. A missing axis that is nearly vertical is ignored.
+        Measured field; NaN for a missing axis. A missing axis that is nearly vertical is ignored.
     R_ws : (3, 3) array
         Rotation from the sensor frame to the world frame.
 
@@ -245,7 +245,7 @@ def rotation_of_pass(field: FloatArray, noise_std: float, n_quiet: int) -> Field
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     n_quiet : int
-        Number of samples at each end that are free of the target.
+        Number of samples before and after the pass.
 
     Returns
     -------

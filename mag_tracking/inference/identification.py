@@ -141,7 +141,7 @@ def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance
     Parameters
     ----------
     vehicles : sequence of EnrolledVehicle
-        Candidates.
+        Enrolled vehicles to compare.
     moment : (3,) array, A m², world frame
         Fitted moment of the pass.
     covariance : (3, 3) array, A² m⁴

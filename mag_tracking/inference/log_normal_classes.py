@@ -33,7 +33,7 @@ class ClassPosterior(NamedTuple):
     name: str
     """Most probable class; `UNKNOWN` if the object matches no class."""
     probabilities: FloatArray
-    """Posterior probabilities, (n_classes,), in the order of the names."""
+    """Posterior probabilities, (n_classes,), in the order of the class names."""
 
 
 def class_posterior(names: Sequence[str], shares: Sequence[float],

@@ -16,9 +16,9 @@ _HEAD = np.dtype([('encapsulation', 'u1', 4), ('sec', '<i4'), ('nanosec', '<u4')
                   ('length', '<u4')])
 """Layout up to the frame name, whose `length` includes the terminating zero."""
 _FIELD_DOUBLES = 12
-"""Values of a MagneticField: x, y, z and the covariance."""
+"""Number of float64 values in a MagneticField: x, y, z and the covariance."""
 _POSE_DOUBLES = 7
-"""Values of a pose: x, y, z and the quaternion."""
+"""Number of float64 values in a pose: x, y, z and the quaternion."""
 
 
 class FieldArrays(NamedTuple):

@@ -297,7 +297,7 @@ def pose_dict(ns: int, frame: str, position: FloatArray, quaternion: FloatArray)
     frame : str
     position : (3,) array, m
     quaternion : (4,) array
-        Order xyzw, body to `frame`.
+        Rotation xyzw from the body to `frame`.
 
     Returns
     -------
@@ -446,7 +446,7 @@ def smoothed_track_dict(poses: Sequence[SmoothedPose], frame: str) -> MessageDic
     Parameters
     ----------
     poses : sequence of SmoothedPose
-        Chronological, at least one.
+        At least one pose, in chronological order.
     frame : str
         World frame.
 

@@ -22,7 +22,7 @@ class LiveTrack:
     Parameters
     ----------
     key : int
-        Unique on the page. Track ids are not unique, because a restarted tracker begins at 1.
+        Key that is unique on the page. Track ids are not unique, because a restarted tracker begins at 1.
     track_id : int
 
     Attributes

@@ -192,7 +192,7 @@ CLEAR = [seed for seed in range(20) if is_clear(seed)][:4]
 @pytest.mark.parametrize('seed', CLEAR)
 @pytest.mark.parametrize('rate', [100.0, 20.0])
 def test_a_departed_vehicle_is_removed_from_the_background_in_seconds(seed, rate):
-    """At the replacement, the vehicle is 30 m away; its field is within the noise of one reading.
+    """When it is removed, the vehicle is at least 30 m away, with a field below the noise.
 
     At 20 Hz, with blocks of 0.4 s, the replacement takes a second longer.
     """
