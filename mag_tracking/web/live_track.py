@@ -22,7 +22,8 @@ class LiveTrack:
     Parameters
     ----------
     key : int
-        Key that is unique on the page. Track ids are not unique, because a restarted tracker begins at 1.
+        Key that is unique on the page. Track ids are not unique, because a restarted tracker
+        begins at 1.
     track_id : int
 
     Attributes
