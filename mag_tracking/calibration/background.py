@@ -352,7 +352,7 @@ class RunningBackground:
         self._departure.end()
 
     def _adopt_if_steady(self, collected: deque[Block]) -> bool:
-        """Adopt the collected blocks as the background, and return whether they lie on one line."""
+        """Adopt the collected blocks if they lie on one line, and return whether they do."""
         blocks = stacked(collected)
         noise = pooled_covariance(blocks) if self._known_noise is None else self._known_noise
         noise = None if noise is None else self._level.without_dead_axes(noise)
