@@ -1,4 +1,4 @@
-"""Comparison of the sensors of a network with the Earth's field, and explanation of differences.
+"""Comparison of measured fields with the Earth's field, and explanations of differences.
 
 Without a target, all sensors measure the same field in different frames. Flipped axes, swapped
 axes, a wrong unit or two exchanged sensors are therefore detected and named.
@@ -29,8 +29,8 @@ MAX_REMAINING_FRACTION = 0.3
 difference."""
 
 MAX_RATIO_TO_NEXT = 0.5
-"""Maximum difference that remains after a partial explanation, relative to the next best change of
-axes of the same complexity."""
+"""Maximum difference that remains after a partial explanation, relative to the difference that
+remains after the next best change of axes of the same complexity."""
 
 UNITS = (('gauss', 1e4), ('millitesla', 1e3), ('microtesla', 1e6), ('nanotesla', 1e9))
 _AXES = 'xyz'
@@ -41,7 +41,7 @@ _AxisChange: TypeAlias = tuple[str, tuple[int, ...], FloatArray]
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A sensor whose field differs from the Earth's field."""
+    """A sensor whose measured field is inconsistent with the Earth's field."""
 
     sensor: str
     size: float
@@ -51,8 +51,8 @@ class Disagreement:
 
     def __str__(self) -> str:
         cause = ' or '.join(self.explanations) or (
-            'no change of axes, other unit or exchange of sensors explains it; check for iron or '
-            'magnets nearby, and check the configured orientation')
+            'not explained by swapped or flipped axes, a wrong unit or exchanged sensors; check '
+            'for iron or magnets nearby, and check the configured orientation')
         return (f'{self.sensor} differs from the Earth\'s field by {self.size * 1e6:.3g} uT: '
                 f'{cause}')
 
@@ -63,7 +63,7 @@ def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
     Parameters
     ----------
     fields : (n, 3) array, T, sensor frames
-        NaN = not reported.
+        Measured fields; NaN for an unreported axis.
     R_ws : (n, 3, 3) array
         Sensor to world.
 
@@ -74,12 +74,13 @@ def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
     Raises
     ------
     ValueError
-        If fewer than three sensors report all axes: two sensors do not reveal the faulty sensor.
+        If fewer than three sensors report all axes. With two sensors, the faulty sensor cannot
+        be identified.
     """
     is_complete = ~np.isnan(fields).any(axis=1)
     if np.count_nonzero(is_complete) < 3:
-        raise ValueError('a comparison without earth_field requires three sensors that report '
-                         f'all axes, but there are {np.count_nonzero(is_complete)}')
+        raise ValueError('if earth_field is unknown, at least three sensors must report all axes, '
+                         f'but only {np.count_nonzero(is_complete)} do')
     field: FloatArray = np.median(
         np.einsum('jik,jk->ji', R_ws[is_complete], fields[is_complete]), axis=0)
     return field
@@ -94,7 +95,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     ----------
     names : sequence of n str
     fields : (n, 3) array, T, sensor frames
-        Measured without a target; NaN = axis not reported.
+        Fields measured without a target; NaN for an unreported axis.
     R_ws : (n, 3, 3) array
         Sensor to world.
     orientation_std : (n, 3) array, rad
@@ -110,7 +111,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     """
     B0 = np.asarray(earth_field, dtype=float)
     suspects = [j for j in range(len(names))
-                if not _fits(fields[j], R_ws[j], orientation_std[j], B0, bias_std)]
+                if not _is_consistent(fields[j], R_ws[j], orientation_std[j], B0, bias_std)]
     out = []
     for j in suspects:
         size = np.sqrt(np.nansum((fields[j] - R_ws[j].T @ B0)**2))
@@ -119,10 +120,11 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     return out
 
 
-def _fits(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray,
-          bias_std: float) -> bool:
-    """Whether a field is consistent with the Earth's field at the best heading."""
-    return _fits_cached(_cache_key(y), _cache_key(R_ws), _cache_key(std), _cache_key(B0), bias_std)
+def _is_consistent(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray,
+                   bias_std: float) -> bool:
+    """Whether a measured field is consistent with the Earth's field at the best heading."""
+    return _is_consistent_cached(
+        _cache_key(y), _cache_key(R_ws), _cache_key(std), _cache_key(B0), bias_std)
 
 
 def _cache_key(a: FloatArray) -> tuple[float, ...]:
@@ -131,10 +133,10 @@ def _cache_key(a: FloatArray) -> tuple[float, ...]:
 
 
 @functools.lru_cache(maxsize=4096)
-def _fits_cached(field: tuple[float, ...], orientation: tuple[float, ...],
-                 orientation_std: tuple[float, ...], B0: tuple[float, ...],
-                 bias_std: float) -> bool:
-    """Cached version of `_fits`, with tuples as arguments."""
+def _is_consistent_cached(field: tuple[float, ...], orientation: tuple[float, ...],
+                          orientation_std: tuple[float, ...], B0: tuple[float, ...],
+                          bias_std: float) -> bool:
+    """Cached version of `_is_consistent`, with tuples as arguments."""
     y, R_ws, std = (np.array(field), np.array(orientation).reshape(3, 3),
                     np.array(orientation_std))
     reported = ~np.isnan(y)
@@ -152,10 +154,10 @@ def _fits_cached(field: tuple[float, ...], orientation: tuple[float, ...],
 def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields: FloatArray,
                   R_ws: FloatArray, orientation_std: FloatArray, B0: FloatArray,
                   bias_std: float) -> tuple[str, ...]:
-    """Simplest explanations of the field of sensor `j`."""
+    """Simplest faults that explain the field of sensor `j`; empty if none does."""
     def fits(y: FloatArray, R: FloatArray = R_ws[j],
              std: FloatArray = orientation_std[j]) -> bool:
-        return _fits(y, R, std, B0, bias_std)
+        return _is_consistent(y, R, std, B0, bias_std)
 
     y = fields[j]
     # Exchanged sensors: both must be suspect, and both must fit after the exchange.
@@ -184,8 +186,8 @@ def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
         # If two changes explain the difference equally well, neither is reported.
         if remainders[0][0] < MAX_REMAINING_FRACTION * original and not (
                 len(remainders) > 1 and remainders[1][0] < remainders[0][0] / MAX_RATIO_TO_NEXT):
-            return (f'{remainders[0][1]}, and {remainders[0][0] * 1e6:.2g} uT remain (iron nearby, '
-                    'or the bias of the sensor)',)
+            return (f'{remainders[0][1]}, and {remainders[0][0] * 1e6:.2g} uT remain (due to '
+                    'nearby iron or the bias of the sensor)',)
     return ()
 
 
@@ -198,7 +200,7 @@ def _remaining_difference(y: FloatArray, R_ws: FloatArray, std: FloatArray,
 
 
 def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Possible heading errors (n,) [rad] of a sensor, and the Earth's field (n, 3) for each."""
+    """Tested heading errors (n,) [rad] of a sensor, and the Earth's field (n, 3) [T] for each."""
     max_error = min(np.pi, MAX_HEADING_STDS * std[2])
     yaw = np.linspace(-max_error, max_error, 1 + 2 * max(1, round(max_error / YAW_STEP)))
     return yaw, np.stack([B0[0] * np.cos(yaw) + B0[1] * np.sin(yaw),

@@ -1,11 +1,11 @@
 """Running estimate of the background and noise of one sensor from intervals without a target.
 
-The background is a line in time (level and drift) through the means of short quiet blocks; the
-noise is pooled from the scatter within the blocks. A block that departs from the line freezes the
-estimate and discards the blocks shortly before it, because a target approaches gradually. Without a
-quiet interval, the most frequent level is a provisional background. TSP14 section VI and T10
-section 6.3 use the mean and covariance of a target-free interval; the line and the freezing are
-additions of this package.
+The background is a line in time (level and drift) through the means of short blocks of readings;
+the noise is pooled from the scatter within the blocks. A block is quiet if its mean is within the
+noise limits of the line. Any other block freezes the estimate and discards the blocks shortly
+before it, because a target approaches gradually. If there is no quiet interval, the most frequent
+level serves as a provisional background. TSP14 section VI and T10 section 6.3 use the mean and
+covariance of a target-free interval; the line and the freezing are additions of this package.
 """
 
 from collections import deque
@@ -30,7 +30,7 @@ from mag_tracking.units import NS
 
 
 class RunningBackground:
-    """Running estimate of one sensor's background; times in seconds since its first reading.
+    """Running estimate of a sensor's background; times are in seconds since the first reading.
 
     Parameters
     ----------
@@ -39,23 +39,27 @@ class RunningBackground:
     memory : float, s
         Length of the interval that the line is fitted to.
     guard : float, s
-        Time by which that interval lags the latest reading.
+        Delay after which a quiet block enters that interval, so that the onset of a target is
+        excluded.
     block : float, s
         Length of a block.
     freeze_std : float
         A block departs from the background if its mean differs by this number of standard
         deviations of the noise.
     relearn : float, s
-        Time on another steady level after which that level becomes the background. It is shorter if
-        the background was observed only briefly, or contains a target that has left. 0 = never.
+        Duration of another steady level after which that level becomes the background. The
+        duration is shorter if the background was observed only briefly, or contains a target that
+        has left. 0 disables the replacement, except of a background set by `resume`.
     background : (3,) array, T, optional
-        Known background.
+        Background, if it is known in advance.
     noise_std : (3,) array, T, optional
-        Known noise. If both are known, the background is ready at once.
+        Standard deviation of the noise, if it is known in advance. If `background` is also given,
+        the background is ready at once.
     phase : float, optional
         Extra length of the first block, as a fraction of `block`, which staggers the blocks of
-        sensors that started together. A complete block is then evaluated by `evaluate_block`, or
-        before the next reading. Default: blocks are evaluated at once.
+        sensors that started together. A complete block is then evaluated by a later call of
+        `evaluate_block`, at the latest before the next reading. Default: blocks are evaluated at
+        once.
     sensors : (1,) SENSOR array
         State of the sensor: the current block, and the line and noise for compiled code.
     evaluate_change : ChangeEvaluator, optional
@@ -77,7 +81,7 @@ class RunningBackground:
                  freeze_std: float, relearn: float, background: FloatArray | None = None,
                  noise_std: FloatArray | None = None, phase: float | None = None, *,
                  sensors: StructArray, evaluate_change: ChangeEvaluator | None = None) -> None:
-        self._learn, self._length, self._relearn = learn, block, relearn
+        self._learn, self._block_length, self._relearn = learn, block, relearn
         self._sensors, self._state = sensors, sensors[0]
         self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
         self._max_blocks = max(3, int(round(memory / block)))
@@ -96,7 +100,7 @@ class RunningBackground:
         self.forget()
 
     def forget(self) -> None:
-        """Discard the learnt background and noise; known values are retained."""
+        """Discard the learnt background and noise; values given in advance are retained."""
         self._state['n'], self._state['end'], self._state['is_full'] = 0, np.nan, False
         self._quiet.clear()
         self._learning_window.clear()
@@ -114,14 +118,14 @@ class RunningBackground:
                         else (0.0, self._known_background, np.zeros(3), 0.0), self._known_noise)
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
-        """Resume with a background that was known recently.
+        """Resume with a recently stored background.
 
-        The level is constant until the quiet interval is as long as a new background requires.
+        The level remains constant until the new quiet interval is as long as `learn`.
 
         Parameters
         ----------
         background : (3,) array, T
-            NaN = axis not reported.
+            Stored background; NaN for an unreported axis.
         covariance : (3, 3) array, T²
             Noise of one reading.
         """
@@ -135,13 +139,13 @@ class RunningBackground:
     def start_from(self, level: FloatArray, covariance: FloatArray) -> None:
         """Start with a level that was determined from other readings.
 
-        Unlike after `resume`, another level must last for the full time to replace this level. No
-        effect if all axes are constant.
+        Unlike after `resume`, another level must last for the full `relearn` time to replace this
+        level. This method has no effect if the noise of all axes is unknown.
 
         Parameters
         ----------
         level : (3,) array, T
-            NaN = axis not reported.
+            Initial background; NaN for an unreported axis.
         covariance : (3, 3) array, T²
             Noise of one reading.
         """
@@ -162,7 +166,7 @@ class RunningBackground:
 
     @property
     def departed_at(self) -> float | None:
-        """Time [s] by which a vehicle present at the start had left; None = no such vehicle."""
+        """Time [s] by which a vehicle present at the start had left; None if none was detected."""
         return self._departure.departed_at
 
     @property
@@ -172,7 +176,7 @@ class RunningBackground:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Noise covariance of one sample, (3, 3) T², or None; NaN = axis not reported.
+        """Noise covariance of one sample, (3, 3) T²; None if unknown, NaN for an unreported axis.
 
         The variance due to the sensor's steps is included.
         """
@@ -203,7 +207,7 @@ class RunningBackground:
 
     @property
     def scatter_std(self) -> FloatArray:
-        """Standard deviation of the quiet readings including steps, (3,) T; NaN = unknown."""
+        """Standard deviation of the quiet readings including steps, (3,) T; NaN if unknown."""
         variance = self._quiet.scatter() + self._state['step_variance']
         return np.where(variance > 0.0, np.sqrt(variance), np.nan)
 
@@ -213,7 +217,7 @@ class RunningBackground:
         return bool(self._quiet) and self.ready
 
     def evaluate_block(self) -> None:
-        """Evaluate the current block if the latest sample has completed it."""
+        """Evaluate the latest complete block, unless it has been evaluated already."""
         if not self._state['is_full']:
             return
         block = block_of(self._sensors)
@@ -240,7 +244,7 @@ class RunningBackground:
             self._start_provisionally(block)
 
     def _start_provisionally(self, block: Block) -> None:
-        """Add a block, and start with the most frequent level if it is known."""
+        """Add a block, and start with the most frequent level if it can be determined."""
         self._provisional.collect(block)
         frequent = self._provisional.frequent_level(corrected_steps(self._sensors))
         if frequent is not None and self._known_background is not None:
@@ -256,7 +260,7 @@ class RunningBackground:
                 self._level.set_uncertainty(frequent.std, is_provisional=True)
 
     def _start_with_frequent(self, frequent: FrequentLevel) -> None:
-        """Start with a frequent level; other levels may still replace it."""
+        """Adopt a frequent level as the background; another level may still replace it."""
         self.start_from(frequent.level.level, frequent.level.covariance)
         self._seen_s, self.frozen, self._is_contested = frequent.observed_s, False, False
         self._learning_window.clear()
@@ -284,7 +288,7 @@ class RunningBackground:
             self._fit(blocks)
 
     def _change_if_steady(self, block: Block) -> None:
-        """While frozen, adopt another level that lasts or that was the background before."""
+        """While frozen, adopt another level that persists or that was the background earlier."""
         self._seen_until = np.nan
         departure = self._departure
         duration = block.time - departure.blocks[0].time
@@ -348,7 +352,7 @@ class RunningBackground:
         self._departure.end()
 
     def _adopt_if_steady(self, collected: deque[Block]) -> bool:
-        """Adopt the collected blocks as the background if they lie on one line."""
+        """Adopt the collected blocks if they lie on one line, and return whether they do."""
         blocks = stacked(collected)
         noise = pooled_covariance(blocks) if self._known_noise is None else self._known_noise
         noise = None if noise is None else self._level.without_dead_axes(noise)
@@ -368,7 +372,7 @@ class RunningBackground:
             self._store_former_level(float(blocks.time[0]))
         # The required length was checked by the caller; the initial length does not apply.
         self._is_resumed = False
-        self._seen_s = float(blocks.time[-1] - blocks.time[0]) + self._length
+        self._seen_s = float(blocks.time[-1] - blocks.time[0]) + self._block_length
         self._seen_until = float(blocks.time[-1])
         self._level.set_uncertainty()
         self._quiet.begin(collected)
@@ -377,7 +381,10 @@ class RunningBackground:
         return True
 
     def _fit(self, blocks: Blocks) -> None:
-        """Fit line and noise to the quiet `blocks`."""
+        """Fit line and noise to the quiet `blocks`.
+
+        A given or resumed background is retained until the blocks span the time `learn`.
+        """
         if (self._known_background is not None or self._is_resumed) \
                 and np.ptp(blocks.time) < self._learn:
             return

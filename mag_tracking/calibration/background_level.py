@@ -36,7 +36,7 @@ class BackgroundLevel:
     limits : (3,) array, T
         Maximum difference between the mean of a block and the background.
     is_provisional : bool
-        Whether the line may not be the background.
+        Whether the line is a preliminary level that may differ from the background.
     """
 
     def __init__(self, sensors: StructArray, freeze_std: float) -> None:
@@ -52,7 +52,7 @@ class BackgroundLevel:
         return self.line is not None and self.noise is not None
 
     def set(self, line: _Line | None, noise: FloatArray | None) -> None:
-        """Set line and noise, also for compiled code.
+        """Set line and noise, and copy them to the sensor state that compiled code reads.
 
         Parameters
         ----------
@@ -70,11 +70,11 @@ class BackgroundLevel:
         self.apply_steps()
 
     def apply_steps(self) -> None:
-        """Add the variance due to the sensor's steps, which may have changed since `set`."""
+        """Update noise and `limits` with the variance due to the sensor's latest steps."""
         core.apply_steps(self._sensors, self._freeze_std, self.limits)
 
     def without_dead_axes(self, noise: FloatArray) -> FloatArray:
-        """Set the noise of dead axes to NaN.
+        """Return the noise with NaN for dead axes.
 
         Parameters
         ----------
@@ -93,7 +93,7 @@ class BackgroundLevel:
         return np.where(dead[:, None] | dead, np.nan, noise)
 
     def without_unknown_noise(self, covariance: FloatArray) -> FloatArray:
-        """Set the covariance of axes without noise and steps to NaN.
+        """Return a covariance with NaN for axes whose noise is unknown.
 
         Parameters
         ----------
@@ -102,7 +102,7 @@ class BackgroundLevel:
         Returns
         -------
         (3, 3) array, T²
-            NaN for an axis that neither changes nor has steps.
+            NaN for a constant axis whose steps are unknown or too fine to be observed.
         """
         steps = corrected_steps(self._sensors)
         dead = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
@@ -114,16 +114,16 @@ class BackgroundLevel:
         Parameters
         ----------
         std : (3,) array or float, T
-            Standard deviation; NaN = axis not reported.
+            Standard deviation; NaN for an unreported axis.
         is_provisional : bool
-            Whether the line may not be the background.
+            Whether the line is a preliminary level that may differ from the background.
         """
         self.is_provisional = is_provisional
         self._state['level_variance'] = np.where(np.isnan(std), 0.0, np.square(std))
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Noise covariance of one sample, (3, 3) T², or None; NaN = axis not reported.
+        """Noise covariance of one sample, (3, 3) T²; None if unknown, NaN for an unreported axis.
 
         The variance due to the sensor's steps is included.
         """
@@ -233,7 +233,7 @@ class BackgroundLevel:
         return latest_blocks if is_long and self.are_steady(stacked(latest_blocks)) else None
 
     def are_steady(self, blocks: Blocks) -> bool:
-        """Whether blocks are at one steady level, given the present noise.
+        """Whether blocks lie on one line within `limits`, and none is far noisier than another.
 
         Parameters
         ----------

@@ -86,8 +86,8 @@ inline void moments(const Sensor& s, int64_t k, double* mean, double* scatter) {
 }
 
 // Pooled covariance within k blocks, from their sums of squared deviations `scatter` (k, 3, 3) and
-// numbers of samples `n` (k, 3), into `out` (3, 3); NaN = axis not reported. Returns false if there
-// are too few samples.
+// numbers of samples `n` (k, 3), into `out` (3, 3); NaN for an axis with too few samples. Returns
+// false if all axes have too few.
 inline bool pool(int64_t k, const double* scatter, const double* n, double* out) {
     double freedom[3] = {0.0, 0.0, 0.0}, sum[9] = {};
     for (int64_t i = 0; i < k; ++i) {

@@ -1,4 +1,4 @@
-"""Blocks: summaries of short intervals of readings, to which a background is fitted."""
+"""Summaries of short intervals of readings (blocks), to which the background line is fitted."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class Block:
     time: float
     """[s] Mean time of the readings."""
     mean: FloatArray
-    """(3,) [T] Mean field; NaN = axis not reported."""
+    """(3,) [T] Mean field; NaN for an unreported axis."""
     scatter: FloatArray
     """(3, 3) [T²] Sum of squared deviations from the mean."""
     n: FloatArray
@@ -31,7 +31,7 @@ class Block:
 
 
 def block_of(sensors: StructArray) -> Block:
-    """Summarise the complete block of a sensor.
+    """Summarise the latest complete block of a sensor.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class BlockWindow:
 
 
 def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
-    """Weighted least-squares line of each axis.
+    """Weighted least-squares line through the means of blocks, for each axis.
 
     Parameters
     ----------
@@ -161,6 +161,6 @@ def pooled_covariance(blocks: Blocks) -> FloatArray | None:
     Returns
     -------
     (3, 3) array or None, T²
-        None = too few samples; NaN = axis not reported.
+        NaN for an axis with too few samples; None if all axes have too few.
     """
     return core.pooled_covariance(plain(blocks.scatter), plain(blocks.n))

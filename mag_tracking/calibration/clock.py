@@ -17,7 +17,7 @@ MIN_CORRELATION = 0.7
 """Minimum correlation of two sensors that measured the same knocks."""
 
 MIN_RIVAL_RATIO = 0.9
-"""Correlation of a second lag, relative to the best lag, above which the lag is ambiguous."""
+"""Correlation at a second lag, relative to the best lag, above which the lag is ambiguous."""
 
 CONTEXT_S = 5.0
 """[s] Interval before the first and after the last knock that is compared in a long recording, so
@@ -39,7 +39,7 @@ class Lag:
     std: float
     """[s] Standard deviation of the offset."""
     correlation: float
-    """Correlation at this offset, 0 to 1; NaN if a sensor measured no knock."""
+    """Correlation at the offset, even if it was rejected, 0 to 1; NaN if it was not computed."""
     reason: str
     """Why the offset is unknown; empty if it is known."""
 
@@ -100,9 +100,10 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
     ----------
     [T10]_ section 6.3 for the correlation of the accelerometers.
     """
-    a, b = _series(t_reference, reference, 'reference'), _series(t, signal, 'sensor')
+    a, b = (_validated_series(t_reference, reference, 'reference'),
+            _validated_series(t, signal, 'sensor'))
     a, b = _without_cut_knocks(*a), _without_cut_knocks(*b)
-    separation = _separation(a, b, max_lag)
+    separation = _knock_separation(a, b, max_lag)
     if separation is not None:
         return _no_lag(f'the knocks are {separation:.3g} s apart, maximum {max_lag:g} s')
     a, b = _around_knocks(a, b, max_lag), _around_knocks(b, a, max_lag)
@@ -123,7 +124,7 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
     return Lag(offset, std, correlation, '')
 
 
-def _series(t: FloatArray, s: FloatArray, name: str) -> _Series:
+def _validated_series(t: FloatArray, s: FloatArray, name: str) -> _Series:
     """Validate the times and values of a series, and remove NaN."""
     t, s = np.asarray(t, dtype=float), np.asarray(s, dtype=float)
     if t.shape != s.shape or t.ndim != 1:
@@ -152,7 +153,7 @@ def _without_cut_knocks(t: FloatArray, s: FloatArray) -> _Series:
     return t, s
 
 
-def _separation(a: _Series, b: _Series, max_lag: float) -> float | None:
+def _knock_separation(a: _Series, b: _Series, max_lag: float) -> float | None:
     """Smallest interval [s] between knocks of two series if it exceeds `max_lag`, else None."""
     if not (len(a[1]) > 7 and len(b[1]) > 7 and _is_knock(a[1]).any() and _is_knock(b[1]).any()):
         return None
@@ -164,7 +165,7 @@ def _separation(a: _Series, b: _Series, max_lag: float) -> float | None:
 
 
 def _around_knocks(a: _Series, b: _Series, max_lag: float) -> _Series:
-    """Part of series `a` around the knocks of `b`."""
+    """Part of series `a` around the knocks of `b`; all of `a` if `b` has no knock."""
     if len(b[1]) < 8 or not _is_knock(b[1]).any():
         return a
     first, last = _knock_times(*b)

@@ -55,7 +55,7 @@ def calibrate_readings(
         fields: FloatArray, own: IntArray, covariances: FloatArray, batches: StructArray,
         out_rows: IntArray, out_stamps: IntArray, out_fields: FloatArray,
         out_covariances: FloatArray) -> int:
-    """Calibrate a batch of readings from `next` on, until Python is required.
+    """Calibrate the readings of a batch from its `next` on, until Python has to act.
 
     Parameters
     ----------
@@ -63,12 +63,12 @@ def calibrate_readings(
         Updated.
     limits : (1,) LIMITS array
     rows : (n,) int array
-        Index of the sensor of each reading; negative = unknown.
+        Index of the sensor of each reading; negative if unknown.
     stamps : (n,) int array, ns
     fields : (n, 3) array, T
         Raw fields.
     own : (n,) int array
-        Covariance in the message: NONE, VALID or INVALID.
+        State of the covariance in the message: NONE, VALID or INVALID.
     covariances : (n, 3, 3) array, T²
         Ignored where `own` is NONE.
     batches : (1,) BATCH array
@@ -112,7 +112,7 @@ def use_reading(
     field : (3,) array, T
         Field after the iron correction.
     own : int
-        Covariance in the message: NONE, VALID or INVALID.
+        State of the covariance in the message: NONE, VALID or INVALID.
     covariance : (3, 3) array, T²
         Covariance in the message; ignored if `own` is NONE.
     out_rows : (m,) int array
@@ -127,7 +127,7 @@ def use_reading(
     Returns
     -------
     bool
-        False if a block has to be evaluated first.
+        False if a complete block must be evaluated first; the reading has not been used then.
     """
 
 def subtract(sensors: StructArray, time: float, field: FloatArray, out: FloatArray) -> None:
@@ -143,7 +143,7 @@ def subtract(sensors: StructArray, time: float, field: FloatArray, out: FloatArr
     """
 
 def steps_of(sensors: StructArray, are_corrected: bool) -> FloatArray:
-    """Steps of the axes of a sensor.
+    """Quantisation steps of the axes of a sensor.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def complete_steps(variance: FloatArray, steps: FloatArray) -> None:
     Parameters
     ----------
     variance : (3,) array, T²
-        Noise variance of each axis; NaN = missing axis.
+        Noise variance of each axis; NaN for a missing axis.
     steps : (3,) array, T
         Updated.
     """
@@ -178,13 +178,13 @@ def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> 
     sensors : (1,) SENSOR array
         Updated.
     freeze_std : float
-        Limits in standard deviations.
+        Limits in standard deviations of the noise.
     limits : (3,) array, T
         Overwritten: maximum difference between the mean of a block and the background.
     """
 
 def block_moments(sensors: StructArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-    """Fields of `blocks.Block` for the complete block.
+    """Attributes of `blocks.Block` for the latest complete block.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
         Updated.
     stamp : int, ns
     raw : (3,) array, T
-        Raw reading; NaN = missing axis.
+        Raw reading; NaN for a missing axis.
     """
 
 def is_stuck(sensors: StructArray, field: FloatArray) -> bool:
@@ -254,7 +254,7 @@ def is_stuck(sensors: StructArray, field: FloatArray) -> bool:
     sensors : (1,) SENSOR array
         Updated.
     field : (3,) array, T
-        Reading; NaN = missing axis.
+        Reading; NaN for a missing axis.
 
     Returns
     -------
@@ -272,7 +272,7 @@ def screen_spike(sensors: StructArray, threshold: float, stamp: int, field: Floa
         Minimum magnitude of a spike in standard deviations of the noise.
     stamp : int, ns
     field : (3,) array, T
-        Reading; NaN = missing axis.
+        Reading; NaN for a missing axis.
 
     Returns
     -------
@@ -289,5 +289,5 @@ def collect(sensors: StructArray, time: float, field: FloatArray) -> None:
         Updated.
     time : float, s
     field : (3,) array, T
-        Reading; NaN = missing axis.
+        Reading; NaN for a missing axis.
     """

@@ -9,11 +9,11 @@ from mag_tracking.arrays import FloatArray
 ATTENUATION_DB = 60.0
 """Attenuation of the frequencies that alias into the pass band."""
 PASS_FRACTION = 0.5
-"""Pass band as a fraction of half the output rate. The transition band ends at the mirrored
-frequency: only frequencies above the pass band alias. A wider pass band would increase the delay,
-which is about four output intervals."""
+"""Pass band as a fraction of half the output rate. The transition band ends at the edge of
+the pass band mirrored about half the output rate, so that only frequencies above the pass band
+alias. A wider pass band would increase the delay, which is about four output intervals."""
 GAP_TOLERANCE = 0.5
-"""Difference from the median interval, relative to it, beyond which an interval is a gap."""
+"""Relative difference from the median interval beyond which an interval is a gap."""
 RATE_SAMPLES = 32
 """Number of samples from which the rate is measured; they are decimated afterwards."""
 
@@ -69,13 +69,13 @@ class Decimator:
         self.reset()
 
     def reset(self) -> None:
-        """Discard the samples; the measured rate remains."""
+        """Discard the stored samples and retain the measured rate."""
         self._window: deque[tuple[int, FloatArray]] = deque(
             maxlen=None if self._taps is None else len(self._taps))
-        self._until_next = 0
+        self._n_until_output = 0
 
     def feed(self, stamp_ns: int, field: FloatArray) -> list[tuple[int, FloatArray]]:
-        """Add a sample, and return the outputs that are now complete, usually none.
+        """Add a sample, and return the outputs that become available; usually an empty list.
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class Decimator:
 
     @property
     def n_waiting(self) -> int:
-        """Number of samples stored until the rate is known, when they are output together."""
+        """Number of samples stored to measure the rate; 0 once it is known."""
         return len(self._window) if self.factor is None else 0
 
     def noise_gain(self) -> float:
@@ -141,10 +141,10 @@ class Decimator:
         """Return the output of the filter if one is due."""
         if len(self._window) < len(taps):
             return []
-        if self._until_next:
-            self._until_next -= 1
+        if self._n_until_output:
+            self._n_until_output -= 1
             return []
-        self._until_next = factor - 1
+        self._n_until_output = factor - 1
         # The filter is symmetric, so its output belongs to the centre sample.
         middle = self._window[len(taps) // 2][0]
         return [(middle, taps @ np.array([f for _, f in self._window]))]

@@ -1,4 +1,4 @@
-"""Directions of the readings of a tumbled sensor: their coverage and weights."""
+"""Coverage of the sphere by the readings of a tumbled sensor, and weights by direction."""
 
 from itertools import product
 
@@ -8,13 +8,13 @@ from scipy.spatial import cKDTree
 from mag_tracking.arrays import FloatArray, IntArray
 
 EMPTY_OCTANT = 0.125
-"""Maximum weight of an empty octant relative to the mean weight."""
+"""Maximum weight of an empty octant relative to the mean weight of an octant."""
 
 N_CELLS = 500
 """Number of equal cells on the sphere of directions, about 10 degrees wide."""
 
 MAX_CELL_WEIGHT = 3.0
-"""Maximum weight of the readings of a cell, in multiples of the median number per cell."""
+"""Maximum total weight of a cell, in multiples of the median number of readings per cell."""
 
 _OCTANTS = np.array(list(product([1.0, -1.0], repeat=3)))
 
@@ -70,7 +70,7 @@ def even_weights(q: FloatArray) -> FloatArray:
     -------
     (n,) array
         0 to 1. The total weight of a cell is at most `MAX_CELL_WEIGHT` times the median number
-        per cell.
+        of directions in the cells that are not empty.
     """
     _, cell, n = binned(q)
     return np.minimum(1.0, MAX_CELL_WEIGHT * np.median(n[n > 0]) / n[cell])
@@ -86,7 +86,7 @@ def coverage(u: FloatArray, w: FloatArray) -> float:
     ----------
     u : (n, 3) array, unit vectors
     w : (n,) array
-        Weights.
+        Weights of the directions.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def empty_octants(u: FloatArray, w: FloatArray) -> tuple[str, ...]:
     ----------
     u : (n, 3) array, unit vectors
     w : (n,) array
-        Weights.
+        Weights of the directions.
 
     Returns
     -------

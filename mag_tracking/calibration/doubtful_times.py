@@ -1,4 +1,4 @@
-"""Intervals in which the background of a sensor was doubtful, by the timestamps of its readings."""
+"""Intervals in which the background of a sensor was doubtful, as timestamps of its readings."""
 
 from collections.abc import Mapping
 from typing import TypeAlias
@@ -12,13 +12,13 @@ MAX_INTERVALS = 16
 
 def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
             max_intervals: int = MAX_INTERVALS) -> DoubtfulTimes:
-    """Record the state of the background at a timestamp.
+    """Return the intervals, updated with the state of the background at a timestamp.
 
     Parameters
     ----------
     times : DoubtfulTimes
     stamp_ns : int, ns
-        Start of the state.
+        Timestamp from which the state applies.
     is_doubtful : bool
     max_intervals : int
         Maximum number of intervals; the oldest intervals are removed.
@@ -36,13 +36,13 @@ def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
 
 
 def doubtful_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
-    """Replace all intervals after a time by one open interval.
+    """Return the intervals with the background doubtful from a time on.
 
     Parameters
     ----------
     times : DoubtfulTimes
     since_ns : int, ns
-        Start of the open interval.
+        Start of the open interval that replaces all later intervals.
 
     Returns
     -------
@@ -56,12 +56,12 @@ def doubtful_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
 
 def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTimes]
            ) -> dict[str, DoubtfulTimes]:
-    """Merge two records of the same sensors.
+    """Merge earlier and latest doubtful intervals of sensors.
 
     An interval in `latest` replaces an earlier interval that begins at the same time or within it.
     If the end of an earlier interval is missing, the interval ends where the next one begins. If
-    `latest` has no interval of a sensor, the background was replaced, and an open interval is
-    removed.
+    the latest intervals of a sensor are empty, its background was replaced, and an open interval
+    is removed.
 
     Parameters
     ----------

@@ -18,16 +18,16 @@ MAX_AGE_S = 600.0
 """[s] Maximum age of a former level."""
 
 MAX_DRIFT = 4.0
-"""Maximum drift of a former level, in multiples of the limits of a block mean. With a wider
+"""Maximum drift of a former level, in multiples of the tolerance of a block mean. With a wider
 tolerance, any stopped vehicle would match a former level."""
 
 MIN_SLOPE_STDS = 4.0
-"""Number of standard deviations by which a drift must exceed the maximum."""
+"""Number of standard deviations by which a slope must exceed `STEEP_DRIFT`."""
 
 
 @dataclass(frozen=True)
 class FormerLevel:
-    """The level that was the background before the present one."""
+    """The level that was the background before the present background."""
 
     until: float
     """[s] End of the level."""
@@ -37,7 +37,7 @@ class FormerLevel:
     """[s] Duration for which the level was observed."""
 
     def is_at(self, block: Block, limits: FloatArray) -> bool:
-        """Whether a block is at this level.
+        """Whether a block is at this level, and the level ended at most `MAX_AGE_S` ago.
 
         Parameters
         ----------
@@ -57,15 +57,15 @@ class FormerLevel:
 
 
 def is_steep(blocks: Blocks, slope: FloatArray, variance: FloatArray) -> bool:
-    """Whether a line through blocks is steeper than the drift of a background, on any axis.
+    """Whether a line through blocks is significantly steeper than `STEEP_DRIFT`, on any axis.
 
     Parameters
     ----------
     blocks : Blocks
     slope : (3,) array, T/s
-        Slope of the line; NaN = axis not reported.
+        Slope of the line; NaN for an unreported axis.
     variance : (3,) array, T²
-        Variance of one reading; NaN = axis not reported.
+        Variance of one reading; NaN for an unreported axis.
 
     Returns
     -------

@@ -55,19 +55,19 @@ MAX_OUTLIER_FRACTION = 0.2
 """Maximum fraction of outliers; beyond it, the robust scatter is not meaningful."""
 
 MIN_GLITCH_DISTANCE = 5.0
-"""Minimum distance of a glitch (an error of the transfer) from the median reading, in multiples of
+"""Minimum distance of a glitch (a data transfer error) from the median reading, in multiples of
 the median distance."""
 
 MAX_GLITCH_FRACTION = 0.02
-"""Maximum fraction of readings at such a distance that are glitches. If the sensor was at rest most
-of the time, all other readings are far from the median."""
+"""Maximum fraction of readings beyond `MIN_GLITCH_DISTANCE`; if it is exceeded, none of them is a
+glitch. If the sensor was at rest most of the time, all other readings are far from the median."""
 
 
 @dataclass(frozen=True)
 class EllipsoidFit:
     """Calibration B = correction (y - offset), its accuracy, and its warnings.
 
-    Quantities that were not computed for a rejected fit are NaN.
+    Results that were not computed because the fit was rejected are NaN.
     """
 
     offset: FloatArray
@@ -96,7 +96,7 @@ class EllipsoidFit:
     shared by adjacent directions are amplified by up to 1/sqrt(coverage) relative to even
     coverage."""
     empty_octants: tuple[str, ...]
-    """Names of octants of the corrected directions, e.g. '+x-y+z', sensor frame."""
+    """Octants of the sensor frame that contain hardly any corrected reading, e.g. '+x-y+z'."""
     n_readings: int
     """Number of readings used by the fit."""
     n_missing: int
@@ -173,7 +173,8 @@ def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) ->
     Raises
     ------
     ValueError
-        If `readings` are not (n, 3) or not finite, or `field_magnitude` is not positive.
+        If the shape of `readings` is not (n, 3), a reading is infinite, or `field_magnitude` is
+        not positive and finite.
 
     References
     ----------
@@ -221,7 +222,7 @@ def _validated(readings: FloatArray, field_magnitude: float | None) -> FloatArra
     """Convert readings to an array (n, 3); raise ValueError for invalid arguments."""
     readings = np.asarray(readings, dtype=float)
     if readings.ndim != 2 or readings.shape[1] != 3:
-        raise ValueError(f'expected readings (n, 3), got {readings.shape}')
+        raise ValueError(f'readings must have the shape (n, 3), got {readings.shape}')
     infinite = np.isinf(readings).any(axis=1)
     if infinite.any():
         raise ValueError(f'reading {infinite.argmax()} is infinite: {readings[infinite.argmax()]}')
@@ -248,7 +249,7 @@ def _notes_on_input(counts: _Counts, is_saturated: BoolArray) -> tuple[str, ...]
 
 
 def _glitches(y: FloatArray) -> BoolArray:
-    """Whether each reading is one of few readings that are far from the median, (n,)."""
+    """Flag readings (n,) far from the median, unless they are too many to be glitches."""
     distance = np.linalg.norm(y - np.median(y, axis=0), axis=1) if len(y) else np.zeros(0)
     is_far = distance > MIN_GLITCH_DISTANCE * np.median(distance) if len(y) \
         else np.zeros(0, dtype=bool)
@@ -259,7 +260,7 @@ def _glitches(y: FloatArray) -> BoolArray:
 def _insufficient_data(y: FloatArray) -> str:
     """Why a quadric cannot be fitted; empty if it can."""
     if len(y) < MIN_READINGS:
-        return f'{len(y)} readings, minimum {MIN_READINGS}'
+        return f'{len(y)} valid readings, minimum {MIN_READINGS}'
     largest = np.abs(y - y[0]).max()
     if not largest > 0.0:
         return f'all {len(y)} readings are equal: the sensor was not moved or is stuck'
@@ -298,10 +299,10 @@ def _rejection_reason(C: FloatArray, P: FloatArray, quality: Quality, outliers: 
         return (f'the fraction of outliers is {outliers:.2g}, maximum '
                 f'{MAX_OUTLIER_FRACTION}')
     if quality['directions'] < MIN_DIRECTIONS:
-        return f'{quality["directions"]} different directions, minimum {MIN_DIRECTIONS}'
+        return f'readings in {quality["directions"]} directions, minimum {MIN_DIRECTIONS}'
     if quality['coverage'] < MIN_COVERAGE:
-        return (f'coverage {quality["coverage"]:.2g}, minimum {MIN_COVERAGE}; octants without '
-                f'readings: {", ".join(quality["empty"]) or "none"}')
+        return (f'the coverage is {quality["coverage"]:.2g}, minimum {MIN_COVERAGE}; octants with '
+                f'few or no readings: {", ".join(quality["empty"]) or "none"}')
     uncertain = np.sqrt(np.linalg.eigvalsh(C @ P[:3, :3] @ C)[-1])
     if not uncertain <= MAX_OFFSET_STD:
         return (f'the standard deviation of the offset is {uncertain:.2g} of the radius, maximum '
@@ -312,10 +313,10 @@ def _rejection_reason(C: FloatArray, P: FloatArray, quality: Quality, outliers: 
 def _notes_on_fit(residual: float, quality: Quality, outliers: float) -> tuple[str, ...]:
     """Warnings about coverage, residual and outliers."""
     checks = {
-        f'coverage {quality["coverage"]:.2g}, recommended at least {GOOD_COVERAGE}':
+        f'the coverage is {quality["coverage"]:.2g}, recommended at least {GOOD_COVERAGE}':
             quality['coverage'] < GOOD_COVERAGE,
-        f'few or no readings from {", ".join(quality["empty"])}': quality['empty'],
-        f'residual {residual:.2g} after correction, recommended at most {GOOD_RESIDUAL}':
+        f'octants with few or no readings: {", ".join(quality["empty"])}': quality['empty'],
+        f'the residual after correction is {residual:.2g}, recommended at most {GOOD_RESIDUAL}':
             residual > GOOD_RESIDUAL,
         f'the fraction of outliers is {outliers:.2g}': outliers > GOOD_OUTLIER_FRACTION}
     return tuple(note for note, holds in checks.items() if holds)

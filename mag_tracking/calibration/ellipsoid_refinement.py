@@ -27,10 +27,10 @@ BASIS[range(6), _ROWS, _COLUMNS] = BASIS[range(6), _COLUMNS, _ROWS] = 1.0
 
 
 class Quality(TypedDict):
-    """Quality of a fitted ellipsoid."""
+    """Quality measures of a fitted ellipsoid."""
 
     solved: bool
-    """Whether the least squares converged."""
+    """Whether the least-squares fit converged."""
     directions: int
     """Number of cells with readings."""
     coverage: float
@@ -105,7 +105,7 @@ def _model(theta: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, Fl
 
 
 def _loss(square: FloatArray, w: FloatArray) -> FloatArray:
-    """Weighted soft L1 and its two derivatives, in scipy's format."""
+    """Weighted soft-L1 loss and its two derivatives, as `scipy.optimize` requires them."""
     root = np.sqrt(1.0 + square)
     return w * np.stack([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3])
 

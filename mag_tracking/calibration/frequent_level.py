@@ -1,4 +1,4 @@
-"""Most frequent level of a sensor: its background if targets are often near."""
+"""Most frequent level of a sensor, which serves as its background if targets are often nearby."""
 
 from dataclasses import dataclass
 
@@ -9,18 +9,18 @@ from mag_tracking.calibration.blocks import Blocks, line_through, pooled_covaria
 from mag_tracking.calibration.resolution import TOGGLE
 
 MAX_CALM_RATIO = 3.0
-"""Maximum standard deviation of a calm block relative to the quietest fifth of the blocks.
-A passing target changes the field within a block."""
+"""Maximum standard deviation within a block, relative to the 20 % quantile of all blocks. Blocks
+above this limit are excluded, because a passing target changes the field within a block."""
 
 LEVEL_WIDTH = 4.0
-"""Maximum difference of the means of blocks of one level, in standard deviations of a mean, per
-axis."""
+"""Maximum difference between the mean of a block and its level, in standard deviations of a mean,
+per axis."""
 
 MIN_WIDTH = 5e-9
 """[T] Minimum tolerance of a level, which allows for drift."""
 
 MIN_REPORTED_FRACTION = 0.5
-"""Minimum fraction of the blocks in which a used axis is reported."""
+"""An axis is evaluated if more than this fraction of the blocks contain it."""
 
 MIN_BLOCKS = 4
 """Minimum number of blocks of a level."""
@@ -30,8 +30,8 @@ MIN_LEVEL_DISTANCE = 3.0
 distant target at the same level."""
 
 MIN_DURATION_RATIO = 4.0
-"""Minimum ratio of the duration of a level to the duration of the initial level for replacing the
-initial level: a target that was present at the start has left."""
+"""Minimum duration of a level that replaces the initial level, relative to the duration of the
+initial level. Such a level indicates that a target present at the start has left."""
 
 BATCH_SIZE = 64
 """Number of blocks that are compared with all other blocks at once, to limit memory."""
@@ -50,21 +50,21 @@ class QuietLevel:
     end: float
     """[s] Time of the last block of the level."""
     level: FloatArray
-    """(3,) [T] Level of the earliest blocks; NaN = axis not reported."""
+    """(3,) [T] Level of the earliest blocks; NaN for an unreported axis."""
     covariance: FloatArray
-    """(3, 3) [T²] Scatter of the readings of the level; NaN = axis not reported."""
+    """(3, 3) [T²] Covariance of the readings within blocks; NaN for an unreported axis."""
     block_s: float
     """[s] Typical length of a block."""
     width: FloatArray
-    """(3,) [T] Maximum difference of the means of blocks of one level."""
+    """(3,) [T] Maximum difference between the mean of a block and the level."""
 
     def is_at(self, level: FloatArray) -> bool:
-        """Whether another level is the same within the tolerance.
+        """Whether another level is the same within `MIN_LEVEL_DISTANCE` widths.
 
         Parameters
         ----------
         level : (3,) array, T
-            Level to compare; NaN = axis not reported.
+            Level to compare; NaN for an unreported axis.
 
         Returns
         -------
@@ -79,9 +79,9 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int) -> Q
     Parameters
     ----------
     blocks : Blocks
-        Chronological.
+        Blocks in chronological order.
     steps : (3,) array, T
-        Smallest change of each axis; 0 = unknown.
+        Smallest change of each axis; 0 if unknown.
     max_blocks : int
         Maximum number of blocks that determine the level; the earliest blocks are used.
 

@@ -52,7 +52,7 @@ def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Gr
     Parameters
     ----------
     time : (k,) array, s
-        Increasing.
+        Times of the blocks, increasing.
     size : (k,) array
         Magnitude of the change.
     low, high : float
@@ -62,7 +62,7 @@ def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Gr
     Returns
     -------
     Growth or None
-        None if `size` never exceeds `high`, was never below `low` before that time, or is missing
+        None if `size` never exceeds `high`, was never below `low` before that time, or has a gap
         in between.
     """
     times, end, begin = [], int(np.flatnonzero(size > high).min(initial=len(size))), 0

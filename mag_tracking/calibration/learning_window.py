@@ -7,12 +7,12 @@ from mag_tracking.calibration.blocks import Block
 
 
 class LearningWindow:
-    """Collector of blocks that finds quiet intervals of sufficient length.
+    """Window of the latest blocks, which provides candidates for the first quiet interval.
 
     Parameters
     ----------
     learn : float, s
-        Required length of a quiet interval.
+        Required duration of a quiet interval.
     length : float, s
         Length of a block.
     max_blocks : int
@@ -31,7 +31,7 @@ class LearningWindow:
         self._recent.clear()
 
     def segments(self, block: Block, is_stuck: bool) -> Iterator[deque[Block]]:
-        """Add a block and yield the intervals that are long enough, best first.
+        """Add a block, and yield the candidate intervals that are long enough, best first.
 
         Parameters
         ----------

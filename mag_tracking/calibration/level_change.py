@@ -25,7 +25,7 @@ DETECTION_STDS = 3.0
 """Detection limit of a change in standard deviations of the mean of a block, per axis."""
 
 MIN_ASYMMETRY = 0.8
-"""Minimum asymmetry of a change (a binary logarithm) for a decision; 0 = equal ends."""
+"""Minimum asymmetry of a change for a decision, as a binary logarithm; 0 for equal ends."""
 
 MIN_GROWTH = 3.5
 """Minimum ratio of the largest evaluated magnitude to the detection limit."""
@@ -47,7 +47,7 @@ CLEAR_SIZE = 60.0
 classified alone; a smaller change may be classified by a larger change at another sensor."""
 
 MAX_TIME_DIFFERENCE_S = 3.0
-"""[s] Maximum time between the new levels of sensors that are changed by the same target."""
+"""[s] Maximum time between the starts of the new levels at sensors near the same target."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +75,11 @@ def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: F
     Parameters
     ----------
     blocks : Blocks
-        Chronological, from the earlier level on.
+        Blocks in chronological order, beginning at the earlier level.
     n_steady : int
         Number of blocks at the end that are at the later level.
     before : (k, 3) array, T
-        Earlier level at the times of the blocks; NaN = axis not reported.
+        Earlier level at the times of the blocks; NaN for an unreported axis.
     noise_std : (3,) array, T
         Standard deviation of one reading.
     origin : float, s
@@ -136,7 +136,7 @@ def _asymmetry(time: FloatArray, off_before: FloatArray, off_after: FloatArray, 
 
 
 NO_CHANGE = LevelChange(np.nan, 0.0, None)
-"""Value that replaces an earlier change of a sensor after the end of that change."""
+"""Placeholder for a sensor whose level does not change."""
 
 
 class SharedChanges:
@@ -146,7 +146,7 @@ class SharedChanges:
         self._latest_changes: dict[int, LevelChange] = {}
 
     def evaluate_change(self, sensor: int, change: LevelChange) -> bool | None:
-        """Evaluate a change of a sensor together with the changes of the other sensors.
+        """Store a change of a sensor, and classify it together with changes at other sensors.
 
         A change that is not clear is classified by the largest simultaneous change.
 

@@ -1,4 +1,4 @@
-"""Interval in which a sensor departs from its background, and the level at the end."""
+"""Interval in which a sensor departs from its background, and the level at its end."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -17,8 +17,8 @@ MIN_RELEARN_S = 10.0
 background."""
 
 SHORTENED_FRACTION = 2.0 / 3.0
-"""Required duration of a level after a departure, and of a former level, relative to the usual
-duration."""
+"""Required duration of the level after a vehicle has departed, and of a former level, as a fraction
+of the usual duration."""
 
 MAX_EVALUATED_BLOCKS = 240
 """Maximum number of blocks (a minute of the usual length) for which arrivals and departures are
@@ -26,7 +26,7 @@ evaluated, since each evaluation uses all blocks."""
 
 
 class LevelDeparture:
-    """Blocks that depart from a frozen background.
+    """Interval in which the blocks of a sensor depart from its frozen background.
 
     Parameters
     ----------
@@ -42,14 +42,15 @@ class LevelDeparture:
     Attributes
     ----------
     blocks : deque of Block
+        Blocks since the departure began.
     former : FormerLevel or None
-        The level before the present one.
+        The level that was the background before the present background.
     has_arrived : bool
         Whether a vehicle has arrived and is present.
     was_steady : bool
-        Whether the sensor was at another steady level for long enough.
+        Whether the sensor was at another steady level for long enough during the departure.
     departed_at : float or None, s
-        Time by which a vehicle present at the start had departed.
+        Time by which a vehicle present at the start had departed; None if none was detected.
     """
 
     def __init__(self, learn: float, relearn: float, state: Record, level: BackgroundLevel,
@@ -74,13 +75,13 @@ class LevelDeparture:
         self.has_arrived = self.was_steady = False
 
     def add(self, block: Block, before: Iterable[Block]) -> None:
-        """Add a block.
+        """Add a block to the departure.
 
         Parameters
         ----------
         block : Block
         before : iterable of Block
-            Blocks immediately before the departure; read with its first block only.
+            Blocks immediately before the departure; used only when its first block is added.
         """
         if not self.blocks:
             self._blocks_before = list(before)
@@ -121,7 +122,7 @@ class LevelDeparture:
         Returns
         -------
         float, s
-            0 = never.
+            0 if no other level becomes the background.
         """
         if relearns_soon:
             return min(self._relearn or inf, max(self._learn, MIN_RELEARN_S))

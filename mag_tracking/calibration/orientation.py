@@ -62,7 +62,7 @@ def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
     Parameters
     ----------
     acceleration : (n, 3) array, m/s², sensor frame
-        May contain knocks.
+        Accelerations, which may contain knocks.
     bias : float, m/s²
         Standard deviation of the bias of the accelerometer, per axis.
 
@@ -73,7 +73,8 @@ def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
     Raises
     ------
     ValueError
-        If fewer than 8 readings are at rest, or the magnitude of the mean differs from gravity.
+        If fewer than 8 readings are at rest, or the magnitude of their mean differs from gravity by
+        more than `MAX_GRAVITY_DIFFERENCE`.
     """
     a = np.asarray(acceleration, dtype=float).reshape(-1, 3)
     finite = a[np.isfinite(a).all(axis=1)]
@@ -120,7 +121,7 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
     ----------
     up : UpDirection
     field : (3,) array, T, sensor frame
-        Measured without a target; NaN = axis not reported.
+        Field measured without a target; NaN for an unreported axis.
     earth_field : (3,) array, T, world frame
     bias_std : float, T
         Standard deviation of the bias of the sensor, including nearby iron, per axis. A bias is
@@ -189,7 +190,7 @@ def _refined_yaw(fit: _Fit, yaw: float) -> float:
 
 def levelled(up: UpDirection | None, stated: FloatArray,
              stated_std: FloatArray) -> Orientation | None:
-    """Correct the tilt of a nominal orientation.
+    """Correct the tilt of a nominal orientation with a measured up direction.
 
     Parameters
     ----------
@@ -214,7 +215,7 @@ def levelled(up: UpDirection | None, stated: FloatArray,
 
 def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
                     weight: float = 4.0) -> float:
-    """Standard deviation of the biases of a network's sensors.
+    """Estimate the standard deviation of the biases of the sensors of a network.
 
     The bias is observable along the heading and the vertical, but not across the heading. Each
     sensor therefore contributes one axis less.
@@ -249,7 +250,7 @@ def with_stated_heading(orientation: Orientation, stated: FloatArray, stated_std
     stated_std : float, rad
         Standard deviation of the nominal heading.
     limit : float
-        Maximum difference in standard deviations; beyond it, the nominal heading is wrong.
+        Maximum difference in standard deviations; beyond it, the nominal heading is rejected.
 
     Returns
     -------

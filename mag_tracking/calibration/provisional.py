@@ -1,4 +1,4 @@
-"""Provisional background before a quiet interval is long enough: the most frequent level so far.
+"""Most frequent level so far: a provisional background until a quiet interval is long enough.
 
 In dense traffic no interval is quiet for several seconds, and a sensor without a background cannot
 contribute to tracking.
@@ -27,7 +27,7 @@ MAX_BLOCKS = 240
 """Maximum number of stored blocks: a minute of blocks of the usual length."""
 
 SEARCH_GROWTH = 1.1
-"""Growth of the number of blocks after which the level is determined again."""
+"""Factor by which the number of blocks must grow before the level is determined again."""
 
 MIN_SEEN_S = 10.0
 """[s] Minimum total duration of a certain level, which must also last far longer than any other
@@ -44,8 +44,8 @@ class FrequentLevel:
     level: QuietLevel
     std: FloatArray
     """(3,) [T] Median distance of all blocks from the level, scaled to a standard deviation: a
-    level observed for less than half of the time may not be the background. NaN = axis not
-    reported."""
+    level observed for less than half of the time may not be the background. NaN for an unreported
+    axis."""
     is_certain: bool
     """Whether the level was observed for long enough, and far longer than any other level."""
 
@@ -61,7 +61,7 @@ class ProvisionalLevel:
     Parameters
     ----------
     learn_s : float, s
-        Required length of a quiet interval.
+        Required duration of a quiet interval.
     """
 
     def __init__(self, learn_s: float) -> None:
@@ -89,12 +89,13 @@ class ProvisionalLevel:
         Parameters
         ----------
         steps : (3,) array, T
-            Steps of the axes of the sensor; inf = unknown.
+            Steps of the axes of the sensor; inf if unknown.
 
         Returns
         -------
         FrequentLevel or None
-            None if the level is not due or no level is frequent enough.
+            None if too few blocks have been added since the last search, or no level is frequent
+            enough.
         """
         blocks = self._blocks
         if self._n_new < self._n_required \

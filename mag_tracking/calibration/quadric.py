@@ -51,14 +51,14 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
         A, a = (A, a) if np.trace(A) > 0.0 else (-A, -a)
         e = np.linalg.eigvalsh(A)
         if not e[0] > 1e-6 * e[2]:
-            return o, C, ('the readings do not lie on an ellipsoid: smallest over largest '
-                          f'eigenvalue of the quadric {e[0] / e[2]:.2g}, must be positive; '
-                          f'{POSSIBLE_CAUSES}')
+            return o, C, ('the readings do not lie on an ellipsoid: the ratio of the smallest to '
+                          'the largest eigenvalue of the quadric must be positive, got '
+                          f'{e[0] / e[2]:.2g}; {POSSIBLE_CAUSES}')
         o = -0.5 * np.linalg.solve(A, a[6:9])
         k = o @ A @ o - a[9]
         if not k > 0.0:
-            return o, C, ('the readings do not lie on an ellipsoid: squared radius '
-                          f'{k:.2g}, must be positive; {POSSIBLE_CAUSES}')
+            return o, C, ('the readings do not lie on an ellipsoid: the squared radius must be '
+                          f'positive, got {k:.2g}; {POSSIBLE_CAUSES}')
         e, V = np.linalg.eigh(A / k)
         C = (V * np.sqrt(e)) @ V.T
         q = (z - o) @ C

@@ -16,19 +16,21 @@ from mag_tracking.calibration.blocks import (
 
 
 class QuietInterval:
-    """Latest quiet blocks, delayed because a target approaches gradually.
+    """Window of the latest quiet blocks.
+
+    A block enters only after the guard time, so that the gradual onset of a target is excluded.
 
     Parameters
     ----------
     guard : float, s
-        Delay of the interval.
+        Time after which a quiet block enters the window.
     max_blocks : int
         Maximum number of blocks.
 
     Attributes
     ----------
     pending : deque of Block
-        Latest blocks, which have not been delayed long enough.
+        Quiet blocks that have not entered the window yet.
     """
 
     def __init__(self, guard: float, max_blocks: int) -> None:
@@ -56,7 +58,7 @@ class QuietInterval:
             self._window.append(block)
 
     def extend(self, block: Block) -> Iterator[Blocks]:
-        """Add the next quiet block.
+        """Queue the next quiet block, and yield the window after each block that enters it.
 
         Parameters
         ----------
@@ -65,7 +67,7 @@ class QuietInterval:
         Yields
         ------
         Blocks
-            All blocks of the interval, after the addition of each sufficiently delayed block.
+            All blocks of the window.
         """
         self.pending.append(block)
         while self.pending and self.pending[0].time <= block.time - self._guard:
@@ -87,7 +89,7 @@ class QuietInterval:
         Returns
         -------
         (3,) array, T²
-            NaN = unknown.
+            NaN if unknown.
         """
         covariance = pooled_covariance(self.blocks()) if self else None
         return np.full(3, np.nan) if covariance is None else covariance.diagonal()

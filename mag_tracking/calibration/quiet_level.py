@@ -1,4 +1,4 @@
-"""Background of a sensor from its most frequent level, for recordings without a quiet beginning."""
+"""Background of a sensor from its most frequent level, if a recording does not start quietly."""
 
 import numpy as np
 
@@ -29,10 +29,10 @@ MAX_BLOCKS = 4000
 
 
 class BlockRecorder(RunningBackground):
-    """Background that only collects the blocks of a sensor, in a first pass over a recording."""
+    """Background estimator that only collects blocks, for a first pass over a recording."""
 
     def evaluate_block(self) -> None:
-        """Store the current block if it is complete."""
+        """Store the latest complete block, unless it has been stored already."""
         if self._state['is_full']:
             self._blocks.append(block_of(self._sensors))
             self._state['is_full'] = False
@@ -53,6 +53,7 @@ class BlockRecorder(RunningBackground):
         Returns
         -------
         QuietLevel or None
+            None if no level has at least `MIN_BLOCKS` blocks.
         """
         blocks = [block for block in self._blocks if block.time >= since]
         if len(blocks) < MIN_BLOCKS:
@@ -66,7 +67,7 @@ class BlockRecorder(RunningBackground):
         """Whether the initial level is the level of the background.
 
         True if the field drifts from the initial level to the most frequent level, or is at the
-        most frequent level for only slightly longer.
+        most frequent level for not much longer than at the initial level.
 
         Parameters
         ----------
@@ -96,7 +97,7 @@ class BlockRecorder(RunningBackground):
         return (NEAR_DURATION_RATIO if is_near else MIN_DURATION_RATIO) * n > found.n_blocks
 
     def has_returned(self, initial: FloatArray, found: QuietLevel, since: float) -> bool:
-        """Whether the field returns to the initial level.
+        """Whether at least `MIN_BLOCKS` blocks after a time are at the initial level.
 
         Parameters
         ----------

@@ -137,7 +137,7 @@ inline Reason check(Sensor& s, const Limits& limits, int64_t stamp, const double
     return limits.reject_stuck && is_stuck(s, field) ? STUCK : DONE;
 }
 
-// `screen_spike`, counting the spikes.
+// Applies `screen_spike`, and counts the spikes.
 inline Verdict screen(Sensor& s, const Limits& limits, Batch& batch, const Reading& reading) {
     if (limits.spike_std <= 0.0) return PASSES;
     const Verdict verdict = screen_spike(s, limits.spike_std, reading);
@@ -165,8 +165,9 @@ inline bool is_credible(const Sensor& s, const double* C) {
     return true;
 }
 
-// Covariance of a reading, into `out` (3, 3): the covariance in the message if it is credible,
-// otherwise the noise of the sensor. The variance of a provisional background is added.
+// Writes the covariance of a reading to `out` (3, 3): the covariance in the message if it is
+// credible, otherwise the noise of the sensor. The variance of a provisional background is added.
+// Counts overruled covariances.
 inline void attach_covariance(Sensor& s, const Limits& limits, Batch& batch, const Reading& reading,
                               double* out) {
     const double* C = reading.covariance;
@@ -185,7 +186,8 @@ inline void attach_covariance(Sensor& s, const Limits& limits, Batch& batch, con
     }
 }
 
-// Calibrate a reading of the sensor of `row`; false if a block has to be evaluated first.
+// Calibrates a reading of the sensor `row`. Returns false, without using the reading, if a complete
+// block must be evaluated first.
 inline bool use(Sensor& s, const Limits& limits, Batch& batch, int64_t row, const Reading& reading,
                 const Calibrated& out) {
     const double time = double(reading.stamp - s.first_ns) / 1e9;

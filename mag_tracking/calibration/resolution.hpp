@@ -24,7 +24,7 @@ constexpr double MIN_REPEATS = 0.2;
 constexpr int64_t MAX_REST_NS = 300'000'000;
 
 // Update the steps of a sensor, and the time of the latest change of each axis. `raw` (3) [T] is
-// the raw reading; NaN = missing axis.
+// the raw reading; NaN for a missing axis.
 inline void note_step(Sensor& s, int64_t stamp, const double* raw) {
     for (int a = 0; a < 3; ++a) {
         const double value = raw[a];

@@ -1,4 +1,4 @@
-"""Resolution of a sensor: the steps of its readings and the resulting error.
+"""Resolution of a sensor: the quantisation steps of its readings and the resulting error.
 
 If the steps are larger than the noise, a reading is constant while the field changes by up to a
 step. Averaging does not remove that error, and a repeated reading adds little information. The
@@ -22,7 +22,7 @@ TOGGLE = core.TOGGLE
 
 
 def corrected_steps(sensors: StructArray) -> FloatArray:
-    """Steps of a sensor's axes after the soft-iron correction.
+    """Quantisation steps of a sensor's axes after the soft-iron correction.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def corrected_steps(sensors: StructArray) -> FloatArray:
 
 
 def raw_steps(sensors: StructArray) -> FloatArray:
-    """Steps of a sensor's axes before the soft-iron correction.
+    """Quantisation steps of a sensor's axes before the soft-iron correction.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def raw_steps(sensors: StructArray) -> FloatArray:
 
 
 def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
-    """Steps of all axes; unknown steps are copied from other axes at rest.
+    """Return the steps of all axes, with unknown steps copied from other axes at rest.
 
     An axis that has never changed is dead if another axis of the same sensor changes with every
     reading. If no axis has changed, all axes may be at rest.
@@ -60,7 +60,7 @@ def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
     Parameters
     ----------
     variance : (3,) array, T²
-        Scatter of quiet readings; NaN = missing axis.
+        Scatter of quiet readings; NaN for a missing axis.
     steps : (3,) array, T
         From `corrected_steps`.
 
@@ -75,12 +75,12 @@ def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
 
 
 def smallest_steps(fields: FloatArray) -> FloatArray:
-    """Smallest change between consecutive readings of each axis.
+    """Smallest non-zero change between consecutive readings of each axis.
 
     Parameters
     ----------
     fields : (n, 3) array, T
-        Chronological; NaN = missing.
+        Readings in chronological order; NaN for a missing axis.
 
     Returns
     -------

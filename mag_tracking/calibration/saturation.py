@@ -1,4 +1,4 @@
-"""Readings of a saturated sensor."""
+"""Detection of saturated readings and of isolated faulty readings."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ MIN_RUN = 3
 """Minimum number of consecutive equal readings at the limit of a saturated axis."""
 
 MIN_JUMP = 3.0
-"""Minimum jump to that limit, in multiples of the smallest step; a smooth curve in coarse steps
-reaches its extreme by single steps."""
+"""Minimum jump to the limit of an axis, in multiples of the smallest step; a smooth curve in coarse
+steps reaches its extreme by single steps."""
 
 MARGIN = 6
 """Number of readings excluded before and after each saturated reading. Noise pushes some of these
@@ -18,17 +18,17 @@ readings beyond the limit, which biases the remaining readings."""
 
 
 MIN_ISOLATION = 10.0
-"""Minimum difference of a bus error from both neighbours, relative to the differences between and
-around these neighbours."""
+"""Minimum difference between an isolated reading (a bus error) and both neighbours, relative to the
+differences between and next to these neighbours."""
 
 
 def isolated_readings(values: FloatArray) -> IntArray:
-    """Find single readings of one axis that differ from both neighbours while these agree.
+    """Find single readings of one axis that differ from both neighbours while these two agree.
 
     Parameters
     ----------
     values : (n,) array
-        Chronological, without NaN.
+        Readings in chronological order, without NaN.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def saturated_readings(values: FloatArray) -> BoolArray:
     Parameters
     ----------
     values : (n,) array
-        Chronological raw readings; NaN = missing.
+        Raw readings in chronological order; NaN for a missing axis.
 
     Returns
     -------

@@ -53,8 +53,8 @@ inline bool is_too_long(const Sensor& s) {
     return usual < COARSE && double(s.run) * std::log(usual) < MIN_LOG_PROBABILITY;
 }
 
-// Whether a reading `field` (3) [T], NaN = missing axis, repeats the previous one for longer than
-// chance or coarse steps can explain.
+// Records a reading `field` (3) [T], NaN for a missing axis. Returns whether it has been repeated for
+// longer than chance or coarse steps can explain.
 inline bool is_stuck(Sensor& s, const double* field) {
     bool is_same = true;
     for (int a = 0; a < 3; ++a) {

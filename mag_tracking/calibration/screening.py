@@ -9,8 +9,8 @@ from mag_tracking.calibration import core
 from mag_tracking.units import NEVER
 
 MIN_CHANGES = core.MIN_CHANGES
-"""Minimum number of changes of a sensor; with fewer changes, its steps may be so coarse that long
-repetitions are normal."""
+"""Minimum number of changes before a sensor can be stuck; with fewer changes, its steps may be so
+coarse that long repetitions are normal."""
 COARSE = core.COARSE
 """Fraction of repeated readings above which the steps of a sensor are coarse: at rest, it may
 repeat a reading indefinitely. With a noise of one step or more on three axes, the fraction is
@@ -22,7 +22,7 @@ readings and the current reading pass."""
 
 
 def clear_spikes(sensor: Record) -> None:
-    """Discard the previous and the held readings.
+    """Reset spike detection: discard the previous and the held readings.
 
     Parameters
     ----------

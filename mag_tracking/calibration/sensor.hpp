@@ -1,5 +1,5 @@
-// State of one sensor that changes with every reading, in [T] and [s], or [ns] if the name ends
-// with `_ns`. Compiled code accesses it for each reading, Python for each block, as an element of a
+// State of one sensor, updated with every reading, in [T] and [s], or in [ns] if the name ends with
+// `_ns`. Compiled code accesses it for each reading, Python for each block, as an element of a
 // structured array (`SENSOR`) whose fields are listed in core.cpp.
 
 #pragma once

@@ -1,4 +1,4 @@
-"""State of each sensor that changes with every reading, as one structured array for all sensors.
+"""Sensor state that is updated with every reading, in one structured array for all sensors.
 
 Compiled code accesses it for each reading, Python for each block.
 """
@@ -15,8 +15,8 @@ MAX_HELD = core.MAX_HELD
 """Maximum number of readings of a spike; a longer change is a step."""
 
 SENSOR = core.SENSOR
-"""State of one sensor, in [T] and [s], or [ns] if the name ends with `_ns`; defined in
-`sensor.hpp`."""
+"""Data type of the state of one sensor, defined in `sensor.hpp`. Values are in [T] and [s], or in
+[ns] if the name ends with `_ns`."""
 
 
 def new_sensors(n: int) -> StructArray:

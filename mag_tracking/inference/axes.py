@@ -16,7 +16,7 @@ def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]
     Parameters
     ----------
     y : (n, 3) array
-        Measurement of each sensor; NaN = missing axis.
+        Measurement of each sensor; NaN for a missing axis.
     C : (n, 3, 3) array
         Noise covariance, in the squared unit of `y`, symmetric. Entries of missing axes are not
         read.
@@ -52,7 +52,7 @@ def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     Parameters
     ----------
     y : (n, 3) array
-        Measurement of each sensor; NaN = missing axis.
+        Measurement of each sensor; NaN for a missing axis.
     C : (n, 3, 3) array
         Noise covariance, in the squared unit of `y`, symmetric.
 
@@ -60,8 +60,8 @@ def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     -------
     (n,) array
         Smallest pivot of the correlation matrix: the smallest fraction of the variance of one axis
-        that the axes before it do not explain. 1 = uncorrelated axes; NaN or not positive = not
-        positive definite.
+        that the axes before it do not explain. 1 for uncorrelated axes; NaN or at most 0 if the
+        covariance is not positive definite.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def are_valid_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
     Parameters
     ----------
     y : (n, 3) array
-        Measurement of each sensor; NaN = missing axis.
+        Measurement of each sensor; NaN for a missing axis.
     C : (n, 3, 3) array
         Noise covariance, in the squared unit of `y`.
 

@@ -6,7 +6,7 @@ from mag_tracking.inference.sliding_sum import SlidingSum
 from mag_tracking.units import NS
 
 WINDOW_S = 1.0
-"""Length of the sliding window in which a target must not be disfavoured [s]."""
+"""Length of the sliding window of `TargetBayesFactor.is_recently_disfavoured` [s]."""
 
 MIN_LOG_RATIO = -30.0
 """Log Bayes factor [nats] at or below which a track cannot become a target again, regardless of its
@@ -29,7 +29,7 @@ class TargetBayesFactor:
         self._recent_sum = SlidingSum(WINDOW_S)
 
     def add(self, log_ratio: float, stamp_ns: int, ratio: float) -> None:
-        """Add a frame.
+        """Update the Bayes factor with a frame.
 
         Parameters
         ----------
@@ -57,14 +57,14 @@ class TargetBayesFactor:
         self._recent_sum.add(stamp_ns, log_ratio)
 
     def would_be_favoured(self, log_ratio: float, ratio: float) -> bool:
-        """Whether a target with a better fit would be favoured.
+        """Whether a target would be favoured if its fit improved.
 
         Parameters
         ----------
         log_ratio : float, nats
             Improvement of the log-likelihood of the whole track.
         ratio : float
-            Bayes factor required.
+            Required Bayes factor.
 
         Returns
         -------
@@ -80,7 +80,7 @@ class TargetBayesFactor:
         Parameters
         ----------
         ratio : float
-            Bayes factor required.
+            Required Bayes factor.
 
         Returns
         -------
@@ -94,7 +94,7 @@ class TargetBayesFactor:
         Parameters
         ----------
         ratio : float
-            Bayes factor required.
+            Required Bayes factor.
 
         Returns
         -------
@@ -103,7 +103,7 @@ class TargetBayesFactor:
         return bool(self._recent_sum.total < -np.log(ratio))
 
     def disfavoured_s(self, stamp_ns: int) -> float:
-        """Time for which the alternative has been favoured over the whole track.
+        """Time for which the Bayes factor of the whole track has favoured the alternative.
 
         Parameters
         ----------

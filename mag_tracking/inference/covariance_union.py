@@ -1,6 +1,6 @@
 """Covariance union: a covariance inflated to cover a second estimate.
 
-If two estimates of one state contradict each other and the wrong estimate is unknown, the
+If two estimates of one state contradict each other and it is unknown which of them is wrong, the
 covariance of one estimate is inflated until it covers the other estimate.
 """
 

@@ -75,7 +75,7 @@ class Observability:
 
     @property
     def kernel_dimension(self) -> int:
-        """Number of unobservable directions of the state; 0 = observable."""
+        """Number of unobservable directions of the state; 0 if all states are observable."""
         return self.kernel.shape[1]
 
 
@@ -128,16 +128,16 @@ def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
     information : (n_x, n_x) array
         Fisher information of the measurements.
     prior : (n_x, n_x) array, optional
-        Prior information: diag(1 / std^2) for independent Gaussian states, or `cpa_information`. On
-        the diagonal, 0 = no prior and inf = exactly known; row and column of an exactly known state
-        are not read.
+        Prior information: diag(1 / std^2) for independent Gaussian states, or `cpa_information`.
+        On the diagonal, 0 means that there is no prior, and inf that the state is exactly known;
+        the other entries of the row and column of an exactly known state are not read.
 
     Returns
     -------
     (n_x, n_x) array
-        Inverse of the sum. If the sum is singular, an unobservable state has variance inf and
-        covariances NaN; the other states have the limit for a vanishing prior. An exactly known
-        state has zeros.
+        Inverse of the total information. If the total is singular, an unobservable state has
+        variance inf and covariances NaN; the other states have the limit for a vanishing prior. An
+        exactly known state has zeros.
 
     References
     ----------
@@ -231,7 +231,7 @@ def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
 
     Notes
     -----
-    The gradient by v0 printed in the proof of TSP14 Proposition 2 lacks a minus sign.
+    The gradient with respect to v0 printed in the proof of TSP14 Proposition 2 lacks a minus sign.
 
     References
     ----------
@@ -311,14 +311,14 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
 
 
 def snr(h: ArrayLike, C: ArrayLike) -> FloatArray:
-    """Signal-to-noise ratio (of energies) h' C^-1 h of a field.
+    """Signal-to-noise energy ratio h' C^-1 h of a field.
 
     The ratio is the non-centrality parameter of `detection_theory.detection_probability`.
 
     Parameters
     ----------
     h : (..., n_y) array
-        Field without noise and background; NaN = axis not measured.
+        Field without noise and background; NaN for an unmeasured axis.
     C : (..., n_y, n_y) array
         Noise covariance, in the squared unit of `h`.
 
@@ -345,7 +345,7 @@ def snr_at_distance(moment: float | FloatArray, noise_std: float | FloatArray,
     Parameters
     ----------
     moment : float or array, A m²
-        Magnitude: 300-600 for a car, 1800 for a truck (TSP14).
+        Magnitude of the moment: 300-600 for a car, 1800 for a truck (TSP14).
     noise_std : float or array, T
         Noise standard deviation of one axis, equal on all axes; 1.1e-8 in TSP14.
     distance : float or array, m

@@ -73,7 +73,7 @@ def detection_probability(snr: float | FloatArray, threshold: float | FloatArray
 
 
 def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray:
-    """Probability that a target is never detected in `run` consecutive frames.
+    """Probability that a pass contains no run of `run` consecutive detections.
 
     Parameters
     ----------

@@ -15,17 +15,17 @@ from scipy.special import log_ndtr, ndtr
 from mag_tracking.arrays import FloatArray
 
 LAG = 0.35
-"""Default lag in widths of the signal energy at half maximum; near the optimum for passes at
-constant speed (PHD15 Paper B eq. (19))."""
+"""Default lag as a fraction of the full width at half maximum of the signal energy; near the
+optimum for passes at constant speed (PHD15 Paper B eq. (19))."""
 
 MIN_SAMPLES = 8
 """Minimum number of samples in a window."""
 
 MAX_CONFIDENCE = 0.98
 """Upper limit of the probability of a direction. The sign of the correlation is exact only for a
-target at the height of the sensor. The field of 0.6 % of
-random moments rotates in the opposite direction if the target is above the sensor by half its
-lateral distance, and of 2.2 % if it is above by the whole distance."""
+target at the height of the sensor. For 0.6 % of random moments, the field rotates in the opposite
+direction if the target is above the sensor by half its lateral distance, and for 2.2 % if it is
+above by the whole distance."""
 
 MAX_VERTICAL_COSINE = 0.2
 """Maximum direction cosine between a missing axis and a horizontal axis at which the missing axis
@@ -65,7 +65,7 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
     ----------
     field : (n, 2) array, T
         Horizontal field x, y in a frame with z up, without the background. The first and the last
-        `lag` samples are free of the target.
+        `lag` samples must not contain the field of the target.
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     lag : int
@@ -89,7 +89,7 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
     if lag < 1 or n < 1:
         raise ValueError(f'lag: expected 1 to {(len(field) - 1) // 2} samples, got {lag}')
     floor = 2.0 * n / lag**2 * noise_std**4
-    estimate = noise_std**2 / lag**2 * _spread(field, lag) - floor
+    estimate = noise_std**2 / lag**2 * _squared_lag_differences(field, lag) - floor
     return FieldRotation(_correlation(field, lag), max(estimate, floor))
 
 
@@ -99,7 +99,7 @@ def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRo
     Parameters
     ----------
     signal : (n, 2) array, T
-        Field without noise in the window; zero outside.
+        Noise-free field in the window; the field outside is assumed to be zero.
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     lag : int
@@ -114,8 +114,9 @@ def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRo
     [PHD15]_ Paper B eq. (12), (14).
     """
     padded = np.pad(signal, ((lag, lag), (0, 0)))
-    return FieldRotation(_correlation(padded, lag), noise_std**2 / lag**2 * _spread(padded, lag)
-                         + 2.0 * len(signal) / lag**2 * noise_std**4)
+    return FieldRotation(
+        _correlation(padded, lag), noise_std**2 / lag**2 * _squared_lag_differences(padded, lag)
+        + 2.0 * len(signal) / lag**2 * noise_std**4)
 
 
 def _correlation(field: FloatArray, lag: int) -> float:
@@ -124,13 +125,13 @@ def _correlation(field: FloatArray, lag: int) -> float:
     return float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
 
 
-def _spread(field: FloatArray, lag: int) -> float:
-    """Sum of the squared differences over two lags."""
+def _squared_lag_differences(field: FloatArray, lag: int) -> float:
+    """Sum of the squared differences of samples two lags apart."""
     return float(np.sum(np.square(field[2 * lag:] - field[:-2 * lag])))
 
 
 def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
-    """Lag matched to the width of a pass.
+    """Lag, in samples, that matches the width of a pass.
 
     Parameters
     ----------
@@ -139,7 +140,7 @@ def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     max_lag : int
-        Maximum lag, the number of samples at each end that are free of the target.
+        Maximum lag, which is the number of samples before and after the pass.
 
     Returns
     -------
@@ -148,8 +149,8 @@ def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     """
     window = 1 + len(field) // 20
     energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(window), 'same')
-    # Another target at an end of the window extends the span of strong samples, but hardly the
-    # count.
+    # Another target at an end of the window extends the span of strong samples, but hardly their
+    # number.
     width = np.count_nonzero(energy > 0.5 * energy.max())
     if not width:
         return 0
@@ -166,7 +167,7 @@ def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     lags : sequence of int
-        Candidates.
+        Candidate lags.
 
     Returns
     -------
@@ -212,7 +213,7 @@ def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
     Parameters
     ----------
     field : (n, 3) array, T, sensor frame
-        NaN = missing axis. A missing axis that is nearly vertical is ignored.
+        Measured field; NaN for a missing axis. A missing axis that is nearly vertical is ignored.
     R_ws : (3, 3) array
         Rotation from the sensor frame to the world frame.
 
@@ -232,7 +233,7 @@ def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
 
 
 def rotation_of_pass(field: FloatArray, noise_std: float, n_quiet: int) -> FieldRotation | None:
-    """`field_rotation` at the lag matched to the width of a pass.
+    """Compute `field_rotation` at the lag that matches the width of a pass.
 
     The prior of the correlation is uniform. The probability of the direction is therefore
     overconfident for a target below the noise.
@@ -244,7 +245,7 @@ def rotation_of_pass(field: FloatArray, noise_std: float, n_quiet: int) -> Field
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     n_quiet : int
-        Number of samples at each end that are free of the target.
+        Number of samples before and after the pass.
 
     Returns
     -------

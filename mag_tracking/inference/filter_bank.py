@@ -125,8 +125,8 @@ class FilterBank:
             mode of the posterior. If many neighbours share the weight, the heaviest hypothesis
             would be a random choice.
         """
-        return core.best(self.x, self.P, self.log_w, _classes(self.label), _classes(self.kind),
-                         _NEGLIGIBLE_LOG_RATIO)
+        return core.best(self.x, self.P, self.log_w, _class_indices(self.label),
+                         _class_indices(self.kind), _NEGLIGIBLE_LOG_RATIO)
 
     def extract_target(self, i: int, n_one: int) -> 'FilterBank':
         """Marginal bank of one target of a joint bank.
@@ -149,7 +149,7 @@ class FilterBank:
         n_target_states = n_one * self.label.shape[1]
         columns = np.append(np.arange(i * n_one, (i + 1) * n_one),
                             np.arange(n_target_states, self.x.shape[1]))
-        return FilterBank(*_of_columns(self.x, self.P, columns), self.log_w,
+        return FilterBank(*_selected_states(self.x, self.P, columns), self.log_w,
                           self.label[:, i].copy(), self.kind[:, i].copy(), self.origin, self.nis)
 
     def without_target(self, i: int, n_one: int) -> 'FilterBank':
@@ -172,8 +172,8 @@ class FilterBank:
         label, kind = np.delete(self.label, i, axis=1), np.delete(self.kind, i, axis=1)
         if n_targets == 2:
             label, kind = label[:, 0].copy(), kind[:, 0].copy()
-        return FilterBank(*_of_columns(self.x, self.P, columns), self.log_w.copy(), label, kind,
-                          self.origin.copy(), self.nis.copy())
+        return FilterBank(*_selected_states(self.x, self.P, columns), self.log_w.copy(), label,
+                          kind, self.origin.copy(), self.nis.copy())
 
     def copy(self) -> 'FilterBank':
         """Return a deep copy.
@@ -230,7 +230,7 @@ class FilterBank:
         return float(np.exp(log_sum_exp(self.log_w[rows]))) if rows.any() else 0.0
 
     def is_concentrated_in(self, n: int, fraction: float) -> bool:
-        """Whether the heaviest hypotheses have at least a given fraction of the weight.
+        """Whether the `n` heaviest hypotheses have at least a given fraction of the weight.
 
         Parameters
         ----------
@@ -345,13 +345,14 @@ class FilterBank:
         return self.keep(mask)
 
 
-def _of_columns(x: FloatArray, P: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
+def _selected_states(x: FloatArray, P: FloatArray, columns: IntArray
+                     ) -> tuple[FloatArray, FloatArray]:
     """Copies of the selected states (n_hyp, n_x) and of their covariances."""
     return (np.ascontiguousarray(x[:, columns]),
             np.ascontiguousarray(P[:, columns[:, None], columns]))
 
 
-def _classes(labels: IntArray) -> IntArray:
+def _class_indices(labels: IntArray) -> IntArray:
     """Class index (n,) of each row of labels, (n,) or (n, n_targets)."""
     if labels.ndim == 1:
         return labels

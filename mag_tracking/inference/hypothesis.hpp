@@ -120,7 +120,7 @@ INLINE void subtract_products(double* __restrict P, const double* __restrict G, 
 // Updates a hypothesis by sensor j, in place, linearised at `x_lin` (n_x). If the sizes are
 // `is_halved`, P must be completed by `complete` after the last sensor.
 //
-// y (3), C (3, 3): measurement, NaN = missing axis, and noise covariance, without NaN. h (3),
+// y (3), C (3, 3): measurement, NaN for a missing axis, and noise covariance, without NaN. h (3),
 // H (3, n_seen): predicted field without the background, and its derivative. `inflation` is added
 // to the variance of each axis. G (3, wide), z (3) and W (6) are written.
 // Returns the normalised innovation squared; adds the log-likelihood to `log_likelihood`.

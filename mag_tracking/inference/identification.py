@@ -32,9 +32,9 @@ class EnrolledVehicle:
     name: str
     """Name of the vehicle."""
     iron: Iron | None
-    """Hard and soft iron; None if all passes have one heading."""
+    """Hard and soft iron; None if all passes have about the same heading."""
     heading: float
-    """Heading of all passes, rad, world frame; NaN if `iron` is known."""
+    """Mean heading of the passes, rad, world frame; NaN if `iron` is known."""
     moment: FloatArray
     """Moment at `heading`, (3,) A m², world frame; NaN if `iron` is known."""
     covariance: FloatArray
@@ -77,10 +77,10 @@ class EnrolledVehicle:
 
 @dataclass(frozen=True)
 class Identification:
-    """The enrolled vehicle that a pass belongs to."""
+    """Result of the comparison of a pass with the enrolled vehicles."""
 
     name: str
-    """The most probable vehicle; `UNKNOWN` if the moment fits no vehicle."""
+    """The most probable vehicle; `UNKNOWN` if the moment matches none of the compared vehicles."""
     probabilities: dict[str, float]
     """{vehicle: probability} of the compared vehicles, for equal priors."""
     distances: dict[str, float]
@@ -141,7 +141,7 @@ def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance
     Parameters
     ----------
     vehicles : sequence of EnrolledVehicle
-        Candidates.
+        Enrolled vehicles to compare.
     moment : (3,) array, A m², world frame
         Fitted moment of the pass.
     covariance : (3, 3) array, A² m⁴

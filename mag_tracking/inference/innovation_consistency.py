@@ -39,12 +39,12 @@ class InnovationConsistency:
         self._recent_sum = SlidingSum(WINDOW_S)
 
     def add(self, nis: FloatArray, n_axes: FloatArray, stamp_ns: int) -> None:
-        """Add a frame.
+        """Add the innovations of a frame.
 
         Parameters
         ----------
         nis : (n_sensors,) array
-            Normalised innovation squared of each sensor; NaN = missing.
+            Normalised innovation squared of each sensor; NaN if missing.
         n_axes : (n_sensors,) array
             Number of axes measured by each sensor.
         stamp_ns : int, ns
@@ -57,7 +57,9 @@ class InnovationConsistency:
 
     @property
     def excess(self) -> float:
-        """Factor by which the latest innovation variances exceed their covariance; 1 = consistent.
+        """Largest significant ratio of actual to predicted innovation variance in the window.
+
+        The value is 1 if the innovations of the network and of each sensor are consistent.
         """
         recent = self._recent_sum.total
         fails = self._fails(recent)
@@ -67,7 +69,7 @@ class InnovationConsistency:
 
     @property
     def fails(self) -> bool:
-        """Whether the innovations of the whole track are too large."""
+        """Whether the innovations of the whole track are too large, in total or at a sensor."""
         return bool(self._fails(self._total).any())
 
     def _fails(self, values: FloatArray) -> FloatArray:

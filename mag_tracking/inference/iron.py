@@ -19,7 +19,7 @@ class Iron:
     covariance: FloatArray
     """Covariance of [m0, D], (4, 4)."""
     residuals: FloatArray
-    """Moments minus their prediction, (n, 3) A m², world frame."""
+    """Measured minus predicted moments, (n, 3) A m², world frame."""
     normalised_cost: float
     """Weighted sum of squared residuals over the degrees of freedom; about 1 if the model and the
     covariances are correct. NaN without covariances."""
@@ -70,7 +70,7 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
     A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = c, -s, s, c
     A[:, 2, 2] = 1.0
     A[:, :, 3] = induction
-    W = _whitening(covariances, n)
+    W = _whitening_matrices(covariances, n)
     whitened = (W @ A).reshape(3 * n, 4)
     # The units of m0 and D differ, so the columns are normalised first.
     scale = np.linalg.norm(whitened, axis=0)
@@ -89,7 +89,7 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
     return Iron(theta[:3], float(theta[3]), covariance, moments - A @ theta, cost)
 
 
-def _whitening(covariances: ArrayLike | None, n: int) -> FloatArray:
+def _whitening_matrices(covariances: ArrayLike | None, n: int) -> FloatArray:
     """Inverse Cholesky factors (n, 3, 3); identity matrices without covariances."""
     if covariances is None:
         return np.tile(np.eye(3), (n, 1, 1))
@@ -99,4 +99,4 @@ def _whitening(covariances: ArrayLike | None, n: int) -> FloatArray:
     try:
         return np.linalg.inv(np.linalg.cholesky(covariances))
     except np.linalg.LinAlgError:
-        raise ValueError('covariances: not positive definite') from None
+        raise ValueError('a covariance is not positive definite') from None

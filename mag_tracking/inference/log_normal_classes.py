@@ -9,9 +9,9 @@ from scipy.special import chdtri
 from mag_tracking.arrays import FloatArray
 
 UNKNOWN = 'unknown'
-"""Name of the class of an object that fits no class."""
+"""Name that is returned for an object that matches no class."""
 SIGNIFICANCE_LEVEL = 0.01
-"""An object that is less probable than this under every class belongs to an unknown class."""
+"""An object that is less probable than this under every class is classified as `UNKNOWN`."""
 
 
 class Feature(NamedTuple):
@@ -31,9 +31,9 @@ class ClassPosterior(NamedTuple):
     """Most probable class of an object, and the probabilities of all classes."""
 
     name: str
-    """Most probable class; `UNKNOWN` if the object fits no class."""
+    """Most probable class; `UNKNOWN` if the object matches no class."""
     probabilities: FloatArray
-    """Posterior probabilities, (n_classes,), in the order of the names."""
+    """Posterior probabilities, (n_classes,), in the order of the class names."""
 
 
 def class_posterior(names: Sequence[str], shares: Sequence[float],

@@ -16,7 +16,7 @@ from scipy.special import ndtr, ndtri
 from mag_tracking.arrays import BoolArray, FloatArray
 
 _BAND_EDGE_TOLERANCE = 1e-9
-"""Relative tolerance with which a frequency on the edge of a band belongs to it."""
+"""Relative tolerance by which a band is extended, so that it includes its edges."""
 
 
 def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,
@@ -74,7 +74,7 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
         Two-sided noise density, positive, equal and independent on all axes. The function is called
         for frequencies in the band only. Frequencies with an infinite density do not contribute.
     band : (2,) sequence, Hz
-        Lowest and highest frequency, both included; infinity = no upper limit.
+        Lowest and highest frequency, both included; the highest may be infinite.
 
     Returns
     -------
@@ -134,14 +134,14 @@ def detection_probability(deflection: ArrayLike, false_alarm_probability: ArrayL
     Parameters
     ----------
     deflection : (...) array
-        Deflection; NaN = not measured.
+        Deflection; NaN where nothing is measured.
     false_alarm_probability : (...) array
         Above 0 and below 1; broadcasts against `deflection`.
 
     Returns
     -------
     (...) array
-        NaN where nothing is measured.
+        NaN where the deflection is NaN.
 
     Raises
     ------
@@ -166,12 +166,12 @@ def detection_probability(deflection: ArrayLike, false_alarm_probability: ArrayL
 
 def any_detection_probability(probability: ArrayLike,
                               axis: int | tuple[int, ...] | None = None) -> FloatArray:
-    """Probability that at least one of several independent detectors detects.
+    """Probability that at least one of several independent detectors detects the signal.
 
     Parameters
     ----------
     probability : (...) array
-        Detection probability of each sensor and period; NaN = missing, treated as 0.
+        Detection probability of each sensor and period; NaN is treated as 0.
     axis : int or tuple of int, optional
         Axes to combine. Default: all axes.
 

@@ -18,7 +18,7 @@ def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
     H : (..., n_y, n_x) array
         Measurement matrices; a row of NaN is not measured.
     C : (..., n_y, n_y) array or None
-        Noise covariances; leading axes broadcast against `H`. None if `H` is whitened.
+        Noise covariances; leading axes broadcast against `H`. None if `H` is whitened already.
 
     Returns
     -------

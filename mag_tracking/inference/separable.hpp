@@ -59,7 +59,7 @@ INLINE void subtract_product(Rows& A, Rows& B, Rows& X) {
 
 // Fits measurements y (n_y), from which `nuisance` (n_y, q) with orthonormal columns has been
 // projected out. A `Model` writes its basis (n_y, n_linear) for theta (n_theta), and the derivative
-// (n_y, n_theta) by theta for linear parameters p (n_linear).
+// (n_y, n_theta) with respect to theta for linear parameters p (n_linear).
 template <class Model>
 class SeparableFit {
   public:

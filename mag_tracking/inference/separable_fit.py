@@ -47,7 +47,7 @@ class SeparableModel(Protocol):
 
 
 class SeparableProblem:
-    """A separable model and its measurements; p is eliminated for every theta.
+    """Least-squares problem of a separable model; p is eliminated for every theta.
 
     Parameters
     ----------

@@ -99,7 +99,7 @@ def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
 
 
 def with_orientations(network: SensorNetwork, message: CalibrationState) -> SensorNetwork:
-    """Copy a network with the sensor orientations of a CalibrationState.
+    """Return a copy of a network that has the sensor orientations of a CalibrationState.
 
     Parameters
     ----------
@@ -113,8 +113,8 @@ def with_orientations(network: SensorNetwork, message: CalibrationState) -> Sens
     Raises
     ------
     RecordingError
-        If sensors or frame differ from those of `network`, or an orientation or its standard
-        deviation is invalid.
+        If the sensors or the frame of `message` differ from `network`, or an orientation or its
+        standard deviation is invalid.
     """
     names = tuple(s.sensor for s in message.sensors)
     if names != network.names:
@@ -129,7 +129,7 @@ def with_orientations(network: SensorNetwork, message: CalibrationState) -> Sens
     for name, v in zip(names, std, strict=True):
         if not (np.isnan(v).all() or (np.isfinite(v) & (v > 0.0)).all()):
             raise RecordingError(f'CalibrationState of {name}: orientation_std is {v.tolist()} '
-                                 'rad; expected positive values, or NaN for unknown')
+                                 'rad; expected positive values, or NaN if unknown')
     try:
         R_ws = rotation_from_quaternion(q)
     except ValueError as error:

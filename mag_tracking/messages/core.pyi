@@ -15,7 +15,7 @@ class Encoder:
     ----------
     fields : sequence of (str, int, str or Encoder, object)
         Name; array length, `SEQUENCE` or `ONE`; built-in type or encoder of the contained message;
-        default (None: zero or empty).
+        default (None selects zero or empty).
     """
 
     def __init__(self, fields: Sequence[tuple[str, int, str | Encoder, Any]]) -> None: ...

@@ -91,4 +91,4 @@ DEFINITIONS: dict[str, str] = {
     'mag_tracking_msgs/msg/TrackArray': (
         'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
 }
-"""{message type: definition}."""
+"""Definition of each message type, as {type: definition}."""

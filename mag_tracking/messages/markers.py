@@ -22,8 +22,8 @@ LIFETIME_S = 2
 """[s] Lifetime of the markers of a track."""
 _ARROW, _CUBE, _SPHERE, _TEXT = 0, 1, 2, 9
 _ADD, _DELETE = 0, 2
-_SCALE_3D = 2.5003
-"""Standard deviations to the surface of the 90 % region (chi-square, 3 degrees of freedom)."""
+_REGION_RADIUS = 2.5003
+"""Radius of the 90 % region in standard deviations (chi-square, 3 degrees of freedom)."""
 SENSOR_SIZE_M = 0.3
 """[m] Maximum length of a sensor marker; the length is at most half the smallest sensor
 distance."""
@@ -70,7 +70,7 @@ def delete_markers(track: Track, frame: str) -> dict[str, Any]:
 
 
 def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
-    """Markers of the sensors and their names.
+    """Markers that show the sensors and their names.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def _ellipsoid(track: Track, frame: str) -> dict[str, Any]:
     values, R = np.linalg.eigh(uncertainty.covariance[:3, :3])
     if np.linalg.det(R) < 0.0:
         R = -R
-    axes = 2.0 * _SCALE_3D * np.sqrt(np.maximum(values, 0.0))
+    axes = 2.0 * _REGION_RADIUS * np.sqrt(np.maximum(values, 0.0))
     return _marker(
         track, frame, 'ellipsoid', _SPHERE, action=_ADD, lifetime={'sec': LIFETIME_S},
         pose={'position': xyz(track.position), 'orientation': _quaternion(R)},

@@ -16,17 +16,18 @@ _HEAD = np.dtype([('encapsulation', 'u1', 4), ('sec', '<i4'), ('nanosec', '<u4')
                   ('length', '<u4')])
 """Layout up to the frame name, whose `length` includes the terminating zero."""
 _FIELD_DOUBLES = 12
-"""Values of a MagneticField: x, y, z and the covariance."""
+"""Number of float64 values in a MagneticField: x, y, z and the covariance."""
 _POSE_DOUBLES = 7
-"""Values of a pose: x, y, z and the quaternion."""
+"""Number of float64 values in a pose: x, y, z and the quaternion."""
 
 
 class FieldArrays(NamedTuple):
     """Contents of sensor_msgs/MagneticField messages as arrays."""
 
     is_decoded: BoolArray
-    """(n,) False for an unusual or damaged message, which must be decoded individually. The
-    corresponding elements of the other arrays are meaningless."""
+    """(n,) False for a message that is damaged, not little-endian CDR or in a frame with a
+    non-ASCII name, and which must be decoded individually. The corresponding elements of the other
+    arrays are meaningless."""
     stamp_ns: IntArray
     """(n,) Timestamps."""
     field: FloatArray
@@ -39,8 +40,9 @@ class PoseArrays(NamedTuple):
     """Contents of geometry_msgs/PoseStamped messages as arrays."""
 
     is_decoded: BoolArray
-    """(n,) False for a message in another frame and for an unusual or damaged message, which must
-    be decoded individually. The corresponding elements of the other arrays are meaningless."""
+    """(n,) False for a message that is in another frame, damaged or not little-endian CDR, and
+    which must be decoded individually. The corresponding elements of the other arrays are
+    meaningless."""
     stamp_ns: IntArray
     """(n,) Timestamps."""
     pose: FloatArray
@@ -109,11 +111,11 @@ class _StampedMessages:
         head = self._data.take(begins[:, None] + np.arange(_HEAD.itemsize), mode='clip'
                                ).view(_HEAD)[:, 0] \
             if len(self._data) else np.zeros(len(begins), dtype=_HEAD)
-        self._length = head['length'].astype(np.int64)
+        self._name_length = head['length'].astype(np.int64)
         # 8-byte values are aligned relative to the end of the encapsulation header.
-        self._first = (_HEAD.itemsize - 4 + self._length + 7) // 8 * 8 + 4
-        self.is_decoded: BoolArray = (ends - begins >= self._first + 8 * n_doubles) \
-            & (self._length > 0) \
+        self._values_begin = (_HEAD.itemsize - 4 + self._name_length + 7) // 8 * 8 + 4
+        self.is_decoded: BoolArray = (ends - begins >= self._values_begin + 8 * n_doubles) \
+            & (self._name_length > 0) \
             & (head['encapsulation'][:, 0] == 0) & (head['encapsulation'][:, 1] == 1)
         self.stamp_ns: IntArray = head['sec'].astype(np.int64) * 1_000_000_000 + head['nanosec']
 
@@ -124,8 +126,8 @@ class _StampedMessages:
     def have_ascii_frames(self, rows: IntArray) -> BoolArray:
         """Whether the frame names of `rows` are zero-terminated ASCII: (k,) array."""
         out = np.zeros(len(rows), dtype=bool)
-        for length in np.unique(self._length[rows]):
-            same_length = np.flatnonzero(self._length[rows] == length)
+        for length in np.unique(self._name_length[rows]):
+            same_length = np.flatnonzero(self._name_length[rows] == length)
             names = self._frames(rows[same_length], length)
             out[same_length] = (names[:, -1] == 0) & (names < 128).all(axis=1)
         return out
@@ -133,7 +135,7 @@ class _StampedMessages:
     def have_frame(self, rows: IntArray, frame: str) -> BoolArray:
         """Whether the messages of `rows` are in `frame`: (k,) array."""
         name = np.frombuffer(frame.encode() + b'\0', np.uint8)
-        out: BoolArray = self._length[rows] == len(name)
+        out: BoolArray = self._name_length[rows] == len(name)
         out[out] = (self._frames(rows[out], len(name)) == name).all(axis=1)
         return out
 
@@ -142,6 +144,6 @@ class _StampedMessages:
         out = np.zeros((len(self._begins), self._n_doubles))
         rows = np.flatnonzero(self.is_decoded)
         if len(rows):
-            at = (self._begins + self._first)[rows, None] + np.arange(8 * self._n_doubles)
+            at = (self._begins + self._values_begin)[rows, None] + np.arange(8 * self._n_doubles)
             out[rows] = self._data[at].view('<f8')
         return out

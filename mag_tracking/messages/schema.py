@@ -79,7 +79,7 @@ def reading_of(message: MagneticField, sensor: str) -> Readings:
 
 
 def known_covariances(C: FloatArray) -> FloatArray | None:
-    """Convert the covariances of messages to those of `Readings`.
+    """Convert covariances of messages to the convention of `Readings`.
 
     A NaN covariance means "unknown" in `Readings` only. In a message, NaN is a fault: it is
     replaced by zero, which the calibration stage rejects.
@@ -114,7 +114,7 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
     Returns
     -------
     AccelerationSample
-        NaN if the message contains no acceleration (its covariance begins with -1).
+        NaN if the message contains no acceleration (its first covariance element is -1).
     """
     a = message.linear_acceleration
     is_present = message.linear_acceleration_covariance[0] != -1.0
@@ -125,7 +125,7 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
 def float64_array(values: ArrayLike) -> 'array[float]':
     """Convert numbers to the array type that a float64[] field accepts without conversion.
 
-    The elements of a list would be checked one by one.
+    The elements of a list would be checked individually.
 
     Parameters
     ----------
@@ -216,8 +216,8 @@ def readings_dict(readings: Readings) -> MessageDict:
     """
     C = readings.covariance
     if not len(readings) or C is not None and np.isnan(C).all(axis=(1, 2)).any():
-        raise RecordingError('FieldReadings requires at least one reading, and covariances of all '
-                             'readings or of none')
+        raise RecordingError('FieldReadings requires at least one reading, and covariances for '
+                             'all readings or for none')
     return {'header': header_dict(int(readings.stamp_ns.max()), ''),
             'sensors': list(readings.names),
             'sensor': array('H', readings.sensor.astype(np.uint16).tobytes()),
@@ -297,7 +297,7 @@ def pose_dict(ns: int, frame: str, position: FloatArray, quaternion: FloatArray)
     frame : str
     position : (3,) array, m
     quaternion : (4,) array
-        Order xyzw, body to `frame`.
+        Rotation xyzw from the body to `frame`.
 
     Returns
     -------
@@ -446,7 +446,7 @@ def smoothed_track_dict(poses: Sequence[SmoothedPose], frame: str) -> MessageDic
     Parameters
     ----------
     poses : sequence of SmoothedPose
-        Chronological, at least one.
+        At least one pose, in chronological order.
     frame : str
         World frame.
 

@@ -54,7 +54,7 @@ def cdr_of(schema: Schema, data: bytes) -> bytes:
     Returns
     -------
     bytes
-        Empty if the message is not a magnetic field.
+        Empty if the message cannot be decoded as a magnetic field.
     """
     try:
         return encoder(MAGNETIC_FIELD)(

@@ -1,4 +1,4 @@
-"""Tracks and sensors as messages of other packages: transforms and 3D detections."""
+"""Conversion of tracks and sensors to standard ROS messages: transforms and 3D detections."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from mag_tracking.records import Track
 
 
 def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageDict | None:
-    """Transform from the world frame to the pose of a `Track`.
+    """Convert a `Track` to a transform from the world frame to the target.
 
     Parameters
     ----------
@@ -60,9 +60,8 @@ def detections_3d_dict(track: Track, frame: str) -> MessageDict:
     """Convert a `Track` to vision_msgs/Detection3DArray.
 
     The results are the kinds of target with their probabilities; each result has the pose of the
-    track.
-    The box has the length of the line of dipoles; its width and height are not observable and set
-    to 0.
+    track. The box has the length of the line of dipoles; its width and height are not observable
+    and are set to 0.
 
     Parameters
     ----------

@@ -73,10 +73,10 @@ class LiveScene:
         self._tracks: dict[int, LiveTrack] = {}
         # {track id: latest track with this id}
         self._latest_by_id: dict[int, LiveTrack] = {}
-        self._is_new = True
+        self._is_scene_new = True
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Add a frame; call it before `add_track` with the same timestamp.
+        """Add a frame; it must be added before the tracks with the same timestamp.
 
         Parameters
         ----------
@@ -147,7 +147,7 @@ class LiveScene:
                 self._notes, self._tables, self._is_health_new = notes, tables, True
 
     def whole(self) -> list[str]:
-        """Messages with the complete state that has been sent, for a new viewer.
+        """Messages that give a new viewer the state that all other viewers have received.
 
         Returns
         -------
@@ -169,8 +169,8 @@ class LiveScene:
             JSON messages.
         """
         with self._lock:
-            if self._is_new:
-                self._is_new = False
+            if self._is_scene_new:
+                self._is_scene_new = False
                 return self._scene_messages([])
             out = [self._health_message()] if self._is_health_new else []
             self._is_health_new = False
@@ -191,7 +191,7 @@ class LiveScene:
             return out
 
     def _scene_messages(self, tracks: list[dict[str, Any]]) -> list[str]:
-        """List of the message that replaces the scene; empty while the sensors are unknown."""
+        """The message that replaces the scene, as a list; empty while the sensors are unknown."""
         if not len(self._network):
             return []
         begin_ns = self._begin_ns or 0
@@ -209,7 +209,7 @@ class LiveScene:
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
             # An empty scene that may have been sent earlier had no start time.
-            self._is_new = True
+            self._is_scene_new = True
         self._end_ns = max(self._end_ns, stamp_ns)
 
     def _remove_old_tracks(self) -> None:

@@ -8,8 +8,8 @@ from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
 MAX_TRACK_POSES, N_REMOVED = 8_000, 1_000
-"""Maximum number of poses of one track, and number of poses removed beyond it. `scene.js` uses the
-same numbers."""
+"""Maximum number of poses of one track, and number of poses that are removed if it is exceeded.
+`scene.js` uses the same numbers."""
 MAX_GAP_S = 60.0
 """[s] A pose after a longer gap belongs to another track with the same id."""
 N_RECENT = 100
@@ -22,7 +22,8 @@ class LiveTrack:
     Parameters
     ----------
     key : int
-        Unique on the page. Track ids are not unique, because a restarted tracker begins at 1.
+        Key that is unique on the page. Track ids are not unique, because a restarted tracker
+        begins at 1.
     track_id : int
 
     Attributes
@@ -39,7 +40,7 @@ class LiveTrack:
         self.key, self.log = key, TrackLog(track_id)
         self.smoothed: dict[str, Any] | None = None
         self.is_smoothed_new = False
-        self._sent, self._is_end_sent = 0, False
+        self._n_sent, self._is_end_sent = 0, False
 
     @property
     def end_ns(self) -> int:
@@ -49,7 +50,7 @@ class LiveTrack:
     @property
     def has_unsent(self) -> bool:
         """Whether poses or the end of the track have not been sent yet."""
-        return self._sent < len(self.log.stamp_ns) or self.log.ended and not self._is_end_sent
+        return self._n_sent < len(self.log.stamp_ns) or self.log.ended and not self._is_end_sent
 
     def continues(self, track: Track) -> bool:
         """Whether a pose belongs to this track.
@@ -76,7 +77,7 @@ class LiveTrack:
         self.log.add(track, frame)
         if len(self.log.stamp_ns) > MAX_TRACK_POSES:
             self.log.forget(N_REMOVED)
-            self._sent = max(0, self._sent - N_REMOVED)
+            self._n_sent = max(0, self._n_sent - N_REMOVED)
 
     def news(self, begin_ns: int) -> dict[str, Any]:
         """Return an entry with all unsent poses, and mark the poses as sent.
@@ -91,9 +92,9 @@ class LiveTrack:
         dict
             JSON object.
         """
-        first, self._sent = self._sent, len(self.log.stamp_ns)
+        first, self._n_sent = self._n_sent, len(self.log.stamp_ns)
         self._is_end_sent = self.log.ended
-        return self._entry(begin_ns, range(first, self._sent))
+        return self._entry(begin_ns, range(first, self._n_sent))
 
     def sent(self, begin_ns: int) -> dict[str, Any] | None:
         """Entry with all poses that have been sent.
@@ -108,7 +109,7 @@ class LiveTrack:
         dict or None
             JSON object; None if nothing has been sent.
         """
-        return self._entry(begin_ns, range(self._sent)) if self._sent else None
+        return self._entry(begin_ns, range(self._n_sent)) if self._n_sent else None
 
     def _entry(self, begin_ns: int, rows: range) -> dict[str, Any]:
         """JSON object of selected poses, with the fields of the recently strongest sensors."""

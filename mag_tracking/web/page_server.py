@@ -42,7 +42,7 @@ class Source(Protocol):
     """Source of the messages, such as a `LiveScene`."""
 
     def whole(self) -> list[str]:
-        """Messages that bring a new viewer up to date.
+        """Messages that give a new viewer the current state.
 
         Returns
         -------
@@ -59,13 +59,14 @@ class Source(Protocol):
 
 
 class PageServer:
-    """Live page for any number of browsers.
+    """Server of the live page, for up to `MAX_VIEWERS` browsers.
 
     Parameters
     ----------
     source : Source
     host : str, optional
-        Local address to listen on. Addresses other than loopback require a token.
+        Local address to listen on. Unless it is a loopback address, browsers need the token in
+        `url`.
     port : int, optional
         0 selects a free port.
 
@@ -162,7 +163,10 @@ class PageServer:
             return [json_text({'type': 'fault', 'text': description})]
 
     def _send_updates(self) -> None:
-        """Send new messages to all viewers, and the complete scene to viewers after a lag."""
+        """Send new messages to all viewers.
+
+        Viewers that have caught up receive the complete scene; stalled viewers are disconnected.
+        """
         if not self._viewers and not self._lagging:
             return
         now = self._loop.time()
@@ -308,7 +312,7 @@ def _open_socket(host: str, port: int) -> socket.socket:
     except (OSError, UnicodeError) as error:
         reason = getattr(error, 'strerror', None) or str(error)
         raise DeviceError(f'the live page cannot be served on {host} port {port}: {reason}; '
-                          'choose another port') from error
+                          'check the address or choose another port') from error
 
 
 def _response(status: HTTPStatus, body: bytes, kind: str, encoding: str = '') -> Response:

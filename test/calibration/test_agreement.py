@@ -1,4 +1,4 @@
-"""Comparison of sensors with the Earth's field: identification of faults, and false alarms."""
+"""Comparison of sensors with the Earth's field: identification of faults, and false-alarm rate."""
 
 from itertools import combinations
 
@@ -26,7 +26,7 @@ R_WS = np.array([Rotation.from_euler('zyx', angles, True).as_matrix() for angles
 
 
 def correct_fields(rng=None, R_ws=R_WS, std=STD):
-    """Fields (n, 3) [T] of correct sensors; with `rng`, biases and mounting errors are added."""
+    """Fields (n, 3) [T] of correct sensors; `rng` adds random biases and mounting errors."""
     out = np.einsum('jki,k->ji', R_ws, EARTH)
     if rng is not None:
         turns = Rotation.from_rotvec(std * rng.standard_normal((len(R_ws), 3))).as_matrix()
@@ -36,7 +36,7 @@ def correct_fields(rng=None, R_ws=R_WS, std=STD):
 
 
 def explanations_of(fields, R_ws=R_WS, std=STD, earth=EARTH, bias_std=BIAS):
-    """Explanations of each disagreement: {sensor: explanations}."""
+    """Explanations of all disagreements, as {sensor: explanations}."""
     n = len(fields)
     found = disagreements(NAMES[:n], fields, R_ws, np.tile(std, (n, 1)), earth, bias_std)
     return {d.sensor: d.explanations for d in found}
@@ -101,7 +101,7 @@ def test_a_match_in_one_direction_is_not_an_exchange():
 
 @pytest.mark.parametrize('turn', [90.0, 180.0])
 def test_exchanged_sensors_at_right_angles_are_identified(turn):
-    """Most sensors are installed at right angles; two sensors with two flipped axes are rare."""
+    """An exchange is more probable than two flipped axes on both sensors."""
     R_ws = np.array([np.eye(3), rotation_about_z(np.deg2rad(turn)), *R_WS[2:]])
     fields = correct_fields(None, R_ws)
     fields[[0, 1]] = fields[[1, 0]]
@@ -116,7 +116,7 @@ def test_iron_near_a_sensor_has_no_explanation():
     (d,) = disagreements(NAMES, fields, R_WS, np.tile(STD, (4, 1)), EARTH, BIAS)
     assert (d.sensor, d.explanations) == ('b', ())
     assert d.size == pytest.approx(np.sqrt(194.0) * 1e-6, rel=1e-9)
-    assert str(d).startswith("b differs from the Earth's field by 13.9 uT: no change of axes,")
+    assert str(d).startswith("b differs from the Earth's field by 13.9 uT: not explained by")
 
 
 def test_message_contains_the_explanation():
@@ -140,7 +140,7 @@ def test_faults_that_are_not_observable_are_not_reported():
 
 @pytest.mark.parametrize('yaw', [10.0, 30.0, 45.0, 90.0, 180.0])
 def test_an_unknown_heading_is_no_fault(yaw):
-    """The heading is within its std; a flipped vertical axis is still detected."""
+    """The heading error is within its std; a flipped vertical axis is still detected."""
     R_ws, std = np.tile(np.eye(3), (3, 1, 1)), np.deg2rad([0.3, 0.3, 180.0])
     fields = correct_fields(None, R_ws)
     fields[0] = rotation_about_z(np.deg2rad(yaw)).T @ EARTH
@@ -183,7 +183,7 @@ def test_consensus_does_not_need_the_earth_field():
     fields = correct_fields(np.random.default_rng(2))
     fields[1] *= -1.0
     fields[3, 1] = np.nan
-    with pytest.raises(ValueError, match='three sensors that report all axes, but there are 2'):
+    with pytest.raises(ValueError, match='three sensors must report all axes, but only 2 do'):
         consensus(fields[[0, 1, 3]], R_WS[[0, 1, 3]])
     five, R = np.vstack([fields, correct_fields(R_ws=R_WS[:1])]), np.vstack([R_WS, R_WS[:1]])
     # The faulty sensor and the sensor with two axes do not contribute.
@@ -218,7 +218,7 @@ def test_two_faults_are_identified_separately():
 @pytest.mark.parametrize('sensor, axis', [
     (j, a) for j, a in np.argwhere(np.abs(correct_fields()) > 2e-5)])
 def test_a_flipped_axis_is_identified_with_iron_nearby(sensor, axis):
-    """Axes with a small part of the field are not tested: flipping these explains little."""
+    """Axes that measure little of the field are not tested: flipping them changes little."""
     first_explanations = []
     for seed in range(20):
         rng = np.random.default_rng(seed)

@@ -94,7 +94,7 @@ def test_a_missing_axis_stays_missing():
 
 
 def test_stage_decimates_and_propagates_the_covariance():
-    """The covariance of a reading is scaled by the noise gain; duplicates are not filtered."""
+    """The covariance is scaled by the noise gain; duplicate readings do not reach the filter."""
     network = line_network(1)
     stage = Calibrate(network, replace(CalibrateSettings(), {'decimate_to_hz': 20.0}))
     rng = np.random.default_rng(2)

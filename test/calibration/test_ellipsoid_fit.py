@@ -58,8 +58,8 @@ def recordings():
 
 RECORDINGS = [('tumbled', 0.015, 0.31951, [0.148, 0.389, -0.059], 5e-4),
               ('counts', 0.03, 0.09519, [6195.0, 250.0, 3480.0], 0.5)]
-"""Maximum residual, residual before correction, and offset from another program with half of its
-last digit."""
+"""Name, maximum residual, residual before correction, offset from another program, and half a unit
+of the last digit of that offset."""
 
 
 @pytest.mark.parametrize('name, limit, before, offset, digit', RECORDINGS)
@@ -277,27 +277,27 @@ LONG = np.diag([1.0, 1.0, 8.0])
 
 
 @pytest.mark.parametrize('y, reason', [
-    (np.zeros((0, 3)), '^0 readings, minimum 50'),
-    (readings(EVEN[:49]), '^49 readings, minimum 50'),
-    (np.full((100, 3), np.nan), '^0 readings, minimum 50'),
+    (np.zeros((0, 3)), '^0 valid readings, minimum 50'),
+    (readings(EVEN[:49]), '^49 valid readings, minimum 50'),
+    (np.full((100, 3), np.nan), '^0 valid readings, minimum 50'),
     (np.zeros((100, 3)), '^all 100 readings are equal'),
     (readings(np.tile(EVEN[0], (900, 1))), 'a sensor at rest'),
     (readings(RING, 0.0), 'in a plane: relative thickness .* minimum 0.05'),
     (readings(RING), 'in a plane: relative thickness .* minimum 0.05'),
     (readings(0.9 * RING + [0.0, 0.0, np.sqrt(0.19)]),
      'in a plane: relative thickness .* minimum 0.05'),
-    (readings(U[np.abs(U[:, 2]) < 0.3]), r'^coverage 0.00.*, minimum 0.01; .*: none'),
+    (readings(U[np.abs(U[:, 2]) < 0.3]), r'^the coverage is 0.00.*, minimum 0.01; .*: none'),
     (readings(U[U[:, 2] > 0.0]),
-     r'^coverage 0.00.*, minimum 0.01; .*: \+x\+y-z, \+x-y-z, -x\+y-z, -x-y-z$'),
-    (readings(U[U[:, 0] < 0.0], 0.0), r'^coverage 0.00.*, minimum 0.01'),
-    (readings(U[U @ [0.6, 0.0, 0.8] > 0.6], 0.0), r'^coverage .*e-05, minimum 0.01'),
+     r'^the coverage is 0.00.*, minimum 0.01; .*: \+x\+y-z, \+x-y-z, -x\+y-z, -x-y-z$'),
+    (readings(U[U[:, 0] < 0.0], 0.0), r'^the coverage is 0.00.*, minimum 0.01'),
+    (readings(U[U @ [0.6, 0.0, 0.8] > 0.6], 0.0), r'^the coverage is .*e-05, minimum 0.01'),
     (readings(U[U @ [0.6, 0.0, 0.8] > 0.6]),
-     'different directions|differ by a factor|not lie on an ellips'),
+     'readings in .* directions|differ by a factor|not lie on an ellips'),
     (readings(EVEN, correction=LONG), 'ratio of 0.73 to 5.8, maximum 1 to 5'),
     (readings(U) * np.where(np.arange(3000) % 12 == 0, 3.0, 1.0)[:, None],
      'scatter about the ellipsoid is 0.* of the radius, maximum 0.1'),
     (readings(ball(3000)), 'scatter about the ellipsoid is 0.* of the radius, maximum 0.1'),
-    (readings(POSES, 1e-4), '^15 different directions, minimum 18'),
+    (readings(POSES, 1e-4), '^readings in 15 directions, minimum 18'),
     (readings(EVEN) * np.where(np.arange(1500) % 25 == 0, 100.0, 1.0)[:, None],
      'fraction of outliers is 0.96, maximum 0.2')])
 def test_readings_that_cannot_be_fitted_are_rejected(y, reason):
@@ -308,7 +308,7 @@ def test_readings_that_cannot_be_fitted_are_rejected(y, reason):
 
 @pytest.mark.parametrize('seed', range(40))
 def test_an_accepted_fit_is_near_the_truth(seed):
-    """Random parts of the sphere, few readings and large noise."""
+    """The directions cover random parts of the sphere; the readings are few or noisy."""
     rng = np.random.default_rng(seed)
     u = scattered(1200, seed)
     along = u @ scattered(1, seed + 1000)[0]
@@ -336,9 +336,9 @@ def test_least_squares_without_convergence_are_rejected(monkeypatch):
 
 
 @pytest.mark.parametrize('y, warning', [
-    (readings(U[np.abs(U[:, 2]) < 0.5]), 'coverage 0.0.*, recommended at least 0.1'),
-    (readings(U[(U < 0.0).any(axis=1)]), r'few or no readings from \+x\+y\+z$'),
-    (readings(EVEN, 0.08), 'residual 0.0.* after correction, recommended at most 0.05')])
+    (readings(U[np.abs(U[:, 2]) < 0.5]), 'the coverage is 0.0.*, recommended at least 0.1'),
+    (readings(U[(U < 0.0).any(axis=1)]), r'octants with few or no readings: \+x\+y\+z$'),
+    (readings(EVEN, 0.08), 'the residual after correction is 0.0.*, recommended at most 0.05')])
 def test_readings_of_poor_quality_raise_a_warning(y, warning):
     fit = fit_ellipsoid(y)
     assert fit.converged and len(fit.warnings) == 1 and re.match(warning, fit.warnings[0])
@@ -353,8 +353,8 @@ def test_coverage_equals_the_known_values():
 
 
 @pytest.mark.parametrize('y, size, message', [
-    (np.zeros((5, 2)), None, r'expected readings \(n, 3\), got \(5, 2\)'),
-    (np.zeros(3), None, r'expected readings \(n, 3\), got \(3,\)'),
+    (np.zeros((5, 2)), None, r'readings must have the shape \(n, 3\), got \(5, 2\)'),
+    (np.zeros(3), None, r'readings must have the shape \(n, 3\), got \(3,\)'),
     (np.where(np.arange(1500)[:, None] == 7, -np.inf, EVEN), None, 'reading 7 is infinite'),
     (EVEN, 0.0, 'field_magnitude is 0.0, must be positive'),
     (EVEN, -1.0, 'field_magnitude is -1.0, must be positive'),

@@ -95,7 +95,7 @@ def time_reversed(blocks):
 
 @pytest.mark.parametrize('stops', [True, False])
 def test_a_stopping_vehicle_has_arrived_and_a_starting_one_has_departed(stops):
-    """Eighty vehicles of each kind are simulated; the reversed change has the opposite result."""
+    """Eighty vehicles of each kind are simulated; reversed changes never have the same result."""
     verdicts = []
     for seed in range(80):
         begin, end = (0.0, 16.0) if stops else (8.0, 30.0)
@@ -131,7 +131,7 @@ def queue(seed):
 def test_a_queue_or_a_reversing_vehicle_has_not_departed(case):
     """The change is evaluated whenever the latest two seconds are steady.
 
-    One of fifty queues is classified as a departure; the aim is zero.
+    One departure in fifty runs is tolerated; the aim is zero.
     """
     n_departed, n_arrived = 0, 0
     for seed in range(50):
@@ -192,7 +192,7 @@ CLEAR = [seed for seed in range(20) if is_clear(seed)][:4]
 @pytest.mark.parametrize('seed', CLEAR)
 @pytest.mark.parametrize('rate', [100.0, 20.0])
 def test_a_departed_vehicle_is_removed_from_the_background_in_seconds(seed, rate):
-    """The vehicle is then at least 30 m away, and its field is within the noise of one reading.
+    """When it is removed, the vehicle is at least 30 m away, with a field below the noise.
 
     At 20 Hz, with blocks of 0.4 s, the replacement takes a second longer.
     """

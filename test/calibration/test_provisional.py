@@ -1,4 +1,7 @@
-"""Live background without a quiet beginning: provisional or doubtful, and replaced later."""
+"""Background estimation when a recording does not start quietly.
+
+Provisional and doubtful backgrounds, and their replacement.
+"""
 
 import dataclasses
 
@@ -73,7 +76,7 @@ def standing_vehicle(until):
 
 
 def test_a_background_with_a_vehicle_at_the_start_is_doubtful_and_replaced():
-    """The vehicle stands for four seconds; four seconds later, the background is ambiguous."""
+    """The vehicle leaves after 4 s; after another 4 s, either level may be the background."""
     for seconds, is_doubtful, has_departed in ((4.0, False, False), (9.5, True, False),
                                                (24.0, False, True)):
         b = run_on(standing_vehicle(4.0), seconds)
@@ -84,7 +87,7 @@ def test_a_background_with_a_vehicle_at_the_start_is_doubtful_and_replaced():
 
 @pytest.mark.parametrize('stood_s', [4.0, 20.0])
 def test_a_background_with_a_vehicle_before_dense_traffic_is_doubtful_and_replaced(stood_s):
-    """There is no further quiet interval, but the most frequent level changes."""
+    """No quiet interval follows, but the most frequent level changes."""
     vehicles = traffic(2.0, begin=stood_s)
 
     def signal(t):
@@ -110,7 +113,7 @@ def test_a_vehicle_that_stood_in_dense_traffic_is_replaced():
 
 @pytest.mark.parametrize('later', [60.0, 700.0])
 def test_another_stopping_car_is_not_a_former_background(later):
-    """One car parks for 100 s; later another car with 0.6 times its field stops for 5 s."""
+    """A car parks for 100 s; later, another car with 60 % of its field stops for 5 s."""
     def signal(t):
         halts = 120.0 + later
         return np.array([2e-6, 0.0, 1e-6]) * ((20.0 < t < 120.0)

@@ -17,7 +17,7 @@ MS = 1_000_000
 
 
 def sensor_after(fields, interval=10 * MS):
-    """State of a sensor after `fields` (n, 3), (1,) SENSOR."""
+    """State of a sensor, (1,) SENSOR array, after the readings `fields` (n, 3)."""
     sensors = new_sensors(1)
     for k, field in enumerate(fields):
         core.note_step(sensors, k * interval, np.array(field, dtype=float))
@@ -79,7 +79,7 @@ def test_a_rest_counts_as_one_measurement_for_a_limited_time():
 
 @pytest.mark.parametrize('sigma', [0.01, 0.1, 0.2, 0.4, 0.5, 1.0, 3.0])
 def test_mean_of_readings_has_the_predicted_error(sigma):
-    """The mean of `n` readings has the error predicted from noise and steps, over all levels."""
+    """Over many levels, the mean of `n` readings has the error predicted from noise and steps."""
     rng, n, errors, stated = np.random.default_rng(0), 8, [], []
     for level in rng.uniform(-0.5, 0.5, 4000):
         y = np.round(level + sigma * rng.standard_normal((n, 1)))

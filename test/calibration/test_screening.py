@@ -19,7 +19,7 @@ from support.sensor_noise import EARTH, NS, SIGMA, noise
 
 
 def quantised(fields, step):
-    """Fields quantised to steps of `step` noise stds; 0 = not quantised."""
+    """Fields quantised to steps of `step` noise stds; 0 leaves the fields unchanged."""
     return np.round(fields / (step * SIGMA)) * step * SIGMA if step else fields
 
 
@@ -32,7 +32,7 @@ class SpikeScreen:
         self.sensors['is_ready'], self.sensors['noise_std'] = std is not None, std or np.nan
 
     def feed(self, row, stamp, field):
-        """Readings that are decided by this reading: [(index, whether it is a spike)]."""
+        """Screen a reading; return the readings that it decides, as [(index, is spike)]."""
         verdict, out = core.screen_spike(self.sensors, self._threshold, stamp, field), []
         if verdict == SPIKE:
             assert self.sensors['n_held'][0] == len(self._held)
@@ -45,14 +45,14 @@ class SpikeScreen:
         return out + self.flush()
 
     def flush(self):
-        """Release the held readings."""
+        """Release the held readings, and return them as `feed` does."""
         out, self._held = [(r, False) for r in self._held], []
         self.sensors['n_held'] = self.sensors['n_released'] = 0
         return out
 
 
 def screened(fields, rate=100.0, std=SIGMA, threshold=30.0, step=np.inf):
-    """Indices of spikes, maximum number of held readings, and indices of late releases."""
+    """Indices of spikes, maximum number of held readings, and indices of readings released late."""
     spikes, max_held, late, out, f = [], 0, [], 0, SpikeScreen(threshold, std, step)
     for k, field in enumerate(fields):
         decided = f.feed(k, round(k * NS / rate), field)
@@ -338,7 +338,7 @@ def test_old_repetitions_are_forgotten():
 
 
 def test_coarse_steps_are_not_classified_as_stuck():
-    """At rest, a sensor with coarse steps may repeat a reading forever after many changes."""
+    """At rest, a sensor with coarse steps may repeat a reading indefinitely after many changes."""
     rng = np.random.default_rng(0)
     changes = np.eye(3)[rng.integers(0, 3, 4000)] * rng.choice([-1.0, 0.0, 1.0], (4000, 1))
     moving = np.cumsum(changes, axis=0) * 1e-7
@@ -348,7 +348,7 @@ def test_coarse_steps_are_not_classified_as_stuck():
 
 
 def test_a_coarse_sensor_that_starts_in_a_pass_recovers():
-    """After a hundred changes and rests with few changes, the sensor is not stuck permanently."""
+    """The sensor changes a hundred times and then rarely; it is not stuck permanently."""
     moving = np.arange(100.0)[:, None] * np.array([1e-7, 2e-7, -1e-7])
     rest = [np.tile(moving[-1] + (k % 2) * 1e-7, (500, 1)) for k in range(20)]
     rows = np.array(stuck(np.concatenate([moving, *rest])))

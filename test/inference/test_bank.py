@@ -121,7 +121,7 @@ def test_best_is_of_the_heaviest_kind_of_the_heaviest_arrival():
 
 
 def test_best_is_at_the_maximum_of_the_mixture_density():
-    """The best of two distant hypotheses of equal weight is the more certain hypothesis.
+    """Of two distant hypotheses of equal weight, the one with the smaller covariance is the best.
 
     If a covariance is invalid, the heaviest hypothesis is the best.
     """
@@ -172,7 +172,7 @@ def initial_bank(network, earth, offset_std=0.5):
 
 
 def matched_run(rng, network, model, sigma):
-    """NEES per state of the best hypothesis at the end of one simulated, matched run."""
+    """NEES per state of the best hypothesis after one run simulated with the filter's model."""
     earth = model.earth_field
     bank = initial_bank(network, earth)
     row = rng.integers(len(bank))
@@ -200,7 +200,7 @@ def matched_run(rng, network, model, sigma):
 
 
 def test_anees_of_matched_runs_is_near_one():
-    """The states are position and velocity; 200 runs with two sensors at 12.5 Hz."""
+    """The NEES of position and velocity is averaged over 200 runs with two sensors at 12.5 Hz."""
     earth = np.array([2e-6, 1.55e-5, -4.9e-5])
     network = line_network(2, tilt=0.0)
     model = RowVehicle(earth, np.array([0.1, 0.1, 1e-4]), 0.003, n_dipoles=1)

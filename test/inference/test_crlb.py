@@ -27,7 +27,7 @@ NOISE = 1.3e-16
 
 
 def jacobian(m, positions, r0=R0, v0=V0, n_t=60):
-    """Jacobian (n_t, n_sensors, 3, 9) by [r0, v0, m]; the minus is due to the moving source."""
+    """Jacobian (n_t, n_sensors, 3, 9) with respect to [r0, v0, m] of the moving source."""
     t = 0.1 * np.arange(n_t)[:, None, None]
     d = np.asarray(positions) - (np.asarray(r0) + t * np.asarray(v0))
     dB_dd, dB_dm = dipole_jacobians(d, np.asarray(m))
@@ -40,7 +40,7 @@ def unitless(m, positions):
 
 
 def car(positions):
-    """Jacobian of 40 samples of a car by [r0, v0, m, b], with the background b of each sensor."""
+    """Jacobian of 40 samples of a car with respect to [r0, v0, m, b]; b are the backgrounds."""
     H, n = jacobian(CAR[6:], positions, CAR[:3], CAR[3:6], n_t=40), len(positions)
     H_b = np.broadcast_to(np.eye(3 * n).reshape(n, 3, 3 * n), (40, n, 3, 3 * n))
     return np.concatenate([H, H_b], axis=-1)
@@ -74,7 +74,7 @@ def test_observability_of_the_published_example(m, sensors, kernel, smallest, co
 
 
 def test_scaled_observability_does_not_depend_on_units():
-    """With given scales, metres and millimetres, tesla and nanotesla give the same eigenvalues."""
+    """If scales are given, the eigenvalues do not depend on the units of the states."""
     J = information(car(ROAD), NOISE * np.eye(3))
     unit = np.repeat([1e3, 1e3, 1.0, 1e9], [3, 3, 3, 6])
     names = NAMES + list('abcdef')
@@ -103,7 +103,7 @@ def test_known_cpa_range_makes_one_sensor_observable():
 
 
 def test_cpa_information_is_that_of_the_gradient_of_the_range():
-    """Oracle: central differences. TSP14 omits the minus sign."""
+    """The oracle uses central differences; TSP14 omits the minus sign."""
     def cpa_range(x):
         return np.linalg.norm(np.cross(x[:3], x[3:6])) / np.linalg.norm(x[3:6])
 
@@ -226,7 +226,7 @@ def plain_kalman(F, Q, H, C, P):
 
 
 def filter_problem():
-    """Models and Jacobians along the path of a car, states [r, v, m, b]; some axes are missing."""
+    """F, Q, H and P0 along the path of a car, states [r, v, m, b]; some axes are missing."""
     dt, n = 0.1, 40
     F, Q, H = np.eye(15), np.zeros((15, 15)), car(ROAD)
     F[:3, 3:6] = dt * np.eye(3)
@@ -238,7 +238,7 @@ def filter_problem():
 
 
 def relative(P, expected):
-    """Maximum difference in units of the standard deviations."""
+    """Maximum difference of covariances, relative to the products of the standard deviations."""
     std = np.sqrt(np.einsum('...ii->...i', expected))
     return np.abs((P - expected) / (std[..., :, None] * std[..., None, :])).max()
 

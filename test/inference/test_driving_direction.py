@@ -17,7 +17,7 @@ N = 100
 
 
 def signal(distance=1.0, direction=1.0, n=N):
-    """(n, 2) field of the moment (1, 1, 1) on a line from -5 to 5, without mu0 / 4 pi."""
+    """(n, 2) field of the moment (1, 1, 1) moving from -5 to 5, without mu0 / 4 pi."""
     r = np.stack([direction * np.linspace(-5.0, 5.0, n), np.full(n, distance), np.zeros(n)], axis=1)
     size = np.linalg.norm(r, axis=1)[:, None]
     return (3.0 * r * r.sum(axis=1)[:, None] / size**5 - 1.0 / size**3)[:, :2]
@@ -80,7 +80,7 @@ def test_sign_is_that_of_the_direction_for_any_yaw_of_the_sensor():
 
 
 def test_the_published_best_lag_requires_a_distance_of_two_metres():
-    """The best lag is 7 samples at the published distance of 1 m, and the published 15 at 2 m."""
+    """The best lag is 7 samples at the published distance of 1 m; the published 15 fits 2 m."""
     def best(distance):
         h = signal(distance)
         std, lags = noise_for(h, -5.0), list(range(1, 26))

@@ -10,7 +10,7 @@ from mag_tracking.inference.gauss_markov import STRENGTHS, SWITCH_S, GaussMarkov
 
 
 def plain_filter(density, std):
-    """Filter of one component by filterpy."""
+    """Kalman filter of one component, from filterpy."""
     kf = KalmanFilter(dim_x=2, dim_z=1)
     kf.H, kf.P = np.array([[1.0, 0.0]]), np.diag([std**2, density])
     return kf
@@ -106,7 +106,7 @@ def test_densities_stay_finite_over_long_gaps_and_with_little_noise(gap, noise):
 
 
 def test_components_of_zero_strength_are_constant():
-    """One varying and one constant component are measured in combinations; oracle: filterpy."""
+    """Combinations of a varying and a constant component are measured; the oracle is filterpy."""
     rng = np.random.default_rng(5)
     bank = GaussMarkovVectors(1, np.array([0.5, 0.0]), 2.0)
     H = np.array([[1.0, 0.3], [0.2, -1.0]])

@@ -14,7 +14,7 @@ AXES = np.array([3, 3])
 
 
 def run(nis):
-    """`InnovationConsistency` after adding the NIS of frames (n, n_sensors)."""
+    """Return an `InnovationConsistency` to which the NIS (n, n_sensors) of n frames is added."""
     consistency = InnovationConsistency(nis.shape[1])
     for k, row in enumerate(nis):
         consistency.add(row, AXES[:nis.shape[1]], round(k * DT * NS))

@@ -48,7 +48,7 @@ def test_a_vehicle_that_fits_no_class_is_unknown():
 
 
 def test_posteriors_are_calibrated():
-    """For vehicles of the assumed distributions, probabilities equal the rates of success."""
+    """For vehicles from the assumed distributions, probabilities equal the success rates."""
     rng, s = np.random.default_rng(0), SETTINGS
     stated, right = [], []
     for _ in range(4000):

@@ -86,7 +86,7 @@ def test_partial_covariances_and_empty_batches_are_refused():
     rng = np.random.default_rng(0)
     for samples in ([], random_samples(2, True, rng) + random_samples(1, False, rng),
                     random_samples(1, False, rng) + random_samples(2, True, rng)):
-        with pytest.raises(RecordingError, match='covariances of all readings or of none'):
+        with pytest.raises(RecordingError, match='covariances for all readings or for none'):
             readings_dict(batch(samples))
 
 

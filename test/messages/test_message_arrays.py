@@ -84,7 +84,7 @@ def test_no_messages_give_empty_arrays():
 
 
 def test_random_bytes_are_decoded_or_skipped():
-    """Valid beginnings and random bytes cause neither errors nor reads beyond the message."""
+    """Truncated messages with random bytes cause neither errors nor reads beyond a message."""
     rng = np.random.default_rng(3)
     data = [message(k)[:rng.integers(0, 130)] + rng.bytes(int(rng.integers(0, 40)))
             for k in range(2000)]

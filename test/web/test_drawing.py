@@ -103,6 +103,6 @@ def test_measured_and_predicted_fields_match_the_track_log(page, log):
 
 
 def test_weights_of_all_arrivals_sum_to_one(page, log):
-    """The weights in the log equal the weights of the published records."""
+    """For each pose, the log contains the total weight of every arrival."""
     total = [sum(weight for weight, *_ in row.values()) for row in log.arrivals]
     np.testing.assert_allclose(total, 1.0, atol=1e-9)

@@ -1,4 +1,4 @@
-"""Server of the live page: slow and lost viewers, access control and errors."""
+"""Server of the live page: slow and disconnected viewers, access control and errors."""
 
 import json
 import socket
@@ -121,7 +121,7 @@ def test_a_viewer_that_never_reads_is_disconnected(scene, records, monkeypatch):
 
 
 def test_a_scene_larger_than_the_buffer_is_followed_by_rows(scene, server, records):
-    """A new viewer of a long session first reads megabytes, which must not be sent twice."""
+    """A new viewer of a long session first receives megabytes, which must not be sent twice."""
     with reading_viewer(server) as quick:
         stamp = publish(scene, records, records[-1].stamp_ns, 7_900)
         while f'"latest_ns": "{stamp}"' not in quick.recv(60.0):
