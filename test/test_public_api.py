@@ -248,7 +248,7 @@ FIELD, STAMPS = np.zeros((3, 3)), np.arange(3)
     (['a'] * 3, STAMPS, FIELD.astype(str), None, 'field: expected floats, got <U'),
     (['a'] * 3, STAMPS, FIELD, np.eye(3), r'covariance: expected shape \(3, 3, 3\)'),
     (['a', 'b', 'a'], [5, 3, 7], FIELD, None, r'reading 1 \(b\) is 2e-09 s older .* sort'),
-    ('abc', STAMPS, FIELD, None, "one name per reading, got the text 'abc'"),
+    ('abc', STAMPS, FIELD, None, "one name per reading, got the string 'abc'"),
     (['a'] * 3, np.arange(3, dtype=np.uint64) + 2**63, FIELD, None, 'nanoseconds since 1970'),
     (['a'] * 3, np.full(3, -2**63), FIELD, None, 'nanoseconds since 1970'),
 ])
@@ -324,7 +324,7 @@ def test_a_track_has_a_map_a_weights_and_a_field_figure(result):
     assert len(titles) == 3 and all('Track 1' in title for title in titles)
     labels = [line.get_label() for line in result.map_figure(1).axes[0].lines]
     assert {'truth', 'smoothed', 'magnetometers'} <= set(labels)
-    with pytest.raises(mt.UnknownTrackError, match='track 7 is not in the result; tracks in the result: 1'):
+    with pytest.raises(mt.UnknownTrackError, match='track 7 is not in the result; tracks.*: 1'):
         result.map_figure(7)
 
 

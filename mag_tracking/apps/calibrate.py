@@ -155,6 +155,6 @@ def _with_pass_records(network: SensorNetwork, surveyed: SensorNetwork, date: st
     """Return `network` with the calibration records of `surveyed` and the number of passes."""
     passes = quantity(n_tracks, 'pass', 'passes')
     return replace(network, calibrated=tuple(
-        surveyed.calibration_record(j, date, f'as stated; {passes}') if record is None
+        surveyed.calibration_record(j, date, f'nominal orientation; {passes}') if record is None
         else replace(record, date=date, by=f'{record.by}; {passes}')
         for j, record in enumerate(surveyed.calibrated)))

@@ -123,6 +123,6 @@ def _table(found: Calibration) -> Table:
             1e3 * float(network.clock_offset[j]) if has_clock else None,
             1e3 * record.clock_offset_std if record is not None and has_clock else None,
             None if noise is None else 1e9 * float(np.nanmean(noise)),
-            'as stated' if record is None else record.by])
+            'nominal orientation' if record is None else record.by])
     return Table('Sensors', ['sensor', 'tilt [deg]', 'heading [deg]', 'std [deg]',
                              'clock [ms]', 'std [ms]', 'noise [nT]', 'source'], rows)

@@ -130,7 +130,7 @@ def _maps(plan: Plan) -> list[Chart]:
         'hoverinfo': 'x+y+text'}
     gain = 100.0 * (1.0 - plan.with_one_more / plan.without)
     ny, nx = gain.shape
-    charts = [Chart('Position bound of a whole pass', [position, *_site_traces(plan, f)], layout),
+    charts = [Chart('Position bound from a whole pass', [position, *_site_traces(plan, f)], layout),
               Chart('Probability that one frame detects the target', [
                   heat_map(x, y, plan.detection, 'Cividis', 'probability', 0.0, 1.0),
                   *_site_traces(plan, f)], layout)]

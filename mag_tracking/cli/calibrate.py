@@ -134,4 +134,4 @@ def _row(result: Calibration, j: int) -> str:
         clock = f'{1e3 * network.clock_offset[j]:+8.2f} ({1e3 * calibrated.clock_offset_std:.2f})'
     noise_column = ' '.join(f'{1e9 * v:5.1f}' for v in noise) if noise is not None else ' ' * 17
     return (f'{tilt:6.1f}  {heading:+8.1f} {sd:>6s}  {clock:16s}  {noise_column}  '
-            f'{"as stated" if calibrated is None else calibrated.by}')
+            f'{"nominal orientation" if calibrated is None else calibrated.by}')

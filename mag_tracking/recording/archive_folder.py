@@ -20,16 +20,13 @@ from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mag_tracking.errors import OutputError
 from mag_tracking.files import output_folder, replace_text
 from mag_tracking.recording.archive_tables import TABLES
 from mag_tracking.recording.parquet_table import VERSION, TableWriter, import_pyarrow
 from mag_tracking.units import NS
-
-if TYPE_CHECKING:
-    pass
 
 MAX_STEM_BYTES = 100
 """Maximum length of the stem of a recording in `NAME` [bytes]."""

@@ -13,7 +13,7 @@ from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_g
 from mag_tracking.network.file import read_network, write_network
 from support.geometry_command import command, through_calibrate, write_table
 from support.magnet_boards import MOMENT, board, simulated
-from support.real_board import BOX, FOLDER, board_of_41, said, within_limits
+from support.real_board import BOX, FOLDER, board_of_41, print_errors, within_limits
 
 POSITIONS = FOLDER / 'sensor_positions_m.csv'
 
@@ -48,7 +48,7 @@ def test_the_written_network_locates_the_magnet(calibrated):
     angle_error = np.rad2deg([np.arccos(np.clip(p.axis @ a, -1.0, 1.0))
                               for p, a in zip(poses, u, strict=True)])
     is_low = positions[1::2, 2] < 0.1
-    said('by the written file', position_error, angle_error, is_low)
+    print_errors('by the written file', position_error, angle_error, is_low)
     within_limits(position_error, angle_error, is_low)
 
 
