@@ -105,8 +105,8 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
         return MagnetPose(nothing, nothing, np.full((6, 6), np.nan), nothing, np.nan, False,
                           f'number of measured axes is {n_values}; more than {N_UNKNOWNS} are '
                           'required')
-    size2 = np.nansum(np.square(field), axis=1)[:, None]
-    std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * size2)
+    squared_norm = np.nansum(np.square(field), axis=1)[:, None]
+    std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * squared_norm)
     problem = _problem(network, field, std, present, moment, settings.ambient_std)
     starts = _starting_states(network, field, std, present, low, high, settings)
     x, cost, covariance, converged = refine(problem, starts, settings.iterations, 1e-9)

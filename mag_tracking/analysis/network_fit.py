@@ -64,7 +64,7 @@ class Priors(Protocol):
 class GeometryProblem:
     """Least-squares problem of a geometry calibration: readings, priors and predictions.
 
-    Each argument `x` contains `Unknowns` in units of their prior standard deviations.
+    The methods take the unknowns `x` in units of their prior standard deviations; see `Unknowns`.
 
     Parameters
     ----------

@@ -245,7 +245,10 @@ def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: Flo
 def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatArray,
                     axes: FloatArray, moment: float, settings: GeometrySettings,
                     shared_unit: FloatArray, pose_unit: FloatArray) -> NetworkGeometry:
-    """Estimate the geometry of a network with given priors of shared unknowns and poses.
+    """Estimate the geometry of a network from readings of a tracked magnet, with given priors.
+
+    `calibrate_geometry` derives the priors from its settings and describes the first six arguments.
+    The shared unknowns (board pose, magnet alignment, moment) are common to all poses.
 
     Parameters
     ----------
@@ -254,7 +257,6 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
     positions, axes : (K, 3) array, m and unit vectors, tracker frame
     moment : float, A m²
     settings : GeometrySettings
-        This and the arguments above are as for `calibrate_geometry`.
     shared_unit : (12,) array
         Prior standard deviations of the shared unknowns, in the units of `TrackedMagnet.poses`;
         zero fixes an unknown.
@@ -268,7 +270,7 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
     Raises
     ------
     ValueError
-        Under the conditions of `calibrate_geometry`.
+        If an argument is invalid; see `calibrate_geometry`.
     """
     field, positions, axes = (np.asarray(a, dtype=float) for a in (field, positions, axes))
     _check_input(network, field, positions, axes, moment)

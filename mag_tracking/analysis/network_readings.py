@@ -32,10 +32,10 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def tool_rotations(axes: FloatArray) -> FloatArray:
-    """Shortest rotations from the tool frame to the tracker frame.
+    """Minimal rotations from the tool frame to the tracker frame.
 
-    The roll about a tracked axis is unknown. The shortest rotation is correct if the tool is tilted
-    without a twist; otherwise, the components across the axis in the tool frame are meaningless.
+    The roll about a tracked axis is not measured. The minimal rotation is exact if the tool is
+    tilted without roll. Otherwise, vectors in the tool frame are wrong perpendicular to the axis.
 
     Parameters
     ----------

@@ -192,8 +192,8 @@ def separable_problem(data: PassData, model_of: ModelOf, relative_error: float =
     W = data.whitening
     if relative_error > 0.0:
         signal = np.einsum('nij,nj->ni', W, data.departure)
-        size2 = np.einsum('ni,ni->n', signal, signal)
-        W = W / np.sqrt(1.0 + relative_error**2 * size2)[:, None, None]
+        squared_norm = np.einsum('ni,ni->n', signal, signal)
+        W = W / np.sqrt(1.0 + relative_error**2 * squared_norm)[:, None, None]
     model = model_of(data.t, data.positions, W @ data.network.R_sw[data.sensor])
     y = np.einsum('nij,nj->ni', W, np.nan_to_num(data.field)).ravel()
     return SeparableProblem(model, y, background_columns(data, W), prior)

@@ -97,7 +97,7 @@ def _remove_negative_eigenvalues(information: FloatArray) -> FloatArray:
 
 def _track_scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], rotation: FloatArray,
                    covariance: FloatArray) -> FloatArray:
-    """Mean squared normalised difference (n_sensors,) between each track and the fused estimate."""
+    """Chi-square per degree of freedom (n_sensors,) of the tracks' angles about the fused ones."""
     squares, freedom = np.zeros(len(rotation)), np.zeros(len(rotation))
     for gain, pull in zip(gains, pulls, strict=True):
         residual = pull - np.einsum('jik,jk->ji', gain, rotation)

@@ -111,8 +111,8 @@ def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: Flo
     """
     def energy(field: FloatArray) -> FloatArray:
         whitened = np.einsum('nij,nj->ni', data.whitening, field)
-        size2: FloatArray = np.einsum('ni,ni->n', whitened, whitened)
-        return size2
+        squared_norm: FloatArray = np.einsum('ni,ni->n', whitened, whitened)
+        return squared_norm
 
     plausible = sum((_plausible_residual_fraction(data, row) * energy(row.field) for row in rows),
                     np.zeros(len(residuals)))
@@ -168,7 +168,7 @@ def rejection_reason(fit: PassFit) -> str:
 
 
 def trusted(fit: PassFit) -> tuple[str, ...]:
-    """Names of the quantities that a fit determines.
+    """Quantities of a fit whose uncertainty is acceptable.
 
     Parameters
     ----------
@@ -177,8 +177,8 @@ def trusted(fit: PassFit) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        Subset of speed, direction and time (of the CPA). Empty if the model does not explain the
-        field, or if the target turned or hardly moved.
+        Subset of speed, direction and time (of the CPA). Empty for a single-sensor fit, a fit that
+        did not converge, or a pass that was not one target at constant velocity.
     """
     if _invalid_pass_reason(fit) or fit.bearing is not None:
         return ()

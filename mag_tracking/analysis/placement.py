@@ -245,7 +245,7 @@ def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: Pla
     still = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
     ratio = np.empty((len(points), len(DIRECTIONS)))
     for part, h, _ in pass_fields(positions, R_sw, target, still, points, 0.0):
-        size2 = np.einsum('pdksa,pdksa->pds', h, h)
-        ratio[part] = (size2 / (np.square(sampling.noise_std) + allowance**2)).sum(axis=-1)
+        squared_norm = np.einsum('pdksa,pdksa->pds', h, h)
+        ratio[part] = (squared_norm / (np.square(sampling.noise_std) + allowance**2)).sum(axis=-1)
     axes = 3 * len(positions)
     return detection_probability(ratio, energy_threshold(false_alarm, axes), axes)

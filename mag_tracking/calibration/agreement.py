@@ -40,11 +40,11 @@ _AxisChange: TypeAlias = tuple[str, tuple[int, ...], FloatArray]
 
 
 @dataclass(frozen=True)
-class Disagreement:
+class FieldInconsistency:
     """A sensor whose measured field is inconsistent with the Earth's field."""
 
     sensor: str
-    size: float
+    magnitude: float
     """[T] Magnitude of the difference between the measured and the expected field."""
     explanations: tuple[str, ...]
     """The simplest possible explanations; empty if no known fault explains the difference."""
@@ -53,7 +53,7 @@ class Disagreement:
         cause = ' or '.join(self.explanations) or (
             'not explained by swapped or flipped axes, a wrong unit or exchanged sensors; check '
             'for iron or magnets nearby, and check the configured orientation')
-        return (f'{self.sensor} differs from the Earth\'s field by {self.size * 1e6:.3g} uT: '
+        return (f'{self.sensor} differs from the Earth\'s field by {self.magnitude * 1e6:.3g} uT: '
                 f'{cause}')
 
 
@@ -88,7 +88,7 @@ def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
 
 def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
                   orientation_std: FloatArray, earth_field: FloatArray,
-                  bias_std: float) -> list[Disagreement]:
+                  bias_std: float) -> list[FieldInconsistency]:
     """Find the sensors that do not measure the Earth's field.
 
     Parameters
@@ -115,7 +115,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     out = []
     for j in suspects:
         size = np.sqrt(np.nansum((fields[j] - R_ws[j].T @ B0)**2))
-        out.append(Disagreement(names[j], float(size), _explanations(
+        out.append(FieldInconsistency(names[j], float(size), _explanations(
             j, suspects, names, fields, R_ws, orientation_std, B0, bias_std)))
     return out
 

@@ -229,7 +229,7 @@ def _refined_lag(a: _Series, b: _Series, lag: float) -> tuple[float, float]:
 
 def _fitted_lag(a: _Series, b: _Series, lag: float,
                 curve: PchipInterpolator | CubicSpline) -> tuple[float, float]:
-    """Offset and standard deviation [s] with `curve` as the interpolated series."""
+    """Fit `curve`, an interpolation of `a`, to `b`; return the lag and its std [s]."""
     t, s = b
     step = max(_sampling_interval(*a), _sampling_interval(*b))
     first, last = _knock_times(*a)

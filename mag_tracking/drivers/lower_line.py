@@ -1,7 +1,8 @@
-"""Slopes of the line under a set of points, used to estimate the skew of a clock.
+"""Lower convex hull of points, and plausible slopes of its supporting line, for clock skew.
 
 Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network delay
-measurements', IEEE INFOCOM 1999. `device_clock` lists the departures.
+measurements', IEEE INFOCOM 1999. `device_clock` lists the differences
+from this paper.
 """
 
 import itertools

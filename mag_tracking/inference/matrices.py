@@ -159,7 +159,9 @@ def triangular_factor(A: FloatArray) -> FloatArray:
 
 
 def ignoring_overflow() -> AbstractContextManager[None]:
-    """Context that suppresses overflow warnings, because a diverging search has infinite cost.
+    """Context manager that suppresses overflow and invalid-value warnings.
+
+    A diverging search may overflow; its cost is then infinite.
 
     Returns
     -------

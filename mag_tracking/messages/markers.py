@@ -14,9 +14,9 @@ from mag_tracking.messages.schema import header_dict, xyz
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import PoseUncertainty, Track
 
-TRACK_KINDS = ('ellipsoid', 'moment', 'label')
+TRACK_NAMESPACES = ('ellipsoid', 'moment', 'label')
 """Marker namespaces of a track."""
-SENSOR_KINDS = ('sensors', 'sensor_labels')
+SENSOR_NAMESPACES = ('sensors', 'sensor_labels')
 """Marker namespaces of a sensor."""
 LIFETIME_S = 2
 """[s] Lifetime of the markers of a track."""
@@ -66,7 +66,7 @@ def delete_markers(track: Track, frame: str) -> dict[str, Any]:
     dict (visualization_msgs/MarkerArray)
     """
     return {'markers': [_marker(track, frame, kind, _SPHERE, action=_DELETE)
-                        for kind in TRACK_KINDS]}
+                        for kind in TRACK_NAMESPACES]}
 
 
 def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
@@ -85,12 +85,12 @@ def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
     for j, name in enumerate(network.names):
         common = {'header': header_dict(0, network.frame), 'id': j, 'action': _ADD}
         markers.append({
-            **common, 'ns': SENSOR_KINDS[0], 'type': _CUBE, 'color': _GREY,
+            **common, 'ns': SENSOR_NAMESPACES[0], 'type': _CUBE, 'color': _GREY,
             'pose': {'position': xyz(network.positions[j]), 'orientation': _quaternion(
                 network.R_ws[j])}, 'scale': xyz(np.array([1.0, 0.6, 0.2]) * size)})
         above = network.positions[j] + [0.0, 0.0, size]
         markers.append({
-            **common, 'ns': SENSOR_KINDS[1], 'type': _TEXT, 'color': _GREY, 'text': name,
+            **common, 'ns': SENSOR_NAMESPACES[1], 'type': _TEXT, 'color': _GREY, 'text': name,
             'pose': {'position': xyz(above), 'orientation': _UPRIGHT},
             'scale': {'x': 0.0, 'y': 0.0, 'z': size}})
     return {'markers': markers}

@@ -36,10 +36,10 @@ from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.sensor_rounds import SensorRounds
 from mag_tracking.nodes.sensor_transforms import SensorTransforms
 from mag_tracking.nodes.stage_node import (
-    LATCHED,
+    LATCHED_QOS,
     READY,
-    STREAM,
-    STREAM_OUTPUT,
+    STREAM_PUBLISHER_QOS,
+    STREAM_QOS,
     StageNode,
     has_subscribers,
 )
@@ -107,20 +107,20 @@ class CalibrationNode(StageNode):
         self._publishers_by_sensor = {}
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self._publishers_by_sensor[sensor] = self.publisher(
-                MagneticField, f'{topic}_calibrated', STREAM_OUTPUT)
+                MagneticField, f'{topic}_calibrated', STREAM_PUBLISHER_QOS)
             self.subscription(MagneticField, topic, partial(self._receive, sensor), self.input_qos,
                               source='sensors')
         for sensor, imu_topic in zip(self.network.names, self.network.imu_topics, strict=True):
             if imu_topic is not None:
                 self.subscription(Imu, imu_topic, partial(self._receive_acceleration, sensor),
                                   self.input_qos)
-        self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, STREAM_OUTPUT)
-        self.subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM,
+        self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, STREAM_PUBLISHER_QOS)
+        self.subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM_QOS,
                           source='sensors', batches=True)
         if self._next_steps is None:
             self.monitor_subscriber('detection', CALIBRATED_READINGS,
                                     'mag_tracking_msgs/msg/NetworkFrame')
-        self._state = self.publisher(CalibrationState, CALIBRATION_STATE, LATCHED)
+        self._state = self.publisher(CalibrationState, CALIBRATION_STATE, LATCHED_QOS)
         self._tf = SensorTransforms(self) if fixed_parameter(
             self, 'publish_sensor_tf', True, 'Publish static transforms from the world frame to '
             'each sensor.') else None

@@ -20,7 +20,13 @@ from mag_tracking.messages.types import CALIBRATED_READINGS, NETWORK_FRAME, TRAC
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
-from mag_tracking.nodes.stage_node import RESULTS, STREAM, STREAM_OUTPUT, StageNode, has_subscribers
+from mag_tracking.nodes.stage_node import (
+    RESULT_QOS,
+    STREAM_PUBLISHER_QOS,
+    STREAM_QOS,
+    StageNode,
+    has_subscribers,
+)
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.records import Detection, FieldFrame, Readings
@@ -62,10 +68,10 @@ class DetectionNode(StageNode):
         self._event_backlog: list[Readings] = []
         if self._events is not None:
             steady_timer(self, EVENT_INTERVAL_S, self._publish_events)
-        self._event_publisher = self.publisher(PassEventMessage, '~/events', RESULTS)
+        self._event_publisher = self.publisher(PassEventMessage, '~/events', RESULT_QOS)
         self._detect = Detect(self.network, self.settings.detect)
-        self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, STREAM_OUTPUT)
-        self._detections = self.publisher(DetectionMessage, '~/detections', RESULTS)
+        self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, STREAM_PUBLISHER_QOS)
+        self._detections = self.publisher(DetectionMessage, '~/detections', RESULT_QOS)
         if tracker is None:
             self._subscribe()
         else:
@@ -79,8 +85,8 @@ class DetectionNode(StageNode):
         """Subscribe to the calibrated fields and monitor the tracker."""
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self.subscription(MagneticField, f'{topic}_calibrated', partial(self._receive, sensor),
-                              STREAM, source='calibration')
-        self.subscription(FieldReadings, CALIBRATED_READINGS, self._receive_batch, STREAM,
+                              STREAM_QOS, source='calibration')
+        self.subscription(FieldReadings, CALIBRATED_READINGS, self._receive_batch, STREAM_QOS,
                           source='calibration', batches=True)
         self.monitor_subscriber('tracker', NETWORK_FRAME, TRACK_ARRAY)
 

@@ -20,7 +20,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.sensor_graph import missing_publisher, topic_findings
 from mag_tracking.nodes.shutdown import shut_down
-from mag_tracking.nodes.stage_node import SENSORS, STREAM, make_executor, spin
+from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS, make_executor, spin
 from mag_tracking.pipeline import Settings
 from mag_tracking.stages.health.sensor_health import Finding
 
@@ -44,10 +44,11 @@ class DoctorNode(Node):
         self._topics = dict(zip(network.names, map(self.resolve_topic_name, network.topics),
                                 strict=True))
         for sensor, topic in self._topics.items():
-            self.create_subscription(MagneticField, topic, partial(self._receive, sensor), SENSORS)
+            self.create_subscription(MagneticField, topic, partial(self._receive, sensor),
+                                     SENSOR_QOS)
         self._batched_sensors: set[str] = set()
         self._invalid_messages: Counter[str] = Counter()
-        self.create_subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM)
+        self.create_subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM_QOS)
 
     def _receive(self, sensor: str, message: MagneticField) -> None:
         """Pass a reading to the doctor."""

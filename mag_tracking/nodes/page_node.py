@@ -20,12 +20,12 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.frame import frame_of
-from mag_tracking.messages.markers import SENSOR_KINDS
+from mag_tracking.messages.markers import SENSOR_NAMESPACES
 from mag_tracking.messages.types import NETWORK_FRAME
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.shutdown import shut_down
-from mag_tracking.nodes.stage_node import LATCHED, RESULTS, STREAM, make_executor, spin
+from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS, make_executor, spin
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.report.page import ERROR, WARNING, Note, Table
 from mag_tracking.web.live_scene import LiveScene
@@ -85,8 +85,10 @@ class PageNode(Node):
         self._subscribe_to_tracker(self.resolve_topic_name('tracker_node/tracks'))
         # Frames are frequent and large, so only displayed frames are deserialised.
         self._frames_topic = self.resolve_topic_name(NETWORK_FRAME)
-        self.create_subscription(NetworkFrame, NETWORK_FRAME, self._receive_frame, STREAM, raw=True)
-        self.create_subscription(DiagnosticArray, '/diagnostics', self._receive_diagnostics, STREAM)
+        self.create_subscription(NetworkFrame, NETWORK_FRAME, self._receive_frame, STREAM_QOS,
+                                 raw=True)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._receive_diagnostics,
+                                 STREAM_QOS)
         steady_timer(self, TICK_S, self._tick)
         steady_timer(self, 1.0, self._update_health)
 
@@ -97,10 +99,10 @@ class PageNode(Node):
         self._tracks_topic, base = tracks, tracks.rpartition('/')[0]
         self._tracker_subscriptions = [
             self.create_subscription(MarkerArray, f'{base}/sensor_markers', self._receive_sensors,
-                                     LATCHED),
-            self.create_subscription(TrackArray, tracks, self._receive_tracks, STREAM),
+                                     LATCHED_QOS),
+            self.create_subscription(TrackArray, tracks, self._receive_tracks, STREAM_QOS),
             self.create_subscription(SmoothedTrack, f'{base}/smoothed', self._receive_smoothed,
-                                     RESULTS)]
+                                     RESULT_QOS)]
 
     def _find_tracker(self) -> list[str]:
         """Return all track topics in the namespace; if there is only one, follow its tracker."""
@@ -114,8 +116,8 @@ class PageNode(Node):
 
     def _receive_sensors(self, message: MarkerArray) -> None:
         """Store the sensor positions; a different network starts a new scene."""
-        bodies = [m for m in message.markers if m.ns == SENSOR_KINDS[0]]
-        labels = {m.id: m.text for m in message.markers if m.ns == SENSOR_KINDS[1]}
+        bodies = [m for m in message.markers if m.ns == SENSOR_NAMESPACES[0]]
+        labels = {m.id: m.text for m in message.markers if m.ns == SENSOR_NAMESPACES[1]}
         if not bodies or {m.id for m in bodies} - labels.keys():
             return
         layout = SensorLayout(

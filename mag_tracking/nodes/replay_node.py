@@ -30,7 +30,7 @@ from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.managed_node import ManagedNode
 from mag_tracking.nodes.paced_service import paced_service
 from mag_tracking.nodes.ros_params import fixed_parameter
-from mag_tracking.nodes.stage_node import STREAM
+from mag_tracking.nodes.stage_node import STREAM_QOS
 from mag_tracking.recording.reader import Recording
 
 TICK_S = 0.005
@@ -86,7 +86,7 @@ class ReplayNode(ManagedNode):
         self.counts: Counter[str] = Counter()
         self.publishers_by_topic: dict[str, Publisher] = {}
         self._not_installed: set[str] = set()
-        self._clock_publisher = self.create_publisher(Clock, '/clock', STREAM)
+        self._clock_publisher = self.create_publisher(Clock, '/clock', STREAM_QOS)
         self.finished, self._is_active, self._start_time = False, False, 0.0
         self._last_tick: float | None = None
         paced_service(self, Trigger, '~/pause', self._pause)
@@ -205,7 +205,7 @@ class ReplayNode(ManagedNode):
                                           'installed')
             else:
                 self.publishers_by_topic[topic] = self.create_publisher(
-                    cls, self._within_namespace(topic), STREAM)
+                    cls, self._within_namespace(topic), STREAM_QOS)
         return self.publishers_by_topic.get(topic)
 
     def _within_namespace(self, topic: str) -> str:

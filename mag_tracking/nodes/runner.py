@@ -24,7 +24,7 @@ from mag_tracking.nodes.driver_node import DriverNode
 from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.replay_node import ReplayNode
 from mag_tracking.nodes.shutdown import shut_down
-from mag_tracking.nodes.stage_node import STREAM, StageNode, freeze, make_executor, spin
+from mag_tracking.nodes.stage_node import STREAM_QOS, StageNode, freeze, make_executor, spin
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.records import Track
@@ -55,7 +55,7 @@ class TrackPrinter(Node):
         super().__init__('track_printer')
         self._every, self._out = every, out
         self._n = 0
-        self.create_subscription(TrackArray, topic, self._receive, STREAM)
+        self.create_subscription(TrackArray, topic, self._receive, STREAM_QOS)
 
     def _receive(self, message: TrackArray) -> None:
         """Print every `every`-th pose, and the end of each track."""

@@ -6,7 +6,7 @@ from tf2_msgs.msg import TFMessage
 from mag_tracking.messages.standard import sensor_transform_dicts
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.stage_node import LATCHED
+from mag_tracking.nodes.stage_node import LATCHED_QOS
 
 
 class SensorTransforms:
@@ -22,7 +22,7 @@ class SensorTransforms:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._publisher = node.create_publisher(TFMessage, '/tf_static', LATCHED)
+        self._publisher = node.create_publisher(TFMessage, '/tf_static', LATCHED_QOS)
 
     def publish(self, network: SensorNetwork) -> None:
         """Publish the transforms of a network.

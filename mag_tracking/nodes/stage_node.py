@@ -35,23 +35,23 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.records import Readings
 from mag_tracking.stages.stage import Stage
 
-RESULTS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+RESULT_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of results for users."""
-STREAM = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
+STREAM_QOS = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of subscriptions between the nodes, and of the topics of a replay, which may be fast. The
 queue does not overflow while the tracker initiates a track."""
-STREAM_OUTPUT = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
+STREAM_PUBLISHER_QOS = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of publishers between the nodes. A restarted node can skip at most 256 older messages with a
 single request (RTPS 2.3, 8.3.5.5). With a longer history, a second request would follow seconds
 later, and the node would receive nothing until then."""
-SENSORS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+SENSOR_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of subscriptions to sensors; best effort matches reliable and best-effort publishers."""
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
-                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                         durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """QoS of topics whose latest message is sent to late subscribers."""
 
 
-TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+TRANSFORM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of /tf, as in tf2."""
 READY = 'ready'
 """State of a node that has received input and operates normally."""
@@ -108,14 +108,14 @@ class StageNode(Node):
                                    'reliable QoS, for a replay.')
         self.network_path = Path(path).resolve()
         self.title = title_of(self)
-        self.input_qos = STREAM if reliable else SENSORS
+        self.input_qos = STREAM_QOS if reliable else SENSOR_QOS
         self.is_replayed = reliable or self.get_parameter('use_sim_time').value
         self.network = read_network(self.network_path)
         self.settings = declare_settings(self, settings_for(target), group)
         if self.settings.track.target != target:
             raise SettingsError(f'{name}: parameter track.target is {self.settings.track.target!r}'
                                 f', but target is {target!r}; set target only')
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULTS)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULT_QOS)
         self._reported_rejections: dict[tuple[str, str], int] = {}
         self.flows: dict[str, Flow] = {}
         self._subscriber_monitors: list[SubscriberMonitor] = []

@@ -51,11 +51,11 @@ from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import fixed_parameter, follow_changes
 from mag_tracking.nodes.stage_node import (
-    LATCHED,
-    RESULTS,
-    STREAM,
-    STREAM_OUTPUT,
-    TRANSFORMS,
+    LATCHED_QOS,
+    RESULT_QOS,
+    STREAM_PUBLISHER_QOS,
+    STREAM_QOS,
+    TRANSFORM_QOS,
     StageNode,
     has_subscribers,
 )
@@ -100,22 +100,23 @@ class TrackerNode(StageNode):
         self._child_frame = fixed_parameter(
             self, 'child_frame', '', 'Frame of the target in odometry and transforms, for example '
             'for robot_localization. If empty, the frame is track_<id>.')
-        self._tf = self.publisher(TFMessage, '/tf', TRANSFORMS) if fixed_parameter(
+        self._tf = self.publisher(TFMessage, '/tf', TRANSFORM_QOS) if fixed_parameter(
             self, 'publish_tf', False, 'Publish the transform from the world frame to the frame '
             'of the target.') else None
-        self._pose = self.publisher(PoseWithCovarianceStamped, '~/pose', STREAM_OUTPUT)
-        self._odometry = self.publisher(Odometry, '~/odometry', RESULTS)
-        self._tracks = self.publisher(TrackArray, '~/tracks', STREAM_OUTPUT)
-        self._hypotheses = self.publisher(HypothesisArray, '~/hypotheses', STREAM_OUTPUT)
-        self._path_publisher = self.publisher(Path, '~/path', RESULTS)
+        self._pose = self.publisher(PoseWithCovarianceStamped, '~/pose', STREAM_PUBLISHER_QOS)
+        self._odometry = self.publisher(Odometry, '~/odometry', RESULT_QOS)
+        self._tracks = self.publisher(TrackArray, '~/tracks', STREAM_PUBLISHER_QOS)
+        self._hypotheses = self.publisher(HypothesisArray, '~/hypotheses', STREAM_PUBLISHER_QOS)
+        self._path_publisher = self.publisher(Path, '~/path', RESULT_QOS)
         self._smoothed_pose = self.publisher(
-            PoseWithCovarianceStamped, '~/pose_smoothed', STREAM_OUTPUT)
-        self._smoothed = self.publisher(SmoothedTrack, '~/smoothed', RESULTS)
-        self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULTS)
-        self._disturbances = self.publisher(DisturbanceMessage, '~/disturbances', STREAM_OUTPUT)
-        self._markers = self.publisher(MarkerArray, '~/markers', RESULTS)
-        self._detections_3d = self.publisher(Detection3DArray, '~/detections_3d', RESULTS)
-        self._sensor_markers = self.publisher(MarkerArray, '~/sensor_markers', LATCHED)
+            PoseWithCovarianceStamped, '~/pose_smoothed', STREAM_PUBLISHER_QOS)
+        self._smoothed = self.publisher(SmoothedTrack, '~/smoothed', RESULT_QOS)
+        self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULT_QOS)
+        self._disturbances = self.publisher(
+            DisturbanceMessage, '~/disturbances', STREAM_PUBLISHER_QOS)
+        self._markers = self.publisher(MarkerArray, '~/markers', RESULT_QOS)
+        self._detections_3d = self.publisher(Detection3DArray, '~/detections_3d', RESULT_QOS)
+        self._sensor_markers = self.publisher(MarkerArray, '~/sensor_markers', LATCHED_QOS)
         self._sensor_markers.publish(to_message(MarkerArray, sensor_markers(self.network)))
         # Poses of each running track.
         self._paths: dict[int, deque[PoseStamped]] = {}
@@ -125,10 +126,11 @@ class TrackerNode(StageNode):
             self.receive_frame = self.direct_input('detection', [NETWORK_FRAME], self._feed,
                                                    lambda frame: frame.stamp_ns)
         else:
-            self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, STREAM,
+            self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, STREAM_QOS,
                               source='detection')
         steady_timer(self, 0.25, self.end_without_frames)
-        self.subscription(CalibrationState, CALIBRATION_STATE, self._receive_calibration, LATCHED)
+        self.subscription(CalibrationState, CALIBRATION_STATE, self._receive_calibration,
+                          LATCHED_QOS)
         self.report_state()
 
     def stages(self) -> dict[str, Stage[Any, Any]]:

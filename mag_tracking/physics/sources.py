@@ -180,14 +180,14 @@ def _second_order_noise(m: FloatArray, before: FloatArray, after: FloatArray) ->
     from the covariance `before` (n, 3, 3) to the covariance `after` (n, 3, 3) of the rotated
     moment, at most |m|^2.
     """
-    size2 = np.einsum('ni,ni->n', m, m)
+    squared_norm = np.einsum('ni,ni->n', m, m)
     along = np.einsum('ni,nj->nij', m, m)
     # The result for a zero moment is zero because `along` is zero.
-    size2 = np.where(size2 > 0.0, size2, 1.0)
-    across = np.eye(3) - along / size2[:, None, None]
+    squared_norm = np.where(squared_norm > 0.0, squared_norm, 1.0)
+    across = np.eye(3) - along / squared_norm[:, None, None]
 
     def second_moment(P: FloatArray) -> FloatArray:
-        S = across @ P @ across / size2[:, None, None]
+        S = across @ P @ across / squared_norm[:, None, None]
         # The sum of the two variances and the sum of their squares are sufficient.
         moment: FloatArray = 0.25 * (2.0 * np.einsum('nij,nji->n', S, S)
                                      + np.trace(S, axis1=1, axis2=2) ** 2)

@@ -115,7 +115,7 @@ def test_iron_near_a_sensor_has_no_explanation():
     fields[1] += [9e-6, -7e-6, 8e-6]
     (d,) = disagreements(NAMES, fields, R_WS, np.tile(STD, (4, 1)), EARTH, BIAS)
     assert (d.sensor, d.explanations) == ('b', ())
-    assert d.size == pytest.approx(np.sqrt(194.0) * 1e-6, rel=1e-9)
+    assert d.magnitude == pytest.approx(np.sqrt(194.0) * 1e-6, rel=1e-9)
     assert str(d).startswith("b differs from the Earth's field by 13.9 uT: not explained by")
 
 
@@ -123,7 +123,7 @@ def test_message_contains_the_explanation():
     fields = correct_fields()
     fields[0, 2] *= -1.0
     (d,) = disagreements(NAMES, fields, R_WS, np.tile(STD, (4, 1)), EARTH, BIAS)
-    assert str(d) == f"a differs from the Earth's field by {d.size * 1e6:.3g} uT: z is flipped"
+    assert str(d) == f"a differs from the Earth's field by {d.magnitude * 1e6:.3g} uT: z is flipped"
 
 
 def test_faults_that_are_not_observable_are_not_reported():

@@ -338,7 +338,7 @@ def test_old_repetitions_are_forgotten():
 
 
 def test_coarse_steps_are_not_classified_as_stuck():
-    """At rest, a sensor with coarse steps may repeat a reading indefinitely after many changes."""
+    """At rest, a coarse sensor whose reading has changed often may repeat one indefinitely."""
     rng = np.random.default_rng(0)
     changes = np.eye(3)[rng.integers(0, 3, 4000)] * rng.choice([-1.0, 0.0, 1.0], (4000, 1))
     moving = np.cumsum(changes, axis=0) * 1e-7

@@ -8,8 +8,8 @@ import pytest
 from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.messages.markers import (
     LIFETIME_S,
-    SENSOR_KINDS,
-    TRACK_KINDS,
+    SENSOR_NAMESPACES,
+    TRACK_NAMESPACES,
     delete_markers,
     sensor_markers,
     track_markers,
@@ -95,10 +95,10 @@ def test_a_magnet_has_a_class():
 def test_markers_have_a_namespace_per_kind_and_an_id_per_track(tracks):
     track = dataclasses.replace(tracks[False], id=7)
     markers = track_markers(track, 'map')['markers']
-    assert tuple(m['ns'] for m in markers) == TRACK_KINDS
+    assert tuple(m['ns'] for m in markers) == TRACK_NAMESPACES
     assert all(m['id'] == 7 and m['lifetime'] == {'sec': LIFETIME_S} for m in markers)
     gone = delete_markers(track, 'map')['markers']
-    assert [(m['ns'], m['id'], m['action']) for m in gone] == [(k, 7, 2) for k in TRACK_KINDS]
+    assert [(m['ns'], m['id'], m['action']) for m in gone] == [(k, 7, 2) for k in TRACK_NAMESPACES]
     label = markers[2]['text']
     assert label.startswith(f'7 {track.kind} ') and label.endswith(' m/s')
     assert track_markers(tracks[True], 'map')['markers'][2]['text'].endswith(' m/s?')
@@ -119,7 +119,7 @@ def test_sensor_markers_are_at_the_sensor_positions():
     network = line_network(4, spacing=0.02)
     network = dataclasses.replace(network, positions=network.positions * 0.01)
     markers = sensor_markers(network)['markers']
-    assert [m['ns'] for m in markers] == list(SENSOR_KINDS) * 4
+    assert [m['ns'] for m in markers] == list(SENSOR_NAMESPACES) * 4
     assert [m['text'] for m in markers[1::2]] == list(network.names)
     for j, m in enumerate(markers[::2]):
         p = m['pose']['position']

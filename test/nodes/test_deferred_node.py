@@ -10,7 +10,7 @@ from mag_tracking.messages.schema import readings_dict
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.deferred import Deferred
-from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from mag_tracking.records import Readings
 from support.bundled import NETWORK_FILE
 from support.node_processes import start, stop
@@ -47,10 +47,11 @@ def test_every_reading_of_a_message_is_evaluated(ros):
     """The calibration node evaluates the readings after publishing."""
     node, spin_until = ros
     received, statuses, rng, stamps = [], {}, np.random.default_rng(0), []
-    publisher = node.create_publisher(FieldReadings, RAW_READINGS, STREAM)
-    node.create_subscription(FieldReadings, '/field_readings_calibrated', received.append, STREAM)
+    publisher = node.create_publisher(FieldReadings, RAW_READINGS, STREAM_QOS)
+    node.create_subscription(FieldReadings, '/field_readings_calibrated', received.append,
+                             STREAM_QOS)
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: statuses.update(
-        {s.name: {v.key: v.value for v in s.values} for s in m.status}), RESULTS)
+        {s.name: {v.key: v.value for v in s.values} for s in m.status}), RESULT_QOS)
 
     def publish():
         field = EARTH + 1.2e-8 * rng.standard_normal((2, 3))

@@ -11,7 +11,7 @@ from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
 from sensor_msgs.msg import Imu, MagneticField
 
 from mag_tracking.messages.schema import readings_of, stamp_ns
-from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from support.bundled import NETWORK_FILE
 from support.node_processes import MAX_S, call, start, stop
 from support.samples import samples_of
@@ -72,7 +72,7 @@ def board(ros, tmp_path):
         line.pull_out()
 
 
-def listen(node, kind, topic, qos=STREAM):
+def listen(node, kind, topic, qos=STREAM_QOS):
     """Subscribe to a topic; return a list of (arrival [ns], message) that `node` fills."""
     received = []
     node.create_subscription(kind, topic, lambda m: received.append((time.time_ns(), m)), qos)
@@ -97,7 +97,7 @@ def test_a_serial_board_is_published_and_reconnected(board):
     node, spin_until, line, drivers, state = board
     fields = listen(node, MagneticField, '/mag_1/imu/mag')
     accelerations = listen(node, Imu, '/mag_2/imu/data_raw')
-    diagnostics = listen(node, DiagnosticArray, '/diagnostics', RESULTS)
+    diagnostics = listen(node, DiagnosticArray, '/diagnostics', RESULT_QOS)
     process = start('driver_node', '-p', f'drivers:={drivers}', '-p', f'network:={NETWORK_FILE}')
     try:
         # Lines that were sent before the port was opened arrive together when it is opened.
@@ -253,7 +253,7 @@ def test_a_missing_port_is_reported_until_it_appears(board):
     line.pull_out()
     state['plugged'] = False
     fields = listen(node, MagneticField, '/mag_1/imu/mag')
-    diagnostics = listen(node, DiagnosticArray, '/diagnostics', RESULTS)
+    diagnostics = listen(node, DiagnosticArray, '/diagnostics', RESULT_QOS)
     process = start('driver_node', '-p', f'drivers:={drivers}')
     try:
         assert spin_until(lambda: status_of(diagnostics) is not None

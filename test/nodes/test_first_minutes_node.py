@@ -13,7 +13,7 @@ from sensor_msgs.msg import MagneticField
 from mag_tracking.messages.schema import stamp_dict
 from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from support.bundled import NETWORK_FILE
 
 pytestmark = pytest.mark.alone
@@ -49,7 +49,7 @@ class NewUser:
     def connect(self, node, namespace):
         """Advertise the topics in a namespace."""
         self._publishers = [node.create_publisher(
-            MagneticField, f'{namespace}/{self.topic.format(s)}', STREAM) for s in self.sensors]
+            MagneticField, f'{namespace}/{self.topic.format(s)}', STREAM_QOS) for s in self.sensors]
         self._rng = np.random.default_rng(0)
         node.create_timer(0.02, self._publish)
 
@@ -106,7 +106,7 @@ def test_mistakes_of_a_new_user_are_reported_within_seconds(ros, capfd):
                 case = list(CASES)[int(status.name.split('/')[0].removeprefix('case_'))]
                 if CASES[case][1] in status.message:
                     reported.setdefault(case, time.monotonic())
-    node.create_subscription(DiagnosticArray, '/diagnostics', check, RESULTS)
+    node.create_subscription(DiagnosticArray, '/diagnostics', check, RESULT_QOS)
     node.create_timer(0.05, lambda: lags.append(time.monotonic()))
     start_times, nodes = {}, []
     other_process = subprocess.Popen([sys.executable, '-c', OTHER_TYPE_PROGRAM])

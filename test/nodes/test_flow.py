@@ -8,7 +8,7 @@ from sensor_msgs.msg import MagneticField
 
 from mag_tracking.nodes import flow as module
 from mag_tracking.nodes.flow import MAX_LATENCIES, Flow, SubscriberMonitor
-from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from mag_tracking.nodes.tracker_node import TRANSPORT_MARGIN_S, TrackerNode
 from mag_tracking.pipeline import settings_for
 from support.bundled import NETWORK_FILE
@@ -202,8 +202,8 @@ def test_a_node_reports_its_queue_and_latency(ros):
     statuses = {}
     node.create_subscription(
         DiagnosticArray, '/diagnostics',
-        lambda m: statuses.update({s.name: values(s) for s in m.status}), RESULTS)
-    out = node.create_publisher(MagneticField, '/mag_1/imu/mag_calibrated', STREAM)
+        lambda m: statuses.update({s.name: values(s) for s in m.status}), RESULT_QOS)
+    out = node.create_publisher(MagneticField, '/mag_1/imu/mag_calibrated', STREAM_QOS)
     process = start('detection_node', '-p', f'network:={NETWORK_FILE}')
     try:
         assert spin_until(lambda: out.get_subscription_count())

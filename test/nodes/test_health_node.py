@@ -16,7 +16,7 @@ from mag_tracking.nodes import sensor_health
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.doctor_node import DoctorNode
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
-from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
@@ -61,7 +61,7 @@ def publish_until(ros):
         for name in ('mag_1', 'mag_2'):
             if name not in now['silent']:
                 publisher = publishers.setdefault(name, None) or node.create_publisher(
-                    MagneticField, f'/{name}/imu/mag', STREAM)
+                    MagneticField, f'/{name}/imu/mag', STREAM_QOS)
                 publishers[name] = publisher
                 field = EARTH + now[name] + 1.2e-8 * rng.standard_normal(3)
                 sample = MagSample(stamp_ns, name, field)
@@ -84,7 +84,7 @@ def statuses(ros):
     latest = {}
     node.create_subscription(
         DiagnosticArray, '/diagnostics',
-        lambda m: latest.update({s.name: s for s in m.status}), RESULTS)
+        lambda m: latest.update({s.name: s for s in m.status}), RESULT_QOS)
     return latest
 
 
@@ -182,7 +182,7 @@ def test_a_restarted_calibration_restores_its_background(ros, publish_until, tmp
     node, _ = ros
     step, calibrated = 4e-7, []
     node.create_subscription(MagneticField, '/mag_1/imu/mag_calibrated',
-                             lambda m: calibrated.append((time.monotonic(), m)), STREAM)
+                             lambda m: calibrated.append((time.monotonic(), m)), STREAM_QOS)
     first = start('calibration_node', '-p', f'network:={NETWORK_FILE}', home=tmp_path)
     assert publish_until(lambda: len(calibrated) > 100 and [
         p for p in tmp_path.rglob('*.json') if '"mag_1"' in p.read_text()])
@@ -223,7 +223,7 @@ def test_the_doctor_finds_faults_of_a_live_system(ros, publish_until):
         assert publish_until(lambda: health['mag_1'].counts['readings'] > 300, silent=('mag_2',))
         findings = [str(f) for f in doctor.findings() + doctor.doctor.findings()]
         assert any(t.startswith('mag_2: no reading') for t in findings), findings
-        second = node.create_publisher(MagneticField, '/mag_1/imu/mag', RESULTS)
+        second = node.create_publisher(MagneticField, '/mag_1/imu/mag', RESULT_QOS)
         assert spin_until(lambda: len(doctor.get_publishers_info_by_topic('/mag_1/imu/mag')) == 2
                           and len(doctor.get_publishers_info_by_topic('/mag_2/imu/mag')) == 1)
         findings = [str(f) for f in doctor.findings()]

@@ -10,7 +10,7 @@ from visualization_msgs.msg import MarkerArray
 
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.nodes.runner import run
-from mag_tracking.nodes.stage_node import LATCHED, STREAM, TRANSFORMS
+from mag_tracking.nodes.stage_node import LATCHED_QOS, STREAM_QOS, TRANSFORM_QOS
 from mag_tracking.pipeline import settings_for
 from support.bundled import NETWORK_FILE, vehicle_path
 
@@ -25,12 +25,12 @@ class Consumer(Node):
         self.tf, self.static, self.odometry, self.detections, self.markers = [], [], [], [], []
         self.sensors = []
         for kind, topic, received, qos in (
-                (TFMessage, '/tf', self.tf, TRANSFORMS),
-                (TFMessage, '/tf_static', self.static, LATCHED),
-                (Odometry, 'tracker_node/odometry', self.odometry, STREAM),
-                (Detection3DArray, 'tracker_node/detections_3d', self.detections, STREAM),
-                (MarkerArray, 'tracker_node/markers', self.markers, STREAM),
-                (MarkerArray, 'tracker_node/sensor_markers', self.sensors, LATCHED)):
+                (TFMessage, '/tf', self.tf, TRANSFORM_QOS),
+                (TFMessage, '/tf_static', self.static, LATCHED_QOS),
+                (Odometry, 'tracker_node/odometry', self.odometry, STREAM_QOS),
+                (Detection3DArray, 'tracker_node/detections_3d', self.detections, STREAM_QOS),
+                (MarkerArray, 'tracker_node/markers', self.markers, STREAM_QOS),
+                (MarkerArray, 'tracker_node/sensor_markers', self.sensors, LATCHED_QOS)):
             self.create_subscription(kind, topic, received.append, qos)
 
 

@@ -15,7 +15,7 @@ from mag_tracking.apps.replay import replay
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.messages.types import MAGNETIC_FIELD, decode
 from mag_tracking.nodes.convert import track_of
-from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.writer import RecordingWriter
@@ -67,9 +67,9 @@ def test_two_networks_on_one_graph_do_not_interfere(ros, tmp_path, road_network)
     received, statuses = {ns: [] for ns in NETWORKS}, {}
     for namespace, messages in received.items():
         node.create_subscription(TrackArray, f'{namespace}/follower/tracks', messages.append,
-                                 STREAM)
+                                 STREAM_QOS)
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: statuses.update(
-        {s.name: s.message for s in m.status}), RESULTS)
+        {s.name: s.message for s in m.status}), RESULT_QOS)
     processes = [p for ns, (_, remapped) in NETWORKS.items() for p in start_network(ns, remapped)]
     try:
         assert spin_until(lambda: all(
@@ -151,7 +151,7 @@ def test_two_nodes_of_the_same_name_are_reported(ros):
     node, spin_until = ros
     statuses = []
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: statuses.extend(
-        s.message for s in m.status if s.name == 'tracker_node: start'), RESULTS)
+        s.message for s in m.status if s.name == 'tracker_node: start'), RESULT_QOS)
     twins = [start('tracker_node', '-p', f'network:={NETWORK_FILE}') for _ in range(2)]
     try:
         assert spin_until(lambda: any('2 nodes are named /tracker_node' in s for s in statuses))

@@ -33,7 +33,7 @@ MAX_VEHICLES = 5
 
 @pytest.fixture(scope='module')
 def site(tmp_path_factory):
-    """`World` of all tests; each test restores its state except for the link."""
+    """`World` shared by all tests. Each test restores the state of the world, except for `link`."""
     with world(tmp_path_factory.mktemp('world')) as running_world:
         yield running_world
 

@@ -8,7 +8,7 @@ from mag_tracking_msgs.srv import Calibrate
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.stage_node import STREAM
+from mag_tracking.nodes.stage_node import STREAM_QOS
 from support.bundled import NETWORK_FILE
 from support.node_processes import MAX_S, call, start, stop
 
@@ -52,8 +52,9 @@ def test_invalid_messages_are_counted(ros):
     node, spin_until = ros
     diagnostics, calibrated = [], []
     node.create_subscription(DiagnosticArray, '/diagnostics', diagnostics.append, 10)
-    node.create_subscription(MagneticField, '/mag_1/imu/mag_calibrated', calibrated.append, STREAM)
-    publisher = node.create_publisher(MagneticField, '/mag_1/imu/mag', STREAM)
+    node.create_subscription(MagneticField, '/mag_1/imu/mag_calibrated', calibrated.append,
+                             STREAM_QOS)
+    publisher = node.create_publisher(MagneticField, '/mag_1/imu/mag', STREAM_QOS)
     process = start('calibration_node', '-p', f'network:={NETWORK_FILE}',
                     '-p', 'calibrate.learn_s:=0.5', '-p', 'reliable_input:=true')
 
@@ -90,7 +91,7 @@ def test_invalid_frames_are_counted(ros):
     node, spin_until = ros
     diagnostics = []
     node.create_subscription(DiagnosticArray, '/diagnostics', diagnostics.append, 10)
-    publisher = node.create_publisher(NetworkFrame, '/network_frame', STREAM)
+    publisher = node.create_publisher(NetworkFrame, '/network_frame', STREAM_QOS)
     process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
     try:
         assert spin_until(lambda: publisher.get_subscription_count() > 0)

@@ -40,7 +40,7 @@ from mag_tracking.messages.schema import (
 from mag_tracking.network.file import read_network, write_network
 from mag_tracking.nodes.convert import to_message, track_of
 from mag_tracking.nodes.runner import run
-from mag_tracking.nodes.stage_node import LATCHED, RESULTS, STREAM
+from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
@@ -64,19 +64,19 @@ class Collector(Node):
         self.poses, self.tracks, self.hypotheses, self.paths = [], [], [], []
         self.fixed_lag, self.smoothed, self.passages, self.summaries = [], [], [], []
         self.create_subscription(VehiclePassage, '/tracker_node/passages', self.passages.append,
-                                 RESULTS)
+                                 RESULT_QOS)
         self.create_subscription(TrafficSummary, '/tracker_node/traffic', self.summaries.append,
-                                 RESULTS)
+                                 RESULT_QOS)
         self.create_subscription(SmoothedTrack, '/tracker_node/smoothed', self.smoothed.append,
-                                 RESULTS)
-        self.create_subscription(Path, '/tracker_node/path_smoothed', self.paths.append, RESULTS)
+                                 RESULT_QOS)
+        self.create_subscription(Path, '/tracker_node/path_smoothed', self.paths.append, RESULT_QOS)
         self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose_smoothed',
-                                 self.fixed_lag.append, STREAM)
+                                 self.fixed_lag.append, STREAM_QOS)
         self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose',
-                                 self.poses.append, STREAM)
-        self.create_subscription(TrackArray, '/tracker_node/tracks', self.tracks.append, STREAM)
+                                 self.poses.append, STREAM_QOS)
+        self.create_subscription(TrackArray, '/tracker_node/tracks', self.tracks.append, STREAM_QOS)
         self.create_subscription(HypothesisArray, '/tracker_node/hypotheses',
-                                 self.hypotheses.append, STREAM)
+                                 self.hypotheses.append, STREAM_QOS)
 
 
 def compare_with_offline(collector, folder):
@@ -218,14 +218,14 @@ def receive_topics(node):
     received = {kind: [] for kind in topics}
     for kind, topic in topics.items():
         node.create_subscription(kind, topic, received[kind].append,
-                                 LATCHED if kind is CalibrationState else STREAM)
+                                 LATCHED_QOS if kind is CalibrationState else STREAM_QOS)
     return received
 
 
 def play_through_processes(ros, recording, received):
     """Play a recording through one process per node until its track and events have arrived.
 
-    At this rate a `STREAM` queue holds 2.5 s of samples: on a machine four times slower, a node
+    At this rate a `STREAM_QOS` queue holds 2.5 s of samples: on a machine four times slower, a node
     may be busy for more than a second.
     """
     node, spin_until = ros
@@ -280,7 +280,7 @@ def test_nodes_in_four_processes_equal_offline(ros, tmp_path, road_network):
 def test_replay_services_pause_seek_and_resume(ros):
     node, spin_until = ros
     fields = []
-    node.create_subscription(MagneticField, '/mag_1/imu/mag', fields.append, STREAM)
+    node.create_subscription(MagneticField, '/mag_1/imu/mag', fields.append, STREAM_QOS)
     process = start('replay_node', '-p', f'recording:={vehicle_path("straight_car_right")}',
                     '-p', 'topics:=[/mag_1/imu/mag]', '-p', 'start_offset:=4.0', '-p', 'loop:=true',
                     '-p', 'wait_for_subscribers:=300.0')

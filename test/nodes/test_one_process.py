@@ -11,7 +11,7 @@ from sensor_msgs.msg import MagneticField
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.messages.types import NETWORK_FRAME
 from mag_tracking.nodes.runner import make_nodes, run
-from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from mag_tracking.pipeline import settings_for
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 
@@ -24,15 +24,16 @@ class Listener(Node):
     def __init__(self):
         super().__init__('listener')
         self.frames, self.poses, self.fields, self.statuses = [], [], [], {}
-        self.create_subscription(NetworkFrame, NETWORK_FRAME, self.frames.append, STREAM)
+        self.create_subscription(NetworkFrame, NETWORK_FRAME, self.frames.append, STREAM_QOS)
         self.create_subscription(MagneticField, '/mag_1/imu/mag_calibrated', self.fields.append,
-                                 STREAM)
+                                 STREAM_QOS)
         self.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose',
-                                 self.poses.append, STREAM)
+                                 self.poses.append, STREAM_QOS)
         self.n_early = 0
-        self.create_subscription(TrackArray, '/tracker_node/tracks', self._receive_tracks, STREAM)
+        self.create_subscription(TrackArray, '/tracker_node/tracks', self._receive_tracks,
+                                 STREAM_QOS)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._receive_diagnostics,
-                                 RESULTS)
+                                 RESULT_QOS)
 
     def _receive_tracks(self, message):
         """Count tracks that arrive before their frame; viewers draw both together."""

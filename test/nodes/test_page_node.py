@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 from mag_tracking.cli import main
 from mag_tracking.nodes.convert import track_of
-from mag_tracking.nodes.stage_node import STREAM
+from mag_tracking.nodes.stage_node import STREAM_QOS
 from support.browser import Page as Opened
 from support.browser import browser, needs_browser
 from support.bundled import NETWORK_FILE, vehicle_path
@@ -52,7 +52,7 @@ def test_the_page_of_running_nodes_shows_the_values_of_the_topic(ros):
     """The page is opened before the nodes are started and names the missing topic."""
     node, spin_until = ros
     received = []
-    node.create_subscription(TrackArray, '/tracker_node/tracks', received.append, STREAM)
+    node.create_subscription(TrackArray, '/tracker_node/tracks', received.append, STREAM_QOS)
     watch = command('watch', '--port', 0)
     try:
         with browser() as chromium:

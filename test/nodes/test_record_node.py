@@ -15,7 +15,7 @@ from mag_tracking.apps.record import Selection, summary
 from mag_tracking.messages.types import decode
 from mag_tracking.nodes import record_node
 from mag_tracking.nodes.record_node import RecordNode
-from mag_tracking.nodes.stage_node import LATCHED, STREAM
+from mag_tracking.nodes.stage_node import LATCHED_QOS, STREAM_QOS
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.recorder import Recorder
 from support.node_processes import MAX_S
@@ -69,7 +69,7 @@ def test_selected_topics_are_recorded(ros, record):
     imu, names = IMUS[0], {
         FIELDS[0]: MagneticField, FIELDS[0] + '_calibrated': MagneticField, '/other': Header,
         '/tracker_node/pose': PoseStamped, '/_hidden': Header, '/_named': Header}
-    publishers = [node.create_publisher(c, t, STREAM) for t, c in {**names, imu: Imu}.items()]
+    publishers = [node.create_publisher(c, t, STREAM_QOS) for t, c in {**names, imu: Imu}.items()]
     sessions = {
         frozenset({FIELDS[0], imu}): record(Selection(FIELDS, IMUS)),
         frozenset({FIELDS[0], imu, '/other', '/_named'}): record(
@@ -119,7 +119,7 @@ def test_messages_lost_in_the_queue_are_counted(ros, record, monkeypatch):
     # Sequence numbers restart before the change of publishers is discovered.
     before, n = session.node.lost, session.recorder.counts[FIELDS[0]]
     node.destroy_publisher(publisher)
-    publisher = node.create_publisher(MagneticField, FIELDS[0], STREAM)
+    publisher = node.create_publisher(MagneticField, FIELDS[0], STREAM_QOS)
     end = time.monotonic() + MAX_S
     while session.recorder.counts[FIELDS[0]] == n and time.monotonic() < end:
         publish(1)
@@ -140,14 +140,14 @@ def test_a_restarted_or_second_publisher_is_no_loss(ros, record):
     session = record(Selection(FIELDS[:1]))
     total = 0
     for _ in range(2):
-        publisher = node.create_publisher(MagneticField, FIELDS[0], STREAM)
+        publisher = node.create_publisher(MagneticField, FIELDS[0], STREAM_QOS)
         assert session.until(publisher.get_subscription_count)
         for _ in range(20):
             publisher.publish(MagneticField())
         total += 20
         assert session.until(lambda: session.recorder.counts[FIELDS[0]] == total)  # noqa: B023
         node.destroy_publisher(publisher)
-    publishers = [node.create_publisher(MagneticField, FIELDS[0], STREAM) for _ in range(2)]
+    publishers = [node.create_publisher(MagneticField, FIELDS[0], STREAM_QOS) for _ in range(2)]
     assert session.until(lambda: all(p.get_subscription_count() for p in publishers)
                          and node.count_publishers(FIELDS[0]) == 2)
     for k in range(40):
@@ -161,7 +161,7 @@ def test_a_restarted_or_second_publisher_is_no_loss(ros, record):
 
 def test_each_file_begins_with_the_last_latched_message(ros, record):
     node, _ = ros
-    early = node.create_publisher(Header, '/calibration_state', LATCHED)
+    early = node.create_publisher(Header, '/calibration_state', LATCHED_QOS)
     early.publish(Header(frame_id='early'))
     session = record(Selection((), results=True), split_bytes=2000)
     topic = '/calibration_state'
@@ -191,7 +191,7 @@ def test_other_types_are_reported(record):
     context = rclpy.Context()
     context.init()
     node = Node('stranger', context=context)
-    node.create_publisher(Header, FIELDS[0], STREAM)
+    node.create_publisher(Header, FIELDS[0], STREAM_QOS)
     try:
         session = record(Selection(FIELDS[:1]))
         assert session.until(lambda: session.reports)

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 from mag_tracking.apps.replay import replay
 from mag_tracking.messages.types import decode
 from mag_tracking.nodes import record_node
-from mag_tracking.nodes.stage_node import STREAM
+from mag_tracking.nodes.stage_node import STREAM_QOS
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.repair import repair
@@ -121,7 +121,7 @@ def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):
     node, spin_until = ros
     before = set(os.listdir('/dev/shm'))
     send_times = []
-    publisher = node.create_publisher(MagneticField, FIELDS[0], STREAM)
+    publisher = node.create_publisher(MagneticField, FIELDS[0], STREAM_QOS)
 
     def publish():
         message = MagneticField()

@@ -8,7 +8,7 @@ from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.messages.schema import stamp_ns
-from mag_tracking.nodes.stage_node import STREAM
+from mag_tracking.nodes.stage_node import STREAM_QOS
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.node_processes import call, start, stop
 
@@ -21,7 +21,7 @@ ROS = ('/**:\n  ros__parameters:\n    detect:\n      onset_frames: 4\n'
 def test_lifecycle_transitions_start_and_stop_playback(ros):
     node, spin_until = ros
     fields = []
-    node.create_subscription(MagneticField, '/mag_1/imu/mag', fields.append, STREAM)
+    node.create_subscription(MagneticField, '/mag_1/imu/mag', fields.append, STREAM_QOS)
     process = start('replay_node', '-p', 'autostart:=false', '-p', f'recording:={RECORDING}',
                     '-p', 'start_delay:=0.0')
 

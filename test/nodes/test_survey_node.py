@@ -7,7 +7,7 @@ from mag_tracking_msgs.srv import Survey
 from mag_tracking.apps.calibrate import calibrate
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import track_of
-from mag_tracking.nodes.stage_node import LATCHED, STREAM
+from mag_tracking.nodes.stage_node import LATCHED_QOS, STREAM_QOS
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from support.bundled import NETWORK_FILE, vehicle_path
@@ -26,8 +26,8 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
     node, spin_until = ros
     states, tracks = [], []
     node.create_subscription(CalibrationState, '/calibration_state', states.append,
-                             LATCHED)
-    node.create_subscription(TrackArray, '/tracker_node/tracks', tracks.append, STREAM)
+                             LATCHED_QOS)
+    node.create_subscription(TrackArray, '/tracker_node/tracks', tracks.append, STREAM_QOS)
     # The result is saved next to the network file.
     saved, network_file = tmp_path / 'surveyed.yaml', tmp_path / 'network.yaml'
     network_file.write_text(NETWORK_FILE.read_text())
@@ -70,7 +70,7 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
 
 def test_a_calibration_of_other_sensors_is_refused(ros):
     node, spin_until = ros
-    publisher = node.create_publisher(CalibrationState, '/calibration_state', LATCHED)
+    publisher = node.create_publisher(CalibrationState, '/calibration_state', LATCHED_QOS)
     process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
     try:
         assert spin_until(lambda: publisher.get_subscription_count() > 0)

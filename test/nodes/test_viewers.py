@@ -13,7 +13,7 @@ from tf2_msgs.msg import TFMessage
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.runner import run
-from mag_tracking.nodes.stage_node import LATCHED
+from mag_tracking.nodes.stage_node import LATCHED_QOS
 from mag_tracking.pipeline import settings_for
 from support.bundled import NETWORK_FILE, ROOT, vehicle_path
 
@@ -43,7 +43,7 @@ class GraphObserver(Node):
     def __init__(self):
         super().__init__('witness')
         self.types, self.frames = {}, set()
-        self.create_subscription(TFMessage, '/tf_static', self._add_frames, LATCHED)
+        self.create_subscription(TFMessage, '/tf_static', self._add_frames, LATCHED_QOS)
         self.create_timer(0.5, self._add_topics)
 
     def _add_frames(self, message):

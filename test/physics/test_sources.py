@@ -261,10 +261,11 @@ def test_total_moment_and_differences_have_their_own_drift():
     model = EXAMPLES['RowVehicle']
     x = row_state(3, 3.0)
     Q = model.propagate(x, 0.5)[2][0, 6:15, 6:15].reshape(3, 3, 3, 3)
-    size2 = 250.0**2 + 90.0**2 + 60.0**2 + (4.0 / MU0) ** 2 * (EARTH @ EARTH)
-    np.testing.assert_allclose(Q.sum(axis=(0, 2)), 0.1**2 * size2 * 0.5 * np.eye(3), rtol=1e-12)
+    squared_norm = 250.0**2 + 90.0**2 + 60.0**2 + (4.0 / MU0) ** 2 * (EARTH @ EARTH)
+    np.testing.assert_allclose(Q.sum(axis=(0, 2)), 0.1**2 * squared_norm * 0.5 * np.eye(3),
+                               rtol=1e-12)
     between = Q[0, :, 0] - Q[0, :, 1]
-    np.testing.assert_allclose(between, 0.02**2 * size2 * 0.5 * np.eye(3), rtol=1e-9)
+    np.testing.assert_allclose(between, 0.02**2 * squared_norm * 0.5 * np.eye(3), rtol=1e-9)
 
 
 @pytest.mark.parametrize('angle', [0.0, 1e-9, 0.0099, 0.0101, 0.5, 3.0])

@@ -5,7 +5,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from mag_tracking.messages.markers import SENSOR_KINDS, TRACK_KINDS
+from mag_tracking.messages.markers import SENSOR_NAMESPACES, TRACK_NAMESPACES
 
 TOPICS = {'/mag_1/imu/mag_calibrated', '/mag_2/imu/mag_calibrated', '/tf', '/tf_static',
           *(f'/tracker_node/{name}' for name in (
@@ -55,10 +55,10 @@ def test_each_pose_has_its_odometry_transform_and_markers(read):
         assert transform.child_frame_id == 'track_1'
     arrays = [m.markers for _, m in messages['/tracker_node/markers']]
     assert len(arrays) == n + 1
-    assert all([m.ns for m in markers] == list(TRACK_KINDS) for markers in arrays)
+    assert all([m.ns for m in markers] == list(TRACK_NAMESPACES) for markers in arrays)
     assert {m.action for m in arrays[-1]} == {2}
     sensors = messages['/tracker_node/sensor_markers'][0][1].markers
-    assert {m.ns for m in sensors} == set(SENSOR_KINDS)
+    assert {m.ns for m in sensors} == set(SENSOR_NAMESPACES)
 
 
 def test_paths_contain_the_whole_track(read):

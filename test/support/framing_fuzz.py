@@ -169,7 +169,7 @@ def text_framing():
 
 
 def json_frame(rng):
-    """Random line {"id", "n", "t", "mag": {x, y, z}, "acc": [...]} for `json_framing`."""
+    """Random line {"id", "n", "t", "mag", "acc"} for `json_framing`, and its readings."""
     sensor, axes, acceleration = rng.choice('ABC'), _axes(rng, 6e4, 2), _axes(rng, 20.0, 3)
     sequence, ticks = rng.randrange(1 << 32), rng.random() * 1e6
     x, y, z = ('null' if math.isnan(v) else str(v) for v in axes)

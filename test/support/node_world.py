@@ -17,7 +17,7 @@ from sensor_msgs.msg import MagneticField
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.middleware import begin
-from mag_tracking.nodes.stage_node import RESULTS, STREAM, make_executor
+from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS, make_executor
 from mag_tracking.simulation.scenario import point_body
 from support.bundled import NETWORK_FILE, POINT
 from support.mqtt_broker import Broker, password_lines
@@ -91,8 +91,8 @@ class World:
         self._processes, self.heard, self.statuses = {}, {name: [] for name in TOPICS}, []
         self.link = None
         for name, (kind, topic) in TOPICS.items():
-            self._subscribe(kind, topic, STREAM, self.heard[name].append)
-        self._subscribe(DiagnosticArray, '/diagnostics', RESULTS, lambda e: self.statuses.extend(
+            self._subscribe(kind, topic, STREAM_QOS, self.heard[name].append)
+        self._subscribe(DiagnosticArray, '/diagnostics', RESULT_QOS, lambda e: self.statuses.extend(
             (e[0], status) for status in e[1].status))
 
     def _subscribe(self, kind, topic, qos, callback):

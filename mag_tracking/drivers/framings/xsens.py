@@ -246,7 +246,7 @@ class XsensFraming:
         return None
 
     def _cause(self, window: bytes, message: _Message) -> str:
-        """Cause under which a message that cannot be decoded is counted."""
+        """Return the name of the count for a message without a reading."""
         if message.mid == _MTDATA:
             if self._layout is None:
                 return 'MTData messages, although mtdata is none'

@@ -144,7 +144,7 @@ class ClockStepFilter:
                 if latest != NEVER and latest >= self.newest - self._max_jump}
 
     def _majority_follows(self, stamp: int) -> bool:
-        """Whether most active sensors have jumped to within the jump limit of a timestamp."""
+        """Whether the majority of the active sensors hold a sample within the limit of `stamp`."""
         agree = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._max_jump}
         return 2 * len(agree) > len(agree | self._active())
 

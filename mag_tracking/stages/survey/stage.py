@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.agreement import Disagreement, consensus, disagreements
+from mag_tracking.calibration.agreement import FieldInconsistency, consensus, disagreements
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.clock import Lag, knock_lag, shock
 from mag_tracking.calibration.orientation import (
@@ -60,7 +60,7 @@ class NetworkSurvey:
     network: SensorNetwork
     """Network with the surveyed orientations and clock offsets."""
     sensors: tuple[SensorSurvey, ...]
-    disagreements: tuple[Disagreement, ...]
+    disagreements: tuple[FieldInconsistency, ...]
     """Sensors whose field differs from the field of the Earth. Their headings remain as in the
     network file."""
     bias_std: float
@@ -208,7 +208,7 @@ class Survey:
 
     def _disagreements(self, field: FloatArray, level: Sequence[Orientation | None],
                        stated_std: FloatArray, warnings: Mapping[str, list[str]]
-                       ) -> list[Disagreement]:
+                       ) -> list[FieldInconsistency]:
         """Find sensors that disagree with the Earth's field; an empty list if it is unknown."""
         network = self._network
         R = np.array([R if o is None else o.R_ws for o, R in zip(level, network.R_ws, strict=True)])

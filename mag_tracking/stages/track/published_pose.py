@@ -134,11 +134,11 @@ class MagnetOrientation:
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
         """Orientation of one state, as for `VehicleOrientation`."""
         m = x[6:9]
-        size2 = m @ m
+        squared_norm = m @ m
         T = np.zeros((3, len(x)))
         # dm = w x m determines the part of w perpendicular to m: w = m x dm / |m|^2.
-        T[:, 6:9] = cross_matrix(m) / size2
-        along = np.outer(m, m) / size2
+        T[:, 6:9] = cross_matrix(m) / squared_norm
+        along = np.outer(m, m) / squared_norm
         nearest = int(np.argmax(np.abs(self.axis)))
         return (quaternion_between(self.axis, m), T, UNOBSERVED_VARIANCE * along,
                 (nearest == 0, nearest == 1, nearest == 2))

@@ -379,13 +379,13 @@ class RunningTrack:
         return None
 
     def admit(self, joint: JointExplanation, id: int) -> None:
-        """Continue with another explanation of the latest frames.
+        """Replace the hypotheses by a joint explanation of recent frames, and add its new vehicle.
 
         Parameters
         ----------
         joint : JointExplanation
         id : int
-            Identifier of the new member, if there is one.
+            Track identifier of the new vehicle; unused if the explanation adds none.
         """
         begin_ns, now_ns = (joint.window.frames[k].stamp_ns for k in (0, -1))
         n, sensors = self._bank.single_target.n_target, self._bank.sensors
