@@ -183,10 +183,10 @@ def _validated(p: Parameter, value: object) -> Value:
 
 
 def _flattened(mapping: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
-    """Flatten nested mappings to one dict with dotted names."""
+    """Flatten nested mappings to one dict with dotted names; empty mappings remain values."""
     out: dict[str, Any] = {}
     for key, value in mapping.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and value:
             _merge(out, _flattened(value, f'{prefix}{key}.'))
         else:
             _merge(out, {f'{prefix}{key}': value})
@@ -224,6 +224,8 @@ def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
     known = {p.name: p for p in flatten(settings)}
     checked = {}
     for name, value in _flattened(changes).items():
+        if value == {} and any(k.startswith(f'{name}.') for k in known):
+            continue
         if name not in known:
             raise SettingsError(_unknown_message(name, value, known))
         checked[name] = _validated(known[name], value)
@@ -253,7 +255,7 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
         return f'; it was renamed to {renamed}'
     if group and not any(k.startswith(f'{group}.') for k in known):
         return _group_suggestion(group, leaf, known)
-    near = _closest(name, known)
+    near = _closest(name, [*known, *dict.fromkeys(k.partition('.')[0] for k in known)])
     return f'; did you mean {near}?' if near else ''
 
 
@@ -341,7 +343,7 @@ def as_ros_parameters(path: str | PathLike[str]) -> str | None:
         return None
     values = read_parameter_file(path)
     lines = [f'    {name}: {_yaml_value(tuple(v) if isinstance(v, list) else v)}'
-             for name, v in values.items()]
+             for name, v in values.items() if v != {}]
     return '\n'.join(['/**:', '  ros__parameters:', *lines, ''])
 
 
