@@ -22,7 +22,7 @@ from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.runner import pose_line, run
-from mag_tracking.nodes.stage_node import RESULTS, STREAM
+from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from mag_tracking.pipeline import settings_for
 from mag_tracking.report.figures import field_figure, map_figure, weights_figure
 from mag_tracking.report.metrics import interpolate_truth, pass_errors
@@ -48,14 +48,14 @@ class Spectator(Node):
         self.network = network
         self.logs, self.truth, self.smoothed = {}, [], {}
         self._frames, self._hypotheses = {}, {}
-        self.create_subscription(NetworkFrame, '/network_frame', self._on_frame, STREAM)
+        self.create_subscription(NetworkFrame, '/network_frame', self._on_frame, STREAM_QOS)
         self.create_subscription(HypothesisArray, '/tracker_node/hypotheses', self._on_hypotheses,
-                                 STREAM)
-        self.create_subscription(TrackArray, '/tracker_node/tracks', self._on_tracks, STREAM)
+                                 STREAM_QOS)
+        self.create_subscription(TrackArray, '/tracker_node/tracks', self._on_tracks, STREAM_QOS)
         self.create_subscription(SmoothedTrack, '/tracker_node/smoothed', self._on_smoothed,
-                                 RESULTS)
+                                 RESULT_QOS)
         self.create_subscription(PoseStamped, '/ground_truth/vehicle_00/pose', self._on_truth,
-                                 STREAM)
+                                 STREAM_QOS)
 
     def _on_frame(self, message):
         frame = frame_of(message, self.network)

@@ -220,8 +220,7 @@ class FieldFrame:
     stamp_ns: int
     """Mean time of the samples, ns since 1970."""
     field: FloatArray
-    """Mean flux density without the background, (n_sensors, 3) T, sensor frames. NaN for a
-    missing axis."""
+    """Mean flux density without background, (n_sensors, 3) T, sensor frames. NaN if missing."""
     covariance: FloatArray
     """Covariance of `field`, (n_sensors, 3, 3) T², sensor frames. NaN for a missing sensor."""
     n_samples: IntArray
@@ -230,14 +229,12 @@ class FieldFrame:
     """Mean time of each sensor's samples relative to `stamp_ns`, (n_sensors,) s. 0 for a missing
     sensor."""
     target_present: bool = False
-    """Whether the detection stage reports a target, including the hold time. False before that
-    stage."""
+    """Whether a target is detected, including the hold time. False before the detection stage."""
     statistic: float = float('nan')
     """Whitened energy of the frame, chi-square distributed under noise. NaN before the detection
     stage."""
     degrees_of_freedom: int = 0
-    """Degrees of freedom of `statistic`: the number of measured axes. 0 before the detection
-    stage."""
+    """Degrees of freedom of `statistic`, the number of measured axes. 0 before detection."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,8 +256,7 @@ class Detection:
     false_alarm_probability: float
     """Probability that noise alone exceeds `threshold` in a single frame."""
     strongest_sensor: str
-    """Name of the sensor with the largest whitened energy per axis. Empty if no axis was
-    measured."""
+    """Sensor with the largest whitened energy per axis. Empty if no axis was measured."""
 
 
 @dataclass(frozen=True, slots=True)

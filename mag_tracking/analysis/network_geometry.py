@@ -310,7 +310,7 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
 
 def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
                      trust: FloatArray, priors: Unknowns) -> float:
-    """Weighted sum of squared residuals per degree of freedom; NaN if less than one is left."""
+    """Weighted sum of squared residuals per degree of freedom; NaN without a degree of freedom."""
     P, P_pose = NormalEquations(problem, x, predicted, W, priors).covariance()
     e2, count, _ = problem.misfit(predicted[0], predicted[1])
     known = np.append(priors[0].ravel(), priors[1]) @ np.diagonal(P)

@@ -356,7 +356,7 @@ def expected_calibration_error(probability: FloatArray, correct: FloatArray, n_b
     correct : (n,) bool array
         Whether the prediction is correct.
     n_bins : int
-        Number of equal bins of the probability.
+        Number of equal-width bins of the probability.
 
     Returns
     -------

@@ -7,7 +7,7 @@ from mag_tracking.stages.calibrate.stage import CAUSES
 
 
 class RejectionCause(enum.IntEnum):
-    """Cause for which the stage Calibrate rejects readings."""
+    """Reason why the `Calibrate` stage rejects a reading."""
 
     UNKNOWN_SENSOR = core.UNKNOWN_SENSOR
     NO_AXIS = core.NO_AXIS

@@ -170,8 +170,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     step(1)
     # The effect of the additional sensor is evaluated where the lanes are near the network.
     half_length = 0.5 * max(np.ptp(network.positions[:, :2], axis=0).max(), 8.0 * target.height)
-    near = [(lane.heading, lane.points[np.abs(lane.along) <= half_length][::4])
-            for lane in planned]
+    near = [(lane.heading, lane.points[np.abs(lane.along) <= half_length][::4]) for lane in planned]
     coarse_x, coarse_y = _grid(area, max(11, n_grid // 2))
     places = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
     allowed = np.all([_lane_distances(lane, places) >= clearance for lane in planned], axis=0)
@@ -180,8 +179,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     median_bound[allowed] = with_sensor
     step(1)
     best = int(np.nanargmin(median_bound)) if allowed.any() else 0
-    observable, blocks = _closest_point_bounds(network, target, sampling, planned[0],
-                                               half_length)
+    observable, blocks = _closest_point_bounds(network, target, sampling, planned[0], half_length)
     shape = len(coarse_y), len(coarse_x)
     return Plan(
         network, target, sampling, x, y,

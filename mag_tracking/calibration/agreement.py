@@ -161,17 +161,17 @@ def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields:
 
     y = fields[j]
     # Exchanged sensors: both must be suspect, and both must fit after the exchange.
-    found = [f'it is exchanged with {names[i]}' for i in suspects if i != j
-             and fits(y, R_ws[i], orientation_std[i])
-             and fits(fields[i], R_ws[j], orientation_std[j])]
-    found += [f'its unit is {unit}' for unit, scale in UNITS if fits(y / scale)]
-    if found:
-        return tuple(found)
+    explanations = [f'it is exchanged with {names[i]}' for i in suspects if i != j
+                    and fits(y, R_ws[i], orientation_std[i])
+                    and fits(fields[i], R_ws[j], orientation_std[j])]
+    explanations += [f'its unit is {unit}' for unit, scale in UNITS if fits(y / scale)]
+    if explanations:
+        return tuple(explanations)
     for changes in _axis_changes():
-        found = [description for description, order, signs in changes
-                 if fits(signs * y[list(order)])]
-        if found:
-            return tuple(found)
+        explanations = [description for description, order, signs in changes
+                        if fits(signs * y[list(order)])]
+        if explanations:
+            return tuple(explanations)
     return _partial_explanation(y, R_ws[j], orientation_std[j], B0)
 
 

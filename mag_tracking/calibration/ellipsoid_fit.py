@@ -227,7 +227,7 @@ def _validated(readings: FloatArray, field_magnitude: float | None) -> FloatArra
     if infinite.any():
         raise ValueError(f'reading {infinite.argmax()} is infinite: {readings[infinite.argmax()]}')
     if field_magnitude is not None and not 0.0 < field_magnitude < np.inf:
-        raise ValueError(f'field_magnitude is {field_magnitude}, must be positive and finite')
+        raise ValueError(f'field_magnitude must be positive and finite, got {field_magnitude}')
     return readings
 
 

@@ -46,7 +46,7 @@ def add(commands: Commands) -> None:
     p.add_argument('recording', nargs='?', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     p.add_argument('--live', type=float, metavar='SECONDS',
-                   help='examine live topics for this time instead of a recording (needs ROS 2)')
+                   help='examine live topics for SECONDS instead of a recording (needs ROS 2)')
     add_recorded_network(p)
     add_settings(p)
     add_report(p)

@@ -48,7 +48,7 @@ def add(commands: Commands) -> None:
     commands : Commands
     """
     p = add_command(commands, 'listen', _listen, _LISTEN)
-    p.add_argument('drivers', type=Path, metavar='DRIVERS', help='drivers file with the devices')
+    p.add_argument('drivers', type=Path, metavar='DRIVERS', help='file that lists the devices')
     add_network(p, False, 'network file; check that its sensors match the drivers file')
     p.add_argument('--seconds', type=float, default=math.inf, metavar='N',
                    help='exit after N seconds (default: at Ctrl-C)')

@@ -137,7 +137,7 @@ def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
     """Check --fleet and --enrol; return the vehicles to recognise, or None if there are none."""
     if args.enrol is not None:
         if args.fleet is None:
-            raise SettingsError('--enrol: give the fleet file with --fleet')
+            raise SettingsError('--enrol requires a fleet file: add --fleet FILE')
         if args.enrol.strip() in ('', UNKNOWN):
             raise SettingsError(f'--enrol: {args.enrol!r} is not a valid name of a vehicle')
         induction_of(network)
@@ -147,7 +147,7 @@ def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
 
 
 def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetPass]) -> None:
-    """Add passes of the vehicle --enrol to the fleet file."""
+    """Add passes of the vehicle named by --enrol to the fleet file."""
     fleet = read_fleet(args.fleet) if args.fleet.exists() else {}
     fleet[args.enrol] = [*fleet.get(args.enrol, []), *passes]
     # Fleet raises an error before a vehicle that cannot be enrolled is written.

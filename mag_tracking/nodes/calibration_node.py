@@ -37,8 +37,8 @@ from mag_tracking.nodes.sensor_rounds import SensorRounds
 from mag_tracking.nodes.sensor_transforms import SensorTransforms
 from mag_tracking.nodes.stage_node import (
     LATCHED_QOS,
+    PUBLISHER_QOS,
     READY,
-    STREAM_PUBLISHER_QOS,
     STREAM_QOS,
     StageNode,
     has_subscribers,
@@ -107,14 +107,14 @@ class CalibrationNode(StageNode):
         self._publishers_by_sensor = {}
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self._publishers_by_sensor[sensor] = self.publisher(
-                MagneticField, f'{topic}_calibrated', STREAM_PUBLISHER_QOS)
+                MagneticField, f'{topic}_calibrated', PUBLISHER_QOS)
             self.subscription(MagneticField, topic, partial(self._receive, sensor), self.input_qos,
                               source='sensors')
         for sensor, imu_topic in zip(self.network.names, self.network.imu_topics, strict=True):
             if imu_topic is not None:
                 self.subscription(Imu, imu_topic, partial(self._receive_acceleration, sensor),
                                   self.input_qos)
-        self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, STREAM_PUBLISHER_QOS)
+        self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, PUBLISHER_QOS)
         self.subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM_QOS,
                           source='sensors', batches=True)
         if self._next_steps is None:

@@ -21,8 +21,8 @@ from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.stage_node import (
+    PUBLISHER_QOS,
     RESULT_QOS,
-    STREAM_PUBLISHER_QOS,
     STREAM_QOS,
     StageNode,
     has_subscribers,
@@ -70,7 +70,7 @@ class DetectionNode(StageNode):
             steady_timer(self, EVENT_INTERVAL_S, self._publish_events)
         self._event_publisher = self.publisher(PassEventMessage, '~/events', RESULT_QOS)
         self._detect = Detect(self.network, self.settings.detect)
-        self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, STREAM_PUBLISHER_QOS)
+        self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, PUBLISHER_QOS)
         self._detections = self.publisher(DetectionMessage, '~/detections', RESULT_QOS)
         if tracker is None:
             self._subscribe()

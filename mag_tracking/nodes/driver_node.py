@@ -32,7 +32,7 @@ from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.driver_health import DriverDiagnostics
 from mag_tracking.nodes.managed_node import ManagedNode
 from mag_tracking.nodes.ros_params import fixed_parameter
-from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_PUBLISHER_QOS
+from mag_tracking.nodes.stage_node import PUBLISHER_QOS, RESULT_QOS
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.records import AccelerationSample, Readings
 
@@ -59,7 +59,7 @@ class DriverNode(ManagedNode):
         super().__init__('driver_node', **node_arguments)
         self._path = fixed_parameter(self, 'drivers', '', 'Path of the drivers file.')
         self._network_path = fixed_parameter(self, 'network', '', 'Path of the network file.')
-        self._readings = self.create_publisher(FieldReadings, RAW_READINGS, STREAM_PUBLISHER_QOS) \
+        self._readings = self.create_publisher(FieldReadings, RAW_READINGS, PUBLISHER_QOS) \
             if fixed_parameter(self, 'batches', False, 'Publish the readings of many sensors in '
                                'one message (FieldReadings).') else None
         self._drivers: list[Driver] = []
@@ -180,8 +180,8 @@ class DriverNode(ManagedNode):
         if network is not None:
             j = network.names.index(sensor)
             topic, imu_topic = network.topics[j], network.imu_topics[j] or imu_topic
-        return (self.create_publisher(MagneticField, topic, STREAM_PUBLISHER_QOS),
-                self.create_publisher(Imu, imu_topic, STREAM_PUBLISHER_QOS))
+        return (self.create_publisher(MagneticField, topic, PUBLISHER_QOS),
+                self.create_publisher(Imu, imu_topic, PUBLISHER_QOS))
 
     def _publish(self, readings: Readings, accelerations: list[AccelerationSample]) -> None:
         """Publish each reading on its sensor topic, or all in one message if `batches` is set."""

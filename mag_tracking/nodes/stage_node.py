@@ -40,7 +40,7 @@ RESULT_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 STREAM_QOS = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of subscriptions between the nodes, and of the topics of a replay, which may be fast. The
 queue does not overflow while the tracker initiates a track."""
-STREAM_PUBLISHER_QOS = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
+PUBLISHER_QOS = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of publishers between the nodes. A restarted node can skip at most 256 older messages with a
 single request (RTPS 2.3, 8.3.5.5). With a longer history, a second request would follow seconds
 later, and the node would receive nothing until then."""

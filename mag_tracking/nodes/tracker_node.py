@@ -52,8 +52,8 @@ from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import fixed_parameter, follow_changes
 from mag_tracking.nodes.stage_node import (
     LATCHED_QOS,
+    PUBLISHER_QOS,
     RESULT_QOS,
-    STREAM_PUBLISHER_QOS,
     STREAM_QOS,
     TRANSFORM_QOS,
     StageNode,
@@ -103,17 +103,16 @@ class TrackerNode(StageNode):
         self._tf = self.publisher(TFMessage, '/tf', TRANSFORM_QOS) if fixed_parameter(
             self, 'publish_tf', False, 'Publish the transform from the world frame to the frame '
             'of the target.') else None
-        self._pose = self.publisher(PoseWithCovarianceStamped, '~/pose', STREAM_PUBLISHER_QOS)
+        self._pose = self.publisher(PoseWithCovarianceStamped, '~/pose', PUBLISHER_QOS)
         self._odometry = self.publisher(Odometry, '~/odometry', RESULT_QOS)
-        self._tracks = self.publisher(TrackArray, '~/tracks', STREAM_PUBLISHER_QOS)
-        self._hypotheses = self.publisher(HypothesisArray, '~/hypotheses', STREAM_PUBLISHER_QOS)
+        self._tracks = self.publisher(TrackArray, '~/tracks', PUBLISHER_QOS)
+        self._hypotheses = self.publisher(HypothesisArray, '~/hypotheses', PUBLISHER_QOS)
         self._path_publisher = self.publisher(Path, '~/path', RESULT_QOS)
-        self._smoothed_pose = self.publisher(
-            PoseWithCovarianceStamped, '~/pose_smoothed', STREAM_PUBLISHER_QOS)
+        self._smoothed_pose = self.publisher(PoseWithCovarianceStamped, '~/pose_smoothed',
+                                             PUBLISHER_QOS)
         self._smoothed = self.publisher(SmoothedTrack, '~/smoothed', RESULT_QOS)
         self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULT_QOS)
-        self._disturbances = self.publisher(
-            DisturbanceMessage, '~/disturbances', STREAM_PUBLISHER_QOS)
+        self._disturbances = self.publisher(DisturbanceMessage, '~/disturbances', PUBLISHER_QOS)
         self._markers = self.publisher(MarkerArray, '~/markers', RESULT_QOS)
         self._detections_3d = self.publisher(Detection3DArray, '~/detections_3d', RESULT_QOS)
         self._sensor_markers = self.publisher(MarkerArray, '~/sensor_markers', LATCHED_QOS)
@@ -126,8 +125,7 @@ class TrackerNode(StageNode):
             self.receive_frame = self.direct_input('detection', [NETWORK_FRAME], self._feed,
                                                    lambda frame: frame.stamp_ns)
         else:
-            self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, STREAM_QOS,
-                              source='detection')
+            self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, STREAM_QOS, 'detection')
         steady_timer(self, 0.25, self.end_without_frames)
         self.subscription(CalibrationState, CALIBRATION_STATE, self._receive_calibration,
                           LATCHED_QOS)

@@ -7,7 +7,7 @@ from mag_tracking.event_records import VehiclePassage
 from mag_tracking.messages.schema import traffic_summary_dict, vehicle_passage_dict
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
-from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_PUBLISHER_QOS, StageNode
+from mag_tracking.nodes.stage_node import PUBLISHER_QOS, RESULT_QOS, StageNode
 from mag_tracking.stages.traffic.stage import TrackedFrame, Traffic
 
 
@@ -29,7 +29,7 @@ class TrafficTopics:
         self.stage = Traffic(node.network, node.settings.traffic,
                              node.settings.track.target == 'vehicle')
         self._classes, self._frame = node.settings.traffic.class_names, node.network.frame
-        self._passages = node.publisher(VehiclePassageMessage, '~/passages', STREAM_PUBLISHER_QOS)
+        self._passages = node.publisher(VehiclePassageMessage, '~/passages', PUBLISHER_QOS)
         self._summaries = node.publisher(TrafficSummaryMessage, '~/traffic', RESULT_QOS)
 
     def add(self, item: TrackedFrame) -> None:

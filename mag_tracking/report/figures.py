@@ -13,7 +13,7 @@ from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.report.literal_text import literal
-from mag_tracking.report.palette import AXIS_COLOURS, SERIES, VERMILLION
+from mag_tracking.report.palette import AXIS_COLOURS, SERIES_COLOURS, VERMILLION
 from mag_tracking.report.scales import field_unit, scale_of
 from mag_tracking.report.style import legend_beside
 from mag_tracking.report.track_log import TrackLog
@@ -51,7 +51,7 @@ def _ellipse(position: FloatArray, covariance: FloatArray, n: int = 48) -> Float
 def _colours(log: TrackLog) -> dict[str, str]:
     """Assign a colour to each arrival direction, in alphabetical order."""
     names = sorted({name for row in log.arrivals for name in row})
-    return {name: SERIES[i % len(SERIES)] for i, name in enumerate(names)}
+    return {name: SERIES_COLOURS[i % len(SERIES_COLOURS)] for i, name in enumerate(names)}
 
 
 def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.report.figures import SCALE_1D
 from mag_tracking.report.literal_text import literal
-from mag_tracking.report.palette import AXIS_COLOURS, SERIES
+from mag_tracking.report.palette import AXIS_COLOURS, SERIES_COLOURS
 from mag_tracking.report.scales import field_unit
 from mag_tracking.report.style import legend_beside, plain_log_ticks
 
@@ -182,7 +182,7 @@ def order_figure(passes: Sequence[_FittedPass]) -> Figure:
         fits = [f for f in one.fits if len(f.x)]
         if not fits:
             continue
-        colour = SERIES[k % len(SERIES)]
+        colour = SERIES_COLOURS[k % len(SERIES_COLOURS)]
         axes.semilogy([f.n_dipoles for f in fits], [f.normalised_cost for f in fits], 'o-',
                       mfc='w', color=colour, label=literal(f'{one.recording}, {one.label}'))
         if one.chosen is not None:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.report.palette import SERIES
+from mag_tracking.report.palette import SERIES_COLOURS
 
 DASHES = ('solid', 'dash', 'dot', 'dashdot', 'longdash')
 """Dash styles, one for each colour."""
@@ -61,7 +61,7 @@ def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') ->
     -------
     dict
     """
-    colour = SERIES[k % len(SERIES)]
+    colour = SERIES_COLOURS[k % len(SERIES_COLOURS)]
     return {'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y),
             'name': plain(name), 'showlegend': bool(name),
             'line': {'color': colour, 'dash': DASHES[k % len(DASHES)], 'width': 2},

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.report.literal_text import literal
-from mag_tracking.report.palette import SERIES
+from mag_tracking.report.palette import SERIES_COLOURS
 from mag_tracking.report.scales import scale_of
 from mag_tracking.report.style import legend_beside, plain_log_ticks
 
@@ -246,7 +246,7 @@ def lane_figure(plan: _Plan) -> Figure:
     top, middle, bottom = figure.subplots(3, 1)
     f, unit = scale_of(np.ptp(plan.x))
     for k, (name, lane) in enumerate(distinct_lanes(plan.lanes)):
-        colour = SERIES[k % len(SERIES)]
+        colour = SERIES_COLOURS[k % len(SERIES_COLOURS)]
         top.semilogy(f * lane.along, f * lane.filter_std, '-', color=colour,
                      label=f'{name}: filter')
         top.semilogy(f * lane.along, f * lane.pass_std[:, 0], '--', color=colour,

@@ -57,7 +57,7 @@ def test_enrolled_vehicles_are_recognised(recordings, tmp_path, capsys):
 def test_invalid_enrolments_are_reported(recordings, tmp_path, capsys):
     file = tmp_path / 'fleet.json'
     assert command(recordings['van_east'], '--enrol', 'van') == 1
-    assert '--enrol: give the fleet file with --fleet' in capsys.readouterr().err
+    assert '--enrol requires a fleet file: add --fleet FILE' in capsys.readouterr().err
     for name in ('', '  ', UNKNOWN):
         assert command(recordings['van_east'], '--fleet', str(file), '--enrol', name) == 1
         assert f'--enrol: {name!r} is not a valid name' in capsys.readouterr().err

@@ -44,12 +44,12 @@ def run_node(role):
 
     from mag_tracking.interrupts import recorded_signals
     from mag_tracking.nodes.middleware import begin
-    from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
+    from mag_tracking.nodes.stage_node import STREAM_QOS, make_executor, spin
     begin()
     node, executor, count = rclpy.create_node(f'chain_{role}'), make_executor(), [0]
     out = {'last': 'pose', 'second': 'c', 'first': 'b', 'source': 'a'}[role]
     kind = PoseWithCovarianceStamped if role == 'last' else FieldReadings
-    publisher = node.create_publisher(kind, f'/chain/{out}', STREAM)
+    publisher = node.create_publisher(kind, f'/chain/{out}', STREAM_QOS)
 
     def forward(message):
         count[0] += 1
@@ -62,7 +62,7 @@ def run_node(role):
         node.create_timer(1.0 / RATE, lambda: forward(readings(count[0])))
     else:
         source = {'last': 'c', 'second': 'b', 'first': 'a'}[role]
-        node.create_subscription(FieldReadings, f'/chain/{source}', forward, STREAM)
+        node.create_subscription(FieldReadings, f'/chain/{source}', forward, STREAM_QOS)
     executor.add_node(node)
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as seen:
         spin(executor, lambda: bool(seen))
@@ -80,13 +80,13 @@ def main():
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
     from mag_tracking.nodes.middleware import begin
-    from mag_tracking.nodes.stage_node import STREAM, make_executor, spin
+    from mag_tracking.nodes.stage_node import STREAM_QOS, make_executor, spin
     begin()
     node, executor, delays = rclpy.create_node('chain'), make_executor(), []
     executor.add_node(node)
     node.create_subscription(
         PoseWithCovarianceStamped, '/chain/pose', lambda m: delays.append(
-            time.time() - m.header.stamp.sec - m.header.stamp.nanosec / 1e9), STREAM)
+            time.time() - m.header.stamp.sec - m.header.stamp.nanosec / 1e9), STREAM_QOS)
     processes = [subprocess.Popen([sys.executable, __file__, '--role', role]) for role in ROLES]
     try:
         end = time.monotonic() + args.seconds + 5.0

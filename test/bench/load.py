@@ -75,7 +75,7 @@ class PoseMonitor:
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PoseWithCovarianceStamped
 
-        from mag_tracking.nodes.stage_node import STREAM
+        from mag_tracking.nodes.stage_node import STREAM_QOS
         self.delays, self.values, self.warnings, self._initial_losses = [], {}, {}, {}
         # Whether each pose is the first of a track.
         self.begins, self._stamp = [], 0.0
@@ -84,10 +84,10 @@ class PoseMonitor:
         # is later by half a frame and the time between the sensors.
         self._completed_s = PERIOD_S / 2.0 + (1.0 if sequential else 0.5) / RATE
         node.create_subscription(PoseWithCovarianceStamped, '/tracker_node/pose', self._record_pose,
-                                 STREAM)
+                                 STREAM_QOS)
         # Diagnostics are parsed later, so that they do not delay the reception of poses.
         self._type = DiagnosticArray
-        node.create_subscription(DiagnosticArray, '/diagnostics', self._unread.append, STREAM,
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._unread.append, STREAM_QOS,
                                  raw=True)
 
     def _record_pose(self, message):

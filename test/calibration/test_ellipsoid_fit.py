@@ -356,10 +356,10 @@ def test_coverage_equals_the_known_values():
     (np.zeros((5, 2)), None, r'readings must have the shape \(n, 3\), got \(5, 2\)'),
     (np.zeros(3), None, r'readings must have the shape \(n, 3\), got \(3,\)'),
     (np.where(np.arange(1500)[:, None] == 7, -np.inf, EVEN), None, 'reading 7 is infinite'),
-    (EVEN, 0.0, 'field_magnitude is 0.0, must be positive'),
-    (EVEN, -1.0, 'field_magnitude is -1.0, must be positive'),
-    (EVEN, np.nan, 'field_magnitude is nan, must be positive'),
-    (EVEN, np.inf, 'field_magnitude is inf, must be positive')])
+    (EVEN, 0.0, 'field_magnitude must be positive and finite, got 0.0'),
+    (EVEN, -1.0, 'field_magnitude must be positive and finite, got -1.0'),
+    (EVEN, np.nan, 'field_magnitude must be positive and finite, got nan'),
+    (EVEN, np.inf, 'field_magnitude must be positive and finite, got inf')])
 def test_invalid_arguments_raise_value_error(y, size, message):
     with pytest.raises(ValueError, match=message):
         fit_ellipsoid(y, size)

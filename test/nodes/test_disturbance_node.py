@@ -10,7 +10,7 @@ from mag_tracking.event_records import Disturbance
 from mag_tracking.messages.schema import disturbance_dict, readings_dict, stamp_ns
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_PUBLISHER_QOS, STREAM_QOS
+from mag_tracking.nodes.stage_node import PUBLISHER_QOS, RESULT_QOS, STREAM_QOS
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.units import NS
 from support.bundled import NETWORK_FILE
@@ -33,9 +33,9 @@ def test_the_tracker_publishes_the_disturbance_of_a_replay(ros):
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: discovered.update(
         s.name.split(':')[0].strip('/') for s in m.status), RESULT_QOS)
     node.create_subscription(DisturbanceMessage, '/tracker_node/disturbances', messages.append,
-                             STREAM_PUBLISHER_QOS)
+                             PUBLISHER_QOS)
     node.create_subscription(NetworkFrame, '/network_frame', frames.append, STREAM_QOS)
-    publisher = node.create_publisher(FieldReadings, RAW_READINGS, STREAM_PUBLISHER_QOS)
+    publisher = node.create_publisher(FieldReadings, RAW_READINGS, PUBLISHER_QOS)
     processes = [start(name, '-p', f'network:={NETWORK_FILE}') for name in NAMES]
     try:
         assert spin_until(lambda: publisher.get_subscription_count() > 0

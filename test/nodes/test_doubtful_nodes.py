@@ -6,7 +6,7 @@ from mag_tracking_msgs.msg import CalibrationState, FieldReadings, TrackArray
 from mag_tracking.messages.schema import readings_dict
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.nodes.convert import to_message, track_of
-from mag_tracking.nodes.stage_node import LATCHED_QOS, STREAM_PUBLISHER_QOS, STREAM_QOS
+from mag_tracking.nodes.stage_node import LATCHED_QOS, PUBLISHER_QOS, STREAM_QOS
 from mag_tracking.units import NS
 from support.bundled import NETWORK_FILE
 from support.dense_traffic import after_dense_traffic
@@ -24,7 +24,7 @@ def test_nodes_track_and_flag_poses_after_dense_traffic(ros):
     node.create_subscription(CalibrationState, '/calibration_state', states.append,
                              LATCHED_QOS)
     node.create_subscription(TrackArray, '/tracker_node/tracks', tracks.append, STREAM_QOS)
-    publisher = node.create_publisher(FieldReadings, RAW_READINGS, STREAM_PUBLISHER_QOS)
+    publisher = node.create_publisher(FieldReadings, RAW_READINGS, PUBLISHER_QOS)
 
     def publish(part):
         for i in range(0, len(part), 40):

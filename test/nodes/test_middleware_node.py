@@ -12,7 +12,7 @@ from sensor_msgs.msg import MagneticField
 from mag_tracking.nodes import middleware
 from mag_tracking.nodes.driver_node import DriverNode
 from mag_tracking.nodes.runner import make_nodes
-from mag_tracking.nodes.stage_node import STREAM_PUBLISHER_QOS
+from mag_tracking.nodes.stage_node import PUBLISHER_QOS
 from mag_tracking.pipeline import settings_for
 from support.bundled import NETWORK_FILE, ROOT
 from support.node_processes import environment
@@ -85,7 +85,7 @@ def test_a_profile_in_the_working_folder_is_kept(init_calls, tmp_path):
 def test_a_restarted_node_receives_messages_at_once(ros, tmp_path):
     """Without the profile, the delay is often 1 to 4 s."""
     node, spin_until = ros
-    publisher = node.create_publisher(MagneticField, '/field', STREAM_PUBLISHER_QOS)
+    publisher = node.create_publisher(MagneticField, '/field', PUBLISHER_QOS)
     # Fast enough to fill the history for a killed node before the next node starts.
     node.create_timer(0.005, lambda: publisher.publish(MagneticField()))
     waits = []

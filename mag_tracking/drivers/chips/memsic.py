@@ -106,7 +106,7 @@ class Mmc5983ma:
         self._registers.write(self.CONTROL_1, self._bandwidth)
 
     def measure(self) -> Measurement:
-        """Measure a SET/RESET pair, or once if the stored offset is recent enough.
+        """Make one measurement if the stored offset is recent enough, otherwise a SET/RESET pair.
 
         Returns
         -------

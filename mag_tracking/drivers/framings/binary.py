@@ -160,7 +160,7 @@ class BinaryFraming:
         return 0
 
     def _rejection_cause(self, data: bytes, start: int) -> str:
-        """Cause for which the frame at `start` is rejected; empty for a valid frame."""
+        """Reason why the frame at `start` is rejected; empty for a valid frame."""
         # An exception would be too slow, as this is called for every byte that looks like a sync.
         if not data.startswith(self._tail, start + self._checksum_end):
             return 'with a wrong tail'

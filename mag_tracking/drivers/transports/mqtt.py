@@ -49,8 +49,8 @@ class MqttSettings:
     tls: bool = param(
         False, "Whether to encrypt the connection and verify the broker's certificate.")
     ca_file: str = param(
-        '', 'File with the certificates (PEM) of trusted authorities; empty selects the '
-        'certificates of the system.')
+        '', 'PEM file with trusted CA certificates. If it is empty, the system trust store is '
+        'used.')
     client_id: str = param(
         '', 'Client identifier, unique for each connection to the broker; empty selects a random '
         'identifier.')
@@ -73,7 +73,7 @@ class _Certificates(ssl.SSLContext):
     """TLS context with an immediate handshake; unlike in paho, its failure closes the socket."""
 
     def wrap_socket(self, sock: socket.socket, *args: Any, **kwargs: Any) -> ssl.SSLSocket:
-        """Wrap a socket with an immediate handshake."""
+        """Wrap a socket in TLS and perform the handshake immediately."""
         return super().wrap_socket(sock, *args, **(kwargs | {'do_handshake_on_connect': True}))
 
 

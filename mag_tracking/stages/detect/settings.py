@@ -7,7 +7,7 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class DetectSettings:
-    """Settings of thresholds, hold time and background uncertainty of the detection."""
+    """Detection settings: thresholds, hold time and background uncertainty."""
 
     false_alarm_probability: float = param(
         1e-3, 'Probability that a single frame of noise exceeds the threshold. The actual '

@@ -9,12 +9,12 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.relinearisation import Window
 
 NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
-"""Field energy per frame, in units of the noise, below which a target that moves away is removed
+"""Squared norm of the whitened field per frame below which a target that moves away is removed
 from a joint track. The larger limit applies if the track has the maximum number of targets. It is
 also the limit up to which the field of a target does not disturb other targets."""
 
 DETECTABLE_ENERGY = 4.0
-"""Minimum field energy of a detectable target, in units of the noise. For a tracked vehicle, it
+"""Minimum squared norm of the whitened field of a detectable target. For a tracked vehicle, it
 applies to the last frame. For a new vehicle, it applies to the sum over a window at each sensor.
 For a path in a search, it applies to the energy in the window that the prior of the moments
 predicts."""
@@ -22,7 +22,7 @@ predicts."""
 
 def field_energies(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame
                 ) -> FloatArray:
-    """Energy of the field of a target at each sensor, in units of the noise.
+    """Squared norm of the whitened field of a target at each sensor.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def field_energies(bank_filter: BankFilter, target: int, state: FloatArray, fram
 
 def field_energy(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame
                  ) -> float:
-    """Energy of the field of a target at all sensors, in units of the noise.
+    """Squared norm of the whitened field of a target, summed over all sensors.
 
     Parameters
     ----------
