@@ -253,8 +253,15 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
     renamed = f'{group}{dot}{RENAMED_SETTINGS.get(leaf)}'
     if renamed in known:
         return f'; it was renamed to {renamed}'
+    if group in known:
+        return f'; {group} is a single setting'
     if group and not any(k.startswith(f'{group}.') for k in known):
         return _group_suggestion(group, leaf, known)
+    if not group:
+        # A setting without its group.
+        leaves = [k for k in known if k.rpartition('.')[2] == leaf]
+        if leaves:
+            return f'; did you mean {" or ".join(leaves)}?'
     near = _closest(name, [*known, *dict.fromkeys(k.partition('.')[0] for k in known)])
     return f'; did you mean {near}?' if near else ''
 

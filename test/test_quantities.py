@@ -33,7 +33,7 @@ def test_one_vehicle_and_no_vehicles():
 
 def test_one_track():
     result = mt.track(vehicle_path('straight_car_right'), NETWORK_FILE, settings=QUICK)
-    assert repr(result).startswith('TrackingResult(1 track, ') and ' 2 detections' in repr(result)
+    assert repr(result).startswith('TrackingResult(1 track, ') and ' 1 detection)' in repr(result)
 
 
 SUMMARY = {

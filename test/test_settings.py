@@ -51,6 +51,8 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
     ({'trak': {'iteration': 1}}, r'there is no group trak; did you mean track.iterations\?'),
     ({'track.vehicel.x': 1}, r'no group track.vehicel; did you mean track.vehicle\?'),
     ({'foo': {'x': 1}}, 'no group foo; the groups are calibrate, align, detect, events, track, '),
+    ({'relearn_s': 3}, r'unknown setting relearn_s; did you mean calibrate.relearn_s\?'),
+    ({'calibrate.relearn_s': {'x': 3}}, 'calibrate.relearn_s is a single setting'),
     ({'trak': {}}, r'unknown setting trak; did you mean track\?'),
     ({'track': 3}, 'track is a group of settings, such as track.target; .* got 3'),
     ({'track.vehicle': None}, 'track.vehicle is a group of settings, .* a mapping, got nothing'),

@@ -302,8 +302,9 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
         doctor.feed(readings, received_ns)
         if stopped is not None and stopped():
             break
-    damage = [Finding(True, recording.path.name, f'{cause}: {n}', 'the recording is damaged: run '
-                      'mag-tracking repair') for cause, n in recording.losses.items()]
+    damage = [Finding(True, recording.path.name, f'{cause}: {n}', 'the recording is damaged; '
+                      'mag-tracking repair writes a missing index and ends a truncated file, but '
+                      'cannot restore lost data') for cause, n in recording.losses.items()]
     damage += [Finding(False, 'recording', f'{cause}: {n}', 'the recording is damaged, or '
                        'a message type is unsupported') for cause, n in reader.rejected.items()]
     return doctor, damage

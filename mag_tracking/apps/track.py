@@ -92,7 +92,7 @@ class TrackingResult:
             notes.append(f'nothing was detected: {self.no_detection_reason}')
         numbers = (quantity(len(self.tracks), 'track'), quantity(len(self.poses), 'pose'),
                    quantity(len(self.smoothed), 'smoothed pose'),
-                   quantity(len(self.detections), 'detection'))
+                   quantity(int(self.detections['onset'].sum()), 'detection'))
         return (f'TrackingResult({", ".join(numbers)}'
                 + (f'; {"; ".join(notes)}' if notes else '') + ')')
 
@@ -236,7 +236,7 @@ class TrackingResult:
         if track_id is None:
             return next(iter(self.tracks.values()))
         if track_id not in self.tracks:
-            raise UnknownTrackError(f'track {track_id} is not in the result; tracks in the '
+            raise UnknownTrackError(f'track {track_id!r} is not in the result; tracks in the '
                                     f'result: {", ".join(map(str, self.tracks))}')
         return self.tracks[track_id]
 

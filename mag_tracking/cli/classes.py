@@ -25,7 +25,7 @@ from mag_tracking.quantities import quantity
 from mag_tracking.recording.signature_tables import read_model, write_model
 
 _CLASSES = '''
-A single sensor determines neither the size nor the distance of a target. A classifier that was
+A single sensor determines neither the moment nor the distance of a target. A classifier that was
 trained on labelled passes identifies the class of a target by the shape of its field over a pass.
 
 LABELLED is one of:

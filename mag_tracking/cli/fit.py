@@ -252,7 +252,7 @@ def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any
     fits = [p.chosen for p in passes if p.chosen is not None and p.n_vehicles == 1]
     try:
         if not fits:
-            raise ValueError('no pass has an estimate')
+            raise ValueError('no vehicle that passed alone has an estimate')
         if network.earth_field is None:
             raise ValueError('the network file has no earth_field')
         moments, covariances = zip(*(f.moment for f in fits), strict=True)
@@ -266,20 +266,34 @@ def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any
     print(f'hard iron m0 = {hard} A m^2 (forward, left, up); soft iron D = {iron.soft:.3f} '
           f'({std[3]:.3f}) m^3; {quantity(len(fits), "pass", "passes")}, '
           f'normalised cost {iron.normalised_cost:.1f}')
-    for warning in _iron_warnings(iron, len(fits)):
+    warnings = list(iron_warnings(iron, len(fits), std[3]))
+    for warning in warnings:
         print(f'  warning: {warning}')
     return {'hard': iron.hard.tolist(), 'soft': iron.soft, 'std': std.tolist(),
-            'normalised_cost': iron.normalised_cost, 'passes': len(fits)}
+            'normalised_cost': iron.normalised_cost, 'passes': len(fits), 'warnings': warnings}
 
 
-def _iron_warnings(iron: Iron, n_passes: int) -> Iterator[str]:
-    """Reasons not to use hard and soft iron that were estimated from `n_passes` moments."""
+def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
+    """Find reasons not to use an estimate of hard and soft iron.
+
+    Parameters
+    ----------
+    iron : Iron
+    n_passes : int
+        Number of moments from which it was estimated.
+    soft_std : float, m³
+        Standard deviation of the soft iron, including the misfit.
+
+    Yields
+    ------
+    str
+    """
     degrees_of_freedom = 3 * n_passes - 4
     if iron.normalised_cost * degrees_of_freedom > energy_threshold(P_WARNING, degrees_of_freedom):
         yield ('the moments contradict each other; the passes may be of different vehicles, or one '
                'of the fits is wrong')
-    if iron.soft < 0.0:
-        yield 'soft iron is negative, which is impossible; add passes at other headings'
+    if iron.soft < -3.0 * soft_std:
+        yield 'soft iron is negative, which is impossible; check the headings of the fits'
 
 
 def _draw(fitted_pass: FittedPass, out: Path) -> None:

@@ -104,7 +104,7 @@ class StageNode(Node):
             raise SettingsError(f'{name}: parameter network is empty; set it to the path of a '
                                 'network file')
         target = fixed_parameter(self, 'target', 'vehicle', 'Kind of target: vehicle or magnet.')
-        reliable = fixed_parameter(self, 'reliable_input', False, 'Subscribe to the sensors with '
+        reliable = fixed_parameter(self, 'reliable_input', False, 'Subscribe to the inputs with '
                                    'reliable QoS, for a replay.')
         self.network_path = Path(path).resolve()
         self.title = title_of(self)

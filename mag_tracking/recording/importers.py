@@ -20,6 +20,8 @@ from mag_tracking.records import Readings
 _Path: TypeAlias = str | PathLike[str]
 _COLUMNS = ('id', 'timestamp', 'Bx', 'By', 'Bz', 'sensor_x', 'sensor_y', 'sensor_z',
             'sensor_ox', 'sensor_oy', 'sensor_oz', 'm_x', 'm_y', 'm_z', 'm_ox', 'm_oy', 'm_oz')
+MAX_ID, MAX_TIME_S = 1e6, 9e9
+"""Limits of `id` and `timestamp`; nanoseconds since 1970 are 64-bit integers."""
 
 
 def import_pose_table(table: _Path, background: _Path, out: _Path,
@@ -99,8 +101,12 @@ def _read_table(path: _Path) -> dict[str, FloatArray]:
         raise RecordingError(f'{path}: column {missing[0]} is missing')
     a = np.array([[number(path, line, c, row[header.index(c)], True) for c in _COLUMNS]
                   for line, row in rows])
-    if (a[:, 0] != a[:, 0].astype(int)).any():
-        raise RecordingError(f'{path}: column id contains numbers that are not integers')
+    if ((a[:, 0] != np.round(a[:, 0])) | (np.abs(a[:, 0]) > MAX_ID)).any():
+        raise RecordingError(f'{path}: column id contains values that are not integers up to '
+                             f'{MAX_ID:g}')
+    if ((a[:, 1] < 0.0) | (a[:, 1] > MAX_TIME_S)).any():
+        raise RecordingError(f'{path}: column timestamp contains values outside 0 to '
+                             f'{MAX_TIME_S:g} s')
     return {'id': a[:, 0], 'timestamp': a[:, 1], 'field': a[:, 2:5], 'sensor': a[:, 5:8],
             'sensor_rotation': a[:, 8:11], 'magnet': a[:, 11:14], 'magnet_rotation': a[:, 14:17]}
 
@@ -113,6 +119,8 @@ def _read_background(path: _Path) -> FloatArray:
         raise RecordingError(f'cannot read {path}: {error}') from error
     except ValueError as error:
         raise RecordingError(f'{path}: {error}') from error
+    if not np.isfinite(values).all():
+        raise RecordingError(f'{path} contains values that are not finite')
     if values.shape[1] != 3:
         raise RecordingError(f'{path}: expected 3 columns, got {values.shape[1]}')
     return values

@@ -73,6 +73,9 @@ class McapFile:
                 summary = make_reader(stream).get_summary()
             except DECODE_ERRORS:
                 summary = None
+            except OSError:
+                # A file of a few bytes has no valid position of the footer.
+                summary = None
         if summary is None:
             self._losses[f'files without a valid index ({file.name}, possibly truncated)'] = 1
             return None

@@ -259,7 +259,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     # A crash at a split leaves an empty file.
     empty = [file for file in files if file.stat().st_size < len(_MAGIC)]
     if len(empty) == len(files):
-        raise RecordingError(f'{path} contains only empty .mcap files: {len(files)}')
+        raise RecordingError(f'{path}: there is nothing to repair, all .mcap files are empty')
     for file in empty:
         report(f'{file} is empty and was skipped')
     for file in [file for file in files if file not in empty]:

@@ -317,11 +317,15 @@ def _parse_model(content: Any) -> SignatureModel:
 def _parse_entry(name: str, value: Any) -> Any:
     """Convert an entry of a model file to the type of its field; raise ValueError if invalid."""
     if name in ('temperature', 'limit'):
-        expected, is_valid = 'a number', isinstance(value, (int, float))
+        expected = 'a number'
+        is_valid = isinstance(value, (int, float)) and not isinstance(value, bool)
+        # An integer may be too large for a float.
+        value = float(value) if is_valid and abs(value) < 1e300 else float('nan')
     elif name in ('method', 'unit'):
         expected, is_valid = 'a string', isinstance(value, str)
     elif name == 'examples':
-        expected, is_valid = 'a mapping from classes to numbers', isinstance(value, dict)
+        expected = 'a mapping from classes to numbers'
+        is_valid = isinstance(value, dict) and all(isinstance(n, int) for n in value.values())
     elif name in ('classes', 'axes'):
         expected = 'a list of names'
         is_valid = isinstance(value, list) and all(isinstance(v, str) for v in value)
@@ -330,7 +334,7 @@ def _parse_entry(name: str, value: Any) -> Any:
         expected, is_valid = 'a list of numbers', isinstance(value, list)
         try:
             value = np.array(value, dtype=float)
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             is_valid = False
     if not is_valid:
         raise ValueError(f'{name}: expected {expected}')

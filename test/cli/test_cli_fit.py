@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from mag_tracking.cli import main
+from mag_tracking.cli.fit import iron_warnings
+from mag_tracking.inference.iron import Iron
 from support.bundled import NETWORK_FILE
 from support.iron_passes import HARD, SOFT, recorded
 
@@ -51,6 +53,13 @@ def test_passes_of_different_vehicles_cause_a_warning(passes, tmp_path, capsys):
     iron = iron_of(names, {**passes, 'other': other}, tmp_path / 'out')
     assert iron['normalised_cost'] > 10.0
     assert 'warning: the moments contradict each other' in capsys.readouterr().out
+    assert any('contradict' in warning for warning in iron['warnings'])
+
+
+@pytest.mark.parametrize('soft, n', [(-0.29, 0), (-0.31, 1)])
+def test_only_a_significantly_negative_soft_iron_causes_a_warning(soft, n):
+    iron = Iron(np.zeros(3), soft, np.eye(4), np.zeros((2, 3)), 1.0)
+    assert len([w for w in iron_warnings(iron, 2, 0.1) if 'negative' in w]) == n
 
 
 def test_hard_and_soft_iron_are_not_separated_at_a_single_heading(passes, tmp_path, capsys):

@@ -31,7 +31,11 @@ def test_a_pose_table_becomes_a_recording(tmp_path):
     (HEADER + ROW.replace('30', 'x'), '1,2,3\n', "row 2: Bz is 'x', not a number"),
     (HEADER + '1,0.5\n', '1,2,3\n', 'row 2: expected 17 columns, got 2'),
     (HEADER + ROW + ROW.replace('50', 'inf'), '1,2,3\n', 'row 3: m_z is not a finite number'),
-    (HEADER + '1.5' + ROW[1:], '1,2,3\n', 'numbers that are not integers'),
+    (HEADER + '1.5' + ROW[1:], '1,2,3\n', 'id contains values that are not integers'),
+    (HEADER + '1e30' + ROW[1:], '1,2,3\n', 'id contains values that are not integers up to'),
+    (HEADER + ROW.replace('0.5', '-5'), '1,2,3\n', 'timestamp contains values outside'),
+    (HEADER + ROW.replace('0.5', '1e300'), '1,2,3\n', 'timestamp contains values outside'),
+    (HEADER + ROW, '1,2,nan\n', 'values that are not finite'),
     (HEADER + ROW, '1,2\n', 'background.csv: expected 3 columns, got 2'),
     (HEADER + ROW, '1,2,3\n4,5,6\n', r'numbers of sensors: .*background.csv has 2, .* has 1$')])
 def test_an_invalid_pose_table_is_refused(tmp_path, table, background, message):

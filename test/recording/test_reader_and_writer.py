@@ -127,6 +127,15 @@ def test_every_field_of_a_track_is_written(vehicle_replays):
     assert all(f"'{name}'" in source for name in names)
 
 
+@pytest.mark.parametrize('n_bytes', [9, 17, 40])
+def test_a_file_of_a_few_bytes_is_reported_as_truncated(n_bytes, tmp_path):
+    path = tmp_path / 'cut.mcap'
+    path.write_bytes(vehicle_path('straight_car_right').read_bytes()[:n_bytes])
+    recording = Recording(path)
+    assert list(recording.messages()) == []
+    assert any('possibly truncated' in cause for cause in recording.losses)
+
+
 def test_a_truncated_file_is_read_up_to_its_end(tmp_path):
     path = tmp_path / 'cut.mcap'
     write(tmp_path / 'a.mcap', 15_000)

@@ -22,13 +22,15 @@ CORRELATION_TIME = 2.0
 CENTRE_OFFSET = 0.15
 """[time scales] Typical distance of a vehicle's magnetic centre from the middle of its body."""
 
+MIN_SAMPLES = 8
+"""Minimum number of samples with all reported axes for a fit."""
+
 
 class ClosestPoint(NamedTuple):
     """Closest point of approach of a pass, estimated from one sensor."""
 
     time: float
-    """[s] Time of the largest field if the closest point is not observable; mean time if there are
-    fewer than 8 samples with all reported axes; NaN without samples."""
+    """[s] Time of the largest field if the closest point is not observable; NaN without samples."""
     time_std: float
     """[s] Standard deviation; inf if the closest point is not observable."""
     time_scale: float
@@ -60,15 +62,15 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
     """
     present = ~np.isnan(field).all(axis=0) & ~np.isnan(noise_std)
     complete = ~np.isnan(field[:, present]).any(axis=1)
-    if not complete.any():
+    if np.count_nonzero(complete) < MIN_SAMPLES:
         strongest = float(t[np.argmax(np.nansum(field**2, axis=1))]) if len(t) else np.nan
         return ClosestPoint(strongest, np.inf, np.nan)
     t, y = _averaged(t[complete], field[complete][:, present] / noise_std[present])
     t, y = plain(t), plain(y)
     span = float(t[-1] - t[0])
-    if len(t) < 8 or not span > 0.0:
-        return ClosestPoint(float(t.mean()), np.inf, np.nan)
     strongest = float(t[np.argmax(np.sum(y**2, axis=1))])
+    if len(t) < MIN_SAMPLES or not span > 0.0:
+        return ClosestPoint(strongest, np.inf, np.nan)
     interval = span / (len(t) - 1)
 
     def cost(time: float, scale: float) -> float:
