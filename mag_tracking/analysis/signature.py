@@ -21,7 +21,7 @@ MIN_PROMINENCE = 0.1
 LAGS = (2, 4, 8, 16)
 """Lags of the autocorrelation of the field magnitude, in samples."""
 
-N_COSINES = 8
+N_DCT_COEFFICIENTS = 8
 """Number of coefficients of the discrete cosine transform of the field magnitude."""
 
 MIN_SAMPLES = 8
@@ -146,5 +146,5 @@ def _magnitude_features(magnitude: FloatArray) -> list[float]:
     centred = magnitude - magnitude.mean()
     variance = float(centred @ centred)
     correlations = [float(centred[:-lag] @ centred[lag:]) / max(variance, 1e-300) for lag in LAGS]
-    cosines = dct(magnitude, norm='ortho')[:N_COSINES]
-    return [_n_maxima(magnitude), *correlations, *(float(c) for c in cosines)]
+    dct_coefficients = dct(magnitude, norm='ortho')[:N_DCT_COEFFICIENTS]
+    return [_n_maxima(magnitude), *correlations, *(float(c) for c in dct_coefficients)]

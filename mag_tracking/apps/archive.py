@@ -1,4 +1,4 @@
-"""Tracking of many or long recordings on several processors or machines, into one dataset."""
+"""Parallel tracking of many or long recordings; the results form one dataset."""
 
 import dataclasses
 import glob

@@ -161,7 +161,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
         if fit.bearing is not None:
             _print_bearing(fit.bearing)
         if fit.reason and fit is fitted_pass.known:
-            print(f'        nevertheless determined: {_trusted_values(fit)}')
+            print(f'        still trusted: {_trusted_values(fit)}')
         if not fit.reason and fit.is_poor_mixture:
             print('        ambiguous: the joint fit of the vehicles is poor')
         elif not fit.reason and fit.ambiguous:

@@ -13,7 +13,7 @@ MAX_GAP_S = 5.0
 
 
 class TrafficIntervals:
-    """Counter of passages in time intervals of equal length, which summarises each interval.
+    """Counts passages in time intervals of equal length and summarises each interval.
 
     Parameters
     ----------

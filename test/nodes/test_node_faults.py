@@ -61,10 +61,10 @@ def check_recovery(world, began, track, lost_ns, where):
     The track continues across a gap shorter than `track.end_gap_s`, and no pose is wrong.
     """
     name = f'driver_node: {world.link}'
-    assert world.told(lost_ns, name)[0][1].level == DiagnosticStatus.ERROR
-    assert where in world.told(lost_ns, name)[0][1].message
-    assert world.wait(lambda: world.told(lost_ns, name, 'lost: mag_1', 'lost: mag_2'))
-    assert world.wait(lambda: world.told(lost_ns, name)[-1][1].message == 'open')
+    assert world.statuses_since(lost_ns, name)[0][1].level == DiagnosticStatus.ERROR
+    assert where in world.statuses_since(lost_ns, name)[0][1].message
+    assert world.wait(lambda: world.statuses_since(lost_ns, name, 'lost: mag_1', 'lost: mag_2'))
+    assert world.wait(lambda: world.statuses_since(lost_ns, name)[-1][1].message == 'open')
     assert world.wait(lambda: ended_tracks(world, began))
     assert {t.id for t in world.tracks(began)} == {track}
     assert world.tracks(began)[-1].stamp_ns > lost_ns + NS
@@ -79,7 +79,7 @@ def track_vehicle(world):
     for _ in range(MAX_VEHICLES):
         assert world.wait(world.is_quiet)
         start_ns = time.time_ns()
-        assert world.wait(lambda start_ns=start_ns: world.told(
+        assert world.wait(lambda start_ns=start_ns: world.statuses_since(
             start_ns, f'driver_node: {world.link}'))
         began = world.call()
         world.pause(2.65)
@@ -135,8 +135,9 @@ def test_a_dead_node_is_reported_by_its_peer(site, name, reporter, words):
     began = track_vehicle_to(site, -4.0)
     killed = time.time_ns()
     site.kill(name)
-    assert site.wait(lambda: site.told(killed, reporter, words, 'check that it is running'))
-    [(arrival_ns, status), *_] = site.told(killed, reporter, words, 'check that it is running')
+    advice = 'check that it is running'
+    assert site.wait(lambda: site.statuses_since(killed, reporter, words, advice))
+    [(arrival_ns, status), *_] = site.statuses_since(killed, reporter, words, advice)
     assert status.level == DiagnosticStatus.ERROR
     reported_s = (arrival_ns - killed) / NS
     print(f'a dead {name}: reported after {reported_s:.1f} s')
@@ -148,7 +149,7 @@ def test_a_dead_node_is_reported_by_its_peer(site, name, reporter, words):
     assert recovery <= scaled(MAX_RECOVERY_S, start_s) \
         and reported_s <= scaled(MAX_REPORT_S, start_s)
     restarted = time.time_ns()
-    assert site.wait(lambda: [s for _, s in site.told(restarted, reporter, 'running')])
+    assert site.wait(lambda: [s for _, s in site.statuses_since(restarted, reporter, 'running')])
 
 
 def test_a_dead_driver_is_reported_by_the_calibration(site):
@@ -157,8 +158,8 @@ def test_a_dead_driver_is_reported_by_the_calibration(site):
     site.kill('driver_node')
     for sensor in ('mag_1', 'mag_2'):
         name = f'calibration_node: {sensor}'
-        assert site.wait(lambda name=name: site.told(killed, name, 'silent', 'driver'))
-        [*_, (arrival_ns, status)] = site.told(killed, name, 'silent')
+        assert site.wait(lambda name=name: site.statuses_since(killed, name, 'silent', 'driver'))
+        [*_, (arrival_ns, status)] = site.statuses_since(killed, name, 'silent')
         assert status.level == DiagnosticStatus.ERROR
     reported_s = (arrival_ns - killed) / NS
     print(f'a dead driver: reported after {reported_s:.1f} s')
@@ -166,7 +167,7 @@ def test_a_dead_driver_is_reported_by_the_calibration(site):
     site.link = 'serial'
     start_s, recovery = site.recovery('driver_node')
     assert recovery <= scaled(MAX_RECOVERY_S, start_s) and reported_s <= scaled(5.0, start_s)
-    assert site.wait(lambda: 'silent' not in site.told(
+    assert site.wait(lambda: 'silent' not in site.statuses_since(
         killed, 'calibration_node: mag_1')[-1][1].message)
 
 
@@ -186,24 +187,24 @@ def test_a_track_survives_a_missing_port(site):
 def test_two_boards_of_one_name_are_reported(site):
     site.use('mqtt')
     start_ns = time.time_ns()
-    assert site.wait(lambda: site.told(start_ns, 'driver_node: mqtt'))
-    assert not site.told(0, 'driver_node: mqtt', 'sequence restarts')
+    assert site.wait(lambda: site.statuses_since(start_ns, 'driver_node: mqtt'))
+    assert not site.statuses_since(0, 'driver_node: mqtt', 'sequence restarts')
     began = time.time_ns()
     site.roadside.twin = True
     # The sequence numbers and the clock reveal the second board, and its readings are rejected.
     for words in ('sequence restarts: mag_1', 'do not fit the clock'):
-        assert site.wait(lambda words=words: site.told(
+        assert site.wait(lambda words=words: site.statuses_since(
             began, 'driver_node: mqtt', words)), words
     site.roadside.twin = False
-    for _, status in site.told(began, 'driver_node: mqtt'):
+    for _, status in site.statuses_since(began, 'driver_node: mqtt'):
         assert status.level == DiagnosticStatus.WARN and 'mag_2' not in status.message
 
 
 def test_a_broker_that_refuses_the_login_is_reported(site):
     site.use('mqtt')
     start_ns = time.time_ns()
-    assert site.wait(lambda: site.told(start_ns, 'driver_node: guarded', 'refused'))
-    [(_, status)] = site.told(start_ns, 'driver_node: guarded')
+    assert site.wait(lambda: site.statuses_since(start_ns, 'driver_node: guarded', 'refused'))
+    [(_, status)] = site.statuses_since(start_ns, 'driver_node: guarded')
     assert status.level == DiagnosticStatus.ERROR
     assert f'127.0.0.1:{site.guarded.port}' in status.message
     assert 'not authori' in status.message.lower()

@@ -165,7 +165,7 @@ class World:
         """Time [ns] of the first output of a node after `since_ns`; None without an output."""
         if name != 'tracker_node':
             return next((arrival for arrival, _ in self.since(since_ns, name)), None)
-        for arrival, status in self.told(since_ns, 'tracker_node: track'):
+        for arrival, status in self.statuses_since(since_ns, 'tracker_node: track'):
             frames = next((int(v.value) for v in status.values if v.key == 'frames'), 0)
             if frames:
                 return arrival - round(frames * FRAME_S * NS)
@@ -186,8 +186,8 @@ class World:
         """Messages of a node that arrived after `since_ns`, as [(arrival [ns], message)]."""
         return [entry for entry in self.heard[name] if entry[0] > since_ns]
 
-    def told(self, since_ns, name, *words):
-        """Statuses `name` after `since_ns` whose message has all `words`: [(arrival, status)]."""
+    def statuses_since(self, since_ns, name, *words):
+        """Statuses called `name` after `since_ns` whose messages contain all `words`."""
         return [(arrival, s) for arrival, s in self.statuses
                 if arrival > since_ns and s.name == name
                 and all(word in s.message for word in words)]

@@ -2,8 +2,8 @@
 
 A message consists of the preamble 0xFA, the address 0xFF, its type (MID), the length of DATA (one
 byte, or 0xFF and two bytes), DATA, and a checksum byte, which makes the sum of all bytes but the
-preamble a multiple of 256. Of the byte sequences that only look like a message (false messages),
-one in 256 has a valid checksum. Further checks are therefore applied:
+preamble a multiple of 256. A byte sequence that only looks like a message (a false message) has a
+valid checksum with probability 1/256. Further checks are therefore applied:
 
 - The message type must be one that devices send: MTData2, MTData, WakeUp, Error, or a reply. The
   MID of a reply is the MID of the request plus one, and therefore odd.
@@ -16,7 +16,7 @@ A false message that begins before a true data message hides it only in two case
 
 - The false message is a data message, and both messages together are longer than the longest frame.
 - The false message is a data message that has lost one byte, and the preamble of the next message
-  completes it to a valid message.
+  takes its place, so that the message is valid.
 
 A false message that overlaps no true message may be accepted. After a rejected message, the search
 continues at the byte after its preamble.

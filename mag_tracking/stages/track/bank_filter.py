@@ -253,7 +253,7 @@ class BankFilter:
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
         """Variance of the model error in the field of a hypothesis.
 
-        Only the variance that is uncorrelated with the previous frame is returned.
+        Only the part of the error that is uncorrelated with the previous frame is included.
 
         Parameters
         ----------

@@ -288,7 +288,9 @@ class TrackEvidence:
         return reasons
 
     def doubts_filter(self, gain: float, stamp_ns: int, window_s: float) -> bool:
-        """Update and return whether the filter fits the frames much better than the path does.
+        """Return whether the filter is doubtful: it fitted recent frames much better than the path.
+
+        Starts or extends the doubt if `gain` is below `-OVERFIT_NATS`.
 
         Parameters
         ----------
@@ -298,7 +300,7 @@ class TrackEvidence:
         stamp_ns : int, ns
             Timestamp of the latest frame.
         window_s : float, s
-            Duration of the compared frames, for which the doubt persists.
+            Duration of the compared frames, and time for which the doubt persists.
 
         Returns
         -------

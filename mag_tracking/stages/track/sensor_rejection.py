@@ -63,7 +63,7 @@ class SensorRejection:
         frame : FieldFrame
             The frame that was used, in which rejected sensors are missing.
         counts : Counter of str
-            For each rejected sensor, one count under the description of this rejection.
+            Number of rejections by description; one count per rejected sensor.
         """
         # Copying all states takes as long as the update. If the frame fits the hypothesis that
         # leads before the update, it usually also fits the hypothesis that leads afterwards.

@@ -313,8 +313,8 @@ class SteadySearch:
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Refine paths by Levenberg-Marquardt steps.
 
-        The prior does not limit the position along a line. A vehicle that explains no field may
-        therefore be moved to any distance.
+        The prior does not constrain the position along the arrival line. A vehicle that explains no
+        field may therefore move arbitrarily far away.
 
         Parameters
         ----------
