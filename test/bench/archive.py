@@ -81,12 +81,13 @@ def main():
         tracks = tables[0][0].to_pandas()
     print(f'{args.passes} recordings of one pass each')
     for n, duration in zip((1, 2), hours, strict=True):
-        figures.add(f'passes an hour, {n} workers', args.passes / duration, '', more_is_better=True)
+        figures.add(f'passes per hour, {n} workers', args.passes / duration, '',
+                    more_is_better=True)
     figures.add('two workers over one', hours[0] / hours[1], '', 1.8, True)
     first = tracks.drop_duplicates('source')
     ratio = first['speed'] / [speeds[Path(source)] for source in first['source']]
     figures.add('passes tracked', len(first) / args.passes, '', more_is_better=True)
-    figures.add('speed off, median', 100.0 * float((ratio - 1.0).abs().median()), '%')
+    figures.add('speed error, median', 100.0 * float((ratio - 1.0).abs().median()), '%')
     passes_a_year = N_STATIONS * VEHICLES_A_DAY * 365.25
     cores = passes_a_year * hours[0] / args.passes / (24 * 365.25)
     print(f'  projection: {N_STATIONS} stations with {VEHICLES_A_DAY} vehicles per day have '

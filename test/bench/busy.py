@@ -88,8 +88,8 @@ def recordings(figures, folder):
             f' (of {len(tracked.passages)} counted)')
         figures.add(f'{name}: RMS', float(np.nanmedian(got.rms)), 'm', rms)
         figures.add(f'{name}: NEES', float(np.nanmedian(got.nees)), '', nees)
-        figures.add(f'{name}: tracks of nobody', got.n_extra, '', 0)
-        figures.add(f'{name}: a search', float(np.median(seconds)), 's',
+        figures.add(f'{name}: false tracks', got.n_extra, '', 0)
+        figures.add(f'{name}: time of a search', float(np.median(seconds)), 's',
                     note=f' (longest {max(seconds):.2g} s, {len(seconds)} searches)')
         counted.append((got.n_sure, got.n_wrong))
     return counted
@@ -105,7 +105,7 @@ def simulated(figures, seeds):
         figures.add(f'boxes, {how}: found', float(found.mean()), '', note=f' (of {len(found)})')
         figures.add(f'boxes, {how}: RMS',
                     float(np.nanmedian(np.concatenate([s.rms for s in scores]))), 'm')
-        figures.add(f'boxes, {how}: tracks of nobody', sum(s.n_extra for s in scores), '')
+        figures.add(f'boxes, {how}: false tracks', sum(s.n_extra for s in scores), '')
         counted += [(s.n_sure, s.n_wrong) for s in scores]
     return counted
 

@@ -70,7 +70,8 @@ def main():
         counted = [(name, p) for name, p in found if p is not None]
         is_correct = np.array([p.vehicle_class == name for name, p in counted])
         figures.add(f'{simulator}: counted', len(counted) / N, '', None, True)
-        figures.add(f'{simulator}: class right', float(is_correct.mean()), '', MIN_CORRECT, True)
+        figures.add(f'{simulator}: correct classes', float(is_correct.mean()), '', MIN_CORRECT,
+                    True)
         for kind in classes:
             of_kind = np.array([name == kind for name, _ in counted])
             figures.add(f'{simulator}: recall of {kind}', float(is_correct[of_kind].mean()), '',

@@ -42,7 +42,7 @@ def main():
                             aim if method == 'correlation' else None, True,
                             f' (published {published[name]:.4f})')
         reported, measured = calibration(vehicles)
-        figures.add(f'{simulator}, far lane: stated less measured error probability',
+        figures.add(f'{simulator}, far lane: predicted minus measured error probability',
                     abs(reported - measured), '', MAX_DIFFERENCE, False,
                     f' ({reported:.3f} reported, {measured:.3f} measured)')
     return figures.save()

@@ -61,7 +61,7 @@ class Tally:
                     float(np.median([of.error for of in self.found])), 'm')
         figures.add(f'{label}: without a flag', float(sure.mean()), '',
                     note=f' ({wrong.sum()} of them wrong)')
-        figures.add(f'{label}: a pass', self.seconds / max(self.n_passes, 1), 's')
+        figures.add(f'{label}: time of a fit', self.seconds / max(self.n_passes, 1), 's')
         return int(sure.sum()), int(wrong.sum())
 
 

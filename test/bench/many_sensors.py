@@ -69,12 +69,12 @@ def main():
         return 0
     figures = Figures('many_sensors')
     print(f'a car along {N_SENSORS} sensors; mounting and model error are estimated')
-    for name, max_sensors in (('those that a track uses by default', 0), ('all', N_SENSORS)):
+    for name, max_sensors in (('default sensors of a track', 0), ('all', N_SENSORS)):
         found = json.loads(subprocess.run(
             [sys.executable, '-m', 'bench.many_sensors', str(max_sensors)], check=True,
             capture_output=True, text=True).stdout)
         figures.add(f'{name}: start', found['start'], 's', 2.0)
-        figures.add(f'{name}: memory of the process at most', found['memory'], 'MB', 500.0)
+        figures.add(f'{name}: peak memory', found['memory'], 'MB', 500.0)
         figures.add(f'{name}: frame, mean', 1e3 * found['frame'], 'ms')
     return figures.save()
 

@@ -38,7 +38,7 @@ MIN_CONFIDENCE = 0.95
 poses in each row and for all poses in the total."""
 MAX_ERROR = 1.03
 """Maximum ratio of an error to the error with the other checkout."""
-SURE, RIGHT = 'no flag', f'no flag, within {WRONG_M:g} m'
+SURE, RIGHT = 'unflagged', f'unflagged, within {WRONG_M:g} m'
 ERRORS = {'rms': 'RMS [m]', 'closest': 'closest [m]', 'anees': 'ANEES', 'position_mean': 'mean [m]',
           'axis_median_deg': 'axis [deg]'}
 

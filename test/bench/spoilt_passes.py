@@ -2,7 +2,7 @@
 
 Each pass is simulated by one of two simulators, modified by one fault and tracked live with two
 sensors at 100 Hz, without a prescan. The figures are the fraction of tracked passes, and the
-fraction of unflagged poses that are wrong (sure and wrong). The aim is at most 1 % of such poses. A
+fraction of unflagged poses that are wrong. The aim is at most 1 % of such poses. A
 flagged or missing track is not an error.
 """
 
@@ -56,13 +56,14 @@ def summary(figures, what, simulator, kind, found):
     n_sure, rate = fraction_of_wrong(found)
     n_tracked = sum(len(f.error) > 0 for f in found)
     n_tracked_right = sum(bool(f.heading > HEADING) for f in found)
-    met = not figures.keep(f'{what}; {simulator}, {kind}: sure and wrong', 100.0 * rate, '%',
+    met = not figures.keep(f'{what}; {simulator}, {kind}: unflagged and wrong', 100.0 * rate, '%',
                            100.0 * MAX_WRONG, note=f'of {n_sure} poses')
     figures.keep(f'{what}; {simulator}, {kind}: tracked', n_tracked / len(found), '', None, True)
     return (f'  {what:27s} {simulator}, {kind}: {sum(f.detected for f in found):2d} of '
             f'{len(found)} detected, {n_tracked:2d} tracked, {n_tracked_right:2d} in the right '
             f'direction; {sum((~f.ambiguous).any() for f in found):2d} with unflagged poses, '
-            f'sure and wrong {rate:5.1%} in {sum(f.sure_and_wrong.any() for f in found)} passes'
+            f'unflagged and wrong {rate:5.1%} in '
+            f'{sum(f.sure_and_wrong.any() for f in found)} passes'
             f'{"" if met else "  MISSED"}', met)
 
 
@@ -73,7 +74,7 @@ def main():
     parser.add_argument('--kinds', nargs='+', choices=KINDS, default=['car'])
     args = parser.parse_args()
     print(f'{args.passes} random passes of each combination, two sensors, 100 Hz; the aim is at '
-          f'most {MAX_WRONG:.0%} sure and wrong')
+          f'most {MAX_WRONG:.0%} unflagged and wrong')
     figures = Figures('spoilt_passes')
     status = count_over([(w, s, k) for w in FAULTS for s in SIMULATORS for k in args.kinds],
                         faulty_pass, args.passes, partial(summary, figures))

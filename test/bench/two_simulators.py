@@ -1,7 +1,7 @@
 """Random trucks, cars and turning cars from two simulators of different structure.
 
 Passes of each kind from each simulator are tracked with two sensors at 100 Hz. The figures are the
-fraction of unflagged poses that are wrong (sure and wrong), filtered and smoothed, the normalised
+fraction of unflagged poses that are wrong, filtered and smoothed, the normalised
 errors and the errors of the speed. The aims are at most 1 % of such poses, a mean NEES per axis
 within 5 m of at most 5 for trucks and 2.5 for cars, and 90 % of the speeds within 10 %.
 """
@@ -56,21 +56,21 @@ def summary(figures, simulator, kind, found):
     smoothed = sum(f.smoothed_wrong for f in found) / max(n_smoothed, 1)
     name = f'{simulator}, {kind}'
     missed = [
-        figures.keep(f'{name}: sure and wrong', 100.0 * rate, '%', 100.0 * MAX_WRONG,
+        figures.keep(f'{name}: unflagged and wrong', 100.0 * rate, '%', 100.0 * MAX_WRONG,
                      note=f'of {n_sure} poses'),
         figures.keep(f'{name}: NEES per axis within 5 m, mean', nees.mean(), '', MAX_NEES[kind]),
         figures.keep(f'{name}: speed within 10 %', 100.0 * within, '%', 100.0 * MIN_SPEED, True)]
     figures.keep(f'{name}: median error at the closest point', np.median(closest), 'm')
-    figures.keep(f'{name}: smoothed, sure and wrong', 100.0 * smoothed, '%',
+    figures.keep(f'{name}: smoothed, unflagged and wrong', 100.0 * smoothed, '%',
                  note=f'of {n_smoothed} poses')
     met = not any(missed)
     return (f'  {simulator}, {kind}: {len(sure)} of {len(found)} with unflagged '
-            f'poses; {n_sure} such poses, sure and wrong {rate:.1%} (aim 1 %), in '
+            f'poses; {n_sure} such poses, unflagged and wrong {rate:.1%} (aim 1 %), in '
             f'{sum(f.sure_and_wrong.any() for f in sure)} passes; within 5 m NEES per axis mean '
             f'{nees.mean():.1f} (aim {MAX_NEES[kind]:.1f}), median {np.median(nees):.1f}; speed '
             f'within 10 % in {within:.0%} (aim 90 %); at the closest point median '
             f'{np.median(closest):.2f} m; of {n_smoothed} unflagged smoothed poses '
-            f'{smoothed:.1%} sure and wrong{"" if met else "  MISSED"}', met)
+            f'{smoothed:.1%} unflagged and wrong{"" if met else "  MISSED"}', met)
 
 
 def main():
