@@ -224,7 +224,8 @@ def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
             raise SettingsError(f'sensors: {short_repr(key)} is not a name: it is not valid '
                                 'Unicode')
         if not isinstance(value, str) or not (value == IGNORED or _NAME.fullmatch(value)):
-            raise SettingsError(f'sensors: {key}: expected a sensor name (letters, digits, _ and '
+            label = f'sensors: {key}' if key != '' else 'sensor'
+            raise SettingsError(f'{label}: expected a sensor name (letters, digits, _ and '
                                 f'/), or - to ignore the sensor, got {short_repr(value)}')
     out = {str(key): value for key, value in sensors.items()}
     if len(out) < len(sensors):

@@ -92,12 +92,12 @@ class Driver:
         self.driver_counts: Counter[str] = Counter()
         self._device, self._settings = device, settings
         self._clock_settings = clock_settings
-        self._scale = scale_of(settings.unit, FIELD_UNITS, f'{name}: unit')
+        self._scale = scale_of(settings.unit, FIELD_UNITS, 'unit')
         self._acceleration_scale = scale_of(
-            settings.acceleration_unit, ACCELERATION_UNITS, f'{name}: acceleration_unit')
+            settings.acceleration_unit, ACCELERATION_UNITS, 'acceleration_unit')
         if settings.stamp_by not in STAMPED_BY:
-            raise SettingsError(f'{name}: stamp_by: expected one of '
-                                f'{", ".join(STAMPED_BY)}, got {settings.stamp_by!r}')
+            raise SettingsError(f'stamp_by: expected one of {", ".join(STAMPED_BY)}, got '
+                                f'{settings.stamp_by!r}')
         self._monotonic_ns, self._wall_ns, self._sleep = monotonic_ns, wall_ns, sleep
         self._sequences = {s: SequenceCheck(settings.sequence_wrap) for s in sensors.values()
                            if s != IGNORED}

@@ -22,6 +22,7 @@ from mag_tracking.nodes.sensor_graph import missing_publisher, topic_findings
 from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS, make_executor, spin
 from mag_tracking.pipeline import Settings
+from mag_tracking.quantities import quantity
 from mag_tracking.stages.health.sensor_health import Finding
 
 
@@ -74,7 +75,7 @@ class DoctorNode(Node):
         list of Finding
         """
         topic = self.resolve_topic_name(RAW_READINGS)
-        found = [Finding(True, topic, f'{n} invalid message{"" if n == 1 else "s"}: {error}',
+        found = [Finding(True, topic, f'{quantity(n, "invalid message")}: {error}',
                          'check the driver that publishes this topic')
                  for error, n in self._invalid_messages.items()]
         for sensor, topic in self._topics.items():

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from mag_tracking.nodes.sensor_graph import shortened
+from mag_tracking.quantities import quantity
 from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S
 from mag_tracking.stages.health.window import quantiles
 from mag_tracking.units import NS
@@ -122,7 +123,7 @@ class Flow:
                 message += ', and its topics have no publisher: check that it is running'
         elif new_losses:
             level = DiagnosticStatus.WARN
-            message = f'{new_losses} message{"" if new_losses == 1 else "s"} from {self.source} ' \
+            message = f'{quantity(new_losses, "message")} from {self.source} ' \
                 'lost: the input queue was full; reduce the load of this computer'
         elif busy > MAX_LOAD or median > MAX_LATENCY_S:
             level = DiagnosticStatus.WARN

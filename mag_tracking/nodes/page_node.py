@@ -27,6 +27,7 @@ from mag_tracking.nodes.middleware import begin
 from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS, make_executor, spin
 from mag_tracking.nodes.steady_timer import steady_timer
+from mag_tracking.quantities import quantity
 from mag_tracking.report.page import ERROR, WARNING, Note, Table
 from mag_tracking.web.live_scene import LiveScene
 from mag_tracking.web.page_server import TICK_S, PageServer
@@ -128,8 +129,7 @@ class PageNode(Node):
             self._layout = layout
             self._frames.clear()
             self._tracks.clear()
-            self._scene.subtitle = f'{len(layout)} sensor{"" if len(layout) == 1 else "s"}, ' \
-                f'frame {layout.frame}'
+            self._scene.subtitle = f'{quantity(len(layout), "sensor")}, frame {layout.frame}'
             self._scene.use_network(layout)
 
     def _receive_frame(self, message: bytes) -> None:

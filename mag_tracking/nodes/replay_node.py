@@ -31,6 +31,7 @@ from mag_tracking.nodes.managed_node import ManagedNode
 from mag_tracking.nodes.paced_service import paced_service
 from mag_tracking.nodes.ros_params import fixed_parameter
 from mag_tracking.nodes.stage_node import STREAM_QOS
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 
 TICK_S = 0.005
@@ -270,7 +271,7 @@ class ReplayNode(ManagedNode):
             return
         self.finished = True
         n = self.counts['messages']
-        self.get_logger().info(f'end of the recording: {n} message{"" if n == 1 else "s"} played')
+        self.get_logger().info(f'end of the recording: {quantity(n, "message")} played')
 
     def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Handle ~/pause."""

@@ -100,9 +100,9 @@ def test_units_are_converted_to_tesla(unit, tesla):
 
 
 @pytest.mark.parametrize('settings, message', [
-    ({'unit': 'gauss'}, "board: unit: 'gauss' is neither"), ({'unit': '0'}, 'unit'),
-    ({'unit': 'nan'}, 'unit'), ({'acceleration_unit': 'G'}, 'board: acceleration_unit'),
-    ({'stamp_by': 'sundial'}, 'board: stamp_by: expected one of auto, ticks')])
+    ({'unit': 'gauss'}, "unit: 'gauss' is neither"), ({'unit': '0'}, 'unit'),
+    ({'unit': 'nan'}, 'unit'), ({'acceleration_unit': 'G'}, 'acceleration_unit'),
+    ({'stamp_by': 'sundial'}, 'stamp_by: expected one of auto, ticks')])
 def test_invalid_settings_are_refused(settings, message):
     with pytest.raises(SettingsError, match=message):
         driver_of([], settings)

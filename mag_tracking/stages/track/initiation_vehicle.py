@@ -12,6 +12,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0, dipole_jacobians
 from mag_tracking.physics.vehicles import RowVehicle
+from mag_tracking.quantities import quantity
 from mag_tracking.records import FieldFrame
 from mag_tracking.settings import param
 
@@ -141,9 +142,8 @@ def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehic
         n = len(getattr(settings, names))
         for name in lists:
             if len(getattr(settings, name)) != n:
-                raise SettingsError(f'track.vehicle.{name}: expected {n} value'
-                                    f'{"" if n == 1 else "s"} (one per {item}), '
-                                    f'got {len(getattr(settings, name))}')
+                raise SettingsError(f'track.vehicle.{name}: expected {quantity(n, "value")} '
+                                    f'(one per {item}), got {len(getattr(settings, name))}')
     if len(set(settings.kinds)) < len(settings.kinds):
         raise SettingsError(f'track.vehicle.kinds: a name is duplicated in {settings.kinds}')
     for name in ('length_stds', 'difference_stds'):

@@ -24,6 +24,7 @@ from mag_tracking.network.counting_line import (
     Pose,
     counting_lines,
 )
+from mag_tracking.quantities import quantity
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.report.traffic_intervals import TrafficIntervals
 from mag_tracking.stages.traffic.field_direction import FieldDirection
@@ -287,9 +288,8 @@ def _check_lists(settings: TrafficSettings) -> None:
         values = getattr(settings, names)
         for name in lists:
             if len(getattr(settings, name)) != len(values):
-                raise SettingsError(f'traffic.{name}: expected {len(values)} value'
-                                    f'{"" if len(values) == 1 else "s"} (one per {item}), '
-                                    f'got {len(getattr(settings, name))}')
+                raise SettingsError(f'traffic.{name}: expected {quantity(len(values), "value")} '
+                                    f'(one per {item}), got {len(getattr(settings, name))}')
         if len(set(values)) < len(values):
             raise SettingsError(f'traffic.{names}: duplicate names in {values}')
         if '' in values or UNKNOWN in values:
