@@ -222,7 +222,7 @@ class BankFilter:
 
     def _frames(self, frames: Sequence[FieldFrame], intervals: Sequence[float]
                 ) -> dict[str, FloatArray]:
-        """Arrays that join the frames, keyed by the argument names of the compiled filter."""
+        """Measurements and process noise of the frames, keyed by compiled filter argument."""
         dt = np.array(intervals, dtype=float)
         decay, variance = self.observation.drift(dt, self._settings.background_drift)
         return {'field': np.array([frame.field for frame in frames]),
@@ -349,7 +349,7 @@ class BankFilter:
         return self.observation.field_of(bank.x[i], others, self.time_offset(frame, dt))
 
     def _lengths(self, kind: IntArray) -> FloatArray:
-        """Near-field lengths (n, n_targets) [m] of `kind` (n,) or (n, n_targets)."""
+        """Near-field length (n, n_targets) [m] of each target, from its kind."""
         return self._near_field_lengths[kind].reshape(len(kind), -1)
 
     def are_long(self, kind: IntArray) -> BoolArray:

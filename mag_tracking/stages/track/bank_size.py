@@ -104,7 +104,7 @@ def max_sensors(observation: Observation, n_hyp: int) -> int:
 
 
 def _max_affordable_sensors(n_hyp: int, n_target: int, n_of_sensor: int) -> int:
-    """Maximum number of sensors within `START_BYTES`, but at least `MIN_SENSORS_AT_START`."""
+    """Maximum number of sensors of a bank within `START_BYTES`; see `max_sensors`."""
     n_states = math.isqrt(START_BYTES // (_FLOAT_BYTES * n_hyp))
     return max((n_states - n_target) // n_of_sensor, MIN_SENSORS_AT_START)
 

@@ -8,7 +8,7 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.stages.track.rigid_pass import MAX_OFFSET, MIN_DISTANCE, RigidPass
 
-SIGNIFICANT_STD = 4.0
+SIGNIFICANT_STDS = 4.0
 """An offset is significant only if it exceeds this number of standard deviations."""
 
 MEMORY_PASSES = 20
@@ -157,13 +157,13 @@ class ClockComparison:
         # time.
         min_offset = MIN_DISTANCE * self._slowness / self._weight
         self._offset_s = np.where(
-            (offset > SIGNIFICANT_STD * std) & (offset > min_offset), offset, 0.0)
+            (offset > SIGNIFICANT_STDS * std) & (offset > min_offset), offset, 0.0)
 
     def _contradicts(self, fit: RigidPass, rows: IntArray, is_known: BoolArray) -> bool:
         """Whether a pass contradicts the previous estimate for any clock in the mask `is_known`."""
         offset, std = self._offsets()
         reference = rows[fit.reference]
-        return any(abs(fit.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STD * np.sqrt(
+        return any(abs(fit.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STDS * np.sqrt(
             fit.clock_variance(j) + std[rows[j], reference]**2) for j in np.flatnonzero(is_known))
 
     def _offsets(self) -> tuple[FloatArray, FloatArray]:

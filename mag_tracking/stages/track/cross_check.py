@@ -140,7 +140,7 @@ class CrossCheck:
         """Differences of smoothed states from the fitted pass.
 
         For states before or after the pass, the difference of the first or last state in the pass
-        is returned.
+        is returned. If no state is in the pass, `difference` is returned for every state.
 
         Parameters
         ----------
@@ -194,7 +194,7 @@ class CrossCheck:
             clocks.add(self.latest, rows)
 
     def _fit_if_due(self, magnitude: float) -> None:
-        """Fit the pass if a fit is due; `magnitude` [T] is the current field."""
+        """Fit the pass if a fit is due; `magnitude` [T] is the largest current field."""
         current, peak = self._current, self._peak
         if current is None or peak is None or self._due_s > AFTER_S \
                 or magnitude > PASSED_FRACTION * peak.magnitude:
@@ -218,7 +218,7 @@ class CrossCheck:
             self._is_misfit = rigid_pass.misfit > MAX_MISFIT
 
     def _pass_doubts(self) -> set[str]:
-        """Doubts from the latest fit."""
+        """Doubts about the track that follow from the latest fit."""
         reasons: set[str] = set()
         latest = self.latest
         if latest is None:

@@ -10,7 +10,7 @@ from mag_tracking.event_records import Disturbance
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.records import FieldFrame
 
-FALSE_ALARM = 1e-6
+P_FALSE_ALARM = 1e-6
 """Probability per frame that noise alone marks a sensor as affected."""
 
 
@@ -83,7 +83,7 @@ class Disturbances:
         if self._current is not None:
             energy, n_axes = whitened_energy(frame.field, frame.covariance)
             self._largest = np.maximum(self._largest, field_magnitudes(frame))
-            self._sensed |= energy > chdtri(np.maximum(n_axes, 1), FALSE_ALARM)
+            self._sensed |= energy > chdtri(np.maximum(n_axes, 1), P_FALSE_ALARM)
 
     def end(self, stamp_ns: int) -> list[Disturbance]:
         """End the current disturbance, at the release of the detection or at a gap in the frames.

@@ -324,7 +324,7 @@ class TrackEvidence:
         return are_doubtful((*self._doubtful_times, *self._smoothed_segments), stamp_ns)
 
     def support(self, by_one_sensor: bool, dt: float) -> None:
-        """Accumulate the time with only one supporting sensor; flag the track if it is too long.
+        """Add up the time with one measuring sensor; flag the track if this time is too long.
 
         A single sensor determines neither the scale of a track nor which of two mirror images is
         correct. The other sensors do not always correct the error when they measure again.

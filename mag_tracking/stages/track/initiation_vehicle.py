@@ -253,7 +253,7 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
 
 
 def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float) -> FilterBank:
-    """Bank with a straight and a turning copy of each hypothesis, if turning is enabled."""
+    """Bank with a turning copy of each hypothesis; the same bank if turning is disabled."""
     if not model.turn_acceleration:
         return bank
     n, w = len(bank), len(model.state_names) - 1
@@ -266,7 +266,7 @@ def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float
 
 
 class _MeasuredEnergy:
-    """Energy of a frame, which determines the initial distance of the target."""
+    """Energy of the whitened field of a frame, which determines the initial distance."""
 
     def __init__(self, network: SensorNetwork, frame: FieldFrame) -> None:
         is_present = ~np.isnan(frame.field)
@@ -275,13 +275,13 @@ class _MeasuredEnergy:
         self.energy = max(energy - np.count_nonzero(is_present), 1.0)
         std = np.sqrt(np.einsum('jii->ji', frame.covariance))
         self.whitening = network.R_sw / np.where(is_present, std, np.inf)[:, :, None]
-        """Matrix (n_sensors, 3, 3) [1/T] from the field (world frame) to units of the noise."""
+        """Rotation (n_sensors, 3, 3) [1/T] from world to sensor, divided by the noise per axis."""
 
 
 def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
                         measured: _MeasuredEnergy, R: FloatArray, moments: FloatArray,
                         height: float) -> FloatArray:
-    """First position (n_offsets, n_moments, 3) on each line at which the field energy matches."""
+    """First position (n_offsets, n_moments, 3) on each line with at least the measured energy."""
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(settings.max_start_distance, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])

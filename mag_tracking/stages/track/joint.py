@@ -53,8 +53,8 @@ class JointExplanation:
     def doubtful(self, n_one: int) -> tuple[int, ...]:
         """Indices of the vehicles whose states may be wrong.
 
-        - All vehicles of an explanation below `CONFIDENT_NATS`, or below `IMPLAUSIBLE_NATS` if
-          vehicles cross or one is much faster.
+        - All vehicles of an explanation whose log-odds are below `CONFIDENT_NATS`, or below
+          `IMPLAUSIBLE_NATS` if a new vehicle crosses another or one overtakes too fast.
         - A vehicle that was found at another position than its track.
         - Two vehicles that replace one vehicle and move in the same direction, because a long
           vehicle with large model errors resembles two vehicles.
@@ -82,7 +82,7 @@ class JointExplanation:
 
 
 def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
-    """Whether one of the last `n_new` vehicles crosses another, or differs too much in speed.
+    """Whether one of the last `n_new` vehicles crosses another, or one overtakes too fast.
 
     The `velocity` is (n, 2) [m/s].
     """

@@ -311,7 +311,7 @@ class TrackManager:
 
 
 def _energy(frame: FieldFrame) -> float:
-    """Sum of the squared field of all sensors [T²].
+    """Squared norm of the field, summed over all sensors [T²].
 
     The energy is not weighted with the noise, because the noise assumed by the detector increases
     during a detection.

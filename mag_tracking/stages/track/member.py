@@ -25,8 +25,8 @@ from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
 
 MAX_POSITIONS = 64
-"""Number of stored recent positions. If two vehicles replace one, they show which of the two
-continues the track."""
+"""Maximum number of stored recent positions. If two vehicles replace one, the positions show which
+of the two continues the track."""
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ class Member:
             or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
 
     def _doubts(self, update: BankUpdate, view: MemberView, is_single_sensor: bool) -> set[str]:
-        """Update and return the doubts about a pose."""
+        """Update the checks of the member, and return the doubts about a pose."""
         bank, best, evidence, settings = view.bank, view.best, self.evidence, update.settings
         reasons = evidence.doubts | ({doubts.ONE_SENSOR} if is_single_sensor else set())
         if update.bank_filter.is_implausible(bank, best, update.frame):
@@ -250,7 +250,7 @@ class Member:
         return reasons | evidence.doubts
 
     def _overfits(self, update: BankUpdate, view: MemberView) -> bool:
-        """Update and return whether the filter fits the frames much better than the path does."""
+        """Update the doubt about the filter, and return whether the filter is doubtful."""
         overfits = self.evidence.doubts_filter(view.gain, update.frame.stamp_ns,
                                                update.settings.relinearise_window_s)
         if overfits:

@@ -6,8 +6,8 @@ from scipy.special import chdtrc
 from mag_tracking.inference.sliding_sum import SlidingSum
 from mag_tracking.units import NS
 
-FALSE_ALARM = 1e-3
-"""Significance level of the latest innovations below which a new target is searched for."""
+P_FALSE_ALARM = 1e-3
+"""Probability per test that noise alone triggers a comparison with other explanations."""
 
 WINDOW_S, MIN_INTERVAL_S = 0.25, 0.15
 """Duration of the latest frames that are tested, and minimum interval before a comparison that
@@ -75,7 +75,7 @@ class NewTargetEvidence:
         elapsed_s = np.inf if self._last_comparison_ns is None \
             else (stamp_ns - self._last_comparison_ns) / NS
         reason = None
-        if self._was_rejected or chdtrc(max(freedom, 1.0), total) <= FALSE_ALARM:
+        if self._was_rejected or chdtrc(max(freedom, 1.0), total) <= P_FALSE_ALARM:
             reason = IMPROBABLE if elapsed_s >= MIN_INTERVAL_S else None
         elif self._is_long and elapsed_s >= self._long_interval_s:
             reason = LONG_VEHICLE
@@ -85,7 +85,7 @@ class NewTargetEvidence:
         return reason
 
     def accepts(self, log_odds: float) -> bool:
-        """Update and return whether another explanation is accepted.
+        """Return whether another explanation is accepted, and store whether it is probable.
 
         Parameters
         ----------

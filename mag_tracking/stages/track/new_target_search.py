@@ -135,7 +135,7 @@ class NewTargetSearch:
 
     def _best_of(self, starts: Sequence[WindowStart], track_evidence: float
                  ) -> JointExplanation | None:
-        """Explanation by refined starts; `track_evidence` is the log-evidence of the track."""
+        """Refine starts and join them; `track_evidence` is the log-evidence of the track."""
         refined = self._add_turning_starts(self._refine_starts(starts))
         prior = LOG_P_ARRIVAL if len(refined[0].kind) > self._n_targets else LOG_P_LOST
         bank, log_likelihood, log_w, paths = self._run_starts(refined)
@@ -233,7 +233,7 @@ class NewTargetSearch:
 
     def _starts_on(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
                    replaced: int | None) -> list[WindowStart]:
-        """Starts of known vehicles and of new ones with `paths` (k, 7) and `moments` (k, 3, 3)."""
+        """Starts that add new vehicles, with `paths` (k, 7) and `moments` (k, 3, 3), to `known`."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
         labels = self._search.prior.nearest_line(paths)[0].tolist()
         starts = []
@@ -251,7 +251,7 @@ class NewTargetSearch:
         return starts
 
     def _sensors_at_start(self) -> FloatArray:
-        """Covariance of the sensor states at the start of a track."""
+        """Prior covariance of the sensor states, as at the start of a track."""
         observation, std = self._filter.observation, self._vehicles.background_std
         return block_diag(*observation.own_covariance,
                           std**2 * np.eye(3 * len(observation.positions)))

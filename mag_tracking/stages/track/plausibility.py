@@ -41,7 +41,7 @@ class Plausibility:
 
     def evaluate(self, observation: Observation, bank: FilterBank, best: int,
                  settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
-        """Update the closest points of all hypotheses; return the doubts about one of them.
+        """Update the closest points of all hypotheses; return the doubts about hypothesis `best`.
 
         Parameters
         ----------
@@ -77,7 +77,7 @@ class Plausibility:
 
     def _update_road_check(self, bank: FilterBank, settings: VehicleSettings,
                            positions: FloatArray) -> None:
-        """Update the closest point of each hypothesis, and whether it was off the road there."""
+        """Update the closest point of each hypothesis, and whether this point was off the road."""
         n_added = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
         self._nearest = np.append(self._nearest, np.full(n_added, np.inf))
         self._was_off_road = np.append(self._was_off_road, np.zeros(n_added, dtype=bool))

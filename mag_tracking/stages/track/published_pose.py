@@ -259,7 +259,7 @@ def covariance_about(bank: FilterBank, best: int, model: SourceModel, is_separat
 
 def _second_moment(bank: FilterBank, best: int, model: SourceModel,
                    log_w: FloatArray) -> FloatArray:
-    """Covariance about hypothesis `best`, from all hypotheses with the log-weights (n_hyp,)."""
+    """Covariance about hypothesis `best`, from all hypotheses weighted by `log_w` (n_hyp,)."""
     n_t = len(model.state_names)
     weight = np.exp(log_w - log_w.max())
     rows = np.flatnonzero(weight >= NEGLIGIBLE_WEIGHT)

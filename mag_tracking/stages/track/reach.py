@@ -1,4 +1,4 @@
-"""Energy of the field of a target at the sensors, computed from the states of its track."""
+"""Energy of the whitened field of a target at the sensors, from the states of its track."""
 
 import numpy as np
 

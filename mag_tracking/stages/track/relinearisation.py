@@ -274,7 +274,7 @@ class Relinearisation:
         self._last_ns = window.frames[-1].stamp_ns
 
     def gain(self, origin: int) -> float:
-        """Log-likelihood along a path minus the log-likelihood in the filter, in the window.
+        """Log-likelihood of the window along a path, minus its log-likelihood in the filter.
 
         Parameters
         ----------
@@ -319,7 +319,7 @@ class Relinearisation:
 
     def _run_along(self, bank_filter: BankFilter, bank: FilterBank, paths: FloatArray,
                    passes: int) -> PathResult:
-        """Run hypotheses of the anchor along `paths` (n_rows, n, n_x); update both in place."""
+        """Run `bank` along `paths` (n_rows, n, n_x) from the anchor; update both in place."""
         n = paths.shape[1]
         return bank_filter.run_along(
             bank, self._frames[:n], self._intervals[:n], paths, passes=passes, step=STEP_SIZE,
@@ -327,7 +327,7 @@ class Relinearisation:
 
 
 def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
-    """Replace states of the bank, in place; each keeps the larger of its covariance and `P`."""
+    """Replace the states `rows` of the bank in place, and the covariances where `P` is larger."""
     bank_variance, path_variance = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
     bank.x[rows] = x
     bank.P[rows[path_variance > bank_variance]] = P[path_variance > bank_variance]

@@ -38,7 +38,7 @@ OFFSET_STD, MAX_OFFSET = 0.15, 0.5
 """[s] Prior standard deviation of clock offsets, and their maximum. A larger offset is not
 accepted, because a turn has the same effect."""
 
-TURN = 0.4
+START_TURN_RATE = 0.4
 """[rad/s] Start value of the turn rate of a bent path, used with both signs."""
 
 GOOD_MISFIT, MAX_MISFIT = 1.3, 1.5
@@ -159,7 +159,7 @@ class RigidPass:
 
     @property
     def widening(self) -> float:
-        """Factor on the variances, above 1 if the residuals are larger than expected."""
+        """Factor for the variances: the reduced chi-square with free clock offsets, at least 1."""
         return max(self.cost_with_offsets / self.freedom, 1.0)
 
     def clock_variance(self, sensor: int) -> float:
@@ -224,7 +224,7 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     if cost > GOOD_MISFIT * (data.n_free(N_SHORT) - N_STRAIGHT):
         # If the vehicle turned, or if the clock offsets are large, the straight path is misleading.
         bends = np.vstack([bends, [np.append(first[0], [0.0, turn, 0.0])
-                                   for turn in (-TURN, TURN)]])
+                                   for turn in (-START_TURN_RATE, START_TURN_RATE)]])
         offset_starts.append((first[0], LARGE_OFFSET))
     clocks = np.array([np.append(p, np.full(n_clocks, sign * offset))
                        for p, offset in offset_starts for sign in (-1.0, 1.0)])
@@ -267,7 +267,7 @@ class _RowFits(NamedTuple):
 
     @property
     def needs_no_bend(self) -> bool:
-        """Whether the straight path explains the pass, and the bent path hardly better."""
+        """Whether the straight path explains the pass, without a significant gain from a bend."""
         n_more = N_PATH - N_STRAIGHT
         gain = (self.cost - self.cost_bent) / max(self.misfit, 1.0)
         return bool(self.cost <= MAX_MISFIT * (self.freedom + n_more)
@@ -293,6 +293,6 @@ def _state_at_zero(path: FloatArray) -> FloatArray:
 
 
 def _is_of_vehicle(state: FloatArray, positions: FloatArray) -> bool:
-    """Whether a vehicle near sensors (n, 3) may have a state (6,), by its distance and speed."""
+    """Whether distance to the sensors (n, 3) and speed of a state (6,) are those of a vehicle."""
     nearest = np.linalg.norm(state[:3] - positions, axis=1).min()
     return bool(nearest < MAX_DISTANCE and np.linalg.norm(state[3:]) < MAX_SPEED)

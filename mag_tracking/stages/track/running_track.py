@@ -250,7 +250,7 @@ class RunningTrack:
         return True
 
     def _update_new_target_evidence(self, advance: FrameUpdate, best: int) -> None:
-        """Update the evidence for new targets with the fit of hypothesis `best`."""
+        """Update the evidence for new targets with the innovations of hypothesis `best`."""
         bank, frame = self.bank, advance.frame
         self._new_target_evidence.add(
             float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
@@ -330,7 +330,7 @@ class RunningTrack:
 
     def _smoothed(self, i: int, view: MemberView, complete: bool, states: list[TrackState],
                   doubtful: bool) -> list[SmoothedPose]:
-        """Smoothed poses of member `i`, also from before it shared its state if `complete`."""
+        """Smoothed poses of member `i`; if `complete`, also those before it shared its state."""
         member, n = self.members[i], self._bank.single_target.n_target
         own_states = member.states_of(member.slot if complete else i, n, states)
         return member.smoothed(view.bank, view.best, complete,

@@ -21,9 +21,9 @@ _States: TypeAlias = tuple[FloatArray, FloatArray]
 """States and covariances of a bank."""
 
 SENSORS_PER_REJECTION = 8
-"""Number of sensors per rejected sensor. With fewer sensors, one may be rejected. If more
-rejections are needed, the track itself is wrong. The majority is no proof of the track, because
-sensors far from the target fit any hypothesis."""
+"""Number of measuring sensors for each sensor that may be rejected. With fewer sensors, one may be
+rejected. If more rejections are needed, the track itself is wrong. The majority is no proof of the
+track, because sensors far from the target fit any hypothesis."""
 
 
 class SensorRejection:
@@ -143,7 +143,7 @@ def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:
 
 
 def _misfit(bank: FilterBank, frame: FieldFrame, log_likelihood: FloatArray) -> float:
-    """Normalised innovation squared per axis of the leading hypothesis."""
+    """Normalised innovation squared per axis of the leader; infinite without a leader."""
     leader = _leader(bank, log_likelihood)
     n_axes = np.count_nonzero(~np.isnan(frame.field))
     return np.inf if leader is None else float(np.nansum(bank.nis[leader])) / n_axes

@@ -292,7 +292,7 @@ class FixedLag:
             self._frames, self._states(bank_filter, bank, best), strict=True) if lagged.published]
 
     def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
-        """Smoothed states of the stored frames; relinearisation would take too long per frame."""
+        """Smoothed states of the stored frames, without relinearisation, which is too slow here."""
         oldest = self._frames[0]
         one, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
         one.x, one.P = oldest.x[row].copy(), oldest.P[row].copy()

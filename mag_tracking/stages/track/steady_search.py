@@ -31,7 +31,7 @@ N_DIPOLES = 3
 GRID_STEP, GRID_MARGIN = 3.0, 12.0
 """[m] Spacing of the grid along an arrival line, and its range beyond the last sensor."""
 
-SPEED = PATH.index('speed')
+SPEED_COLUMN = PATH.index('speed')
 """Column of the speed in a path."""
 
 MIN_STD = 1e-3
@@ -50,7 +50,7 @@ PATH_TOLERANCE: FloatArray = np.array([1.0, 1.0, 1.0, 2.0, 0.3, 1.0, 9.0])
 """[m], [m/s], [rad] Differences of path parameters up to which two starts, or two refined paths,
 are treated as identical."""
 
-KNOWN_STD: FloatArray = np.array([2.0, 1.5, 0.2, 3.0, 0.1, 0.1, 1.5])
+FIRST_PATH_STD: FloatArray = np.array([2.0, 1.5, 0.2, 3.0, 0.1, 0.1, 1.5])
 """[m], [m/s], [rad] Standard deviations of the path of the first vehicle in the search for a
 second vehicle."""
 
@@ -68,7 +68,7 @@ class PathPrior:
     std: FloatArray
     """(7,) Standard deviations about `mean`; infinite for the position along the line."""
     moment_std: FloatArray
-    """(3 d,) [A m^2] Standard deviations of the combinations of moments."""
+    """(3 d,) [A m^2] Standard deviations of the orthogonal combinations of the dipole moments."""
     min_speed: float
     """[m/s] Minimum speed of an arriving vehicle. A slower vehicle was already near the sensors."""
 
@@ -331,7 +331,7 @@ class SteadySearch:
         if not len(theta):
             return theta, np.zeros(0)
         path, cost, _, _ = refine(self.residual_and_jacobian, theta, n_steps, TOLERANCE)
-        are_moving = (path[:, SPEED::N_STRAIGHT] >= self.prior.min_speed).all(axis=1)
+        are_moving = (path[:, SPEED_COLUMN::N_STRAIGHT] >= self.prior.min_speed).all(axis=1)
         return path, np.where(are_moving & self._are_detectable(path), cost, np.inf)
 
     def best(self, grid: StartGrid, most: int) -> FloatArray:
@@ -384,7 +384,7 @@ class SteadySearch:
         _, _, _, p = self._solve(path[None])
         return replace(self, columns=np.hstack([
             self.columns, self._model.basis(path[None])[0] * self.prior.moment_std,
-            self._model.derivative(path[None], p)[0] * KNOWN_STD]))
+            self._model.derivative(path[None], p)[0] * FIRST_PATH_STD]))
 
     def pairs(self, grid: StartGrid, most: int, most_second: int) -> list[FloatArray]:
         """Search for the pairs of paths that explain the frames best.
@@ -417,7 +417,7 @@ class SteadySearch:
             -1, 2, N_STRAIGHT))
 
     def _log_determinant_of_moments(self, theta: FloatArray) -> FloatArray:
-        """Log-determinant (n,) of the information of the moments, relative to the prior."""
+        """Log-determinant (n,) of each matrix from `_information_of_moments`."""
         with ignoring_overflow():
             return _log_determinant(self._information_of_moments(theta))
 
@@ -430,14 +430,14 @@ class SteadySearch:
         return are_detectable
 
     def _information_of_moments(self, theta: FloatArray) -> FloatArray:
-        """Information (n, 9 m, 9 m) of the moments, relative to the prior."""
+        """Information matrices (n, 9 m, 9 m) of the moments, in units of the prior information."""
         std = self._moment_std(theta)
         information: FloatArray = self._solve(theta)[1] * np.outer(std, std)
         return information
 
 
 def _log_determinant(A: FloatArray) -> FloatArray:
-    """Log-determinants (n,) of matrices (n, k, k); infinite if rounding has made one indefinite."""
+    """Log-determinants (n,) of matrices (n, k, k); infinite for an indefinite matrix."""
     sign, value = np.linalg.slogdet(A)
     return np.where(sign > 0.0, value, np.inf)
 
@@ -464,7 +464,7 @@ def _block_diagonal(A: FloatArray, m: int) -> FloatArray:
 
 def _best_distinct(theta: FloatArray, cost: FloatArray, tolerance: FloatArray, n_max: int
                    ) -> FloatArray:
-    """The best distinct paths (n, 7) with a finite cost."""
+    """At most `n_max` distinct rows of `theta` with a finite cost, the best first."""
     is_usable = np.isfinite(cost)
     paths: FloatArray = theta[is_usable]
     return paths[distinct(paths, cost[is_usable], tolerance, n_max)]

@@ -97,7 +97,7 @@ class TrackBank:
         return self._fixed_lag is not None
 
     def gain(self, row: int) -> float:
-        """Log-likelihood along a path minus the log-likelihood in the filter, in the window.
+        """Log-likelihood of the window along a path, minus its log-likelihood in the filter.
 
         Parameters
         ----------

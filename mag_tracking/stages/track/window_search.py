@@ -83,7 +83,7 @@ class WindowSearch:
                             np.hstack([self._backgrounds(), (W @ columns).reshape(3 * len(W), -1)]))
 
     def _backgrounds(self) -> FloatArray:
-        """Whitened fields (3 n, q) of one standard deviation of each background."""
+        """Whitened fields (3 n, q) of the backgrounds, each at one standard deviation."""
         return self._vehicles.background_std * self.samples.backgrounds
 
     def _columns(self, H: FloatArray, x: FloatArray, t: FloatArray, n_one: int) -> FloatArray:

@@ -9,7 +9,7 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.geometry import overlap
 from mag_tracking.stages.track.bank_filter import BankFilter
 
-WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 1.0
+OVERLAP_WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 1.0
 """[m] Lateral distance below which two vehicles overlap, minimum longitudinal gap between their
 rows of dipoles, and standard deviation of the overlap depth due to uncertain paths."""
 
@@ -131,5 +131,6 @@ def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length: int | No
             gap = OVERHANG + (0.0 if length is None else
                               0.5 * (np.abs(x[:, i, length]) + np.abs(x[:, k, length])))
             pair = x[:, [i, k]].swapaxes(0, 1)
-            depth = max(depth, float(overlap(pair[:, :, :2], pair[:, :, 3:5], gap, WIDTH).max()))
+            depth = max(depth, float(overlap(
+                pair[:, :, :2], pair[:, :, 3:5], gap, OVERLAP_WIDTH).max()))
     return depth

@@ -18,7 +18,7 @@ from support.situation_worlds import ambient_world
 from support.situations import simulated_world
 from support.steady_frames import ROAD, STRAIGHT, state_at, steady_frames
 
-FAST = np.where(np.arange(10) == 3, 60.0, STRAIGHT)
+FAST_PATH = np.where(np.arange(10) == 3, 60.0, STRAIGHT)
 
 
 def run_check(check, frames, path=STRAIGHT):
@@ -44,7 +44,7 @@ def test_fits_follow_the_cpa_at_increasing_intervals():
 
 @pytest.mark.parametrize('of_frames, path, expected', [
     ({'clocks': (0.3,)}, STRAIGHT, doubts.CLOCKS_APART),
-    ({'path': FAST}, FAST, doubts.FRAMES_TOO_LONG),
+    ({'path': FAST_PATH}, FAST_PATH, doubts.FRAMES_TOO_LONG),
     ({'change': lambda B: np.clip(B, -3e-7, 3e-7)}, STRAIGHT, doubts.NO_STEADY_PATH)])
 def test_faults_found_in_the_whole_pass_flag_the_track(of_frames, path, expected):
     """The doubt begins after the vehicle has passed, and is permanent."""

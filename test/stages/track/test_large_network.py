@@ -13,7 +13,7 @@ from support.networks import line_network
 from support.samples import one, simulate
 
 SETTINGS = read_parameter_file(ROOT / 'config' / 'large_network.yaml')
-LOST = [8, 13, 15, 18, 63, 118]
+LOST_SEEDS = [8, 13, 15, 18, 63, 118]
 """Seeds of vehicles that are lost if the limit applies from the first frame (the first four), or if
 the limit is 60 (the other two)."""
 
@@ -47,11 +47,12 @@ def distances(some, others):
                      ((a.position[:2] - b.position[:2], b) for a, b in pairs)])
 
 
-DIFFERING = {76: 'the last of four poses differs by 4 standard deviations; cause unknown'}
+DIFFERING_SEEDS = {76: 'the last of four poses differs by 4 standard deviations; cause unknown'}
 
 
-@pytest.mark.parametrize('seed', studied(range(150), LOST, lambda seed: [
-    pytest.mark.xfail(strict=True, reason=DIFFERING[seed])] if seed in DIFFERING else []))
+@pytest.mark.parametrize('seed', studied(range(150), LOST_SEEDS, lambda seed: [
+    pytest.mark.xfail(strict=True, reason=DIFFERING_SEEDS[seed])]
+    if seed in DIFFERING_SEEDS else []))
 def test_more_hypotheses_do_not_change_the_poses(drive, seed):
     bounded = drive(seed, {})
     free = drive(seed, {'track.max_hypotheses': 100_000})

@@ -242,7 +242,7 @@ DETERMINISTIC = {**matched.TARGETS['point'], 'track.vehicle.acceleration': 0.0,
 
 
 def fields_along(model, network, x0, n):
-    """Fields (n, n_sensors, 3) [T] of frames from a state `x0` (n_x,) and backgrounds."""
+    """Fields (n, n_sensors, 3) [T] on the path from a state `x0` (n_x,), with backgrounds."""
     n_t, out = len(model.state_names), []
     filter_ = BankFilter(network, model, settings_for('vehicle', DETERMINISTIC).track)
     for k in range(n):
@@ -351,8 +351,8 @@ def test_a_path_through_a_sensor_is_rejected(monkeypatch):
 @pytest.mark.study
 @pytest.mark.parametrize('target', matched.TARGETS)
 def test_the_error_of_matched_targets_is_near_its_bound(target, n=60):
-    """Ratio of RMS error to path bound, without the worst 5 % of the runs. Without relinearisation,
-    the ratio is 1.4 and 1.8."""
+    """The worst 5 % of the runs are excluded from the ratio of RMS error to path bound. Without
+    relinearisation, the ratio is 1.4 and 1.8."""
     with ProcessPoolExecutor(2) as pool:
         error, bound = (np.array(a)[:, matched.STEPS // 2:] for a in zip(
             *pool.map(partial(matched.one_run, target), range(n)), strict=True))

@@ -24,9 +24,9 @@ from support.samples import one
 SETTINGS = settings_for('vehicle', {**POINT, 'track.mounting_std_deg': 0.0,
                                     'track.model_error_time_s': 0.0}).track
 SIGMA = 1.2e-8 / 8**0.5
-TARGET = np.array([4.0, -1.0, 0.5])
+TARGET_POSITION = np.array([4.0, -1.0, 0.5])
 MOMENT = np.array([200.0, -150.0, 80.0])
-FAULT = np.array([3e-5, -2e-5, 4e-5])
+FAULT_FIELD = np.array([3e-5, -2e-5, 4e-5])
 DT = 0.08
 
 
@@ -46,7 +46,7 @@ def situation(n=6, seed=0, spread=0.3, n_hyp=5):
     network = line_network(n, spacing=4.0, tilt=0.2)
     model = vehicle_model(SETTINGS.vehicle, network)
     bank_filter = CountingFilter(network, model, SETTINGS)
-    state = np.array([*TARGET, 10.0, 0.0, 0.0, *(MOMENT - 4.0 * network.earth_field / MU0),
+    state = np.array([*TARGET_POSITION, 10.0, 0.0, 0.0, *(MOMENT - 4.0 * network.earth_field / MU0),
                       4.0, 4.0, 4.0])
     x = np.tile(state, (n_hyp, 1))
     x[:, :2] += spread * rng.standard_normal((n_hyp, 2))
@@ -55,7 +55,7 @@ def situation(n=6, seed=0, spread=0.3, n_hyp=5):
                 (n_hyp, 1, 1))
     bank = FilterBank.from_targets(x, P, np.arange(n_hyp), n, 1e-8,
                                    bank_filter.observation.own_covariance)
-    B = dipole_field(network.positions - TARGET, MOMENT)
+    B = dipole_field(network.positions - TARGET_POSITION, MOMENT)
     field = np.einsum('jik,jk->ji', network.R_sw, B) + SIGMA * rng.standard_normal((n, 3))
     frame = FieldFrame(1000, field, np.tile(SIGMA**2 * np.eye(3), (n, 1, 1)), np.full(n, 8),
                        1e-3 * np.arange(n), True, 99.0, 3 * n)
@@ -65,7 +65,7 @@ def situation(n=6, seed=0, spread=0.3, n_hyp=5):
 def with_fault(frame, *rows, size=1.0):
     field = frame.field.copy()
     for k, j in enumerate(rows):
-        field[j] += (1.0 + k) * size * FAULT
+        field[j] += (1.0 + k) * size * FAULT_FIELD
     return dataclasses.replace(frame, field=field)
 
 
@@ -238,7 +238,7 @@ def test_the_second_of_two_wrong_sensors_is_sought_among_the_others():
 def test_the_frame_has_to_fit_the_hypothesis_that_leads_by_weight():
     """Another hypothesis explains the frame, but its weight is negligible."""
     bank_filter, bank, frame, names = situation(n_hyp=2)
-    bank.x[1, bank_filter.observation.n_target + 3 * 2:][:3] = FAULT
+    bank.x[1, bank_filter.observation.n_target + 3 * 2:][:3] = FAULT_FIELD
     bad = with_fault(frame, 2)
     assert cost(bank_filter, SensorRejection(names), bank, bad) == (1, [])
     bank.log_w = np.array([0.0, -1e9])

@@ -13,9 +13,9 @@ from support.busy_worlds import NETWORKS
 
 NOISE = 6e-9
 VEHICLE = settings_for('vehicle').track.vehicle
-FIRST = np.array([4.0, -1.8, 0.5, 12.0, 0.0, 0.0, 3.0])
-SECOND = np.array([-2.0, 1.7, 0.6, 15.0, np.pi, 0.0, 2.5])
-MOMENTS = {id(FIRST): [120.0, -90.0, -100.0], id(SECOND): [-60.0, 130.0, -110.0]}
+FIRST_PATH = np.array([4.0, -1.8, 0.5, 12.0, 0.0, 0.0, 3.0])
+SECOND_PATH = np.array([-2.0, 1.7, 0.6, 15.0, np.pi, 0.0, 2.5])
+MOMENTS = {id(FIRST_PATH): [120.0, -90.0, -100.0], id(SECOND_PATH): [-60.0, 130.0, -110.0]}
 
 
 def field_of(path, network, t):
@@ -50,7 +50,7 @@ def assert_near(path, truth, distance=0.5, speed=1.0):
     assert abs(path[3] - truth[3]) <= speed and abs(np.cos(path[4] - truth[4]) - 1.0) <= 0.02
 
 
-@pytest.mark.parametrize('truth', [FIRST, SECOND])
+@pytest.mark.parametrize('truth', [FIRST_PATH, SECOND_PATH])
 def test_a_single_vehicle_is_found(truth):
     search, grid = search_of(truth)
     best = search.best(grid, 3)
@@ -61,28 +61,28 @@ def test_a_single_vehicle_is_found(truth):
 
 @pytest.mark.parametrize('n_sensors', [2, 4])
 def test_two_vehicles_that_meet_are_found_in_any_order(n_sensors):
-    search, grid = search_of(FIRST, SECOND, n_sensors=n_sensors)
+    search, grid = search_of(FIRST_PATH, SECOND_PATH, n_sensors=n_sensors)
     pair = search.pairs(grid, 3, 2)[0]
     pair = pair if pair[0, 0] > pair[1, 0] else pair[::-1]
-    assert_near(pair[0], FIRST, 1.5, 1.5)
-    assert_near(pair[1], SECOND, 1.5, 1.5)
+    assert_near(pair[0], FIRST_PATH, 1.5, 1.5)
+    assert_near(pair[1], SECOND_PATH, 1.5, 1.5)
 
 
 def test_another_vehicle_is_found_beside_a_known_one():
-    search, grid = search_of(FIRST, SECOND)
-    assert_near(search.beside(FIRST).best(grid, 1)[0], SECOND, 1.0, 1.5)
+    search, grid = search_of(FIRST_PATH, SECOND_PATH)
+    assert_near(search.beside(FIRST_PATH).best(grid, 1)[0], SECOND_PATH, 1.0, 1.5)
 
 
 def test_the_field_of_a_known_vehicle_is_not_another_vehicle():
     """Only noise remains, which no path explains better than another."""
-    search, grid = search_of(FIRST)
-    alone, beside = search.cost(grid), search.beside(FIRST).cost(grid)
+    search, grid = search_of(FIRST_PATH)
+    alone, beside = search.cost(grid), search.beside(FIRST_PATH).cost(grid)
     assert np.ptp(alone) > 1000.0
     # The priors of paths and moments contribute a few dozen to the difference.
     assert np.ptp(beside) < 100.0
 
 
-@pytest.mark.parametrize('truths', [[FIRST], [FIRST, SECOND]])
+@pytest.mark.parametrize('truths', [[FIRST_PATH], [FIRST_PATH, SECOND_PATH]])
 def test_the_gradient_of_the_cost_is_exact(truths):
     """Kaufman's Jacobian yields the exact gradient, also for two vehicles together."""
     search, _ = search_of(*truths)
@@ -101,8 +101,8 @@ def test_the_gradient_of_the_cost_is_exact(truths):
 def test_the_cost_of_the_grid_matches_the_full_covariance():
     """Cost differences match the log-density of the frames for a point target with Gaussian moment,
     backgrounds and noise."""
-    search, grid = search_of(FIRST)
-    beside, rows = search.beside(SECOND), np.arange(0, len(grid.theta), 97)
+    search, grid = search_of(FIRST_PATH)
+    beside, rows = search.beside(SECOND_PATH), np.arange(0, len(grid.theta), 97)
     std = search.prior.moment_std[0] * np.sqrt(3.0)
     expected = []
     for k in rows:
@@ -118,19 +118,19 @@ def test_the_cost_of_the_grid_matches_the_full_covariance():
 @pytest.mark.parametrize('miss', [0.0, 1e-12, 1e-9, 1e-6])
 def test_a_path_through_a_sensor_raises_no_error(miss):
     """A step of the search may lead through a sensor."""
-    search, grid = search_of(FIRST, SECOND)
-    at = np.append(search.samples.positions[0] + [0.0, 0.0, miss], FIRST[3:])
-    pair = np.append(at, SECOND)
+    search, grid = search_of(FIRST_PATH, SECOND_PATH)
+    at = np.append(search.samples.positions[0] + [0.0, 0.0, miss], FIRST_PATH[3:])
+    pair = np.append(at, SECOND_PATH)
     for theta in (at[None], pair[None]):
         search.refined(theta, 3)
-    through = StartGrid(search.samples, search.prior, np.vstack([at, FIRST]))
+    through = StartGrid(search.samples, search.prior, np.vstack([at, FIRST_PATH]))
     cost = search.cost(through)
     assert np.isfinite(cost[1]) and not np.isnan(cost).any()
 
 
 def test_pairs_are_ranked_by_the_density_of_the_frames():
     """The density includes moments, backgrounds and noise; all pairs are in the same order."""
-    search, grid = search_of(FIRST, SECOND)
+    search, grid = search_of(FIRST_PATH, SECOND_PATH)
     pairs = search.pairs(grid, 3, 2)
     model, density = search.samples.straight_model(N_DIPOLES), []
     for pair in pairs:
@@ -147,15 +147,15 @@ def test_pairs_are_ranked_by_the_density_of_the_frames():
 
 
 def test_moments_of_a_pair_are_those_of_its_vehicles():
-    search, _ = search_of(FIRST, SECOND)
-    for pair in ([FIRST, SECOND], [SECOND, FIRST]):
+    search, _ = search_of(FIRST_PATH, SECOND_PATH)
+    for pair in ([FIRST_PATH, SECOND_PATH], [SECOND_PATH, FIRST_PATH]):
         totals = search.moments(np.concatenate(pair)).sum(axis=1)
         np.testing.assert_allclose(totals, [3.0 * np.array(MOMENTS[id(path)]) for path in pair],
                                    atol=60.0)
 
 
 def test_pairs_belong_to_different_minima():
-    search, grid = search_of(FIRST, SECOND)
+    search, grid = search_of(FIRST_PATH, SECOND_PATH)
     pairs = np.array(search.pairs(grid, 3, 2))
     apart = np.abs(pairs[:, None] - pairs)
     assert len(pairs) > 1
@@ -164,8 +164,8 @@ def test_pairs_belong_to_different_minima():
 
 @pytest.mark.parametrize('stationary', [0, 1])
 def test_a_pair_with_a_stationary_vehicle_is_rejected(stationary):
-    search, _ = search_of(FIRST, SECOND)
-    pair = np.array([FIRST, SECOND])
+    search, _ = search_of(FIRST_PATH, SECOND_PATH)
+    pair = np.array([FIRST_PATH, SECOND_PATH])
     assert np.isfinite(search.refined(pair.reshape(1, -1), 0)[1]).all()
     pair[stationary, 3] = 0.1
     assert np.isinf(search.refined(pair.reshape(1, -1), 0)[1]).all()
@@ -175,15 +175,15 @@ def test_a_pair_with_a_stationary_vehicle_is_rejected(stationary):
     (0.0, True), (15.0, True), (90.0, False), (300.0, False), (1e23, False), (-1e200, False)])
 def test_a_vehicle_that_no_sensor_senses_is_rejected(away, is_sensed):
     """A distant vehicle does not improve the fit of the frames."""
-    search, _ = search_of(FIRST)
-    other = np.append(away, SECOND[1:])
-    for theta in (other, np.append(FIRST, other), np.append(other, FIRST)):
+    search, _ = search_of(FIRST_PATH)
+    other = np.append(away, SECOND_PATH[1:])
+    for theta in (other, np.append(FIRST_PATH, other), np.append(other, FIRST_PATH)):
         assert np.isfinite(search.refined(theta[None], 0)[1]).all() == is_sensed
 
 
 def test_pairs_that_diverge_are_discarded(monkeypatch):
     """The squares of the diverged positions overflow."""
-    search, grid = search_of(FIRST, SECOND)
+    search, grid = search_of(FIRST_PATH, SECOND_PATH)
     refined = SteadySearch.refined
 
     def diverging(self, theta, *args):
@@ -198,12 +198,12 @@ def test_pairs_that_diverge_are_discarded(monkeypatch):
 
 
 def test_a_search_without_a_valid_start_finds_nothing():
-    search, _ = search_of(FIRST)
-    at = np.append(search.samples.positions[0], FIRST[3:])
+    search, _ = search_of(FIRST_PATH)
+    at = np.append(search.samples.positions[0], FIRST_PATH[3:])
     grid = StartGrid(search.samples, search.prior, at[None])
     assert search.best(grid, 3).shape == (0, 7) and search.pairs(grid, 3, 2) == []
 
 
 def test_stationary_and_reversing_vehicles_are_not_found():
-    search, grid = search_of(FIRST)
+    search, grid = search_of(FIRST_PATH)
     assert (search.best(grid, 5)[:, 3] >= 0.2 * min(VEHICLE.speeds)).all()
