@@ -108,7 +108,7 @@ class VehiclePassage:
     speed_std: float
     """Standard deviation of `speed`, m/s."""
     heading_std: float
-    """Standard deviation of the direction of `velocity`, rad."""
+    """Standard deviation of the heading, rad."""
     length: float
     """Length of the row of dipoles that models the vehicle, m. 0 for a point target."""
     length_std: float

@@ -317,7 +317,7 @@ class Hypotheses(Sequence[Hypothesis]):
 
 
 def best_of_arrivals(members: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Best hypothesis of each arrival direction.
+    """Select the most probable hypothesis of each arrival direction.
 
     Parameters
     ----------

@@ -101,14 +101,14 @@ class Parameter:
 
 
 def _types_of_hint(hint: Any) -> tuple[_Class, _Class | None]:
-    """Type and element type of an annotation such as float or tuple[float, ...]."""
+    """Type of an annotation, and element type of a tuple such as tuple[float, ...], else None."""
     if typing.get_origin(hint) is tuple:
         return tuple, typing.get_args(hint)[0]
     return hint, None
 
 
 def _is_group(value: object) -> 'TypeGuard[DataclassInstance]':
-    """Whether a field of a settings dataclass is itself a group of settings."""
+    """Whether the value of a field is itself a group of settings."""
     return dataclasses.is_dataclass(value)
 
 
@@ -285,7 +285,7 @@ def _closest(name: str, candidates: Iterable[str]) -> str:
 
 
 def _rebuild(settings: _Settings, checked: Mapping[str, Value], prefix: str) -> _Settings:
-    """Copy a settings tree and insert the validated values."""
+    """Copy a settings tree with the validated values inserted."""
     changes: dict[str, Any] = {}
     for f in dataclasses.fields(settings):
         name, value = prefix + f.name, getattr(settings, f.name)

@@ -23,7 +23,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
     """Loader that rejects duplicate keys, instead of silently keeping only the last value."""
 
     def get_single_node(self) -> yaml.Node | None:
-        """Return the root after checking that its expanded size is bounded."""
+        """Return the root node after checking its expanded size; None for an empty document."""
         node = super().get_single_node()
         if node is not None:
             _check_size(node)
@@ -45,7 +45,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
-        """Return an integer; raises YAMLError if it exceeds `MAX_BITS`."""
+        """Convert a node to an integer; raises YAMLError if it exceeds `MAX_BITS`."""
         value = super().construct_yaml_int(node)
         if value.bit_length() > MAX_BITS:
             raise yaml.YAMLError(f'an integer of {value.bit_length()} bits exceeds the maximum of '

@@ -26,9 +26,10 @@ _HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')
 os.environ['ROS_HOME'] = _HOME.name
 
 
-LONGEST = ('test_site.py', 'test_wheel.py', 'test_busy.py', 'test_pass_fit.py', 'test_archive.py',
-           'test_archive_faults.py', 'test_traffic.py', 'test_situations.py', 'test_cli.py',
-           'test_nodes.py', 'test_node_faults.py', 'test_shutdown.py', 'test_health_node.py')
+LONGEST_FILES = (
+    'test_site.py', 'test_wheel.py', 'test_busy.py', 'test_pass_fit.py', 'test_archive.py',
+    'test_archive_faults.py', 'test_traffic.py', 'test_situations.py', 'test_cli.py',
+    'test_nodes.py', 'test_node_faults.py', 'test_shutdown.py', 'test_health_node.py')
 """Files with the longest run times; files without nodes come first."""
 
 
@@ -37,8 +38,8 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.path.is_relative_to(ROOT / 'test' / 'nodes'):
             item.add_marker('alone')
-    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST
-               else len(LONGEST))
+    items.sort(key=lambda item: LONGEST_FILES.index(item.path.name)
+               if item.path.name in LONGEST_FILES else len(LONGEST_FILES))
 
 
 @pytest.fixture(scope='session')

@@ -19,7 +19,7 @@ CHECKS = {
 the first line (GL01, GL02); extended summary, examples and see-also are optional (ES01, EX01,
 SA01), and so is a description if name and type are sufficient (PR07, RT03); a summary may be a
 noun phrase, which SS05 treats as a verb if its first word is a plural."""
-ARRAY = re.compile(r'\b(FloatArray|IntArray|BoolArray|ArrayLike|NDArray|StructArray)\b')
+ARRAY_TYPE = re.compile(r'\b(FloatArray|IntArray|BoolArray|ArrayLike|NDArray|StructArray)\b')
 PROGRAMMING_ERRORS = {'AssertionError', 'NotImplementedError', 'AttributeError'}
 
 
@@ -58,9 +58,9 @@ def shape_issues(node, doc):
     types = {name: p.type for p in doc['Parameters'] for name in re.split(r',\s*', p.name)}
     arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
     missing = [f'no shape: {a.arg}' for a in arguments
-               if a.annotation is not None and ARRAY.search(ast.unparse(a.annotation))
+               if a.annotation is not None and ARRAY_TYPE.search(ast.unparse(a.annotation))
                and not has_shape(types.get(a.arg, '('))]
-    returns_array = node.returns is not None and ARRAY.search(ast.unparse(node.returns))
+    returns_array = node.returns is not None and ARRAY_TYPE.search(ast.unparse(node.returns))
     if returns_array and doc['Returns'] and not is_property(node) \
             and not any(has_shape(r.type) or has_shape(r.name) for r in doc['Returns']):
         missing.append('no shape: return value')

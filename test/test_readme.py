@@ -9,10 +9,10 @@ import pytest
 from mag_tracking.cli import main
 from support.bundled import ROOT
 
-TEXT = (ROOT / 'README.md').read_text(encoding='utf-8')
+README_TEXT = (ROOT / 'README.md').read_text(encoding='utf-8')
 MAX_WORDS = 600
-SHELL = re.findall(r'^\$ (.+)$', TEXT, re.M)
-PYTHON, = re.findall(r'```python\n(.+?)```', TEXT, re.S)
+SHELL_LINES = re.findall(r'^\$ (.+)$', README_TEXT, re.M)
+PYTHON_EXAMPLE, = re.findall(r'```python\n(.+?)```', README_TEXT, re.S)
 
 
 def recipe(target):
@@ -23,23 +23,23 @@ def recipe(target):
 
 
 def test_it_is_short_and_has_two_pictures():
-    assert len(TEXT.split()) <= MAX_WORDS
-    pictures = re.findall(r'!\[.+?\]\((.+?)\)', TEXT)
+    assert len(README_TEXT.split()) <= MAX_WORDS
+    pictures = re.findall(r'!\[.+?\]\((.+?)\)', README_TEXT)
     assert len(pictures) == 2 and all((ROOT / p).is_file() for p in pictures)
 
 
 def test_its_links_refer_to_existing_files():
-    links = re.findall(r'\]\(((?!http)[^)]+)\)', TEXT)
+    links = re.findall(r'\]\(((?!http)[^)]+)\)', README_TEXT)
     assert len(links) > 8 and [link for link in links if not (ROOT / link).exists()] == []
 
 
 def test_every_command_has_a_test():
     """The commands listed here are tested below; a new command in README needs another test."""
-    assert [line for line in SHELL if not line.startswith('mag-tracking ')] == [
+    assert [line for line in SHELL_LINES if not line.startswith('mag-tracking ')] == [
         '. .venv/bin/activate']
-    assert re.findall(r'^    (make \w+)', TEXT, re.M) == ['make demo', 'make test']
-    assert set(re.findall(r'`(make \w+)`', TEXT)) == {'make docs'}
-    assert set(re.findall(r'`(mag-tracking [^`]+)`', TEXT)) == {
+    assert re.findall(r'^    (make \w+)', README_TEXT, re.M) == ['make demo', 'make test']
+    assert set(re.findall(r'`(make \w+)`', README_TEXT)) == {'make docs'}
+    assert set(re.findall(r'`(mag-tracking [^`]+)`', README_TEXT)) == {
         'mag-tracking run --network network.yaml --drivers drivers.yaml'}
 
 
@@ -52,7 +52,7 @@ def test_make_test_runs_pytest_and_docs_builds_the_site():
     assert 'pytest' in recipe('test') and 'sphinx' in recipe('docs')
 
 
-@pytest.mark.parametrize('line', [line for line in SHELL if line.startswith('mag-tracking ')])
+@pytest.mark.parametrize('line', [line for line in SHELL_LINES if line.startswith('mag-tracking ')])
 def test_commands_run(line, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     words = [str(tmp_path) if word.startswith('out/') else word for word in line.split()[1:]]
@@ -62,8 +62,8 @@ def test_commands_run(line, tmp_path, monkeypatch, capsys):
 
 def test_the_python_example_runs(tmp_path):
     """The code is run unchanged, except for the path of the picture, in the project folder."""
-    assert len(PYTHON.split('\n\n')[1].strip().splitlines()) + 1 <= 5
-    code = PYTHON.replace("'map.png'", repr(str(tmp_path / 'map.png')))
+    assert len(PYTHON_EXAMPLE.split('\n\n')[1].strip().splitlines()) + 1 <= 5
+    code = PYTHON_EXAMPLE.replace("'map.png'", repr(str(tmp_path / 'map.png')))
     process = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True,
                              text=True, check=False)
     assert process.returncode == 0, process.stderr

@@ -125,7 +125,7 @@ class ClockStepFilter:
         return self._pass(self._release(lambda *_: True))
 
     def _jumps(self, i: int, stamp: int) -> bool:
-        """Whether a timestamp is so far beyond the newest accepted one that it must be checked."""
+        """Whether a timestamp of sensor `i` jumps beyond the limit and must be checked."""
         if self.newest == NEVER or stamp <= self.newest + self._max_jump:
             return False
         # With two sensors, the first sample of one is as credible as the samples of the other.
@@ -139,21 +139,21 @@ class ClockStepFilter:
         return samples
 
     def _active(self) -> set[int]:
-        """Indices of the sensors whose latest sample is within the jump limit of the newest."""
+        """Indices of the sensors whose latest timestamp is at most `max_jump` before `newest`."""
         return {j for j, latest in enumerate(self.latest.tolist())
                 if latest != NEVER and latest >= self.newest - self._max_jump}
 
     def _majority_follows(self, stamp: int) -> bool:
-        """Whether the majority of the active sensors hold a sample within the limit of `stamp`."""
+        """Whether most of the active sensors have a held sample within `max_jump` of `stamp`."""
         agree = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._max_jump}
         return 2 * len(agree) > len(agree | self._active())
 
     def _is_alone(self, i: int, stamp: int) -> bool:
-        """Whether sensor `i` has been ahead for the jump limit while no sample was accepted."""
+        """Whether sensor `i`, while ahead, has advanced by `max_jump` with no sample accepted."""
         return stamp - self._ahead_since[i][1] >= self._max_jump
 
     def _release_expired(self, i: int, stamp: int) -> SensorSamples:
-        """Release samples of sensor `i` that were held too long or exceed the maximum number."""
+        """Remove and return samples of sensor `i` that were held too long or exceed `max_held`."""
         of_sensor = [s for j, s, _ in self._held if j == i]
         first = of_sensor[0] if len(of_sensor) > self._max_held else None
         return self._release(lambda j, s, _: j == i and (

@@ -45,9 +45,9 @@ def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
     """Frame period: the setting, or a period derived from the geometry if the setting is 0.
 
     A frame that is longer than the delay between two sensors mixes their signals, so in a compact
-    network the period is half the shortest delay. A larger network is tracked without this
-    delay, so it has the default period, which saves computing time. In burst mode, the period is
-    the maximum duration of a round.
+    network the period is half the shortest delay. In a larger network, tracking
+    does not use this delay. The default period then saves computing time. In burst mode, the period
+    is the maximum duration of a round.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ from mag_tracking.stages.align.frame_period import frame_period
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.units import NS
 
-UNLIMITED = np.iinfo(np.int64).max
+UNLIMITED_NS = np.iinfo(np.int64).max
 """[ns] Later than any timestamp."""
 MAX_HELD = 16
 """Maximum number of samples per sensor that are held while a clock step is unconfirmed."""
@@ -66,7 +66,7 @@ class Align:
     def _reset(self) -> None:
         """Reset to the initial state."""
         settings = self._settings
-        longest_jump = int(round(settings.max_clock_jump_s * NS)) or UNLIMITED
+        longest_jump = int(round(settings.max_clock_jump_s * NS)) or UNLIMITED_NS
         self._alignment = core.Alignment(
             self._n, self._period, self._wait, longest_jump,
             int(round(settings.max_backward_jump_s * NS)),
@@ -143,7 +143,7 @@ class Align:
                 self._reject(CAUSES[reason])
 
     def _handle_clock_step(self, i: int, sample: HeldSample) -> list[FieldFrame]:
-        """Check a sample of sensor `i` for a clock step; return the frames that are completed."""
+        """Check a sample of sensor `i` for a clock step; return the completed frames."""
         passed, rejected = self._clock_steps.feed(i, sample)
         for j, _ in rejected:
             self._reject(f'ahead of all other sensors: {self._names[j]}')
@@ -158,7 +158,7 @@ class Align:
         return out
 
     def _restart(self) -> list[FieldFrame]:
-        """Reset after a backward jump in time, and return the frames of the pending samples."""
+        """Return the frames of the held and pending samples, and reset after time jumped back."""
         out = self.flush()
         self._reset()
         self.counts['time jumped back'] += 1

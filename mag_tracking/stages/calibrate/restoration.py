@@ -47,7 +47,7 @@ def stored_background(background: RunningBackground, stamp_ns: int,
 
 
 class BackgroundRestoration:
-    """Stored backgrounds of the sensors that have not delivered a reading yet.
+    """Restores the stored background of each sensor at its first reading.
 
     Parameters
     ----------

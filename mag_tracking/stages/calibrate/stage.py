@@ -126,7 +126,7 @@ class Calibrate:
         self._mark_restorable()
 
     def _configure(self, i: int, shift: int) -> None:
-        """Apply the network file to sensor `i`; shift stored timestamps of the sensor [ns]."""
+        """Apply the network file to sensor `i`; add `shift` [ns] to the sensor's timestamps."""
         s, network = self._sensors[i], self._network
         for name in ('first_ns', 'last_ns', 'unconfirmed_ns'):
             if s[name] != NEVER:
@@ -182,7 +182,7 @@ class Calibrate:
         return self._per_sensor[sensor] + Counter(accepted=int(self._state_of(sensor)['accepted']))
 
     def _state_of(self, sensor: str) -> Record:
-        """State of a sensor."""
+        """State of a sensor: its element of the array that compiled code updates."""
         return self._sensors[self._index[sensor]]
 
     def feed(self, readings: Readings) -> list[Readings]:
@@ -245,7 +245,7 @@ class Calibrate:
             self._reject(name, self._causes[reason])
 
     def _use_passed(self, i: int, out: OutputBuffer) -> None:
-        """Calibrate the held readings of sensor `i` that have passed the spike filter."""
+        """Calibrate the readings of sensor `i` that the spike filter has released."""
         s, name = self._sensors[i], self._network.names[i]
         for k in range(int(s['n_released'])):
             stamp, own = int(s['held_ns'][k]), int(s['held_own'][k])
@@ -263,7 +263,7 @@ class Calibrate:
 
     def _use(self, i: int, stamp: int, field: FloatArray, own: int, covariance: FloatArray,
              out: OutputBuffer) -> None:
-        """Calibrate one reading of sensor `i` that has passed the spike filter."""
+        """Calibrate one reading of sensor `i`, and append the result to `out`."""
         background = self._background[self._network.names[i]]
         background.evaluate_block()
         while not core.use_reading(self._sensors, self._limits, self._batches, i, stamp,
@@ -318,7 +318,7 @@ class Calibrate:
         self._mark_restorable()
 
     def _mark_restorable(self) -> None:
-        """Mark the sensors with a stored background; compiled code reports their first reading."""
+        """Mark sensors with a stored background, so that their first reading is reported."""
         self._sensors['is_restorable'] = [name in self._restoration for name in self._index]
 
     def stored(self, sensor: str) -> StoredBackground | None:

@@ -23,7 +23,7 @@ step of one axis, which background drift can cause, remains below the threshold.
 
 
 class RestingAxes:
-    """Variance of each axis of a network, averaged over frames without a target.
+    """Mean square of each axis of a network over frames without a target.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class RestingAxes:
         core.learn(plain(field), MEMORY_FRAMES, self._n, self._square)
 
     def covariance(self, covariance: FloatArray, allowance: float) -> FloatArray:
-        """Covariance of a frame and its background, with reduced variances of axes at rest.
+        """Reduce the variances of axes at rest in a covariance, and add the background variance.
 
         Parameters
         ----------

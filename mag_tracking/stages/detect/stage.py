@@ -133,7 +133,7 @@ class Detect:
 
     def _record_excursions(self, energy: FloatArray, axes: IntArray, statistic: float,
                            n: int) -> None:
-        """Update the largest ratios of energy to threshold with a frame without a detection."""
+        """Update the largest ratios of energy to threshold unless a target is detected."""
         if not self._present:
             ratio = statistic / self.threshold(self._settings.false_alarm_probability, n)
             self._max_ratio = max(self._max_ratio, ratio)
@@ -145,7 +145,9 @@ class Detect:
         return float(np.sqrt(self._max_ratio))
 
     def largest_excursions(self) -> FloatArray:
-        """As `largest_excursion`, but of each sensor relative to a threshold for this sensor alone.
+        """Square root of the largest ratio of energy to single-sensor threshold, for each sensor.
+
+        As for `largest_excursion`, only frames without a detection are used.
 
         Returns
         -------
@@ -164,7 +166,7 @@ class Detect:
 
     def _update_presence(self, stamp_ns: int, statistic: float, n: int,
                          per_axis: FloatArray) -> list[Detection]:
-        """Update the detection state, and return the onset or release that results."""
+        """Update the detection state, and return the onset or release, if there is one."""
         s = self._settings
         if statistic > self.threshold(s.false_alarm_probability, n):
             self.counts['frames above the threshold'] += 1
@@ -187,7 +189,7 @@ class Detect:
         return []
 
     def _strongest(self, per_axis: FloatArray) -> str:
-        """Name of the sensor with the largest energy per axis (n_sensors,)."""
+        """Name of the sensor with the largest element of `per_axis` (n_sensors,)."""
         return self._names[int(per_axis.argmax())]
 
     def _release(self, stamp_ns: int, statistic: float, n: int, strongest: str) -> list[Detection]:

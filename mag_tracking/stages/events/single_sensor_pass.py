@@ -13,8 +13,8 @@ MAX_SAMPLES = 200
 """Maximum number of samples in the search. If a pass has more, blocks of samples are averaged."""
 
 MAX_STARTS = 5
-"""Maximum number of grid points from which the search starts; the cost of a single axis has
-several minima."""
+"""Maximum number of grid points from which the search starts. With a single axis, the cost function
+has several local minima."""
 
 CORRELATION_TIME = 2.0
 """[time scales] Correlation time of the residual when a dipole is fitted to a vehicle."""
@@ -23,7 +23,7 @@ CENTRE_OFFSET = 0.15
 """[time scales] Typical distance of a vehicle's magnetic centre from the middle of its body."""
 
 MIN_SAMPLES = 8
-"""Minimum number of samples with all reported axes for a fit."""
+"""Minimum number of samples for a fit. Only samples with all reported axes are counted."""
 
 
 class ClosestPoint(NamedTuple):

@@ -87,7 +87,7 @@ class Events:
 
 
 class _SensorEvents:
-    """Detects the passes of one sensor, and creates the events."""
+    """Detects the passes of targets at one sensor, and creates an event for each pass."""
 
     def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
                  counts: 'Counter[str]') -> None:
@@ -145,14 +145,14 @@ class _SensorEvents:
         return out
 
     def _on_detection(self, detection: Detection) -> list[PassEvent]:
-        """Store the time of an onset, or return the event of a release."""
+        """Store the time of an onset, or return the event that a release completes."""
         if detection.onset:
             self._onset_ns = detection.stamp_ns
             return []
         return self._event(detection.stamp_ns - self._hold_ns, True)
 
     def _event(self, release_ns: int, ended: bool) -> list[PassEvent]:
-        """Return a list with the event until `release_ns`; empty if there are no readings."""
+        """Return a list with the event that ends at `release_ns`; empty without finite readings."""
         onset_ns, self._onset_ns = self._onset_ns, None
         assert onset_ns is not None
         readings = Readings.joined(self._buffer)
@@ -208,7 +208,7 @@ def _median_noise(readings: Readings) -> FloatArray:
 
 
 def _median_interval(stamp: IntArray) -> float:
-    """Median interval [s] between readings."""
+    """Median interval [s] between readings; 0 for fewer than two readings."""
     return float(np.median(np.diff(stamp))) / NS if len(stamp) > 1 else 0.0
 
 

@@ -111,7 +111,7 @@ class SensorHealth:
 
     @property
     def counts(self) -> 'Counter[str]':
-        """Number of readings and of each kind of fault.
+        """Number of readings, and number of faults of each type.
 
         The keys are `readings`, `lost`, `duplicates`, `backward timestamps`, `clock steps`,
         `spikes`, `saturated`, `without any axis` and `stuck readings`; `x`, `y` and `z` count
@@ -202,7 +202,7 @@ class SensorHealth:
         self._counts['saturated'] += int(np.count_nonzero(is_saturated.any(axis=0)))
 
     def _check_stuck(self, n: int) -> None:
-        """Count the `n` latest readings that have been identical for too long."""
+        """Count the stuck readings among the `n` latest readings."""
         stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
         equal = (fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])
         self._has_changed |= (~equal & ~np.isnan(fields[1:]) & ~np.isnan(fields[:-1])).any(axis=0)
@@ -241,7 +241,7 @@ class SensorHealth:
 
     @property
     def is_coarse(self) -> bool:
-        """Whether the sensor repeats readings at rest, or has changed too rarely to decide."""
+        """Whether the sensor repeats readings at rest, or readings changed too rarely to decide."""
         return self._changes < MIN_CHANGES \
             or self._repeats >= COARSE * (self._repeats + self._changes)
 
@@ -253,7 +253,7 @@ class SensorHealth:
 
     @property
     def rate(self) -> float:
-        """Rate of the latest readings [Hz]; NaN if there are too few."""
+        """Sampling rate [Hz] from the median interval of the window; NaN for too few readings."""
         self.update()
         return NS / self._interval_ns
 

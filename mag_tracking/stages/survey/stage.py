@@ -209,7 +209,7 @@ class Survey:
     def _disagreements(self, field: FloatArray, level: Sequence[Orientation | None],
                        stated_std: FloatArray, warnings: Mapping[str, list[str]]
                        ) -> list[FieldInconsistency]:
-        """Find sensors that disagree with the Earth's field; an empty list if it is unknown."""
+        """Find sensors that contradict the Earth's field; empty if this field is unknown."""
         network = self._network
         R = np.array([R if o is None else o.R_ws for o, R in zip(level, network.R_ws, strict=True)])
         std = np.array([s if o is None else o.std for o, s in zip(level, stated_std, strict=True)])
@@ -269,7 +269,7 @@ class Survey:
 
     def _lags(self, signals: Mapping[str, tuple[FloatArray, FloatArray]]
               ) -> tuple[str, dict[str, Lag]]:
-        """Find the reference sensor and {sensor: lag} from the knocks."""
+        """Find the reference sensor, and estimate {sensor: lag} of other sensors from knocks."""
         longest = self._settings.max_clock_offset_s
         first: dict[str, Lag] = {}
         for reference, (t, s) in signals.items():
@@ -306,7 +306,7 @@ class NoiseSource(Protocol):
     """Part of the interface of `Calibrate` that `with_measured_noise` uses."""
 
     def backgrounds(self) -> Mapping[str, RunningBackground]:
-        """Background of each sensor of the network, in order.
+        """Background estimator of each sensor, in the order of the network.
 
         Returns
         -------
@@ -325,7 +325,7 @@ def with_measured_noise(network: SensorNetwork, calibrate: NoiseSource) -> Senso
     Returns
     -------
     SensorNetwork
-        Sensors for which the noise of any axis is not known retain their previous noise.
+        A sensor retains its previous noise if the measured noise of any axis is unknown.
     """
     noise = list(network.noise_std)
     for j, background in enumerate(calibrate.backgrounds().values()):

@@ -196,7 +196,7 @@ class Traffic:
                     path.add(record)
 
     def _add_pose(self, track: Track) -> None:
-        """Add a pose of a running track, or its end."""
+        """Add a pose of a running track, or mark the track as ended."""
         if track.ended:
             if track.id in self._open:
                 self._open[track.id].ended = True
@@ -211,7 +211,10 @@ class Traffic:
             path.add(track)
 
     def _count_ended(self, now_ns: int | None) -> list[VehiclePassage]:
-        """Return passages once no earlier one can follow, or all if `now_ns` is None."""
+        """Find the crossings of ended tracks, and return the passages that are due.
+
+        A passage is due when no earlier passage can follow, or if `now_ns` is None.
+        """
         ended = {id: track for id, track in self._open.items() if track.ended}
         self._ended += ended.values()
         for id, track in ended.items():
@@ -233,7 +236,7 @@ class Traffic:
         return [p for p in map(self._passage, due) if p is not None]
 
     def _direction_error(self, crossing: Crossing, track: _TrackHistory) -> float:
-        """Error probability of a direction from the fields; NaN if other vehicles interfere."""
+        """Probability that a direction is wrong; NaN if unknown or if other vehicles interfere."""
         near = round(INTERFERENCE_S * NS)
         if any(other is not track
                and other.overlaps(crossing.stamp_ns - near, crossing.stamp_ns + near)

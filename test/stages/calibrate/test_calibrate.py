@@ -180,12 +180,12 @@ def test_forget_refuses_an_unknown_sensor():
         stage().forget(['mag_9'])
 
 
-SOFT = np.array([[1.02, 0.03, 0.0], [-0.01, 0.97, 0.02], [0.0, 0.04, 1.05]])
-HARD = np.array([4e-6, -3e-6, 7e-6])
+SOFT_IRON = np.array([[1.02, 0.03, 0.0], [-0.01, 0.97, 0.02], [0.0, 0.04, 1.05]])
+HARD_IRON = np.array([4e-6, -3e-6, 7e-6])
 
 
 def corrected(**properties):
-    """Create `Calibrate` for a network with backgrounds and `properties` of the second sensor."""
+    """Create `Calibrate` for two sensors with backgrounds; the second sensor has `properties`."""
     n = line_network(2)
     properties = {key: (None, value) for key, value in properties.items()
                   if key != 'clock_offset'} | {
@@ -205,34 +205,34 @@ def test_the_clock_offset_is_subtracted_from_timestamps():
 
 
 def test_hard_and_soft_iron_of_a_sensor_are_corrected():
-    s = corrected(offset=HARD, correction=SOFT)
+    s = corrected(offset=HARD_IRON, correction=SOFT_IRON)
     B = EARTH + [3e-7, -2e-7, 5e-7]
-    (out,) = fed(s, sample(1.0, np.linalg.solve(SOFT, B) + HARD, 'mag_2'))
+    (out,) = fed(s, sample(1.0, np.linalg.solve(SOFT_IRON, B) + HARD_IRON, 'mag_2'))
     np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
     # The other sensor has no correction.
     (out,) = fed(s, sample(1.0, B))
     np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
-    (out,) = fed(corrected(offset=HARD), sample(1.0, B + HARD, 'mag_2'))
+    (out,) = fed(corrected(offset=HARD_IRON), sample(1.0, B + HARD_IRON, 'mag_2'))
     np.testing.assert_allclose(out.field, B - EARTH, atol=1e-18)
 
 
 def test_the_covariance_is_transformed_by_the_correction():
     own = np.diag([1e-16, 2e-16, 3e-16])
-    (out,) = fed(corrected(correction=SOFT), sample(1.0, sensor='mag_2', covariance=own))
-    np.testing.assert_allclose(out.covariance, SOFT @ own @ SOFT.T)
+    (out,) = fed(corrected(correction=SOFT_IRON), sample(1.0, sensor='mag_2', covariance=own))
+    np.testing.assert_allclose(out.covariance, SOFT_IRON @ own @ SOFT_IRON.T)
     rng = np.random.default_rng(0)
-    drawn = (rng.standard_normal((20000, 3)) * np.sqrt(np.diagonal(own))) @ SOFT.T
+    drawn = (rng.standard_normal((20000, 3)) * np.sqrt(np.diagonal(own))) @ SOFT_IRON.T
     np.testing.assert_allclose(out.covariance, np.cov(drawn.T), atol=0.03 * 3e-16)
 
 
 def test_a_reading_without_an_axis_that_the_correction_needs_is_rejected():
     field = [EARTH[0], EARTH[1], np.nan]
-    s = corrected(correction=SOFT + 0.01)
+    s = corrected(correction=SOFT_IRON + 0.01)
     assert fed(s, sample(1.0, field, 'mag_2')) == []
     assert rejected(s.counts) == {'an axis that the correction needs is missing': 1}
     # An offset needs no other axis.
-    (out,) = fed(corrected(offset=HARD), sample(1.0, field, 'mag_2'))
-    np.testing.assert_allclose(out.field[:2], -HARD[:2], atol=1e-18)
+    (out,) = fed(corrected(offset=HARD_IRON), sample(1.0, field, 'mag_2'))
+    np.testing.assert_allclose(out.field[:2], -HARD_IRON[:2], atol=1e-18)
     assert np.isnan(out.field[2])
 
 

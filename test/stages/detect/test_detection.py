@@ -64,7 +64,7 @@ def test_the_false_alarm_rate_is_as_configured(p):
     (1, '3.5e-4 per frame of one sample (12.5 Hz)', 1e-3),
     (8, '1.5e-7 per frame of eight samples (100 Hz)', 0.05)])
 def test_the_default_false_alarm_probability_is_as_documented(per_frame, documented, tested):
-    """The noise is 12 nT per sample, with `per_frame` samples per frame and `background_std`."""
+    """A frame averages `per_frame` samples of 12 nT noise; `background_std` is the default."""
     settings, variance = DetectSettings(), SIGMA**2 / per_frame
     wider = 1.0 + settings.background_std**2 / variance
     p = chi2.sf(chi2.isf(settings.false_alarm_probability, 6) * wider, 6)

@@ -19,10 +19,10 @@ from support.samples import recorded, samples_of
 
 EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
 DATE = '2026-05-01'
-START = 1_790_000_000_000_000_000
+START_NS = 1_790_000_000_000_000_000
 ROTATIONS = (Rotation.identity(), Rotation.from_euler('zyx', [-3.0, 2.0, 1.5], True),
              Rotation.from_euler('zyx', [4.0, -1.0, -2.5], True))
-CLOCK = np.array([0.0, 0.0213, -0.0087])
+CLOCK_OFFSETS = np.array([0.0, 0.0213, -0.0087])
 
 
 def nominal(n=3, earth=EARTH, **changes):
@@ -39,7 +39,7 @@ def readings_of(rotation, offset_s, knocks=(1.2, 2.1), seed=0, noise=0.02, durat
     level = sum((8.0 * np.exp(-np.abs(t - k) / 0.03) for k in knocks), 0.0 * t)
     a = rotation.inv().apply(np.array([0.0, 0.0, 9.81]) + level[:, None] * [0.3, 0.5, -0.4])
     a += noise * rng.standard_normal(a.shape)
-    return [(START + round((s + offset_s) * 1e9), v) for s, v in zip(t, a, strict=True)]
+    return [(START_NS + round((s + offset_s) * 1e9), v) for s, v in zip(t, a, strict=True)]
 
 
 def surveyed(network=None, rotations=ROTATIONS, change=None, fields=None, settings=None,
@@ -51,7 +51,7 @@ def surveyed(network=None, rotations=ROTATIONS, change=None, fields=None, settin
     network = nominal(len(rotations)) if network is None else network
     readings = {name: readings_of(R, offset_s, (1.2, 2.1) if knocks is None else knocks, seed)
                 for seed, (name, R, offset_s) in
-                enumerate(zip(network.names, rotations, CLOCK, strict=False))}
+                enumerate(zip(network.names, rotations, CLOCK_OFFSETS, strict=False))}
     if change is not None:
         change(readings)
     survey = Survey(network, settings or SurveySettings())
@@ -65,7 +65,7 @@ def surveyed(network=None, rotations=ROTATIONS, change=None, fields=None, settin
 
 
 def warnings(result):
-    """{sensor: warnings} of all sensors with warnings."""
+    """Return {sensor: warnings} for the sensors with warnings."""
     return {s.sensor: s.warnings for s in result.sensors if s.warnings}
 
 
@@ -82,7 +82,7 @@ def test_orientations_and_clock_offsets_are_found():
         # Three sensors that agree reduce the compass uncertainty below its prior.
         assert abs(off[2]) < std[2] < np.deg2rad(2.5)
         np.testing.assert_allclose(std[:2], 0.05 / 9.81, rtol=0.01)
-        assert result.network.clock_offset[j] == pytest.approx(CLOCK[j], abs=1e-3)
+        assert result.network.clock_offset[j] == pytest.approx(CLOCK_OFFSETS[j], abs=1e-3)
         record = result.network.calibrated[j]
         assert (record.date, record.by) == (DATE, 'accelerometer, compass and nominal heading')
         assert record.clock_offset_std < 1e-3
@@ -124,7 +124,7 @@ def test_tilt_and_clock_offset_are_found_without_an_earth_field():
         assert s.by == 'accelerometer, nominal heading'
         np.testing.assert_allclose(s.orientation.R_ws.T[:, 2], R.as_matrix()[2], atol=1e-3)
         assert np.degrees(s.orientation.std[2]) == pytest.approx(5.0)
-    assert result.network.clock_offset[1] == pytest.approx(CLOCK[1], abs=1e-3)
+    assert result.network.clock_offset[1] == pytest.approx(CLOCK_OFFSETS[1], abs=1e-3)
     # With two sensors, it is unknown which sensor is correct.
     result, _ = surveyed(nominal(2, earth=None), ROTATIONS[:2])
     assert 'three sensors' in result.sensors[0].warnings[0]
@@ -161,7 +161,7 @@ def test_accelerations_in_g_are_named():
     assert 'is its unit g?' in result.sensors[2].warnings[0]
     assert result.sensors[2].orientation is None
     # The knocks still give the clock offset.
-    assert result.network.clock_offset[2] == pytest.approx(CLOCK[2], abs=1e-3)
+    assert result.network.clock_offset[2] == pytest.approx(CLOCK_OFFSETS[2], abs=1e-3)
 
 
 def test_clock_offsets_are_unchanged_without_a_knock():
@@ -180,17 +180,18 @@ def test_a_sensor_that_measured_no_knock_is_named():
     # Another sensor becomes the reference.
     assert result.reference == 'mag_2'
     assert result.sensors[0].lag.reason == 'the sensor measured no knock'
-    assert result.network.clock_offset[2] == pytest.approx(CLOCK[2] - CLOCK[1], abs=1e-3)
+    assert result.network.clock_offset[2] == pytest.approx(
+        CLOCK_OFFSETS[2] - CLOCK_OFFSETS[1], abs=1e-3)
     assert np.isnan(result.network.calibrated[0].clock_offset_std)
     assert result.network.calibrated[1].clock_offset_std == 0.0
 
 
 def test_known_clock_offsets_keep_their_common_zero():
     """mag_1 has no accelerations, so its offset relative to the other sensors must not change."""
-    network = nominal(clock_offset=CLOCK)
+    network = nominal(clock_offset=CLOCK_OFFSETS)
     result, _ = surveyed(network, change=lambda readings: readings.pop('mag_1'))
     offset = result.network.clock_offset
-    np.testing.assert_allclose(offset - offset[0], CLOCK, atol=1e-3)
+    np.testing.assert_allclose(offset - offset[0], CLOCK_OFFSETS, atol=1e-3)
 
 
 def test_a_tilted_sensor_is_named_and_levelled():
@@ -281,7 +282,7 @@ def test_a_jump_back_in_time_discards_earlier_accelerations():
     assert survey.counts['time jumped'] == 1
     assert len(result.shocks['mag_2'][0]) == 400
     np.testing.assert_allclose(result.network.R_ws[1][2], ROTATIONS[1].as_matrix()[2], atol=1e-3)
-    assert result.network.clock_offset[1] == pytest.approx(CLOCK[1], abs=1e-3)
+    assert result.network.clock_offset[1] == pytest.approx(CLOCK_OFFSETS[1], abs=1e-3)
 
 
 def test_calibration_records_are_replaced_for_surveyed_sensors_only():
@@ -350,7 +351,7 @@ def test_the_result_rotates_with_the_world_frame():
 
 def test_clocks_decades_apart_do_not_fill_the_memory():
     def of_1970(readings):
-        readings['mag_2'] = [(stamp - START, a) for stamp, a in readings['mag_2']]
+        readings['mag_2'] = [(stamp - START_NS, a) for stamp, a in readings['mag_2']]
     result, _ = surveyed(change=of_1970)
     assert result.reference == 'mag_1' and result.sensors[2].lag.reason == ''
     assert 'the knocks are 1.79e+09 s apart' in result.sensors[1].lag.reason

@@ -25,7 +25,7 @@ STEP = 0.1
 
 
 def drive(begin_s, end_s, at_s, v=10.0, y=-1.5, **changes):
-    """Track records {step: [Track]}, including the end, of a vehicle on the line at `at_s`."""
+    """Simulate a vehicle that crosses the line at `at_s`: {step: [Track]}, including the end."""
     steps = range(round(begin_s / STEP), round(end_s / STEP) + 1)
     out = {k: [track_pose(k * STEP, v * (k * STEP - at_s), y, v, **changes)] for k in steps}
     out[steps[-1]].append(replace(out[steps[-1]][0], ended=True))
