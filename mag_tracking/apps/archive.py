@@ -84,7 +84,7 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
 
 
 def _recordings_at(path: Path, visited: set[Path]) -> list[Path]:
-    """Find the recordings at or below a path; skip the `visited` folders, and extend this set.
+    """Find the recordings at or below a path; skip folders in `visited`, and add new ones to it.
 
     An unreadable folder is returned like a recording, so that it is reported as failed.
     """
@@ -221,7 +221,10 @@ class _Scheduler:
         self._states: dict[Path, list[list[Any]]] = {}
 
     def run(self, recordings: Sequence[Path], stopped: Callable[[], bool]) -> None:
-        """Track recordings, a few at a time to limit intermediate files; end when stopped."""
+        """Track recordings until all are processed or `stopped()` returns true.
+
+        Only a few recordings are processed at a time, to limit the intermediate files.
+        """
         queued = list(reversed(recordings))
         while queued or self._cluster.n_running:
             while queued and self._n_active_recordings() < 2 * self._cluster.n_workers + 1:
@@ -233,7 +236,7 @@ class _Scheduler:
                 self._on_finished(kind, job, result)
 
     def _n_active_recordings(self) -> int:
-        """Number of recordings whose tasks are running."""
+        """Number of recordings with unfinished tasks."""
         return len({job.recording for _, job in self._cluster.keys()})
 
     def _start(self, path: Path) -> None:
@@ -248,7 +251,7 @@ class _Scheduler:
         self._cluster.submit(('cut', job), 0, cut, job)
 
     def _on_finished(self, kind: str, job: Job, result: Any) -> None:
-        """Process a task's result, submit dependent tasks; raises OutputError and ClusterError."""
+        """Record a task's result and submit dependent tasks; raises OutputError, ClusterError."""
         path = job.recording
         if isinstance(result, OutputError | ClusterError):
             raise result
@@ -274,6 +277,6 @@ class _Scheduler:
                 self._cluster.submit(('join', job), 2, join, job)
 
     def _fail(self, path: Path, reason: str) -> None:
-        """Record and report a failed recording; other recordings continue."""
+        """Record and report the failure of a recording; other recordings are still tracked."""
         self._run.failed[path] = reason
         self._report(f'{path.name}: {reason}')

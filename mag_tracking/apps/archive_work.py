@@ -218,7 +218,7 @@ class _Segmenter:
         self._add_health(self._health.due(frame.stamp_ns, self._passes.calibrate))
 
     def _add_passes(self, passes: Iterable[tuple[PassData, tuple[str, ...]]]) -> None:
-        """Number completed passes and write them."""
+        """Assign indices to completed passes and write the passes."""
         for data, notes in passes:
             self._n_passes += 1
             self._writer.add_pass(self._n_passes, data, notes)

@@ -41,7 +41,7 @@ class GeometrySurvey:
     stated: SensorNetwork
     """Network before the calibration, including the assumed noise."""
     network: SensorNetwork
-    """Calibrated network; invalid if the geometry has not converged."""
+    """Calibrated network; invalid if the estimation has not converged."""
     geometry: NetworkGeometry
     """Result of the estimation."""
     rows: IntArray
@@ -51,7 +51,7 @@ class GeometrySurvey:
     n_poses: int
     """Number of poses in the table."""
     silent_axes: tuple[tuple[str, str], ...]
-    """(sensor, its axes without readings) for each sensor that reports some axes but not all."""
+    """(sensor, axes without readings) for each sensor that reports some axes but not all."""
 
     @property
     def rotation_angle(self) -> FloatArray:
@@ -234,7 +234,7 @@ def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
 
 
 def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:
-    """Return `network` with `noise_std` [T] for sensors that have no noise; unchanged if None."""
+    """Return `network` with `noise_std` [T] where no noise is configured; unchanged if None."""
     if noise_std is None:
         return network
     return replace(network, noise_std=tuple(
@@ -242,7 +242,7 @@ def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwor
 
 
 def _silent_axes(network: SensorNetwork, field: FloatArray) -> Iterator[tuple[str, str]]:
-    """Yield (sensor, its axes without readings) for sensors that report some axes but not all."""
+    """Yield (sensor, axes without readings) for each sensor that reports some axes but not all."""
     silent: BoolArray = np.all(np.isnan(field), axis=0)
     for name, axes in zip(network.names, silent, strict=True):
         if axes.any() and not axes.all():

@@ -103,7 +103,7 @@ def _survey_recording(recording: Recording, network: SensorNetwork, settings: Se
                       progress: Callable[[int], object] | None,
                       stopped: Callable[[], bool] | None,
                       ) -> tuple[dict[str, FloatArray], NetworkSurvey, Calibrate, bool]:
-    """Survey the sensors in a recording; return (levels, survey, stage, interrupted)."""
+    """Survey a network from a recording; return (backgrounds, survey, stage, interrupted)."""
     reader = SampleReader(recording, network)
     # Backgrounds and noise in the network file may be outdated; they are learnt again.
     unlearnt = replace(network, background=(), noise_std=())
@@ -152,7 +152,7 @@ def _track_passes(recording: Recording, network: SensorNetwork, settings: Settin
 
 def _with_pass_records(network: SensorNetwork, surveyed: SensorNetwork, date: str,
                        n_tracks: int) -> SensorNetwork:
-    """Return `network` with the calibration records of `surveyed` and the number of passes."""
+    """Return `network` with the records of `surveyed`, each with the number of passes added."""
     passes = quantity(n_tracks, 'pass', 'passes')
     return replace(network, calibrated=tuple(
         surveyed.calibration_record(j, date, f'nominal orientation; {passes}') if record is None

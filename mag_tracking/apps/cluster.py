@@ -210,10 +210,11 @@ class Cluster(Generic[_Key]):
 
 @cache
 def _event_loop() -> 'IOLoop':
-    """Return the event loop of all clusters, which runs in a daemon thread; raises ClusterError.
+    """Return the event loop that all clusters share; raises ClusterError.
 
-    Dask would start its own loop while holding a lock, which a failed client also acquires when it
-    is garbage-collected. A collection in the starting thread would block the start for ten seconds.
+    The loop runs in a daemon thread. Dask would start its own loop while holding a lock that a
+    failed client also acquires when it is garbage-collected. A garbage collection in the starting
+    thread would block the start for ten seconds.
     """
     from tornado.ioloop import IOLoop
 

@@ -1,4 +1,4 @@
-"""Covariances in messages that contradict the noise of the readings, and their likely cause."""
+"""Diagnosis of message covariances that contradict the noise of the readings."""
 
 from collections.abc import Iterator
 
@@ -11,7 +11,7 @@ from mag_tracking.stages.health.sensor_health import Finding
 MAX_MISMATCH = 3.0
 """Factor within which a likely cause must explain the ratio of declared to measured noise."""
 
-_UNITS = (('millitesla', 1e3), ('gauss', 1e4), ('microtesla', 1e6), ('nanotesla', 1e9))
+_UNITS_PER_TESLA = (('millitesla', 1e3), ('gauss', 1e4), ('microtesla', 1e6), ('nanotesla', 1e9))
 
 
 def likely_cause(stated: float, measured: float) -> str:
@@ -33,7 +33,7 @@ def likely_cause(stated: float, measured: float) -> str:
         return 'the standard deviation instead of the variance'
     exponent = 2.0 * np.log10(stated)
     is_round = abs(exponent - round(exponent)) < 1e-6
-    for unit, scale in _UNITS:
+    for unit, scale in _UNITS_PER_TESLA:
         if not is_round and abs(np.log(stated / measured / scale)) < np.log(MAX_MISMATCH):
             return f'the variance in {unit}^2'
     return 'a placeholder' if is_round else 'a placeholder, or another unit'
@@ -63,7 +63,8 @@ def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator
     valid = (declared > 0.0) & np.isfinite(declared) & (measured > 0.0)
     if not valid.any() or np.abs(np.log(declared[valid] / measured[valid])).max() < np.log(2.0):
         yield Finding(False, name, f'the covariances on {topic} contradict the quiet readings '
-                      '(not positive definite, not finite, or with correlated axes)', advice)
+                      '(not positive definite, not finite, or with errors correlated between axes)',
+                      advice)
         return
     log_ratio = np.full(3, -1.0)
     log_ratio[valid] = np.abs(np.log(declared[valid] / measured[valid]))

@@ -90,17 +90,17 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
 
 
 def _poor_fits(passes: Sequence[FittedPass]) -> list[str]:
-    """Return one warning if chosen fits have a high cost, otherwise an empty list."""
+    """Return one warning if chosen fits have a high normalised cost, otherwise an empty list."""
     costs = [fitted.chosen.normalised_cost for fitted in passes if fitted.chosen is not None]
     n_poor = sum(cost > MAX_NORMALISED_COST for cost in costs)
     if not n_poor:
         return []
     return [f'poor fits (normalised cost above {MAX_NORMALISED_COST:g}): {n_poor} of {len(costs)}; '
-            'errors of their speed and position may exceed several standard deviations']
+            'errors in speed and position may exceed several standard deviations']
 
 
 def _peaks_ns(passes: Sequence[FittedPass]) -> list[int]:
-    """Return the time of the strongest field of each pass on the time axis of the page [ns]."""
+    """Return each pass's time of strongest field on the time axis of the page [ns]."""
     out: list[int] = []
     recording, shift, end = '', 0, 0
     for fitted in passes:
@@ -115,7 +115,7 @@ def _peaks_ns(passes: Sequence[FittedPass]) -> list[int]:
 
 
 def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak: float) -> dict[str, Any]:
-    """Create the scene entry of a chosen fit, whose field is strongest at the time `peak` [s]."""
+    """Create the scene entry of a chosen fit; `peak` is the time of the strongest field [s]."""
     data = fit.data
     t = np.linspace(data.t.min(), data.t.max(), N_POSES)
     F = np.tile(np.eye(6), (N_POSES, 1, 1))
@@ -137,7 +137,7 @@ def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak: float) -> d
 
 
 def _order_chart(passes: Sequence[FittedPass]) -> Chart:
-    """Chart of the normalised cost over the number of dipoles."""
+    """Chart of the normalised cost against the number of dipoles."""
     traces = []
     for k, fitted in enumerate(passes):
         fits = [f for f in fitted.fits if len(f.x)]

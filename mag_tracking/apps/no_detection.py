@@ -11,7 +11,7 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
 
 MAX_NOISE_RATIO = 3.0
-"""Ratio of configured noise to scatter above which the noise is considered the cause."""
+"""Ratio of configured noise to scatter of the readings above which noise is the likely cause."""
 
 
 def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: Calibrate,

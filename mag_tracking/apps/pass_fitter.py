@@ -48,7 +48,7 @@ class FittedPass:
 
     @property
     def label(self) -> str:
-        """Name in messages and file names."""
+        """Name of the pass, and of one of several vehicles, in messages and file names."""
         return f'pass {self.number}' + (f', vehicle {self.vehicle}' if self.n_vehicles > 1 else '')
 
     @property

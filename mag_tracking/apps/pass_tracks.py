@@ -41,7 +41,7 @@ class PassTracks:
         self._last_stamp_ns = 0
 
     def add(self, records: Iterable[object]) -> None:
-        """Store the poses and ends of tracks among the records of a tracker.
+        """Store the poses and the ends of tracks from the outputs of a tracker.
 
         Parameters
         ----------
@@ -111,7 +111,7 @@ class PassTracks:
 
 
 def ground_prior(settings: TrackSettings) -> GroundPrior:
-    """Prior of height and climb rate from the settings of a tracker.
+    """Compute the prior of the height and climb rate of vehicles from the settings of a tracker.
 
     Parameters
     ----------

@@ -98,7 +98,7 @@ class Plan:
 
 def detection_range(target: PlannedTarget, noise_std: float, n_axes: int,
                     false_alarm: float) -> float:
-    """Approximate range at which a frame of one sensor detects half of the targets.
+    """Compute the approximate range at which a frame of one sensor detects half of the targets.
 
     Averaged over all directions of the moment, the energy is twice the energy of a dipole abeam.
 
@@ -193,7 +193,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
 def _closest_point_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                           lane: Lane, distance_scale: float,
                           ) -> tuple[Observability, dict[str, FloatArray]]:
-    """Compute `Plan.observability`, scaled with a distance [m], and `Plan.blocks`."""
+    """Compute `Plan.observability`, with positions scaled by a distance [m], and `Plan.blocks`."""
     closest = lane.points[np.argmin(np.abs(lane.along))][None]
     J = pass_information(network.positions, network.R_sw, target, sampling, closest,
                          lane.heading)[0].sum(axis=1)
@@ -293,7 +293,11 @@ def _filter_bound(network: SensorNetwork, target: PlannedTarget, sampling: Sampl
 def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                          near: Sequence[tuple[float, FloatArray]],
                          places: FloatArray) -> tuple[float, FloatArray]:
-    """Compute (median bound, (n_places,) median bounds with a sensor added at each place) [m]."""
+    """Compute the median position bound [m] without an added sensor and with one at each place.
+
+    The bounds with an added sensor have the shape (n_places,). If `near` or `places` is empty, the
+    results are NaN and an empty array.
+    """
     height = network.positions[:, 2].mean()
     candidates = np.column_stack([places, np.full(len(places), height)])
     upright = np.tile(np.eye(3), (len(places), 1, 1))

@@ -154,7 +154,7 @@ def _log_bar(low: float, high: float, title: str) -> dict[str, Any]:
 
 
 def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
-    """Traces of the lanes and sensors on a map whose coordinates are multiplied by `f`."""
+    """Traces of the lanes and sensors on a map whose coordinates are scaled by `f`."""
     low, high = (plan.x[0], plan.y[0]), (plan.x[-1], plan.y[-1])
     traces = []
     for lane in plan.lanes:
@@ -166,7 +166,7 @@ def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
 
 
 def _lanes(plan: Plan) -> list[Chart]:
-    """Charts of bounds and detection along the lanes, and of missed passes."""
+    """Charts of position bound and detection probability along the lanes, and of missed passes."""
     f, unit = scale_of(np.ptp(plan.x))
     bounds, detection = [], []
     for k, (name, lane) in enumerate(distinct_lanes(plan.lanes)):

@@ -16,7 +16,7 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.units import NS
 
 LEARNING_TOLERANCE_S = 1.0
-"""Excess of the initial learning time above which a target is considered present [s]."""
+"""Excess over the nominal learning time above which a target is considered present [s]."""
 
 MIN_BLOCKS = 6.0
 """Minimum learning time [blocks], which applies to slow sensors with long blocks."""
@@ -110,10 +110,10 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
 
 def _level_of(recorder: BlockRecorder, departed_at: float | None,
               learnt: tuple[float, FloatArray] | None) -> tuple[QuietLevel | None, bool]:
-    """Return (most frequent level, whether a target was present until `departed_at` [s]).
+    """Return (most frequent level or None, whether a target was present until `departed_at` [s]).
 
-    If so, only later readings determine the level. If the field later returns to the level `learnt`
-    at the start, no target was present.
+    If a target was present, only later readings determine the level. If the field later returns to
+    the level `learnt` at the start, no target was present.
     """
     level = recorder.quiet_level()
     if level is None or departed_at is None or learnt is None \

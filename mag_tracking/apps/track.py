@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_BATCH = 4096
+_BATCH_SIZE = 4096
 """Number of readings per batch when arrays are processed, to bound the memory for outputs."""
 
 
@@ -75,7 +75,7 @@ class TrackingResult:
     missing_topics: tuple[str, ...]
     """Topics of the network that are not in the recording."""
     no_detection_reason: str | None
-    """One sentence if nothing was detected; otherwise None."""
+    """Explanation, in one sentence, of why nothing was detected; None if a target was detected."""
     sensors_without_background: tuple[str, ...]
     """Sensors that were not used because their background was not learnt. To use them, record a
     quiet interval, or set `background` and `noise_std` in the network file."""
@@ -299,8 +299,8 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
 
 
 def _batches(readings: Readings) -> Iterator[Readings]:
-    """Split readings into batches of at most `_BATCH` readings."""
-    return (readings.part(slice(i, i + _BATCH)) for i in range(0, len(readings), _BATCH))
+    """Split readings into batches of at most `_BATCH_SIZE` readings."""
+    return (readings.part(slice(i, i + _BATCH_SIZE)) for i in range(0, len(readings), _BATCH_SIZE))
 
 
 class _Results:

@@ -30,7 +30,7 @@ from mag_tracking.records import FieldFrame, Track
 from mag_tracking.units import NS
 
 RETENTION_S = 300.0
-"""Time for which the frames of an ended track are stored until its passage is reported [s]."""
+"""Time for which frames of an ended track are kept, because its passage is reported later [s]."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class TrafficResult:
     sensors_without_background: tuple[str, ...]
     """Sensors whose background was not learnt."""
     no_detection_reason: str | None
-    """One sentence if nothing was detected; otherwise None."""
+    """Explanation, in one sentence, of why nothing was detected; None if a target was detected."""
     no_track_reason: str | None
     """Explanation if nothing was tracked because only one sensor measured; otherwise None."""
 
@@ -192,7 +192,7 @@ class _Counter:
         self._tracks_before_jump = set(self._frames) if jumped else set()
 
     def _delay_motion(self, track_id: int) -> CorrelatedMotion:
-        """Compute the velocity of a track from the delays between the sensors."""
+        """Compute the velocity of a track from sensor delays, or the reason why it is missing."""
         frames = self._frames.get(track_id)
         if not frames:
             return CorrelatedMotion('the fields of the track are no longer stored')

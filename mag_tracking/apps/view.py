@@ -49,7 +49,7 @@ def view(recording: Recording, network: SensorNetwork, settings: Settings, scene
     prescan_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
     playback_due, last_log_ns, health_due = time.monotonic(), None, 0.0
     for readings, log_ns in _batches(reader.readings_as_received()):
-        # Log times set the pace, because one wrong sensor timestamp could stop the page.
+        # Log times set the pace, because one wrong sensor timestamp could stop the playback.
         step_s = 0.0 if last_log_ns is None else (log_ns - last_log_ns) / NS
         playback_due, last_log_ns = playback_due + min(max(step_s, 0.0), MAX_WAIT_S) / rate, log_ns
         while time.monotonic() < playback_due and not stopped():
@@ -80,7 +80,7 @@ def _batches(messages: Iterable[tuple[Readings, int]]) -> Iterator[tuple[Reading
 
 
 def _add_records(scene: LiveScene, records: Iterable[Output]) -> None:
-    """Add frames and tracks to the scene."""
+    """Add frames, tracks and completely smoothed tracks to the scene."""
     smoothed: dict[int, list[FloatArray]] = {}
     for record in records:
         if isinstance(record, FieldFrame):

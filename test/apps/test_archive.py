@@ -86,7 +86,7 @@ def test_a_recording_in_segments_gives_the_rows_of_a_replay(
 @pytest.mark.parametrize('ahead_s', [0.0, 0.2])
 def test_clock_differences_carry_over_between_segments(
         tmp_path, monkeypatch, road_network_file, ahead_s):
-    """If clocks differ, tracks are doubtful because of passes in earlier segments."""
+    """If clocks differ, the doubts of a track depend on passes in earlier segments."""
     monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 60)
     path = tmp_path / 'network.yaml'
     text = road_network_file.read_text()

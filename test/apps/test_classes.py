@@ -19,7 +19,7 @@ ROAD = DATA / 'two_way_road'
 
 @pytest.fixture(scope='module')
 def tables(tmp_path_factory):
-    """Folder with two tables of the same signatures: a row per sample, and a row per signature."""
+    """Folder with the same signatures as a table by sample and as a table by signature."""
     folder, found = tmp_path_factory.mktemp('classes'), signatures(COUNTS, 'boxes')
     write_by_sample(folder / 'by_sample.csv', found)
     write_by_row(folder / 'by_row.csv', found)

@@ -54,7 +54,7 @@ def test_every_vehicle_of_a_recording_is_fitted(name):
 
 
 def pass_of(begin, end):
-    """`PassData` of zero fields between two times [s]."""
+    """Create `PassData` with zero fields from `begin` to `end` [s]."""
     t = np.arange(0.0, end - begin, 0.1)
     n = len(t)
     return PassData(ROAD, round(begin * NS), np.tile(t, 2), np.repeat([0, 1], n),

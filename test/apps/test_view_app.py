@@ -22,7 +22,7 @@ YEARS_NS = 10 * 365 * 86400 * 1_000_000_000
 
 
 class StoringScene(LiveScene):
-    """Live scene that stores its tracks and notes."""
+    """Live scene that stores its tracks, smoothed tracks and notes."""
 
     def __init__(self, network):
         super().__init__('road', network)
@@ -70,7 +70,10 @@ def test_an_hour_without_messages_is_skipped(road_network, tmp_path):
 
 
 def rewrite(path, network, log_time_of, stamp_of):
-    """Copy the recording; the functions map (index of a message, time [ns]) to a new time."""
+    """Copy the recording with new log times and new sensor timestamps.
+
+    Both functions map (index of a message, original time [ns]) to the new time [ns].
+    """
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
     with RecordingWriter(path) as writer:
         for k, (readings, log_ns) in enumerate(reader.readings_as_received()):
