@@ -54,7 +54,7 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
 
 
 def bearing_of(fit: PassFit, place: FloatArray) -> Bearing:
-    """Compute the quantities of a fit at one sensor that do not depend on the CPA range.
+    """Compute the quantities of a single-sensor fit that do not depend on the CPA range.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def bearing_of(fit: PassFit, place: FloatArray) -> Bearing:
 
 
 def _direction_std(x: FloatArray, P: FloatArray) -> float:
-    """Largest standard deviation [rad] of the direction of x (3,); inf if P is not finite."""
+    """Largest std [rad] of the direction of x (3,) with covariance P; inf if P is not finite."""
     if not np.isfinite(P).all():
         return np.inf
     u = x / np.linalg.norm(x)

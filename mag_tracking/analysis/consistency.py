@@ -10,7 +10,7 @@ from mag_tracking.physics.motion import constant_velocity, integrator_noise
 from mag_tracking.report.metrics import interpolate_truth
 from mag_tracking.report.track_log import TrackLog
 
-MIN_MOTION = 1e-9
+MIN_VELOCITY_STD = 1e-9
 """[m/s] Minimum standard deviation of the velocity prior, for targets at rest."""
 
 
@@ -96,9 +96,9 @@ def _measurement_model(network: SensorNetwork, log: TrackLog, true: FloatArray, 
 
 def _motion_model(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: TrackLog,
                   known: IntArray, n_x: int) -> tuple[FloatArray, FloatArray]:
-    """Transition matrix and process noise, (k, n_x, n_x) each, from the previous to each pose.
+    """Transition matrices F and process noise covariances Q, (k, n_x, n_x), between the poses.
 
-    For the first pose, they are identity and zero.
+    F[i] and Q[i] lead from pose i - 1 to pose i; F[0] is the identity and Q[0] is zero.
     """
     F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
     for k, dt in enumerate(np.diff(t), 1):
@@ -114,7 +114,7 @@ def _prior_covariance(network: SensorNetwork, true: FloatArray, t: FloatArray, l
     """Prior covariance (n_x, n_x) of the first pose, from the extent and speed of the path."""
     extent = max(np.ptp(true, axis=0).max(), np.ptp(network.positions, axis=0).max())
     speed = max(np.linalg.norm(np.diff(true, axis=0), axis=1).max()
-                / np.diff(t).min(), MIN_MOTION)
+                / np.diff(t).min(), MIN_VELOCITY_STD)
     std = np.full(9 + 3 * len(network), background_std)
     std[:3], std[3:6], std[6:9] = extent, speed, np.linalg.norm(log.moment[known[0]])
     return np.diag(std**2)

@@ -31,16 +31,16 @@ N_COARSE = 512
 
 SCALE_STD, GAIN_STD, ROTATION_STD = 0.05, 0.02, np.deg2rad(2.0)
 """Prior standard deviations of the differences between the fields at two sensors: common scale
-(distance to the target), gain of each axis, and rotation [rad] about each axis (careful
-mounting)."""
+(distance to the target), gain of each axis, and rotation [rad] about each axis. The standard
+deviation of the rotation assumes careful mounting."""
 
 MIN_DELAY = 3.0
 """Minimum delay in standard deviations; a smaller delay is not significant."""
 
-SMOOTHING = 0.3
+RELATIVE_KERNEL_WIDTH = 0.3
 """Width of the smoothing kernel relative to the RMS duration of the field."""
 
-MAX_SHIFT = 4.0
+MAX_DELAY_SHIFT = 4.0
 """Maximum shift of a delay during the refinement, in widths of the smoothing kernel. A larger shift
 leads to a different correlation maximum."""
 
@@ -53,8 +53,8 @@ MIN_DIFFERENCE_STDS, MIN_RELATIVE_DIFFERENCE = 3.0, 0.1
 and relative to the speed."""
 
 MIN_COSINE = 0.3
-"""Minimum cosine of the angle between the heading and the line of the sensors. At a smaller cosine,
-the target crosses the line, and its speed is not compared."""
+"""Minimum cosine of the angle between the heading and the line through both sensors. At a
+smaller cosine, the target crosses the line, and its speed is not compared."""
 
 MAX_READINGS = 1_000_000
 """Maximum number of resampled readings of a pair. A pair that requires more, due to irregular
@@ -141,7 +141,7 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
                        delay: CorrelatedMotion) -> bool:
     """Whether a speed and a heading contradict the delays between the sensors.
 
-    On a path oblique to the line of the sensors, the delay is shorter than on a path along the
+    On a path oblique to the line through the sensors, the delay is shorter than on a path along the
     line; the speeds are compared accordingly. A path almost perpendicular to the line, or an
     unknown value, never contradicts the delays. A significantly opposite heading always does.
 
@@ -173,7 +173,10 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
 
 
 def _nearest_pairs(data: PassData) -> list[tuple[int, int]]:
-    """Pairs of sensors to compare, closest first; pairs at almost the same place are excluded."""
+    """Pairs of sensors to compare, closest first; at most `MAX_PAIRS`.
+
+    Pairs closer than `MIN_DELAY_BASELINE` are excluded.
+    """
     positions = data.network.positions[:, :2]
     pairs = list(combinations(data.sensors.tolist(), 2))
     distance = np.array([np.linalg.norm(positions[i] - positions[j]) for i, j in pairs])
@@ -276,7 +279,7 @@ def _resampled_pair(data: PassData, i: int, j: int) -> _SmoothedPair | None:
     # Exclude the parts of a long window in which the field is weak.
     energy = np.where(energy > 0.1 * energy.max(), energy, 0.0)
     energy /= energy.sum()
-    width = max(step, SMOOTHING * float(np.sqrt(energy @ np.square(t - energy @ t))))
+    width = max(step, RELATIVE_KERNEL_WIDTH * float(np.sqrt(energy @ np.square(t - energy @ t))))
     smooth = first.smoothed(t, width)
     return _SmoothedPair(t, smooth, np.gradient(smooth, t, axis=0), second.smoothed(t, width),
                          width, float(np.hypot(first.noise, second.noise)))
@@ -343,7 +346,7 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
             return tau, np.inf, 0.0
         if abs(step[0]) < 1e-6 * pair.width:
             break
-    if abs(theta[0] - tau) > MAX_SHIFT * pair.width or theta @ prior @ theta > MAX_PRIOR_CHI2:
+    if abs(theta[0] - tau) > MAX_DELAY_SHIFT * pair.width or theta @ prior @ theta > MAX_PRIOR_CHI2:
         return tau, np.inf, 0.0
     residuals, J = _residuals(pair, t, y, theta)
     return (float(theta[0]), _delay_std(t, J / std, residuals / std, prior),

@@ -66,7 +66,7 @@ def _minimum_residual(t: FloatArray, field: FloatArray, lane: LaneHypothesis) ->
 
 def _residuals(t: FloatArray, field: FloatArray, lane: LaneHypothesis,
                t_cpa: FloatArray) -> FloatArray:
-    """Residual sums of squares (k,) [T²] of the best moment at each CPA time `t_cpa` (k,) [s]."""
+    """Residual sum of squares (k,) [T²] for the least-squares moment at each `t_cpa` (k,) [s]."""
     along = lane.speed * (t - t_cpa[:, None])
     r = np.stack([along, np.full_like(along, lane.distance),
                   np.full_like(along, lane.height)], axis=-1)

@@ -33,13 +33,13 @@ from mag_tracking.physics.passes import SuperposedPasses
 from mag_tracking.units import NS
 
 N_REFINED, N_STEPS = 150, 6
-"""Number of starts of the coarse search, and number of refinement steps of each start."""
+"""Number of starting points that are refined in the coarse search, and number of steps of each."""
 
 N_PLACEMENTS = 10
 """Number of coarse solutions that are refined until convergence."""
 
 N_FINE = 2
-"""Number of coarse minima at which the fit of all measurements starts."""
+"""Number of coarse minima from which the fit to all measurements starts."""
 
 INITIAL_LENGTH = 3.0
 """[m] Initial length of a row of dipoles that replaces a point."""
@@ -52,7 +52,8 @@ MAX_DETECTION_RANGE = 15.0
 """[m] Maximum distance at which a sensor detects a target."""
 
 MAX_ROUNDS = 3
-"""Maximum number of rounds in which the order of each target is selected for given other orders."""
+"""Maximum number of rounds of the order selection. Each round selects the order of every target in
+turn, given the current orders of the other targets."""
 
 MAX_VELOCITY_DIFFERENCE, MAX_TRACK_DISTANCE = 0.5, 5.0
 """Maximum relative difference of velocity, and maximum distance [m], between two fits of one
@@ -239,7 +240,7 @@ class _JointFits:
 
 
 def _exclude_solutions(cost: FloatArray, is_allowed: BoolArray, max_ratio: float) -> FloatArray:
-    """Return the costs (n,), with infinity for the solutions that are not allowed.
+    """Return the costs (n,), with infinity for solutions that are not allowed.
 
     Return them unchanged if no allowed cost is within `max_ratio` times the lowest cost.
     """
@@ -299,7 +300,7 @@ def _with_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[Flo
 
 
 def _check_against_track(fits: Sequence[PassFit], best: int, path: FloatArray) -> list[PassFit]:
-    """Return fits of one target, with a reason if they differ from the track or the best fit.
+    """Return the fits of one target; reject fits that differ from the track or the best fit.
 
     The fit `best` is compared with the tracked `path` (6,), the other fits with the best fit.
     """

@@ -25,10 +25,10 @@ OUTLIER_PROBABILITY = 1e-3
 """Readings whose residuals are less probable than this under the noise are down-weighted."""
 
 STEP_TOLERANCE = 1e-3
-"""Maximum squared length of the last step, in posterior standard deviations."""
+"""Squared norm of a step, in posterior standard deviations, below which the fit has converged."""
 
 MAX_DAMPING = 1e10
-"""Damping beyond which the search for a step is abandoned."""
+"""Damping factor at which the search for a step that reduces the cost is abandoned."""
 
 Unknowns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Unknowns of the sensors (n, 10), shared unknowns (12,) and unknowns of the poses (K, 8)."""
@@ -199,7 +199,7 @@ class GeometryProblem:
         priors : Unknowns
             Weights of the priors.
         scale : float
-            Factor by which the median squared residual exceeds the expected value; at least one.
+            Median of `median_ratio` over all sensors and poses with readings; at least one.
         trust : (n, K) array
             Robust weight of each sensor at each pose, 0 to 1.
         """
@@ -245,7 +245,7 @@ class GeometryProblem:
 
 
 def median_ratio(d2: FloatArray, count: IntArray) -> FloatArray:
-    """Ratio of squared residuals to the median expected for pure noise.
+    """Ratio of sums of squared residuals to their median for pure noise.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ def median_ratio(d2: FloatArray, count: IntArray) -> FloatArray:
 
 
 def _robust_weights(d2: FloatArray, count: IntArray | int) -> FloatArray:
-    """Robust weights (0 to 1) from squared residuals, each the sum of `count` values."""
+    """Robust weights (0 to 1) from the sums `d2` of `count` squared residuals."""
     limit = chi2.isf(OUTLIER_PROBABILITY, np.maximum(count, 1))
     return limit / np.maximum(d2, limit)
 
@@ -364,7 +364,7 @@ class NormalEquations:
         return P, B + np.swapaxes(CB, 1, 2) @ (P @ CB)
 
     def _lost_information(self, CB: FloatArray) -> FloatArray:
-        """Information (N, N) that is lost by the elimination of the poses."""
+        """Information (N, N) on [sensors, shared] that is lost by eliminating the poses."""
         N = len(self.g)
         lost: FloatArray = (np.swapaxes(CB, 0, 1).reshape(N, -1)
                             @ np.swapaxes(self.C, 0, 1).reshape(N, -1).T)

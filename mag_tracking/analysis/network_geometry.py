@@ -104,9 +104,9 @@ class NetworkGeometry:
     normalised_cost: float
     """Cost per degree of freedom; about one if model, noise and field error are correct."""
     sensor_residual: FloatArray
-    """(n,) RMS of the normalised residuals; NaN without readings."""
+    """(n,) RMS of the normalised residuals over the poses that fit; NaN without readings."""
     pose_residual: FloatArray
-    """(K,) median residual over the sensors, relative to the median for pure noise."""
+    """(K,) median of the sensor residuals of each pose, relative to the median for pure noise."""
     suspect_sensors: tuple[str, ...]
     """Names of the sensors with large residuals, or with corrections beyond `MAX_CORRECTION` prior
     standard deviations."""
@@ -322,7 +322,7 @@ def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Predictio
 
 def _sensor_and_pose_residuals(problem: GeometryProblem,
                                predicted: Prediction) -> tuple[FloatArray, FloatArray]:
-    """RMS residual of each sensor (n,), and median residual of each pose over its sensors (K,)."""
+    """RMS residual (n,) of each sensor over the poses that fit; median residual (K,) per pose."""
     e2, count, _ = problem.misfit(predicted[0], predicted[1])
     e2 = e2.sum(axis=2)
     by_pose = np.sqrt([np.median(median_ratio(d2, c)[c > 0])

@@ -159,7 +159,7 @@ class PassData:
 
     @cached_property
     def departure(self) -> FloatArray:
-        """Field minus the median of each sensor, (n, 3) T: approximately the target's field."""
+        """Field minus its median at each sensor, (n, 3) T: approximately the target's field."""
         out = np.zeros_like(self.field)
         for j in self.sensors:
             of_sensor = self.sensor == j

@@ -30,7 +30,7 @@ PATH_TOLERANCE = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2, 0.3])
 [m]."""
 
 CPA_UNIT_STD = 1e-4
-"""[m] Standard deviation of an assumed CPA range, which only defines the unit of length."""
+"""[m] Standard deviation of an assumed CPA range. Such a range only defines the unit of length."""
 
 
 def fits_at_minimum(data: PassData, orders: Sequence[int], found: Minimum, p: FloatArray,

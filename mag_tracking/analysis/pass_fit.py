@@ -107,7 +107,7 @@ def centred_on_peak(data: PassData) -> tuple[PassData, PassData]:
 
 
 def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
-    """Check whether there are enough measurements for a fit.
+    """Reason why a fit is not possible; empty if there are enough measurements.
 
     Parameters
     ----------

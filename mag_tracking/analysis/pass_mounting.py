@@ -29,9 +29,9 @@ class MountingEvidence:
     covariance: FloatArray
     """(n_sensors, 3, 3) [rad²] of `rotation`, world axes."""
     scatter: FloatArray
-    """(n_sensors,) mean squared normalised difference between the tracks. About one if the track
-    covariances are consistent; NaN for fewer than two tracks. Values above one scale the
-    covariance."""
+    """(n_sensors,) chi-square per degree of freedom of the tracks relative to `rotation`. About one
+    if the track covariances are consistent; NaN for fewer than two tracks. Values above one scale
+    the covariance."""
     n_tracks: int
     """Number of fused tracks."""
 
@@ -97,7 +97,7 @@ def _remove_negative_eigenvalues(information: FloatArray) -> FloatArray:
 
 def _track_scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], rotation: FloatArray,
                    covariance: FloatArray) -> FloatArray:
-    """Chi-square per degree of freedom (n_sensors,) of the tracks' angles about the fused ones."""
+    """Chi-square per degree of freedom (n_sensors,) of the tracks relative to the fused angles."""
     squares, freedom = np.zeros(len(rotation)), np.zeros(len(rotation))
     for gain, pull in zip(gains, pulls, strict=True):
         residual = pull - np.einsum('jik,jk->ji', gain, rotation)

@@ -24,8 +24,8 @@ MAX_LENGTH = 18.75
 """[m] Maximum length of the iron of one vehicle: a road train (Directive 96/53/EC)."""
 
 MAX_VELOCITY_SPREAD = 0.25
-"""Maximum difference between the velocities of parts of a vehicle and their mean, relative to the
-mean."""
+"""Maximum difference between the velocity of a part of a vehicle and the mean velocity of all
+parts, relative to the mean."""
 
 
 def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, ground: GroundPrior,

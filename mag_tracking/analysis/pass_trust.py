@@ -40,11 +40,11 @@ MIN_ELSEWHERE, MAX_ELSEWHERE = 0.003, 0.1
 MIN_DISTANCE = 0.3
 """Minimum distance travelled during a pass, relative to the distance of the nearest sensor."""
 
-MAX_CHANGE = 0.3
+MAX_VELOCITY_CHANGE = 0.3
 """Maximum apparent relative change of the velocity during the pass, equivalent to a turn of 17
 degrees. The model errors of vehicles cause up to 0.2."""
 
-MIN_CHANGE_STDS = 2.5
+MIN_VELOCITY_CHANGE_STDS = 2.5
 """Minimum significant change of the velocity, in standard deviations."""
 
 MAX_SPEED_STD = 0.25
@@ -208,7 +208,7 @@ def _invalid_pass_reason(fit: PassFit) -> str:
         return ('not at constant velocity: the velocity changed by '
                 f'{fit.velocity_change:.0%} during the pass (a turn, braking)')
     if np.linalg.norm(fit.velocity) * fit.duration_s < MIN_DISTANCE * _nearest_cpa_range(fit):
-        return 'no pass: the target hardly moved'
+        return 'no pass: the distance travelled is too short'
     return ''
 
 
@@ -238,7 +238,8 @@ def has_velocity_change(fit: PassFit) -> bool:
     -------
     bool
     """
-    return bool(fit.velocity_change > max(MAX_CHANGE, MIN_CHANGE_STDS * fit.velocity_change_std))
+    return bool(fit.velocity_change > max(
+        MAX_VELOCITY_CHANGE, MIN_VELOCITY_CHANGE_STDS * fit.velocity_change_std))
 
 
 def contradicts_straight_pass(fit: PassFit) -> bool:

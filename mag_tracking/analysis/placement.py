@@ -186,7 +186,7 @@ def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTar
 
 
 def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
-    """Cramér-Rao bounds of the standard deviations of position, velocity and moment.
+    """Cramér-Rao bounds on the standard deviations of position, velocity and moment.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ TAIL_FRACTION = 0.005
 MIN_PROMINENCE = 0.1
 """Minimum prominence of an extremum relative to the range of its axis."""
 
-LAGS = (2, 4, 8, 16)
+AUTOCORRELATION_LAGS = (2, 4, 8, 16)
 """Lags of the autocorrelation of the field magnitude, in samples."""
 
 N_DCT_COEFFICIENTS = 8
@@ -61,7 +61,7 @@ def features(signature: Signature) -> FloatArray:
         For each axis: logarithm of the range, fraction of the energy, numbers of maxima and minima,
         positions of the largest and the smallest value, fraction of the power in the upper third of
         the spectrum. For the field magnitude: logarithm of its maximum, number of maxima,
-        autocorrelation, cosine transform. The duration is not a feature, because the speed is
+        autocorrelation, DCT coefficients. The duration is not a feature, because the speed is
         unknown.
 
     Raises
@@ -96,25 +96,25 @@ def _subtract_baseline(t: FloatArray, field: FloatArray) -> FloatArray:
     ends = np.r_[:n, len(t) - n:len(t)]
     A = np.stack([np.ones_like(t), (t - t[0]) / (t[-1] - t[0])], axis=1)
     line = np.linalg.lstsq(A[ends], field[ends], rcond=None)[0]
-    departure: FloatArray = field - A @ line
-    return departure
+    corrected_field: FloatArray = field - A @ line
+    return corrected_field
 
 
 def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
-    """Resample the part of a signature with 99 % of the energy to (N_SAMPLES, n_axes)."""
-    even = np.linspace(t[0], t[-1], max(4 * N_SAMPLES, len(t)))
-    fine = np.stack([np.interp(even, t, axis) for axis in field.T], axis=1)
-    energy = np.square(fine).sum(axis=1)
+    """Cut off both tails of a signature and resample the rest to (N_SAMPLES, n_axes)."""
+    even_times = np.linspace(t[0], t[-1], max(4 * N_SAMPLES, len(t)))
+    fine_field = np.stack([np.interp(even_times, t, axis) for axis in field.T], axis=1)
+    energy = np.square(fine_field).sum(axis=1)
     fraction = np.cumsum(energy) / energy.sum()
     begin = int(np.searchsorted(fraction, TAIL_FRACTION))
     end = int(np.searchsorted(fraction, 1.0 - TAIL_FRACTION)) + 1
-    at = np.linspace(begin, min(end, len(even) - 1), N_SAMPLES)
+    at = np.linspace(begin, min(end, len(even_times) - 1), N_SAMPLES)
     # Average over the new sampling interval to prevent aliasing.
     width = max(1, round((at[-1] - at[0]) / N_SAMPLES))
-    smooth = np.stack([np.convolve(axis, np.ones(width) / width, 'same') for axis in fine.T],
+    smooth = np.stack([np.convolve(axis, np.ones(width) / width, 'same') for axis in fine_field.T],
                       axis=1)
-    out: FloatArray = np.stack([np.interp(at, np.arange(len(even)), axis) for axis in smooth.T],
-                               axis=1)
+    out: FloatArray = np.stack([np.interp(at, np.arange(len(even_times)), axis)
+                                for axis in smooth.T], axis=1)
     return out
 
 
@@ -131,7 +131,7 @@ def _axis_features(axis: FloatArray, energy_fraction: float, max_magnitude: floa
 
 
 def _n_maxima(values: FloatArray) -> int:
-    """Number of prominent maxima."""
+    """Number of maxima with a prominence of at least `MIN_PROMINENCE` times the range."""
     # Deferred: the import takes 0.25 s.
     from scipy.signal import find_peaks
 
@@ -140,11 +140,12 @@ def _n_maxima(values: FloatArray) -> int:
 
 
 def _magnitude_features(magnitude: FloatArray) -> list[float]:
-    """Features of the field magnitude, which is normalised to a maximum of one."""
+    """Features of a field magnitude that is normalised to a maximum of one."""
     from scipy.fft import dct
 
     centred = magnitude - magnitude.mean()
     variance = float(centred @ centred)
-    correlations = [float(centred[:-lag] @ centred[lag:]) / max(variance, 1e-300) for lag in LAGS]
+    correlations = [float(centred[:-lag] @ centred[lag:]) / max(variance, 1e-300)
+                    for lag in AUTOCORRELATION_LAGS]
     dct_coefficients = dct(magnitude, norm='ortho')[:N_DCT_COEFFICIENTS]
     return [_n_maxima(magnitude), *correlations, *(float(c) for c in dct_coefficients)]

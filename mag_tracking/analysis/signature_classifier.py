@@ -13,11 +13,11 @@ from mag_tracking.errors import LabelsError, MissingDependencyError
 from mag_tracking.inference.log_normal_classes import UNKNOWN
 
 VERSION = 1
-"""Version of the model files."""
+"""Version of the model file format."""
 MIN_SAMPLES = 4
 """Minimum number of training examples of a class."""
 
-FOLDS = 5
+N_FOLDS = 5
 """Number of folds of the cross-validation."""
 PENALTIES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Candidate values of C, the inverse regularisation strength of the logistic regression."""
@@ -170,7 +170,7 @@ def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray
 
 def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tuple[str, ...],
           unit: str, seed: int = 0) -> SignatureModel:
-    """Train a classifier; method and penalty are selected by cross-validation.
+    """Train a classifier; select its method and penalty by cross-validation.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
     mean, scale = x.mean(axis=0), x.std(axis=0)
     scale = np.where(scale > 1e-9 * (1.0 + np.abs(mean)), scale, 1.0)
     z = (x - mean) / scale
-    folds = list(_folds(y, groups, min(FOLDS, min(counts.values())), seed))
+    folds = list(_folds(y, groups, min(N_FOLDS, min(counts.values())), seed))
     candidates = []
     for name, create in _candidates():
         logits = np.zeros((len(y), len(classes)))
@@ -400,7 +400,10 @@ def _logits(fitted: Any, z: FloatArray) -> FloatArray:
 
 
 def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
-    """Create stratified folds of undivided groups: indices of training and test examples."""
+    """Create stratified folds without splitting groups; return an iterator of indices.
+
+    Each item contains the indices of the training examples and of the test examples.
+    """
     try:
         from sklearn.model_selection import StratifiedGroupKFold
     except ImportError as error:
@@ -412,7 +415,7 @@ def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
 
 def _random_split(y: Any, groups: Any, test_fraction: float, seed: int
                   ) -> tuple[IntArray, IntArray]:
-    """Stratified random split of undivided groups: indices of training and test examples."""
+    """Stratified random split without splitting groups; return (training, test) indices."""
     rng, test_groups = np.random.default_rng(seed), set[str]()
     for name in np.unique(y):
         class_groups = rng.permutation(np.unique(groups[y == name]))

@@ -1,7 +1,7 @@
 """Expansions of the field of a straight pass: multipoles about one point, or Anderson functions.
 
 The classes implement `inference.separable_fit.SeparableModel`: the field is linear in all
-parameters but those of the path.
+parameters except the path parameters.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from mag_tracking.physics.anderson import anderson_functions
 from mag_tracking.physics.multipole import multipole_jacobians
 
 _N_MOMENTS = {1: 3, 2: 8, 3: 15}
-"""Number of moments by the highest order of the expansion."""
+"""Number of moments for each highest order of an expansion."""
 
 
 @dataclass(frozen=True)

@@ -172,7 +172,7 @@ class Magnet:
 
 
 def _second_order_noise(m: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Increase (n, 3, 3) of the second moment of the shortening of m by an uncertain rotation.
+    """Process noise (n, 3, 3) due to the shortening of the moment m by an uncertain rotation.
 
     A rotation by small angles (a, b) about axes perpendicular to `m` (n, 3) shortens the component
     along m by (a^2 + b^2)/2 |m|, which the Jacobian neglects. With the variances p, q of a, b, the

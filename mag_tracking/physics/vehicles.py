@@ -82,8 +82,9 @@ class RowVehicle:
 
     @cached_property
     def _moment_walk(self) -> FloatArray:
-        """Random walk covariance of the hard iron moments, (3 d, 3 d) 1/s, over the squared
-        magnitude of the hard and soft iron moments.
+        """Relative random walk covariance of the hard iron moments, (3 d, 3 d) 1/s.
+
+        It is relative to the squared magnitude of the hard and soft iron moments.
         """
         d = self.n_dipoles
         mean = np.full((d, d), 1.0 / d)

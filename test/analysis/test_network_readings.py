@@ -1,4 +1,4 @@
-"""Predicted readings of a board near a magnet, and their derivatives by all unknowns."""
+"""Predicted readings of a board near a magnet; derivatives with respect to all unknowns."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Calibration of a board of 41 sensors with recorded readings, and test with other readings."""
+"""Calibration of a board of 41 sensors from recorded readings, validated with held-out readings."""
 
 import numpy as np
 import pytest
@@ -67,7 +67,7 @@ def fit_registration(r, u, positions, axes):
 
 @pytest.mark.study
 def test_blind_calibration_is_accurate_for_the_other_readings(recorded):
-    """Calibrate without the tracker, register with the same readings, test with other readings."""
+    """Calibrate without the tracker, register with the same data, validate with held-out data."""
     network, field, positions, axes = recorded
     g = calibrate_geometry_blind(network, field[::2], MOMENT, *BOX, GeometrySettings())
     assert g.converged and g.suspect_sensors == () and len(g.rows) >= 155

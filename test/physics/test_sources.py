@@ -1,4 +1,4 @@
-"""Source models: Jacobians compared with differences, process noise with exact integrals."""
+"""Source models: finite-difference check of Jacobians, and exact integrals of process noise."""
 
 import inspect
 
