@@ -106,7 +106,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
 
     Returns
     -------
-    list of Disagreement
+    list of FieldInconsistency
         In the order of `names`.
     """
     B0 = np.asarray(earth_field, dtype=float)
@@ -154,7 +154,7 @@ def _is_consistent_cached(field: tuple[float, ...], orientation: tuple[float, ..
 def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields: FloatArray,
                   R_ws: FloatArray, orientation_std: FloatArray, B0: FloatArray,
                   bias_std: float) -> tuple[str, ...]:
-    """Simplest faults that explain the field of sensor `j`; empty if none does."""
+    """Simplest faults that explain the field of sensor `j`; empty if no fault does."""
     def fits(y: FloatArray, R: FloatArray = R_ws[j],
              std: FloatArray = orientation_std[j]) -> bool:
         return _is_consistent(y, R, std, B0, bias_std)
@@ -177,7 +177,7 @@ def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields:
 
 def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
                          B0: FloatArray) -> tuple[str, ...]:
-    """Simplest change of axes that explains most of the difference, if any."""
+    """Simplest change of axes that explains most of the difference of a field, if any."""
     original = _remaining_difference(y, R_ws, std, B0)
     for changes in _axis_changes():
         remainders = sorted(
@@ -193,7 +193,7 @@ def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
 
 def _remaining_difference(y: FloatArray, R_ws: FloatArray, std: FloatArray,
                           B0: FloatArray) -> float:
-    """Difference [T] from the Earth's field at the best heading."""
+    """Difference [T] of a measured field from the Earth's field at the best heading."""
     reported = ~np.isnan(y)
     _, B = _headings(std, B0)
     return float(np.linalg.norm((y - B @ R_ws)[:, reported], axis=1).min())

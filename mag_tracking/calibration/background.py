@@ -166,7 +166,7 @@ class RunningBackground:
 
     @property
     def departed_at(self) -> float | None:
-        """Time [s] by which a vehicle present at the start had left; None if none was detected."""
+        """Time [s] by which a vehicle present at the start had left; None if undetected."""
         return self._departure.departed_at
 
     @property
@@ -244,7 +244,7 @@ class RunningBackground:
             self._start_provisionally(block)
 
     def _start_provisionally(self, block: Block) -> None:
-        """Add a block, and start with the most frequent level if it can be determined."""
+        """Add a block, and adopt a frequent level or the given background when possible."""
         self._provisional.collect(block)
         frequent = self._provisional.frequent_level(corrected_steps(self._sensors))
         if frequent is not None and self._known_background is not None:
@@ -352,7 +352,7 @@ class RunningBackground:
         self._departure.end()
 
     def _adopt_if_steady(self, collected: deque[Block]) -> bool:
-        """Adopt the collected blocks if they lie on one line, and return whether they do."""
+        """Adopt the collected blocks if they lie on one line; return whether they were adopted."""
         blocks = stacked(collected)
         noise = pooled_covariance(blocks) if self._known_noise is None else self._known_noise
         noise = None if noise is None else self._level.without_dead_axes(noise)

@@ -25,7 +25,7 @@ class Block:
     mean: FloatArray
     """(3,) [T] Mean field; NaN for an unreported axis."""
     scatter: FloatArray
-    """(3, 3) [T²] Sum of squared deviations from the mean."""
+    """(3, 3) [T²] Scatter matrix: sum of the outer products of the deviations from the mean."""
     n: FloatArray
     """(3,) Number of samples per axis."""
 
@@ -132,7 +132,7 @@ def stacked(blocks: Iterable[Block]) -> Blocks:
 
 
 def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
-    """Whether one block has a far larger scatter than the quietest block, on any axis.
+    """Whether the variance of any block far exceeds that of the quietest block, on any axis.
 
     Parameters
     ----------

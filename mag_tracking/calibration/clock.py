@@ -39,7 +39,7 @@ class Lag:
     std: float
     """[s] Standard deviation of the offset."""
     correlation: float
-    """Correlation at the offset, even if it was rejected, 0 to 1; NaN if it was not computed."""
+    """Correlation at the offset, 0 to 1, even if the offset was rejected; NaN if not computed."""
     reason: str
     """Why the offset is unknown; empty if it is known."""
 
@@ -194,7 +194,7 @@ def _sampling_interval(t: FloatArray, s: FloatArray) -> float:
 
 
 def _coarse_lag(a: _Series, b: _Series, max_lag: float) -> tuple[float, float, str]:
-    """Lag [s] of the largest correlation, that correlation, and a reason for rejecting the lag."""
+    """Lag [s] of the largest correlation, that correlation, and why the lag is rejected or ''."""
     step = 0.5 * min(_sampling_interval(*a), _sampling_interval(*b))
     if not np.isfinite(step):
         return float('nan'), float('nan'), 'the knock is shorter than the sampling interval'
@@ -220,7 +220,7 @@ def _coarse_lag(a: _Series, b: _Series, max_lag: float) -> tuple[float, float, s
 
 
 def _refined_lag(a: _Series, b: _Series, lag: float) -> tuple[float, float]:
-    """Offset and standard deviation [s] of the best fit of `a`, interpolated and scaled, to `b`."""
+    """Least-squares lag [s] of `b` relative to an interpolation of `a`, and its std [s]."""
     offset, std = _fitted_lag(a, b, lag, PchipInterpolator(*a, extrapolate=False))
     # The signal between two readings is unknown; a second interpolation estimates its effect.
     other_offset, _ = _fitted_lag(a, b, lag, CubicSpline(*a, extrapolate=False))
@@ -229,7 +229,7 @@ def _refined_lag(a: _Series, b: _Series, lag: float) -> tuple[float, float]:
 
 def _fitted_lag(a: _Series, b: _Series, lag: float,
                 curve: PchipInterpolator | CubicSpline) -> tuple[float, float]:
-    """Fit `curve`, an interpolation of `a`, to `b`; return the lag and its std [s]."""
+    """Fit lag and scale of `curve`, an interpolation of `a`, to `b`; return the lag and std [s]."""
     t, s = b
     step = max(_sampling_interval(*a), _sampling_interval(*b))
     first, last = _knock_times(*a)

@@ -20,7 +20,7 @@ _OCTANTS = np.array(list(product([1.0, -1.0], repeat=3)))
 
 
 def _cells() -> cKDTree:
-    """Tree of N_CELLS evenly spread unit vectors (a Fibonacci spiral)."""
+    """Build a k-d tree of N_CELLS evenly spread unit vectors (a Fibonacci spiral)."""
     i = np.arange(N_CELLS) + 0.5
     z, angle = 1.0 - 2.0 * i / N_CELLS, np.pi * (1.0 + np.sqrt(5.0)) * i
     rho = np.sqrt(1.0 - z * z)

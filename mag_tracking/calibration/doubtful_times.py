@@ -60,8 +60,8 @@ def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTi
 
     An interval in `latest` replaces an earlier interval that begins at the same time or within it.
     If the end of an earlier interval is missing, the interval ends where the next one begins. If
-    the latest intervals of a sensor are empty, its background was replaced, and an open interval
-    is removed.
+    a sensor has no latest intervals, its background was replaced, and its open earlier interval is
+    removed.
 
     Parameters
     ----------

@@ -45,8 +45,8 @@ MAX_OFFSET_STD = 0.1
 """Maximum standard deviation of the offset relative to the radius, in the worst direction."""
 
 GOOD_RESIDUAL = 0.05
-"""std/mean of the corrected magnitudes above which a warning is issued: the field was not
-uniform."""
+"""Coefficient of variation (std/mean) of the corrected magnitudes above which a warning is issued:
+the field was not uniform."""
 
 GOOD_OUTLIER_FRACTION = 0.01
 """Fraction of outliers above which a warning is issued."""
@@ -79,10 +79,10 @@ class EllipsoidFit:
     """Magnitude of B after correction: the given value, or the mean radius for det(correction) = 1,
     in the unit of the readings."""
     residual: float
-    """std/mean of ‖B‖ over all readings after correction, including outliers and saturated
-    readings."""
+    """Coefficient of variation (std/mean) of ‖B‖ over all readings after correction, including
+    outliers and saturated readings."""
     residual_before: float
-    """std/mean of ‖y‖."""
+    """Coefficient of variation (std/mean) of ‖y‖, the magnitudes before correction."""
     offset_std: FloatArray
     """(3,), unit of the readings: standard deviation of `offset`."""
     correction_std: FloatArray
@@ -105,7 +105,7 @@ class EllipsoidFit:
     """Number of readings excluded because of saturation."""
     n_outliers: int
     """Number of excluded glitches, plus the number of readings further than OUTLIER robust standard
-    deviations from the ellipsoid. The loss limits the influence of the latter."""
+    deviations from the ellipsoid. The robust loss limits the influence of the latter."""
     converged: bool
     """Whether the calibration is valid."""
     reason: str
@@ -232,7 +232,7 @@ def _validated(readings: FloatArray, field_magnitude: float | None) -> FloatArra
 
 
 def _relative_spread(magnitudes: FloatArray) -> float:
-    """std/mean of magnitudes; NaN without readings or if all readings are zero."""
+    """Coefficient of variation of magnitudes; NaN without readings or if all readings are zero."""
     return float(magnitudes.std() / magnitudes.mean()) if magnitudes.any() else float('nan')
 
 
@@ -265,9 +265,9 @@ def _insufficient_data(y: FloatArray) -> str:
     if not largest > 0.0:
         return f'all {len(y)} readings are equal: the sensor was not moved or is stuck'
     z = (y - y[0]) / largest
-    thick = np.linalg.svd(z - z.mean(axis=0), compute_uv=False)
-    if not thick[2] >= MIN_THICKNESS * thick[0]:
-        return (f'the readings lie in a plane: relative thickness {thick[2] / thick[0]:.2g}, '
+    spreads = np.linalg.svd(z - z.mean(axis=0), compute_uv=False)
+    if not spreads[2] >= MIN_THICKNESS * spreads[0]:
+        return (f'the readings lie in a plane: relative thickness {spreads[2] / spreads[0]:.2g}, '
                 f'minimum {MIN_THICKNESS}; rotate the sensor about more than one axis')
     return ''
 
@@ -278,39 +278,41 @@ def _in_units(o: FloatArray, C: FloatArray, P: FloatArray, centre: FloatArray, s
     volume = np.linalg.det(C)**(-1.0 / 3.0)
     t = np.einsum('ij,kji->k', np.linalg.inv(C), BASIS)
     if field_magnitude is None:
-        k, size = volume, scale * volume
+        k, magnitude = volume, scale * volume
         D = k * (BASIS - C * t[:, None, None] / 3.0)
-        size_std = size / 3.0 * np.sqrt(t @ P[3:, 3:] @ t)
+        magnitude_std = magnitude / 3.0 * np.sqrt(t @ P[3:, 3:] @ t)
     else:
-        k, size, size_std = field_magnitude / scale, float(field_magnitude), 0.0
+        k, magnitude, magnitude_std = field_magnitude / scale, float(field_magnitude), 0.0
         D = k * BASIS
-    return {'offset': centre + scale * o, 'correction': k * C, 'field_magnitude': float(size),
+    return {'offset': centre + scale * o, 'correction': k * C, 'field_magnitude': float(magnitude),
             'offset_std': scale * np.sqrt(np.diagonal(P)[:3]),
             'correction_std': np.sqrt(np.einsum('kij,kl,lij->ij', D, P[3:, 3:], D)),
-            'field_magnitude_std': float(size_std)}
+            'field_magnitude_std': float(magnitude_std)}
 
 
-def _rejection_reason(C: FloatArray, P: FloatArray, quality: Quality, outliers: float) -> str:
+def _rejection_reason(C: FloatArray, P: FloatArray, quality: Quality,
+                      outlier_fraction: float) -> str:
     """Why a fit is rejected; empty if it is accepted."""
     if quality['scatter'] > MAX_SCATTER:
         return (f'the scatter about the ellipsoid is {quality["scatter"]:.2g} of the radius, '
                 f'maximum {MAX_SCATTER}; {POSSIBLE_CAUSES}')
-    if outliers > MAX_OUTLIER_FRACTION:
-        return (f'the fraction of outliers is {outliers:.2g}, maximum '
+    if outlier_fraction > MAX_OUTLIER_FRACTION:
+        return (f'the fraction of outliers is {outlier_fraction:.2g}, maximum '
                 f'{MAX_OUTLIER_FRACTION}')
     if quality['directions'] < MIN_DIRECTIONS:
         return f'readings in {quality["directions"]} directions, minimum {MIN_DIRECTIONS}'
     if quality['coverage'] < MIN_COVERAGE:
         return (f'the coverage is {quality["coverage"]:.2g}, minimum {MIN_COVERAGE}; octants with '
                 f'few or no readings: {", ".join(quality["empty"]) or "none"}')
-    uncertain = np.sqrt(np.linalg.eigvalsh(C @ P[:3, :3] @ C)[-1])
-    if not uncertain <= MAX_OFFSET_STD:
-        return (f'the standard deviation of the offset is {uncertain:.2g} of the radius, maximum '
+    offset_std = np.sqrt(np.linalg.eigvalsh(C @ P[:3, :3] @ C)[-1])
+    if not offset_std <= MAX_OFFSET_STD:
+        return (f'the standard deviation of the offset is {offset_std:.2g} of the radius, maximum '
                 f'{MAX_OFFSET_STD}')
     return '' if quality['solved'] else 'least squares did not converge in 100 evaluations'
 
 
-def _notes_on_fit(residual: float, quality: Quality, outliers: float) -> tuple[str, ...]:
+def _notes_on_fit(residual: float, quality: Quality,
+                  outlier_fraction: float) -> tuple[str, ...]:
     """Warnings about coverage, residual and outliers."""
     checks = {
         f'the coverage is {quality["coverage"]:.2g}, recommended at least {GOOD_COVERAGE}':
@@ -318,7 +320,8 @@ def _notes_on_fit(residual: float, quality: Quality, outliers: float) -> tuple[s
         f'octants with few or no readings: {", ".join(quality["empty"])}': quality['empty'],
         f'the residual after correction is {residual:.2g}, recommended at most {GOOD_RESIDUAL}':
             residual > GOOD_RESIDUAL,
-        f'the fraction of outliers is {outliers:.2g}': outliers > GOOD_OUTLIER_FRACTION}
+        f'the fraction of outliers is {outlier_fraction:.2g}':
+            outlier_fraction > GOOD_OUTLIER_FRACTION}
     return tuple(note for note, holds in checks.items() if holds)
 
 

@@ -10,7 +10,7 @@ from mag_tracking.calibration.directions import binned, coverage, empty_octants,
 from mag_tracking.calibration.quadric import OUTLIER, robust_std
 
 LOSS_SCALE = 2.0
-"""[std] Residual at which the loss changes from quadratic to linear; the loss of precision for
+"""[std] Residual at which the loss changes from quadratic to linear; the loss of efficiency for
 Gaussian noise is small."""
 
 N_BLOCKS = 40

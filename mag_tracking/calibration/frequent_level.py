@@ -100,11 +100,11 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int) -> Q
     if not is_used.any():
         return None
     quietest = np.nanquantile(variance[:, is_used], 0.2, axis=0)
-    calm = (variance[:, is_used] <= MAX_CALM_RATIO**2 * quietest).all(axis=1)
+    is_calm = (variance[:, is_used] <= MAX_CALM_RATIO**2 * quietest).all(axis=1)
     width = np.full(3, np.nan)
     width[is_used] = np.maximum(LEVEL_WIDTH * np.sqrt(quietest / np.median(n[:, is_used], axis=0)),
                                 np.maximum(TOGGLE * steps[is_used], MIN_WIDTH))
-    rows = np.flatnonzero(calm)
+    rows = np.flatnonzero(is_calm)
     if len(rows) < MIN_BLOCKS:
         return None
     means = blocks.mean[rows][:, is_used]

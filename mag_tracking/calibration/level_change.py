@@ -105,7 +105,7 @@ def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: F
 
 
 def _magnitude(off: FloatArray) -> FloatArray:
-    """Norm over the reported axes, (...)."""
+    """Euclidean norms (...) of differences (..., 3) over the reported axes."""
     size: FloatArray = np.sqrt(np.nansum(np.square(off), axis=-1))
     return size
 

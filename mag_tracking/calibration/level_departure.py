@@ -50,7 +50,7 @@ class LevelDeparture:
     was_steady : bool
         Whether the sensor was at another steady level for long enough during the departure.
     departed_at : float or None, s
-        Time by which a vehicle present at the start had departed; None if none was detected.
+        Time by which a vehicle present at the start had departed; None if undetected.
     """
 
     def __init__(self, learn: float, relearn: float, state: Record, level: BackgroundLevel,
@@ -103,7 +103,7 @@ class LevelDeparture:
         Returns
         -------
         deque of Block or None
-            None if they are not steady.
+            None if the latest blocks are not steady.
         """
         new_blocks = self._level.steady_end(self.blocks, ratio * self._learn)
         self.was_steady |= new_blocks is not None
@@ -141,8 +141,8 @@ class LevelDeparture:
             0 if the latest block is not at the former level.
         """
         former = self.former
-        is_at_it = former is not None and former.is_at(self.blocks[-1], self._level.limits)
-        return former.observed_s if former is not None and is_at_it else 0.0
+        is_at_former = former is not None and former.is_at(self.blocks[-1], self._level.limits)
+        return former.observed_s if former is not None and is_at_former else 0.0
 
     def has_departed(self, new_blocks: deque[Block]) -> bool | None:
         """Determine and store whether a vehicle that was part of the background has departed.

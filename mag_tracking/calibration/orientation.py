@@ -159,13 +159,13 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
         [abs(yaw_between(rotation_about_z(yaw) @ R_level, stated)) for yaw in yaws])
     yaw = yaws[int(np.argmin(np.where(costs <= costs.min() + MAX_EQUAL_COST, preference, np.inf)))]
     slope = fit(yaw)[1]
-    level, upright = np.hypot(*B0[:2]), abs(B0[2])
+    horizontal, vertical = np.hypot(*B0[:2]), abs(B0[2])
     information = slope @ slope / bias_std**2
     if information * MAX_HEADING_STD**2 <= 1.0:
         raise ValueError('the heading is not observable: the measured part of the horizontal field '
-                         f'of {level:.2g} T is too small for a bias of {bias_std:.2g} T')
+                         f'of {horizontal:.2g} T is too small for a bias of {bias_std:.2g} T')
     # A tilt error projects part of the vertical field onto the horizontal plane.
-    heading_std = np.sqrt(1.0 / information + (up.std * upright / level)**2)
+    heading_std = np.sqrt(1.0 / information + (up.std * vertical / horizontal)**2)
     differences = [np.angle(np.exp(1j * (other - yaw))) for other in yaws]
     rivals = [d for d, c in zip(differences, costs, strict=True)
               if abs(d) > 0.1 and c < costs.min() + MAX_RIVAL_COST]

@@ -43,9 +43,9 @@ class FrequentLevel:
 
     level: QuietLevel
     std: FloatArray
-    """(3,) [T] Median distance of all blocks from the level, scaled to a standard deviation: a
-    level observed for less than half of the time may not be the background. NaN for an unreported
-    axis."""
+    """(3,) [T] Uncertainty of the level: median distance of all blocks from the level, scaled to a
+    standard deviation. It is large for a level observed for less than half of the time. NaN for an
+    unreported axis."""
     is_certain: bool
     """Whether the level was observed for long enough, and far longer than any other level."""
 

@@ -84,7 +84,7 @@ class QuietInterval:
         return self._window.blocks()
 
     def scatter(self) -> FloatArray:
-        """Variance within the blocks.
+        """Pooled variance of the readings within the blocks.
 
         Returns
         -------

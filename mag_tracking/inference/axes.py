@@ -11,7 +11,7 @@ MIN_PIVOT = 1e-12
 
 
 def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Energy of a measurement relative to its noise: y' C^-1 y over the measured axes.
+    """Whitened energy y' C^-1 y of each measurement, over the measured axes.
 
     Parameters
     ----------

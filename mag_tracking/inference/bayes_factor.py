@@ -113,8 +113,8 @@ class TargetBayesFactor:
         Returns
         -------
         float, s
-            0 if a target has been favoured before: the field of a vehicle that has stopped is as
-            smooth as the alternative.
+            0 if a target has been favoured before, because the field of a vehicle that has stopped
+            is as smooth as the alternative.
         """
         if self._was_favoured or self._disfavoured_since_ns is None or not self._is_known:
             return 0.0

@@ -394,13 +394,16 @@ def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
 
 
 def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scale, root G of the pseudo-inverse G G' and kernel basis of J at unit diagonal."""
+    """Scale J to unit diagonal, and decompose the scaled matrix.
+
+    Returns the scale, a root G of the pseudo-inverse G G' and an orthonormal kernel basis.
+    """
     scale, w, V = unit_diagonal('information', J)
     zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
     return scale, V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]
 
 
 def _is_in_kernel(kernel: FloatArray) -> BoolArray:
-    """Whether each state has a component in an orthonormal kernel basis (n, k), (n,)."""
+    """Whether each state has a component in the kernel with orthonormal basis (n, k); (n,)."""
     in_kernel: BoolArray = np.linalg.norm(kernel, axis=1) > _KERNEL_TOLERANCE
     return in_kernel

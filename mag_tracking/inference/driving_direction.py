@@ -120,7 +120,7 @@ def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRo
 
 
 def _correlation(field: FloatArray, lag: int) -> float:
-    """Correlation of PHD15 Paper B eq. (5a), without the first and last `lag` samples."""
+    """Lagged correlation of the horizontal axes, PHD15 Paper B eq. (5a), on the inner samples."""
     current, delayed = field[lag:-lag], field[2 * lag:]
     return float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
 

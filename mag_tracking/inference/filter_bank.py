@@ -201,7 +201,7 @@ class FilterBank:
         return FilterBank(**{**selected, 'log_w': np.full(len(rows), -np.log(len(rows)))})
 
     def alone(self, i: int) -> 'FilterBank':
-        """Bank of a single hypothesis.
+        """Create a bank with a single hypothesis.
 
         Parameters
         ----------

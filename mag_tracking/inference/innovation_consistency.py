@@ -73,7 +73,7 @@ class InnovationConsistency:
         return bool(self._fails(self._total).any())
 
     def _fails(self, values: FloatArray) -> FloatArray:
-        """Whether sums (2, n_sensors + 1) exceed their thresholds, (n_sensors + 1,)."""
+        """Whether each sum of NIS exceeds its chi-square threshold, (n_sensors + 1,)."""
         probability = np.append(np.full(self._n_sensors, FALSE_ALARM / self._n_sensors),
                                 FALSE_ALARM)
         nis, freedom = values

@@ -21,8 +21,8 @@ class Iron:
     residuals: FloatArray
     """Measured minus predicted moments, (n, 3) A m², world frame."""
     normalised_cost: float
-    """Weighted sum of squared residuals over the degrees of freedom; about 1 if the model and the
-    covariances are correct. NaN without covariances."""
+    """Chi-square of the residuals per degree of freedom; about 1 if the model and the covariances
+    are correct. NaN without covariances."""
 
 
 def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: ArrayLike,
@@ -90,7 +90,7 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
 
 
 def _whitening_matrices(covariances: ArrayLike | None, n: int) -> FloatArray:
-    """Inverse Cholesky factors (n, 3, 3); identity matrices without covariances."""
+    """Inverse Cholesky factors (n, 3, 3) of covariances; identity matrices if None is given."""
     if covariances is None:
         return np.tile(np.eye(3), (n, 1, 1))
     covariances = np.asarray(covariances, dtype=float)

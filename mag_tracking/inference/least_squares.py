@@ -35,14 +35,14 @@ def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iteration
     n_iterations : int
         Maximum number of iterations.
     tolerance : float
-        Relative decrease of the cost in one step at or below which a start has converged.
+        Relative decrease of the cost in one step at or below which a search has converged.
 
     Returns
     -------
     x : (n, n_x) array
         Final points.
     cost : (n,) array
-        Sum of squared whitened residuals; infinite for an unusable start.
+        Sum of squared whitened residuals; infinite for an unusable starting point.
     covariance : (n, n_x, n_x) array
         Pseudo-inverse of the information at `x`.
     converged : (n,) bool array

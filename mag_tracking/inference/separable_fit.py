@@ -189,9 +189,9 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
     Parameters
     ----------
     smooth : SeparableProblem
-        Reduced problem with nearly the same minima, smoother than `coarse`; see `coarse_minima`.
+        Reduced problem with nearly the same minima as `coarse`, but smoother; see `coarse_minima`.
     coarse : SeparableProblem
-        Reduced problem with nearly the same minima.
+        Reduced problem with nearly the same minima as `fine`.
     fine : SeparableProblem
         Problem to be solved; see `fine_minimum`.
     starts : (n, n_theta) array

@@ -80,7 +80,7 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
 
 
 def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
-    """Latest doubtful interval of the background of each sensor in a CalibrationState.
+    """Latest interval in which each sensor's background was doubtful, from a CalibrationState.
 
     Parameters
     ----------

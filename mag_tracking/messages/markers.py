@@ -65,8 +65,8 @@ def delete_markers(track: Track, frame: str) -> dict[str, Any]:
     -------
     dict (visualization_msgs/MarkerArray)
     """
-    return {'markers': [_marker(track, frame, kind, _SPHERE, action=_DELETE)
-                        for kind in TRACK_NAMESPACES]}
+    return {'markers': [_marker(track, frame, namespace, _SPHERE, action=_DELETE)
+                        for namespace in TRACK_NAMESPACES]}
 
 
 def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
@@ -103,10 +103,10 @@ def _smallest_distance(positions: FloatArray) -> float:
     return float(distances.min())
 
 
-def _marker(track: Track, frame: str, kind: str, shape: int,
+def _marker(track: Track, frame: str, namespace: str, shape: int,
             **message_fields: Any) -> dict[str, Any]:
     """Build a visualization_msgs/Marker as a dict."""
-    return {'header': header_dict(track.stamp_ns, frame), 'ns': kind, 'id': track.id,
+    return {'header': header_dict(track.stamp_ns, frame), 'ns': namespace, 'id': track.id,
             'type': shape, **message_fields}
 
 
@@ -118,15 +118,15 @@ def _quaternion(R: FloatArray) -> dict[str, float]:
 def _ellipsoid(track: Track, frame: str) -> dict[str, Any]:
     """Marker of the 90 % region of the position."""
     uncertainty: Track | PoseUncertainty = track.topic_uncertainty or track
-    values, R = np.linalg.eigh(uncertainty.covariance[:3, :3])
+    variances, R = np.linalg.eigh(uncertainty.covariance[:3, :3])
     if np.linalg.det(R) < 0.0:
         R = -R
-    axes = 2.0 * _REGION_RADIUS * np.sqrt(np.maximum(values, 0.0))
+    diameters = 2.0 * _REGION_RADIUS * np.sqrt(np.maximum(variances, 0.0))
     return _marker(
         track, frame, 'ellipsoid', _SPHERE, action=_ADD, lifetime={'sec': LIFETIME_S},
         pose={'position': xyz(track.position), 'orientation': _quaternion(R)},
         # RViz rejects spheres with zero thickness.
-        scale=xyz(np.maximum(axes, 1e-6)),
+        scale=xyz(np.maximum(diameters, 1e-6)),
         color={**_BLUE, 'a': 0.15 if track.ambiguous else 0.35})
 
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.messages.schema import known_covariances
 
-_HEAD = np.dtype([('encapsulation', 'u1', 4), ('sec', '<i4'), ('nanosec', '<u4'),
-                  ('length', '<u4')])
+_HEADER_TYPE = np.dtype([('encapsulation', 'u1', 4), ('sec', '<i4'), ('nanosec', '<u4'),
+                         ('length', '<u4')])
 """Layout up to the frame name, whose `length` includes the terminating zero."""
 _FIELD_DOUBLES = 12
 """Number of float64 values in a MagneticField: x, y, z and the covariance."""
@@ -107,21 +107,21 @@ class _StampedMessages:
     def __init__(self, content: bytes, begins: IntArray, ends: IntArray, n_doubles: int) -> None:
         self._data: NDArray[np.uint8] = np.frombuffer(content, np.uint8)
         self._begins, self._n_doubles = begins, n_doubles
-        # The head of a truncated message may extend beyond the end of the data.
-        head = self._data.take(begins[:, None] + np.arange(_HEAD.itemsize), mode='clip'
-                               ).view(_HEAD)[:, 0] \
-            if len(self._data) else np.zeros(len(begins), dtype=_HEAD)
-        self._name_length = head['length'].astype(np.int64)
+        # The header of a truncated message may extend beyond the end of the data.
+        header = self._data.take(begins[:, None] + np.arange(_HEADER_TYPE.itemsize), mode='clip'
+                                 ).view(_HEADER_TYPE)[:, 0] \
+            if len(self._data) else np.zeros(len(begins), dtype=_HEADER_TYPE)
+        self._name_length = header['length'].astype(np.int64)
         # 8-byte values are aligned relative to the end of the encapsulation header.
-        self._values_begin = (_HEAD.itemsize - 4 + self._name_length + 7) // 8 * 8 + 4
+        self._values_begin = (_HEADER_TYPE.itemsize - 4 + self._name_length + 7) // 8 * 8 + 4
         self.is_decoded: BoolArray = (ends - begins >= self._values_begin + 8 * n_doubles) \
             & (self._name_length > 0) \
-            & (head['encapsulation'][:, 0] == 0) & (head['encapsulation'][:, 1] == 1)
-        self.stamp_ns: IntArray = head['sec'].astype(np.int64) * 1_000_000_000 + head['nanosec']
+            & (header['encapsulation'][:, 0] == 0) & (header['encapsulation'][:, 1] == 1)
+        self.stamp_ns: IntArray = header['sec'].astype(np.int64) * 1_000_000_000 + header['nanosec']
 
     def _frames(self, rows: IntArray, length: int) -> NDArray[np.uint8]:
         """Frame names of `rows` (k,), all of which have `length` bytes: (k, length) array."""
-        return self._data[(self._begins[rows] + _HEAD.itemsize)[:, None] + np.arange(length)]
+        return self._data[(self._begins[rows] + _HEADER_TYPE.itemsize)[:, None] + np.arange(length)]
 
     def have_ascii_frames(self, rows: IntArray) -> BoolArray:
         """Whether the frame names of `rows` are zero-terminated ASCII: (k,) array."""

@@ -111,7 +111,7 @@ def field_decoder(encoding: str, name: str, content: bytes) -> Callable[[bytes],
 
 
 def _field(message: Any) -> MessageDict:
-    """Convert a message to sensor_msgs/MagneticField; raise ValueError if it lacks the fields."""
+    """Convert a message to sensor_msgs/MagneticField; raise ValueError for an invalid message."""
     field = getattr(message, 'magnetic_field', None)
     header = getattr(message, 'header', message)
     stamp = next((s for name in _STAMPS for s in (getattr(header, name, None),
@@ -131,7 +131,7 @@ def _field(message: Any) -> MessageDict:
 
 
 def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
-    """Return the first existing field of `names`; raise ValueError unless in [0, limit)."""
+    """First integer field of `names`; raise ValueError if it is missing or not in [0, limit)."""
     for name in names:
         value = getattr(stamp, name, None)
         if isinstance(value, int) and not isinstance(value, bool):
@@ -142,7 +142,7 @@ def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
 
 
 def _axis_value(field: Any, axis: str) -> float:
-    """Return the field of one axis [T], NaN for null; raise ValueError if it is missing."""
+    """Field of one axis [T], NaN for null; raise ValueError if it is missing or not a number."""
     if not hasattr(field, axis):
         raise ValueError(f'magnetic_field.{axis} is missing')
     value = getattr(field, axis)

@@ -24,7 +24,8 @@ MAX_POSES = 30_000
 MAX_FRAMES = 64
 """Number of recent frames that are stored for matching with tracks."""
 JUMP_BACK_S = 1.0
-"""[s] A larger backward jump of frames starts a new scene, for example when a bag is looped."""
+"""[s] Maximum backward jump of the timestamps of frames. A larger jump starts a new scene, for
+example when a bag is looped."""
 
 
 class LiveScene:
@@ -191,7 +192,7 @@ class LiveScene:
             return out
 
     def _scene_messages(self, tracks: list[dict[str, Any]]) -> list[str]:
-        """The message that replaces the scene, as a list; empty while the sensors are unknown."""
+        """List with the message that replaces the scene; empty while the sensors are unknown."""
         if not len(self._network):
             return []
         begin_ns = self._begin_ns or 0
@@ -205,7 +206,7 @@ class LiveScene:
                           'tables': [asdict(table) for table in self._tables]})
 
     def _extend_time(self, stamp_ns: int) -> None:
-        """Extend the time range of the scene."""
+        """Extend the time range of the scene to include a timestamp."""
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
             # An empty scene that may have been sent earlier had no start time.

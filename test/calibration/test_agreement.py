@@ -29,14 +29,14 @@ def correct_fields(rng=None, R_ws=R_WS, std=STD):
     """Fields (n, 3) [T] of correct sensors; `rng` adds random biases and mounting errors."""
     out = np.einsum('jki,k->ji', R_ws, EARTH)
     if rng is not None:
-        turns = Rotation.from_rotvec(std * rng.standard_normal((len(R_ws), 3))).as_matrix()
-        out = np.einsum('jki,k->ji', turns @ R_ws, EARTH)
+        rotations = Rotation.from_rotvec(std * rng.standard_normal((len(R_ws), 3))).as_matrix()
+        out = np.einsum('jki,k->ji', rotations @ R_ws, EARTH)
         out = out + BIAS * rng.standard_normal(out.shape)
     return out
 
 
 def explanations_of(fields, R_ws=R_WS, std=STD, earth=EARTH, bias_std=BIAS):
-    """Explanations of all disagreements, as {sensor: explanations}."""
+    """Explanations of all inconsistent sensors, as {sensor: explanations}."""
     n = len(fields)
     found = disagreements(NAMES[:n], fields, R_ws, np.tile(std, (n, 1)), earth, bias_std)
     return {d.sensor: d.explanations for d in found}

@@ -37,7 +37,7 @@ def accelerations(t, shape=double_sided, knocks=KNOCKS, rotation=None, direction
 
 
 def times(rng, rate, end=5.0):
-    """Sampling times (n,) [s] of random phase, with a jitter of a fifth of an interval."""
+    """Sampling times (n,) [s] with a random phase and a jitter of a fifth of an interval."""
     n = int(end * rate)
     return (np.arange(n) + rng.random() + 0.2 * rng.uniform(-1.0, 1.0, n)) / rate
 

@@ -54,12 +54,12 @@ def ride(t, at, acceleration, top, stops):
     """Position (n,) [m] along the road of a vehicle that stops or starts at time `at` [s]."""
     since = np.maximum(at - t if stops else t - at, 0.0)
     straight = np.minimum(since, top / acceleration)
-    way = 0.5 * acceleration * straight**2 + top * (since - straight)
-    return -way if stops else way
+    distance = 0.5 * acceleration * straight**2 + top * (since - straight)
+    return -distance if stops else distance
 
 
 def vehicle(seed, stops, at=12.0):
-    """Signal (3,) [T], a function of t [s], of a vehicle that stops at a sensor or starts there."""
+    """Signal of a vehicle that stops or starts at a sensor: function of t [s], (3,) [T]."""
     rng = np.random.default_rng(seed)
     moment = rng.uniform(200.0, 600.0) * _direction(rng)
     place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
@@ -113,7 +113,7 @@ def test_a_stopping_vehicle_has_arrived_and_a_starting_one_has_departed(stops):
 
 
 def queue(seed):
-    """Signal and its end [s]: a vehicle stops at a sensor, and another one stops behind it."""
+    """Signal of a vehicle that stops and of another one that stops behind it; its end [s]."""
     rng = np.random.default_rng(seed)
     gap, delay = rng.uniform(6.0, 8.0), rng.uniform(1.5, 5.0)
     place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
@@ -148,7 +148,7 @@ def test_a_queue_or_a_reversing_vehicle_has_not_departed(case):
 
 
 def reverse(seed):
-    """Signal and its end [s]: a vehicle overshoots by 6 m, stands for a second, and reverses."""
+    """Signal of a vehicle that overshoots by 6 m, stands for a second and reverses; its end [s]."""
     rng = np.random.default_rng(seed)
     moment = rng.uniform(200.0, 600.0) * _direction(rng)
     place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])

@@ -35,7 +35,7 @@ def jacobian(m, positions, r0=R0, v0=V0, n_t=60):
 
 
 def unitless(m, positions):
-    """Information of the example of TSP14: R = I and the field without mu0/4pi."""
+    """Fisher information in the example of TSP14, with R = I and the field without mu0/4pi."""
     return information(jacobian(m, positions) / K_DIPOLE, np.eye(3))
 
 
@@ -238,7 +238,7 @@ def filter_problem():
 
 
 def relative(P, expected):
-    """Maximum difference of covariances, relative to the products of the standard deviations."""
+    """Maximum difference of two covariances, relative to the products of the expected stds."""
     std = np.sqrt(np.einsum('...ii->...i', expected))
     return np.abs((P - expected) / (std[..., :, None] * std[..., None, :])).max()
 

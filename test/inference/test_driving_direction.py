@@ -17,7 +17,7 @@ N = 100
 
 
 def signal(distance=1.0, direction=1.0, n=N):
-    """(n, 2) field of the moment (1, 1, 1) moving from -5 to 5, without mu0 / 4 pi."""
+    """Field (n, 2) of a dipole (1, 1, 1) that moves from -5 to 5, without mu0 / 4 pi."""
     r = np.stack([direction * np.linspace(-5.0, 5.0, n), np.full(n, distance), np.zeros(n)], axis=1)
     size = np.linalg.norm(r, axis=1)[:, None]
     return (3.0 * r * r.sum(axis=1)[:, None] / size**5 - 1.0 / size**3)[:, :2]

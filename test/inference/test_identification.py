@@ -19,7 +19,7 @@ HARD, SOFT = SCALE * np.array([-0.47, 0.29, -0.56]), 1.22
 
 
 def distances(between_std, monkeypatch):
-    """Squared distance of each published pass from the prediction by the twelve other passes."""
+    """Squared Mahalanobis distance of each published pass from a prediction by the others."""
     monkeypatch.setattr('mag_tracking.inference.identification.PASS_TO_PASS_STD', between_std)
     out = []
     for k in range(len(TABLE)):
@@ -53,7 +53,7 @@ def moment_at(hard, heading):
 
 
 def rotated_hard_iron(degrees):
-    """Hard iron of a car of equal moment: HARD, rotated about the vertical."""
+    """Hard iron of another car: HARD rotated about the vertical, with the same magnitude."""
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ HARD
 

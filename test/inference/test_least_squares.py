@@ -10,7 +10,7 @@ from mag_tracking.inference.separable_fit import SeparableProblem
 
 
 class ExponentialModel:
-    """Basis exp(theta t) of one parameter; overflows beyond theta t = 709."""
+    """Model p exp(theta t), which overflows beyond theta t = 709."""
 
     t = np.linspace(0.5, 1.0, 8)
 
@@ -42,7 +42,7 @@ def test_an_infinite_model_has_no_linear_solution():
 
 
 class SineModel:
-    """a sin(f t) + b cos(f t), with theta = (f, unused phase)."""
+    """Model a sin(f t) + b cos(f t), with theta = (f, unused phase)."""
 
     t = np.linspace(0.0, 3.0, 40)
 

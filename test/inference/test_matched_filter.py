@@ -13,13 +13,13 @@ from mag_tracking.inference.matched_filter import (
 )
 
 ALL = (0.0, np.inf)
-MITRE = {'background': 1e-10, 'resolution': 9e-10, 'bandwidth': 11.0}
+MITRE_NOISE = {'background': 1e-10, 'resolution': 9e-10, 'bandwidth': 11.0}
 """Noise parameters of MITRE12 table 1."""
 
 
 def mitre(f):
     """Noise density of MITRE12 [T^2/Hz]."""
-    return noise_spectrum(f, **MITRE)
+    return noise_spectrum(f, **MITRE_NOISE)
 
 
 def white(density):

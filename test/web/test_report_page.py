@@ -24,7 +24,7 @@ EVIL = '</script><script>window.broken = true</script><b>left</b>'
 
 @pytest.fixture(scope='module')
 def report(vehicle_replays, road_network):
-    """Path of the page, and rows of poses.csv."""
+    """Path of a report page, and the rows of its poses.csv."""
     run, folder = vehicle_replays[RECORDING]
     path = write_report(run, road_network, folder)
     with open(folder / 'poses.csv', newline='') as stream:
