@@ -34,17 +34,17 @@ from mag_tracking.network.sensor_network import SensorNetwork
 from mag_tracking.settings import replace
 from mag_tracking.yaml_file import is_text, read_yaml, short_repr
 
-_HERE = 'mag_tracking.drivers'
+_PACKAGE = 'mag_tracking.drivers'
 KINDS = {
-    'transport': {'serial': f'{_HERE}.transports.serial_port:SerialPort',
-                  'udp': f'{_HERE}.transports.udp:UdpSocket',
-                  'mqtt': f'{_HERE}.transports.mqtt:MqttTopics'},
-    'framing': {'text': f'{_HERE}.framings.text:TextFraming',
-                'json': f'{_HERE}.framings.json_objects:JsonFraming',
-                'binary': f'{_HERE}.framings.binary:BinaryFraming',
-                'xsens': f'{_HERE}.framings.xsens:XsensFraming'},
-    'device': {'i2c': f'{_HERE}.transports.i2c:I2cDevice',
-               'simulator': f'{_HERE}.simulated_device:SimulatedDevice'},
+    'transport': {'serial': f'{_PACKAGE}.transports.serial_port:SerialPort',
+                  'udp': f'{_PACKAGE}.transports.udp:UdpSocket',
+                  'mqtt': f'{_PACKAGE}.transports.mqtt:MqttTopics'},
+    'framing': {'text': f'{_PACKAGE}.framings.text:TextFraming',
+                'json': f'{_PACKAGE}.framings.json_objects:JsonFraming',
+                'binary': f'{_PACKAGE}.framings.binary:BinaryFraming',
+                'xsens': f'{_PACKAGE}.framings.xsens:XsensFraming'},
+    'device': {'i2c': f'{_PACKAGE}.transports.i2c:I2cDevice',
+               'simulator': f'{_PACKAGE}.simulated_device:SimulatedDevice'},
 }
 """Class of each kind of transport, framing and device."""
 
@@ -53,7 +53,7 @@ METHODS = {'transport': ('open', 'read', 'close'), 'framing': ('parse',),
 """Methods required of a transport, framing and device."""
 _ENTRY_KEYS = frozenset(('clock', 'sensor', 'sensors', *KINDS))
 """Keys of a device besides the driver settings and the groups of its kinds."""
-_NAME = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')
+_NAME_PATTERN = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')
 Settings = TypeVar('Settings', ClockSettings, DriverSettings)
 
 
@@ -223,7 +223,7 @@ def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
         if not is_text(str(key)):
             raise SettingsError(f'sensors: {short_repr(key)} is not a name: it is not valid '
                                 'Unicode')
-        if not isinstance(value, str) or not (value == IGNORED or _NAME.fullmatch(value)):
+        if not isinstance(value, str) or not (value == IGNORED or _NAME_PATTERN.fullmatch(value)):
             label = f'sensors: {key}' if key != '' else 'sensor'
             raise SettingsError(f'{label}: expected a sensor name (letters, digits, _ and '
                                 f'/), or - to ignore the sensor, got {short_repr(value)}')

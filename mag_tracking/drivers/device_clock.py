@@ -6,7 +6,7 @@ device's oscillator. The estimate is the line under all points of the window tha
 them on average: the edge of their lower convex hull over their mean abscissa.
 
 Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network delay
-measurements', IEEE INFOCOM 1999. Departures: only the lowest point of each short block of device
+measurements', IEEE INFOCOM 1999. Differences: only the lowest point of each short block of device
 time is kept; the window slides; and of all slopes about as likely as the best slope, the slope
 nearest to the previous estimate is used. For exponential delays, Moon's line is the
 maximum-likelihood line. Lowering a line by 1/K of the mean height of the K points above it reduces
@@ -31,13 +31,13 @@ STEP_BACK = 'device clock steps back'
 LOST = 'clock restarts after a long interval without a fitting reading'
 
 _MAX_BLOCKS = 64
-_MIN_BLOCK = 1.0 / 16.0
+_MIN_BLOCK_FRACTION = 1.0 / 16.0
 """Length of the first blocks after a start, as a fraction of the final block length."""
 _MIN_POINTS = 5
 """Minimum number of points for estimating the slope; with fewer, only the height is estimated."""
 _MIN_AGREEING = 3
 """Number of different device times that must agree on a new clock."""
-_EARLY_NS = 1e6
+_EARLY_TOLERANCE_NS = 1e6
 """[ns] Distance below the line up to which a message is always accepted."""
 
 
@@ -111,7 +111,7 @@ class ArrivalClock:
 
 
 class _ClockCandidate:
-    """Readings that deviate from the clock and may belong to a new one."""
+    """Readings that do not fit the clock and may belong to a new clock."""
 
     def __init__(self, ticks: float, arrival_ns: int, last_fit_ns: int, is_near: bool) -> None:
         self.since_ns, self.last_fit_ns, self._is_near = arrival_ns, last_fit_ns, is_near
@@ -203,7 +203,7 @@ class DeviceClock:
         self._height = self._middle = self._newest = self._lowest = 0.0
         self._points: list[Point] = []
         self._point: Point = (0.0, 0.0)
-        self._block = self._block_end = self._window_ns / _MAX_BLOCKS * _MIN_BLOCK
+        self._block = self._block_end = self._window_ns / _MAX_BLOCKS * _MIN_BLOCK_FRACTION
         self._early_tolerance_ns, self.stamp_std = self._max_delay_ns, math.nan
         self._candidate: _ClockCandidate | None = None
         self._has_begun, self._drift_bound = True, self._max_drift
@@ -307,11 +307,11 @@ class DeviceClock:
                 or candidate.total >= _MIN_AGREEING and wait > self._window_ns)
 
     def _close_block(self, t: float) -> None:
-        """Store the lowest point of the completed block, and update the estimate."""
+        """Store the lowest point of the completed block; update the line and the tolerance."""
         points, longest = self._points, self._window_ns / _MAX_BLOCKS
         points.append(self._point)
         if t - self._newest > self._window_ns:
-            self._block = longest * _MIN_BLOCK
+            self._block = longest * _MIN_BLOCK_FRACTION
         while points[0][0] < t - self._window_ns and len(points) > 1:
             del points[0]
         if len(points) >= _MAX_BLOCKS and self._block < longest:
@@ -333,7 +333,7 @@ class DeviceClock:
         return point[1] - self._height - self._slope * (point[0] - self._middle)
 
     def _update_line(self, points: list[Point]) -> None:
-        """Update height and slope of the line under the points."""
+        """Estimate the height and slope of the line under the points, and the timestamp error."""
         self._middle = sum(t for t, _ in points) / len(points)
         if len(points) >= _MIN_POINTS and points[0][0] < points[-1][0]:
             low, high = slope_range(points)
@@ -346,4 +346,4 @@ class DeviceClock:
         if len(points) >= _MIN_POINTS:
             error = heights[int(0.9 * (len(heights) - 1))] - heights[0]
             self.stamp_std = error * 1e-9
-            self._early_tolerance_ns, self._drift_bound = _EARLY_NS + 8.0 * error, 0.0
+            self._early_tolerance_ns, self._drift_bound = _EARLY_TOLERANCE_NS + 8.0 * error, 0.0

@@ -36,7 +36,7 @@ MAX_NAMES = 20
 """Maximum number of unknown sensors, and of errors of one type, that are counted individually."""
 MAX_SOURCES = 4096
 """Maximum number of sources, each with its own clock."""
-_AXES = struct.Struct('3d')
+_AXES_STRUCT = struct.Struct('3d')
 PollResult: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
 """Fields and accelerations received by one poll."""
 EMPTY_RESULT: PollResult = Readings.joined([]), ()
@@ -320,7 +320,7 @@ class Driver:
         return sensor, self._stamp(reading, arrival)
 
     def _sensor_of(self, at_device: str, source: str) -> str | None:
-        """Return the network name of a sensor, or None if ignored or unknown; count the latter."""
+        """Return the network name of a sensor, None if ignored or unknown; count unknown ones."""
         sensor = next((self.sensors[name] for name in (at_device, source)
                        if name and name in self.sensors), None)
         if sensor is None and '' in self.sensors and self._sole_source.accepts(
@@ -366,7 +366,7 @@ def _bytes_of(axes: Axes | None) -> bytes:
     # Thousands of readings are stored as bytes. Tuples would be tracked by the garbage collector,
     # whose full collections would scan all of them.
     try:
-        return b'-' if axes is None else _AXES.pack(*axes)
+        return b'-' if axes is None else _AXES_STRUCT.pack(*axes)
     except struct.error as error:
         raise ValueError(f'expected three numbers, got {axes}'[:100]) from error
 

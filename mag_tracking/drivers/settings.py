@@ -39,8 +39,8 @@ class DriverSettings:
         0.0, 'Interval over which readings are collected before they are passed on; with `batches` '
         'they form one message.', 's', (0.0, 1.0))
     silence_timeout_s: float = param(
-        10.0, 'Interval without data after which a device is closed and reopened; 0 disables this.',
-        's', (0.0, 86400.0))
+        10.0, 'Interval without data after which a device is closed and reopened; 0 disables the '
+        'timeout.', 's', (0.0, 86400.0))
 
 
 def scale_of(unit: str, units: Mapping[str, float], name: str) -> float:

@@ -105,7 +105,7 @@ class SimulatedDevice:
                                       / (len(self._network) * settings.rate_hz)).tolist()
 
     def open(self) -> None:
-        """Compute the pass at the first call; skip readings that were due before this call."""
+        """Compute the pass at the first call; at every call, skip the readings already due."""
         if self._table is None:
             self._table = self._field_of_pass()
             self._start_ns = self._monotonic_ns()

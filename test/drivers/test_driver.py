@@ -384,7 +384,7 @@ def test_errors_in_processing_do_not_close_the_device():
 
 
 class DigitFraming:
-    """Framing of two bytes: a digit and a newline."""
+    """Framing of two-byte frames: a digit and a newline."""
 
     def parse(self, data, final=False):
         n = len(data) // 2 * 2

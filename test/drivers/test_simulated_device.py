@@ -18,8 +18,8 @@ from mag_tracking.network.file import read_network
 from mag_tracking.simulation.scenario import Path, random_vehicle
 from support.bundled import NETWORK_FILE
 
-QUIET = SimulatorSettings(network=str(NETWORK_FILE), rate_hz=50.0, noise=0.0, period_s=12.0,
-                          lead=30.0, offset=-1.0)
+QUIET_SETTINGS = SimulatorSettings(network=str(NETWORK_FILE), rate_hz=50.0, noise=0.0,
+                                   period_s=12.0, lead=30.0, offset=-1.0)
 
 
 class Clock:
@@ -32,7 +32,7 @@ class Clock:
         self.ns += math.ceil(seconds * 1e9)
 
 
-def device_of(settings=QUIET):
+def device_of(settings=QUIET_SETTINGS):
     """(simulated device, its clock)."""
     clock = Clock()
     return SimulatedDevice(settings, lambda: clock.ns, clock.sleep), clock
@@ -47,13 +47,13 @@ def first_arrivals(device, n, timeout_s=1.0):
 
 
 def true_field(network, t):
-    """Field at `t` [s] after the start of a pass with `QUIET`, (n_sensors, 3) T, world frame.
+    """World field (n_sensors, 3) T at `t` [s] after the start of a pass with `QUIET_SETTINGS`.
 
     Both sensors are at x = 0. The path starts 30 m before them and takes 6 s at 10 m/s.
     """
     path = Path(np.array([-30.0, network.positions[:, 1].mean() - 1.0]), 0.0, 10.0)
-    body = random_vehicle(np.random.default_rng(QUIET.seed), length=QUIET.length,
-                          moment=QUIET.moment)
+    body = random_vehicle(np.random.default_rng(QUIET_SETTINGS.seed), length=QUIET_SETTINGS.length,
+                          moment=QUIET_SETTINGS.moment)
     position, heading = path.at(np.array([t]))
     return network.earth_field + body.field(network.earth_field, position, heading,
                                             network.positions)[0]
@@ -96,7 +96,7 @@ def test_readings_arrive_in_time_with_the_specified_noise():
 
 def test_sequential_sensors_measure_at_their_own_times():
     """Each sensor measures a fraction of the sampling interval after the previous sensor."""
-    device, _ = device_of(dataclasses.replace(QUIET, sequential=True))
+    device, _ = device_of(dataclasses.replace(QUIET_SETTINGS, sequential=True))
     device.open()
     network = read_network(NETWORK_FILE)
     arrivals = first_arrivals(device, 2 * 250)

@@ -16,7 +16,7 @@ def test_a_bench_script_can_be_imported(path):
 
 
 def test_the_cost_fraction_of_the_disturbance_model_is_measured():
-    """The script names the timed methods in strings, which a rename may miss."""
+    """The script refers to the timed methods by strings, and may miss a renamed method."""
     assert 0.0 < situations.cost() < 1.0
 
 

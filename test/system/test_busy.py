@@ -14,7 +14,7 @@ from support.marks import studied
 from support.random_passes import SIMULATORS, one_random_pass, random_pass
 from support.samples import scenario
 
-MAX_WRONG = 0.01
+MAX_WRONG_FRACTION = 0.01
 """Aim: maximum fraction of wrong poses among unflagged poses."""
 AIMS = {'meeting_2_sensors': (15, 1.0, 4.0), 'following_2_sensors': (16, 0.9, 4.0),
         'traffic_2_sensors': (11, np.inf, np.inf), 'traffic_4_sensors': (11, np.inf, np.inf)}
@@ -50,7 +50,7 @@ def test_every_vehicle_of_a_recording_is_counted(name):
 
 
 def test_smoothed_poses_of_new_targets_are_near_the_published_ones():
-    """Smoothing is linearised at the position of track initiation; otherwise errors reach 50 m."""
+    """The smoother is linearised at the position of initiation; otherwise errors reach 50 m."""
     n = 0
     for name in IN_EVERY_TEST:
         got = tracked_recording(name)
@@ -67,7 +67,7 @@ def test_smoothed_poses_of_new_targets_are_near_the_published_ones():
 def test_poses_without_a_flag_are_rarely_wrong():
     scores = [tracked_recording(name).score for name in IN_EVERY_TEST]
     n_sure, n_wrong = (sum(getattr(s, of) for s in scores) for of in ('n_sure', 'n_wrong'))
-    assert n_sure > 250 and n_wrong <= MAX_WRONG * n_sure
+    assert n_sure > 250 and n_wrong <= MAX_WRONG_FRACTION * n_sure
 
 
 @pytest.mark.study
@@ -110,7 +110,7 @@ def test_one_vehicle_is_rarely_tracked_as_two(kind, simulator):
 
 
 def test_more_vehicles_than_are_tracked_together_are_counted():
-    """Ten vehicles pass in seven seconds; the joint targets are limited to two."""
+    """Ten vehicles pass in seven seconds; at most two are tracked jointly."""
     rng = np.random.default_rng(4)
     plan = [(12.0 + 0.7 * k, 1 - 2 * (k % 2), rng.uniform(8.0, 12.0)) for k in range(10)]
     world = busy_worlds.world(

@@ -15,7 +15,7 @@ SEEDS = range(40)
 
 
 def counts(found):
-    """Count (all, right direction, speed within 10 %, error < 3 std) of [(truth, (value, std))]."""
+    """Return numbers of (answers, right directions, speeds within 10 %, errors within 3 std)."""
     v = np.array([truth for truth, _ in found])
     answer, std = np.array([a for _, a in found]).T
     return (len(v), int((answer * v > 0).sum()), int((np.abs(answer / v - 1.0) < 0.1).sum()),
@@ -23,7 +23,7 @@ def counts(found):
 
 
 def delay_of(a):
-    """(velocity along x, its std) from the delay between the sensors [m/s]."""
+    """(velocity along x, standard deviation) [m/s] from the delay between the sensors."""
     along = np.cos(a.delay.heading)
     return a.delay.speed * along, a.delay.speed_std
 

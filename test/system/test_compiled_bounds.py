@@ -12,18 +12,18 @@ import pytest
 
 from support.bundled import ROOT
 
-TESTS = ('calibration', 'inference', 'physics', 'stages/align', 'stages/calibrate',
-         'stages/detect', 'stages/health', 'stages/track/test_core.py')
-FLAGS = ('-O1', '-g', '-std=c++17', '-shared', '-fPIC', '-fvisibility=hidden', '-Wno-psabi',
-         '-fsanitize=address,undefined', '-fno-sanitize-recover=undefined')
+TEST_PATHS = ('calibration', 'inference', 'physics', 'stages/align', 'stages/calibrate',
+              'stages/detect', 'stages/health', 'stages/track/test_core.py')
+COMPILER_FLAGS = ('-O1', '-g', '-std=c++17', '-shared', '-fPIC', '-fvisibility=hidden',
+                  '-Wno-psabi', '-fsanitize=address,undefined', '-fno-sanitize-recover=undefined')
 
 
 def build(source):
     """Compile a module with sanitizers, in the folder of its source."""
     module = source.with_name('core' + sysconfig.get_config_var('EXT_SUFFIX'))
     includes = (pybind11.get_include(), sysconfig.get_path('include'))
-    subprocess.run(['g++', *FLAGS, *(f'-I{folder}' for folder in includes), str(source), '-o',
-                    str(module)], check=True)
+    subprocess.run(['g++', *COMPILER_FLAGS, *(f'-I{folder}' for folder in includes), str(source),
+                    '-o', str(module)], check=True)
 
 
 def sanitizer(name):
@@ -44,6 +44,6 @@ def test_compiled_code_stays_within_its_arrays(tmp_path):
                    'LD_PRELOAD': f'{sanitizer("libasan.so")} {sanitizer("libubsan.so")}'}
     done = subprocess.run(
         [sys.executable, '-m', 'pytest', '-q', '-x', '-p', 'no:cacheprovider', '-m', 'not study',
-         *(str(ROOT / 'test' / name) for name in TESTS)],
+         *(str(ROOT / 'test' / name) for name in TEST_PATHS)],
         cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]

@@ -12,15 +12,15 @@ from support.bundled import POINT
 from support.faulty_streams import FAULTS, NS, stream
 from support.samples import one
 
-WRONG = chi2.ppf(1.0 - 1e-4, 2)
-"""Normalised squared error above which a pose is wrong."""
+MAX_NEES = chi2.ppf(1.0 - 1e-4, 2)
+"""NEES above which a pose is wrong."""
 
 
 @functools.cache
 def track_pass(n_sensors, seed, fault=None):
     """Track a pass; return (pipeline, rows, (begin, end)).
 
-    A row is (t, error [m], normalised squared error, flagged).
+    A row is (t, error [m], NEES, flagged).
     """
     network, samples, truth, times = stream(n_sensors, seed, fault)
     pipeline = Pipeline(network, settings_for('vehicle', POINT))
@@ -65,8 +65,8 @@ def test_a_fault_during_a_pass_is_named_and_gives_no_unflagged_errors(n_sensors,
     assert not any(n for s in pipeline.network.names if s != 'mag_2'
                    for key, n in pipeline.calibrate.counts_of(s).items()
                    if key.startswith('rejected'))
-    unflagged = sum(z > WRONG and not flagged for _, _, z, flagged in reference)
-    wrong = [r for r in rows if r[2] > WRONG and not r[3]]
+    unflagged = sum(z > MAX_NEES and not flagged for _, _, z, flagged in reference)
+    wrong = [r for r in rows if r[2] > MAX_NEES and not r[3]]
     assert len(wrong) <= unflagged, wrong[:3]
     if n_sensors > 2:
         # The other sensors support the track, whose accuracy recovers within two seconds.

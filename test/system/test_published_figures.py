@@ -10,7 +10,7 @@ from scipy.stats import chi2, ncx2, norm
 from mag_tracking.physics.dipole import dipole_field
 
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
-PNG = b'\x89PNG\r\n\x1a\n'
+PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 
 
 def example(name):
@@ -57,7 +57,7 @@ def test_an_example_draws_figures_and_prints_differences(name, figures, expected
     module.main(['--out', str(out)])
     stem = 'figure_5_' if name.startswith('t10') else 'figure_'
     assert {p.name for p in out.iterdir()} == {f'{stem}{i}.png' for i in figures}
-    assert all(p.read_bytes().startswith(PNG) and p.stat().st_size > 10_000
+    assert all(p.read_bytes().startswith(PNG_SIGNATURE) and p.stat().st_size > 10_000
                for p in out.iterdir())
     printed = capsys.readouterr().out
     for words in expected:
@@ -167,7 +167,7 @@ def test_bounds_of_one_sensor_without_a_prior_are_infinite(mitre12, bounded):
 
 
 def test_printed_jacobian_and_prior_do_not_explain_the_published_bounds(mitre12, bounded):
-    """(20) affects only phi. With four priors of (26), the bounds are finite at zero speed."""
+    """Equation (20) affects only phi. With four priors of (26), bounds are finite at zero speed."""
     x, y, h = -20.0, 25.0, 1e-5
     phi = np.array([np.arctan2(y, x + h) - np.arctan2(y, x - h),
                     np.arctan2(y + h, x) - np.arctan2(y - h, x)]) / (2.0 * h)
@@ -247,5 +247,5 @@ def test_the_cost_of_simulated_passes_falls_with_the_model_order(tmp_path, capsy
     script.passes = lambda rate: found[rate]
     assert script.main(['--out', str(tmp_path)]) == 0
     for rate in ('12.5_Hz', '100_Hz'):
-        assert (tmp_path / f'figure_7_{rate}.png').read_bytes().startswith(PNG)
+        assert (tmp_path / f'figure_7_{rate}.png').read_bytes().startswith(PNG_SIGNATURE)
     assert 'differs' in capsys.readouterr().out

@@ -20,8 +20,9 @@ from mag_tracking.report.metrics import interpolate_truth
 from support.bundled import DATA, VEHICLES, vehicle_path
 from support.samples import one, recorded
 
-ARRIVAL = {name: 'right' if '_left' in name and name.startswith('straight') else
-           name.split('_')[1] if name.startswith('junction') else 'left' for name in VEHICLES}
+ARRIVAL_SIDES = {name: 'right' if '_left' in name and name.startswith('straight') else
+                 name.split('_')[1] if name.startswith('junction') else 'left'
+                 for name in VEHICLES}
 CARS = [name for name in VEHICLES if 'truck' not in name]
 
 
@@ -55,10 +56,10 @@ def test_the_arrival_direction_is_right(vehicle_replays, name):
     run, _ = vehicle_replays[name]
     log = run.logs[track['id']]
     best = [max(row, key=lambda a: row[a][0]) for row in log.arrivals]
-    assert track['arrival'] == best[-1] == ARRIVAL[name]
+    assert track['arrival'] == best[-1] == ARRIVAL_SIDES[name]
     # The direction is already right when the position is most certain.
     sd = [np.trace(C[:2, :2]) for C in log.covariance]
-    assert best[int(np.argmin(sd))] == ARRIVAL[name]
+    assert best[int(np.argmin(sd))] == ARRIVAL_SIDES[name]
 
 
 @pytest.mark.parametrize('name', VEHICLES)
@@ -72,7 +73,7 @@ def test_a_replay_with_truth_reports_its_error_over_the_bound(vehicle_replays, n
 
 
 def expected_to_fail(names, reasons):
-    """Parameters `names`, of which the names in `reasons` are expected to fail."""
+    """Test parameters `names`; the names in `reasons` are marked as expected failures."""
     return [pytest.param(n, marks=pytest.mark.xfail(strict=True, reason=reasons[n]))
             if n in reasons else n for n in names]
 

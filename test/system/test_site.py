@@ -11,7 +11,7 @@ import pytest
 
 from support.bundled import ROOT
 
-BUILD_S = 900.0
+BUILD_TIMEOUT_S = 900.0
 """[s] Time limit of a build on a machine that is four times slower."""
 PAGES = ('index', 'getting_started', 'benchmarks', 'limitations', 'changelog', 'gallery/index',
          'guides/own_recording', 'concepts/uncertainty', 'reference/command_line',
@@ -22,8 +22,9 @@ def sphinx(builder, source, out, *options):
     """Run a builder; every warning is an error."""
     done = subprocess.run(
         [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-q', '-b', builder, *options,
-         str(source), str(out)], capture_output=True, text=True, timeout=BUILD_S, check=False,
-        cwd=ROOT, env=os.environ | {'OPENBLAS_NUM_THREADS': '1', 'ROS_DOMAIN_ID': '99'})
+         str(source), str(out)], capture_output=True, text=True, timeout=BUILD_TIMEOUT_S,
+        check=False, cwd=ROOT,
+        env=os.environ | {'OPENBLAS_NUM_THREADS': '1', 'ROS_DOMAIN_ID': '99'})
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-8000:]
     return out
 
@@ -49,7 +50,7 @@ def site(tmp_path_factory):
     return sphinx('html', ROOT / 'docs', tmp_path_factory.mktemp('site') / 'html')
 
 
-@pytest.mark.timeout(BUILD_S)
+@pytest.mark.timeout(BUILD_TIMEOUT_S)
 def test_the_site_builds_without_a_warning(site):
     assert [page for page in PAGES if not (site / f'{page}.html').is_file()] == []
     examples = {p.stem for p in (ROOT / 'examples' / 'gallery').glob('plot_*.py')}
@@ -59,7 +60,7 @@ def test_the_site_builds_without_a_warning(site):
     assert examples - drawn == set()
 
 
-@pytest.mark.timeout(BUILD_S)
+@pytest.mark.timeout(BUILD_TIMEOUT_S)
 def test_every_internal_link_leads_to_a_page_and_an_anchor(site):
     pages = {path: Page(path.read_text(encoding='utf-8')) for path in site.rglob('*.html')}
     broken, n = [], 0
@@ -77,7 +78,7 @@ def test_every_internal_link_leads_to_a_page_and_an_anchor(site):
     assert n > 1000 and broken == []
 
 
-@pytest.mark.timeout(BUILD_S)
+@pytest.mark.timeout(BUILD_TIMEOUT_S)
 def test_examples_in_the_text_print_the_documented_output(site, tmp_path):
     """The generated pages and doctrees of the built site are reused."""
     sphinx('doctest', ROOT / 'docs', tmp_path, '-d', str(site / '.doctrees'))

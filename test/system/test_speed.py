@@ -11,10 +11,10 @@ from bench import figures
 from bench.bench import Peer, bank_ratio
 from support.bundled import NETWORK_FILE, vehicle_path
 
-HEAVY = ('dask', 'distributed', 'pyarrow', 'scipy', 'matplotlib', 'rclpy', 'google.protobuf',
-         'rosbags', 'plotly')
+HEAVY_MODULES = ('dask', 'distributed', 'pyarrow', 'scipy', 'matplotlib', 'rclpy',
+                 'google.protobuf', 'rosbags', 'plotly')
 RECORDING = str(vehicle_path('straight_car_right'))
-IMPORTED = '''
+IMPORT_SCRIPT = '''
 import contextlib, io, json, sys
 from mag_tracking.cli import main
 with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
@@ -28,10 +28,10 @@ print(json.dumps(sorted(sys.modules)))
     (['info', RECORDING], ()), (['info', RECORDING, '--network', str(NETWORK_FILE)], ()),
     (['topics', '--help'], ())])
 def test_a_command_imports_only_what_it_needs(args, excluded):
-    done = subprocess.run([sys.executable, '-c', IMPORTED, *args], capture_output=True, text=True,
-                          check=True)
+    done = subprocess.run([sys.executable, '-c', IMPORT_SCRIPT, *args], capture_output=True,
+                          text=True, check=True)
     imported = json.loads(done.stdout)
-    assert [m for m in imported if m.startswith((*HEAVY, *excluded))] == []
+    assert [m for m in imported if m.startswith((*HEAVY_MODULES, *excluded))] == []
 
 
 def test_the_tracker_imports_no_rarely_needed_modules():
@@ -45,7 +45,7 @@ def test_the_tracker_imports_no_rarely_needed_modules():
 
 @pytest.mark.parametrize('n_sensors, min_ratio', [(2, 80.0), (8, 40.0)])
 def test_the_bank_is_many_times_faster_than_a_loop_over_filterpy(n_sensors, min_ratio):
-    """The aims are 350 and 120 (`bench.bench`); the limits are lower, as other tests may run."""
+    """The aims are 350 and 120 (`bench.bench`); limits are lower because other tests may run."""
     _, _, ratio, *_ = bank_ratio(Peer, n_sensors, False, rounds=4, repeats=20)
     assert ratio >= min_ratio
 

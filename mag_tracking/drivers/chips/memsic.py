@@ -129,7 +129,7 @@ class Mmc5983ma:
         return _conversion(middle_ns, (x, y, z))
 
     def _measure_pair(self) -> Measurement:
-        """Measure after SET and RESET; store the offset, and return the field without it."""
+        """Measure after SET and after RESET; store the offset, and return the corrected field."""
         halves = []
         for pulse in (SET, RESET):
             self._registers.write(self.CONTROL_0, pulse)
@@ -182,6 +182,6 @@ class Mmc5603(Mmc5983ma):
 
 
 def _conversion(middle_ns: int, counts: Axes) -> Conversion:
-    """Conversion with `counts` scaled to tesla."""
+    """Create a conversion from its middle [ns] and its counts, which are scaled to tesla."""
     x, y, z = (c / COUNTS_PER_TESLA for c in counts)
     return Conversion(middle_ns, (x, y, z))

@@ -21,7 +21,7 @@ from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
-_CODES = {'u8': 'B', 'i8': 'b', 'u16': 'H', 'i16': 'h', 'u24': '3s', 'i24': '3s', 'u32': 'I',
+_STRUCT_CODES = {'u8': 'B', 'i8': 'b', 'u16': 'H', 'i16': 'h', 'u24': '3s', 'i24': '3s', 'u32': 'I',
           'i32': 'i', 'u64': 'Q', 'i64': 'q', 'f32': 'f', 'f64': 'd'}
 _ByteOrder: TypeAlias = Literal['little', 'big']
 _Converter: TypeAlias = Callable[[Any], object]
@@ -35,7 +35,7 @@ class BinarySettings:
     fields: tuple[str, ...] = param(
         (), 'Values of the payload in order, each as name:type, such as x:i16. Names: sensor, '
         'ticks, sequence, x, y, z, ax, ay, az, or - to skip a value. x.A:i16 is an axis of sensor '
-        'A, for frames with several sensors. Types: ' + ' '.join(_CODES) + '.')
+        'A, for frames with several sensors. Types: ' + ' '.join(_STRUCT_CODES) + '.')
     each: tuple[str, ...] = param(
         (), 'Axes and types of one sensor, for frames with several identical sensors. They are '
         'repeated `count` times after `fields`.')
@@ -98,7 +98,7 @@ class BinaryFraming:
                                    settings.count)
         types = [kind for _, kind in fields + each * settings.count]
         self._struct = struct.Struct(
-            '<>'[self._order == 'big'] + ''.join(_CODES[kind] for kind in types))
+            '<>'[self._order == 'big'] + ''.join(_STRUCT_CODES[kind] for kind in types))
         self._converters = [_converter(quantity, kind, self._order) for quantity, kind
                             in zip(self._layout.quantities, types, strict=True)]
         self._payload = len(self._sync)
@@ -171,7 +171,7 @@ class BinaryFraming:
         return ''
 
     def _read(self, data: bytes, start: int) -> list[Reading]:
-        """Readings of the frame at `start`; raises Rejected."""
+        """Extract the readings of the frame at `start`; raises Rejected for an invalid value."""
         values = self._struct.unpack_from(data, start + self._payload)
         return self._layout.readings(
             [convert(value) for convert, value in zip(self._converters, values, strict=True)])
@@ -196,9 +196,9 @@ def _parse_fields(setting: str, fields: Sequence[str]) -> list[tuple[str, str]]:
     out = []
     for text in fields:
         name, _, kind = text.rpartition(':')
-        if kind not in _CODES:
+        if kind not in _STRUCT_CODES:
             raise SettingsError(f'{setting}: {text!r}: expected a name with one of the types '
-                                f'{" ".join(_CODES)}, such as x:i16')
+                                f'{" ".join(_STRUCT_CODES)}, such as x:i16')
         if kind[0] == 'f' and name in ('sensor', 'sequence'):
             raise SettingsError(f'{setting}: {name} must be an integer, got {kind}')
         out.append((name, kind))

@@ -60,7 +60,7 @@ def _forward_table(polynomial: int) -> tuple[int, ...]:
 
 
 def _reflected_table(polynomial: int) -> tuple[int, ...]:
-    """Table of the 256 remainders of a CRC with a reflected polynomial, low-order bit first."""
+    """Table of the 256 remainders of a reflected CRC, least significant bit first."""
     table = []
     for byte in range(256):
         for _ in range(8):
@@ -69,8 +69,8 @@ def _reflected_table(polynomial: int) -> tuple[int, ...]:
     return tuple(table)
 
 
-_CRC8 = _forward_table(0x107)
-_MODBUS = _reflected_table(0xA001)
+_CRC8_TABLE = _forward_table(0x107)
+_MODBUS_TABLE = _reflected_table(0xA001)
 
 
 def crc8(data: bytes) -> int:
@@ -84,7 +84,7 @@ def crc8(data: bytes) -> int:
     -------
     int
     """
-    crc, table = 0, _CRC8
+    crc, table = 0, _CRC8_TABLE
     for byte in data:
         crc = table[crc ^ byte]
     return crc
@@ -115,7 +115,7 @@ def crc16_modbus(data: bytes) -> int:
     -------
     int
     """
-    crc, table = 0xFFFF, _MODBUS
+    crc, table = 0xFFFF, _MODBUS_TABLE
     for byte in data:
         crc = crc >> 8 ^ table[(crc ^ byte) & 0xFF]
     return crc

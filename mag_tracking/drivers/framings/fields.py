@@ -23,8 +23,8 @@ Values: TypeAlias = Sequence[Any]
 """Values of one frame; the type of each follows from its field."""
 MAX_NAME = 64
 """Maximum length of a sensor's name in characters."""
-_ESCAPE = re.compile(r'\\(x[0-9A-Fa-f]{2}|.?)', re.DOTALL)
-_ESCAPED = {'n': '\n', 'r': '\r', 't': '\t', '0': '\0', '\\': '\\'}
+_ESCAPE_PATTERN = re.compile(r'\\(x[0-9A-Fa-f]{2}|.?)', re.DOTALL)
+_ESCAPED_CHARACTERS = {'n': '\n', 'r': '\r', 't': '\t', '0': '\0', '\\': '\\'}
 _Choice = TypeVar('_Choice', bound=str)
 
 
@@ -116,7 +116,7 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _axes_getter(axes: Mapping[str, int], names: Sequence[str]) -> Callable[[Values], Any]:
-    """Function that selects three axes of a frame's values; it returns None if all are missing."""
+    """Function that returns three axes from a frame's values, or None if all are missing."""
     if not any(name in axes for name in names):
         return itemgetter(-1)
     return itemgetter(*(axes.get(name, -2) for name in names))
@@ -270,15 +270,15 @@ def decode_escapes(setting: str, text: str) -> bytes:
     """
     def character(match: re.Match[str]) -> str:
         code = match[1]
-        if code in _ESCAPED:
-            return _ESCAPED[code]
+        if code in _ESCAPED_CHARACTERS:
+            return _ESCAPED_CHARACTERS[code]
         if len(code) == 3 and int(code[1:], 16) < 0x80:
             return chr(int(code[1:], 16))
         raise SettingsError(f'{setting}: unknown escape sequence {match[0]!r}; expected \\n \\r '
                             '\\t \\0 \\\\ or \\x00 .. \\x7f')
 
     try:
-        return _ESCAPE.sub(character, text).encode()
+        return _ESCAPE_PATTERN.sub(character, text).encode()
     except UnicodeEncodeError:
         raise SettingsError(f'{setting}: {text!r} cannot be encoded as UTF-8') from None
 

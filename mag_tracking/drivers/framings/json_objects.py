@@ -125,7 +125,7 @@ class JsonFraming:
         return True
 
     def _decode_document(self, line: bytes) -> Any:
-        """Decode a JSON document; raises Rejected."""
+        """Decode a JSON document; raises Rejected if it is not valid."""
         try:
             return self._decode(line.decode())
         except RecursionError:
@@ -137,7 +137,7 @@ class JsonFraming:
             raise Rejected('that are not JSON') from None
 
     def _read(self, line: bytes) -> list[Reading]:
-        """Readings of one object; raises Rejected."""
+        """Extract the reading of one object; raises Rejected if the object is not valid."""
         content = self._decode_document(line)
         if not isinstance(content, dict):
             raise Rejected('that are not a JSON object')
@@ -178,14 +178,14 @@ def _lookup(value: Any, path: str, keys: _Keys) -> Any:
 
 
 def _number(value: object, path: str) -> int | float:
-    """Check that a value is a number; a bool is not a number in JSON."""
+    """Return a value that is a number; raises Rejected otherwise, also for a bool."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise Rejected(f'whose {path} is not a number')
     return value
 
 
 def _axis(value: object, path: str) -> float:
-    """Convert an axis; NaN for null. Raises Rejected."""
+    """Convert an axis, NaN for null; raises Rejected if it is infinite or not a number."""
     return float('nan') if value is None else axis_value(_number(value, path))
 
 

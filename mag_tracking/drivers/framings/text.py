@@ -130,7 +130,7 @@ class Lines:
         return Parsed(tuple(readings), consumed, rejected)
 
     def _clean(self, line: bytes) -> bytes:
-        """Check a line and remove its carriage return; raises Rejected."""
+        """Remove the carriage return; raises Rejected if a line is too long, empty or not UTF-8."""
         if len(line) > self.max_length:
             raise Rejected('longer than max_length')
         if not line.isascii():
@@ -206,7 +206,7 @@ class TextFraming:
         return self._lines.parse(data, final, self._read)
 
     def _read(self, line: bytes) -> list[Reading]:
-        """Readings of one line; raises Rejected."""
+        """Extract the readings of one line; raises Rejected if the line is not valid."""
         if self._comment and line.startswith(self._comment):
             raise Rejected('that are comments')
         if not line.startswith(self._prefix):
@@ -221,7 +221,7 @@ class TextFraming:
 
 
 def _strip_checksum(line: bytes) -> bytes:
-    """Verify the checksum and remove `*hh`; raises Rejected."""
+    """Verify and remove the checksum `*hh`; raises Rejected if it is missing or wrong."""
     if line[-3:-2] != b'*':
         raise Rejected('without a checksum')
     line, digits = line[:-3], line[-2:]
@@ -240,7 +240,7 @@ def _converter(quantity: str) -> Callable[[bytes], object]:
 
 
 def _axis(text: bytes) -> float:
-    """Parse an axis; NaN if missing. Raises Rejected."""
+    """Parse an axis, NaN if missing; raises Rejected if it is not a finite number."""
     text = text.strip(b' \t')
     if _NUMBER(text):
         return axis_value(text)

@@ -44,7 +44,7 @@ _PREAMBLE = b'\xfa'
 _START = b'\xfa\xff'
 _MTDATA, _MTDATA2, _WAKE_UP, _ERROR = 0x32, 0x36, 0x3E, 0x42
 _DATA_MESSAGES = (_MTDATA, _MTDATA2)
-_EXTENDED = 0xFF
+_EXTENDED_LENGTH = 0xFF
 _MAX_OVERHEAD = 7
 """Number of bytes outside DATA in a message with extended length."""
 
@@ -85,8 +85,8 @@ class _ParseStep(NamedTuple):
     reading: Reading | None = None
 
 
-_WAIT = _ParseStep(0, False)
-_REFUSE = _ParseStep(1, False)
+_WAIT_STEP = _ParseStep(0, False)
+_REJECT_STEP = _ParseStep(1, False)
 
 
 def _is_from_device(mid: int) -> bool:
@@ -102,10 +102,10 @@ def _message_at(window: bytes, index: int, longest: int) -> _Message | None:
         return None
     if len(header) > 2 and not _is_from_device(header[2]):
         return None
-    if len(header) < 4 or header[3] == _EXTENDED and len(header) < 6:
+    if len(header) < 4 or header[3] == _EXTENDED_LENGTH and len(header) < 6:
         return _Message(-1, len(window), len(window) + 1)
     length, begin = header[3], index + 4
-    if length == _EXTENDED:
+    if length == _EXTENDED_LENGTH:
         length, begin = header[4] << 8 | header[5], index + 6
     if length > longest:
         return None
@@ -190,14 +190,14 @@ class XsensFraming:
         """Parse the message at the beginning of `window`; `more` is true if bytes may follow."""
         message = _message_at(window, 0, self._longest)
         if message is None:
-            return _REFUSE
+            return _REJECT_STEP
         if message.end > len(window):
-            return _WAIT if more else _REFUSE
+            return _WAIT_STEP if more else _REJECT_STEP
         if not _is_checksum_valid(window, 0, message):
-            return _REFUSE._replace(causes=('frames with a wrong checksum',))
+            return _REJECT_STEP._replace(causes=('frames with a wrong checksum',))
         decoded = self._decode(window, message)
         if decoded is None and message.mid == _MTDATA2:
-            return _REFUSE._replace(causes=('MTData2 messages with invalid packet lengths',))
+            return _REJECT_STEP._replace(causes=('MTData2 messages with invalid packet lengths',))
         step = self._search_inside(window, message, decoded is not None, more)
         if step is not None:
             return step
@@ -207,8 +207,8 @@ class XsensFraming:
 
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:
-        """Search `outer` for a data message; return a step to reject `outer` or wait, or None."""
-        rejection = _REFUSE._replace(causes=('messages that contain the start of another',))
+        """Search `outer` for a data message; return a step to reject it or wait, else None."""
+        rejection = _REJECT_STEP._replace(causes=('messages that contain the start of another',))
         index = 0
         while True:
             # The checksum of a message may also be the preamble of the next. A data message does
@@ -221,7 +221,7 @@ class XsensFraming:
                 continue
             if inner.end > len(window):
                 if more:
-                    return _WAIT
+                    return _WAIT_STEP
                 if len(window) == self._longest + _MAX_OVERHEAD and not outer_is_data:
                     return rejection
             elif (_is_checksum_valid(window, index, inner)
@@ -230,7 +230,7 @@ class XsensFraming:
 
     @staticmethod
     def _next_start(window: bytes, index: int, end: int, whole: bool) -> int:
-        """Index of the next start before `end`, or -1; `whole` requires both start bytes."""
+        """Index of the next start before `end`, or -1; `whole` requires both bytes before `end`."""
         found = window.find(_START, index, end if whole else end + 1)
         if found < 0 and not whole and end == len(window) and window.endswith(_PREAMBLE, index):
             return end - 1

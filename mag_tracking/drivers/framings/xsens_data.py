@@ -25,18 +25,18 @@ _PACKET_COUNTER = 0x1020
 _SAMPLE_TIME_FINE = 0x1060
 _ACCELERATION = 0x4020
 _MAGNETIC_FIELD = 0xC020
-_COMPONENT_READOUT = 0xA000
+_RAW_VALUE_GROUP = 0xA000
 """Identifier group of the raw sensor values."""
-_MAGNETIC = 0xC000
-_KIND = 0xFFF0
-_GROUP = 0xFE00
+_MAGNETIC_GROUP = 0xC000
+_TYPE_MASK = 0xFFF0
+_GROUP_MASK = 0xFE00
 
 _FLOAT, _FIXED_12_20, _FIXED_16_32 = 0, 1, 2
 _TRIPLE_FORMATS = (struct.Struct('>3f'), struct.Struct('>3i'), struct.Struct('>IhIhIh'),
                    struct.Struct('>3d'))
 """Formats of three real numbers, indexed by the two precision bits of the identifier."""
 
-_BLOCKS = {
+_BLOCK_LENGTHS = {
     'temp': 4, 'acc': 12, 'gyr': 12, 'mag': 12, 'quaternion': 16, 'euler': 12, 'matrix': 36,
     'analog_1': 2, 'analog_2': 2, 'status': 1, 'counter': 2}
 """Length in bytes of the blocks of MTData, in the order of the protocol."""
@@ -78,7 +78,7 @@ def _decode_packet(identifier: int, data: bytes) -> tuple[str, float | _Triple |
         return 'sequence', int.from_bytes(data, 'big') if len(data) == 2 else None
     if identifier == _SAMPLE_TIME_FINE:
         return 'ticks', float(int.from_bytes(data, 'big')) if len(data) == 4 else None
-    kind = identifier & _KIND
+    kind = identifier & _TYPE_MASK
     if kind == _MAGNETIC_FIELD:
         return 'field', _three_reals(data, identifier & 3)
     if kind == _ACCELERATION:
@@ -115,7 +115,7 @@ def read_mtdata2(data: bytes) -> DecodedMessage | None:
             return None
         decoded = _decode_packet(identifier, data[begin:position])
         if decoded is None:
-            if identifier & _GROUP in (_COMPONENT_READOUT, _MAGNETIC):
+            if identifier & _GROUP_MASK in (_RAW_VALUE_GROUP, _MAGNETIC_GROUP):
                 causes.append(f'packets not used: 0x{identifier:04X}')
             continue
         name, value = decoded
@@ -129,7 +129,7 @@ def read_mtdata2(data: bytes) -> DecodedMessage | None:
 
 
 def _message_of(values: Mapping[str, Any], causes: Sequence[str]) -> DecodedMessage:
-    """Create the message; its reading is None if `values` has no field and no acceleration."""
+    """Create a message; the reading is None if `values` has neither field nor acceleration."""
     if 'field' in values or 'acceleration' in values:
         return DecodedMessage(Reading(**values), tuple(causes))
     return DecodedMessage(None, (*causes, 'messages without field or acceleration'))
@@ -160,11 +160,12 @@ class MTDataLayout:
 
     def __init__(self, blocks: Sequence[str], number_format: str) -> None:
         for name in blocks:
-            if name not in _BLOCKS:
-                raise SettingsError(f'mtdata: unknown block {name!r}; known: {", ".join(_BLOCKS)}')
-        if list(blocks) != [name for name in _BLOCKS if name in blocks]:
+            if name not in _BLOCK_LENGTHS:
+                raise SettingsError(f'mtdata: unknown block {name!r}; known: '
+                                    f'{", ".join(_BLOCK_LENGTHS)}')
+        if list(blocks) != [name for name in _BLOCK_LENGTHS if name in blocks]:
             raise SettingsError(f'mtdata: expected blocks in protocol order, each at most once '
-                                f'({", ".join(_BLOCKS)}), got {", ".join(blocks)}')
+                                f'({", ".join(_BLOCK_LENGTHS)}), got {", ".join(blocks)}')
         if len(_ORIENTATIONS.intersection(blocks)) > 1:
             raise SettingsError(
                 'mtdata: expected at most one of ' + ', '.join(sorted(_ORIENTATIONS)))
@@ -178,7 +179,7 @@ class MTDataLayout:
         self.size = 0
         for name in blocks:
             self._begin[name] = self.size
-            self.size += _BLOCKS[name]
+            self.size += _BLOCK_LENGTHS[name]
 
     def read(self, data: bytes) -> DecodedMessage:
         """Decode DATA of an MTData message.

@@ -161,7 +161,7 @@ class I2cDevice(Closable):
         return f'/dev/i2c-{self._settings.bus}'
 
     def _create_chips(self, bus: Bus) -> dict[str, Chip]:
-        """Create the chip of each sensor, by sensor name, without access to the bus."""
+        """Create the chips {sensor name: chip} without access to the bus."""
         chips: dict[str, Chip] = {}
         for name, sensor in self._sensors.items():
             registers = Registers(bus, sensor.place)
@@ -246,7 +246,7 @@ class I2cDevice(Closable):
                     return sorted(arrivals, key=lambda a: a.arrival_ns)
 
     def _wait(self, end_ns: int) -> bool:
-        """Wait until the next cycle is due or `end_ns`; return whether a cycle is due."""
+        """Wait for a cycle until `end_ns`; count missed cycles; return whether a cycle is due."""
         while not self._closing:
             now_ns = self._monotonic_ns()
             late = (now_ns - self._due_ns) // self._period_ns
@@ -289,7 +289,7 @@ class I2cDevice(Closable):
         return arrivals
 
     def _arrivals(self, name: str, conversion: Conversion | None) -> list[Arrival]:
-        """Return a conversion as arrivals; count a missing conversion, and detect a silent chip."""
+        """List the arrival of a conversion; count a missing conversion, detect a silent chip."""
         self._n_failed[name] = 0
         if conversion is None:
             self._count('polling cycles without a new conversion', name)

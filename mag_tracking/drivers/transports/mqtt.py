@@ -58,8 +58,8 @@ class MqttSettings:
         10, 'Keep-alive interval. The connection is closed if the broker does not answer for twice '
         'this interval.', 's', (1, 65535))
     connect_timeout_s: float = param(
-        5.0, "Timeout for connecting, and again for the broker's acknowledgements.", 's',
-        (0.1, 600.0))
+        5.0, "Timeout for connecting to the broker. The broker's acknowledgements must arrive "
+        'within the same time after that.', 's', (0.1, 600.0))
     queue: int = param(
         10000, 'Maximum number of messages in the queue. If the queue is full, its oldest message '
         'is dropped.', '', (1, 10_000_000))
@@ -69,8 +69,8 @@ class MqttSettings:
         False, 'Whether to accept retained messages, whose time of publication is unknown.')
 
 
-class _Certificates(ssl.SSLContext):
-    """TLS context with an immediate handshake; unlike in paho, its failure closes the socket."""
+class _TlsContext(ssl.SSLContext):
+    """TLS context with an immediate handshake; a failed handshake closes the socket."""
 
     def wrap_socket(self, sock: socket.socket, *args: Any, **kwargs: Any) -> ssl.SSLSocket:
         """Wrap a socket in TLS and perform the handshake immediately."""
@@ -87,8 +87,8 @@ class MqttTopics:
     Attributes
     ----------
     counts : Counter
-        Number of dropped messages by cause. It includes 'messages with the dup flag', which the
-        broker has delivered again and which are accepted.
+        Number of dropped messages by cause. Messages that the broker has delivered again are
+        accepted; they are counted as 'messages with the dup flag'.
 
     Raises
     ------
@@ -129,7 +129,8 @@ class MqttTopics:
         Raises
         ------
         DeviceError
-            If the broker cannot be reached, or refuses the connection or a subscription.
+            If the broker cannot be reached, or refuses the connection or a subscription, or if a
+            configured file cannot be read.
         """
         self.close()
         client = self._client()
@@ -164,23 +165,23 @@ class MqttTopics:
         if s.username:
             client.username_pw_set(s.username, self._password())
         if s.tls:
-            client.tls_set_context(self._certificates())
+            client.tls_set_context(self._tls_context())
         return client
 
-    def _certificates(self) -> ssl.SSLContext:
-        """Create a TLS context with the trusted authorities."""
+    def _tls_context(self) -> ssl.SSLContext:
+        """Load the trusted CA certificates into a TLS context; raises DeviceError if this fails."""
         path = self._settings.ca_file
-        # This kind of context requires a certificate that matches the host name.
-        certificates = _Certificates(ssl.PROTOCOL_TLS_CLIENT)
+        # A context of this type requires a certificate that matches the host name.
+        context = _TlsContext(ssl.PROTOCOL_TLS_CLIENT)
         try:
             if path:
-                certificates.load_verify_locations(path)
+                context.load_verify_locations(path)
             else:
-                certificates.load_default_certs()
+                context.load_default_certs()
         except OSError as error:
             raise DeviceError(f'{self._name}: the certificates in ca_file {path} cannot be read: '
                               f'{error.strerror or error}') from error
-        return certificates
+        return context
 
     def _password(self) -> str | None:
         """First line of the password file; None if no file is configured."""
@@ -233,7 +234,7 @@ class MqttTopics:
 
     def _on_connect(self, client: paho.Client, _: Any, flags: paho.ConnectFlags,
                     reason_code: ReasonCode, properties: Properties | None) -> None:
-        """Subscribe once the broker has accepted the connection."""
+        """Subscribe to the topics, or report that the broker has refused the connection."""
         if reason_code.is_failure:
             self._set_lost(f'connection refused: {reason_code}')
             return
@@ -244,7 +245,7 @@ class MqttTopics:
 
     def _on_subscribe(self, client: paho.Client, _: Any, mid: int,
                       reason_codes: list[ReasonCode], properties: Properties | None) -> None:
-        """Check that the broker has granted all subscriptions."""
+        """Report that the broker has granted all subscriptions, or refused one of them."""
         refused = [topic for topic, code in zip(self._settings.topics, reason_codes, strict=True)
                    if code.is_failure]
         if refused:
@@ -271,7 +272,7 @@ class MqttTopics:
             self._changed.notify_all()
 
     def _rejection_cause(self, message: paho.MQTTMessage) -> tuple[str, str]:
-        """(cause of the rejection of a message, topic); the cause is empty for a valid message."""
+        """Return (cause of rejection, topic) of a message; the cause is empty if it is valid."""
         try:
             topic = message.topic
         except UnicodeDecodeError:

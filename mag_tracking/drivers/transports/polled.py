@@ -13,7 +13,7 @@ class Handle(Protocol):
     """Object with a file descriptor."""
 
     def fileno(self) -> int:
-        """File descriptor.
+        """Return the file descriptor.
 
         Returns
         -------
@@ -63,7 +63,7 @@ class Polled(Closable, Generic[H]):
         self._poll.register(handle.fileno(), select.POLLIN)
 
     def _wait(self, timeout_s: float) -> int | None:
-        """Wait for data; return the time of its arrival [ns], or None after the timeout."""
+        """Wait for data; return the wake-up time [ns], or None after the timeout or `close`."""
         end = time.monotonic() + timeout_s
         while not self._closing:
             remaining = end - time.monotonic()

@@ -252,7 +252,7 @@ class UdpSocket(Polled[socket.socket]):
         return False
 
     def _arrival(self, ancillary: list[Ancillary], difference: int | None, woken_ns: int) -> int:
-        """Return the monotonic arrival time of a datagram [ns]; count the use of `woken_ns`."""
+        """Return the monotonic arrival time of a datagram [ns], or count and return `woken_ns`."""
         if difference is not None:
             for level, kind, data in ancillary:
                 if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):
