@@ -14,7 +14,7 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.quantities import quantity
 
-_ARCHIVE = '''
+_ARCHIVE_HELP = '''
 Tracks many or long recordings on several processors or machines. Each recording has the same
 results as with `mag-tracking replay`; long recordings are divided while no target is present. An
 interrupted run continues when the same command is run again; completed recordings are skipped. A
@@ -46,7 +46,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'archive', _archive, _ARCHIVE)
+    p = add_command(commands, 'archive', _archive, _ARCHIVE_HELP)
     p.add_argument('recordings', nargs='+', metavar='FOLDER|GLOB|RECORDING',
                    help='recordings; folders are searched recursively')
     add_recorded_network(p)

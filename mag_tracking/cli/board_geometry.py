@@ -27,7 +27,7 @@ from mag_tracking.network.file import read_network, write_network
 from mag_tracking.quantities import quantity
 from mag_tracking.settings import flatten, read_parameter_file, replace
 
-_GEOMETRY = '''
+_GEOMETRY_HELP = '''
 Estimates the position, orientation, gain and bias of each sensor of a board from the readings
 of all sensors while a magnet of known moment is moved over the board. The poses of the magnet
 are measured by a tracker; the offsets between tracker and board, and between tool and magnet,
@@ -60,7 +60,7 @@ def add(commands: Commands) -> None:
     settings = '\n'.join(f'  {p.name}: {p.value}  # {p.doc}{f" [{p.unit}]" if p.unit else ""}'
                          for p in flatten(GeometrySettings()))
     p = add_command(commands, 'board-geometry', _geometry,
-                    _GEOMETRY.replace('{settings}', settings))
+                    _GEOMETRY_HELP.replace('{settings}', settings))
     p.add_argument('table', type=Path, metavar='TABLE', help='readings and poses (.csv)')
     geometry = p.add_mutually_exclusive_group(required=True)
     geometry.add_argument('--sensors', type=Path, metavar='FILE',
@@ -196,7 +196,7 @@ def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
 
 
 def _print_magnet(g: NetworkGeometry, has_unknown_poses: bool) -> None:
-    """Print the moment, and the offset and tilt of the magnet in its tool."""
+    """Print the moment of the magnet and, for known poses, its offset and tilt in the tool."""
     def formatted(values: FloatArray, std: FloatArray, scale: float, digits: int) -> str:
         return ' '.join(f'{scale * v:.{digits}f} ({scale * s:.{digits}f})'
                         for v, s in zip(values, std, strict=True))

@@ -23,7 +23,7 @@ from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import write_network
 from mag_tracking.recording.reader import Recording
 
-_CALIBRATE = '''
+_CALIBRATE_HELP = '''
 Estimates the orientation of each sensor (from its accelerometer and as a compass), its clock
 offset (from two or more knocks, at uneven intervals, that shake all sensors) and its noise. Keep
 targets away during the first seconds of the recording. Checks that all sensors measure the same
@@ -49,7 +49,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'calibrate', _calibrate, _CALIBRATE)
+    p = add_command(commands, 'calibrate', _calibrate, _CALIBRATE_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)

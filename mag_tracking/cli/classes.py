@@ -24,7 +24,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.signature_tables import read_model, write_model
 
-_CLASSES = '''
+_CLASSES_HELP = '''
 A single sensor determines neither the moment nor the distance of a target. A classifier that was
 trained on labelled passes identifies the class of a target by the shape of its field over a pass.
 
@@ -55,7 +55,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'classes', _reject_missing_action, _CLASSES)
+    p = add_command(commands, 'classes', _reject_missing_action, _CLASSES_HELP)
     actions = p.add_subparsers(dest='action', metavar='ACTION', required=True)
     for name, run, description in (
             ('train', _train, 'Train a classifier on labelled passes.'),
@@ -142,7 +142,7 @@ def _print_evaluation(evaluation: Evaluation) -> None:
 
 
 def _mean_fraction(values: 'np.ndarray[tuple[int, ...], np.dtype[np.float64]]') -> str:
-    """Format the mean of a fraction over the test sets, and its spread if there are several."""
+    """Format the mean, and for several values the standard deviation, over the test sets."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 'no examples'

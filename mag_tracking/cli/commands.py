@@ -16,7 +16,7 @@ class Command(NamedTuple):
     """Description of a command that is available before its module is imported."""
 
     module: str
-    """Module in this folder; its function `add` registers all commands of the module."""
+    """Module in this folder. The function `add` of the module registers all its commands."""
     short: str
     """Summary in the list of commands."""
     aliases: tuple[str, ...] = ()
@@ -88,6 +88,6 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _module_of(word: str) -> str | None:
-    """Module of the command whose name or alias is `word`; None if no command matches."""
+    """Return the module of the command with name or alias `word`; None if no command matches."""
     return next((command.module for name, command in COMMANDS.items()
                  if word in (name, *command.aliases)), None)

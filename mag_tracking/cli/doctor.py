@@ -23,7 +23,7 @@ from mag_tracking.interrupts import recorded_signals
 from mag_tracking.recording.reader import Recording
 from mag_tracking.stages.health.sensor_health import Finding, SensorHealth
 
-_DOCTOR = '''
+_DOCTOR_HELP = '''
 Examines a recording or live topics, and reports the faults of each sensor with a remedy: missing,
 lost or duplicate readings, clock steps, delays, noise above the calibration, stuck or saturated
 sensors, spikes, flipped or swapped axes, wrong units (gauss or microtesla published as tesla),
@@ -42,7 +42,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'doctor', _doctor, _DOCTOR)
+    p = add_command(commands, 'doctor', _doctor, _DOCTOR_HELP)
     p.add_argument('recording', nargs='?', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     p.add_argument('--live', type=float, metavar='SECONDS',

@@ -19,7 +19,7 @@ from mag_tracking.recording.event_tables import write_events
 from mag_tracking.recording.reader import Recording
 from mag_tracking.units import NS
 
-_EVENTS = '''
+_EVENTS_HELP = '''
 Detects the passes at each sensor and describes them without tracking: onset and release, peak,
 energy, time of the closest point of approach, direction (needs two horizontal axes), and the
 signature of the field. One sensor with one axis is sufficient. Distance and speed are not
@@ -40,7 +40,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'events', _events, _EVENTS)
+    p = add_command(commands, 'events', _events, _EVENTS_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)

@@ -34,9 +34,9 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.settings import read_parameter_file
 
 P_WARNING = 1e-3
-"""Probability that correct moments of one vehicle cause a warning of contradictory moments."""
+"""False-alarm probability of the chi-square test for contradictory moments of one vehicle."""
 
-_FIT = '''
+_FIT_HELP = '''
 Extracts each pass from a recording (from shortly before a detection until the end of the
 detection) and fits the whole pass with a row of 1, 2, 3 or 4 dipoles at constant velocity (TSP14).
 For a vehicle on a straight road this is the most accurate estimate. The normalised cost is about 1
@@ -72,7 +72,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'fit', _fit, _FIT)
+    p = add_command(commands, 'fit', _fit, _FIT_HELP)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
@@ -187,7 +187,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
 
 
 def _trusted_values(fit: PassFit) -> str:
-    """Format the values (of speed, direction, time) that are trusted although a fit is rejected."""
+    """Format the speed, direction and time that are trusted although the fit is rejected."""
     speed, speed_std = fit.speed
     heading, heading_std = np.degrees(fit.heading)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
@@ -244,7 +244,7 @@ def _print_bearing(b: Bearing) -> None:
 
 
 def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any] | None:
-    """Estimate and print hard and soft iron; return the content for JSON, or None on failure."""
+    """Estimate and print hard and soft iron; return them as a dict for JSON, or None on failure."""
     simultaneous = [p for p in passes if p.n_vehicles > 1]
     if simultaneous:
         print('--same-vehicle: vehicles not used because they passed simultaneously with others: '
@@ -280,9 +280,9 @@ def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
     ----------
     iron : Iron
     n_passes : int
-        Number of moments from which it was estimated.
+        Number of moments from which `iron` was estimated.
     soft_std : float, m³
-        Standard deviation of the soft iron, including the misfit.
+        Standard deviation of the soft iron, inflated if the normalised cost exceeds 1.
 
     Yields
     ------

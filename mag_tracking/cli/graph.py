@@ -10,7 +10,7 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.quantities import quantity
 
-_NOTE = '''
+_GRAPH_HELP = '''
 A substitute for the command `ros2`, which ROS from PyPI lacks. Names are relative to the
 namespace set with --ros-args -r __ns:=/NAMESPACE.
 '''
@@ -23,15 +23,15 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    add_command(commands, 'topics', _topics, _NOTE)
-    p = add_command(commands, 'echo', _echo, _NOTE)
+    add_command(commands, 'topics', _topics, _GRAPH_HELP)
+    p = add_command(commands, 'echo', _echo, _GRAPH_HELP)
     p.add_argument('topic', metavar='TOPIC', help='name of the topic')
     p.add_argument('--count', type=int, metavar='N', help='exit after N messages')
-    p = add_command(commands, 'param', _param, _NOTE)
+    p = add_command(commands, 'param', _param, _GRAPH_HELP)
     p.add_argument('node', metavar='NODE', help='name of the node')
     p.add_argument('name', nargs='?', metavar='NAME', help='parameter (default: all parameters)')
     p.add_argument('value', nargs='?', metavar='VALUE', help='new value of the parameter (YAML)')
-    p = add_command(commands, 'lifecycle', _lifecycle, _NOTE)
+    p = add_command(commands, 'lifecycle', _lifecycle, _GRAPH_HELP)
     p.add_argument('node', metavar='NODE', help='name of the node')
     p.add_argument('transition', nargs='?', metavar='TRANSITION', help='transition to trigger: '
                    'configure, activate, deactivate, cleanup or shutdown')

@@ -7,7 +7,7 @@ from mag_tracking.cli.options import Commands, add_command
 from mag_tracking.errors import SettingsError
 from mag_tracking.quantities import quantity
 
-_IMPORT = '''
+_IMPORT_HELP = '''
 Converts a table (CSV with a header) to a recording.
 
 Table of readings: --columns assigns the columns and --unit gives the unit of the field. Each row
@@ -36,7 +36,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'import', _import, _IMPORT)
+    p = add_command(commands, 'import', _import, _IMPORT_HELP)
     p.add_argument('table', type=Path, metavar='TABLE.csv', help='table of readings or poses')
     p.add_argument('--columns', nargs='+', metavar='KEY=COLUMN',
                    help='columns of a table of readings: time=, and sensor= x= y= z= or, for each '

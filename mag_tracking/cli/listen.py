@@ -25,7 +25,7 @@ from mag_tracking.records import AccelerationSample, Readings
 Sample: TypeAlias = tuple[int, FloatArray | None]
 """Timestamp [ns], and field (3,) [T] or None for an acceleration."""
 
-_LISTEN = '''
+_LISTEN_HELP = '''
 Opens the devices of a drivers file and prints, once per second, the state and error counts of
 each device and the rate and field of each sensor. The command needs no ROS and is suitable as the
 first test of a new connection. Ctrl-C ends the command. The exit status is 1 if a sensor has sent
@@ -47,7 +47,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'listen', _listen, _LISTEN)
+    p = add_command(commands, 'listen', _listen, _LISTEN_HELP)
     p.add_argument('drivers', type=Path, metavar='DRIVERS', help='file that lists the devices')
     add_network(p, False, 'network file; check that its sensors match the drivers file')
     p.add_argument('--seconds', type=float, default=math.inf, metavar='N',

@@ -20,20 +20,20 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.web.live_scene import LiveScene
 from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK, PageServer, check_port
 
-_PAGE = '''
+_PAGE_HELP = '''
 Open the printed address in a browser. The page shows a map with tracks, 90% regions and
 hypotheses, the fields of the sensors, and the health of the system. The page is available on this
 machine only; --host 0.0.0.0 also serves it to other machines, which need the token in the address.
 '''
-_VIEW = f'''
+_VIEW_HELP = f'''
 Tracks a recording in real time and shows the result on a live page. Ctrl-C ends the command.
-{_PAGE}
+{_PAGE_HELP}
 example:
   mag-tracking view junction.mcap --network config/network.yaml
 '''
-_WATCH = f'''
+_WATCH_HELP = f'''
 Shows the tracks of running nodes. Ctrl-C ends the page, not the nodes.
-{_PAGE}
+{_PAGE_HELP}
 examples:
   mag-tracking watch
   mag-tracking watch --ros-args -r __ns:=/robot1
@@ -48,14 +48,14 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'view', _view, _VIEW)
+    p = add_command(commands, 'view', _view, _VIEW_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
     add_settings(p)
     p.add_argument('--rate', type=float, default=1.0, help='playback speed (default: 1)')
     add_page(p)
-    p = add_command(commands, 'watch', _watch, _WATCH)
+    p = add_command(commands, 'watch', _watch, _WATCH_HELP)
     add_page(p)
     p.add_argument('--until-eof', action='store_true', help=argparse.SUPPRESS)
 

@@ -17,7 +17,7 @@ from mag_tracking.network.topics import checked_namespace
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 """Subparsers of the main parser, to which each command is added."""
 
-FIGURES = ('.png', '.pdf', '.svg')
+FIGURE_SUFFIXES = ('.png', '.pdf', '.svg')
 """File name extensions accepted for figures."""
 
 
@@ -206,6 +206,6 @@ def check_outputs(args: argparse.Namespace) -> None:
     """
     for path in (args.out, args.figure):
         check_writable(path)
-    if args.figure is not None and args.figure.suffix.lower() not in FIGURES:
-        raise SettingsError(f'--figure: expected a file name ending in {", ".join(FIGURES)}; got '
-                            f'{args.figure.name}')
+    if args.figure is not None and args.figure.suffix.lower() not in FIGURE_SUFFIXES:
+        raise SettingsError(f'--figure: expected a file name ending in '
+                            f'{", ".join(FIGURE_SUFFIXES)}; got {args.figure.name}')

@@ -17,7 +17,7 @@ from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.report.json_text import without_nan
 from mag_tracking.settings import read_parameter_file
 
-_PLAN = '''
+_PLAN_HELP = '''
 Predicts, before installation, the position accuracy, the detection probability, and the best
 position of an additional sensor. The accuracies are Cramer-Rao bounds for a point target at
 constant speed: a good estimator approaches them, and no unbiased estimator is more accurate.
@@ -48,7 +48,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'plan', _plan, _PLAN)
+    p = add_command(commands, 'plan', _plan, _PLAN_HELP)
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
     p.add_argument('--target', metavar='KIND', help='small, car or truck selects the moment and '

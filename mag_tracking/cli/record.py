@@ -10,7 +10,7 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network
 from mag_tracking.network.topics import NAME
 
-_RECORD = '''
+_RECORD_HELP = '''
 Records the magnetic fields on the topics of the network, unchanged, until Ctrl-C. The
 sensor_msgs/Imu topics of the sensors (/mag_1/imu/data_raw next to /mag_1/imu/mag) are
 also recorded. DIR becomes a rosbag2 recording: MCAP files and a metadata.yaml.
@@ -33,7 +33,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'record', _record, _RECORD)
+    p = add_command(commands, 'record', _record, _RECORD_HELP)
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR',
                    help='output folder')

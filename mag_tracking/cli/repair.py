@@ -6,7 +6,7 @@ from pathlib import Path
 from mag_tracking.cli.options import Commands, add_command
 from mag_tracking.recording.repair import repair
 
-_REPAIR = '''
+_REPAIR_HELP = '''
 A recording that was interrupted (power failure, crash, full disk) has no index.
 `mag-tracking replay` can still read it; rosbag2 and other tools need the index.
 This command writes the index and a new metadata.yaml, and keeps the messages unchanged.
@@ -23,7 +23,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'repair', _repair, _REPAIR)
+    p = add_command(commands, 'repair', _repair, _REPAIR_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap file or rosbag2 folder')
 

@@ -29,7 +29,7 @@ from mag_tracking.report.page import WARNING
 from mag_tracking.report.rerun_file import RERUN_FILE, check_rerun, write_rerun
 from mag_tracking.stages.track.doubts import MEANINGS
 
-_REPLAY = '''
+_REPLAY_HELP = '''
 Reads the magnetic fields on the topics of the network, learns the background of each sensor
 from a quiet interval, detects targets and tracks them with a bank of filters. ROS does not
 have to run; the ROS nodes use the same code.
@@ -81,7 +81,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'replay', _replay, _REPLAY)
+    p = add_command(commands, 'replay', _replay, _REPLAY_HELP)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)

@@ -12,7 +12,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.recording.reader import Recording
 from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK
 
-_RUN = '''
+_RUN_HELP = '''
 Starts the calibration, detection and tracker nodes in one process, the replay node with
 --recording, and the driver node with --drivers. The nodes call each other directly. All other
 messages are published after the pose; intermediate results (calibrated fields, frames) are
@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'run', _run, _RUN)
+    p = add_command(commands, 'run', _run, _RUN_HELP)
     add_network(p)
     add_settings(p)
     p.add_argument('--recording', type=Path, metavar='RECORDING', help='replay this recording')

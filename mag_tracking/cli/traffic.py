@@ -41,7 +41,7 @@ from mag_tracking.recording.traffic_tables import (
 )
 from mag_tracking.units import NS
 
-_TRAFFIC = '''
+_TRAFFIC_HELP = '''
 Tracks the vehicles in each recording. Counts each vehicle that crosses a line, and reports its
 time, direction, speed, length, class and headway. The default line is perpendicular to the x axis,
 through the centre of the network; the settings traffic.line_* define other lines. A vehicle is
@@ -69,7 +69,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'traffic', _traffic, _TRAFFIC)
+    p = add_command(commands, 'traffic', _traffic, _TRAFFIC_HELP)
     p.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
@@ -134,7 +134,7 @@ def _recordings(args: argparse.Namespace, network: SensorNetwork) -> list[Record
 
 
 def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
-    """Check --fleet and --enrol; return the vehicles to recognise, or None if there are none."""
+    """Check --fleet and --enrol; return the fleet to match; None without one or with --enrol."""
     if args.enrol is not None:
         if args.fleet is None:
             raise SettingsError('--enrol requires a fleet file: add --fleet FILE')
@@ -159,14 +159,14 @@ def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetP
 
 
 def _vehicle(identification: Identification | None) -> dict[str, Any]:
-    """Table columns of the identified vehicle; an empty dict without a fleet file."""
+    """Return the table columns of the identified vehicle; an empty dict without a fleet file."""
     return {} if identification is None else {
         'vehicle': identification.name,
         'p_vehicle': identification.probabilities.get(identification.name, np.nan)}
 
 
 def _delay(vehicle: CountedVehicle) -> dict[str, Any]:
-    """Table columns of the speed from the delay between sensors."""
+    """Return the table columns of the speed from the delay between sensors."""
     return {'delay_speed': vehicle.delay.speed, 'sd_delay_speed': vehicle.delay.speed_std,
             'speeds_contradict': vehicle.speeds_contradict}
 

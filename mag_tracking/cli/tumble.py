@@ -22,7 +22,7 @@ from mag_tracking.network.file import write_network
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 
-_TUMBLE = '''
+_TUMBLE_HELP = '''
 For sensors that can be held in the hand: rotate each slowly through all orientations, far from
 iron, while `mag-tracking record` runs. The readings lie on an ellipsoid; the correction to a
 sphere (hard iron, soft iron, scale factors, skewness) is written to the network file and applied
@@ -42,7 +42,7 @@ def add(commands: Commands) -> None:
     ----------
     commands : Commands
     """
-    p = add_command(commands, 'tumble', _tumble, _TUMBLE)
+    p = add_command(commands, 'tumble', _tumble, _TUMBLE_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)

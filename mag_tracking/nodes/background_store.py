@@ -42,7 +42,7 @@ class BackgroundStore:
         self._next_write = 0.0
 
     def restore(self, network: SensorNetwork) -> None:
-        """Pass the stored backgrounds to the stage, which restores each at the first reading.
+        """Pass the stored backgrounds to the stage; each is restored at its sensor's first reading.
 
         Outdated backgrounds are not restored; invalid backgrounds are logged.
 

@@ -59,7 +59,7 @@ from mag_tracking.stages.survey.stage import Survey
 MIN_STEP_S = 0.01
 """[s] Minimum interval between the steps of a round over the sensors. A round takes one second, or
 longer if there are many sensors."""
-DEFERRED_S = 0.0055
+DEFERRAL_S = 0.0055
 """[s] Delay of deferred work after a batch of readings has been published. It leaves the processor
 cores to the tracker until the tracker has computed a pose, even with a hundred sensors."""
 
@@ -91,7 +91,7 @@ class CalibrationNode(StageNode):
             [self.resolve_topic_name(t) for t in self.network.imu_topics if t is not None])
         self._health = HealthDiagnostics(self.network, self.settings, self, self.is_replayed)
         self._health_backlog: list[tuple[Readings, int]] = []
-        self._deferred = Deferred(self, DEFERRED_S, self._do_deferred_work)
+        self._deferred = Deferred(self, DEFERRAL_S, self._do_deferred_work)
         self._connect()
         self._rounds = SensorRounds(
             self.title, self.network, self._stage, self._health, self._store, self._is_live,
@@ -132,7 +132,7 @@ class CalibrationNode(StageNode):
             self._tf.publish(self.network)
 
     def _state_path(self) -> Path | None:
-        """Path of the background file; None during a replay or if storage is disabled."""
+        """Return the path of the background file; None during a replay or if storage is off."""
         name = fixed_parameter(self, 'state_file', '', 'File in which backgrounds are stored for a '
                                'restart. If empty, a file below $ROS_HOME or ~/.ros is used.')
         if self.is_replayed or not self.settings.calibrate.max_resume_gap_s:
@@ -162,7 +162,7 @@ class CalibrationNode(StageNode):
         return folder / path.name
 
     def _survey_path(self) -> Path:
-        """Path to which a survey is saved; never the network file, which is edited by hand."""
+        """Return the path to which a survey is saved; raise SettingsError for a disallowed path."""
         save_as = fixed_parameter(self, 'save_as', '', 'Network file to which a survey is saved. '
                                   'If empty, <network>_calibrated.yaml is used.')
         path = self.network_path
@@ -242,7 +242,7 @@ class CalibrationNode(StageNode):
         return calibrated
 
     def _do_deferred_work(self) -> None:
-        """Run deferred work, health checks and a due step of the round; report new doubts."""
+        """Run the stages' deferred work, health checks and a due step; report changed doubts."""
         self._stage.idle()
         if self._next_steps is not None:
             self._next_steps[1].idle()

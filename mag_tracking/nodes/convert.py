@@ -70,14 +70,14 @@ def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
 
 @functools.cache
 def _element_class(cls: Any, name: str) -> Any:
-    """Message class of the elements of the sequence field `name`."""
+    """Return the message class of the elements in the sequence field `name`."""
     element = cls.get_fields_and_field_types()[name].removeprefix('sequence<').removesuffix('>')
     package, leaf = element.split('/')
     return message_class(f'{package}/msg/{leaf}')
 
 
 def _vector(v: Any) -> FloatArray:
-    """Array (3,) of the fields x, y and z of a message."""
+    """Convert the fields x, y and z of a message to an array (3,)."""
     return np.array([v.x, v.y, v.z])
 
 

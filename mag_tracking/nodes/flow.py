@@ -57,7 +57,7 @@ class Flow:
         self._busy_s, self._report_time = 0.0, time.monotonic()
 
     def add(self, stamp_ns: int, came_ns: int, began: float) -> None:
-        """Add a message that has been processed.
+        """Add the latency and processing time of a message to the statistics.
 
         Parameters
         ----------

@@ -129,7 +129,7 @@ def valid_names() -> Iterator[None]:
     Raises
     ------
     GraphError
-        If the context uses an invalid name.
+        If code in the context uses an invalid name.
     """
     try:
         yield

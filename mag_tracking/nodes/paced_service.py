@@ -10,9 +10,9 @@ from rclpy.service import Service
 
 from mag_tracking.nodes.steady_timer import steady_timer
 
-PACE_S = 0.002
+RESPONSE_INTERVAL_S = 0.002
 """[s] Interval between responses."""
-CALLS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+SERVICE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of the service; the queue is long enough for many simultaneous calls."""
 
 
@@ -36,7 +36,7 @@ def paced_service(node: Node, service_type: Any, name: str,
     -------
     Service
     """
-    service = node.create_service(service_type, name, callback, qos_profile=CALLS)
+    service = node.create_service(service_type, name, callback, qos_profile=SERVICE_QOS)
     send, queue = service.send_response, deque[tuple[Any, Any]]()
 
     def send_next() -> None:
@@ -50,6 +50,6 @@ def paced_service(node: Node, service_type: Any, name: str,
         if timer.is_canceled():
             timer.reset()
 
-    timer = steady_timer(node, PACE_S, send_next, autostart=False)
+    timer = steady_timer(node, RESPONSE_INTERVAL_S, send_next, autostart=False)
     service.send_response = send_later  # type: ignore[method-assign]
     return service

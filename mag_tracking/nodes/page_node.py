@@ -38,7 +38,7 @@ MAX_FRAMES = 64
 """Maximum number of serialised frames stored for the next tick."""
 MAX_TRACKS = 1000
 """Maximum number of track messages stored for the next tick."""
-TRACKS = 'mag_tracking_msgs/msg/TrackArray'
+TRACKS_TYPE = 'mag_tracking_msgs/msg/TrackArray'
 STALE_TIMEOUT_S = 5.0
 """[s] A diagnostic status that has not been repeated for this time is stale."""
 _LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warning',
@@ -59,7 +59,7 @@ class SensorLayout:
         return len(self.names)
 
 
-NO_SENSORS = SensorLayout('', (), np.zeros((0, 3)))
+EMPTY_LAYOUT = SensorLayout('', (), np.zeros((0, 3)))
 """Placeholder until the tracker has published its sensors."""
 
 
@@ -78,7 +78,7 @@ class PageNode(Node):
     def __init__(self, scene: LiveScene) -> None:
         super().__init__('mag_tracking_page', start_parameter_services=False)
         self._scene = scene
-        self._layout = NO_SENSORS
+        self._layout = EMPTY_LAYOUT
         self._frames: deque[bytes] = deque(maxlen=MAX_FRAMES)
         self._tracks: deque[Any] = deque(maxlen=MAX_TRACKS)
         self._statuses: dict[str, tuple[float, DiagnosticStatus]] = {}
@@ -109,7 +109,7 @@ class PageNode(Node):
         """Return all track topics in the namespace; if there is only one, follow its tracker."""
         namespace = self.get_namespace().rstrip('/')
         topics = [name for name, kinds in self.get_topic_names_and_types()
-                  if TRACKS in kinds and name.startswith(f'{namespace}/')
+                  if TRACKS_TYPE in kinds and name.startswith(f'{namespace}/')
                   and self.count_publishers(name)]
         if topics and self._tracks_topic not in topics and len(topics) == 1:
             self._subscribe_to_tracker(topics[0])
@@ -147,7 +147,7 @@ class PageNode(Node):
         self._scene.add_smoothed(message.track_id, np.array([[p.x, p.y, p.z] for p in points]))
 
     def _receive_diagnostics(self, message: DiagnosticArray) -> None:
-        """Store the latest diagnostic status of each name."""
+        """Store the latest diagnostic status of each node and sensor in this namespace."""
         now = time.monotonic()
         self._statuses.update({s.name: (now, s) for s in message.status
                                if self._is_in_namespace(s.name)})
@@ -236,7 +236,7 @@ def watch(host: str, port: int, report: Callable[[str], object],
         If the port cannot be opened.
     """
     os.nice(NICENESS)
-    scene = LiveScene('mag_tracking', NO_SENSORS)
+    scene = LiveScene('mag_tracking', EMPTY_LAYOUT)
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, \
             PageServer(scene, host, port) as server:
         report(f'live page: {server.url}')

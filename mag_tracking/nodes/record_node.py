@@ -36,7 +36,7 @@ PROGRESS_INTERVAL_S = 10.0
 """[s] Interval between progress lines if the output is not a terminal."""
 DEPTHS = {MAGNETIC_FIELD: 1000, IMU: 1000, FIELD_READINGS: 1000}
 """Queue length by message type. A disk may stall for a second or more between two fetches."""
-OTHER_DEPTH = 100
+DEFAULT_DEPTH = 100
 """Queue length for other types, such as images, which are large."""
 
 
@@ -45,7 +45,7 @@ class _PolledSubscription:
 
     def __init__(self, node: Node, topic: str, type_name: str, latched: bool) -> None:
         self.node, self.type, self.latched = node, type_name, latched
-        self.depth = DEPTHS.get(type_name, OTHER_DEPTH)
+        self.depth = DEPTHS.get(type_name, DEFAULT_DEPTH)
         # A best-effort subscription matches every publisher but does not receive latched messages.
         self.subscription = node.create_subscription(
             message_class(type_name), topic, lambda _: None, QoSProfile(
@@ -73,7 +73,7 @@ class _PolledSubscription:
         return out
 
     def _count_lost(self, number: int | None) -> None:
-        """Count messages missing before sequence number `number`, if there is one publisher."""
+        """Count the messages lost before sequence number `number`, for at most one publisher."""
         if number is None or len(self.publishers) > 1:
             self.last_number = None
             return
@@ -82,7 +82,7 @@ class _PolledSubscription:
         self.last_number = number
 
     def set_publishers(self, infos: list[TopicEndpointInfo]) -> None:
-        """Update the publishers; if one is gone, ignore the jump of the next sequence number."""
+        """Update the publishers; if one is gone, ignore the next jump of the sequence number."""
         publishers = tuple(sorted(tuple(i.endpoint_gid) for i in infos))
         if set(self.publishers) - set(publishers):
             self.last_number = None
@@ -191,7 +191,7 @@ class RecordNode(Node):
         self._report(f'{topic} is not recorded: {why}')
 
     def _update_publishers(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
-        """Update the publishers of a topic; resubscribe if they are no longer all latched."""
+        """Update a topic's publishers; resubscribe as volatile if one of them is not latched."""
         source = self._sources[topic]
         other_types = sorted({i.topic_type for i in infos} - {source.type})
         if other_types and f'{topic} as {other_types[0]}' not in self._refused:

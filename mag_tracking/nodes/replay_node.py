@@ -55,7 +55,7 @@ class ReplayNode(ManagedNode):
     counts : Counter of str
         Numbers of messages played and rejected.
     publishers_by_topic : dict of str to Publisher
-        Publisher of each recorded topic.
+        Publisher of each topic that is played.
     finished : bool
         Whether playback has reached the end of the recording.
 
@@ -81,8 +81,8 @@ class ReplayNode(ManagedNode):
                                       'activation, for discovery of the subscribers [s].')
         self._paused = fixed_parameter(self, 'paused', False, 'Start paused.')
         self._subscriber_timeout_s = fixed_parameter(
-            self, 'wait_for_subscribers', 0.0, 'Maximum additional delay until all magnetic fields '
-            'have a subscriber [s].')
+            self, 'wait_for_subscribers', 0.0, 'Maximum additional delay until all magnetic field '
+            'topics have a subscriber [s].')
         self._recording: Recording | None = None
         self.counts: Counter[str] = Counter()
         self.publishers_by_topic: dict[str, Publisher] = {}
@@ -210,7 +210,7 @@ class ReplayNode(ManagedNode):
         return self.publishers_by_topic.get(topic)
 
     def _within_namespace(self, topic: str) -> str:
-        """Name of a recorded topic within the namespace of this node."""
+        """Return the name of a recorded topic in the namespace of this node."""
         namespace = self.get_namespace().rstrip('/')
         return topic if topic.startswith(f'{namespace}/') else f'{namespace}{topic}'
 
@@ -254,7 +254,7 @@ class ReplayNode(ManagedNode):
             self._end()
 
     def _has_subscribers(self, now: float) -> bool:
-        """Whether every magnetic field has a subscriber, or the wait for subscribers has ended."""
+        """Whether every magnetic field topic has a subscriber, or the timeout has expired."""
         recording = self._recording
         if recording is not None and now < self._start_time + self._subscriber_timeout_s:
             return all(p.get_subscription_count() for topic, p in self.publishers_by_topic.items()

@@ -235,7 +235,7 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
                recording: PathLike | None, rate: float, loop: bool,
                observers: Sequence[Callable[[], Node]],
                sources: Sequence[Callable[[], Node]]) -> int:
-    """Run the nodes until `stopped()`, see `run`; `sources` create the nodes to start last."""
+    """Run the nodes until `stopped()`; see `run`. Nodes created by `sources` start last."""
     executor = make_executor()
     nodes: list[Node] = []
     status = 1

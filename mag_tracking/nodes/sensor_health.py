@@ -155,7 +155,10 @@ class HealthDiagnostics:
                 name: b.n_relearnt for name, b in calibrate.backgrounds().items()}]
 
     def _compare(self, calibrate: Calibrate) -> None:
-        """Compare the sensors with each other and with the Earth's field."""
+        """Compare the sensors with each other and with the Earth's field.
+
+        Also records since when each frozen background has been frozen.
+        """
         for name, background in calibrate.backgrounds().items():
             if not background.frozen:
                 self._frozen_ns.pop(name, None)
@@ -168,7 +171,7 @@ class HealthDiagnostics:
                 self._network_findings[finding.subject].append(finding)
 
     def _reported_window(self, name: str) -> SensorHealth:
-        """Current window of a sensor; the previous window if the current one has few readings."""
+        """Return a sensor's current window; the previous window if the current one is sparse."""
         previous, current = self._previous[name], self._current[name]
         return previous if previous is not None and current.counts['readings'] < MIN_READINGS \
             else current
@@ -201,7 +204,7 @@ class HealthDiagnostics:
         return sorted(findings.values(), key=lambda f: not f.serious)
 
     def _silence_findings(self, name: str, silent_s: float) -> list[Finding]:
-        """Fault of a silent sensor; `silent_s` is NaN if the sensor has sent no reading so far."""
+        """Return the fault of a silent sensor, if any; without readings, `silent_s` is NaN."""
         topic = self._topics[name]
         if not math.isnan(silent_s):
             return [Finding(True, name, f'silent for {silent_s:.0f} s', 'check its cable, its '
@@ -215,7 +218,7 @@ class HealthDiagnostics:
         return [missing_publisher(self._node, name, topic, self._topics)]
 
     def _clock_findings(self, name: str) -> list[Finding]:
-        """Fault of a sensor whose timestamps differ by days from the clock of this computer."""
+        """Return a fault if a sensor's timestamps differ from the computer's time by over a day."""
         delay_s = self._reported_window(name).delay_s[0]
         if self._is_replayed or not abs(delay_s) > MAX_LIVE_DELAY_S:
             return []

@@ -59,7 +59,7 @@ class SensorRounds:
         self._states = [self._state(j) for j in range(len(network))]
 
     def tick(self) -> None:
-        """Mark a step as due; it runs after the next readings, or else at the next tick."""
+        """Mark the next step as due, to run after the next readings; first run a step still due."""
         if self._is_due:
             self._step()
         self._is_due = True
@@ -70,7 +70,7 @@ class SensorRounds:
             self._step()
 
     def report_doubts(self) -> None:
-        """Publish the calibration immediately if the doubt about a background begins or ends.
+        """Publish the calibration immediately if a background becomes or ceases to be doubtful.
 
         The tracker flags tracks as ambiguous only after it has received this message.
         """
@@ -93,11 +93,11 @@ class SensorRounds:
         self._publish_states(self._states)
 
     def _state(self, j: int) -> SensorCalibration:
-        """Current calibration of sensor `j`, as a message."""
+        """Return the current calibration of sensor `j` as a message."""
         return to_message(SensorCalibration, sensor_dict(self._stage, self._network, j))
 
     def _rounds(self) -> Iterator[None]:
-        """Run endless rounds, with one `yield` per step: compare, report, publish, store."""
+        """Run endless rounds and yield after each step: compare, update, report, publish, store."""
         while True:
             self._health.begin_round(self._stage)
             yield

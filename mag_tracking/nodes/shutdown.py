@@ -76,7 +76,7 @@ def flush() -> None:
 
 
 def _final_message() -> bytes:
-    """Message of the deadline, preceded by the pending error, which would otherwise be lost."""
+    """Return the pending error, if any, which would otherwise be lost, and the timeout message."""
     error = sys.exc_info()[1]
     if error is None or isinstance(error, KeyboardInterrupt):
         pending = ''

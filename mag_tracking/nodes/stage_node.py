@@ -277,7 +277,7 @@ class StageNode(Node):
         return receive
 
     def readings_of(self, message: FieldReadings, stage: Stage[Any, Any]) -> Readings | None:
-        """Convert a FieldReadings message; log an invalid message and count it as a rejection.
+        """Convert a FieldReadings message; log an invalid message and count the rejection.
 
         Parameters
         ----------
@@ -322,7 +322,7 @@ class StageNode(Node):
         self.report_state()
 
     def _start_statuses(self) -> list[DiagnosticStatus]:
-        """Status that reports faults of the start: a duplicate node name or a missing clock."""
+        """Return a status that reports startup faults: a duplicate node name or a missing clock."""
         faults = []
         full_name = self.get_name(), self.get_namespace()
         n_same = self.get_node_names_and_namespaces().count(full_name)
@@ -339,7 +339,7 @@ class StageNode(Node):
             message='; '.join(faults) or self.state())]
 
     def _published_types(self, name: str) -> set[str]:
-        """Types of the messages that a node publishes; empty if it has not been discovered."""
+        """Return the message types that a node publishes; empty if it has not been discovered."""
         namespace, _, leaf = name.rpartition('/')
         try:
             found = self.get_publisher_names_and_types_by_node(leaf, namespace or '/')

@@ -70,7 +70,7 @@ from mag_tracking.stages.traffic.stage import TrackedFrame
 
 TRANSPORT_MARGIN_S = 1.0
 """[s] Margin for the transport of a frame, in addition to `track.end_gap_s`."""
-MAX_PATH = 2000
+MAX_PATH_POSES = 2000
 """Maximum number of poses in `~/path`."""
 
 
@@ -87,7 +87,7 @@ class TrackerNode(StageNode):
     Attributes
     ----------
     after_pose : function or None
-        Called between publishing a pose and its track; publishes the frame of the pose.
+        Publishes the frame of a pose; called after the pose and before the track are published.
     """
 
     def __init__(self, has_direct_input: bool = False, **node_arguments: Any) -> None:
@@ -199,7 +199,7 @@ class TrackerNode(StageNode):
         self._stage.set_doubtful_times(times)
 
     def idle(self) -> None:
-        """Do work that is deferred until the preceding step has published its results."""
+        """Do the work that the stage defers until the preceding step has published its results."""
         self._stage.idle()
 
     def _feed(self, frame: FieldFrame) -> None:
@@ -277,7 +277,7 @@ class TrackerNode(StageNode):
         publish_if_any(self._odometry, Odometry, odometry_dict(track, frame, child_frame))
         if self._tf is not None:
             publish_if_any(self._tf, TFMessage, track_transform_dict(track, frame, child_frame))
-        path = self._paths.setdefault(track.id, deque(maxlen=MAX_PATH))
+        path = self._paths.setdefault(track.id, deque(maxlen=MAX_PATH_POSES))
         if track.topic_uncertainty is not None:
             path.append(to_message(PoseStamped, pose_dict(
                 track.stamp_ns, frame, track.position, track.orientation)))

@@ -15,7 +15,7 @@ from support.geometry_command import command, through_calibrate, write_table
 from support.magnet_boards import MOMENT, board, simulated
 from support.real_board import BOX, FOLDER, board_of_41, print_errors, within_limits
 
-POSITIONS = FOLDER / 'sensor_positions_m.csv'
+POSITIONS_FILE = FOLDER / 'sensor_positions_m.csv'
 
 
 @pytest.fixture(scope='module')
@@ -79,14 +79,14 @@ def test_the_printed_table_and_figure_match_the_network(calibrated):
 def test_sensor_positions_alone_are_sufficient(tmp_path, capsys):
     out = tmp_path / 'board.yaml'
     short_table = write_table(tmp_path / 'poses.csv', *(v[::6] for v in board_of_41()[1:]))
-    assert command(short_table, '--sensors', POSITIONS, out=out) == 0
+    assert command(short_table, '--sensors', POSITIONS_FILE, out=out) == 0
     text = capsys.readouterr().out
     assert 'note: noise of 41 sensors assumed to be 1e-07 T' in text
     # With one noise level for two kinds of sensors, the noisier kind is inconsistent.
     assert 'warning: sensors inconsistent with other sensors' in text
     network = read_network(out)
     assert network.noise_std == (None,) * 41 and network.imu_topics == (None,) * 41
-    assert command(short_table, '--sensors', POSITIONS, '--noise-std', 3e-7, out=out) == 0
+    assert command(short_table, '--sensors', POSITIONS_FILE, '--noise-std', 3e-7, out=out) == 0
     assert 'assumed' not in capsys.readouterr().out
     noise = np.array(read_network(out).noise_std) * [[C[0, 0] ** -1] for C in
                                                      read_network(out).correction]
@@ -168,7 +168,7 @@ def test_settings_are_read_from_a_file(tmp_path, capsys):
     (['--figure', '/nowhere/board.png'], 'the folder /nowhere does not exist'),
     (['--params', '/nowhere.yaml'], '/nowhere.yaml')])
 def test_invalid_options_are_named(tmp_path, capsys, options, message):
-    assert command(FOLDER / 'poses.csv', '--sensors', POSITIONS, *options,
+    assert command(FOLDER / 'poses.csv', '--sensors', POSITIONS_FILE, *options,
                    out=tmp_path / 'out.yaml') == 1
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
@@ -183,7 +183,7 @@ def test_invalid_files_are_named(tmp_path, capsys):
     short_table.write_text('0,0,0\n0,0,0\n')
     assert command(FOLDER / 'poses.csv', '--sensors', short_table, out=out) == 1
     assert 'few.csv: sensors mag_0 and mag_1 are both at' in capsys.readouterr().err
-    assert command(tmp_path / 'none.csv', '--sensors', POSITIONS, out=out) == 1
+    assert command(tmp_path / 'none.csv', '--sensors', POSITIONS_FILE, out=out) == 1
     assert 'cannot read' in capsys.readouterr().err
     nominal, field, positions, axes, _ = simulated(1, n_poses=5)
     write_network(tmp_path / 'stated.yaml', nominal)
@@ -224,7 +224,7 @@ def test_ctrl_c_ends_the_command_without_files(tmp_path):
     process = subprocess.Popen(
         [sys.executable, '-m', 'mag_tracking.cli', 'board-geometry', FOLDER / 'poses.csv',
          '--sensors',
-         POSITIONS, '--moment', str(MOMENT), '--unknown-poses', '--low', *map(str, BOX[0]),
+         POSITIONS_FILE, '--moment', str(MOMENT), '--unknown-poses', '--low', *map(str, BOX[0]),
          '--high', *map(str, BOX[1]), '--out', tmp_path / 'out.yaml'],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         # In a background job, the process would inherit that SIGINT is ignored.

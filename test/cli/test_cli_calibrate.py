@@ -18,7 +18,7 @@ from mag_tracking.recording.writer import RecordingWriter
 from support.bundled import DATA, NETWORK_FILE, QUICK, parameter_file, vehicle_path
 from support.samples import MagSample, recorded, sample_dict
 
-ROAD = vehicle_path('straight_car_right')
+RECORDING = vehicle_path('straight_car_right')
 
 
 def write_recording(folder, readings, name='mag_1'):
@@ -39,7 +39,7 @@ def tumbled():
 
 def test_calibrate_writes_a_network_that_replay_accepts(tmp_path, capsys):
     out, figure = tmp_path / 'calibrated.yaml', tmp_path / 'calibration.png'
-    assert main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--out', str(out),
+    assert main(['calibrate', str(RECORDING), '--network', str(NETWORK_FILE), '--out', str(out),
                  '--figure', str(figure)]) == 0
     output = capsys.readouterr().out
     assert ('clock offsets relative to mag_1' in output and 'passes used: 1' in output
@@ -51,7 +51,7 @@ def test_calibrate_writes_a_network_that_replay_accepts(tmp_path, capsys):
     assert all((std < np.deg2rad(5.0)).all() for std in network.orientation_std)
     assert all(1e-9 < std.min() < std.max() < 1e-7 for std in network.noise_std)
     params = parameter_file(tmp_path / 'quick.yaml', QUICK)
-    assert main(['replay', str(ROAD), '--network', str(out), '--params', str(params), '--out',
+    assert main(['replay', str(RECORDING), '--network', str(out), '--params', str(params), '--out',
                  str(tmp_path / 'run'), '--no-figures']) == 0
     assert ': 1 track (' in capsys.readouterr().out
 
@@ -60,7 +60,8 @@ def test_a_repeated_calibration_adds_no_information(tmp_path):
     """The same compass and the same pass give no new evidence."""
     first, again = tmp_path / 'first.yaml', tmp_path / 'again.yaml'
     for network, out in ((NETWORK_FILE, first), (first, again)):
-        assert main(['calibrate', str(ROAD), '--network', str(network), '--out', str(out)]) == 0
+        assert main(['calibrate', str(RECORDING), '--network', str(network), '--out',
+                     str(out)]) == 0
     a, b = read_network(first), read_network(again)
     np.testing.assert_allclose(b.R_ws, a.R_ws, atol=1e-9)
     np.testing.assert_allclose(b.orientation_std, a.orientation_std, rtol=1e-6)
@@ -68,14 +69,14 @@ def test_a_repeated_calibration_adds_no_information(tmp_path):
 
 def test_a_given_background_does_not_hide_a_flipped_axis(tmp_path, capsys):
     first, flipped = tmp_path / 'first.yaml', tmp_path / 'flipped.yaml'
-    main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--no-passes', '--out',
+    main(['calibrate', str(RECORDING), '--network', str(NETWORK_FILE), '--no-passes', '--out',
           str(first)])
     network = read_network(first)
     background = tuple(R.T @ (network.earth_field * [1.0, 1.0, -1.0]) for R in network.R_ws)
     write_network(flipped, replace(network, background=background,
                                    earth_field=network.earth_field * [1.0, 1.0, -1.0]))
     capsys.readouterr()
-    assert main(['calibrate', str(ROAD), '--network', str(flipped), '--out',
+    assert main(['calibrate', str(RECORDING), '--network', str(flipped), '--out',
                  str(tmp_path / 'out.yaml')]) == 2
     assert 'mag_1 differs' in capsys.readouterr().out
 
@@ -85,7 +86,7 @@ def test_replay_warns_of_a_large_orientation_uncertainty(tmp_path, capsys, std):
     network = read_network(NETWORK_FILE)
     path = tmp_path / 'network.yaml'
     write_network(path, replace(network, orientation_std=(np.full(3, np.deg2rad(std)), None)))
-    assert main(['replay', str(ROAD), '--network', str(path), '--out', str(tmp_path / 'run'),
+    assert main(['replay', str(RECORDING), '--network', str(path), '--out', str(tmp_path / 'run'),
                  '--no-figures']) == 0
     output = capsys.readouterr().out
     assert ('1 sensor has an orientation uncertainty of more than 15 degrees' in output
@@ -99,7 +100,7 @@ def test_a_calibration_without_passes_is_less_certain(tmp_path, capsys):
     stds = []
     for extra in ([], ['--no-passes']):
         out = tmp_path / f'{len(extra)}.yaml'
-        assert main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--out', str(out),
+        assert main(['calibrate', str(RECORDING), '--network', str(NETWORK_FILE), '--out', str(out),
                      *extra]) == 0
         stds.append([std[2] for std in read_network(out).orientation_std])
     assert 'compass and nominal heading\n' in capsys.readouterr().out.split('network written to')[1]
@@ -109,7 +110,7 @@ def test_a_calibration_without_passes_is_less_certain(tmp_path, capsys):
 def test_a_flipped_axis_is_named(tmp_path, capsys):
     network = read_network(NETWORK_FILE)
     with RecordingWriter(tmp_path / 'flipped.mcap') as writer:
-        for sample in recorded(SampleReader(Recording(ROAD), network)):
+        for sample in recorded(SampleReader(Recording(RECORDING), network)):
             flipped = [1.0, 1.0, -1.0] if sample.sensor == 'mag_2' else np.ones(3)
             writer.write(f'/{sample.sensor}/imu/mag', MAGNETIC_FIELD, sample_dict(
                 replace(sample, field=sample.field * flipped), sample.sensor), sample.stamp_ns)
@@ -125,10 +126,11 @@ def test_a_flipped_axis_is_named(tmp_path, capsys):
 @pytest.mark.parametrize('arguments, message', [
     (['calibrate', 'nothing.mcap'], 'nothing.mcap does not exist'),
     (['tumble', 'nothing.mcap'], 'nothing.mcap does not exist'),
-    (['tumble', str(ROAD), '--sensor', 'mag_9'], 'unknown sensor mag_9'),
-    (['calibrate', str(ROAD), '--figure', 'found.xyz'],
+    (['tumble', str(RECORDING), '--sensor', 'mag_9'], 'unknown sensor mag_9'),
+    (['calibrate', str(RECORDING), '--figure', 'found.xyz'],
      '--figure: expected a file name ending in .png, .pdf, .svg; got found.xyz'),
-    (['tumble', str(ROAD), '--field-size', '50'], '--field-size: expected 1e-6 to 1e-3 T, got 50'),
+    (['tumble', str(RECORDING), '--field-size', '50'],
+     '--field-size: expected 1e-6 to 1e-3 T, got 50'),
 ])
 def test_invalid_arguments_are_named(tmp_path, capsys, arguments, message):
     command, *rest = arguments
@@ -141,7 +143,7 @@ def test_invalid_arguments_are_named(tmp_path, capsys, arguments, message):
 @pytest.mark.parametrize('option', ['--out', '--figure'])
 def test_a_missing_folder_is_named_before_the_calibration(tmp_path, capsys, option):
     missing = ['--out', str(tmp_path / 'o.yaml')] if option == '--figure' else []
-    assert main(['calibrate', str(ROAD), '--network', str(NETWORK_FILE), *missing, option,
+    assert main(['calibrate', str(RECORDING), '--network', str(NETWORK_FILE), *missing, option,
                  str(tmp_path / 'no' / 'x.png')]) == 1
     assert (f'the folder {tmp_path / "no"} does not exist' in capsys.readouterr().err
             and not list(tmp_path.iterdir()))
@@ -156,7 +158,8 @@ def test_an_interrupted_calibration_writes_nothing(tmp_path):
          'def interrupted(self, sample):\n'
          '    os.kill(os.getpid(), signal.SIGINT)\n    return feed(self, sample)\n'
          'calibrating.Survey.feed = interrupted\nsys.exit(main(sys.argv[1:]))',
-         'calibrate', str(ROAD), '--network', str(NETWORK_FILE), '--out', str(tmp_path / 'o.yaml')],
+         'calibrate', str(RECORDING), '--network', str(NETWORK_FILE), '--out',
+         str(tmp_path / 'o.yaml')],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     output, _ = process.communicate(timeout=120)
     # The exit status after Ctrl-C that `cli.main` documents.
@@ -193,7 +196,7 @@ def test_tumbling_removes_background_and_noise_of_raw_readings(tmp_path, capsys)
 
 
 def test_tumbling_calibrates_raw_counts(tmp_path, capsys):
-    """The sensor is of another kind, and at rest for the first minute."""
+    """The sensor is of another type, and is at rest for the first minute."""
     with gzip.open(DATA / 'calibration' / 'qmc5883l_raw_counts.csv.gz', 'rt') as stream:
         counts = np.loadtxt(stream, delimiter=',', skiprows=3)
     assert main(['tumble', str(write_recording(tmp_path, counts * 1e-9)), '--network',
@@ -206,7 +209,7 @@ def test_tumbling_calibrates_raw_counts(tmp_path, capsys):
 
 
 def test_tumbling_refuses_sensors_that_were_not_rotated(tmp_path, capsys):
-    assert main(['tumble', str(ROAD), '--network', str(NETWORK_FILE), '--out',
+    assert main(['tumble', str(RECORDING), '--network', str(NETWORK_FILE), '--out',
                  str(tmp_path / 'out.yaml')]) == 1
     output = capsys.readouterr().out
     assert output.count('calibration rejected') == 2 and 'nothing was written' in output

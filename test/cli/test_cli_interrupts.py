@@ -82,7 +82,7 @@ def test_an_interrupt_does_not_wait_for_the_next_batch(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('step', ['summarise', 'add', 'errors_against_truth', 'write_figures'])
 def test_an_interrupt_while_writing_loses_no_results(tmp_path, monkeypatch, capsys, step):
-    """SIGINT arrives in the first two calls of a step that updates or completes the output."""
+    """SIGINT arrives during the first and second call of a step that updates or writes results."""
     from mag_tracking.apps import replay as app
     from mag_tracking.cli import replay
 

@@ -22,19 +22,21 @@ pytestmark = [pytest.mark.alone, pytest.mark.timeout(600)]
 
 N_ATTACKS = 200
 N_CONCURRENT = 40
-PATHS = ('', '/', '.', '..', '/etc/passwd', '/dev/full', '/dev/null', '../../../../x.yaml',
-         '~/.bashrc', 'a' * 5000, '/proc/self/mem', 'outside/theirs.yaml', '\n', '//', 'ä\u202e',
-         '/nonexistent/dir/file.yaml', 'link.yaml', 'network.yaml')
+ATTACK_PATHS = (
+    '', '/', '.', '..', '/etc/passwd', '/dev/full', '/dev/null', '../../../../x.yaml',
+    '~/.bashrc', 'a' * 5000, '/proc/self/mem', 'outside/theirs.yaml', '\n', '//', 'ä\u202e',
+    '/nonexistent/dir/file.yaml', 'link.yaml', 'network.yaml')
 NODES = ('calibration_node', 'detection_node', 'tracker_node', 'replay_node', 'driver_node')
-FIXED = {'calibration_node': ('network', 'save_as', 'state_file', 'target', 'reliable_input'),
-         'detection_node': ('network', 'target'), 'tracker_node': ('network', 'target'),
-         'replay_node': ('recording', 'topics', 'rate'),
-         'driver_node': ('drivers', 'network', 'autostart')}
+READ_ONLY_PARAMETERS = {
+    'calibration_node': ('network', 'save_as', 'state_file', 'target', 'reliable_input'),
+    'detection_node': ('network', 'target'), 'tracker_node': ('network', 'target'),
+    'replay_node': ('recording', 'topics', 'rate'),
+    'driver_node': ('drivers', 'network', 'autostart')}
 
 
 @pytest.fixture
 def folders(tmp_path):
-    """(folder of the network file, protected folder to which the first one has links)."""
+    """(folder of the network file, protected folder to which links in the first folder point)."""
     network_folder, protected = tmp_path / 'here', tmp_path / 'outside'
     network_folder.mkdir()
     protected.mkdir()
@@ -107,9 +109,9 @@ def set_parameters(call, node, pairs, atomically=False):
 def attack_once(call, rng, k):
     """Run attack `k`: set a read-only parameter or call services; check the responses."""
     node = NODES[k % len(NODES)]
-    path = PATHS[int(rng.integers(len(PATHS)))]
+    path = ATTACK_PATHS[int(rng.integers(len(ATTACK_PATHS)))]
     if k % 4 < 2:
-        name = FIXED[node][int(rng.integers(len(FIXED[node])))]
+        name = READ_ONLY_PARAMETERS[node][int(rng.integers(len(READ_ONLY_PARAMETERS[node])))]
         for result in set_parameters(call, node, [(name, path)], atomically=k % 4 == 1):
             assert not result.successful, (node, name, path)
     elif k % 4 == 2:

@@ -15,7 +15,7 @@ from mag_tracking.records import Readings
 from support.bundled import NETWORK_FILE
 from support.node_processes import start, stop
 
-EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
+EARTH_FIELD = np.array([2e-6, 1.55e-5, -4.9e-5])
 
 
 def test_repeated_requests_cause_one_call(ros):
@@ -54,7 +54,7 @@ def test_every_reading_of_a_message_is_evaluated(ros):
         {s.name: {v.key: v.value for v in s.values} for s in m.status}), RESULT_QOS)
 
     def publish():
-        field = EARTH + 1.2e-8 * rng.standard_normal((2, 3))
+        field = EARTH_FIELD + 1.2e-8 * rng.standard_normal((2, 3))
         stamps.append(time.time_ns())
         publisher.publish(to_message(FieldReadings, readings_dict(Readings(
             ('mag_1', 'mag_2'), np.arange(2), np.full(2, stamps[-1]), field))))

@@ -18,7 +18,7 @@ from support.node_processes import start, stop
 from support.situations import simulated_world
 
 pytestmark = pytest.mark.timeout(600)
-NAMES = ('calibration_node', 'detection_node', 'tracker_node')
+NODE_NAMES = ('calibration_node', 'detection_node', 'tracker_node')
 
 
 def test_the_tracker_publishes_the_disturbance_of_a_replay(ros):
@@ -36,14 +36,14 @@ def test_the_tracker_publishes_the_disturbance_of_a_replay(ros):
                              PUBLISHER_QOS)
     node.create_subscription(NetworkFrame, '/network_frame', frames.append, STREAM_QOS)
     publisher = node.create_publisher(FieldReadings, RAW_READINGS, PUBLISHER_QOS)
-    processes = [start(name, '-p', f'network:={NETWORK_FILE}') for name in NAMES]
+    processes = [start(name, '-p', f'network:={NETWORK_FILE}') for name in NODE_NAMES]
     try:
         assert spin_until(lambda: publisher.get_subscription_count() > 0
                           and node.count_subscribers('/field_readings_calibrated')
                           and node.count_subscribers('/network_frame') > 1
                           and node.count_publishers('/network_frame')
                           and node.count_publishers('/tracker_node/disturbances')
-                          and discovered.issuperset(NAMES))
+                          and discovered.issuperset(NODE_NAMES))
         for i in range(0, len(readings), 40):
             part = readings.part(slice(i, i + 40))
             publisher.publish(to_message(FieldReadings, readings_dict(part)))

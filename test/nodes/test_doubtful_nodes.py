@@ -13,7 +13,7 @@ from support.dense_traffic import after_dense_traffic
 from support.node_processes import start, stop
 
 pytestmark = pytest.mark.timeout(600)
-NAMES = ('calibration_node', 'detection_node', 'tracker_node')
+NODE_NAMES = ('calibration_node', 'detection_node', 'tracker_node')
 
 
 def test_nodes_track_and_flag_poses_after_dense_traffic(ros):
@@ -31,7 +31,7 @@ def test_nodes_track_and_flag_poses_after_dense_traffic(ros):
             publisher.publish(to_message(FieldReadings, readings_dict(part.part(slice(i, i + 40)))))
             spin_until(lambda: True)
 
-    processes = [start(name, '-p', f'network:={NETWORK_FILE}') for name in NAMES]
+    processes = [start(name, '-p', f'network:={NETWORK_FILE}') for name in NODE_NAMES]
     try:
         assert spin_until(lambda: publisher.get_subscription_count() > 0
                           and node.count_subscribers('/field_readings_calibrated')

@@ -17,7 +17,7 @@ from support.node_processes import MAX_S, call, start, stop
 from support.samples import samples_of
 from support.serial_line import SerialLine
 
-BOARD = """
+BOARD_DRIVERS = """
 board:
   transport: serial
   serial: {port: PORT}
@@ -51,7 +51,7 @@ def board(ros, tmp_path):
     line = SerialLine(tmp_path / 'port')
     line.plug_in()
     drivers = tmp_path / 'drivers.yaml'
-    drivers.write_text(BOARD.replace('PORT', str(line.path)))
+    drivers.write_text(BOARD_DRIVERS.replace('PORT', str(line.path)))
     state = {'k': 0, 'tick': 0, 'plugged': True, 'garbage': b'', 'skip': 0}
     begin = time.monotonic()
 
@@ -233,11 +233,12 @@ def test_readings_in_batches_reach_the_frames(ros, tmp_path):
 
 
 @pytest.mark.parametrize('content, error', [
-    (BOARD.replace('PORT', '/dev/null').replace('B: mag_2', 'B: mag_9'),
+    (BOARD_DRIVERS.replace('PORT', '/dev/null').replace('B: mag_2', 'B: mag_9'),
      'sensor mag_9 is not in the network'),
-    (BOARD.replace('PORT', '/dev/null').replace('B: mag_2', 'B: mag_1'),
+    (BOARD_DRIVERS.replace('PORT', '/dev/null').replace('B: mag_2', 'B: mag_1'),
      'sensor mag_1 is already assigned to board'),
-    (BOARD.replace('PORT', '/dev/null').replace('  framing: text\n', ''), 'framing is missing'),
+    (BOARD_DRIVERS.replace('PORT', '/dev/null').replace('  framing: text\n', ''),
+     'framing is missing'),
     ('', 'expected a mapping of devices')])
 def test_an_invalid_drivers_file_ends_the_node(ros, tmp_path, content, error):
     drivers = tmp_path / 'drivers.yaml'

@@ -19,13 +19,13 @@ from support.bundled import NETWORK_FILE
 pytestmark = pytest.mark.alone
 
 MAX_REPORT_S = 5.0
-EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
+EARTH_FIELD = np.array([2e-6, 1.55e-5, -4.9e-5])
 YEAR_NS = 365 * 86400 * 1_000_000_000
-BOTH = ('mag_1', 'mag_2')
+BOTH_SENSORS = ('mag_1', 'mag_2')
 
 
 class NewUser:
-    """Publisher of fields at 50 Hz with a mistake of a new user.
+    """Publishes fields at 50 Hz with a mistake that a new user may make.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class NewUser:
         Parameter of the calibration node.
     """
 
-    def __init__(self, topic='{}/imu/mag', unit=1.0, delay_ns=0, sensors=BOTH,
+    def __init__(self, topic='{}/imu/mag', unit=1.0, delay_ns=0, sensors=BOTH_SENSORS,
                  use_sim_time=False):
         self.topic, self.unit, self.delay_ns = topic, unit, delay_ns
         self.sensors, self.use_sim_time = sensors, use_sim_time
@@ -55,7 +55,7 @@ class NewUser:
 
     def _publish(self):
         for publisher in self._publishers:
-            x, y, z = self.unit * (EARTH + 1.2e-8 * self._rng.standard_normal(3))
+            x, y, z = self.unit * (EARTH_FIELD + 1.2e-8 * self._rng.standard_normal(3))
             publisher.publish(to_message(MagneticField, {
                 'header': {'stamp': stamp_dict(time.time_ns() - self.delay_ns)},
                 'magnetic_field': {'x': x, 'y': y, 'z': z}}))
@@ -90,7 +90,7 @@ time.sleep(600.0)
 
 
 def node_in(namespace, user):
-    """Create the calibration node of a case."""
+    """Create a calibration node in a namespace, with the `use_sim_time` of a new user."""
     return CalibrationNode(namespace=namespace, parameter_overrides=[
         Parameter('network', value=str(NETWORK_FILE)),
         Parameter('use_sim_time', value=user.use_sim_time)])

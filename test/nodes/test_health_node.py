@@ -25,7 +25,7 @@ from support.node_processes import MAX_S, scaled, start, stop
 from support.samples import MagSample, one, sample_dict
 
 STEP_NS = 10_000_000
-EARTH = np.array([2e-6, 1.55e-5, -4.9e-5])
+EARTH_FIELD = np.array([2e-6, 1.55e-5, -4.9e-5])
 OTHER_PUBLISHER = """
 import time
 import rclpy
@@ -63,7 +63,7 @@ def publish_until(ros):
                 publisher = publishers.setdefault(name, None) or node.create_publisher(
                     MagneticField, f'/{name}/imu/mag', STREAM_QOS)
                 publishers[name] = publisher
-                field = EARTH + now[name] + 1.2e-8 * rng.standard_normal(3)
+                field = EARTH_FIELD + now[name] + 1.2e-8 * rng.standard_normal(3)
                 sample = MagSample(stamp_ns, name, field)
                 publisher.publish(to_message(MagneticField, sample_dict(sample, name)))
 
@@ -247,7 +247,7 @@ def test_a_new_clock_offset_is_no_clock_step():
     def feed(begin, end):
         for k in range(begin, end):
             readings = Readings(network.names, np.arange(2), np.full(2, k * 10_000_000),
-                                EARTH + 1.2e-8 * rng.standard_normal((2, 3)))
+                                EARTH_FIELD + 1.2e-8 * rng.standard_normal((2, 3)))
             health.add(readings, k * 10_000_000 + 2_000_000)
     feed(0, 90)
     health.use_network(dataclasses.replace(network, clock_offset=np.array([0.5, -0.5])))
@@ -270,7 +270,7 @@ def test_past_faults_expire_after_two_windows(monkeypatch):
         for name in network.names:
             parked = 1e-6 * (name == 'mag_1' and now[0] > 20.0)
             sample = MagSample(k * 50_000_000, name,
-                               EARTH + parked + 1.2e-8 * rng.standard_normal(3))
+                               EARTH_FIELD + parked + 1.2e-8 * rng.standard_normal(3))
             health.add(one(sample), sample.stamp_ns)
             stage.feed(one(sample))
         if k % 100 == 99:

@@ -25,7 +25,7 @@ from support.samples import MagSample, sample_dict
 
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(600)]
 
-PATIENT = {'align.max_wait_s': 5.0}
+LONG_WAIT = {'align.max_wait_s': 5.0}
 NODES = {'calibration_node': 'magnetic_calibration', 'detection_node': 'watchman',
          'tracker_node': 'follower', 'replay_node': 'player'}
 """{node: its name in these tests}."""
@@ -99,7 +99,7 @@ def test_two_networks_on_one_graph_do_not_interfere(ros, tmp_path, road_network)
     for namespace, messages in received.items():
         folder = tmp_path / namespace[1:].replace('/', '_')
         replay(Recording(vehicle_path(NETWORKS[namespace][0])), road_network,
-               settings_for('vehicle', PATIENT), folder)
+               settings_for('vehicle', LONG_WAIT), folder)
         offline = positions(folder)
         live = [t for m in messages for t in map(track_of, m.tracks) if not t.ended]
         assert [t.stamp_ns for t in live] == list(offline)

@@ -213,7 +213,7 @@ def test_a_broker_that_refuses_the_login_is_reported(site):
 
 
 def restart(pipeline, name):
-    """Reset the stage of a restarted node."""
+    """Simulate a node restart: replace the alignment and the stage of the node by new ones."""
     network, settings = pipeline.network, pipeline.settings
     # Messages in transit to a dead node are lost.
     if name:

@@ -53,7 +53,7 @@ pytestmark = pytest.mark.timeout(600)
 
 # At a higher rate, the messages of a sensor may be late by more than the 0.5 s of recording time
 # after which a sensor is treated as silent.
-PATIENT = {'align.max_wait_s': 5.0}
+LONG_WAIT = {'align.max_wait_s': 5.0}
 
 
 class Collector(Node):
@@ -158,7 +158,7 @@ def collect_from_nodes(network_file, settings, recording, rate):
 
 @pytest.mark.parametrize('name', studied(VEHICLES, ['junction_rear_turns_right']))
 def test_nodes_equal_offline_on_vehicles(name, tmp_path, road_network):
-    settings = settings_for('vehicle', {**PATIENT, 'track.smoothing_lag_s': 0.3})
+    settings = settings_for('vehicle', {**LONG_WAIT, 'track.smoothing_lag_s': 0.3})
     replay(Recording(vehicle_path(name)), road_network, settings, tmp_path)
     collector = collect_from_nodes(NETWORK_FILE, settings, vehicle_path(name), 6.0)
     max_difference = compare_with_offline(collector, tmp_path)
@@ -172,7 +172,7 @@ def test_nodes_equal_offline_on_several_vehicles(tmp_path):
     name = 'traffic_2_sensors'
     network = network_of_recording(name)
     write_network(network_file := tmp_path / 'network.yaml', network)
-    settings, recording = settings_for('vehicle', PATIENT), BUSY / f'{name}.mcap'
+    settings, recording = settings_for('vehicle', LONG_WAIT), BUSY / f'{name}.mcap'
     replay(Recording(recording), network, settings, tmp_path)
     collector = collect_from_nodes(network_file, settings, recording, 2.0)
     max_difference = compare_with_offline(collector, tmp_path)
@@ -182,7 +182,7 @@ def test_nodes_equal_offline_on_several_vehicles(tmp_path):
     assert len(ids) > 5 and together
     smoothed = [m.track_id for m in collector.smoothed]
     assert len(smoothed) == len(set(smoothed)) and set(smoothed) <= ids
-    compare_traffic(collector, mt.traffic(recording, network, PATIENT))
+    compare_traffic(collector, mt.traffic(recording, network, LONG_WAIT))
     print('several vehicles: nodes against offline, largest relative difference '
           f'{max_difference:.1e}')
     assert max_difference <= 1e-9
@@ -255,7 +255,7 @@ def test_nodes_in_four_processes_equal_offline(ros, tmp_path, road_network):
     """One process per node, as on a robot; all processes end with status 0."""
     recording, received = vehicle_path('straight_car_right'), receive_topics(ros[0])
     play_through_processes(ros, recording, received)
-    replay(Recording(recording), road_network, settings_for('vehicle', PATIENT), tmp_path)
+    replay(Recording(recording), road_network, settings_for('vehicle', LONG_WAIT), tmp_path)
     with open(tmp_path / 'poses.csv', newline='') as stream:
         offline = {int(r['stamp_ns']): [float(r['x']), float(r['y'])]
                    for r in csv.DictReader(stream)}
@@ -269,7 +269,7 @@ def test_nodes_in_four_processes_equal_offline(ros, tmp_path, road_network):
     state = received[CalibrationState]
     assert state and all(s.ready for s in state[-1].sensors)
     offline = {e.sensor: pass_event_dict(e) for e in mt.events(
-        recording, road_network, PATIENT).events}
+        recording, road_network, LONG_WAIT).events}
     for event in received[PassEvent]:
         expected = offline[event.sensor]
         assert event.left_to_right == expected['left_to_right']

@@ -23,7 +23,7 @@ from support.node_processes import MAX_S, environment
 
 COMMAND = [sys.executable, '-m', 'mag_tracking.cli']
 RECORDING = vehicle_path('straight_car_right')
-PATIENT = ('--ros-args', '-p', 'align.max_wait_s:=5.0')
+LONG_WAIT_ARGUMENTS = ('--ros-args', '-p', 'align.max_wait_s:=5.0')
 """At a high playback rate, readings are later (in recording time) than the default allows."""
 
 
@@ -60,7 +60,7 @@ def test_the_page_of_running_nodes_shows_the_values_of_the_topic(ros):
             page.wait('document.getElementById("notes").textContent.includes('
                       '"no publisher on /tracker_node/tracks")')
             run = command('run', '--network', NETWORK_FILE, '--recording', RECORDING,
-                          '--rate', 3, *PATIENT)
+                          '--rate', 3, *LONG_WAIT_ARGUMENTS)
             assert spin_until(lambda: any(t.status == t.ENDED for m in received for t in m.tracks))
             page.wait('magTracking.scene?.tracks.length && magTracking.scene?.tracks[0]?.ended')
             poses = [track_of(t) for m in received for t in m.tracks if t.status == t.ACTIVE]
@@ -105,7 +105,8 @@ def test_a_renamed_tracker_is_found_and_may_be_restarted():
         url = address(watch)
         for _ in range(2):
             run = command('run', '--network', NETWORK_FILE, '--recording', RECORDING,
-                          '--rate', '4', *PATIENT, '-r', 'tracker_node:__node:=follower')
+                          '--rate', '4', *LONG_WAIT_ARGUMENTS,
+                          '-r', 'tracker_node:__node:=follower')
             n = 0
             for message in messages_of(url, lambda m: any(
                     t['ended'] and t['doubts'] for t in m.get('tracks', ()))

@@ -16,7 +16,7 @@ from support.dense_traffic import after_dense_traffic
 
 READINGS = after_dense_traffic('junction_left_to_right', 7.0)
 """Both backgrounds become doubtful twice, and are both doubtful for a while."""
-BATCH = 40
+BATCH_SIZE = 40
 
 
 class Listener:
@@ -35,7 +35,7 @@ class Listener:
 
     def feed(self, k):
         """Feed batch `k` of the readings."""
-        self.stage.feed(READINGS.part(slice(k * BATCH, (k + 1) * BATCH)))
+        self.stage.feed(READINGS.part(slice(k * BATCH_SIZE, (k + 1) * BATCH_SIZE)))
         self.rounds.report_doubts()
 
     @property
@@ -46,7 +46,7 @@ class Listener:
 
 def test_each_begin_and_end_of_a_doubt_is_reported_once_without_delay():
     listener, changes = Listener(), 0
-    for k in range(len(READINGS) // BATCH):
+    for k in range(len(READINGS) // BATCH_SIZE):
         before = listener.stage.doubtful_intervals()
         listener.feed(k)
         changes += listener.stage.doubtful_intervals() != before
@@ -60,7 +60,7 @@ def test_each_begin_and_end_of_a_doubt_is_reported_once_without_delay():
 def test_rounds_of_any_length_agree_with_the_reports(steps, phase):
     """A round updates the published states of the sensors at different times."""
     listener = Listener()
-    for k in range(len(READINGS) // BATCH):
+    for k in range(len(READINGS) // BATCH_SIZE):
         listener.feed(k)
         if (k + phase) % steps == 0:
             listener.rounds.tick()
@@ -77,6 +77,6 @@ def test_relearning_ends_a_doubt():
     listener.stage.forget(())
     listener.rounds.report_doubts()
     assert listener.is_consistent and listener.times['mag_1'][-1][1] is not None
-    for k in range(n, len(READINGS) // BATCH):
+    for k in range(n, len(READINGS) // BATCH_SIZE):
         listener.feed(k)
     assert listener.is_consistent

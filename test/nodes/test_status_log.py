@@ -25,7 +25,7 @@ class Logger:
 
 @pytest.fixture
 def log(monkeypatch):
-    """f(seconds, level, message): lines that are logged for a status at that time."""
+    """f(seconds, level, message): return the lines logged for a status at a time [s]."""
     now, logger = [0.0], Logger()
     monkeypatch.setattr(status_log.time, 'monotonic', lambda: now[0])
     statuses = StatusLog(logger)

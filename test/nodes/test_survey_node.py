@@ -13,13 +13,13 @@ from mag_tracking.recording.reader import Recording
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.node_processes import call, start, stop
 
-NAME = 'junction_left_turns_to_rear'
+RECORDING_NAME = 'junction_left_turns_to_rear'
 
 
 def offline(road_network):
     """Network calibrated offline, without passes."""
-    return calibrate(Recording(vehicle_path(NAME)), road_network, settings_for('vehicle'), 'now',
-                     passes=False).network
+    return calibrate(Recording(vehicle_path(RECORDING_NAME)), road_network,
+                     settings_for('vehicle'), 'now', passes=False).network
 
 
 def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_network):
@@ -41,7 +41,7 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
         response = call(ros, Survey, '/calibration_node/survey', Survey.Request(save=True))
         assert not response.success and 'no background' in response.message
         assert not saved.exists()
-        processes.append(start('replay_node', '-p', f'recording:={vehicle_path(NAME)}',
+        processes.append(start('replay_node', '-p', f'recording:={vehicle_path(RECORDING_NAME)}',
                                '-p', 'rate:=1.0', '-p', 'start_delay:=1.0',
                                '-p', 'wait_for_subscribers:=300.0'))
         assert spin_until(lambda: states and all(s.ready for s in states[-1].sensors))
