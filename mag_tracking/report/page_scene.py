@@ -13,7 +13,7 @@ from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
 MAX_SENSORS = 8
-"""Maximum number of sensors per track whose fields are included. The strongest are selected."""
+"""Maximum number of sensors per track; those with the strongest fields are included."""
 MAX_BYTES = 4_000_000
 """Approximate size limit of the track data [bytes]. Larger reports show fewer poses per track."""
 MAX_TRACKS = 1_000

@@ -34,7 +34,7 @@ AIMS = {'meeting': (1.0, 4.0, 1.0), 'meeting more': (0.7, 3.0, 1.0),
 """{kind of recording: (median RMS [m], median NEES of two axes, fraction of vehicles found)}, or
 None for a figure without an aim."""
 MIN_MEETING = 15 / 16
-"""With two sensors, one of sixteen vehicles may be missed."""
+"""Minimum fraction of meeting vehicles that two sensors must find: one of sixteen may be missed."""
 MAX_WRONG, MAX_COST = 0.01, 4.0
 N_HYP, RUNS = 20, 25
 

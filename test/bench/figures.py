@@ -21,7 +21,7 @@ from support.bundled import ROOT
 FOLDER = ROOT / 'benchmarks'
 LATEST, HISTORY = FOLDER / 'latest.json', FOLDER / 'history.jsonl'
 MAX_RATIO = 1.15
-"""Factor beyond which a figure is reported as worse."""
+"""Factor by which a reported figure is worse than the best earlier figure."""
 RUNS = 5
 RED, PLAIN = '\033[31m', '\033[0m'
 

@@ -25,8 +25,8 @@ from support.node_processes import MAX_S, start, stop
 from support.roadside import NOISE, Roadside
 from support.serial_line import SerialLine
 
-WRONG = chi2.ppf(1.0 - 1e-4, 2)
-"""A pose is wrong if its squared error, normalised by its covariance, exceeds this."""
+MAX_NEES = chi2.ppf(1.0 - 1e-4, 2)
+"""Maximum NEES of a correct pose, with two degrees of freedom."""
 BODY = point_body([0.0, 300.0, -300.0], 5.0, 0.5)
 """Vehicle whose hard and soft iron do not cancel, so that it is detected at 12 m."""
 TOPICS = {'driver_node': (MagneticField, '/mag_1/imu/mag'),
@@ -223,9 +223,9 @@ class World:
 
 
 def is_wrong(track, truth):
-    """Whether a pose is unflagged and its normalised squared error exceeds `WRONG`."""
+    """Whether a pose is unflagged and its NEES exceeds `MAX_NEES`."""
     e = track.position[:2] - truth
-    return not track.ambiguous and e @ np.linalg.solve(track.covariance[:2, :2], e) > WRONG
+    return not track.ambiguous and e @ np.linalg.solve(track.covariance[:2, :2], e) > MAX_NEES
 
 
 @contextmanager
