@@ -1,4 +1,4 @@
-"""Storage of the learnt backgrounds of a running calibration, for use after a restart.
+"""Background file: the calibration stores learnt backgrounds and restores them after a restart.
 
 A network file contains parameters that stay valid for years. A background file contains the current
 background of each sensor, which is soon outdated.

@@ -13,7 +13,7 @@ class ReadingStopped(Exception):
 
 def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progress | None = None,
                   stopped: Callable[[], bool] | None = None) -> Iterator[_Item]:
-    """Iterate over the items of `read` until the caller stops it.
+    """Iterate over the items of `read` until the caller stops the iteration.
 
     Parameters
     ----------

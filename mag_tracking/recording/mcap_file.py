@@ -25,7 +25,7 @@ from mag_tracking.units import LATEST_NS
 
 BATCH_SIZE = 256
 """Maximum number of messages outside of chunks that are read at once."""
-_DEFINITIONS: dict[int, type[Schema] | type[Channel]] = {
+_DEFINITION_TYPES: dict[int, type[Schema] | type[Channel]] = {
     Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
 
 
@@ -146,7 +146,7 @@ class McapFile:
                          f'{seconds:.1f} s long, {after:.1f} s after the start)')
 
     def _count_loss(self, offset: int, description: str) -> None:
-        """Count an unreadable part at a byte offset, once even if the file is read repeatedly."""
+        """Count an unreadable part at a byte offset; a repeated read does not count it again."""
         if offset not in self._lost_offsets:
             self._lost_offsets.add(offset)
             self._losses[description] += 1
@@ -198,7 +198,7 @@ class _LooseMessages:
         self._messages.append(message)
 
     def flush(self, channels: '_Channels') -> Iterator[MessageBlock]:
-        """Empty the buffer, and yield a block of its messages unless it was empty."""
+        """Yield the buffered messages as one block, if there are any, and empty the buffer."""
         messages, self._messages = self._messages, []
         if not messages:
             return
@@ -239,7 +239,7 @@ class _Channels:
         data = stream.read(size)
         rows, definitions = core.records_of(data, LATEST_NS)
         for kind, begin, end in definitions:
-            self.add(_DEFINITIONS[kind].read(ReadDataStream(BytesIO(data[begin:end]))))
+            self.add(_DEFINITION_TYPES[kind].read(ReadDataStream(BytesIO(data[begin:end]))))
         untyped = [c for c in np.unique(rows[:, 0]).tolist() if not self.has_schema(c)]
         if untyped:
             rows = rows[~np.isin(rows[:, 0], untyped)]

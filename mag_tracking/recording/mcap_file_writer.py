@@ -124,7 +124,7 @@ class McapFileWriter:
         self._stream.raw.close()
 
     def abandon(self) -> None:
-        """Truncate the file to its complete chunks after a failure, and close it without index."""
+        """Truncate the file to its complete chunks after a failure; close it without an index."""
         self.counts -= self.pending
         with suppress(OSError):
             self._stream.raw.truncate(self._intact_size)

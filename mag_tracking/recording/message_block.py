@@ -145,7 +145,7 @@ class MessageBlock:
                             self.begin[which], self.end[which])
 
     def merged(self, other: 'MessageBlock') -> 'MessageBlock':
-        """Merge two blocks of the same file in order of log time.
+        """Merge this block with another block of the same file, in order of log time.
 
         Parameters
         ----------

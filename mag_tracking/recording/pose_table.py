@@ -6,7 +6,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.recording.csv_file import CsvPath, Lines, csv_lines, number, read_csv
 
-_POSE = ('mag_x0', 'mag_y0', 'mag_z0', 'mag_mx0', 'mag_my0', 'mag_mz0')
+_POSE_COLUMNS = ('mag_x0', 'mag_y0', 'mag_z0', 'mag_mx0', 'mag_my0', 'mag_mz0')
 
 
 def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -31,7 +31,7 @@ def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
         If the file is invalid or the length of an axis differs from 1 by more than 1e-3. The
         message names file, row and column.
     """
-    rows, values = _values(path, _POSE)
+    rows, values = _values(path, _POSE_COLUMNS)
     axes = values[:, -3:]
     lengths = np.linalg.norm(axes, axis=1)
     for (line, _), vector_length in zip(rows, lengths, strict=True):
@@ -88,7 +88,7 @@ def read_sensor_positions(path: CsvPath) -> FloatArray:
 
 
 def _values(path: CsvPath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
-    """Read [(line, cells)], and an array of the readings and the columns `pose` of each row."""
+    """Read a table; return [(line, cells)], and the readings and `pose` columns as an array."""
     header, rows = read_csv(path)
     n = sum(name[:1] == 'x' and name[1:].isdigit() for name in header)
     fields = [f'{a}{j}' for j in range(n) for a in 'xyz']

@@ -200,7 +200,7 @@ class Recorder:
 
     def _attempt(self, file: McapFileWriter, action: Callable[..., None],
                  *arguments: object) -> bool:
-        """Call `action` of the open file; abandon the file on failure. Return True on success."""
+        """Call `action` on the open file; abandon the file on failure. Return True on success."""
         try:
             action(*arguments)
         except OSError as error:

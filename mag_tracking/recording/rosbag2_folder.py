@@ -185,7 +185,7 @@ def _qos_profiles(name: str, topic: Topic) -> object:
 
 
 def _span(firsts: Sequence[int], lasts: Sequence[int]) -> dict[str, dict[str, int]]:
-    """Start and duration in the format of rosbag2."""
+    """Start time and duration from the first to the last message, as entries of the metadata."""
     first, last = min(firsts, default=0), max(lasts, default=0)
     return {'starting_time': {'nanoseconds_since_epoch': first},
             'duration': {'nanoseconds': last - first}}

@@ -182,13 +182,13 @@ class SampleReader:
 
     def _records(self, imus: Mapping[str, Sequence[str]], progress: Progress | None
                  ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """Iterate over (record, log time): readings, and accelerations from the topics in
-        `imus`, {topic: sensors}."""
+        """Iterate over (record, log time) in the recording. A record is a batch of readings, or an
+        acceleration from a topic in `imus`, {topic: sensors}."""
         return self._records_of(self._recording.messages(progress=progress), imus)
 
     def _records_of(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
                     ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """Iterate as `_records` over messages; collect true poses and count unusable messages."""
+        """Decode messages to (record, log time); collect true poses, count unusable messages."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
             truth = self._truth.accepts(message.topic, message.type)

@@ -32,8 +32,8 @@ UNITS = {'t': 1.0, 'ut': 1e-6, 'nt': 1e-9}
 """Tesla per unit, by suffix of the column."""
 
 _VERSION_ENTRY = 'mag_tracking.classes'
-_AXIS = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?')
-_SAMPLE = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?_?(?P<number>\d+)')
+_AXIS_COLUMN = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?')
+_SAMPLE_COLUMN = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?_?(?P<number>\d+)')
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,8 @@ def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list
 
 
 def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
-    """Read signatures with one row per sample; the other columns identify its signature."""
-    axes = {name: match for name in header if (match := _AXIS.fullmatch(name.lower()))}
+    """Read signatures with one row per sample; other columns identify the signature of a row."""
+    axes = {name: match for name in header if (match := _AXIS_COLUMN.fullmatch(name.lower()))}
     names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
     if not axes:
         raise LabelsError(f'{path}: no column contains a field; expected x, y, z (or x_nt, ...)')
@@ -109,7 +109,7 @@ def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> li
 
 
 def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> str:
-    """Only value of a column, '' if it is missing; raises LabelsError if there are several."""
+    """Return the only value of a column, '' without a column; raises LabelsError if it varies."""
     values = sorted({cells.get(column, '').strip() for _, cells in rows})
     if len(values) > 1:
         raise LabelsError(f'{source} has several values of {column}: {", ".join(values)}')
@@ -120,7 +120,7 @@ def _by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> list[
     """Read signatures with one row per signature, with columns x0, x1, ... (and y0, ...)."""
     axes: dict[tuple[str, str], list[tuple[int, str]]] = {}
     for name in header:
-        match = _SAMPLE.fullmatch(name.lower())
+        match = _SAMPLE_COLUMN.fullmatch(name.lower())
         if match:
             axes.setdefault((match['axis'], match['unit'] or ''), []).append(
                 (int(match['number']), name))
@@ -164,7 +164,7 @@ class _Fields:
         self._path, self._columns, self._unit = path, columns, 'T' if known else ''
 
     def of(self, line: int, cells: dict[str, str]) -> FloatArray:
-        """Field of a row of the table, (n, n_axes)."""
+        """Parse the field samples in a row of the table; return an array (n, n_axes)."""
         return np.array([[number(self._path, line, name, cells[name], False)
                           * UNITS.get(unit, 1.0) for name in names]
                          for _, unit, names in self._columns]).T

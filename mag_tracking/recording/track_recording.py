@@ -158,5 +158,5 @@ class TrackRecording:
                     disturbance.stamp_ns)
 
     def _write(self, name: str, kind: str, content: MessageDict, stamp_ns: int) -> None:
-        """Write a message on a topic of the tracker."""
+        """Write a message on the topic `/tracker_node/<name>`."""
         self._writer.write(f'/tracker_node/{name}', kind, content, stamp_ns)

@@ -15,7 +15,7 @@ from mag_tracking.recording.parquet_table import Column, TableWriter, columns_of
 
 DIRECTIONS = {True: 'forward', False: 'backward'}
 
-_PASSAGE = (
+_PASSAGE_COLUMNS = (
     *columns_of('s', '', recording='name of the recording'),
     *columns_of('i', '', number='index of the passage in chronological order, from 1'),
     *columns_of('i', 'ns', stamp_ns='time at which the middle of the vehicle was on the line'),
@@ -40,15 +40,15 @@ _PASSAGE = (
     *columns_of('f', 'A m^2', mx='magnetic moment, x', my='magnetic moment, y',
                 mz='magnetic moment, z', moment_size='magnitude of the magnetic moment'),
     Column('class', 's', '', 'most probable class, or unknown'))
-_VEHICLE = (
+_VEHICLE_COLUMNS = (
     *columns_of('s', '', vehicle='name of the matching enrolled vehicle, or unknown'),
     *columns_of('f', '', p_vehicle='probability of the vehicle among the enrolled vehicles that '
                                    'can be compared at this heading'))
-_PASSAGE_END = (
+_FINAL_COLUMNS = (
     *columns_of('f', 's', headway='time since the previous vehicle in the same direction'),
     *columns_of('b', '', ambiguous='whether the passage is ambiguous'),
     *columns_of('s', '', doubts='reasons why the passage is ambiguous'))
-_INTERVAL = (
+_INTERVAL_COLUMNS = (
     *columns_of('s', '', recording='name of the recording'),
     *columns_of('i', 'ns', begin_ns='beginning of the interval',
                 end_ns='end of the interval'),
@@ -78,8 +78,9 @@ def tables_of(class_names: Sequence[str], with_fleet: bool) -> dict[str, tuple[C
     """
     classes = tuple(Column(f'p_{name}', 'f', '', f'probability of the class {name}')
                     for name in class_names)
-    vehicle = _VEHICLE if with_fleet else ()
-    return {'passages': (*_PASSAGE, *classes, *vehicle, *_PASSAGE_END), 'intervals': _INTERVAL}
+    vehicle = _VEHICLE_COLUMNS if with_fleet else ()
+    return {'passages': (*_PASSAGE_COLUMNS, *classes, *vehicle, *_FINAL_COLUMNS),
+            'intervals': _INTERVAL_COLUMNS}
 
 
 def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[str],

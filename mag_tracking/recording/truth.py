@@ -21,7 +21,7 @@ TRUTH_TYPES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)
 """Types of messages that carry true poses."""
 _Rows: TypeAlias = tuple[IntArray, FloatArray]
 """Times (n,) [ns], and positions and quaternions (n, 7)."""
-_TIMES = {'stamp_ns': 1, 't': NS, 'time': NS}
+_NS_PER_UNIT = {'stamp_ns': 1, 't': NS, 'time': NS}
 """Nanoseconds per unit, by column."""
 
 
@@ -143,7 +143,7 @@ def read_truth_table(path: str | PathLike[str]) -> dict[str, Truth]:
         If the file is invalid. The message names file, row and column.
     """
     header, rows = read_csv(path)
-    time = next((name for name in _TIMES if name in header), None)
+    time = next((name for name in _NS_PER_UNIT if name in header), None)
     missing = [name for name in ('x', 'y') if name not in header]
     if time is None or missing:
         raise RecordingError(f'{path}: column {(missing or ["stamp_ns, t or time"])[0]} is missing')
@@ -165,7 +165,8 @@ def _stamp(path: str | PathLike[str], line: int, column: str, text: str) -> int:
         stamp = int(text) if column == 'stamp_ns' else None
     except ValueError:
         stamp = None
-    exact = stamp if stamp is not None else number(path, line, column, text, True) * _TIMES[column]
+    exact = stamp if stamp is not None else \
+        number(path, line, column, text, True) * _NS_PER_UNIT[column]
     if abs(exact) > LATEST_NS:
         raise RecordingError(f'{path}: row {line}: {column} is {text.strip()}, not a valid time')
     return round(exact)

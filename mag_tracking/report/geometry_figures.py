@@ -10,7 +10,7 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.report.figures import SCALE_1D
 from mag_tracking.report.literal_text import literal
 
-_SUSPECT = 'tab:red'
+_SUSPECT_COLOUR = 'tab:red'
 _MAX_NAMES = 60
 """Maximum number of sensor names on an axis. In a larger network, only every second, third, ...
 name is drawn."""
@@ -135,7 +135,7 @@ def _plot_displacements(figure: SubFigure, axes: Axes, found: _Survey, suspect: 
     axes.plot(positions[:, a], positions[:, b], 'k.', ms=3, zorder=3, label='nominal positions')
     if suspect.any():
         axes.plot(positions[suspect, a], positions[suspect, b], 'o', ms=12, mfc='none', mew=1.5,
-                  color=_SUSPECT, label='does not fit')
+                  color=_SUSPECT_COLOUR, label='does not fit')
     if len(positions) <= _MAX_NAMES:
         for name, position in zip(found.network.names, positions, strict=True):
             axes.annotate(literal(name), position[[a, b]], xytext=(3, -8),
@@ -182,7 +182,7 @@ def _plot_residuals(axes: Axes, along: IntArray, residual: FloatArray, suspect: 
                     title: str) -> None:
     """Plot the residuals of the sensors as bars; bars of suspect sensors are red."""
     axes.bar(along, np.nan_to_num(residual), width=0.8,
-             color=np.where(suspect, _SUSPECT, 'tab:blue').tolist())
+             color=np.where(suspect, _SUSPECT_COLOUR, 'tab:blue').tolist())
     axes.axhline(1.0, color='k', lw=0.8, ls=':')
     axes.set_title(title, fontsize=10, loc='left')
     axes.grid(alpha=0.3)
@@ -193,7 +193,7 @@ def _plot_pose_residuals(axes: Axes, found: _Survey) -> None:
     suspect = np.isin(found.rows, found.suspect_rows)
     residual = found.geometry.pose_residual
     axes.plot(found.rows[~suspect], residual[~suspect], '.', ms=4, color='tab:blue')
-    axes.plot(found.rows[suspect], residual[suspect], 'o', ms=5, color=_SUSPECT)
+    axes.plot(found.rows[suspect], residual[suspect], 'o', ms=5, color=_SUSPECT_COLOUR)
     axes.set_ylim(0.0)
     axes.axhline(1.0, color='k', lw=0.8, ls=':')
     axes.set_title('residual of the poses, relative to the noise'

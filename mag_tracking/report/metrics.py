@@ -120,8 +120,8 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
     ----------
     logs : iterable of TrackLog
     truths : iterable of Truth
-        A pose is wrong if it is wrong, as defined by `WRONG_M`, for every target whose truth covers
-        the time of the pose.
+        A pose is wrong if its error exceeds `WRONG_M` and `WRONG_STD` standard deviations for every
+        target whose truth covers the time of the pose.
 
     Returns
     -------

@@ -13,7 +13,7 @@ from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
 MAX_SENSORS = 8
-"""Maximum number of sensors per track whose fields are included. The strongest are selected."""
+"""Maximum number of sensors per track; those with the strongest fields are included."""
 MAX_BYTES = 4_000_000
 """Approximate size limit of the track data [bytes]. Larger reports show fewer poses per track."""
 MAX_TRACKS = 1_000
@@ -278,7 +278,7 @@ def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _array(values: Sequence[FloatArray], *shape: int) -> FloatArray:
-    """Stack arrays to an array (n, *shape), also for n = 0."""
+    """Stack n arrays into one array (n, *shape), also for n = 0."""
     return np.array(values, dtype=float).reshape(-1, *shape)
 
 
@@ -303,7 +303,7 @@ def _columns(times: FloatArray, position: FloatArray, velocity: FloatArray, C: F
 
 
 def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Packed]:
-    """Normalised innovation squared per axis, and its 90 % band for a consistent filter."""
+    """NIS per axis of each pose, and the 90 % band of the NIS of a consistent filter."""
     n, axes = degrees_of_freedom, np.maximum(degrees_of_freedom, 1.0)
     low, high = (np.where(n > 0.0, chdtri(axes, p) / axes, np.nan) for p in (0.95, 0.05))
     return {'nis': packed(np.where(n > 0.0, nis / axes, np.nan), 'f4'),
@@ -311,7 +311,7 @@ def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Pa
 
 
 def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]]:
-    """Weight and best hypothesis of each arrival direction; weight 0 and NaN where it is absent."""
+    """Weight and best hypothesis by arrival direction; 0 and NaN at poses without the direction."""
     log_rows = [log.arrivals[k] for k in rows]
     out = {}
     for name in sorted({name for row in log_rows for name in row}):
@@ -328,7 +328,7 @@ def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]
 
 
 def _fields(log: TrackLog, rows: Sequence[int], sensors: IntArray) -> list[dict[str, Any]]:
-    """Fields of the selected sensors at the times of the poses."""
+    """Measured and predicted fields of the selected sensors, as returned by `field_entry`."""
     measured = np.array([log.measured[k] for k in rows]).reshape(-1, len(log.measured[0]), 3)
     predicted = np.array([log.predicted[k] for k in rows]).reshape(measured.shape)
     return [field_entry(j, measured[:, j], predicted[:, j]) for j in sensors.tolist()]

@@ -114,7 +114,7 @@ def _levels(values: FloatArray, factor: float) -> FloatArray:
 
 
 def position_figure(plan: _Plan) -> Figure:
-    """Plot a map of the position bound (standard deviation) from a whole pass through each point.
+    """Plot a map of the position's Cramér-Rao bound (std) for a whole pass through each point.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def detection_figure(plan: _Plan) -> Figure:
 
 
 def sensor_figure(plan: _Plan) -> Figure:
-    """Plot a map of how much an additional sensor at each point reduces the median bound.
+    """Plot the relative reduction of the median bound by an additional sensor at each point.
 
     The map is white where no sensor is allowed.
 

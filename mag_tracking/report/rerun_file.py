@@ -41,7 +41,7 @@ def check_rerun() -> None:
 
 def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, TrackLog],
                 smoothed: Mapping[int, SmoothedLog]) -> None:
-    """Write a Rerun recording of the sensors and of the poses, 90 % regions, speeds and fields.
+    """Write sensors and tracks (poses, 90 % regions, speeds, fields) to a Rerun recording.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ class SmoothedLog:
 
 @dataclass
 class TrackLog:
-    """History of one track. Each list has one element per frame: values of `Track` or the frame."""
+    """History of one track. Each list has one element per pose, from the `Track` or its frame."""
 
     id: int
     stamp_ns: list[int] = field(default_factory=list)
@@ -115,7 +115,7 @@ class TrackLog:
                 del values[:n]
 
     def seconds(self) -> FloatArray:
-        """Time since the first pose.
+        """Time of each pose since the first pose.
 
         Returns
         -------

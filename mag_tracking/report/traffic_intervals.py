@@ -37,7 +37,7 @@ class TrafficIntervals:
         self._last_ns: int | None = None
 
     def add(self, passage: VehiclePassage) -> None:
-        """Add a passage. If its interval is closed, it is counted in the earliest open interval.
+        """Add a passage to its interval, or to the earliest open interval if its own is closed.
 
         Parameters
         ----------
@@ -85,7 +85,7 @@ class TrafficIntervals:
         return stamp_ns // self._length * self._length
 
     def _observe(self, now_ns: int) -> None:
-        """Add the time since the previous frame to the observed time of each interval it covers."""
+        """Add the time since the previous frame to the observed times, divided by interval."""
         self._observed.setdefault(self._begin_of(now_ns), 0)
         last_ns, self._last_ns = self._last_ns, now_ns
         if last_ns is None or now_ns - last_ns > MAX_GAP_S * NS:

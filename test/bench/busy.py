@@ -34,7 +34,7 @@ AIMS = {'meeting': (1.0, 4.0, 1.0), 'meeting more': (0.7, 3.0, 1.0),
 """{kind of recording: (median RMS [m], median NEES of two axes, fraction of vehicles found)}, or
 None for a figure without an aim."""
 MIN_MEETING = 15 / 16
-"""With two sensors, one of sixteen vehicles may be missed."""
+"""Minimum fraction of meeting vehicles that two sensors must find: one of sixteen may be missed."""
 MAX_WRONG, MAX_COST = 0.01, 4.0
 N_HYP, RUNS = 20, 25
 
@@ -72,7 +72,7 @@ def timed_searches():
 
 
 def recordings(figures, folder):
-    """Track the recordings; return the numbers [(unflagged poses, wrong unflagged poses)]."""
+    """Track the recordings; return their numbers of [(unflagged, wrong unflagged)] poses."""
     counted = []
     for path in with_progress_bar(sorted(folder.glob('*.truth.json')), 'recordings'):
         name = path.name.removesuffix('.truth.json')
@@ -96,7 +96,7 @@ def recordings(figures, folder):
 
 
 def simulated(figures, seeds):
-    """Track worlds of the second simulator; return [(unflagged poses, wrong unflagged poses)]."""
+    """Track worlds of the second simulator; return [(unflagged, wrong unflagged)] pose counts."""
     counted = []
     for how in ('meeting', 'following', 'traffic'):
         scores = [tracked(busy(how, n, 'boxes', seed))[0]
@@ -111,7 +111,7 @@ def simulated(figures, seeds):
 
 
 def single_vehicles(passes):
-    """Track single vehicles; return the numbers [(unflagged poses, wrong unflagged poses)].
+    """Track single vehicles; return the numbers of [(unflagged, wrong unflagged)] poses.
 
     The vehicles are in the bundled recordings, and in passes of each kind of the second simulator.
     """
@@ -134,7 +134,7 @@ def single_vehicles(passes):
 
 
 def cost():
-    """Ratio of the times of a frame with two vehicles and with one vehicle, for equal banks."""
+    """Ratio of the time of a frame with two vehicles to the time with one, for equal banks."""
     settings, network = settings_for('vehicle').track, NETWORKS[2]
     model, C = vehicle_model(settings.vehicle, network), np.tile(3.6e-17 * np.eye(3), (2, 1, 1))
     frame = FieldFrame(0, np.full((2, 3), 2e-8), C, np.full(2, 4), np.zeros(2), True)

@@ -31,7 +31,7 @@ FRACTIONS = {'motorcycle': 0.05, 'car': 0.8, 'truck': 0.15}
 """Fractions of the classes, as in `traffic.class_shares`."""
 N = 120
 """Number of passes per simulator."""
-EXAMPLES = {'motorcycle': 30, 'car': 160, 'truck': 30}
+EXAMPLE_COUNTS = {'motorcycle': 30, 'car': 160, 'truck': 30}
 """Number of signatures of each class."""
 MIN_CORRECT, MAX_CALIBRATION_ERROR = 0.95, 0.05
 
@@ -82,7 +82,7 @@ def main():
         figures.add(f'{simulator}: expected calibration error',
                     expected_calibration_error(probability, is_best), '', MAX_CALIBRATION_ERROR)
     for simulator in SIMULATORS:
-        examples = examples_of(signatures(EXAMPLES, simulator))
+        examples = examples_of(signatures(EXAMPLE_COUNTS, simulator))
         found = evaluate_classes(examples, progress=partial(
             tqdm, desc='splits', disable=None, leave=False))
         figures.add(f'{simulator}, one sensor: accuracy', float(found.accuracy.mean()), '', None,

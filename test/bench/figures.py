@@ -20,8 +20,8 @@ from support.bundled import ROOT
 
 FOLDER = ROOT / 'benchmarks'
 LATEST, HISTORY = FOLDER / 'latest.json', FOLDER / 'history.jsonl'
-WORSE = 1.15
-"""Factor beyond which a figure is reported as worse."""
+MAX_RATIO = 1.15
+"""Factor by which a reported figure is worse than the best earlier figure."""
 RUNS = 5
 RED, PLAIN = '\033[31m', '\033[0m'
 
@@ -97,7 +97,7 @@ def worse(run, before):
             more = figure['more_is_better']
             best = max(earlier) if more else min(earlier)
             value = figure['value']
-            if not (value * WORSE >= best if more else value <= WORSE * best):
+            if not (value * MAX_RATIO >= best if more else value <= MAX_RATIO * best):
                 out.append((benchmark, name, figure, best))
     return out
 

@@ -7,8 +7,8 @@
 
 Driver, calibration, detection and tracker run as processes; a simulator in the driver replaces the
 hardware. The figures are the delay of a pose after the sample that completed its frame, by the
-clock of this machine, the CPU time of all nodes, their memory growth, and the number of kinds of
-losses.
+clock of this machine, the CPU time of all nodes, their memory growth, and the number of loss
+counters that increased.
 The aim is a median delay of 10 ms, or 5 ms with all nodes in one process, without losses. The exit
 status is 1 if a sample or a frame is lost.
 """
@@ -113,7 +113,7 @@ class PoseMonitor:
             self._total_losses(), [], [], {}
 
     def losses(self):
-        """Number of losses since `begin`, by counter; counters without losses are omitted."""
+        """Losses since `begin` by counter, without the counters that have not increased."""
         return {k: n - self._initial_losses.get(k, 0) for k, n in self._total_losses().items()
                 if n != self._initial_losses.get(k, 0)}
 

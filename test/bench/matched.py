@@ -1,4 +1,4 @@
-"""Error of the tracker relative to the path bound, for targets that match its model.
+"""Error of the tracker relative to the Cramér-Rao bound, for targets that match its model.
 
 Points and rows of three dipoles are drawn from a wide prior, moved with the process noise of the
 model and measured with the noise of two sensors. The tracker starts at the first frame. The bound
@@ -71,7 +71,7 @@ def prior_of(settings, n_t):
 
 
 def truths(model, settings, rng):
-    """Draw a truth from the prior; return its states (n_x,), F and Q as lists over the steps."""
+    """Draw a true trajectory; return the lists of states (n_x,), F and Q over the steps."""
     n_t = len(model.state_names)
     x0, P0 = prior_of(settings, n_t)
     states, F, Q = [rng.multivariate_normal(x0, P0, method='eigh')], [np.eye(n_t + 6)], []
@@ -87,7 +87,7 @@ def truths(model, settings, rng):
 
 
 def one_run(target, seed):
-    """Track one target; return (horizontal error [m], its bound [m]) at each step."""
+    """Track one target; return (horizontal error [m], bound on its RMS [m]) at each step."""
     settings = settings_for('vehicle', TARGETS[target]).track
     model, rng = vehicle_model(settings.vehicle, NETWORK), np.random.default_rng(seed)
     n_t = len(model.state_names)

@@ -19,7 +19,7 @@ PAGES, MAX_WORSE = 10, 1.10
 
 
 def main():
-    """Print the ratio; return 1 if the aim is missed or something was lost."""
+    """Print the ratio; return 1 if the aim is missed or if there were losses."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--rounds', type=int, default=3)
     parser.add_argument('--minutes', type=float, default=1.0)
@@ -38,7 +38,7 @@ def main():
     without, with_pages = np.median(p99[0]), np.median(p99[PAGES])
     print(f'99 % of the poses within {without:.1f} ms without pages, with {PAGES} pages within '
           f'{with_pages:.1f} ms: ratio {with_pages / without:.2f} (aim {MAX_WORSE}); '
-          f'{"something" if has_losses else "nothing"} was lost')
+          f'{"with" if has_losses else "without"} losses')
     figures = Figures('pages')
     figures.keep(f'99 % latency with {PAGES} pages over that without', with_pages / without,
                  'times', MAX_WORSE)

@@ -33,7 +33,7 @@ from support.situation_worlds import FOUR, car, straight, usual
 
 RUNS = 5
 """Number of simulated passes of each control and simulator."""
-MIN_CONFIDENCE = 0.95
+MIN_UNFLAGGED_RATIO = 0.95
 """Minimum ratio of the number of unflagged poses to the number with the other checkout, for correct
 poses in each row and for all poses in the total."""
 MAX_ERROR = 1.03
@@ -124,7 +124,7 @@ def measure_checkout(checkout):
 def is_worse(name, figure, now, before):
     """Whether a figure is worse than before by more than its tolerance."""
     if RIGHT in figure or (name, figure) == ('all', SURE):
-        return now < MIN_CONFIDENCE * before
+        return now < MIN_UNFLAGGED_RATIO * before
     if SURE in figure:
         return False  # A decrease is an improvement if the poses were wrong.
     return now > max(MAX_ERROR * before, 1.0 if 'ANEES' in figure else 0.0)

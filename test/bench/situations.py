@@ -1,4 +1,4 @@
-"""Wrong poses without a flag, in situations that no model assumes.
+"""Wrong poses without a flag, in situations that violate the model assumptions.
 
 Each situation is simulated by two simulators and tracked live, by default with two sensors. The
 figure is the fraction of poses without a flag that are more than 2 m and three standard deviations

@@ -23,13 +23,13 @@ MAX_WRONG, MIN_SPEED = 0.01, 0.9
 
 
 def fraction_of_wrong(found):
-    """Number of unflagged poses of [`Tracked`], and fraction of wrong poses among them."""
+    """Count the unflagged poses of [`Tracked`]; return (number, fraction of wrong poses)."""
     n_sure = sum(int((~f.ambiguous).sum()) for f in found)
     return n_sure, sum(int(f.sure_and_wrong.sum()) for f in found) / max(n_sure, 1)
 
 
 def count_over(products, one_pass, n, summary):
-    """Run `n` passes per product (str, ...), and print summaries; return 1 if an aim is missed."""
+    """Run `n` passes of each combination, and print its summary; return 1 if an aim is missed."""
     met = True
     with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
         jobs = {p: [pool.submit(one_pass, *p, seed) for seed in range(n)] for p in products}

@@ -28,7 +28,7 @@ STEP = np.array([0.0, 4e-7, 0.0])
 
 
 def readings(begin_s, seconds, seed, step=0.0):
-    """Simulated samples of mag_1, with the Earth's field plus `step`."""
+    """Simulate samples of mag_1 in the Earth field plus `step` [T]."""
     rng = np.random.default_rng(seed)
     return [MagSample(int((begin_s + k / RATE) * NS), 'mag_1',
                       EARTH + step + STD * rng.standard_normal(3))
@@ -126,7 +126,7 @@ def test_a_changed_calibration_discards_stored_backgrounds(tmp_path, change):
 
 
 def test_a_sensor_moved_before_the_restart_is_relearnt_soon(tmp_path):
-    """It is relearnt even if `relearn_s` is 0, which disables the relearning of steady changes."""
+    """The background is relearnt even with `relearn_s` = 0, which disables usual relearning."""
     network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
     stage.resume(stored)

@@ -1,4 +1,4 @@
-"""Recordings are readable by other software, and are read in spite of damage."""
+"""Recordings: other software can read them, and the reader tolerates damaged files."""
 
 import io
 import re

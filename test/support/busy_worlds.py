@@ -129,7 +129,7 @@ FOUND_M = 5.0
 
 
 def score(poses, vehicles):
-    """`Score` of poses (`Track` records) for vehicles [(t (n,) [s], position (n, 2) [m])]."""
+    """Compute the `Score` of `Track` records for vehicles [(t (n,) [s], position (n, 2) [m])]."""
     of_track = {i: [p for p in poses if p.id == i] for i in sorted({p.id for p in poses})}
     candidates, sure = [], [p for p in poses if not p.ambiguous]
     wrong = np.ones(len(sure), dtype=bool)
@@ -156,7 +156,7 @@ def score(poses, vehicles):
 
 
 def _outside(poses, t):
-    """Whether each pose is before or after the true trajectory, (n,)."""
+    """Whether the time of each pose is outside the times `t` of the true trajectory, (n,)."""
     stamps = np.array([p.stamp_ns for p in poses]) / 1e9
     return (stamps < t[0]) | (stamps > t[-1])
 

@@ -9,7 +9,7 @@ from support.spoilt_runs import recorded
 
 
 def traffic(gap, begin=0.0, end=np.inf, size=2e-6, seed=0):
-    """Function from a time [s] to the field (3,) [T] of random vehicles about every `gap` [s]."""
+    """Create a function t [s] -> field (3,) [T] of random vehicles at intervals of about `gap`."""
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(0.7, 1.3, 200) * gap) + begin
     times, sizes = times[times < end], size * rng.normal(size=(200, 3))

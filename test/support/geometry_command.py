@@ -29,7 +29,7 @@ def command(table, *options, out):
 
 
 def through_calibrate(network, readings):
-    """Calibrate raw readings (K, n, 3) by the stage; NaN where the stage returns no reading."""
+    """Calibrate raw readings (K, n, 3) with a `Calibrate` stage; NaN where it returns none."""
     stage = Calibrate(network, settings_for('magnet').calibrate)
     out = np.full(readings.shape, np.nan)
     for k, frame in enumerate(readings):

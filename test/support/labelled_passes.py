@@ -35,7 +35,7 @@ def signature(rng, name, simulator, n_axes=3):
 
 
 def signatures(counts, simulator, seed=0, n_axes=3):
-    """Generate the number of signatures given by `counts` ({class: number})."""
+    """Generate random signatures; `counts` is {class: number of signatures}."""
     rng = np.random.default_rng(seed)
     return [signature(rng, name, simulator, n_axes) for name, n in counts.items()
             for _ in range(n)]

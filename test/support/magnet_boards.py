@@ -67,7 +67,7 @@ def simulated(seed, n_poses=40, network=None, settings=SETTINGS):
 
 
 def estimated(geometry, network):
-    """Estimated unknowns (10 n + 12,) of a `NetworkGeometry`, in the order of its covariance."""
+    """Estimated unknowns (10 n + 12,) of a `NetworkGeometry`, ordered as in its covariance."""
     n = len(network)
     rotations = [_rotation_vector(a.T @ b)
                  for a, b in zip(network.R_ws, geometry.network.R_ws, strict=True)]

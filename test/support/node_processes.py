@@ -48,7 +48,7 @@ def stop(processes):
 
 
 def without_states(output):
-    """Output of nodes without INFO lines."""
+    """Remove the INFO lines from the output of nodes."""
     return ''.join(line for line in output.splitlines(keepends=True)
                    if not line.startswith('[INFO]'))
 

@@ -25,8 +25,8 @@ from support.node_processes import MAX_S, start, stop
 from support.roadside import NOISE, Roadside
 from support.serial_line import SerialLine
 
-WRONG = chi2.ppf(1.0 - 1e-4, 2)
-"""A pose is wrong if its squared error, normalised by its covariance, exceeds this."""
+MAX_NEES = chi2.ppf(1.0 - 1e-4, 2)
+"""Maximum NEES of a correct pose, with two degrees of freedom."""
 BODY = point_body([0.0, 300.0, -300.0], 5.0, 0.5)
 """Vehicle whose hard and soft iron do not cancel, so that it is detected at 12 m."""
 TOPICS = {'driver_node': (MagneticField, '/mag_1/imu/mag'),
@@ -141,12 +141,12 @@ class World:
         self.pause(0.05)
 
     def publishers(self):
-        """Discovered publishers of diagnostics, including publishers of killed nodes."""
+        """Identifiers of the discovered publishers of diagnostics, also those of killed nodes."""
         return {tuple(p.endpoint_gid) for p in
                 self.node.get_publishers_info_by_topic('/diagnostics')}
 
     def recovery(self, name):
-        """Start a node; return the seconds until it is up and from then to its first output."""
+        """Start a node; return (seconds until it is up, seconds from then to its first output)."""
         # A node is up when its publisher appears, or at its first output. The tracker has no output
         # without a vehicle, so the first frame that it counts is used instead.
         known, began_ns = self.publishers(), time.time_ns()
@@ -187,7 +187,10 @@ class World:
         return [entry for entry in self.heard[name] if entry[0] > since_ns]
 
     def statuses_since(self, since_ns, name, *words):
-        """Statuses called `name` after `since_ns` whose messages contain all `words`."""
+        """Select the received statuses `name` after `since_ns` that contain all `words`.
+
+        Returns [(arrival [ns], DiagnosticStatus)].
+        """
         return [(arrival, s) for arrival, s in self.statuses
                 if arrival > since_ns and s.name == name
                 and all(word in s.message for word in words)]
@@ -204,7 +207,7 @@ class World:
         return frames and not frames[-1][1].target_present and self.roadside.is_gone()
 
     def call(self):
-        """Start a vehicle after the previous vehicle has left; return the time [ns]."""
+        """Start a vehicle after the previous vehicle has left; return the start time [ns]."""
         assert self.wait(self.is_quiet)
         self.roadside.call()
         return time.time_ns()
@@ -220,9 +223,9 @@ class World:
 
 
 def is_wrong(track, truth):
-    """Whether a pose is unflagged and its normalised squared error exceeds `WRONG`."""
+    """Whether a pose is unflagged and its NEES exceeds `MAX_NEES`."""
     e = track.position[:2] - truth
-    return not track.ambiguous and e @ np.linalg.solve(track.covariance[:2, :2], e) > WRONG
+    return not track.ambiguous and e @ np.linalg.solve(track.covariance[:2, :2], e) > MAX_NEES
 
 
 @contextmanager

@@ -63,7 +63,7 @@ def together(first, second):
 
 
 def unknowns_at(path, moments, seconds):
-    """Unknowns of a fit whose time zero is `seconds` later than time zero of `path`."""
+    """Shift time zero of `path` later by `seconds`; return path and moments as fit unknowns."""
     moved = path.copy()
     moved[:3] += seconds * path[3:6]
     return np.concatenate([moved, moments.ravel()])

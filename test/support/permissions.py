@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 VERSION = 0x20080522
 """_LINUX_CAPABILITY_VERSION_3 of the system call."""
-OVERRIDING = 1 << 1 | 1 << 2
+OVERRIDE_BITS = 1 << 1 | 1 << 2
 """Bits of CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH."""
 
 
@@ -20,7 +20,7 @@ def as_files_say():
     header, rows = (ctypes.c_uint32 * 2)(VERSION, 0), (ctypes.c_uint32 * 6)()
     assert libc.capget(header, rows) == 0
     before = rows[0]
-    rows[0] &= ~OVERRIDING
+    rows[0] &= ~OVERRIDE_BITS
     assert libc.capset(header, rows) == 0
     try:
         yield

@@ -18,7 +18,7 @@ class Gains:
     """
 
     A: np.ndarray
-    """Complete derivative [H | I], (n_hyp, n_sensors, 3, n_x)."""
+    """Jacobian [H | I] for all states, (n_hyp, n_sensors, 3, n_x)."""
     G: np.ndarray
     """Whitened gain, (n_hyp, n_sensors, 3, n_x)."""
     z: np.ndarray

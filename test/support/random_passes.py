@@ -126,9 +126,9 @@ def tracked(network, body, course, duration, flaws, seed, changes=None, faults=(
 
 
 def one_random_pass(simulator, kind, seed, changes=None, faults=()):
-    """Simulate a random pass with `faults`, and track it with the settings `changes`; `Tracked`.
+    """Simulate a random pass with `faults`, and track it with the settings `changes`.
 
-    The network is the bundled network.
+    The network is the bundled network. Returns `Tracked`.
     """
     return tracked(read_network(NETWORK_FILE), *random_pass(simulator, kind, seed), seed, changes,
                    faults)

@@ -36,7 +36,7 @@ def numbers(path, topic=TOPIC):
 
 
 def by_rosbags(path, topic=TOPIC):
-    """Read a recording by rosbags; return [(time, number)]."""
+    """Read a recording with the library `rosbags`; return [(time, number)]."""
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         rows = [(t, reader.deserialize(raw, c.msgtype).header.stamp)
                 for c, t, raw in reader.messages() if c.topic == topic]

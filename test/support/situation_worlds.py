@@ -73,7 +73,9 @@ def straight(rng, simulator, body, speed, network=ROAD, **of_lane):
 
 
 def stop_and(rng, stop_s, then):
-    """(`Ride`, duration [s]) that stops near the sensors, then continues at `then` times the speed.
+    """Random `Ride` that stops near the sensors, then continues at `then` times its speed.
+
+    Returns (ride, duration [s]).
     """
     speed = rng.uniform(6.0, 12.0)
     brake = rng.uniform(1.5, 3.0)

@@ -9,15 +9,15 @@ from support.random_passes import SIMULATORS, errors_of
 from support.situations import simulated_world, wrong_of
 
 STOPS = ('stops for 5 s', 'stops for 20 s', 'stops for 60 s')
-STANDING = 0.05
+MAX_STOPPED_SPEED = 0.05
 """[m/s] Speed below which a vehicle counts as stopped."""
-RIGHT = 2.0
+MAX_BACKGROUND_ERROR = 2.0
 """Maximum error of a correct background, in standard deviations of a reading."""
 SOON_S = 3.0
 """[s] Maximum time from the departure of a parked vehicle until the background is correct."""
 TRACKED_M = 2.0
 """[m] Maximum median error of a tracked vehicle."""
-PART = 50
+BATCH_SIZE = 50
 """Number of readings per batch."""
 
 
@@ -28,7 +28,7 @@ def poses_of(records):
 def stands(a_world, body=0):
     """(begin, end) [s] of the stop of a body in a `World`."""
     velocity = np.gradient(a_world.positions[body], a_world.t, axis=0)
-    still = a_world.t[np.linalg.norm(velocity, axis=1) < STANDING]
+    still = a_world.t[np.linalg.norm(velocity, axis=1) < MAX_STOPPED_SPEED]
     return still.min(), still.max()
 
 
@@ -46,8 +46,8 @@ def is_one_track(name, run):
 
 def background_recovery_s(run):
     """Time [s] from a vehicle's departure until all backgrounds remain correct; inf if never."""
-    # The vehicle has left when no sensor differs from its final level by more than `RIGHT`. The
-    # stage runs as in live operation, without a first pass over the readings.
+    # The vehicle has left when no sensor differs from its final level by more than
+    # `MAX_BACKGROUND_ERROR`. The stage runs as in live operation, without a prescan.
     a_world = simulated_world('there at the start, leaves', SIMULATORS[run % 2], run // 2)
     stage = Pipeline(a_world.network, settings_for('vehicle')).calibrate
     readings, names = a_world.readings, a_world.network.names
@@ -58,14 +58,14 @@ def background_recovery_s(run):
     width = 25
     smooth = np.stack([[np.convolve(field[:, j, a], np.ones(width) / width, 'same')
                         for a in range(3)] for j in range(n)]).transpose(2, 0, 1)
-    deviates = (np.abs(smooth - level) > RIGHT * std).any(axis=(1, 2))[width:-width]
+    deviates = (np.abs(smooth - level) > MAX_BACKGROUND_ERROR * std).any(axis=(1, 2))[width:-width]
     departure = a_world.t[width + np.flatnonzero(deviates).max()]
     times, is_correct = [], []
-    for a in range(0, len(readings), PART):
-        stage.feed(readings.part(slice(a, a + PART)))
-        times.append(readings.stamp_ns[min(a + PART, len(readings)) - 1] / 1e9)
+    for a in range(0, len(readings), BATCH_SIZE):
+        stage.feed(readings.part(slice(a, a + BATCH_SIZE)))
+        times.append(readings.stamp_ns[min(a + BATCH_SIZE, len(readings)) - 1] / 1e9)
         is_correct.append(not stage.unready() and all(
-            (np.abs(stage.background(name) - level[j]) < RIGHT * std[j]).all()
+            (np.abs(stage.background(name) - level[j]) < MAX_BACKGROUND_ERROR * std[j]).all()
             for j, name in enumerate(names)))
     wrong = np.flatnonzero(~np.array(is_correct))
     return np.inf if wrong.max() == len(times) - 1 else max(
@@ -75,7 +75,7 @@ def background_recovery_s(run):
 def error_after_parked(run):
     """(median error [m] or inf, n_sure, n_wrong) of the first vehicle after the parked vehicle.
 
-    The recording is processed offline, with a first pass.
+    The readings are processed offline, with a prescan.
     """
     a_world = simulated_world('there at the start, then cars', SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))

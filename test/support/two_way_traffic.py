@@ -135,7 +135,7 @@ class Shares:
 
 
 def shares(vehicles, log_odds):
-    """`Shares` of vehicles (`Passing`) with ([log odds of each sensor], fused log odds) each."""
+    """Compute the `Shares` of [`Passing`] from [([log odds of each sensor], fused log odds)]."""
     north = np.array([v.is_north for v in vehicles])
     near = np.array([v.near for v in vehicles])
     single = (np.array([each for each, _ in log_odds]) > 0.0) == north[:, None]
