@@ -133,6 +133,7 @@ def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: Fl
         Bias [T, sensor frame], gain minus one, rotation vector [rad, nominal sensor frame],
         position minus the nominal position [m, world frame].
     shared : (12,) array
+        As for `TrackedMagnet.poses`.
     pose : (K, 8) array
         As for `TrackedMagnet.poses`.
 

@@ -32,7 +32,8 @@ equivalent to a point. The maximum length is the distance travelled."""
 class Bearing:
     """Observable quantities of a pass at a single sensor, relative to the sensor.
 
-    The distance is not observable. The path reversed through the sensor has the same field.
+    The distance is not observable. Reflecting the path through the sensor leaves the
+    field unchanged.
     """
 
     cpa_direction: FloatArray

@@ -48,7 +48,7 @@ def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Pa
     -------
     Page
     """
-    notes = [Note(ERROR if f.serious else NOTE, f'{f.subject}: {f.what}. {f.advice}')
+    notes = [Note(ERROR if f.serious else NOTE, str(f))
              for f in findings] or [Note(NOTE, 'no faults found')]
     serious = sum(f.serious for f in findings)
     numbers = (f'{quantity(serious, "serious finding")}, '

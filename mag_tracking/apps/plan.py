@@ -100,7 +100,8 @@ def detection_range(target: PlannedTarget, noise_std: float, n_axes: int,
                     false_alarm: float) -> float:
     """Compute the approximate range at which a frame of one sensor detects half of the targets.
 
-    Averaged over all directions of the moment, the energy is twice the energy of a dipole abeam.
+    The mean signal energy over all directions of the moment is used. It is twice the energy
+    perpendicular to the axis of the dipole.
 
     Parameters
     ----------

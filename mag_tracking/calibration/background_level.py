@@ -125,7 +125,7 @@ class BackgroundLevel:
     def covariance(self) -> FloatArray | None:
         """Noise covariance of one sample, (3, 3) T²; None if unknown, NaN for an unreported axis.
 
-        The variance due to the sensor's steps is included.
+        Includes the quantisation variance of the sensor.
         """
         if self.noise is None:
             return None

@@ -44,11 +44,12 @@ class LevelDeparture:
     blocks : deque of Block
         Blocks since the departure began.
     former : FormerLevel or None
-        The level that was the background before the present background.
+        Previous background.
     has_arrived : bool
         Whether a vehicle has arrived and is present.
     was_steady : bool
-        Whether the sensor was at another steady level for long enough during the departure.
+        Whether the sensor stayed at another steady level for the required duration during the
+        departure.
     departed_at : float or None, s
         Time by which a vehicle present at the start had departed; None if undetected.
     """

@@ -81,8 +81,8 @@ def _parse_sensor(name: str, entry: Any) -> dict[str, Any]:
             'imu_topics': None if imu_topic is None else _check_topic(label, 'imu_topic',
                                                                       imu_topic),
             'noise_std': _parse_noise(label, entry.get('noise_std')),
-            'background': _parse_small_field(label, 'background', entry.get('background')),
-            'offset': _parse_small_field(label, 'offset', entry.get('offset')),
+            'background': _parse_field(label, 'background', entry.get('background')),
+            'offset': _parse_field(label, 'offset', entry.get('offset')),
             'correction': _parse_correction(label, entry.get('correction')),
             'orientation_std': _parse_orientation_std(label, entry.get('orientation_std_deg')),
             'clock_offset': _parse_clock_offset(label, entry.get('clock_offset', 0.0)),
@@ -101,7 +101,7 @@ def _parse_noise(label: str, noise: object) -> FloatArray | None:
     return std
 
 
-def _parse_small_field(label: str, key: str, value: object) -> FloatArray | None:
+def _parse_field(label: str, key: str, value: object) -> FloatArray | None:
     """Parse a field (3,) [T] of at most 0.1 T from three numbers."""
     if value is None:
         return None

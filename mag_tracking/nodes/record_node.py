@@ -73,7 +73,7 @@ class _PolledSubscription:
         return out
 
     def _count_lost(self, number: int | None) -> None:
-        """Count the messages lost before sequence number `number`, for at most one publisher."""
+        """Count the messages lost before sequence number `number`, if there is one publisher."""
         if number is None or len(self.publishers) > 1:
             self.last_number = None
             return

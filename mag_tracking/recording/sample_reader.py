@@ -72,18 +72,18 @@ class SampleReader:
         self._truth = TruthTopics(absolute(TRUTH_PREFIX, self.namespace), network.frame, truth)
         if truth is not None and recording.types and not self._truth.accepts(
                 truth, recording.types.get(truth, '')):
-            poses = sorted(t for t, kind in recording.types.items() if kind in TRUTH_TYPES)
+            pose_topics = sorted(t for t, kind in recording.types.items() if kind in TRUTH_TYPES)
             raise RecordingError(f'{recording.path}: the truth topic {truth} has no poses: it is '
                                  f'{recording.types.get(truth, "not in the recording")}; '
-                                 f'topics with poses: {", ".join(poses) or "none found"}')
+                                 f'topics with poses: {", ".join(pose_topics) or "none found"}')
         self.rejected: Counter[str] = Counter()
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
         if recording.types and not self._is_batched \
                 and not any(t in recording.types for t in self._sensors):
-            fields = sorted(t for t, k in recording.types.items() if k == MAGNETIC_FIELD)
+            field_topics = sorted(t for t, k in recording.types.items() if k == MAGNETIC_FIELD)
             raise RecordingError(
                 f'{recording.path} has none of the network\'s topics ({", ".join(self._sensors)}); '
-                f'topics with magnetic fields: {", ".join(fields) or "none found"}')
+                f'topics with magnetic fields: {", ".join(field_topics) or "none found"}')
         for topic in self._sensors:
             kind = recording.types.get(topic)
             if kind not in (None, MAGNETIC_FIELD):

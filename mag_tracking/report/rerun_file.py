@@ -105,7 +105,7 @@ def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> No
 
 
 def _ellipsoid(C: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Half axes (3,) [m] and quaternion xyzw of the 90 % region of a covariance."""
+    """Semi-axes (3,) [m] and quaternion xyzw of the 90 % ellipsoid of a covariance."""
     values, R = np.linalg.eigh(C)
     if np.linalg.det(R) < 0.0:
         R = -R

@@ -96,7 +96,7 @@ def recordings(figures, folder):
 
 
 def simulated(figures, seeds):
-    """Track worlds of the second simulator; return [(unflagged, wrong unflagged)] pose counts."""
+    """Track the worlds of the second simulator; return [(unflagged, unflagged and wrong)] poses."""
     counted = []
     for how in ('meeting', 'following', 'traffic'):
         scores = [tracked(busy(how, n, 'boxes', seed))[0]

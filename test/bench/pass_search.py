@@ -2,9 +2,10 @@
 
 Random passes of rows of one, two and three dipoles are simulated at 100 Hz, along the road and with
 any heading. The optimum is found if the cost is not above the minimum at the truth (aim: 99 %). The
-time includes the whole fit, with search and covariance. It is compared, alternately, with one run
-of `scipy.optimize.least_squares` (defaults and x_scale='jac') over all unknowns of the same
-compiled model, from a plausible guess and from the best of the 432 starts of the search.
+time includes the whole fit, with search and covariance. The baseline is
+`scipy.optimize.least_squares` (x_scale='jac', otherwise defaults), which estimates all unknowns of
+the same compiled model. Its two runs start from a plausible guess and from the best of the 432
+starting points of the search. Runs of both methods alternate.
 """
 
 import sys

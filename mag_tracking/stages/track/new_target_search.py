@@ -26,7 +26,7 @@ from mag_tracking.stages.track.vehicle_state import VehicleState
 from mag_tracking.stages.track.window_search import WindowSearch
 from mag_tracking.stages.track.window_start import (
     DEPTH_STD,
-    KnownVehicles,
+    KnownVehicleHypothesis,
     WindowStart,
     in_order_of,
     inserted,
@@ -122,7 +122,7 @@ class NewTargetSearch:
                          else self._is_elsewhere(joint))),
                    key=lambda joint: joint.log_odds, default=None)
 
-    def _all_starts(self, known: KnownVehicles) -> list[WindowStart]:
+    def _all_starts(self, known: KnownVehicleHypothesis) -> list[WindowStart]:
         """Starts of all explanations that are based on one hypothesis of the track."""
         starts = self._starts_beside(known) if self._may_add and self._is_improbable else []
         for i in range(self._n_targets):
@@ -175,20 +175,21 @@ class NewTargetSearch:
                 chosen.append(k)
         return chosen
 
-    def _known_vehicles(self, row: int, log_w: float, path: FloatArray) -> KnownVehicles:
+    def _known_vehicles(self, row: int, log_w: float, path: FloatArray) -> KnownVehicleHypothesis:
         """Vehicles of hypothesis `row` of the track; `log_w` is its log-weight at the anchor."""
         at = np.searchsorted(self._window.anchor.origin, self._bank.origin[[row]])
         before = self._window.anchor.rows(at)
         label, kind = (tuple(np.ravel(of[row]).tolist())
                        for of in (self._bank.label, self._bank.kind))
-        return KnownVehicles(before.x[0], before.P[0], path, label, kind, log_w, self._filter)
+        return KnownVehicleHypothesis(before.x[0], before.P[0], path, label, kind, log_w,
+                                      self._filter)
 
-    def _may_be_two(self, known: KnownVehicles, i: int) -> bool:
+    def _may_be_two(self, known: KnownVehicleHypothesis, i: int) -> bool:
         """Whether vehicle `i` may be two vehicles: it is long, or the only vehicle."""
         return self._n_targets == 1 or bool(
             self._filter.are_long(np.array([known.kind[i]]))[0])
 
-    def _is_sensed(self, known: KnownVehicles, i: int) -> bool:
+    def _is_sensed(self, known: KnownVehicleHypothesis, i: int) -> bool:
         """Whether the sensors sense vehicle `i` in the last frame."""
         return field_energy(
             self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
@@ -202,27 +203,27 @@ class NewTargetSearch:
         before = now[joint.replaced * n:joint.replaced * n + 2]
         return bool(np.hypot(*(found[last:last + 2] - before)) > MIN_DISPLACEMENT_M)
 
-    def _remove_vehicle(self, known: KnownVehicles, i: int) -> KnownVehicles:
+    def _remove_vehicle(self, known: KnownVehicleHypothesis, i: int) -> KnownVehicleHypothesis:
         """Known vehicles without vehicle `i`; only the sensor states if no vehicle remains."""
         n = self._n_one
         if self._n_targets == 1:
             sensor_P = self._sensors_at_start()
             nowhere = np.zeros((len(self._search.times), len(sensor_P)))
-            return KnownVehicles(nowhere[0], sensor_P, nowhere, (), (), 0.0, None)
+            return KnownVehicleHypothesis(nowhere[0], sensor_P, nowhere, (), (), 0.0, None)
         rows = np.delete(np.arange(known.path.shape[1]), np.arange(i * n, (i + 1) * n))
-        return KnownVehicles(
+        return KnownVehicleHypothesis(
             known.x[rows], known.P[np.ix_(rows, rows)], known.path[:, rows],
             known.label[:i] + known.label[i + 1:], known.kind[:i] + known.kind[i + 1:],
             known.log_w, self._filter_of(self._n_targets - 1))
 
-    def _starts_beside(self, known: KnownVehicles, replaced: int | None = None
+    def _starts_beside(self, known: KnownVehicleHypothesis, replaced: int | None = None
                        ) -> list[WindowStart]:
         """Starts with an additional vehicle, which is new or replaces vehicle `replaced`."""
         search = self._search.beside(known)
         return [start for theta in search.best(self._search.grid, MAX_FIRST)
                 for start in self._starts_on(known, theta[None], search.moments(theta), replaced)]
 
-    def _pair_starts(self, others: KnownVehicles, i: int) -> list[WindowStart]:
+    def _pair_starts(self, others: KnownVehicleHypothesis, i: int) -> list[WindowStart]:
         """Starts of two vehicles in place of vehicle `i`."""
         search = self._search.beside(others)
         starts: list[WindowStart] = []
@@ -231,7 +232,7 @@ class NewTargetSearch:
             starts += self._starts_on(others, pair, search.moments(pair.ravel()), i)
         return starts
 
-    def _starts_on(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
+    def _starts_on(self, known: KnownVehicleHypothesis, paths: FloatArray, moments: FloatArray,
                    replaced: int | None) -> list[WindowStart]:
         """Starts that add new vehicles, with `paths` (k, 7) and `moments` (k, 3, 3), to `known`."""
         n_known, times = len(known.kind) * self._n_one, self._search.times

@@ -338,7 +338,7 @@ class RunningTrack:
 
     @property
     def unexplained(self) -> list[UnexplainedField]:
-        """Fields of the ended members that no target has ever explained."""
+        """Measured fields of ended members, where no target has explained the field."""
         found = [m.unexplained(self._disturbance_model.uniform) for m in self.members if m.ended]
         return [u for u in found if u is not None]
 

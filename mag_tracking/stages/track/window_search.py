@@ -9,7 +9,7 @@ from mag_tracking.stages.track.pass_samples import PassSamples
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.steady_search import PathPrior, StartGrid, SteadySearch
 from mag_tracking.stages.track.vehicle_state import VehicleState
-from mag_tracking.stages.track.window_start import KnownVehicles
+from mag_tracking.stages.track.window_start import KnownVehicleHypothesis
 from mag_tracking.units import NS
 
 MAX_SAMPLES = 320
@@ -54,12 +54,12 @@ class WindowSearch:
         return StartGrid(self.samples, self.prior,
                          self.prior.starts(self._vehicles.settings, self._vehicles.network))
 
-    def beside(self, known: KnownVehicles) -> SteadySearch:
+    def beside(self, known: KnownVehicleHypothesis) -> SteadySearch:
         """Return a search for a vehicle in addition to known vehicles.
 
         Parameters
         ----------
-        known : KnownVehicles
+        known : KnownVehicleHypothesis
 
         Returns
         -------

@@ -46,7 +46,7 @@ class WindowStart(PathHypothesis):
 
 
 @dataclass(frozen=True)
-class KnownVehicles(PathHypothesis):
+class KnownVehicleHypothesis(PathHypothesis):
     """Hypothesis of the known vehicles in a search for new vehicles."""
 
     filter: BankFilter | None

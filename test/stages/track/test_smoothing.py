@@ -167,7 +167,7 @@ def errors_of(poses, truth):
 
 
 def near(poses, truth):
-    """Whether each pose (n,) is within five metres of the middle between the sensors."""
+    """Whether each pose (n,) is within five metres of the midpoint of the sensors."""
     return np.hypot(*truth([p.stamp_ns for p in poses]).T) < 5.0
 
 
