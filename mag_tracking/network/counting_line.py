@@ -178,7 +178,7 @@ class CrossingDetector:
                         forward[1] > forward[0], before if fraction < 0.5 else after, False)
 
     def _extrapolate(self, first: Pose, last: Pose) -> Crossing | None:
-        """Crossing shortly before the first pose or after the last pose; None if there is none."""
+        """Crossing shortly before the first or after the last pose; None without a crossing."""
         for pose, sign in ((first, -1.0), (last, 1.0)):
             speed = float(pose.velocity[:2] @ self.line.along)
             if abs(speed) < MIN_SPEED:

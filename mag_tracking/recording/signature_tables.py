@@ -319,8 +319,10 @@ def _parse_entry(name: str, value: Any) -> Any:
     if name in ('temperature', 'limit'):
         expected = 'a number'
         is_valid = isinstance(value, (int, float)) and not isinstance(value, bool)
-        # An integer may be too large for a float.
-        value = float(value) if is_valid and abs(value) < 1e300 else float('nan')
+        try:
+            value = float(value) if is_valid else value
+        except OverflowError:
+            is_valid = False
     elif name in ('method', 'unit'):
         expected, is_valid = 'a string', isinstance(value, str)
     elif name == 'examples':

@@ -44,8 +44,7 @@ def summary(figures, what, found):
     if what == 'leaves':
         n_soon = sum(s <= SOON_S for s in found)
         figures.keep(f'present at the start: correct background within {SOON_S:g} s', n_soon / n,
-                     '',
-                     1.0, True, note=f'{n} runs')
+                     '', 1.0, True, note=f'{n} runs')
         return (f'present at the start: in {n_soon} of {n} runs the background is correct within '
                 f'{SOON_S:g} s after the departure, median {np.median(found):.1f} s '
                 '(aim all)', n_soon == n)

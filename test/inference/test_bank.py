@@ -121,7 +121,7 @@ def test_best_is_of_the_heaviest_kind_of_the_heaviest_arrival():
 
 
 def test_best_is_at_the_maximum_of_the_mixture_density():
-    """Of two distant hypotheses of equal weight, the one with the smaller covariance is the best.
+    """The best of two distant hypotheses of equal weight has the smaller covariance.
 
     If a covariance is invalid, the heaviest hypothesis is the best.
     """

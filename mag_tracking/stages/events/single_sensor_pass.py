@@ -69,7 +69,7 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
     t, y = plain(t), plain(y)
     span = float(t[-1] - t[0])
     strongest = float(t[np.argmax(np.sum(y**2, axis=1))])
-    if len(t) < MIN_SAMPLES or not span > 0.0:
+    if not span > 0.0:
         return ClosestPoint(strongest, np.inf, np.nan)
     interval = span / (len(t) - 1)
 

@@ -91,7 +91,7 @@ def drive(network, changes, speed=20.0, seed=1):
 
 
 def test_a_target_is_tracked_along_forty_sensors():
-    """Of forty sensors over 180 m, six are used at any time. The errors match the covariance."""
+    """A track uses six of forty sensors over 180 m at a time; its errors match the covariance."""
     network = line_network(40, tilt=0.02)
     records, pipeline, truth = drive(network, {'track.max_sensors': 6})
     live = [r for r in records if isinstance(r, Track) and not r.ended]
