@@ -169,7 +169,8 @@ def test_an_inconsistent_model_is_refused(tables, tmp_path, capsys):
     good = json.loads(model.read_text())
     changes = [({name: value}, f'{name}: expected ') for name, value in (
         ('weights', [[1.0]]), ('weights', [[1.0], [1.0, 2.0]]), ('temperature', 0),
-        ('temperature', 10**400), ('limit', True), ('limit', None), ('scale', 0), ('classes', ['car']), ('classes', ['car', 'car']),
+        ('temperature', 10**400), ('limit', True), ('limit', None), ('scale', 0),
+        ('classes', ['car']), ('classes', ['car', 'car']),
         ('classes', 'car'), ('offsets', [1.0]), ('mean', None), ('mean', []), ('unit', 7),
         ('examples', 3))]
     contents = [({**good, **change}, message) for change, message in changes]
