@@ -153,7 +153,8 @@ def driver_of(name: object, entry: object) -> Driver:
         _check_places(options, {*_ENTRY_KEYS, *_names(DriverSettings())}, kinds)
         device = _device(options, kinds)
         clock = replace(_class_defaults(ClockSettings(), device, 'CLOCK'),
-                        _pop_group(options, 'clock'))
+                        _pop_group(options, 'clock', ClockSettings(), kinds))
+        _check_unused_groups(options, kinds)
         sensors = _pop_sensors(options)
         for unit in ('unit', 'acceleration_unit'):
             if isinstance(options.get(unit), (int, float)) and not isinstance(options[unit], bool):
@@ -190,20 +191,30 @@ def _create_part(role: str, options: dict[str, Any], kinds: Collection[str]) -> 
     kind = options.pop(role)
     cls = load_class(role, kind)
     group = kind if kind in KINDS[role] else f'{role}_settings'
-    defaults, changes = cls.SETTINGS(), _pop_group(options, group)
-    try:
-        _check_places(changes, _names(defaults), kinds)
-    except SettingsError as error:
-        raise SettingsError(f'{group}: {error}') from error
-    return cls(replace(defaults, changes))
+    defaults = cls.SETTINGS()
+    return cls(replace(defaults, _pop_group(options, group, defaults, kinds)))
 
 
-def _pop_group(options: dict[str, Any], name: str) -> Mapping[str, Any]:
-    """Remove the group `name` from `options` and return its settings."""
+def _pop_group(options: dict[str, Any], name: str, settings: Any,
+               kinds: Collection[str]) -> Mapping[str, Any]:
+    """Remove the group `name` from `options`; return its values, which belong to `settings`."""
     group = options.pop(name, {})
     if not isinstance(group, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {short_repr(group)}')
+    try:
+        _check_places(group, _names(settings), kinds)
+    except SettingsError as error:
+        raise SettingsError(f'{name}: {error}') from error
     return group
+
+
+def _check_unused_groups(options: Mapping[str, Any], kinds: Collection[str]) -> None:
+    """Raise SettingsError if `options` still contains the group of a kind that is not used."""
+    unused = [name for name, value in options.items()
+              if isinstance(value, Mapping) and name in settings_by_kind()]
+    if unused:
+        raise SettingsError(f'{unused[0]} is not used by the device, which uses '
+                            f'{" and ".join(kinds)}; remove {unused[0]}, or change the kind')
 
 
 def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:

@@ -75,7 +75,8 @@ def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
     (without(text={'fields': ['x', 'y', 'w']}), 'board: '),
     (without(clock={'tick_s': -1.0}), 'tick_s: -1.0 is outside'),
     (without(uint='nT'), 'unknown setting uint; did you mean unit?'),
-    (without(binary={'sync': 'A5'}), 'unknown setting binary'),
+    (without(binary={'sync': 'A5'}), 'board: binary is not used by the device, which uses serial '
+     'and text; remove binary, or change the kind'),
     (without('sensor'), 'expected `sensor: mag_1`, or `sensors:`'),
     (without(sensors={'A': 'mag_2'}), 'sensor and sensors are mutually exclusive'),
     ('{"\\ud800": {}}', "'\\ud800' is not a device name: it is not valid Unicode"),
@@ -117,6 +118,8 @@ SERIAL = {'port': '/dev/ttyUSB0'}
      'board: text: port is misplaced; move it to serial, as in serial: {port: ...}'),
     (without(serial={**SERIAL, 'unit': 'nT'}),
      'board: serial: unit is misplaced; move it to the top level of the device'),
+    (without(clock=SERIAL),
+     'board: clock: port is misplaced; move it to serial, as in serial: {port: ...}'),
     (without(tick_s=1e-3), 'board: tick_s is misplaced; move it to clock, as in clock: {tick_s: '),
     ({'pi': {'device': 'i2c', 'i2c': {'sensors': ['A:lis3mdl:0x1c'], 'port': 1}, 'sensor': 'a'}},
      'pi: i2c: port is misplaced; it is a setting of serial, udp or mqtt, but the device uses i2c'),
