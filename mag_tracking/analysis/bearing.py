@@ -43,7 +43,7 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
     """
     r, v = theta[:3] - place, theta[3:6]
     time, cpa_range, _ = closest_approach(r, v)
-    if cpa_range <= MIN_CPA_FRACTION * np.linalg.norm(r - time * v):
+    if cpa_range <= MIN_CPA_FRACTION * np.linalg.norm(time * v):
         return None
     u = distance / cpa_range
     # The path reversed through the sensor has the same field; use the path above the sensor.

@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
+from mag_tracking.analysis.bearing import MIN_CPA_FRACTION, scaled_to_range
 from mag_tracking.analysis.model_order import choose_order, order_criteria
 from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_data import separable_problem
@@ -281,6 +282,16 @@ def test_a_moment_perpendicular_to_the_plane_leaves_directions_unknown():
 def test_a_path_through_the_sensor_is_rejected():
     data, _, _ = single_sensor_pass([0.0, 200.0, -200.0], path=(0.04, -4.5, 0.0, 9.0, 0.0, 0.0))
     assert 'r0 parallel to v0' in fit_pass(data, 1).reason
+
+
+@pytest.mark.parametrize('time', [-2.0, 2.0])
+def test_only_a_path_with_a_very_small_cpa_range_passes_through_the_sensor(time):
+    v = np.array([9.0, 0.0, 0.0])
+    for fraction, passes_through in ((0.9, True), (1.1, False)):
+        cpa = np.array([0.0, 0.0, fraction * MIN_CPA_FRACTION * abs(time) * v[0]])
+        theta = np.concatenate([cpa - time * v, v])
+        scaled = scaled_to_range(theta, np.ones(3), np.zeros(3), 1.0)
+        assert (scaled is None) == passes_through
 
 
 def test_data_that_cannot_be_fitted_result_in_a_reason():
