@@ -1,4 +1,4 @@
-"""Formatting of numbers and their nouns in messages."""
+"""Formatting of numbers with their nouns in messages."""
 
 
 def quantity(n: int, singular: str, plural: str = '') -> str:
@@ -17,3 +17,17 @@ def quantity(n: int, singular: str, plural: str = '') -> str:
     str
     """
     return f'{n} {singular if n == 1 else plural or singular + "s"}'
+
+
+def times(n: int) -> str:
+    """Format a number of occurrences, such as 'once' or '2 times'.
+
+    Parameters
+    ----------
+    n : int
+
+    Returns
+    -------
+    str
+    """
+    return 'once' if n == 1 else f'{n} times'

@@ -6,7 +6,7 @@ import pytest
 
 import mag_tracking as mt
 from mag_tracking.apps.replay_notes import notes_of
-from mag_tracking.quantities import quantity
+from mag_tracking.quantities import quantity, times
 from mag_tracking.stages.track.evidence import LOST
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 
@@ -15,6 +15,10 @@ from support.bundled import NETWORK_FILE, QUICK, vehicle_path
     (0, '0 tracks', '0 passes'), (1, '1 track', '1 pass'), (2, '2 tracks', '2 passes')])
 def test_a_quantity_has_the_right_number(n, track, passes):
     assert quantity(n, 'track') == track and quantity(n, 'pass', 'passes') == passes
+
+
+def test_a_single_occurrence_is_once():
+    assert [times(n) for n in (0, 1, 2)] == ['0 times', 'once', '2 times']
 
 
 def test_one_event_and_two_events():

@@ -69,8 +69,10 @@ def summary_lines(p: Plan) -> list[str]:
                      f'velocity {v:.3g} m/s, moment {m:.3g} A m^2')
     for lane in p.lanes:
         good = np.flatnonzero(lane.detection >= GOOD_PD)
-        first = (f'at {-lane.along[good[0]]:.3g} m before the centre' if len(good)
-                 else 'nowhere')
+        first = 'nowhere'
+        if len(good):
+            along = lane.along[good[0]]
+            first = f'at {abs(along):.3g} m {"past" if along > 0.0 else "before"} the centre'
         closest = int(np.argmin(np.abs(lane.along)))
         lines.append(f'lane {lane.name}: the detection probability of a frame reaches '
                      f'{GOOD_PD:.0%} {first}; position bound at the centre '

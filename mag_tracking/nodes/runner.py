@@ -44,29 +44,20 @@ class TrackPrinter(Node):
     ----------
     topic : str
         Topic of the tracks.
-    every : int
-        Print only every `every`-th pose.
     out : text stream
         Output stream.
     """
 
-    def __init__(self, topic: str = 'tracker_node/tracks', every: int = 1,
-                 out: TextIO = sys.stdout) -> None:
+    def __init__(self, topic: str = 'tracker_node/tracks', out: TextIO = sys.stdout) -> None:
         super().__init__('track_printer')
-        self._every, self._out = every, out
-        self._n = 0
+        self._out = out
         self.create_subscription(TrackArray, topic, self._receive, STREAM_QOS)
 
     def _receive(self, message: TrackArray) -> None:
-        """Print every `every`-th pose, and the end of each track."""
+        """Print the pose of each track, or its end."""
         for track in map(track_of, message.tracks):
-            if track.ended:
-                print(f'track {track.id} has ended', file=self._out, flush=True)
-                self._n = 0
-                continue
-            if self._n % self._every == 0:
-                print(pose_line(track), file=self._out, flush=True)
-            self._n += 1
+            line = f'track {track.id} has ended' if track.ended else pose_line(track)
+            print(line, file=self._out, flush=True)
 
 
 def pose_line(track: Track) -> str:

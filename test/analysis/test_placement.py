@@ -1,6 +1,7 @@
 """Sensor placement: bounds compared with oracles and fits, detection, and the command `plan`."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from mag_tracking.analysis.placement import (
     pass_information,
 )
 from mag_tracking.apps.plan import compute_plan
+from mag_tracking.apps.plan_report import summary_lines
 from mag_tracking.cli import main
 from mag_tracking.inference.crlb import bound, information
 from mag_tracking.inference.detection_theory import missed_detection_probability
@@ -219,6 +221,17 @@ def test_the_additional_sensor_has_the_clearance_from_each_lane():
     y = np.linspace(-12.0, 12.0, p.with_one_more.shape[0])
     free = (np.abs(y - 2.0) >= 1.5) & (np.abs(y + 3.0) >= 1.5)
     assert np.array_equal(np.isfinite(p.with_one_more).all(axis=1), free)
+
+
+def test_the_summary_states_on_which_side_of_the_centre_detection_begins(road_plan):
+    lane, = road_plan.lanes
+    for first, text in ((-5.0, 'at 5 m before the centre;'), (3.0, 'at 3 m past the centre;'),
+                        (np.inf, 'nowhere;')):
+        plan = replace(road_plan, lanes=(replace(
+            lane, along=np.array([-5.0, 3.0, 9.0]), detection=1.0 * (
+                np.array([-5.0, 3.0, 9.0]) >= first), filter_std=np.ones(3),
+            pass_std=np.ones((3, 3))),))
+        assert any(f'reaches 90% {text}' in line for line in summary_lines(plan))
 
 
 def test_missed_detection_probability_agrees_with_simulation():

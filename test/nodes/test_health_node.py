@@ -275,7 +275,7 @@ def test_past_faults_expire_after_two_windows(monkeypatch):
             stage.feed(one(sample))
         if k % 100 == 99:
             reports.append((now[0], [s.message for s in health.statuses('node', stage)]))
-    times = [t for t, messages in reports if 'became its background 1 time' in messages[0]]
+    times = [t for t, messages in reports if 'became its background once' in messages[0]]
     assert 20.0 < min(times) < 35.0
     assert sensor_health.WINDOW_S < max(times) - min(times) <= 2.0 * sensor_health.WINDOW_S + 5.0
     assert reports[-1][1] == ['running', 'running']

@@ -13,6 +13,7 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE, MIN_CHANGES
+from mag_tracking.quantities import times
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 
@@ -37,11 +38,6 @@ change every other axis by at least one step."""
 SPIKE_STD = 30.0
 """Minimum difference of a spike from both neighbouring readings, in the same direction, in standard
 deviations of the noise."""
-
-
-def _times(n: int) -> str:
-    """Format a number of occurrences, such as 'once' or '2 times'."""
-    return 'once' if n == 1 else f'{n} times'
 
 
 @dataclass(frozen=True)
@@ -338,11 +334,11 @@ class SensorHealth:
     def _clock_findings(self, name: str) -> Iterator[Finding]:
         """Yield findings about clock steps and backward timestamps."""
         if n := self.counts['clock steps']:
-            yield Finding(True, name, f'its clock stepped {_times(n)} relative to the '
+            yield Finding(True, name, f'its clock stepped {times(n)} relative to the '
                           f'host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
                           'clocks (chrony, PTP), and take timestamps from a monotonic clock')
         if n := self.counts['backward timestamps']:
-            yield Finding(True, name, f'timestamps went back {_times(n)}', 'check for two '
+            yield Finding(True, name, f'timestamps went back {times(n)}', 'check for two '
                           'publishers on one topic, a clock that was set, or a looped replay')
 
     def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
