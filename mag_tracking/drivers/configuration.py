@@ -150,7 +150,7 @@ def driver_of(name: object, entry: object) -> Driver:
     options = dict(entry)
     try:
         kinds = [kind for role in KINDS if isinstance(kind := options.get(role), str)]
-        _refuse_misplaced(options, {*_ENTRY_KEYS, *_setting_names(DriverSettings())}, kinds)
+        _check_places(options, {*_ENTRY_KEYS, *_names(DriverSettings())}, kinds)
         device = _device(options, kinds)
         clock = replace(_class_defaults(ClockSettings(), device, 'CLOCK'),
                         _pop_group(options, 'clock'))
@@ -192,7 +192,7 @@ def _create_part(role: str, options: dict[str, Any], kinds: Collection[str]) -> 
     group = kind if kind in KINDS[role] else f'{role}_settings'
     defaults, changes = cls.SETTINGS(), _pop_group(options, group)
     try:
-        _refuse_misplaced(changes, _setting_names(defaults), kinds)
+        _check_places(changes, _names(defaults), kinds)
     except SettingsError as error:
         raise SettingsError(f'{group}: {error}') from error
     return cls(replace(defaults, changes))
@@ -252,7 +252,7 @@ def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> 
                                     f'sensors are {", ".join(network.names)}')
 
 
-def _setting_names(settings: Any) -> set[str]:
+def _names(settings: Any) -> set[str]:
     """Names of the settings and groups of a settings dataclass."""
     return {field.name for field in dataclasses.fields(settings)}
 
@@ -261,8 +261,7 @@ def _groups_of(name: object) -> list[str]:
     """Groups of settings that contain `name`; '' stands for the top level of a device."""
     if name in _ENTRY_KEYS:
         return ['']
-    return [group for group, settings in settings_by_kind().items()
-            if name in _setting_names(settings)]
+    return [group for group, settings in settings_by_kind().items() if name in _names(settings)]
 
 
 def _joined(groups: Collection[str]) -> str:
@@ -271,7 +270,7 @@ def _joined(groups: Collection[str]) -> str:
     return f'{", ".join(others)} or {last}' if others else last
 
 
-def _refuse_misplaced(names: Iterable[object], permitted: Collection[str],
+def _check_places(names: Iterable[object], permitted: Collection[str],
                   kinds: Collection[str]) -> None:
     """Raise SettingsError for a setting that is not permitted here but in another group."""
     for name in names:
