@@ -11,10 +11,10 @@
 
 The kind of a transport, framing or device is a name in `KINDS`, or `package.module:Class` for a
 custom class. Such a class has an attribute `SETTINGS` and the methods of `reading.Transport`,
-`Framing` or `Device`. Its optional attributes `CLOCK` and `DRIVER`, mappings of settings, replace
-the defaults for every device of that kind. The settings of a kind in `KINDS` are listed under its
-name, and the settings of a custom class under `transport_settings`, `framing_settings` or
-`device_settings`.
+`Framing` or `Device`. Its optional attributes `CLOCK` and `DRIVER` are mappings of clock and driver
+settings that replace the defaults for every device of that kind. The settings of a kind in `KINDS`
+are listed under its name. The settings of a custom class are listed under `transport_settings`,
+`framing_settings` or `device_settings`.
 """
 
 import dataclasses
@@ -52,7 +52,7 @@ METHODS = {'transport': ('open', 'read', 'close'), 'framing': ('parse',),
            'device': ('open', 'read', 'close')}
 """Methods required of a transport, framing and device."""
 _ENTRY_KEYS = frozenset(('clock', 'sensor', 'sensors', *KINDS))
-"""Keys of a device besides the driver settings and the groups of its kinds."""
+"""Keys of a device other than the driver settings and the groups of its kinds."""
 _NAME_PATTERN = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')
 Settings = TypeVar('Settings', ClockSettings, DriverSettings)
 
@@ -125,7 +125,7 @@ def load_class(role: str, name: object) -> Any:
 
 
 def driver_of(name: object, entry: object) -> Driver:
-    """Create the driver of one entry of a drivers file.
+    """Create a driver from an entry of a drivers file.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def driver_of(name: object, entry: object) -> Driver:
 
 
 def _class_defaults(settings: Settings, device: Device, name: str) -> Settings:
-    """Return `settings` updated with the attribute `name` of the device, if it exists."""
+    """Return `settings` with the changes in the attribute `name` of the device, if it has one."""
     return replace(settings, getattr(device, name, {}))
 
 
@@ -241,8 +241,9 @@ def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
     out = {str(key): value for key, value in sensors.items()}
     if len(out) < len(sensors):
         names = [str(key) for key in sensors]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise SettingsError(f'sensors: the name {twice} at the device appears twice; remove one')
+        duplicate = next(name for name in names if names.count(name) > 1)
+        raise SettingsError(f'sensors: the name {duplicate} at the device appears twice; remove '
+                            'one')
     return out
 
 
@@ -268,31 +269,31 @@ def _names(settings: Any) -> set[str]:
 
 
 def _groups_of(name: object) -> list[str]:
-    """Groups of a device that have the setting `name`; '' stands for its top level."""
+    """Groups of settings that contain `name`; '' stands for the top level of a device."""
     if name in _ENTRY_KEYS:
         return ['']
     return [group for group, settings in settings_by_kind().items() if name in _names(settings)]
 
 
-def _any_of(groups: Collection[str]) -> str:
-    """List of groups for a message: 'serial, udp or mqtt'."""
+def _joined(groups: Collection[str]) -> str:
+    """Join names for a message, such as 'serial, udp or mqtt'."""
     *others, last = groups
     return f'{", ".join(others)} or {last}' if others else last
 
 
 def _check_places(names: Iterable[object], permitted: Collection[str],
                   kinds: Collection[str]) -> None:
-    """Raise SettingsError if a name that is not permitted belongs to another group of a device."""
+    """Raise SettingsError for a setting that is not permitted here but in another group."""
     for name in names:
         groups = [] if name in permitted else _groups_of(name)
         if '' in groups:
             raise SettingsError(f'{name} is misplaced; move it to the top level of the device')
-        used = [group for group in groups if group in (*kinds, 'clock')]
-        if used:
-            raise SettingsError(f'{name} is misplaced; move it to {_any_of(used)}, as in '
-                                f'{used[0]}: {{{name}: ...}}')
+        used_groups = [group for group in groups if group in (*kinds, 'clock')]
+        if used_groups:
+            raise SettingsError(f'{name} is misplaced; move it to {_joined(used_groups)}, as in '
+                                f'{used_groups[0]}: {{{name}: ...}}')
         if groups:
-            raise SettingsError(f'{name} is misplaced; it is a setting of {_any_of(groups)}, but '
+            raise SettingsError(f'{name} is misplaced; it is a setting of {_joined(groups)}, but '
                                 f'the device uses {" and ".join(kinds) or "no transport"}')
 
 
@@ -306,9 +307,9 @@ def _check_devices(content: Mapping[object, object]) -> None:
         else:
             groups = _groups_of(name)
         if groups:
-            place = '' if '' in groups else f', under {_any_of(groups)}'
+            hint = '' if '' in groups else f', under {_joined(groups)}'
             raise SettingsError(f'{name} is misplaced; the top level of the file contains devices. '
-                                f'Move {name} into a device{place}')
+                                f'Move {name} into a device{hint}')
 
 
 def settings_by_kind() -> dict[str, Any]:

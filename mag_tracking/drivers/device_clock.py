@@ -7,10 +7,11 @@ them on average: the edge of their lower convex hull over their mean abscissa.
 
 Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network delay
 measurements', IEEE INFOCOM 1999. Differences: only the lowest point of each short block of device
-time is kept; the window slides; and of all slopes about as likely as the best slope, the slope
-nearest to the previous estimate is used. For exponential delays, Moon's line is the
-maximum-likelihood line. Lowering a line by 1/K of the mean height of the K points above it reduces
-its likelihood by a factor of e. Slopes within that range are considered about as likely.
+time is kept; the window slides; and the estimated slope is the slope nearest to the previous
+estimate among all slopes that are about as likely as the best slope. If the delays are exponential,
+Moon's line is the maximum-likelihood line. Lowering a line by 1/K of the mean height of the K
+points above it reduces its likelihood by a factor of e. Slopes within that range are considered
+about as likely.
 """
 
 import math
@@ -36,7 +37,7 @@ _MIN_BLOCK_FRACTION = 1.0 / 16.0
 _MIN_POINTS = 5
 """Minimum number of points for estimating the slope; with fewer, only the height is estimated."""
 _MIN_AGREEING = 3
-"""Number of different device times that must agree on a new clock."""
+"""Minimum number of different device times that must agree before a new clock starts."""
 _EARLY_TOLERANCE_NS = 1e6
 """[ns] Distance below the line up to which a message is always accepted."""
 
@@ -58,9 +59,9 @@ class ClockSettings:
         5.0, 'Maximum delay of a message. A message delayed by more indicates a step of the device '
         'clock.', 's', (0.01, 3600.0))
     min_step_s: float = param(
-        0.1, 'Minimum detectable clock step, in addition to the spread of the delays. A device '
-        'time that goes back by more, or remains late by more for max_delay_s, indicates a step of '
-        'the device clock.', 's', (1e-3, 60.0))
+        0.1, 'Minimum detectable clock step, in addition to the spread of the delays. The '
+        'device clock is considered to have stepped if a device time goes back by more, or remains '
+        'late by more for max_delay_s.', 's', (1e-3, 60.0))
     window_s: float = param(
         120.0, 'Length of the estimation window. The drift is estimated only if at least five '
         'readings are in the window.', 's', (1.0, 86400.0))
@@ -111,7 +112,7 @@ class ArrivalClock:
 
 
 class _ClockCandidate:
-    """Readings that do not fit the clock and may belong to a new clock."""
+    """Candidate for a new clock: readings that do not fit the present clock."""
 
     def __init__(self, ticks: float, arrival_ns: int, last_fit_ns: int, is_near: bool) -> None:
         self.since_ns, self.last_fit_ns, self._is_near = arrival_ns, last_fit_ns, is_near
@@ -167,19 +168,19 @@ class DeviceClock:
         95th percentile of the delays of recent messages, relative to the fastest message. NaN until
         estimated.
     stamp_std : float, s
-        Error of a timestamp due to the delays and to changes of the drift: the 90th percentile of
-        the heights of the blocks' lowest points above the line. An error of `min_delay_s` is not
-        included. NaN until estimated, and again after a restart.
+        Estimated error of a timestamp due to delays and changes of the drift. It is the 90th
+        percentile of the height above the line, taken over the lowest points of all blocks. An
+        error of `min_delay_s` is not included. NaN until estimated, and again after a restart.
 
     Raises
     ------
     SettingsError
-        If `min_step_s` exceeds `max_delay_s`, or the counter wraps within 4 `min_step_s`.
+        If `min_step_s` exceeds `max_delay_s`, or the counter wraps within four times `min_step_s`.
     """
 
     def __init__(self, settings: ClockSettings) -> None:
         self._tick_ns, self._wrap = settings.tick_s * 1e9, settings.wrap
-        self._top = settings.wrap or math.inf
+        self._counter_limit = settings.wrap or math.inf
         self._min_delay_ns = round(settings.min_delay_s * 1e9)
         self._max_delay_ns = settings.max_delay_s * 1e9
         self._step_ns = self._tolerance_ns = settings.min_step_s * 1e9
@@ -202,32 +203,33 @@ class DeviceClock:
         self._ticks, self._arrival_ns, self._last_ns = ticks, arrival_ns, arrival_ns
         self._height = self._middle = self._newest = self._lowest = 0.0
         self._points: list[Point] = []
-        self._point: Point = (0.0, 0.0)
-        self._block = self._block_end = self._window_ns / _MAX_BLOCKS * _MIN_BLOCK_FRACTION
+        self._lowest_point: Point = (0.0, 0.0)
+        self._block_length = self._block_end = self._window_ns / _MAX_BLOCKS * _MIN_BLOCK_FRACTION
         self._early_tolerance_ns, self.stamp_std = self._max_delay_ns, math.nan
         self._candidate: _ClockCandidate | None = None
         self._has_begun, self._drift_bound = True, self._max_drift
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int | None:
-        """Update the clock with a reading; return the time at which it was measured.
+        """Update the clock with a reading; return the measurement time of the reading.
 
         Parameters
         ----------
         ticks : float or None
-            Device counter, 0 .. wrap. Repeated and slightly earlier values are accepted.
+            Device counter, at least 0 and less than `wrap`. Repeated and slightly earlier values
+            are accepted.
         arrival_ns : int, ns
             `time.monotonic_ns()` at arrival.
 
         Returns
         -------
         int or None, ns
-            Not later than `arrival_ns` minus the minimum delay. None if the time is unknown; the
-            cause is counted in `counts`.
+            Monotonic time of the measurement, at most `arrival_ns` minus the minimum delay. None if
+            the time is unknown; the cause is counted in `counts`.
         """
         if ticks is None:
             self.counts[NO_TICKS] += 1
             return None
-        if not 0 <= ticks < self._top:
+        if not 0 <= ticks < self._counter_limit:
             self.counts[OUT_OF_RANGE] += 1
             return None
         if not self._has_begun:
@@ -261,12 +263,12 @@ class DeviceClock:
         return count * self._tick_ns
 
     def _add_point(self, t: float, offset: float, low: float, arrival_ns: int) -> int:
-        """Add a point that fits the clock; return its delay [ns]."""
+        """Add a point that fits the clock; return its delay relative to the line [ns]."""
         if t >= self._block_end:
             self._close_block(t)
             low = offset - self._slope * (t - self._middle)
         if low < self._lowest:
-            self._lowest, self._point = low, (t, offset)
+            self._lowest, self._lowest_point = low, (t, offset)
         self._height = min(self._height, low)
         self._newest, self._last_ns = max(self._newest, t), arrival_ns
         self._delays.append(low - self._height)
@@ -309,19 +311,19 @@ class DeviceClock:
     def _close_block(self, t: float) -> None:
         """Store the lowest point of the completed block; update the line and the tolerance."""
         points, longest = self._points, self._window_ns / _MAX_BLOCKS
-        points.append(self._point)
+        points.append(self._lowest_point)
         if t - self._newest > self._window_ns:
-            self._block = longest * _MIN_BLOCK_FRACTION
+            self._block_length = longest * _MIN_BLOCK_FRACTION
         while points[0][0] < t - self._window_ns and len(points) > 1:
             del points[0]
-        if len(points) >= _MAX_BLOCKS and self._block < longest:
-            self._block *= 2.0
+        if len(points) >= _MAX_BLOCKS and self._block_length < longest:
+            self._block_length *= 2.0
             self._points = points = [min(points[i:i + 2], key=self._height_above)
                                      for i in range(0, len(points), 2)]
         # A message that overtook another may be the lowest point of a later block.
         points.sort()
         self._update_line(points)
-        self._block_end, self._lowest = t + self._block, math.inf
+        self._block_end, self._lowest = t + self._block_length, math.inf
         delays = sorted(self._delays)
         self.spread_s = delays[int(0.95 * (len(delays) - 1))] * 1e-9
         # Late messages of a new clock must not widen the tolerance by which they are detected.

@@ -42,7 +42,7 @@ PollResult: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
 EMPTY_RESULT: PollResult = Readings.joined([]), ()
 """Result of a poll without data."""
 MIN_CLOCK_STEP_NS = 10_000_000
-"""[ns] Larger changes of wall clock minus monotonic clock are counted as clock steps."""
+"""[ns] A larger change of wall clock minus monotonic clock is counted as a clock step."""
 
 
 class Driver:
@@ -70,11 +70,11 @@ class Driver:
     name : str
     sensors : dict of str to str
     driver_counts : Counter
-        Number of samples by sensor, and of losses and faults that the driver itself has detected,
+        Number of samples by sensor, and number of losses and faults detected by the driver itself,
         by cause.
     fault : str
-        Latest failure, such as a lost connection or silence. Empty before the first failure, and
-        as soon as data arrive.
+        Message of the latest failure, such as a lost connection or a silent device. Empty before
+        the first failure; cleared when data arrive.
 
     Raises
     ------
@@ -151,14 +151,14 @@ class Driver:
         Returns
         -------
         Counter
-            By sensor or cause, such as 'samples: mag_1' or 'connections lost'.
+            Number by sensor or cause, such as 'samples: mag_1' or 'connections lost'.
         """
         # Each counter is copied in one step, because the polling thread may add a cause meanwhile.
         total = self.driver_counts.copy()
         total.update({'source changes': n} if (n := self._sole_source.changes) else {})
         total.update(self._device.counts.copy())
         for sensor, check in self._sequences.items():
-            total.update({f'{what}: {sensor}': n for what, n in check.counts.copy().items() if n})
+            total.update({f'{cause}: {sensor}': n for cause, n in check.counts.copy().items() if n})
         for clock in self.clocks().values():
             total.update(clock.counts.copy())
             total.update(clock.restarts.copy())
@@ -185,6 +185,8 @@ class Driver:
         ------
         ValueError
             If a field does not consist of three numbers.
+        OverflowError
+            If an integer in a field exceeds the range of float64.
         """
         if not self._is_open and not self._try_to_open(timeout_s):
             return EMPTY_RESULT
@@ -255,9 +257,9 @@ class Driver:
         self._is_open, self._last_receipt_ns = True, self._monotonic_ns()
         return True
 
-    def _schedule_retry(self, why: object) -> None:
+    def _schedule_retry(self, reason: object) -> None:
         """Close the device, schedule its reopening, and double the delay for the next failure."""
-        self._is_open, self.fault = False, str(why)
+        self._is_open, self.fault = False, str(reason)
         try:
             self._device.close()
         # A third-party device or a removed port may raise any error; the device is reopened anyway.
@@ -319,15 +321,15 @@ class Driver:
             return sensor, None
         return sensor, self._stamp(reading, arrival)
 
-    def _sensor_of(self, at_device: str, source: str) -> str | None:
-        """Return the network name of a sensor, None if ignored or unknown; count unknown ones."""
-        sensor = next((self.sensors[name] for name in (at_device, source)
+    def _sensor_of(self, reported_name: str, source: str) -> str | None:
+        """Return a sensor's network name; None if it is ignored, or unknown and then counted."""
+        sensor = next((self.sensors[name] for name in (reported_name, source)
                        if name and name in self.sensors), None)
         if sensor is None and '' in self.sensors and self._sole_source.accepts(
-                (at_device, source), self._monotonic_ns()):
+                (reported_name, source), self._monotonic_ns()):
             return self.sensors['']
         if sensor is None:
-            name = (at_device or source)[:80]
+            name = (reported_name or source)[:80]
             if len(self._unknown_names) < MAX_NAMES:
                 self._unknown_names.add(name)
             self.driver_counts['readings of unknown sensors' + (
@@ -335,19 +337,19 @@ class Driver:
         if sensor is None or sensor == IGNORED:
             return None
         if len(self._known_sensors) < MAX_SOURCES:
-            self._known_sensors[at_device, source] = sensor
+            self._known_sensors[reported_name, source] = sensor
         return sensor
 
     def _stamp(self, reading: Reading, arrival: Arrival) -> int | None:
         """Return the monotonic time of the measurement [ns], or None if no clock provides it."""
-        by = self._settings.stamp_by
-        ticks = reading.sequence if by == 'sequence' else reading.ticks
+        stamp_by = self._settings.stamp_by
+        ticks = reading.sequence if stamp_by == 'sequence' else reading.ticks
         clock = self._clocks.get(arrival.source)
         if clock is None:
             if len(self._clocks) >= MAX_SOURCES:
                 self.driver_counts['readings beyond the maximum number of sources'] += 1
                 return None
-            uses_arrivals = by == 'arrival' or by == 'auto' and ticks is None
+            uses_arrivals = stamp_by == 'arrival' or stamp_by == 'auto' and ticks is None
             clock = (ArrivalClock if uses_arrivals else DeviceClock)(self._clock_settings)
             self._clocks[arrival.source] = clock
         if ticks is None and isinstance(clock, DeviceClock):
@@ -397,9 +399,9 @@ def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]
                 take(readings, accelerations)
         except Exception as error:
             # The device is not affected and stays open.
-            what = f'errors while processing readings: {type(error).__name__}'
-            text = f'{what}: {error}'[:100]
-            known = sum(key.startswith(what) for key in driver.driver_counts)
-            driver.driver_counts[text if text in driver.driver_counts or known < MAX_NAMES
-                                 else f'{what} (and others)'] += 1
+            prefix = f'errors while processing readings: {type(error).__name__}'
+            cause = f'{prefix}: {error}'[:100]
+            n_causes = sum(key.startswith(prefix) for key in driver.driver_counts)
+            driver.driver_counts[cause if cause in driver.driver_counts or n_causes < MAX_NAMES
+                                 else f'{prefix} (and others)'] += 1
     driver.close()

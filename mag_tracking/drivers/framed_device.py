@@ -36,7 +36,13 @@ class FramedDevice:
         return total
 
     def open(self) -> None:
-        """Open the transport; discard and count unconsumed bytes of the previous connection."""
+        """Open the transport; discard and count unconsumed bytes of the previous connection.
+
+        Raises
+        ------
+        DeviceError
+            If opening fails.
+        """
         if self._unconsumed:
             self._rejected['bytes of truncated frames'] += len(self._unconsumed)
             self._unconsumed = b''
@@ -54,12 +60,18 @@ class FramedDevice:
         -------
         list of Arrival
             Empty if nothing arrived in time.
+
+        Raises
+        ------
+        DeviceError
+            If the connection is lost.
         """
         out: list[Arrival] = []
         for chunk in self._transport.read(timeout_s):
-            data = chunk.data if self._transport.whole else self._unconsumed + chunk.data
-            parsed = self._framing.parse(data, final=self._transport.whole)
-            if not self._transport.whole:
+            data = (chunk.data if self._transport.is_message_oriented
+                    else self._unconsumed + chunk.data)
+            parsed = self._framing.parse(data, final=self._transport.is_message_oriented)
+            if not self._transport.is_message_oriented:
                 self._unconsumed = data[parsed.consumed:]
             self._rejected.update(parsed.rejected)
             out += [Arrival(chunk.arrival_ns, reading, chunk.source)

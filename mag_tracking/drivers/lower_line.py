@@ -1,8 +1,7 @@
-"""Lower convex hull of points, and plausible slopes of its supporting line, for clock skew.
+"""Lower convex hull of points, and plausible slopes of the best line under them (clock skew).
 
 Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network delay
-measurements', IEEE INFOCOM 1999. `device_clock` lists the
-differences from this paper.
+measurements', IEEE INFOCOM 1999. `device_clock` lists the differences from this paper.
 """
 
 import itertools
@@ -41,7 +40,7 @@ def lower_hull(points: Sequence[Point]) -> list[Point]:
 def slope_range(points: Sequence[Point]) -> tuple[float, float]:
     """Range of slopes that are about as likely as the slope of the best line under the points.
 
-    The best line, according to Moon et al., is the edge of the lower convex hull over the mean x.
+    The best line, according to Moon et al., is the edge of the lower convex hull at the mean of x.
 
     Parameters
     ----------

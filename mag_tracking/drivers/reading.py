@@ -1,7 +1,7 @@
-"""Type of a device reading, and the protocols `Transport`, `Framing` and `Device`.
+"""Data types of device readings, and the protocols `Transport`, `Framing` and `Device`.
 
 A *transport* receives bytes (serial line, UDP, MQTT). A *framing* extracts readings from bytes and
-is a pure function. A *device* returns readings with their times of arrival: a transport with a
+has no state. A *device* returns readings with their times of arrival: a transport with a
 framing, the chips on a bus, or the simulator.
 """
 
@@ -78,10 +78,10 @@ class Chunk(NamedTuple):
 class Transport(Protocol):
     """Receives bytes over a connection.
 
-    No method except `close` is called before `open`, or by two threads at the same time.
+    Only `close` may be called before `open`, or while another thread calls a method.
     """
 
-    whole: bool
+    is_message_oriented: bool
     """Whether each chunk is a complete message (a datagram), so that no frame spans two chunks."""
     counts: Counter[str]
     """Number of losses by cause, such as 'empty datagrams'."""
@@ -129,7 +129,7 @@ class Arrival(NamedTuple):
 
 
 class Device(Protocol):
-    """Receives readings. The calling rules of `Transport` apply."""
+    """Receives readings of sensors. The calling rules of `Transport` apply."""
 
     @property
     def counts(self) -> Counter[str]:

@@ -36,15 +36,15 @@ class DriverSettings:
     max_retry_s: float = param(
         1.0, 'Maximum delay between two attempts to reopen a device.', 's', (1e-3, 3600.0))
     batch_s: float = param(
-        0.0, 'Interval over which readings are collected before they are passed on; with `batches` '
-        'they form one message.', 's', (0.0, 1.0))
+        0.0, 'Interval over which readings are collected before they are passed on; the '
+        'option `batches` publishes them in one message.', 's', (0.0, 1.0))
     silence_timeout_s: float = param(
         10.0, 'Interval without data after which a device is closed and reopened; 0 disables the '
         'timeout.', 's', (0.0, 86400.0))
 
 
 def scale_of(unit: str, units: Mapping[str, float], name: str) -> float:
-    """Factor from a unit to SI.
+    """Factor that converts a unit to SI.
 
     Parameters
     ----------

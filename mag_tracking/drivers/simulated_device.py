@@ -1,7 +1,7 @@
 """Device that simulates vehicles passing the sensors of a network in real time.
 
-It serves to try the complete system without hardware, and to measure the system's computational
-cost.
+It is used to try the complete system without hardware, and to measure the computational cost of
+the system.
 """
 
 import bisect
@@ -157,18 +157,18 @@ class SimulatedDevice:
         return (self._monotonic_ns() - self._start_ns) / 1e9
 
     def _due(self, i: int) -> float:
-        """Measurement time of reading `i` [s]; each cycle has one reading of each sensor."""
+        """Measurement time of reading `i` [s], relative to the first `open`."""
         index, j = divmod(i, len(self._network))
         return index / self._settings.rate_hz + self._shift_s[j]
 
     def _n_due(self, elapsed: float) -> int:
-        """Number of readings due so far; rounding may omit some readings of the last interval."""
-        whole = math.floor(elapsed * self._settings.rate_hz)
-        return whole * len(self._network) + bisect.bisect_right(
-            self._shift_s, elapsed - whole / self._settings.rate_hz)
+        """Number of readings due by `elapsed` [s]; rounding may omit some of the last interval."""
+        n_cycles = math.floor(elapsed * self._settings.rate_hz)
+        return n_cycles * len(self._network) + bisect.bisect_right(
+            self._shift_s, elapsed - n_cycles / self._settings.rate_hz)
 
     def _readings(self, table: FloatArray, first: int, end: int) -> list[Arrival]:
-        """Readings from `first` up to, but not including, `end`."""
+        """Arrivals of the readings with the indices `first` .. `end` - 1."""
         index, j = np.divmod(np.arange(first, end), len(self._network))
         due_s = index / self._settings.rate_hz + np.array(self._shift_s)[j]
         # The table covers one pass; its last row, without a vehicle, is used until the next pass.

@@ -1,4 +1,4 @@
-"""Device clock on simulated links; the limits follow from the delay distribution."""
+"""Device clock on simulated links; error limits follow from the distribution of the delays."""
 
 import math
 import pickle
@@ -59,7 +59,7 @@ def constant(rng, t):
 
 def device_ticks(rng, seconds, rate=100.0, ppm=0.0, wander_ppm=0.0, counter=MHZ,
                  first=4_294_000_000, irregular=1.0):
-    """(ticks of a counter without wraps, their times [s]), with a random phase."""
+    """(ticks of a counter without wraps, measurement times [s]); the intervals are random."""
     n = int(seconds * rate)
     d = (np.arange(n) + irregular * rng.random(n)) / rate
     count = np.floor(d / counter['tick_s']).astype(np.int64)
@@ -69,7 +69,7 @@ def device_ticks(rng, seconds, rate=100.0, ppm=0.0, wander_ppm=0.0, counter=MHZ,
 
 
 def arrival_times(rng, t, delay):
-    """Arrival times [ns]; no message overtakes another."""
+    """Arrival times [ns] of messages in the order of measurement."""
     arrival = np.maximum.accumulate(t + delay(rng, t))
     return START + np.round(arrival * 1e9).astype(np.int64)
 
@@ -100,7 +100,7 @@ LINKS = {
 
 
 def error_limit(mean, rate, wander_ppm, begin, end, z):
-    """Limit [s] of the error at the newest end of a fitted line after `begin` .. `end` s.
+    """Limit [s] of the error at the newest end of a line, `begin` .. `end` s after the start.
 
     No point lies between the fitted and the true line. If the fitted line has the error x at its
     end and is not too low in the middle, the triangle between the lines has the area x T / 4 and
@@ -323,8 +323,8 @@ def test_a_step_or_reset_restarts_the_clock(change, cause, counter):
 
 
 @pytest.mark.parametrize('reset, cause', [(False, STEP_BACK), (True, RESET)])
-def test_a_step_back_during_silence_is_first_treated_as_a_queue(reset, cause):
-    """The counter stops for 0.3 s, or the device restarts."""
+def test_a_step_back_during_silence_is_first_treated_as_a_delay(reset, cause):
+    """During the silence, the counter stops for 0.3 s or the device restarts."""
     ticks, arrival, t = simulate(counter=SMALL, first=3 if reset else 4_294_000_000)
     keep = (t < 45.5) | (t > 47.9)
     ticks, arrival, t, after = ticks[keep], arrival[keep], t[keep], t[keep] > 47.9
@@ -346,12 +346,12 @@ def test_occasional_wrong_device_times_affect_no_other_timestamp(sensors):
     ticks, arrival, t = (np.repeat(a, sensors) for a in simulate(seconds=60.0))
     rng = np.random.default_rng(2)
     wrong = np.repeat(rng.random(len(t) // sensors) < 0.02, sensors) & (t > 6.0)
-    bad = ticks.copy()
-    bad[wrong] = np.repeat(np.where(rng.random(len(t) // sensors) < 0.5, ticks[::sensors] + 30_000,
-                                    rng.integers(0, 2**32, len(t) // sensors)),
-                           sensors)[wrong] % 2**32
+    corrupted = ticks.copy()
+    corrupted[wrong] = np.repeat(
+        np.where(rng.random(len(t) // sensors) < 0.5, ticks[::sensors] + 30_000,
+                 rng.integers(0, 2**32, len(t) // sensors)), sensors)[wrong] % 2**32
     clock = clock_of()
-    stamps = timestamps_of(clock, bad, arrival)
+    stamps = timestamps_of(clock, corrupted, arrival)
     assert wrong.sum() > 50 * sensors and not clock.restarts
     assert clock.counts == {NO_FIT: wrong.sum()} and np.isnan(stamps[wrong]).all()
     right = timestamps_of(clock_of(), ticks[~wrong], arrival[~wrong])
@@ -406,14 +406,14 @@ def test_the_clock_continues_after_an_hour_of_disconnection(change_ms, back, res
     """While disconnected, the drift changes by 3 ppm; in two cases, the clock steps by 30 s."""
     ticks, arrival, t = simulate(seed=3, seconds=200.0, ppm=40.0)
     hour = 3600 * 10**9 + round(change_ms * 1e6)
-    out = t > 100.0
-    arrival[out] += hour
-    ticks[out] += round(3.6e9 / (1.0 + 40e-6) - back * 1e6)
+    reconnected = t > 100.0
+    arrival[reconnected] += hour
+    ticks[reconnected] += round(3.6e9 / (1.0 + 40e-6) - back * 1e6)
     clock = clock_of()
-    e = errors_of(timestamps_of(clock, ticks % 2**32, arrival), t) - out * hour
+    e = errors_of(timestamps_of(clock, ticks % 2**32, arrival), t) - reconnected * hour
     assert clock.restarts == restarts and np.isnan(e).sum() == clock.counts[NO_FIT]
     assert clock.counts[NO_FIT] <= (max_rejected(100.0) if restarts else 0)
-    after = e[out][~np.isnan(e[out])]
+    after = e[reconnected][~np.isnan(e[reconnected])]
     # At first the previous drift is used; after one block, the line follows the new messages.
     assert np.abs(after[:20]).max() < 24e6 and np.abs(after[50:]).max() < 2e6
     assert np.abs(after[1000:]).max() * 1e-9 < error_limit(2e-3, 100.0, 0.0, 10.0, 10.0, 12.0)
@@ -421,9 +421,9 @@ def test_the_clock_continues_after_an_hour_of_disconnection(change_ms, back, res
 
 def test_a_step_during_a_minute_of_silence_is_detected():
     ticks, arrival, t = simulate()
-    out = t > 50.0
-    arrival[out] += 60 * 10**9
-    ticks[out] += 70_000_000
+    reconnected = t > 50.0
+    arrival[reconnected] += 60 * 10**9
+    ticks[reconnected] += 70_000_000
     clock = clock_of()
     timestamps_of(clock, ticks % 2**32, arrival)
     assert clock.restarts == {STEP_FORWARD: 1}

@@ -16,7 +16,7 @@ from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample
 from support.samples import MagSample, samples_of
 
-DAY_NS = 1_700_000_000_000_000_000
+WALL_OFFSET_NS = 1_700_000_000_000_000_000
 CLOCK = ClockSettings(tick_s=1e-6, min_delay_s=0.0)
 
 
@@ -31,7 +31,7 @@ class SimulatedHost:
         return self.now_ns
 
     def wall_ns(self):
-        return DAY_NS + self.step_ns + self.now_ns
+        return WALL_OFFSET_NS + self.step_ns + self.now_ns
 
     def sleep(self, seconds):
         self.slept.append(seconds)
@@ -39,7 +39,7 @@ class SimulatedHost:
 
 
 class ScriptedDevice:
-    """Device that follows `script`: errors are raised, lists are returned as arrivals."""
+    """Device with a script of connection failures, read errors and lists of arrivals."""
 
     def __init__(self, machine, script):
         self.counts = Counter()
@@ -65,7 +65,7 @@ class ScriptedDevice:
 
 
 def poll_samples(driver, timeout_s):
-    """Fields and accelerations from one poll, in one list."""
+    """Poll once; return the field samples and then the accelerations in one list."""
     readings, accelerations = driver.poll(timeout_s)
     return [*samples_of(readings), *accelerations]
 
@@ -88,7 +88,7 @@ def test_a_reading_becomes_a_sample_in_si_units_and_wall_time():
     np.testing.assert_allclose(field.field, [1e-6, -2e-6, np.nan])
     np.testing.assert_allclose(acceleration.acceleration, [0.0, 0.0, 9.80665])
     assert field.covariance is None
-    assert field.stamp_ns == acceleration.stamp_ns == DAY_NS + machine.now_ns
+    assert field.stamp_ns == acceleration.stamp_ns == WALL_OFFSET_NS + machine.now_ns
 
 
 @pytest.mark.parametrize('unit, tesla', [('T', 1.0), ('mT', 1e-3), ('uT', 1e-6), ('nT', 1e-9),
@@ -174,20 +174,20 @@ def test_stamp_by_selects_the_source_of_timestamps():
         out = []
         for k in range(len(readings)):
             machine.now_ns = 5_000_000_000 + 10_000_000 * k + (3_000_000 if k == 1 else 0)
-            out += [s.stamp_ns - DAY_NS - 5_000_000_000 for s in poll_samples(driver, 0.1)]
+            out += [s.stamp_ns - WALL_OFFSET_NS - 5_000_000_000 for s in poll_samples(driver, 0.1)]
         return driver, out
     field = (1.0, 2.0, 3.0)
-    ticked = [Reading('', field, ticks=10_000 * k, sequence=k) for k in range(3)]
+    with_ticks = [Reading('', field, ticks=10_000 * k, sequence=k) for k in range(3)]
     # The second reading arrives 3 ms late, which the clock of the device corrects.
-    _, by_ticks = stamps({}, ticked)
+    _, by_ticks = stamps({}, with_ticks)
     np.testing.assert_allclose(by_ticks, [0, 1e7, 2e7], atol=1e4)
-    _, by_sequence = stamps({'stamp_by': 'sequence'}, ticked, ClockSettings(tick_s=0.01))
+    _, by_sequence = stamps({'stamp_by': 'sequence'}, with_ticks, ClockSettings(tick_s=0.01))
     np.testing.assert_allclose(by_sequence, [0, 1e7, 2e7], atol=1e4)
-    _, by_arrival = stamps({'stamp_by': 'arrival'}, ticked)
+    _, by_arrival = stamps({'stamp_by': 'arrival'}, with_ticks)
     assert by_arrival == [0, 13_000_000, 20_000_000]
     _, auto = stamps({}, [Reading('', field)] * 3)
     assert auto == by_arrival
-    driver, mixed = stamps({}, [ticked[0], Reading('', field), ticked[2]])
+    driver, mixed = stamps({}, [with_ticks[0], Reading('', field), with_ticks[2]])
     assert len(mixed) == 2
     assert driver.counts()['readings without a device time'] == 1
 
@@ -291,7 +291,7 @@ def test_duplicate_readings_are_dropped():
     assert (counts['duplicates: mag_1'], counts['sequence restarts: mag_1']) == (1, 1)
 
 
-def test_remembered_readings_do_not_burden_the_garbage_collector():
+def test_stored_readings_are_not_tracked_by_the_garbage_collector():
     gc.collect()
     gc.disable()
     try:
@@ -397,8 +397,9 @@ class DigitFraming:
 class ScriptedTransport:
     """Transport that returns predefined chunks."""
 
-    def __init__(self, chunks, whole=False):
-        self.whole, self.counts, self._chunks = whole, Counter(dropped=2), list(chunks)
+    def __init__(self, chunks, is_message_oriented=False):
+        self.is_message_oriented, self.counts, self._chunks = (
+            is_message_oriented, Counter(dropped=2), list(chunks))
 
     def open(self):
         pass
@@ -432,14 +433,14 @@ def test_messages_are_not_joined():
 
 def test_numbers_skipped_while_closed_are_not_lost():
     """A gap is counted only while the driver is open."""
-    def at(*numbers):
+    def readings_of(*numbers):
         return [Reading('', (float(n), 0.0, 0.0), sequence=n) for n in numbers]
-    driver, *_ = driver_of([at(1, 2), at(50, 51, 53)])
+    driver, *_ = driver_of([readings_of(1, 2), readings_of(50, 51, 53)])
     poll_samples(driver, 0.1)
     driver.close()
     assert len(poll_samples(driver, 0.1)) == 3
     assert driver.counts()['lost: mag_1'] == 1
-    driver, *_ = driver_of([at(1, 2), at(50, 51, 53)])
+    driver, *_ = driver_of([readings_of(1, 2), readings_of(50, 51, 53)])
     poll_samples(driver, 0.1)
     poll_samples(driver, 0.1)
     assert driver.counts()['lost: mag_1'] == 48

@@ -1,4 +1,4 @@
-"""Simulated roadside device: fields, times, and the command `listen`."""
+"""Simulated device: fields, times, and the output of the command `listen`."""
 
 import dataclasses
 import math
@@ -33,7 +33,7 @@ class Clock:
 
 
 def device_of(settings=QUIET_SETTINGS):
-    """(simulated device, its clock)."""
+    """Return (simulated device, its clock)."""
     clock = Clock()
     return SimulatedDevice(settings, lambda: clock.ns, clock.sleep), clock
 

@@ -6,7 +6,7 @@ DEVICE, STRAY = ('', '10.0.0.5'), ('', '10.0.0.66')
 S = 1_000_000_000
 
 
-def test_a_stray_first_message_does_not_block_the_device():
+def test_a_stray_first_message_blocks_the_device_only_until_the_timeout():
     source = SingleSource()
     assert source.accepts(STRAY, 0)
     times = [round((0.1 + 0.1 * k) * S) for k in range(100)]

@@ -109,8 +109,8 @@ def test_one_vehicle_is_rarely_tracked_as_two(kind, simulator):
     assert np.count_nonzero(new) <= (0 if kind == 'car' else 0.1 * n), new
 
 
-def test_more_vehicles_than_are_tracked_together_are_counted():
-    """Ten vehicles pass in seven seconds; at most two are tracked jointly."""
+def test_new_targets_beyond_the_maximum_are_counted():
+    """Ten vehicles pass in seven seconds, but at most two targets are tracked jointly."""
     rng = np.random.default_rng(4)
     plan = [(12.0 + 0.7 * k, 1 - 2 * (k % 2), rng.uniform(8.0, 12.0)) for k in range(10)]
     world = busy_worlds.world(
@@ -129,6 +129,6 @@ def test_more_vehicles_than_are_tracked_together_are_counted():
 @pytest.mark.study
 @pytest.mark.parametrize('seed', [1, 14])
 def test_wrong_smoothed_poses_of_a_truck_tracked_as_two_are_flagged(seed):
-    """No unflagged smoothed pose is wrong, and some filtered poses have no flag."""
+    """Some filtered poses have no flag; no smoothed pose without a flag is wrong."""
     got = one_random_pass('clouds', 'truck', seed)
     assert got.smoothed_wrong == 0 and not got.ambiguous.all()

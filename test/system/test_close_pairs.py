@@ -1,4 +1,4 @@
-"""Two coarse sensors half a metre apart: speed and direction from fit, delay and track.
+"""Two sensors of coarse resolution half a metre apart: speed and direction from three methods.
 
 The series of 40 passes is a study; `make test` runs a few of them.
 """
@@ -23,7 +23,7 @@ def counts(found):
 
 
 def delay_of(a):
-    """(velocity along x, standard deviation) [m/s] from the delay between the sensors."""
+    """(velocity along x, its standard deviation) [m/s] from the delay between the sensors."""
     along = np.cos(a.delay.heading)
     return a.delay.speed * along, a.delay.speed_std
 

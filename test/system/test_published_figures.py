@@ -32,17 +32,17 @@ def t10():
 
 
 @pytest.fixture(scope='module')
-def detected(mitre12):
+def detection_results(mitre12):
     return mitre12.compare_detection()
 
 
 @pytest.fixture(scope='module')
-def bounded(mitre12):
+def bound_results(mitre12):
     return mitre12.compare_bounds()
 
 
 @pytest.fixture(scope='module')
-def observed(t10):
+def observability_results(t10):
     return t10.comparison(t10.condition_maps())
 
 
@@ -86,7 +86,7 @@ def test_the_moment_and_field_of_the_car_match_the_equations(mitre12):
     np.testing.assert_allclose(dipole_field(-np.array([x, y, 0.0]), m)[:2], B, rtol=1e-4)
 
 
-def test_places_follow_the_published_equations_of_motion(mitre12):
+def test_positions_follow_the_published_equations_of_motion(mitre12):
     theta, k = 0.4, np.arange(11)
     r = mitre12.places(3.0, -2.0, 10.0, theta)
     np.testing.assert_allclose(r[:, 0], 3.0 - k / 22.0 * 10.0 * np.sin(theta), rtol=1e-12)
@@ -127,9 +127,9 @@ def test_the_detection_probability_matches_explicit_sums(mitre12, divisor, scale
     assert p[0, 0] == pytest.approx(expected, rel=1e-9) and 0.3 < expected < 0.95
 
 
-def test_detection_probabilities_are_near_the_published_ones(mitre12, detected):
+def test_detection_probabilities_are_near_the_published_ones(mitre12, detection_results):
     """The differences from 59.3 % and 90 % are 3.3 and 1.5 percentage points."""
-    n = detected
+    n = detection_results
     # The aim is the published numbers. Tolerances are the printed differences, rounded up.
     assert n['most'] == pytest.approx(0.593, abs=0.034)
     assert n['once'] == pytest.approx(0.900, abs=0.016)
@@ -148,9 +148,9 @@ def test_detection_probabilities_are_near_the_published_ones(mitre12, detected):
         assert np.all(np.diff(once, axis=0) <= 1e-9) and np.all(once[:, 1] >= once[:, 0])
 
 
-def test_bounds_of_one_sensor_without_a_prior_are_infinite(mitre12, bounded):
+def test_bounds_of_one_sensor_without_a_prior_are_infinite(mitre12, bound_results):
     """The scale is unobservable with one sensor, so only theta has a bound without a prior."""
-    n = bounded
+    n = bound_results
     assert n['lost'] == ('x0', 'y0', 'v', 'M1', 'M2')
     m = mitre12.moment('car')
     lost = np.array([-20.0, 25.0, mitre12.SPEED, 0.0, 3 * m[0], 3 * m[1]]) / 25.0
@@ -166,22 +166,22 @@ def test_bounds_of_one_sensor_without_a_prior_are_infinite(mitre12, bounded):
     assert np.all(np.isfinite(mitre12.std_bounds(J)))
 
 
-def test_printed_jacobian_and_prior_do_not_explain_the_published_bounds(mitre12, bounded):
+def test_printed_jacobian_and_prior_do_not_explain_the_published_bounds(mitre12, bound_results):
     """Equation (20) affects only phi. With four priors of (26), bounds are finite at zero speed."""
     x, y, h = -20.0, 25.0, 1e-5
     phi = np.array([np.arctan2(y, x + h) - np.arctan2(y, x - h),
                     np.arctan2(y + h, x) - np.arctan2(y - h, x)]) / (2.0 * h)
     C = mitre12.bound(mitre12.measured(x), mitre12.PRIOR)[:2, :2]
-    printed, right = bounded['phi at -20 m']
+    printed, right = bound_results['phi at -20 m']
     assert right == pytest.approx(np.degrees(np.sqrt(phi @ C @ phi)), rel=1e-6)
     assert printed < 0.8 * right
-    assert np.all(np.isfinite(bounded['at 0 mph'][2]))
-    assert np.all(bounded['prior on four'][:, :4] <= np.array([30.0, 5.0, 10.0, 15.0]) + 1e-9)
-    assert np.all(bounded['prior on four'][:, 4:].max(axis=0) > 500.0)
+    assert np.all(np.isfinite(bound_results['at 0 mph'][2]))
+    assert np.all(bound_results['prior on four'][:, :4] <= np.array([30.0, 5.0, 10.0, 15.0]) + 1e-9)
+    assert np.all(bound_results['prior on four'][:, 4:].max(axis=0) > 500.0)
 
 
-def test_observability_values_match_the_published_ones(observed):
-    n = observed
+def test_observability_values_match_the_published_ones(observability_results):
+    n = observability_results
     biggest = n['one'][-1]
     assert abs(n['one'][0]) < 1e-12 * biggest and np.all(np.abs(n['up'][:2]) < 1e-12 * biggest)
     assert n['one'][1] == pytest.approx(0.2305, abs=5e-5)
@@ -193,9 +193,9 @@ def test_observability_values_match_the_published_ones(observed):
     assert n['thrice'] < 1e-14
 
 
-def test_the_best_place_of_the_second_sensor_depends_on_the_state(t10, observed):
+def test_the_best_position_of_the_second_sensor_depends_on_the_state(t10, observability_results):
     """The conclusion of T10 holds for the state at the CPA, but not for the state at the start."""
-    n = observed
+    n = observability_results
     assert n['plain best'][0] == (-2.0, 2.0) and n['plain best'][1] == pytest.approx(1110, abs=1)
     assert n['plain best same side'][0] == (-2.2, 0.0)
     assert n['plain best same side'][1] == pytest.approx(2451, abs=1)
@@ -218,9 +218,9 @@ def test_the_best_place_of_the_second_sensor_depends_on_the_state(t10, observed)
     np.testing.assert_allclose(t10.about_cpa(moved), J, rtol=1e-6, atol=1e-6 * np.abs(J).max())
 
 
-def test_the_threshold_and_the_ranges_match_t10(observed):
+def test_the_threshold_and_the_ranges_match_t10(observability_results):
     """T10 gives a threshold of 11.2 and an SNR of 9.2."""
-    n = observed
+    n = observability_results
     assert n['threshold'] == pytest.approx(chi2.isf(0.01, 3), rel=1e-9)
     assert ncx2.sf(n['threshold'], 3, n['snr']) == pytest.approx(0.5, rel=1e-6)
     assert n['snr'] == pytest.approx(9.31, abs=0.005)

@@ -33,7 +33,8 @@ def all_vehicles(replays):
 
 MAX_STEP = 1.5
 """Maximum ratio of successive standard deviations of the position. In 0.08 s, a vehicle moves by a
-fraction of its distance. New evidence may reduce the standard deviation by any factor."""
+small fraction of its distance to the sensors. New evidence may reduce the standard deviation by any
+factor."""
 
 
 def step_of(covariances):
@@ -73,7 +74,7 @@ def test_a_replay_with_truth_reports_its_error_over_the_bound(vehicle_replays, n
 
 
 def expected_to_fail(names, reasons):
-    """Test parameters `names`; the names in `reasons` are marked as expected failures."""
+    """Return `names` as test parameters; those in `reasons` are marked as expected failures."""
     return [pytest.param(n, marks=pytest.mark.xfail(strict=True, reason=reasons[n]))
             if n in reasons else n for n in names]
 
@@ -131,8 +132,8 @@ def test_the_speed_error_is_within_its_limit(vehicle_replays, name):
 
 
 SMOOTHED_NOT_REACHED = {
-    'junction_left_turns_to_rear': '0.64 m at the closest point: it has not converged, three more '
-                                   'passes give 0.45 m',
+    'junction_left_turns_to_rear': '0.64 m at the closest point: the smoother has not converged, '
+                                   'three more passes of it give 0.45 m',
 }
 
 

@@ -17,7 +17,7 @@ from mag_tracking.report.metrics import interpolate_truth
 from support.bundled import ROOT, VEHICLES, vehicle_path
 
 CONFIGURATION = ROOT / 'config' / 'robot_localization.yaml'
-FIRST_SPEED_STD = 30.0
+INITIAL_SPEED_STD = 30.0
 """[m/s] Initial standard deviation of the velocity, which is unknown at the first pose."""
 
 
@@ -44,7 +44,7 @@ def fuse(poses, noise):
     for stamp_ns, position, R in poses:
         if last_ns is None:
             ekf.x = np.r_[position, 0.0, 0.0]
-            ekf.P = np.diag([0.0, 0.0, FIRST_SPEED_STD**2, FIRST_SPEED_STD**2])
+            ekf.P = np.diag([0.0, 0.0, INITIAL_SPEED_STD**2, INITIAL_SPEED_STD**2])
             ekf.P[:2, :2] = R
         else:
             dt = (stamp_ns - last_ns) / 1e9

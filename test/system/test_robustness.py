@@ -202,7 +202,7 @@ def test_a_summary_with_non_finite_numbers_is_valid_json(tmp_path):
     assert json.loads((tmp_path / 'summary.json').read_text()) == {'a': None, 'b': [1.0, None]}
 
 
-def test_the_existence_of_a_target_falls_on_noise():
+def test_the_existence_probability_of_a_target_decreases_without_a_signal():
     network = line_network(2)
     stage_ = TrackManager(network, settings_for('vehicle').track)
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Situations outside the model of the tracker: poses without a flag are not wrong.
+"""Situations that violate the assumptions of the tracker: poses without a flag are not wrong.
 
 `bench.situations` prints a table of more runs.
 """
@@ -28,7 +28,8 @@ MISSED_AIMS = {
     'clocks 200 ms apart': 'clock offset: the four wrong poses are within 0.5 s of the closest '
                            'point, before the whole pass reveals the offset',
     'a car with a trailer': 'some poses belong to the car alone, 2 to 3 m ahead of the middle '
-                            'of both, until the trailer has passed; for others it is unknown',
+                            'of both, until the trailer has passed; the cause of the others is '
+                            'unknown',
     'one follows, four sensors': 'in one of six runs two cars 9 m apart are tracked as a truck '
                                  'between them for 0.8 s, until the second one is found',
     'one overtakes': 'two cars side by side are tracked as a truck of 8 to 12 m',
@@ -38,7 +39,7 @@ MISSED_AIMS = {
 wrong poses."""
 
 MISSED_EVENT_AIMS = {
-    'a car that turns': '226 of 241: the other 15 are or were flagged for their height',
+    'a car that turns': '226 of 241 poses: the other 15 are or were flagged for their height',
     'a tram line switched': 'five of six; the cause is unknown and persists without new_targets',
 }
 """{situation: cause of the missed aim for events}."""

@@ -1,4 +1,4 @@
-"""Combinations of simulators and faults that `make bench` evaluates."""
+"""Passes with sensor faults, from each simulator, as evaluated by `make bench`."""
 
 import numpy as np
 import pytest

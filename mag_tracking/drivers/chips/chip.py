@@ -116,8 +116,8 @@ class Bus:
     sleep : callable
         Function that waits for a time in seconds, such as `time.sleep`.
     multiplexers : collection of int, optional
-        Addresses of all TCA9548A multiplexers. Of all their channels, at most one is open at any
-        time, and none is open during transfers to a chip directly on the bus.
+        Addresses of all TCA9548A multiplexers. At most one channel of all multiplexers is open at
+        any time. No channel is open during a transfer to a chip directly on the bus.
 
     Attributes
     ----------
@@ -145,27 +145,27 @@ class Bus:
             raise OSError(errno.ENODEV, 'the bus is not open')
         return self._smbus
 
-    def select(self, place: ChipLocation) -> None:
+    def select(self, location: ChipLocation) -> None:
         """Open the multiplexer channel of a chip and close all other channels.
 
         Parameters
         ----------
-        place : ChipLocation
+        location : ChipLocation
         """
-        selection = (place.multiplexer, place.channel)
+        selection = (location.multiplexer, location.channel)
         if not self._multiplexers or selection == self._selected:
             return
         open_multiplexer = None if self._selected is None else self._selected[0]
         # Multiplexers in an unknown state may have an open channel.
         to_close = self._multiplexers if self._selected is None else [open_multiplexer]
         for address in to_close:
-            if address is not None and address != place.multiplexer:
+            if address is not None and address != location.multiplexer:
                 self.smbus.write_byte(address, 0)
-        if place.multiplexer is not None and place.channel is not None:
-            self.smbus.write_byte(place.multiplexer, 1 << place.channel)
+        if location.multiplexer is not None and location.channel is not None:
+            self.smbus.write_byte(location.multiplexer, 1 << location.channel)
         self._selected = selection
 
-    def forget(self) -> None:
+    def invalidate_selection(self) -> None:
         """Discard the stored state of the multiplexers, because a failure may have changed it."""
         self._selected = None
 
@@ -176,7 +176,7 @@ class Registers:
     Parameters
     ----------
     bus : Bus
-    place : ChipLocation
+    location : ChipLocation
         Location of the chip.
 
     Attributes
@@ -187,8 +187,8 @@ class Registers:
         Function that waits for a time in seconds.
     """
 
-    def __init__(self, bus: Bus, place: ChipLocation) -> None:
-        self._bus, self._place = bus, place
+    def __init__(self, bus: Bus, location: ChipLocation) -> None:
+        self._bus, self._location = bus, location
         self.monotonic_ns, self.sleep = bus.monotonic_ns, bus.sleep
 
     def read(self, register: int) -> int:
@@ -202,8 +202,8 @@ class Registers:
         -------
         int
         """
-        self._bus.select(self._place)
-        return self._bus.smbus.read_byte_data(self._place.address, register)
+        self._bus.select(self._location)
+        return self._bus.smbus.read_byte_data(self._location.address, register)
 
     def read_block(self, register: int, length: int) -> bytes:
         """Read successive registers.
@@ -224,8 +224,8 @@ class Registers:
         OSError
             If the chip does not answer, or the block is shorter than requested.
         """
-        self._bus.select(self._place)
-        block = bytes(self._bus.smbus.read_i2c_block_data(self._place.address, register, length))
+        self._bus.select(self._location)
+        block = bytes(self._bus.smbus.read_i2c_block_data(self._location.address, register, length))
         if len(block) != length:
             raise OSError(errno.EIO, f'received {len(block)} of {length} bytes')
         return block
@@ -238,8 +238,8 @@ class Registers:
         register : int
         value : int
         """
-        self._bus.select(self._place)
-        self._bus.smbus.write_byte_data(self._place.address, register, value)
+        self._bus.select(self._location)
+        self._bus.smbus.write_byte_data(self._location.address, register, value)
 
     def transfer(self, *messages: i2c_msg) -> None:
         """Transfer messages in one transaction.
@@ -248,7 +248,7 @@ class Registers:
         ----------
         *messages : i2c_msg
         """
-        self._bus.select(self._place)
+        self._bus.select(self._location)
         self._bus.smbus.i2c_rdwr(*messages)
 
 

@@ -1,4 +1,4 @@
-"""Adapter for drivers written for CircuitPython, which exist for nearly every magnetometer.
+"""Adapter for CircuitPython drivers, which exist for nearly every magnetometer.
 
 The chip name `adafruit_lis3mdl.LIS3MDL` selects the class `LIS3MDL` of the module
 `adafruit_lis3mdl`, which must be installed (`pip install adafruit-circuitpython-lis3mdl`). The
@@ -6,9 +6,10 @@ adapter creates an instance with a bus, an address and the default arguments of 
 its property `magnetic`.
 
 If `chips/` has a module for the chip, that module is preferable, because the adapter has several
-limitations. It does not distinguish an old conversion from a new one. Some drivers block while they
-wait for a conversion. An axis over its range is not detected. The driver defines axes and scale
-(the scale of the MMC5603 driver 1.0.16 is 2.4 % above the data sheet's 16384 counts per gauss). The
+limitations. The adapter does not distinguish an old conversion from a new one, and does not detect
+an axis over its range. Some drivers block while they wait for a conversion. The driver defines axes
+and scale (the MMC5603 driver 1.0.16 returns 2.4 % more than 16384 counts per gauss, the scale of
+the data sheet). The
 timestamp of a reading is the middle of the call, which is 0.5 to 1.5 periods late for a chip that
 measures continuously.
 
@@ -45,16 +46,16 @@ class BusioI2c:
         self._locked = False
         self._deadline_ns = 0
 
-    def begin(self, longest_ns: int) -> None:
+    def begin(self, timeout_ns: int) -> None:
         """Unlock the bus and set the deadline.
 
         Parameters
         ----------
-        longest_ns : int, ns
+        timeout_ns : int, ns
             Time until the deadline.
         """
         self._locked = False
-        self._deadline_ns = self._registers.monotonic_ns() + longest_ns
+        self._deadline_ns = self._registers.monotonic_ns() + timeout_ns
 
     def try_lock(self) -> bool:
         """Lock the bus if it is free.
@@ -64,7 +65,7 @@ class BusioI2c:
         bool
             Whether the bus was free.
         """
-        self._check_time()
+        self._check_deadline()
         free, self._locked = not self._locked, True
         return free
 
@@ -124,10 +125,10 @@ class BusioI2c:
 
     def _transfer(self, *messages: i2c_msg) -> None:
         """Make one transaction; raise OSError if the deadline has passed."""
-        self._check_time()
+        self._check_deadline()
         self._registers.transfer(*messages)
 
-    def _check_time(self) -> None:
+    def _check_deadline(self) -> None:
         """Raise OSError if the deadline has passed."""
         if self._registers.monotonic_ns() > self._deadline_ns:
             raise OSError(errno.EIO, 'timeout while the driver waited for its chip')

@@ -1,4 +1,4 @@
-"""Parser of the I2C sensors in the settings: name:chip:address[@multiplexer.channel]."""
+"""Parser of sensor entries in the I2C settings: name:chip:address[@multiplexer.channel]."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -16,7 +16,7 @@ class Sensor(NamedTuple):
 
     name: str
     chip: str
-    place: ChipLocation
+    location: ChipLocation
 
 
 def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor]:
@@ -38,22 +38,22 @@ def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor
         If an entry is not valid, or two entries conflict with each other.
     """
     sensors = [parse_sensor(entry, known) for entry in entries]
-    multiplexers = {s.place.multiplexer for s in sensors} - {None}
+    multiplexers = {s.location.multiplexer for s in sensors} - {None}
     for i, sensor in enumerate(sensors):
-        if sensor.place.address in multiplexers:
-            raise SettingsError(f'sensors: {sensor.name}: address {sensor.place.address:#04x} is '
-                                'used by a multiplexer')
+        if sensor.location.address in multiplexers:
+            raise SettingsError(f'sensors: {sensor.name}: address {sensor.location.address:#04x} '
+                                'is used by a multiplexer')
         for other in sensors[:i]:
             if other.name == sensor.name:
                 raise SettingsError(f'sensors: {sensor.name} appears twice')
-            if _conflict(sensor.place, other.place):
+            if _conflict(sensor.location, other.location):
                 raise SettingsError(f'sensors: {other.name} and {sensor.name} both answer at '
-                                    f'{sensor.place}')
+                                    f'{sensor.location}')
     return sensors
 
 
 def _conflict(one: ChipLocation, other: ChipLocation) -> bool:
-    """Whether two chips would answer at once; a chip directly on the bus answers on any channel."""
+    """Whether both chips would answer; a chip directly on the bus answers on every channel."""
     return one.address == other.address and (
         one == other or None in (one.multiplexer, other.multiplexer))
 
@@ -84,15 +84,15 @@ def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
     if chip not in known and '.' not in chip:
         raise SettingsError(f'sensors: {name}: chip {chip} is neither one of '
                             f'{", ".join(known)} nor a module.Class')
-    address = _address(name, 'address', match['address'], 0x08)
+    address = _parse_address(name, 'address', match['address'], 0x08)
     if match['multiplexer'] is None:
         return Sensor(name, chip, ChipLocation(address))
-    multiplexer = _address(name, 'multiplexer', match['multiplexer'], 0x70)
+    multiplexer = _parse_address(name, 'multiplexer', match['multiplexer'], 0x70)
     return Sensor(name, chip, ChipLocation(address, multiplexer, int(match['channel'])))
 
 
-def _address(name: str, role: str, digits: str, lowest: int) -> int:
-    """Parse an address and check its range."""
+def _parse_address(name: str, role: str, digits: str, lowest: int) -> int:
+    """Parse the digits of an address; raises SettingsError if it is not in `lowest` .. 0x77."""
     address = int(digits, 16)
     if not lowest <= address <= 0x77:
         raise SettingsError(f'sensors: {name}: {role} {address:#04x} is outside '

@@ -129,7 +129,10 @@ class Mmc5983ma:
         return _conversion(middle_ns, (x, y, z))
 
     def _measure_pair(self) -> Measurement:
-        """Measure after SET and after RESET; store the offset, and return the corrected field."""
+        """Measure after SET and after RESET, store the offset, and return the corrected conversion.
+
+        The result is None if a conversion is not finished in time.
+        """
         halves = []
         for pulse in (SET, RESET):
             self._registers.write(self.CONTROL_0, pulse)
@@ -182,6 +185,6 @@ class Mmc5603(Mmc5983ma):
 
 
 def _conversion(middle_ns: int, counts: Axes) -> Conversion:
-    """Create a conversion from its middle [ns] and its counts, which are scaled to tesla."""
+    """Create a conversion from the time of its middle [ns] and its field [counts]."""
     x, y, z = (c / COUNTS_PER_TESLA for c in counts)
     return Conversion(middle_ns, (x, y, z))

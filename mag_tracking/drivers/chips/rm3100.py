@@ -31,7 +31,7 @@ from mag_tracking.settings import param
 CONTINUOUS, CYCLE_COUNTS, RATE, RESULTS, STATUS = 0x01, 0x04, 0x0B, 0x24, 0x34
 ALL_AXES_READY = 0x79
 """Register value: measure all three axes continuously, and report them when all are ready."""
-FASTEST = 0x92
+FASTEST_RATE = 0x92
 READY = 0x80
 FULL_SCALE = 800e-6
 """[T] Measurement range of an axis."""
@@ -75,7 +75,7 @@ class Rm3100:
         for axis in range(3):
             self._registers.write(CYCLE_COUNTS + 2 * axis, self._cycles >> 8)
             self._registers.write(CYCLE_COUNTS + 2 * axis + 1, self._cycles & 0xFF)
-        self._registers.write(RATE, FASTEST)
+        self._registers.write(RATE, FASTEST_RATE)
         self._registers.write(CONTINUOUS, ALL_AXES_READY)
         self._registers.sleep(self._delay_ns * 1e-9 * CONVERSION_MARGIN)
 

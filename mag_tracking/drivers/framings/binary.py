@@ -13,7 +13,7 @@ from mag_tracking.drivers.framings.fields import (
     FieldLayout,
     Rejected,
     axis_value,
-    chosen,
+    check_choice,
     ignore_value,
     ticks_value,
 )
@@ -52,13 +52,13 @@ class BinarySettings:
 class BinaryFraming:
     """Extracts readings from binary frames. Implements `Framing`.
 
-    If a frame is not valid, the search continues one byte after the beginning of its sync. With an
-    n-bit checksum, every true frame is found at any position, with one exception: a sync in garbage
-    or in a payload is accepted as a frame with probability 2^-n, and then hides the true frames
-    that begin within its length. Without a checksum, every sync is accepted; a tail is a weak
-    checksum. True frames are then found if they follow each other without a gap, or if the gap
-    contains no sync. After any other gap, readings may be false or lost until the search is aligned
-    with the frames again.
+    If a frame is not valid, the search continues one byte after the beginning of its sync. If the
+    frames have an n-bit checksum, every true frame is found, with one exception: a sync in garbage
+    or in a payload begins a false frame, which is accepted with probability 2^-n. An accepted false
+    frame hides the true frames that begin within it. If the frames have no checksum, every sync is
+    accepted; a tail is a weak checksum. True frames are then found if they follow each other
+    without a gap, or if the gap contains no sync. After any other gap, readings may be false or
+    lost until the search is aligned with the frames again.
 
     No standard defines this format, but many sensor boards use it.
 
@@ -71,9 +71,10 @@ class BinaryFraming:
     size : int
         Length of a frame in bytes.
     CLOCK : dict of str to float
-        Clock settings derived from the field types: a counter wraps at the limit of its type.
+        Clock settings: `wrap`, from the type of `ticks`. Empty if frames contain no `ticks`.
     DRIVER : dict of str to int
-        Driver settings derived from the field types.
+        Driver settings: `sequence_wrap`, from the type of `sequence`. Empty if frames contain no
+        `sequence`.
 
     Raises
     ------
@@ -88,10 +89,10 @@ class BinaryFraming:
         if not self._sync:
             raise SettingsError('sync: at least one byte is required, such as A5')
         self._tail = _parse_bytes('tail', settings.tail)
-        self._order: _ByteOrder = chosen('byte_order', settings.byte_order, ('little', 'big'))
-        name = chosen('checksum', settings.checksum, ('none', *CHECKSUMS))
+        self._order: _ByteOrder = check_choice('byte_order', settings.byte_order, ('little', 'big'))
+        name = check_choice('checksum', settings.checksum, ('none', *CHECKSUMS))
         self._checksum = CHECKSUMS.get(name, Checksum(0, _empty_checksum))
-        first_part = chosen('checksum_from', settings.checksum_from, ('sync', 'payload'))
+        first_part = check_choice('checksum_from', settings.checksum_from, ('sync', 'payload'))
         fields, each = (_parse_fields('fields', settings.fields),
                         _parse_fields('each', settings.each))
         self._layout = FieldLayout([name for name, _ in fields], [name for name, _ in each],
@@ -101,9 +102,9 @@ class BinaryFraming:
             '<>'[self._order == 'big'] + ''.join(_STRUCT_CODES[kind] for kind in types))
         self._converters = [_converter(quantity, kind, self._order) for quantity, kind
                             in zip(self._layout.quantities, types, strict=True)]
-        self._payload = len(self._sync)
-        self._covered = 0 if first_part == 'sync' else self._payload
-        self._payload_end = self._payload + self._struct.size
+        self._payload_start = len(self._sync)
+        self._coverage_start = 0 if first_part == 'sync' else self._payload_start
+        self._payload_end = self._payload_start + self._struct.size
         self._checksum_end = self._payload_end + self._checksum.size
         self.size = self._checksum_end + len(self._tail)
         kinds = dict(fields)
@@ -153,7 +154,7 @@ class BinaryFraming:
         return Parsed(tuple(readings), consumed, rejected)
 
     def _partial_sync(self, data: bytes, at: int) -> int:
-        """Length of a partial sync at the end of `data`, after the index `at`."""
+        """Length of the partial sync at the end of `data[at:]`; 0 if there is none."""
         for n in range(min(len(self._sync) - 1, len(data) - at), 0, -1):
             if data.endswith(self._sync[:n]):
                 return n
@@ -166,13 +167,13 @@ class BinaryFraming:
             return 'with a wrong tail'
         end = start + self._payload_end
         sent = int.from_bytes(data[end:start + self._checksum_end], self._order)
-        if sent != self._checksum.value(data[start + self._covered:end]):
+        if sent != self._checksum.compute(data[start + self._coverage_start:end]):
             return 'with a wrong checksum'
         return ''
 
     def _read(self, data: bytes, start: int) -> list[Reading]:
         """Extract the readings of the frame at `start`; raises Rejected for an invalid value."""
-        values = self._struct.unpack_from(data, start + self._payload)
+        values = self._struct.unpack_from(data, start + self._payload_start)
         return self._layout.readings(
             [convert(value) for convert, value in zip(self._converters, values, strict=True)])
 
@@ -183,7 +184,7 @@ def _empty_checksum(data: bytes) -> int:
 
 
 def _parse_bytes(setting: str, text: str) -> bytes:
-    """Parse a setting of hexadecimal bytes."""
+    """Parse hexadecimal bytes; raises SettingsError if `text` is not hexadecimal."""
     try:
         return bytes.fromhex(text)
     except ValueError:
@@ -192,7 +193,7 @@ def _parse_bytes(setting: str, text: str) -> bytes:
 
 
 def _parse_fields(setting: str, fields: Sequence[str]) -> list[tuple[str, str]]:
-    """Parse fields such as x:i16 into [(name, type)]."""
+    """Parse fields such as x:i16 into [(name, type)]; raises SettingsError for a wrong type."""
     out = []
     for text in fields:
         name, _, kind = text.rpartition(':')

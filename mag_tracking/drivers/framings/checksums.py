@@ -1,6 +1,6 @@
 """Checksums of the frames sent by devices.
 
-Source: names, polynomials and check values of the "Catalogue of parametrised CRC algorithms" (G.
+Source of the names, polynomials and check values: "Catalogue of parametrised CRC algorithms" (G.
 Cook). The check value is the checksum of the ASCII string '123456789'.
 """
 
@@ -17,7 +17,7 @@ class Checksum(NamedTuple):
 
     size: int
     """Length in bytes."""
-    value: Callable[[bytes], int]
+    compute: Callable[[bytes], int]
     """Function that computes the checksum of the covered bytes."""
 
 

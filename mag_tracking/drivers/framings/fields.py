@@ -54,7 +54,8 @@ class FieldLayout:
     Raises
     ------
     SettingsError
-        If a field is unknown or appears twice, or if no field is an axis.
+        If a field is unknown or appears twice, if no field is an axis, if only some of the axes
+        name a sensor, or if only one of `each` and `count` is given.
     """
 
     def __init__(self, fields: Sequence[str], each: Sequence[str] = (), count: int = 0) -> None:
@@ -116,14 +117,14 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _axes_getter(axes: Mapping[str, int], names: Sequence[str]) -> Callable[[Values], Any]:
-    """Function that returns three axes from a frame's values, or None if all are missing."""
+    """Function that selects three axes from a frame's values; it returns None if none is sent."""
     if not any(name in axes for name in names):
         return itemgetter(-1)
     return itemgetter(*(axes.get(name, -2) for name in names))
 
 
 def _expand(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """Check all fields of a frame and repeat the fields of identical sensors."""
+    """Return `fields`, followed by `each` for every sensor; raises SettingsError if invalid."""
     for name in fields:
         quantity, sensor = _split(name)
         if quantity not in (AXES if '.' in name else (*FRAME_QUANTITIES, *AXES, SKIP)):
@@ -153,7 +154,7 @@ def axis_value(value: float | bytes) -> float:
     Parameters
     ----------
     value : float or bytes
-        NaN if the axis is missing.
+        Number, or text of a number. NaN if the axis is missing.
 
     Returns
     -------
@@ -209,7 +210,7 @@ def sequence_value(value: int) -> int:
     Raises
     ------
     Rejected
-        If `value` exceeds 64 bits.
+        If `value` is outside -2^63 .. 2^64 - 1.
     """
     if not -2**63 <= value < 2**64:
         raise Rejected('with a sequence of more than 64 bits')
@@ -283,7 +284,7 @@ def decode_escapes(setting: str, text: str) -> bytes:
         raise SettingsError(f'{setting}: {text!r} cannot be encoded as UTF-8') from None
 
 
-def chosen(setting: str, value: str, choices: Sequence[_Choice]) -> _Choice:
+def check_choice(setting: str, value: str, choices: Sequence[_Choice]) -> _Choice:
     """Check that a setting is one of the permitted values.
 
     Parameters

@@ -52,8 +52,8 @@ class JsonFraming:
     object that spans several lines is parsed only if the data are `final` and contain only this
     object; otherwise each line is parsed separately.
 
-    Source: RFC 8259. NaN and Infinity are not defined there, but accepted, because many libraries
-    and devices write them.
+    Source: RFC 8259. The parser also accepts NaN and Infinity, which RFC 8259 does not define,
+    because many libraries and devices write them. An infinite axis is rejected.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class JsonFraming:
         self._layout = FieldLayout(names)
 
     def _axis_paths(self, name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the paths of three axes; the path of a list is stored and expanded."""
+        """Return the paths of three axes; the path of a list is expanded and added to `_lists`."""
         if len(paths) == 1 and paths[0]:
             self._lists.append((paths[0], _split_path(name, paths[0])))
             return tuple(f'{paths[0]}.{i}' for i in range(3))
@@ -115,7 +115,7 @@ class JsonFraming:
         return self._lines.parse(data, final, self._read)
 
     def _is_single_document(self, data: bytes) -> bool:
-        """Whether a whole message is one JSON document that spans several lines."""
+        """Whether `data` is a single JSON document that spans several lines."""
         if self._lines.end not in data.strip() or len(data) > self._lines.max_length:
             return False
         try:
@@ -150,7 +150,7 @@ class JsonFraming:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """JSON object as a dict; raises Rejected for duplicate keys."""
+    """Create the dict of a JSON object; raises Rejected for a duplicate key."""
     content = dict(pairs)
     if len(content) != len(pairs):
         raise Rejected('with a duplicate key')
@@ -178,7 +178,7 @@ def _lookup(value: Any, path: str, keys: _Keys) -> Any:
 
 
 def _number(value: object, path: str) -> int | float:
-    """Return a value that is a number; raises Rejected otherwise, also for a bool."""
+    """Return `value` if it is a number; raises Rejected otherwise, also for a bool."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise Rejected(f'whose {path} is not a number')
     return value
@@ -195,7 +195,7 @@ def _ticks(value: object, path: str) -> float:
 
 
 def _sequence(value: object, path: str) -> int:
-    """Convert a sequence number; JSON does not distinguish 12 from 12.0."""
+    """Convert a sequence number, such as 12 or 12.0; raises Rejected if it is not an integer."""
     value = _number(value, path)
     if isinstance(value, float):
         if not value.is_integer():
@@ -205,7 +205,7 @@ def _sequence(value: object, path: str) -> int:
 
 
 def _sensor(value: object, path: str) -> str:
-    """Convert the name of a sensor, which may be an integer."""
+    """Convert a sensor name, a string or an integer; raises Rejected for any other value."""
     if isinstance(value, int) and not isinstance(value, bool):
         value = str(value)
     if not isinstance(value, str):

@@ -12,7 +12,7 @@ from mag_tracking.drivers.framings.fields import (
     FieldLayout,
     Rejected,
     axis_value,
-    chosen,
+    check_choice,
     decode_escapes,
     ignore_value,
     sensor_name,
@@ -171,7 +171,7 @@ class TextFraming:
         self._layout = FieldLayout(settings.fields, settings.each, settings.count)
         self._prefix = decode_escapes('prefix', settings.prefix)
         self._comment = decode_escapes('comment', settings.comment)
-        self._nmea = chosen('checksum', settings.checksum, ('none', 'nmea')) == 'nmea'
+        self._has_checksum = check_choice('checksum', settings.checksum, ('none', 'nmea')) == 'nmea'
         separator = decode_escapes('separator', settings.separator)
         self._separator = None if separator == b' ' else separator
         self._converters = [_converter(q) for q in self._layout.quantities]
@@ -211,7 +211,7 @@ class TextFraming:
             raise Rejected('that are comments')
         if not line.startswith(self._prefix):
             raise Rejected('without the prefix')
-        if self._nmea:
+        if self._has_checksum:
             line = _strip_checksum(line)
         values = line[len(self._prefix):].split(self._separator)
         if len(values) != len(self._converters):

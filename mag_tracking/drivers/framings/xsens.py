@@ -65,7 +65,7 @@ class XsensSettings:
 
 
 class _Message(NamedTuple):
-    """Type and position of a message in a window; it may end after the last byte received."""
+    """Type and position of a message in a window; the message may end after the window."""
 
     mid: int
     begin: int
@@ -75,7 +75,7 @@ class _Message(NamedTuple):
 
 
 class _ParseStep(NamedTuple):
-    """Result of parsing the message that may begin at a position."""
+    """Result of parsing a possible message at the beginning of a window."""
 
     length: int
     """Number of bytes consumed; 0 if more bytes are needed."""
@@ -207,7 +207,7 @@ class XsensFraming:
 
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:
-        """Search `outer` for a data message; return a step to reject it or wait, else None."""
+        """Return a step that rejects `outer` or waits, if it may contain data; None otherwise."""
         rejection = _REJECT_STEP._replace(causes=('messages that contain the start of another',))
         index = 0
         while True:
@@ -229,10 +229,13 @@ class XsensFraming:
                 return rejection
 
     @staticmethod
-    def _next_start(window: bytes, index: int, end: int, whole: bool) -> int:
-        """Index of the next start before `end`, or -1; `whole` requires both bytes before `end`."""
-        found = window.find(_START, index, end if whole else end + 1)
-        if found < 0 and not whole and end == len(window) and window.endswith(_PREAMBLE, index):
+    def _next_start(window: bytes, index: int, end: int, complete: bool) -> int:
+        """Index of the next message start from `index` on; -1 if there is none before `end`.
+
+        Both bytes of the start must be before `end` if `complete` is set, otherwise the first byte.
+        """
+        found = window.find(_START, index, end if complete else end + 1)
+        if found < 0 and not complete and end == len(window) and window.endswith(_PREAMBLE, index):
             return end - 1
         return found
 

@@ -72,8 +72,10 @@ def _three_reals(data: bytes, precision: int) -> _Triple | None:
 
 
 def _decode_packet(identifier: int, data: bytes) -> tuple[str, float | _Triple | None] | None:
-    """Decode a packet into (attribute of `Reading`, value); None if the packet is not used."""
-    # The value is None if the length of the packet is wrong.
+    """Decode a packet into (attribute of `Reading`, value); None if the packet is not used.
+
+    The value is None if the length of the packet is wrong.
+    """
     if identifier == _PACKET_COUNTER:
         return 'sequence', int.from_bytes(data, 'big') if len(data) == 2 else None
     if identifier == _SAMPLE_TIME_FINE:
@@ -136,7 +138,7 @@ def _message_of(values: Mapping[str, Any], causes: Sequence[str]) -> DecodedMess
 
 
 class MTDataLayout:
-    """Layout of MTData messages, which the messages themselves do not describe.
+    """Layout of MTData messages, which is known only from the settings.
 
     Parameters
     ----------
@@ -154,8 +156,8 @@ class MTDataLayout:
     Raises
     ------
     SettingsError
-        If a block is unknown or out of order, if there is a second orientation, or if there is
-        neither 'acc' nor 'mag'.
+        If a block is unknown or out of order, if there is a second orientation, if there is
+        neither 'acc' nor 'mag', or if the number format is unknown.
     """
 
     def __init__(self, blocks: Sequence[str], number_format: str) -> None:

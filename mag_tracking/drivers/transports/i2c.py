@@ -1,6 +1,6 @@
 """Magnetometer chips on an I2C bus of this machine, polled cyclically.
 
-A polling cycle begins every 1 / rate_hz at absolute deadlines, so timing errors do not accumulate.
+Polling cycles begin at multiples of 1 / rate_hz after opening, so timing errors do not accumulate.
 Every chip is read once per cycle, and chips that measure on request measure at the same time. The
 arrival time of a reading is the estimated middle of the chip's conversion; the modules of `chips/`
 give the accuracy. The field is in tesla.
@@ -141,8 +141,8 @@ class I2cDevice(Closable):
                 opened = self._open_bus(self._settings.bus)
             except OSError as error:
                 raise DeviceError(f'{self._name}: {_open_error(error)}') from error
-            multiplexers = {s.place.multiplexer for s in self._sensors.values()
-                            if s.place.multiplexer is not None}
+            multiplexers = {s.location.multiplexer for s in self._sensors.values()
+                            if s.location.multiplexer is not None}
             self._bus = bus = Bus(opened, self._monotonic_ns, self._sleep, multiplexers)
             try:
                 self._chips = self._create_chips(bus)
@@ -164,12 +164,12 @@ class I2cDevice(Closable):
         """Create the chips {sensor name: chip} without access to the bus."""
         chips: dict[str, Chip] = {}
         for name, sensor in self._sensors.items():
-            registers = Registers(bus, sensor.place)
+            registers = Registers(bus, sensor.location)
             if sensor.chip in CHIPS:
                 chips[name] = CHIPS[sensor.chip](registers, getattr(self._settings, sensor.chip),
                                                  partial(self._count, name=name))
             else:
-                chips[name] = CircuitpythonChip(registers, sensor.chip, sensor.place.address)
+                chips[name] = CircuitpythonChip(registers, sensor.chip, sensor.location.address)
         return chips
 
     def _count(self, cause: str, name: str) -> None:
@@ -177,19 +177,19 @@ class I2cDevice(Closable):
         self.counts[f'{cause}: {name}'] += 1
 
     def _set_up(self, name: str, chip: Chip, bus: Bus) -> None:
-        """Identify and configure a chip; raises DeviceError."""
+        """Identify and configure a chip; raises DeviceError if this fails."""
         sensor = self._sensors[name]
-        where = f'{self._name}: {name} ({sensor.chip}, {sensor.place})'
-        registers = Registers(bus, sensor.place)
+        label = f'{self._name}: {name} ({sensor.chip}, {sensor.location})'
+        registers = Registers(bus, sensor.location)
         try:
             check_identity(chip, registers)
             chip.set_up()
         except DeviceError as error:
             known = [] if sensor.chip not in CHIPS else self._matching_chips(registers)
             hint = f'; it is identified as {known[0]}' if known else ''
-            raise DeviceError(f'{where}: {error}{hint}') from error
+            raise DeviceError(f'{label}: {error}{hint}') from error
         except OSError as error:
-            raise DeviceError(f'{where}: {self._fault(error)}') from error
+            raise DeviceError(f'{label}: {self._fault(error)}') from error
 
     def _matching_chips(self, registers: Registers) -> list[str]:
         """Names of the supported chips whose identity matches the registers."""
@@ -249,10 +249,10 @@ class I2cDevice(Closable):
         """Wait for a cycle until `end_ns`; count missed cycles; return whether a cycle is due."""
         while not self._closing:
             now_ns = self._monotonic_ns()
-            late = (now_ns - self._due_ns) // self._period_ns
-            if late > 0:
-                self.counts['polling cycles missed'] += late
-                self._due_ns += late * self._period_ns
+            n_missed = (now_ns - self._due_ns) // self._period_ns
+            if n_missed > 0:
+                self.counts['polling cycles missed'] += n_missed
+                self._due_ns += n_missed * self._period_ns
             if now_ns >= self._due_ns:
                 self._due_ns += self._period_ns
                 return True
@@ -289,7 +289,7 @@ class I2cDevice(Closable):
         return arrivals
 
     def _arrivals(self, name: str, conversion: Conversion | None) -> list[Arrival]:
-        """List the arrival of a conversion; count a missing conversion, detect a silent chip."""
+        """Return a list of the arrival; count a missing conversion and detect a silent chip."""
         self._n_failed[name] = 0
         if conversion is None:
             self._count('polling cycles without a new conversion', name)
@@ -302,8 +302,8 @@ class I2cDevice(Closable):
         return [Arrival(conversion.middle_ns, Reading(name, conversion.field))]
 
     def _fail(self, bus: Bus, name: str, error: OSError) -> None:
-        """Count a failure; mark the device as lost after too many consecutive failures."""
-        bus.forget()
+        """Count a failure; mark the device as lost after `max_failures` consecutive failures."""
+        bus.invalidate_selection()
         self._count('failed readings', name)
         self._n_failed[name] += 1
         n = self._n_failed[name]

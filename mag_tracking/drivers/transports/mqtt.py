@@ -93,11 +93,11 @@ class MqttTopics:
     Raises
     ------
     SettingsError
-        If no topic is configured, a password has no user name, or `ca_file` is set without TLS.
+        If a topic filter is empty, a password has no user name, or `ca_file` is set without TLS.
     """
 
     SETTINGS = MqttSettings
-    whole = True
+    is_message_oriented = True
 
     def __init__(self, settings: MqttSettings) -> None:
         s = settings
@@ -135,7 +135,7 @@ class MqttTopics:
         self.close()
         client = self._client()
         with self._changed:
-            self._count()
+            self._add_pending_counts()
             self._is_ready = self._closing = False
         self._connect(client)
         with self._changed:
@@ -184,7 +184,7 @@ class MqttTopics:
         return context
 
     def _password(self) -> str | None:
-        """First line of the password file; None if no file is configured."""
+        """Read the password, None if no file is configured; raises DeviceError if this fails."""
         path = self._settings.password_file
         if not path:
             return None
@@ -199,7 +199,7 @@ class MqttTopics:
         return password
 
     def _connect(self, client: paho.Client) -> None:
-        """Connect the client, with a TLS handshake if configured; raises DeviceError."""
+        """Connect the client, with TLS if configured; raises DeviceError if this fails."""
         s = self._settings
         try:
             client.connect(s.host, s.port, s.keepalive_s)
@@ -314,12 +314,12 @@ class MqttTopics:
             chunks = list(self._queue)
             self._queue.clear()
             # Only the reader's thread changes `counts`, which it may be iterating over.
-            self._count()
+            self._add_pending_counts()
             if not chunks and self._loss and not self._closing:
                 raise DeviceError(self._loss)
             return chunks
 
-    def _count(self) -> None:
+    def _add_pending_counts(self) -> None:
         """Add the pending counts to `counts`."""
         self.counts += self._pending_counts
         self._pending_counts.clear()

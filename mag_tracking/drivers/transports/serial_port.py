@@ -3,7 +3,7 @@
 The transport returns a stream of bytes, in which the framing finds the readings. Data received
 before `open` are discarded, so the first bytes may belong to an incomplete frame.
 
-Sources: the termios of pyserial 3.5; TIOCGICOUNT of Linux (ioctl_tty(2), and `struct
+Sources: termios back end of pyserial 3.5; TIOCGICOUNT of Linux (ioctl_tty(2), and `struct
 serial_icounter_struct` in linux/serial.h) for losses on the line and in the driver. A
 pseudo-terminal has no such counters, and no losses.
 """
@@ -67,7 +67,7 @@ class SerialPort(Polled[serial.Serial]):
     """
 
     SETTINGS = SerialSettings
-    whole = False
+    is_message_oriented = False
 
     def __init__(self, settings: SerialSettings) -> None:
         super().__init__()
@@ -163,5 +163,5 @@ class SerialPort(Polled[serial.Serial]):
 
 
 def _line_errors_of(port: serial.Serial) -> tuple[int, ...]:
-    """Read the kernel's error counters; raises OSError if the port's driver does not count."""
+    """Read the kernel's error counters; raises OSError if the port's driver has no counters."""
     return ICOUNTER.unpack(fcntl.ioctl(port.fileno(), TIOCGICOUNT, bytes(ICOUNTER.size)))

@@ -106,7 +106,7 @@ class UdpSocket(Polled[socket.socket]):
     """
 
     SETTINGS = UdpSettings
-    whole = True
+    is_message_oriented = True
 
     def __init__(self, settings: UdpSettings, report: Callable[[str], object] = print) -> None:
         super().__init__()
@@ -146,12 +146,13 @@ class UdpSocket(Polled[socket.socket]):
                 self._set_up(opened)
             except OSError as error:
                 opened.close()
-                raise DeviceError(f'UDP {self._where()}: {self._open_error(error)}') from error
+                raise DeviceError(
+                    f'UDP {self._socket_name()}: {self._open_error(error)}') from error
             self._drops, self._difference = 0, clock_difference()
             self._attach(opened)
 
     def _set_up(self, opened: socket.socket) -> None:
-        """Set the options, then bind, because a bound socket receives datagrams at once."""
+        """Set the options and bind. Binding is last, because a bound socket receives datagrams."""
         s = self._settings
         opened.setblocking(False)
         opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
@@ -159,7 +160,7 @@ class UdpSocket(Polled[socket.socket]):
         # The kernel doubles the requested size for its overhead, and returns the doubled size.
         buffer_size = opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
         if buffer_size < s.receive_buffer:
-            self._report(f'UDP {self._where()}: the kernel limits the receive buffer to '
+            self._report(f'UDP {self._socket_name()}: the kernel limits the receive buffer to '
                          f'{buffer_size} bytes instead of {s.receive_buffer}; increase '
                          'net.core.rmem_max')
         if s.group:
@@ -169,7 +170,7 @@ class UdpSocket(Polled[socket.socket]):
                               socket.inet_aton(s.group) + socket.inet_aton(s.address))
         opened.bind((s.group or s.address, s.port))
 
-    def _where(self) -> str:
+    def _socket_name(self) -> str:
         """Local address and group, for messages."""
         s = self._settings
         return f'{s.address}:{s.port}' + (f', group {s.group}' if s.group else '')
@@ -209,13 +210,13 @@ class UdpSocket(Polled[socket.socket]):
         """
         with self._lock:
             if self._handle is None:
-                raise DeviceError(f'UDP {self._where()}: not open')
+                raise DeviceError(f'UDP {self._socket_name()}: not open')
             try:
                 woken_ns = self._wait(timeout_s)
                 chunks = [] if woken_ns is None else self._drain(self._handle, woken_ns)
                 self._count_drops(self._handle)
             except OSError as error:
-                raise DeviceError(f'UDP {self._where()}: {error}') from error
+                raise DeviceError(f'UDP {self._socket_name()}: {error}') from error
         return chunks
 
     def _drain(self, opened: socket.socket, woken_ns: int) -> list[Chunk]:
@@ -263,7 +264,7 @@ class UdpSocket(Polled[socket.socket]):
         return woken_ns
 
     def _count_drops(self, opened: socket.socket) -> None:
-        """Add the number of datagrams that the kernel has dropped since the last call."""
+        """Count the datagrams that the kernel has dropped since the previous call."""
         drops = MEMINFO.unpack(
             opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))[DROPS]
         if drops != self._drops:

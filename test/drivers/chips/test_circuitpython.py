@@ -72,7 +72,7 @@ def test_wrong_and_missing_chips_are_reported(clock):
         open_device(clock, LIS3MDL, silent)
 
 
-def test_failed_readings_are_counted_and_finally_raise(clock):
+def test_failed_readings_are_counted_and_repeated_failures_raise(clock):
     fake = FakeMmc5603(clock)
     _, device = open_device(clock, MMC5603, fake, max_failures=3)
     fake.answers = False
@@ -84,7 +84,7 @@ def test_failed_readings_are_counted_and_finally_raise(clock):
         device.read(1.0)
 
 
-def test_a_driver_that_waits_for_ever_times_out(clock):
+def test_a_driver_that_waits_forever_times_out(clock):
     fake = FakeMmc5603(clock)
     _, device = open_device(clock, MMC5603, fake, max_failures=2)
     assert device.read(1.0)
@@ -97,7 +97,7 @@ def test_a_driver_that_waits_for_ever_times_out(clock):
 
 
 def custom_device(name, cls, **changes):
-    """Rig (clock, bus, device) of a LIS3MDL with a custom driver from the module `name`."""
+    """Return (clock, bus, device) of a LIS3MDL whose driver is the class `name`.Sensor."""
     clock = Clock()
     settings = replace(I2cSettings(), {'sensors': [f'A:{name}.Sensor:0x1c'], **changes})
     bus = FakeBus(clock, {0x1C: FakeLis3mdl(clock)})
@@ -193,14 +193,14 @@ def test_slices_of_buffers_are_transferred(module):
         @property
         def magnetic(self):
             assert self.i2c.try_lock()
-            whole = bytearray(b'....')
+            first_buffer = bytearray(b'....')
             self.i2c.writeto(self.address, b'_\x23\x0c_', start=1, end=3)
             self.i2c.writeto(self.address, b'_\x0f', start=1)
-            self.i2c.readfrom_into(self.address, whole, start=1, end=2)
-            other = bytearray(b'....')
-            self.i2c.writeto_then_readfrom(self.address, b'__\x23__', other, out_start=2,
-                                           out_end=3, in_start=2, in_end=3)
-            assert (bytes(whole), bytes(other)) == (b'.\x3d..', b'..\x0c.')
+            self.i2c.readfrom_into(self.address, first_buffer, start=1, end=2)
+            second_buffer = bytearray(b'....')
+            self.i2c.writeto_then_readfrom(self.address, b'__\x23__', second_buffer,
+                                           out_start=2, out_end=3, in_start=2, in_end=3)
+            assert (bytes(first_buffer), bytes(second_buffer)) == (b'.\x3d..', b'..\x0c.')
             self.i2c.unlock()
             assert self.i2c.try_lock()
             return 1.0, -2.0, 3.0

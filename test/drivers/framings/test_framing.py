@@ -1,4 +1,4 @@
-"""Binary framing, checksums and field layouts; properties of every framing."""
+"""Binary framing, checksums, field layouts, and properties that every framing has."""
 
 import math
 import random
@@ -220,8 +220,9 @@ FRAMINGS = {
     'tail': (BinaryFraming(BinarySettings(sync='01', fields=('x:f32',), tail='02')), (
         b'\x01', b'\x02', b'\x01\x00\x00\x80\x7f\x02', b'\x01\x00\x00\x80\x3f\x02')),
 }
-MAX_REST = {'text': 121, 'json': 257, 'binary': 24, 'binary of a board': 41, 'short lines': 13,
-            'lines with a long end': 11, 'objects': 25, 'no checksum': 6, 'tail': 6}
+MAX_UNCONSUMED = {'text': 121, 'json': 257, 'binary': 24, 'binary of a board': 41,
+                  'short lines': 13, 'lines with a long end': 11, 'objects': 25, 'no checksum': 6,
+                  'tail': 6}
 
 
 def random_stream(name, seed):
@@ -249,7 +250,7 @@ def parse_pieces(name, pieces, final):
         readings += map(repr, parsed.readings)
         counts.update(parsed.rejected)
         rest = data[parsed.consumed:]
-        assert len(rest) <= (0 if last else MAX_REST[name])
+        assert len(rest) <= (0 if last else MAX_UNCONSUMED[name])
     return readings, counts, rest
 
 
@@ -287,12 +288,12 @@ def test_every_lost_frame_is_counted(name):
 
 
 @pytest.mark.parametrize('name', CASES)
-def test_every_frame_between_garbage_is_found_and_none_invented(name):
+def test_every_frame_between_garbage_is_found_and_no_reading_is_false(name):
     result = fuzz(CASES[name], 20_000)
     # A 16-bit checksum accepts one false frame in 65536; with this seed it accepts none.
     assert result.lost == result.invented == 0
     assert result.found == result.readings >= result.sent == 20_000
-    assert result.garbage > 200_000 and result.worst_rest <= MAX_REST[name]
+    assert result.garbage > 200_000 and result.worst_rest <= MAX_UNCONSUMED[name]
 
 
 def test_the_fuzzer_detects_lost_and_invented_readings():
@@ -323,7 +324,7 @@ def test_a_megabyte_without_frames_takes_linear_time(name, piece, size):
     parsed = framing.parse(stream)
     # Parsing takes about a second; in quadratic time it would take hours.
     assert time.process_time() - start < 20.0
-    assert not parsed.readings and len(stream) - parsed.consumed <= MAX_REST[name]
+    assert not parsed.readings and len(stream) - parsed.consumed <= MAX_UNCONSUMED[name]
     pieces = [stream[i:i + 1000] for i in range(0, 2**16, 1000)]
     assert parse_pieces(name, pieces, True) == parse_pieces(name, [b''.join(pieces)], True)
 

@@ -202,7 +202,7 @@ def test_a_path_without_a_valid_value_rejects_the_object(old, new, cause):
     assert parsed.rejected == {f'lines {cause}': 1} and not parsed.readings
 
 
-def test_an_object_of_several_lines_requires_a_whole_message():
+def test_an_object_of_several_lines_must_be_a_message_of_its_own():
     pretty = b'{\n "m": [1,\n 2, 3]\n}\n'
     assert json_framing().parse(pretty).rejected == {'lines that are not JSON': 4}
     parsed = json_framing().parse(pretty, final=True)

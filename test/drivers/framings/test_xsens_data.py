@@ -77,10 +77,10 @@ def test_a_recorded_message_of_an_mti_300_is_decoded():
     assert parsed.rejected == {}
 
 
-def test_recorded_answers_are_consumed_and_counted():
-    answers = bytes.fromhex('faff3100d0') + CONFIGURATION + bytes.fromhex('faff0304037003f88c')
-    parsed = FRAMING.parse(answers + FRAME)
-    assert parsed.readings == (READING,) and parsed.consumed == len(answers + FRAME)
+def test_recorded_replies_are_consumed_and_counted():
+    replies = bytes.fromhex('faff3100d0') + CONFIGURATION + bytes.fromhex('faff0304037003f88c')
+    parsed = FRAMING.parse(replies + FRAME)
+    assert parsed.readings == (READING,) and parsed.consumed == len(replies + FRAME)
     assert parsed.rejected == {
         'other messages: 0x31': 1, 'other messages: 0x0D': 1, 'other messages: 0x03': 1}
 
@@ -112,7 +112,7 @@ def test_encoded_readings_are_decoded(seed, precision, extended):
     assert parsed.readings == (reading,) and parsed.rejected == {}
 
 
-def test_packets_may_have_any_order_and_unknown_ones_are_skipped():
+def test_packets_may_have_any_order_and_unknown_packets_are_skipped():
     data = (packet(0xC020, reals(READING.field, FLOAT)) + packet(0x5A5F, b'\xfa\xff\x36')
             + packet(0x1070, b'\x00\x00\x00\x07') + packet(0x1020, b'\xa6\x55')
             + packet(0x2030, b'') + packet(0x1021, b'\x01\x02')

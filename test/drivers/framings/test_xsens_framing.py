@@ -96,7 +96,7 @@ def test_a_message_beyond_the_maximum_length_is_garbage():
 
 # Properties of every framing.
 
-def test_every_byte_is_parsed_counted_or_left():
+def test_every_byte_is_parsed_counted_or_unconsumed():
     rng = random.Random(5)
     for _ in range(200):
         frames = [encode_random_frame(rng)[0] for _ in range(10)]
@@ -142,7 +142,7 @@ def test_all_frames_between_garbage_are_found():
     assert lost_and_false(sent, found) == (0, 0)
 
 
-def test_the_helper_counts_lost_and_false_readings():
+def test_lost_and_false_counts_missing_and_additional_readings():
     a, b, c = (Reading(sequence=n) for n in range(3))
     assert lost_and_false([a, b, c], [a, b, c]) == (0, 0)
     assert lost_and_false([a, b, c], [a, c]) == (1, 0)
@@ -151,7 +151,7 @@ def test_the_helper_counts_lost_and_false_readings():
     assert lost_and_false([a, a], [a]) == (1, 0)
 
 
-def test_the_end_of_a_datagram_leaves_no_rest():
+def test_the_end_of_a_datagram_leaves_no_unconsumed_bytes():
     for n in range(len(FRAME)):
         parsed = FRAMING.parse(FRAME + FRAME[:n], final=True)
         assert parsed.readings == (READING,) and parsed.consumed == len(FRAME) + n
@@ -177,11 +177,11 @@ def test_message_starts_without_an_end_take_linear_time(unit):
 
 # False messages.
 
-def forged(mid, size, inside, at, adjust):
-    """False message of type `mid`, whose DATA is `at` zeros and the start of `inside`.
+def false_message(mid, size, inside, at, adjust):
+    """False message of type `mid`, followed by the remaining bytes of `inside`.
 
-    DATA has `size` bytes. The byte at the index `adjust` makes the checksum valid. The message is
-    followed by the remaining bytes of `inside`.
+    DATA has `size` bytes: `at` zeros and the beginning of `inside`. The byte at the index
+    `adjust` makes the checksum valid.
     """
     header = bytearray(b'\xfa\xff' + bytes([mid, size]) + bytes(at))
     rest = inside[:size + 5 - len(header)]
@@ -195,7 +195,7 @@ def forged(mid, size, inside, at, adjust):
 @pytest.mark.parametrize('size', range(9, 200, 7))
 def test_a_message_that_contains_another_is_rejected(inside, size):
     """The outer message ends within the inner message, with it, or after it."""
-    data = forged(0x0D, size, inside, 6, 5)
+    data = false_message(0x0D, size, inside, 6, 5)
     whole = LEGACY.parse(data, final=True)
     assert whole.readings == LEGACY.parse(inside).readings
     assert whole.rejected[SPLICED] == 1
@@ -215,14 +215,14 @@ def test_a_message_that_ends_with_the_next_preamble_is_rejected():
         assert FRAMING.parse(data[:n]).consumed == 0
 
 
-def test_an_answer_that_ends_with_a_preamble_waits_but_a_reading_does_not():
-    answer = message(0x01, b'\x00\x00\x00\x01')
-    answer = message(0x01, bytes([0, 0, 0, (answer[-1] + 1 - 0xFA) & 0xFF]))
-    assert answer[-1] == 0xFA
-    assert FRAMING.parse(answer).consumed == 0
+def test_a_reply_that_ends_with_a_preamble_is_delayed_but_a_reading_is_not():
+    reply = message(0x01, b'\x00\x00\x00\x01')
+    reply = message(0x01, bytes([0, 0, 0, (reply[-1] + 1 - 0xFA) & 0xFF]))
+    assert reply[-1] == 0xFA
+    assert FRAMING.parse(reply).consumed == 0
     rejected = {'other messages: 0x01': 1}
-    assert FRAMING.parse(answer, final=True).rejected == rejected
-    parsed = FRAMING.parse(answer + FRAME)
+    assert FRAMING.parse(reply, final=True).rejected == rejected
+    parsed = FRAMING.parse(reply + FRAME)
     assert parsed.readings == (READING,) and parsed.rejected == rejected
     for count in range(256):
         sent = mtdata2(READING._replace(sequence=count))
@@ -306,15 +306,15 @@ def test_a_reading_waits_for_at_most_the_longest_message():
     assert FRAMING.parse(data).readings == (READING,) * 21
 
 
-def test_an_answer_that_may_contain_the_longest_message_is_rejected():
-    answer = message(0x0D, bytes(3) + b'\xfa\xff\x36\xff\x02\x00' + bytes(5))
-    data = answer + FRAME * 20
+def test_a_reply_that_may_contain_the_longest_message_is_rejected():
+    reply = message(0x0D, bytes(3) + b'\xfa\xff\x36\xff\x02\x00' + bytes(5))
+    data = reply + FRAME * 20
     assert FRAMING.parse(data[:MAX_MESSAGE - 1]).consumed == 0
     parsed = FRAMING.parse(data)
     assert parsed.readings == (READING,) * 20
-    assert parsed.rejected[SPLICED] == 1 and parsed.rejected[BETWEEN] == len(answer)
+    assert parsed.rejected[SPLICED] == 1 and parsed.rejected[BETWEEN] == len(reply)
     # A datagram that ends earlier cannot contain that message.
-    assert FRAMING.parse(answer + FRAME, final=True).rejected == {'other messages: 0x0D': 1}
+    assert FRAMING.parse(reply + FRAME, final=True).rejected == {'other messages: 0x0D': 1}
 
 
 @pytest.mark.parametrize('false', [b'\xfa', b'\xfa\xff', b'\xfa\xff\x36', b'\xfa\xff\x36\xfe',

@@ -62,7 +62,7 @@ def test_full_scale_is_measured_and_values_beyond_are_nan(chip, changes, largest
 
 @pytest.mark.parametrize('chip', FAKES)
 def test_the_arrival_time_is_that_of_the_conversion(chip):
-    """The field changes by 1 mT/s and so encodes the time."""
+    """The field encodes the time, because it changes by 1 mT/s."""
     clock, _, device, fake = one(chip, rate_hz=23.0)
     errors = []
     for _ in range(40):
@@ -112,7 +112,7 @@ def test_missed_polling_cycles_are_counted_and_the_grid_is_kept():
     assert device.counts == {'polling cycles missed': 5}
 
 
-def test_a_polling_cycle_longer_than_the_period_misses_others():
+def test_polling_cycles_longer_than_the_period_are_partly_missed():
     clock, _, device, _ = one('mmc5983ma', rate_hz=100.0, mmc5983ma={'conversion_ms': 8.0})
     arrivals = read_for(device, clock, 2.0)
     assert len(arrivals) + device.counts['polling cycles missed'] == pytest.approx(200, abs=3)
@@ -146,8 +146,8 @@ def test_the_chips_on_a_bus_measure_simultaneously():
 @pytest.mark.parametrize('chip', ['lis3mdl', 'rm3100'])
 def test_no_conversion_is_read_twice(chip):
     clock, _, device, fake = one(chip, rate_hz=400.0)
-    serial = itertools.count()
-    fake.field = lambda ns: (next(serial) * 1e-7, 0.0, 0.0)
+    numbers = itertools.count()
+    fake.field = lambda ns: (next(numbers) * 1e-7, 0.0, 0.0)
     arrivals = read_for(device, clock, 1.0)
     rate = {'lis3mdl': 155, 'rm3100': 147}[chip]
     assert len(arrivals) == pytest.approx(rate, abs=2)

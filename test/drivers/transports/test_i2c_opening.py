@@ -160,8 +160,8 @@ def test_a_failure_during_set_up_is_reported_and_closes_the_bus(error, message, 
 def test_a_truncated_block_is_a_failed_reading():
     clock, bus, device, fake = one('lis3mdl')
     device.read(1.0)
-    whole = bus.read_i2c_block_data
-    bus.read_i2c_block_data = lambda *arguments: whole(*arguments)[:5]
+    read_block = bus.read_i2c_block_data
+    bus.read_i2c_block_data = lambda *arguments: read_block(*arguments)[:5]
     assert device.read(0.02) == []
     assert device.counts['failed readings: A'] == 1
 
@@ -201,12 +201,12 @@ def test_close_ends_a_read_in_another_thread():
 
 
 def multiplexed_rig():
-    """(clock, bus, device): three chips with one address on channels, two directly on the bus."""
+    """(clock, bus, device): three chips on channels share an address; two are on the bus itself."""
     clock = Clock()
-    at = {name: FakeLis3mdl(clock, (i * 1e-5, 0.0, 0.0))
-          for i, name in enumerate('ABC', start=1)}
-    chips = {0x70: FakeMultiplexer(clock, {0: {0x1C: at['A']}, 5: {0x1C: at['B']}}),
-             0x71: FakeMultiplexer(clock, {0: {0x1C: at['C']}}),
+    fakes = {name: FakeLis3mdl(clock, (i * 1e-5, 0.0, 0.0))
+             for i, name in enumerate('ABC', start=1)}
+    chips = {0x70: FakeMultiplexer(clock, {0: {0x1C: fakes['A']}, 5: {0x1C: fakes['B']}}),
+             0x71: FakeMultiplexer(clock, {0: {0x1C: fakes['C']}}),
              0x1E: FakeHmc5883l(clock), 0x30: FakeMmc5603(clock)}
     return rig(['A:lis3mdl:0x1c@0x70.0', 'B:lis3mdl:0x1c@0x70.5', 'D:hmc5883l:0x1e',
                 'C:lis3mdl:0x1c@0x71.0', 'E:mmc5603:0x30'], chips, clock)

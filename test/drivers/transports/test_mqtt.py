@@ -1,4 +1,4 @@
-"""MQTT with a real broker: delivery, counted losses, failures, TLS and closing."""
+"""MQTT transport with real and scripted brokers: delivery, losses, failures, TLS, closing."""
 
 import os
 import threading
@@ -106,7 +106,7 @@ def test_messages_arrive_complete_and_in_order_with_their_topic(broker, topics, 
     assert arrivals == sorted(arrivals)
     assert before < arrivals[0] and arrivals[-1] < time.monotonic_ns()
     assert not mqtt.counts
-    assert mqtt.whole
+    assert mqtt.is_message_oriented
 
 
 def test_only_subscribed_topics_are_received(broker, topics):
@@ -374,7 +374,7 @@ def test_a_broker_that_does_not_answer_a_subscription_is_reported(topics):
     bytes([0x20, 0]), bytes([0xF0, 0]), bytes([0x30, 1, 0]), bytes([0x32, 2, 0, 0]),
     bytes([0x00, 0]), b'\x30\xff\xff\xff\xff\xff'])
 def test_invalid_packets_end_the_connection_and_are_reported(topics, garbage):
-    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + garbage) as server:
+    with ScriptedBroker(CONNECTED, lambda request: granted(request) + garbage) as server:
         mqtt = topics(server.port, connect_timeout_s=2.0)
         try:
             mqtt.open()
@@ -387,7 +387,7 @@ def test_invalid_packets_end_the_connection_and_are_reported(topics, garbage):
 
 def test_duplicates_are_counted_and_passed_on(topics):
     packets = publish_packet(b'mag/a', b'1') + publish_packet(b'mag/a', b'1', 0x08)
-    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
+    with ScriptedBroker(CONNECTED, lambda request: granted(request) + packets) as server:
         mqtt = topics(server.port)
         mqtt.open()
         assert [c.data for c in read_chunks(mqtt, 2)] == [b'1', b'1']
@@ -396,7 +396,7 @@ def test_duplicates_are_counted_and_passed_on(topics):
 
 def test_a_topic_that_is_not_utf_8_is_counted(topics):
     packets = publish_packet(b'mag/\xff', b'1') + publish_packet(b'mag/a', b'2')
-    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
+    with ScriptedBroker(CONNECTED, lambda request: granted(request) + packets) as server:
         mqtt = topics(server.port)
         mqtt.open()
         assert [c.data for c in read_chunks(mqtt, 1)] == [b'2']
@@ -405,7 +405,7 @@ def test_a_topic_that_is_not_utf_8_is_counted(topics):
 
 def test_counts_survive_a_lost_connection(topics):
     packets = publish_packet(b'mag/\xff', b'1')
-    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
+    with ScriptedBroker(CONNECTED, lambda request: granted(request) + packets) as server:
         mqtt = topics(server.port)
         mqtt.open()
         server.hang_up()

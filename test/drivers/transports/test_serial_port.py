@@ -110,7 +110,7 @@ def test_a_million_bytes_arrive_complete_and_in_order(device, port):
     writer.start()
     assert read_bytes(port, len(sent), 20.0) == sent
     writer.join()
-    assert not port.counts and not port.whole
+    assert not port.counts and not port.is_message_oriented
 
 
 def test_every_byte_arrives_unchanged(device, port):

@@ -1,4 +1,4 @@
-"""UDP over real sockets of this machine."""
+"""UDP transport over real sockets of the local machine."""
 
 import os
 import socket
@@ -77,7 +77,7 @@ def test_each_datagram_is_a_chunk(listen, sender):
     chunks += udp.read(5.0)
     assert [c.data for c in chunks] == sent
     assert {c.source for c in chunks} == {'127.0.0.1'}
-    assert not udp.counts and udp.whole
+    assert not udp.counts and udp.is_message_oriented
 
 
 def test_the_source_may_include_its_port(listen, sender):
@@ -218,7 +218,7 @@ def test_datagrams_dropped_by_the_kernel_are_counted(listen, sender):
 
 
 def test_a_reader_that_keeps_up_loses_nothing(listen, sender):
-    """Up to 2500 datagrams of 200 bytes are sent per second."""
+    """The sender transmits up to 2500 datagrams of 200 bytes per second."""
     udp = listen()
     sent = [i.to_bytes(4, 'big') * 50 for i in range(1000)]
 
@@ -245,10 +245,10 @@ def test_an_overflow_of_the_kernel_counter_is_handled(listen, monkeypatch):
         drops = 0
 
         def getsockopt(self, level, kind, *size):
-            given = super().getsockopt(level, kind, *size)
+            value = super().getsockopt(level, kind, *size)
             if kind != udp_socket.SO_MEMINFO:
-                return given
-            return given[:-4] + self.drops.to_bytes(4, sys.byteorder)
+                return value
+            return value[:-4] + self.drops.to_bytes(4, sys.byteorder)
 
     monkeypatch.setattr(socket, 'socket', Dropping)
     udp = listen()
@@ -355,10 +355,10 @@ def test_a_reserved_port_is_reported(monkeypatch):
 def test_a_limited_receive_buffer_is_reported(sockets, listen):
     reports = []
     udp = listen(reports.append, receive_buffer=1 << 30)
-    given = sockets[-1].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+    actual_size = sockets[-1].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
     assert reports == [
         f'UDP 127.0.0.1:{udp.settings.port}: the kernel limits the receive buffer to '
-        f'{given} bytes instead of {1 << 30}; increase net.core.rmem_max']
+        f'{actual_size} bytes instead of {1 << 30}; increase net.core.rmem_max']
     reports.clear()
     listen(reports.append, receive_buffer=100_000)
     assert sockets[-1].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == 200_000
