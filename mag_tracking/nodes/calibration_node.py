@@ -232,7 +232,7 @@ class CalibrationNode(StageNode):
         self._deferred.request()
 
     def _calibrate_readings(self, raw: Readings) -> list[Readings]:
-        """Calibrate readings and return them; also pass them to the `next_steps`, if any."""
+        """Calibrate readings, return the result, and pass it to the `next_steps`, if any."""
         calibrated = self._stage.feed(raw)
         if self._next_steps is not None:
             detection, tracker = self._next_steps
@@ -242,7 +242,7 @@ class CalibrationNode(StageNode):
         return calibrated
 
     def _do_deferred_work(self) -> None:
-        """Run the stages' deferred work, health checks and a due step; report changed doubts."""
+        """Run deferred work, health checks and, if due, a step of the round; report new doubts."""
         self._stage.idle()
         if self._next_steps is not None:
             self._next_steps[1].idle()

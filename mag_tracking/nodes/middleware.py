@@ -63,18 +63,19 @@ def _init(arguments: list[str] | None) -> None:
 
 
 def _with_ros_files(arguments: list[str] | None, folder: Path) -> list[str] | None:
-    """Replace plain parameter files by converted copies; raise SettingsError for invalid files.
+    """Return the arguments, with plain parameter files replaced by converted copies in `folder`.
 
-    None selects `sys.argv`. The copies are only needed until `rclpy.init` has returned.
+    `arguments` is None for `sys.argv`. The copies are only needed until `rclpy.init` has returned.
+    Raises SettingsError for an invalid file.
     """
-    words = list(sys.argv if arguments is None else arguments)
-    for k, word in enumerate(words[:-1]):
+    converted = list(sys.argv if arguments is None else arguments)
+    for k, argument in enumerate(converted[:-1]):
         # rclpy reports missing files and invalid arguments.
-        if word != PARAMETER_FILE or ROS_ARGUMENTS not in words[:k] \
-                or not Path(words[k + 1]).is_file():
+        if argument != PARAMETER_FILE or ROS_ARGUMENTS not in converted[:k] \
+                or not Path(converted[k + 1]).is_file():
             continue
-        content = as_ros_parameters(words[k + 1])
+        content = as_ros_parameters(converted[k + 1])
         if content is not None:
-            words[k + 1] = str(folder / f'{k}.yaml')
-            Path(words[k + 1]).write_text(content, encoding='utf-8')
-    return words
+            converted[k + 1] = str(folder / f'{k}.yaml')
+            Path(converted[k + 1]).write_text(content, encoding='utf-8')
+    return converted

@@ -185,10 +185,10 @@ class RecordNode(Node):
                                 max(1, len(infos)) if source.latched else 0)
         self._described_topics.add(topic)
 
-    def _refuse(self, topic: str, why: str) -> None:
+    def _refuse(self, topic: str, reason: str) -> None:
         """Report once that a topic is not recorded."""
-        self._refused[topic] = why
-        self._report(f'{topic} is not recorded: {why}')
+        self._refused[topic] = reason
+        self._report(f'{topic} is not recorded: {reason}')
 
     def _update_publishers(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
         """Update a topic's publishers; resubscribe as volatile if one of them is not latched."""

@@ -13,7 +13,7 @@ from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute
 from mag_tracking.nodes.flow import SILENCE_TIMEOUT_S
-from mag_tracking.nodes.sensor_graph import missing_publisher, topic_findings
+from mag_tracking.nodes.sensor_graph import no_message_finding, topic_findings
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
@@ -215,7 +215,7 @@ class HealthDiagnostics:
         if self._node is None:
             return [Finding(True, name, 'no message received', 'check its cable, its driver and '
                             f'the topic {topic}')]
-        return [missing_publisher(self._node, name, topic, self._topics)]
+        return [no_message_finding(self._node, name, topic, self._topics)]
 
     def _clock_findings(self, name: str) -> list[Finding]:
         """Return a fault if a sensor's timestamps differ from the computer's time by over a day."""

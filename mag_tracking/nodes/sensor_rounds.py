@@ -59,7 +59,7 @@ class SensorRounds:
         self._states = [self._state(j) for j in range(len(network))]
 
     def tick(self) -> None:
-        """Mark the next step as due, to run after the next readings; first run a step still due."""
+        """Mark the next step as due after the next readings; first run a step that is still due."""
         if self._is_due:
             self._step()
         self._is_due = True
@@ -97,7 +97,7 @@ class SensorRounds:
         return to_message(SensorCalibration, sensor_dict(self._stage, self._network, j))
 
     def _rounds(self) -> Iterator[None]:
-        """Run endless rounds and yield after each step: compare, update, report, publish, store."""
+        """Run endless rounds; yield after each step: compare, update, report, publish, store."""
         while True:
             self._health.begin_round(self._stage)
             yield

@@ -77,7 +77,7 @@ class StageNode(Node):
         Network file.
     network : SensorNetwork
     settings : Settings
-        Settings in force.
+        Defaults of the target, overridden by parameters.
     title : str
         Name of the node in diagnostics.
     input_qos : QoSProfile
@@ -235,10 +235,10 @@ class StageNode(Node):
 
         def receive(message: Any) -> None:
             assert flow is not None
-            began = time.monotonic()
+            start_s = time.monotonic()
             self.now_ns = self.get_clock().now().nanoseconds
             callback(message)
-            flow.add(stamp_ns(message.header.stamp), self.now_ns, began)
+            flow.add(stamp_ns(message.header.stamp), self.now_ns, start_s)
 
         return self.create_subscription(
             message_type, topic, callback if flow is None else receive, qos,
@@ -269,10 +269,10 @@ class StageNode(Node):
         flow.topics += map(self.resolve_topic_name, topics)
 
         def receive(record: _Record) -> None:
-            began = time.monotonic()
+            start_s = time.monotonic()
             self.now_ns = self.get_clock().now().nanoseconds
             callback(record)
-            flow.add(stamp_of(record), self.now_ns, began)
+            flow.add(stamp_of(record), self.now_ns, start_s)
 
         return receive
 

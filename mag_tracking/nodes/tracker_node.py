@@ -87,7 +87,7 @@ class TrackerNode(StageNode):
     Attributes
     ----------
     after_pose : function or None
-        Publishes the frame of a pose; called after the pose and before the track are published.
+        Publishes the frame of a pose; called between the publication of the pose and of the track.
     """
 
     def __init__(self, has_direct_input: bool = False, **node_arguments: Any) -> None:
@@ -199,7 +199,7 @@ class TrackerNode(StageNode):
         self._stage.set_doubtful_times(times)
 
     def idle(self) -> None:
-        """Do the work that the stage defers until the preceding step has published its results."""
+        """Run the deferred work of the stage; called after the preceding step has published."""
         self._stage.idle()
 
     def _feed(self, frame: FieldFrame) -> None:

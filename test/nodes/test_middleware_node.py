@@ -35,10 +35,10 @@ node, received = Node('listener'), Future()
 executor = EventsExecutor()
 executor.add_node(node)
 # The creation of the node is not part of the measured delay.
-began = time.monotonic()
+start = time.monotonic()
 node.create_subscription(MagneticField, '/field', received.set_result, STREAM_QOS)
 executor.spin_until_future_complete(received, 60.0)
-waited = time.monotonic() - began
+waited = time.monotonic() - start
 partial = Path(sys.argv[1]).with_suffix('.partial')
 partial.write_text(str(waited))
 partial.rename(sys.argv[1])
@@ -103,7 +103,7 @@ def test_a_restarted_node_receives_messages_at_once(ros, tmp_path):
 
 
 def test_the_history_of_each_publisher_fits_into_one_request(ros):
-    """Otherwise a restarted node needs a second request, which follows seconds later."""
+    """With a longer history, a restarted node needs a second request, which is seconds later."""
     driver = DriverNode(parameter_overrides=[
         Parameter('drivers', value=str(ROOT / 'config' / 'drivers.yaml')),
         Parameter('network', value=str(NETWORK_FILE)), Parameter('batches', value=True),
