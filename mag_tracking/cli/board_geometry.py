@@ -199,7 +199,7 @@ def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
 
 
 def _print_magnet(g: NetworkGeometry, has_unknown_poses: bool) -> None:
-    """Print the moment and, for known poses, the offset and tilt of the magnet in the tool frame."""
+    """Print the moment and, for known poses, the offset and tilt of the magnet in the tool."""
     def formatted(values: FloatArray, std: FloatArray, scale: float, digits: int) -> str:
         return ' '.join(f'{scale * v:.{digits}f} ({scale * s:.{digits}f})'
                         for v, s in zip(values, std, strict=True))
