@@ -19,7 +19,7 @@ PROFILE = Path(__file__).with_name('fastdds.xml')
 """Fast DDS profile for fast discovery, also of nodes that were killed and restarted."""
 PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 """Environment variable that selects a profile in Fast DDS 2.14 (Jazzy)."""
-PROFILE_IN_FOLDER = 'DEFAULT_FASTRTPS_PROFILES.xml'
+WORKING_FOLDER_PROFILE = 'DEFAULT_FASTRTPS_PROFILES.xml'
 """Name of the profile that Fast DDS loads from the working folder by default."""
 ROS_ARGUMENTS, PARAMETER_FILE = '--ros-args', '--params-file'
 
@@ -42,7 +42,7 @@ def begin(arguments: list[str] | None = None) -> None:
         If the ROS arguments or a parameter file are invalid.
     """
     profile = os.environ.get(PROFILE_VARIABLE)
-    if profile is None and not Path(PROFILE_IN_FOLDER).exists():
+    if profile is None and not Path(WORKING_FOLDER_PROFILE).exists():
         os.environ[PROFILE_VARIABLE] = str(PROFILE)
     with tempfile.TemporaryDirectory(prefix='mag_tracking_') as folder:
         _init(_with_ros_files(arguments, Path(folder)))

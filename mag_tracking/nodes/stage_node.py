@@ -115,7 +115,8 @@ class StageNode(Node):
         if self.settings.track.target != target:
             raise SettingsError(f'{name}: parameter track.target is {self.settings.track.target!r}'
                                 f', but target is {target!r}; set target only')
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULT_QOS)
+        self._diagnostics_publisher = self.create_publisher(
+            DiagnosticArray, '/diagnostics', RESULT_QOS)
         self._reported_rejections: dict[tuple[str, str], int] = {}
         self.flows: dict[str, Flow] = {}
         self._subscriber_monitors: list[SubscriberMonitor] = []
@@ -364,7 +365,7 @@ class StageNode(Node):
         if statuses:
             array = DiagnosticArray(status=statuses)
             array.header.stamp = self.get_clock().now().to_msg()
-            self._diagnostics.publish(array)
+            self._diagnostics_publisher.publish(array)
 
 
 def has_subscribers(publisher: Publisher) -> bool:

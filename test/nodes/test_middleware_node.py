@@ -77,7 +77,7 @@ def test_a_profile_of_the_user_is_kept(init_calls, capfd, own, is_reported):
 
 
 def test_a_profile_in_the_working_folder_is_kept(init_calls, tmp_path):
-    (tmp_path / middleware.PROFILE_IN_FOLDER).write_text('<dds/>')
+    (tmp_path / middleware.WORKING_FOLDER_PROFILE).write_text('<dds/>')
     middleware.begin()
     assert middleware.PROFILE_VARIABLE not in os.environ and len(init_calls) == 1
 
