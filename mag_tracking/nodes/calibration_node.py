@@ -243,7 +243,7 @@ class CalibrationNode(StageNode):
         return calibrated
 
     def _do_deferred_work(self) -> None:
-        """Run deferred work, health checks and, if due, a step of the round; report new doubts."""
+        """Run deferred work, health checks and any due step of the round; report changed doubts."""
         self._stage.idle()
         if self._next_steps is not None:
             self._next_steps[1].idle()

@@ -187,5 +187,5 @@ class SubscriberMonitor:
         return DiagnosticStatus(
             level=DiagnosticStatus.ERROR if is_gone else DiagnosticStatus.OK,
             name=f'{node}: to {self.role}', hardware_id='magnetometer network',
-            message=f'{", ".join(missing)} is gone: check that it is running'
+            message=f'{", ".join(missing)} has disappeared: check that it is running'
             if is_gone else message)

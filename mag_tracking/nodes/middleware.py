@@ -45,7 +45,7 @@ def begin(arguments: list[str] | None = None) -> None:
     if profile is None and not Path(WORKING_FOLDER_PROFILE).exists():
         os.environ[PROFILE_VARIABLE] = str(PROFILE)
     with tempfile.TemporaryDirectory(prefix='mag_tracking_') as folder:
-        _init(_with_ros_files(arguments, Path(folder)))
+        _init(_with_ros_parameter_files(arguments, Path(folder)))
     if profile and not Path(profile).exists():
         rclpy.logging.get_logger('middleware').warning(
             f'{PROFILE_VARIABLE}: file {profile} does not exist: no Fast DDS profile is active, '
@@ -62,7 +62,7 @@ def _init(arguments: list[str] | None) -> None:
         raise SettingsError(f'ROS arguments: {str(error).partition(", at /")[0]}') from error
 
 
-def _with_ros_files(arguments: list[str] | None, folder: Path) -> list[str] | None:
+def _with_ros_parameter_files(arguments: list[str] | None, folder: Path) -> list[str] | None:
     """Return the arguments, with plain parameter files replaced by converted copies in `folder`.
 
     `arguments` is None for `sys.argv`. The copies are only needed until `rclpy.init` has returned.

@@ -82,7 +82,7 @@ class _PolledSubscription:
         self.last_number = number
 
     def set_publishers(self, infos: list[TopicEndpointInfo]) -> None:
-        """Update the publishers; if one is gone, ignore the next jump of the sequence number."""
+        """Update the publishers; if one has disappeared, ignore the next sequence number jump."""
         publishers = tuple(sorted(tuple(i.endpoint_gid) for i in infos))
         if set(self.publishers) - set(publishers):
             self.last_number = None

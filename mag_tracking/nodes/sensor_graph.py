@@ -1,4 +1,4 @@
-"""Faults of the publishers of the sensor topics."""
+"""Detection of faults in the publishers of sensor topics."""
 
 from collections.abc import Mapping
 

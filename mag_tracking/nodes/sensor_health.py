@@ -158,7 +158,7 @@ class HealthDiagnostics:
     def _compare(self, calibrate: Calibrate) -> None:
         """Compare the sensors with each other and with the Earth's field.
 
-        Also records since when each frozen background has been frozen.
+        Also records the time at which each frozen background was frozen.
         """
         for name, background in calibrate.backgrounds().items():
             if not background.frozen:

@@ -1,4 +1,4 @@
-"""Topics of the traffic statistics of the tracker node."""
+"""Traffic statistics topics of the tracker node."""
 
 from mag_tracking_msgs.msg import TrafficSummary as TrafficSummaryMessage
 from mag_tracking_msgs.msg import VehiclePassage as VehiclePassageMessage

@@ -1,4 +1,4 @@
-"""Invalid calls to running nodes: no file is overwritten, no node ends, each call is answered."""
+"""Invalid calls to nodes: no file is overwritten, no node ends, each call gets a response."""
 
 import os
 from pathlib import Path

@@ -139,7 +139,7 @@ def test_a_subscriber_that_disappears_is_reported():
     assert status('/rviz', '/other').message == 'running'
     disappeared = status('/rviz')
     assert disappeared.level == DiagnosticStatus.ERROR and disappeared.name == 'me: to tracker'
-    assert disappeared.message == '/other is gone: check that it is running'
+    assert disappeared.message == '/other has disappeared: check that it is running'
     assert status('/other').level == DiagnosticStatus.OK
     # A tracker with another name may replace the first; other subscribers may disappear.
     assert status('/second').level == DiagnosticStatus.OK

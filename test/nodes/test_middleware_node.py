@@ -83,7 +83,7 @@ def test_a_profile_in_the_working_folder_is_kept(init_calls, tmp_path):
 
 
 def test_a_restarted_node_receives_messages_at_once(ros, tmp_path):
-    """Without the profile, the delay is often 1 to 4 s."""
+    """The delay is often 1 to 4 s without the profile."""
     node, spin_until = ros
     publisher = node.create_publisher(MagneticField, '/field', PUBLISHER_QOS)
     # Fast enough to fill the history for a killed node before the next node starts.
@@ -103,7 +103,7 @@ def test_a_restarted_node_receives_messages_at_once(ros, tmp_path):
 
 
 def test_the_history_of_each_publisher_fits_into_one_request(ros):
-    """With a longer history, a restarted node needs a second request, which is seconds later."""
+    """A longer history would require a second request, which follows seconds after a restart."""
     driver = DriverNode(parameter_overrides=[
         Parameter('drivers', value=str(ROOT / 'config' / 'drivers.yaml')),
         Parameter('network', value=str(NETWORK_FILE)), Parameter('batches', value=True),

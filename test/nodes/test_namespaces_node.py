@@ -89,7 +89,7 @@ def test_two_networks_on_one_graph_do_not_interfere(ros, tmp_path, road_network)
         killed.kill()
         killed.communicate(timeout=MAX_S)
         assert spin_until(lambda: statuses['north/watchman: to tracker'].startswith(
-            '/north/follower is gone'))
+            '/north/follower has disappeared'))
         assert statuses['a/b/watchman: to tracker'] == 'running'
     finally:
         exit_codes, outputs = stop(processes)

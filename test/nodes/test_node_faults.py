@@ -44,7 +44,7 @@ def ended_tracks(world, since_ns):
 
 
 def seconds_to_first_reading(world, sensor_back_ns):
-    """Seconds until the first reading that was measured after `sensor_back_ns`."""
+    """Seconds from `sensor_back_ns` to the first later reading, at most `MAX_RECOVERY_S`."""
     assert world.wait(lambda: any(
         m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns
         for _, m in world.since(sensor_back_ns, 'driver_node')))
@@ -128,7 +128,7 @@ def test_a_killed_node_recovers_after_its_restart(site, name):
 @pytest.mark.parametrize('name, reporter, words', [
     ('calibration_node', 'detection_node: from calibration', 'no message from'),
     ('detection_node', 'tracker_node: from detection', 'no message from'),
-    ('tracker_node', 'detection_node: to tracker', 'tracker_node is gone')])
+    ('tracker_node', 'detection_node: to tracker', 'tracker_node has disappeared')])
 def test_a_dead_node_is_reported_by_its_peer(site, name, reporter, words):
     """A track without frames ends."""
     site.use('mqtt')
